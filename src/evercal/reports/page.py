@@ -86,11 +86,12 @@ def render(template: str, **values: object) -> str:
 
     The document has no references to other files.
     """
-    return _environment().get_template(template).render(values)
+    return environment().get_template(template).render(values)
 
 
 @functools.cache
-def _environment() -> "Environment":
+def environment() -> "Environment":
+    """The templates; undefined names raise."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     return Environment(
