@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evercal.recordings.formats.generic import pose_to_dict
-
 if TYPE_CHECKING:
     from evercal.calibration.calibration import ErrorTerm
     from evercal.calibration.drift import Shift
@@ -37,6 +35,8 @@ def answer_row(answer: Answer) -> dict[str, object]:
 
     Where the unit of length is unknown, lengths are in that unit and there are no millimetres.
     """
+    from evercal.recordings.formats.generic import pose_to_dict
+
     estimate = answer.estimate
     pose, uncertain = pose_to_dict(estimate.base_from_camera), finite_pose(estimate)
     if pose is not None and estimate.base_from_camera is not None:

@@ -39,8 +39,8 @@ def camera_views(calibration: Calibration, around: Surroundings) -> Picture:
     side = int(depth > width), 2  # the wider one
     figure = new_figure(10.8, 4.8)
     for panel, plane in zip(figure.subplots(1, 2), (ABOVE, side), strict=True):
-        draw_view(panel, plane, lines, around, bounds, (parent, "m"))
         panel.fill(*ellipse(pose, times, plane).T, color=COLOURS[1], alpha=0.3, zorder=2)
+        draw_view(panel, plane, lines, around, bounds, (parent, "m"))
     c, b, a = 1000 * np.sqrt(CHI2_95 * variances.clip(0))
     forward = pose.pose.rotation_matrix()[:, 2]
     angle = np.rad2deg(np.arccos(np.clip(abs(axes[:, 2] @ forward), 0.0, 1.0)))

@@ -112,6 +112,10 @@ def draw_view(
     frame, unit = names
     (x0, y0), (x1, y1) = bounds[:, plane]
     x, y = (plain(f"{'xyz'[axis]} of {frame[:24]} ({unit})") for axis in plane)
-    panel.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel=x, ylabel=y)
+    panel.set(xlabel=x, ylabel=y)
     panel.locator_params(nbins=7)
     tidy(panel)
+    # Where the box is narrower than the panel, more is shown, and nothing white.
+    panel.set_xlim(x0, x1, auto=True)
+    panel.set_ylim(y0, y1, auto=True)
+    panel.set_aspect("equal", adjustable="datalim")
