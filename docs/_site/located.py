@@ -9,7 +9,7 @@ from pathlib import Path
 import evercal
 from evercal.recordings import write_image
 from evercal.reports.answers import Answer
-from evercal.reports.scene.animation import Animation
+from evercal.reports.video import animate
 
 OUT = Path(__file__).parents[1] / "located.jpg"
 
@@ -19,7 +19,7 @@ def main(store: Path, image: Path) -> None:
     localizer = evercal.Map.open(store).localizer
     estimate = localizer.localize(evercal.read_image(image))
     answer = Answer(image, estimate, estimate.milliseconds)
-    [frame] = Animation([answer], localizer, evercal.read_image)
+    [frame] = animate([answer], localizer, evercal.read_image)
     write_image(OUT, frame)
 
 

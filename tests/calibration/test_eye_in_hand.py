@@ -84,6 +84,11 @@ def test_report_becomes_a_calibration(learned: tuple[Path, LearnReport], hand: R
     calibration = report.calibration(hand.test[0].camera, "arm", 60)
     assert (calibration.mount, calibration.parent_frame) == ("eye_in_hand", "gripper")
     assert tier(calibration) in TIERS
+    # As in the report of a fixed camera: images, their residuals, and causes that sum to the whole.
+    assert len(calibration.images) > 10
+    assert all(0 < (image.residual_mm or 0) < 5 for image in calibration.images if image.used)
+    parts = [term.translation_mm for term in calibration.error_terms]
+    assert np.linalg.norm(parts) == pytest.approx(calibration.sigma_mm)
     doubtful = replace(report, warnings=("the clocks differ",))
     verdict = doubtful.calibration(hand.test[0].camera, "arm", 60).verdict
     assert verdict == "Do not rely on it: the clocks differ."

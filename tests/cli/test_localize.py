@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -161,12 +162,11 @@ def test_camera_file_replaces_the_camera_of_the_scene(
 def test_video_holds_every_image_and_json_only_its_object(
     run: Any, hall_store: Path, images: Path, tmp_path: Path
 ) -> None:
-    av = pytest.importorskip("av")
     ran = run("localize", hall_store, images, "--video", tmp_path / "a.mp4", "--json")
     rows = json.loads(ran.out)["images"]
     assert (ran.code, ran.err) == (0, [])
-    with av.open(str(tmp_path / "a.mp4")) as container:
-        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    frames = [image for ok, image in (video.read() for _ in range(9)) if ok]
     assert len(frames) == len(rows)
     assert frames[0].shape == (560, 1280, 3)
 

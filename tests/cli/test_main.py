@@ -148,7 +148,6 @@ def test_unusable_arguments_are_an_error_object(run: Any, words: list[str], mess
         (["learn", "S", "R", "--calibration", "GONE/c.json"], "--calibration GONE/c.json: folder"),
         (["learn", "S", "R", "--calibration", "DIR"], "--calibration DIR: is a folder"),
         (["localize", "S", "IMAGE", "--overlay", "FILE/x"], "--overlay FILE/x: cannot be created"),
-        (["evaluate", "S", "R", "--report", "GONE/r.html"], "--report GONE/r.html: folder"),
         (["calibrate", "S", "IMAGE", "--out", "GONE/c.json"], "--out GONE/c.json: folder"),
         (["calibrate", "S", "IMAGE", "--out", "DIR"], "--out DIR: is a folder"),
         (["detect", "IMAGE", "--board", "apriltag", "--out", "GONE/b.json"], "--out GONE/b.json"),

@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from evercal.calibration.boards.board_poses import board_poses
+from evercal.calibration.boards.corners import BoardView
+from evercal.calibration.boards.detection import Board
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import write_image
-from evercal.reports.calibration_images import annotate_images, select_images
-from evercal.reports.overlay import exaggeration
+from evercal.reports.calibration_images import annotate_images, boards_seen, select_images
+from evercal.reports.overlay import LandmarkPicture
 
 
 def pose(quaternion: ArrayLike, translation: ArrayLike) -> SE3:
@@ -52,9 +55,6 @@ class FixedLocalizer:
         self.contents = SimpleNamespace(scenes=[scene], short_side=60)
         self.pose = pose
 
-    def camera_for(self, stated: Camera) -> Camera | None:
-        return stated
-
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         assert camera is not None
         if self.pose is None:
@@ -63,6 +63,12 @@ class FixedLocalizer:
         pixels = camera.resized(80, 60).project([[0.1, 0.1, 1.0], [0.2, -0.1, 1.0]])
         pixels[1, 0] += 3
         return PoseEstimate("ok", "", "room", self.pose, None, 2, 1.0, 1.0, pixels, points)
+
+
+def drawn_in(own: Calibration, folder: Path, localizer: Any) -> list[LandmarkPicture]:
+    """The annotated images of a calibration in a folder."""
+    files, _ = select_images(own, folder)
+    return list(annotate_images(own, files, None, localizer).images.values())
 
 
 def test_selection_is_spread_and_includes_a_rejected_image(tmp_path: Path) -> None:
@@ -100,30 +106,12 @@ def test_unusable_images_are_reported(tmp_path: Path) -> None:
     (tmp_path / "broken.png").write_bytes(b"no image")
     own = calibration({"a.png": True, "wide.png": True, "broken.png": True})
     result = annotate_images(own, select_images(own, tmp_path)[0])
-    assert [Path(image.name).name for image in result.images] == ["a.png"]
-    assert result.images[0].summary == "used"
-    assert not result.landmarks
+    [(name, image)] = result.images.items()
+    assert (Path(name).name, image.summary, image.landmarks) == ("a.png", "used", 0)
     text = " ".join(result.missing)
     assert "wide.png is 160x90, which does not fit the camera, 160x120" in text
     assert "broken.png: not a readable image" in text
     assert "No landmarks: pass --store" in text
-
-
-def test_axes_are_drawn_at_the_projected_base(tmp_path: Path) -> None:
-    write_images(tmp_path, "a.png")
-    own = calibration({"a.png": True})
-    result = annotate_images(own, select_images(own, tmp_path)[0])
-    assert result.axes is not None
-    # K [R | t] by hand: the camera looks straight down from a metre above.
-    assert result.axes.origin_px == pytest.approx((79.5 - 15, 59.5 + 7.5))
-    image = result.images[0].image.astype(int)
-    scale = image.shape[1] / 160
-    x, y = np.round((result.axes.origin_px + 0.5) * scale - 0.5).astype(int)
-    coloured = np.argwhere(np.ptp(image, axis=2) > 60)
-    assert np.abs(coloured - [y, x]).max(axis=1).min() <= 3
-    # 10 cm are 15 pixels of the camera: x to the right, y up.
-    assert coloured[:, 1].max() == pytest.approx(x + 15 * scale, abs=40)
-    assert coloured[:, 0].min() == pytest.approx(y - 15 * scale, abs=40)
 
 
 def test_axes_of_an_older_calibration_are_added(tmp_path: Path) -> None:
@@ -131,12 +119,15 @@ def test_axes_of_an_older_calibration_are_added(tmp_path: Path) -> None:
     own = calibration({"a.png": True})
     older = replace(own, parent_from_child=pose([0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
     files, _ = select_images(own, tmp_path)
-    alone, both = annotate_images(own, files), annotate_images(own, files, older)
-    assert both.older_axes is not None
-    assert both.older_axes.origin_px == pytest.approx((79.5, 59.5))
-    differ = np.argwhere((alone.images[0].image != both.images[0].image).any(axis=2))
-    scale = both.images[0].image.shape[1] / 160
-    assert np.abs(differ - [60 * scale, 80 * scale]).max(axis=1).min() < 12
+    alone, both = (
+        next(iter(annotate_images(own, files, other).images.values())).image
+        for other in (None, older)
+    )
+    # K [R | t] by hand: both look straight down from a metre above.
+    coloured = np.argwhere(np.ptp(alone.astype(int), axis=2) > 60)
+    assert np.abs(coloured - [4 * (59.5 + 7.5), 4 * (79.5 - 15)]).max(axis=1).min() < 6
+    differ = np.argwhere((alone != both).any(axis=2))
+    assert np.abs(differ - [4 * 60, 4 * 80]).max(axis=1).min() < 12
 
 
 @pytest.mark.parametrize(
@@ -152,7 +143,7 @@ def test_residuals_refer_to_the_calibration_of_a_fixed_camera(
     write_images(tmp_path, "a.png")
     own = calibration({"a.png": True}, mount=mount, parent_frame="parent")
     localizer: Any = FixedLocalizer(BASE_FROM_CAMERA @ SE3.exp([0.05, 0, 0, 0, 0, 0]))
-    [image] = annotate_images(own, select_images(own, tmp_path)[0], None, localizer).images
+    [image] = drawn_in(own, tmp_path, localizer)
     assert image.landmarks == 2
     words = f"used; 2 landmarks, median residual {median_px:.2f} px, lines "
     assert image.summary.startswith(words)
@@ -162,7 +153,7 @@ def test_lines_lead_from_the_detections_to_the_projections(tmp_path: Path) -> No
     write_images(tmp_path, "a.png")
     own = calibration({"a.png": True})
     localizer: Any = FixedLocalizer(BASE_FROM_CAMERA)
-    [image] = annotate_images(own, select_images(own, tmp_path)[0], None, localizer).images
+    [image] = drawn_in(own, tmp_path, localizer)
     assert image.summary.endswith("lines 1 times as long")
     # The second landmark is seen 24 pixels of the page right of its projection.
     [(x, y)] = CAMERA.resized(640, 480).project([[0.2, -0.1, 1.0]]).round().astype(int)
@@ -172,29 +163,45 @@ def test_lines_lead_from_the_detections_to_the_projections(tmp_path: Path) -> No
     assert orange.max() == pytest.approx(x + 24 + 3, abs=2)  # with the radius of the yellow dot
 
 
-@pytest.mark.parametrize(
-    ("length", "times"), [(0.1, 100), (0.6, 20), (2.4, 10), (26.0, 1), (np.nan, 1)]
-)
-def test_lines_are_exaggerated_by_a_round_factor(length: float, times: int) -> None:
-    assert exaggeration(np.full((20, 2), length / 2**0.5)) == times
-
-
-def test_an_outlier_does_not_shorten_the_other_lines() -> None:
-    vectors = np.full((20, 2), 1.0)
-    vectors[0] = 500.0
-    assert exaggeration(vectors) == 10
-
-
 def test_reason_for_missing_landmarks_is_given(tmp_path: Path) -> None:
     write_images(tmp_path, "a.png")
     own = calibration({"a.png": True}, source={"scene": "room", "map": "another"})
     files, _ = select_images(own, tmp_path)
     without_pose: Any = FixedLocalizer(None)
     result = annotate_images(own, files, None, without_pose)
-    assert result.images[0].summary == "used; too dark"
+    assert [image.summary for image in result.images.values()] == ["used; too dark"]
     assert result.other_map
     assert not annotate_images(calibration({}), [], None, without_pose).other_map
     localizer: Any = FixedLocalizer(BASE_FROM_CAMERA)
     elsewhere = replace(own, source={"scene": "attic"})
-    [image] = annotate_images(elsewhere, files, None, localizer).images
+    [image] = drawn_in(elsewhere, tmp_path, localizer)
     assert image.summary == "used; shows room, not attic"
+
+
+def test_corners_are_projected_with_the_estimated_size(tmp_path: Path) -> None:
+    points = np.array([[x, y, 0] for y in range(3) for x in range(3)]) * 0.03
+    board_pose = SE3.from_translation([0.01, 0.02, 0.5])
+    # The board is stated 2 % too large.
+    view = BoardView(1.02 * points, CAMERA.project(board_pose.apply(points)))
+    views = {"images/a.png": view, "images/b.png": "no board"}
+    board_poses(Board("chessboard", 0.03, 3, 3), CAMERA, views).write(tmp_path / "board.json")
+    (tmp_path / "images").mkdir()
+    write_images(tmp_path, "images/a.png")
+    stated = {"translation_m": [0.01, 0.02, 0.5], "quaternion_wxyz": [1, 0, 0, 0]}
+    own = calibration(
+        {"images/a.png": True},
+        checks={"camera_from_board": {"images/a.png": stated}, "scale": 1 / 1.02},
+        source={"command": "solve", "camera_poses": "board.json"},
+    )
+    seen = boards_seen(own, tmp_path)
+    assert list(seen) == ["images/a.png"]
+    assert seen["images/a.png"].projected(CAMERA) == pytest.approx(view.pixels, abs=1e-9)
+    files, _ = select_images(own, tmp_path)
+    result = annotate_images(own, files, boards=seen)
+    assert [image.summary for image in result.images.values()] == [
+        "used; 9 corners, 0.00 px rms, lines 100 times as long"
+    ]
+    assert not result.missing
+    assert boards_seen(own, tmp_path / "elsewhere") == {}
+    (tmp_path / "board.json").write_text("0 0 0 0 0 0 1")
+    assert boards_seen(own, tmp_path) == {}

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from evercal.evaluation import FrameResult
-from evercal.geometry import SE3
-from evercal.localization.estimate import PoseEstimate
-from evercal.recordings.frame import Frame, Recording
 from evercal.reports.demo_page import DemoResult, FixedCamera, LearnedRoom, demo_page
-from evercal.reports.evaluate_page import evaluation_page
 from evercal.reports.page import Picture, Table
 
-from .test_calibration_page import CAMERA, GREY, full, read, solved
+from .test_calibration_page import full, read, solved
 from .test_page import PNG, page
 
 pytestmark = pytest.mark.slow
@@ -46,19 +40,6 @@ CONTRAST = """() => {
 }"""
 
 
-def evaluated() -> str:
-    """The page of an evaluation of two frames, one of them without a pose."""
-    pose = SE3.identity()
-    frames = tuple(Frame(name, GREY, CAMERA, pose) for name in ("a", "b"))
-    rows = [
-        FrameResult("room", "a", 0.002, 0.001, "ok", "room", False, 1.0, 9, 0.5, estimated=pose),
-        FrameResult("room", "b", math.inf, math.inf, "failed", None, False, 1.0, 0, 0.0),
-    ]
-    nothing = PoseEstimate("failed", "too dark", None, None, None, 0, 0.0, 1.0)
-    localizer: Any = SimpleNamespace(localize=lambda image, camera: nothing)
-    return evaluation_page(localizer, {"room": Recording("room", (), frames)}, rows, "a.evercal")
-
-
 def demonstrated() -> str:
     rows = [FrameResult("a", "1", 0.001, 0.001, "ok", "a", False, 1.0, 9, 0.5)]
     result = DemoResult(
@@ -77,9 +58,8 @@ PAGES = {
     "good": lambda: read(full())[1].html,
     "bad": lambda: read(full(checks={"repeatability_mm": 100.0}, verdict=""))[1].html,
     "solved": lambda: read(solved(), name="a_long_name_without_a_space" * 4)[1].html,
-    "evaluate": evaluated,
     "demo": demonstrated,
-    "bench": lambda: page(WIDE, Picture(PNG)),
+    "wide table": lambda: page(WIDE, Picture(PNG)),
 }
 
 

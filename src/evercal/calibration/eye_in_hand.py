@@ -4,20 +4,23 @@
 refines it together with all poses and landmarks. This file connects the two and reports.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from evercal.calibration.calibration import Calibration
+from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
 from evercal.calibration.eye_in_hand_start import HandEyeStart, hand_eye_start
+from evercal.calibration.located import length_mm_deg
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
 from evercal.mapping.build import Adjusted, BuiltMap, OnProgress
-from evercal.recordings.frame import Recording
+from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.frame import lacks_camera_poses as lacks_camera_poses
 
 MOST_FOCAL_PERCENT, MOST_POSE_SIGMA_MM = 1.0, 5.0
@@ -45,6 +48,10 @@ class HandEyeReport:
     given_deg: float | None = None
     warnings: tuple[str, ...] = ()
     """Reasons not to rely on the estimate."""
+    error_terms: tuple[ErrorTerm, ...] = ()
+    """Parts of the covariance by cause."""
+    images: tuple[ImageUse, ...] = ()
+    """Use of each frame; residuals are those of its gripper pose."""
 
     @property
     def gripper_from_camera(self) -> UncertainPose:
@@ -61,6 +68,8 @@ class HandEyeReport:
             estimate.covariance,
             parent_frame="gripper",
             camera=camera,
+            images=self.images,
+            error_terms=self.error_terms,
             source={"command": "learn", "scene": scene, "frames": frames},
             created=datetime.now(UTC).isoformat(timespec="seconds"),
         )
@@ -104,19 +113,21 @@ def posed_by_gripper(
 
 
 def hand_eye_report(
-    start: HandEyeStart, built: BuiltMap, given: SE3 | None = None
+    start: HandEyeStart, built: BuiltMap, frames: Sequence[Frame], given: SE3 | None = None
 ) -> HandEyeReport:
     """Return the estimate after bundle adjustment.
 
     Args:
         start: First estimate.
         built: Map that was built with `MapOptions.for_hand_eye`.
+        frames: The frames that it was built from.
         given: `gripper_from_camera` from another source, to compare with.
     """
     correction = built.hand_eye
     assert correction is not None, "the map was built for a hand-eye calibration"
     # The covariance of the correction is about camera axes, as that of a pose after an exact one.
-    start_from_camera = UncertainPose(correction.start_camera_from_camera, correction.covariance)
+    covariance = correction.by_noise + correction.by_drift
+    start_from_camera = UncertainPose(correction.start_camera_from_camera, covariance)
     estimate = start.gripper_from_camera @ start_from_camera
     start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.gripper_from_camera)
     given_mm = given_deg = None
@@ -133,7 +144,24 @@ def hand_eye_report(
         given_mm=given_mm,
         given_deg=given_deg,
         warnings=_warnings(built.adjusted),
+        error_terms=(
+            ErrorTerm.of("noise of images and gripper poses", correction.by_noise),
+            ErrorTerm.of("slowly varying errors of gripper poses", correction.by_drift),
+        ),
+        images=tuple(use for frame in frames if (use := _use(frame, built)) is not None),
     )
+
+
+def _use(frame: Frame, built: BuiltMap) -> ImageUse | None:
+    """How the adjustment used a frame; None if it left it out as redundant."""
+    assert built.hand_eye is not None, "the map was built for a hand-eye calibration"
+    name = str(frame.image) if isinstance(frame.image, Path) else frame.name
+    if frame.name in built.adjusted.wrong_poses:
+        return ImageUse(name, False, "its gripper pose contradicts the images")
+    if frame.name in built.adjusted.untracked:
+        return ImageUse(name, False, "it could not be tracked in other images")
+    residual = built.hand_eye.residuals.get(frame.name)
+    return None if residual is None else ImageUse(name, True, "", *length_mm_deg(residual))
 
 
 def _warnings(adjusted: Adjusted) -> tuple[str, ...]:

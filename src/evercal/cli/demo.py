@@ -231,17 +231,16 @@ def _pose(recording: "Recording") -> "SE3":
 
 def _pictures(localizer: "Localizer", scene: "Recording") -> "list[Picture]":
     """Test images with detected landmarks."""
-    from evercal.reports.overlay import encode_image
+    from evercal.reports.overlay import draw_landmarks
     from evercal.reports.page import Picture
-    from evercal.reports.pictures import draw_landmarks
 
     pictures = []
     for frame in _spread(scene.test, PICTURES):
         image = frame.read_image()
         estimate = localizer.localize(image, frame.camera)
         drawn = draw_landmarks(image, estimate, localizer)
-        caption = f"{estimate.scene or estimate.status}: {estimate.inliers} landmarks"
-        pictures.append(Picture(encode_image(drawn, "jpg"), caption))
+        caption = f"{estimate.scene or estimate.status}: {drawn.summary}"
+        pictures.append(Picture.photo(drawn.image, caption))
     return pictures
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar, require_writable
+from evercal.cli.console import print_json, print_next, progress_bar
 from evercal.cli.device import Device
 from evercal.cli.stores import open_localizer
 from evercal.errors import InputError
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class Evaluate:
     """Measure the localization accuracy on the test frames of scenes.
 
-    Example: evercal evaluate cell.evercal kitchen/ --report report.html
+    Example: evercal evaluate cell.evercal kitchen/
     """
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
@@ -28,8 +28,6 @@ class Evaluate:
         Positional[tuple[str, ...]], arg(metavar="[NAME=]SCENE...", help_behavior_hint="")
     ]
     """Folders of recorded scenes. NAME is the scene's name in the store, if it differs."""
-    report: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
-    """HTML report with error curves, trajectories and the worst frames."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
@@ -38,7 +36,6 @@ class Evaluate:
         """Evaluate and print a table."""
         if not self.scenes:
             raise InputError("no scene given; name one or more scene folders after the store")
-        require_writable(self.report, "--report")
         scenes = load_named(self.scenes)
         from evercal.evaluation import evaluate, scores
         from evercal.evaluation.tables import score_table
@@ -52,23 +49,12 @@ class Evaluate:
 
             results = evaluate(localizer, scenes, on_frame=show)
         summary = scores(results)
-        if self.report is not None:
-            from evercal.reports.evaluate_page import evaluation_page
-            from evercal.storage import write_bytes
-
-            page = evaluation_page(localizer, scenes, results, str(self.store))
-            write_bytes(self.report, page.encode())
         if self.json:
             print_json(summary.to_dict())
             return 0
         print(score_table(summary))
         print(f"{summary.ms_per_image:.0f} ms per image, one at a time, decoding included")
-        if self.report is None:
-            words = [*self.scenes, "--report", "report.html"]
-            print_next("evercal", "evaluate", self.store, *words)
-        else:
-            print(f"wrote {self.report}")
-            print_next("evercal", "learn", self.store, "SCENE")
+        print_next("evercal", "learn", self.store, "SCENE")
         return 0
 
 

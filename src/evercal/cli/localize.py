@@ -46,10 +46,10 @@ class Localize:
     """Intrinsics: 3x3 matrix as text, JSON, YAML, NPZ, ROS camera_info or OpenCV's storage.
     Default: those of the camera that recorded the scene."""
     overlay: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Output folder for copies of the images with their inliers."""
+    """Output folder for copies of the images with their landmarks and residuals."""
     video: Annotated[Path | None, arg(metavar="FILE.mp4", help_behavior_hint="")] = None
     """A video of the sequence: each image with its landmarks and residuals, beside the map seen
-    from above with the camera's path and its uncertainty (extra `video`)."""
+    from above with the camera's path and its uncertainty."""
     at: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None
     """A point in the camera frame (x right, y down, z forward; metres), such as an object that the
     camera sees: print its standard deviation in the base frame."""
@@ -66,10 +66,10 @@ class Localize:
         camera = camera_for(self.camera, files)
         require_folder(self.overlay, "--overlay")
         if self.video is not None:
-            from evercal.reports.scene.animation import require_video
+            from evercal.reports.video import require_ending
 
             require_writable(self.video, "--video")
-            require_video(self.video)
+            require_ending(self.video)
         localizer = open_localizer(self.store, self.device)
         answers = self._answers(localizer, files, camera)
         if self.video is not None:
@@ -91,7 +91,7 @@ class Localize:
         """The answer for each image; times include decoding."""
         from evercal.localization.parallel import in_parallel
         from evercal.recordings import read_image, write_image
-        from evercal.reports.pictures import draw_estimate, scene_camera
+        from evercal.reports.overlay import draw_landmarks
 
         def answer(number: int) -> Answer:
             path, began = files[number], time.perf_counter()
@@ -100,9 +100,8 @@ class Localize:
             milliseconds = 1000 * (time.perf_counter() - began)
             known = unit_known(localizer, estimate.scene)
             if self.overlay is not None and estimate.scene is not None:
-                intrinsics = camera or scene_camera(localizer, estimate.scene)
-                drawn = draw_estimate(image, estimate, intrinsics, legend=known)
-                write_image(self.overlay / _overlay_name(files, number), drawn)
+                drawn = draw_landmarks(image, estimate, localizer, camera, width=image.shape[1])
+                write_image(self.overlay / _overlay_name(files, number), drawn.image)
             return Answer(path, estimate, milliseconds, known)
 
         answers = []
@@ -114,7 +113,7 @@ class Localize:
 
     def _animate(self, path: Path, localizer: "LearnedLocalizer", answers: list[Answer]) -> None:
         from evercal.recordings import read_image
-        from evercal.reports.scene.animation import Animation, write_video
+        from evercal.reports.video import animate, write_video
 
         with progress_bar("drawing", len(answers), "image") as bar:
 
@@ -122,7 +121,7 @@ class Localize:
                 bar.update()
                 return read_image(file)
 
-            write_video(path, iter(Animation(answers, localizer, read)))
+            write_video(path, animate(answers, localizer, read))
 
     def _next(self, files: list[Path], located: int) -> None:
         if not located:

@@ -12,8 +12,7 @@ from evercal.cli.point_words import point_dict, point_of, point_text
 from evercal.cli.stores import open_localizer
 
 if TYPE_CHECKING:
-    from evercal.reports.board_views import BoardSeen
-    from evercal.reports.calibration_images import AnnotatedImages
+    from evercal.reports.calibration_images import AnnotatedImages, BoardSeen
     from evercal.reports.calibration_page import NamedCalibration
 
 
@@ -50,7 +49,7 @@ class Report:
         point = point_of(self.at)
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.verdict import expected_error, tier, verdict
-        from evercal.reports.board_views import boards_seen
+        from evercal.reports.calibration_images import boards_seen
         from evercal.reports.calibration_page import NamedCalibration, calibration_page, difference
         from evercal.storage import write_bytes
 
@@ -62,7 +61,7 @@ class Report:
         boards = boards_seen(calibration, self.calibration.parent)
         images = self._images(file, older, boards)
         store = None if self.store is None else str(self.store)
-        page = calibration_page(file, images, store, older, point, boards)
+        page = calibration_page(file, images, store, older, point, bool(boards))
         write_bytes(self.out, page.html.encode())
         text = calibration.verdict or verdict(calibration)
         if not self.json:
@@ -83,7 +82,7 @@ class Report:
                 "tier": None if best is None else best.name,
                 "expected_error_mm": mm,
                 "expected_error_deg": deg,
-                "pictures": [image.name for image in images.images],
+                "pictures": list(images.images),
                 "against": against,
                 "missing": list(page.missing),
                 **({} if point is None else {"at": point_dict(point, calibration.uncertain_pose)}),

@@ -38,7 +38,7 @@ class Track:
     out: Annotated[
         tuple[Path, ...], arg(metavar="FILE...", help_behavior_hint="(default: none)")
     ] = ()
-    """Files to write: .jsonl (JSON lines), .tum or .txt (TUM), .mcap (Foxglove)."""
+    """Files to write: .jsonl (JSON lines), .tum or .txt (TUM)."""
     camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Intrinsics. Default: those of the camera that recorded the scene."""
     at_most: Annotated[float | None, arg(metavar="MS", help_behavior_hint="")] = None
@@ -82,7 +82,7 @@ class Track:
                         known = unit_known(localizer, frame.estimate.scene)
                         row = track_row(frame, name, known)
                         for file in files:
-                            file.write(frame, row, image)
+                            file.write(frame, row)
                     if not self.json:
                         print(_line(name, frame), flush=True)
                     if self.most is not None and len(times) >= self.most:

@@ -114,7 +114,8 @@ def learn_scene(
     if start is not None:
         from evercal.calibration.eye_in_hand import hand_eye_report
 
-        report = replace(report, hand_eye=hand_eye_report(start, built, gripper_from_camera))
+        hand_eye = hand_eye_report(start, built, split.train, gripper_from_camera)
+        report = replace(report, hand_eye=hand_eye)
     return scene, report
 
 

@@ -120,8 +120,12 @@ class HandEyeCorrection:
 
     start_camera_from_camera: SE3
     """gripper_from_camera is the rough one times this."""
-    covariance: NDArray[np.float64]
-    """(6, 6), camera frame, translation in metres and rotation in radians."""
+    by_noise: NDArray[np.float64]
+    """(6, 6) covariance by noise of images and gripper poses; camera frame, metres and radians."""
+    by_drift: NDArray[np.float64]
+    """(6, 6) covariance by errors of gripper poses that vary slowly over the recording."""
+    residuals: dict[str, NDArray[np.float64]]
+    """(6,) deviation of each frame's gripper pose from the images, by name; camera frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,10 +367,13 @@ def _finish(
         )
         if not options.bundle.common_stated:
             # The common transform is part of the answer and not an error to undo.
-            covariance = np.asarray(adjustment.common_covariance, np.float64)
-            covariance = HAND_EYE_COVARIANCE_SCALE * covariance + adjustment.common_systematic
-            hand_eye = HandEyeCorrection(common, covariance)
-            base = frame_covariance(frames.stated @ common, covariance)
+            by_noise = np.asarray(adjustment.common_covariance, np.float64)
+            by_noise = HAND_EYE_COVARIANCE_SCALE * by_noise
+            by_drift = np.asarray(adjustment.common_systematic, np.float64)
+            names = (frame.name for frame in frames.frames)
+            residuals = dict(zip(names, adjustment.correction, strict=True))
+            hand_eye = HandEyeCorrection(common, by_noise, by_drift, residuals)
+            base = frame_covariance(frames.stated @ common, by_noise + by_drift)
             frame = replace(frame, common=SE3.identity(), base_covariance=base)
     return BuiltMap(
         SceneMap(

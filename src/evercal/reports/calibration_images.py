@@ -3,26 +3,26 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.calibration.boards.board_poses import read_board_poses
+from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.calibration.from_images import map_digest
 from evercal.errors import InputError
-from evercal.geometry import Camera, resize_pixels
+from evercal.geometry import SE3, Camera, resize_pixels
 from evercal.recordings.images import read_image
-from evercal.reports.board_views import BoardSeen
-from evercal.reports.frame_axes import (
-    AxesInView,
-    axes_in_view,
-    close_up,
+from evercal.reports.overlay import (
+    PICTURE_PX,
+    LandmarkPicture,
     draw_axes,
-    draw_directions,
+    draw_landmarks,
+    draw_residuals,
+    resized,
 )
-from evercal.reports.overlay import overlay_points, overlay_vectors
-from evercal.reports.pictures import draw_residuals, landmark_errors
 from evercal.reports.scene.side_views import Surroundings
 
 if TYPE_CHECKING:
@@ -32,124 +32,44 @@ Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
 
 MAX_IMAGES = 4
-_WIDTH_PX = 640
-_CLOSE_UP_PX = 480
-_ASPECT_TOLERANCE = 0.01
-
-
-@dataclass(frozen=True)
-class ImageFile:
-    """An image of the camera."""
-
-    path: Path
-    """An existing file."""
-    use: ImageUse | None
-    """Its entry in the calibration; None for other images."""
 
 
 @dataclass(frozen=True, eq=False)
-class AnnotatedImage:
-    """One image with overlays."""
+class BoardSeen:
+    """A board in one image."""
 
-    name: str
-    """Path of the image."""
-    image: Image
-    """(h, w, 3) uint8 RGB."""
-    summary: str
-    """Use in the calibration and number of landmarks, or the reason for their absence."""
-    landmarks: int | None = None
-    """Number of detected landmarks; None without a store."""
+    view: BoardView
+    """Detected corners."""
+    camera_from_board: SE3
+    """Pose by the robot's pose and the calibration."""
+    scale: float
+    """Estimated length per stated length of the board."""
+
+    def projected(self, camera: Camera) -> Array:
+        """Return the (k, 2) pixels of the corners by the calibration."""
+        return camera.project(self.camera_from_board.apply(self.scale * self.view.points_m))
+
+
+class ImageFile(NamedTuple):
+    """An existing image of the camera."""
+
+    path: Path
+    use: ImageUse | None
+    """Its entry in the calibration; None for other images."""
 
 
 @dataclass(frozen=True, eq=False)
 class AnnotatedImages:
     """The images of a calibration with overlays."""
 
-    images: tuple[AnnotatedImage, ...] = ()
-    """At most `MAX_IMAGES`."""
-    axes: AxesInView | None = None
-    """Axes of the parent frame, the same in every image; None without intrinsics."""
-    older_axes: AxesInView | None = None
-    """Axes according to an older calibration."""
-    close_up: Image | None = None
-    """The origin of the parent frame in the first image, enlarged; None if it is not visible."""
+    images: Mapping[str, LandmarkPicture] = field(default_factory=dict)
+    """At most `MAX_IMAGES`, by path; each summary begins with the use in the calibration."""
     missing: tuple[str, ...] = ()
     """Sentences about overlays that are not possible."""
     other_map: bool = False
     """Whether the map in the store differs from the map of the calibration."""
     surroundings: Surroundings = field(default_factory=Surroundings)
     """The map around a fixed camera; empty without a store."""
-
-    @property
-    def landmarks(self) -> bool:
-        """Whether landmarks were drawn."""
-        return any(image.landmarks for image in self.images)
-
-
-def annotate_images(
-    calibration: Calibration,
-    files: Sequence[ImageFile],
-    older: Calibration | None = None,
-    localizer: "LearnedLocalizer | None" = None,
-    boards: Mapping[str, BoardSeen] | None = None,
-    on_image: Callable[[], object] = lambda: None,
-) -> AnnotatedImages:
-    """Draw a calibration into some of its images.
-
-    The older calibration is drawn pale and dashed; the localizer detects landmarks. Corners of
-    boards are drawn by name of the image.
-    """
-    camera = calibration.camera
-    if camera is None:
-        return AnnotatedImages(missing=("No pictures: the calibration holds no intrinsics.",))
-    axes = axes_in_view(camera, calibration.parent_from_child.inverse())
-    older_axes = None
-    if older is not None:
-        older_axes = axes_in_view(camera, older.parent_from_child.inverse())
-    annotated, missing, detail = [], [], None
-    for file in files:
-        try:
-            image = read_image(file.path)
-        except InputError as error:
-            missing.append(f"One picture is missing: {error}.")
-            continue
-        height, width = image.shape[:2]
-        if abs(camera.width * height / (camera.height * width) - 1) > _ASPECT_TOLERANCE:
-            missing.append(
-                f"One picture is missing: {file.path} is {width}x{height}, which does not fit the"
-                f" camera, {camera.width}x{camera.height}."
-            )
-            continue
-        if not annotated:
-            detail = close_up(image, camera, axes, older_axes, _CLOSE_UP_PX)
-        use = file.use
-        board = boards.get(use.name) if boards and use is not None else None
-        drawer = board if board is not None else localizer
-        annotated.append(_annotate(calibration, file, image, (axes, older_axes), drawer))
-        on_image()
-    if annotated and localizer is None and not boards:
-        missing.append("No landmarks: pass --store to draw them.")
-    other_map = localizer is not None and _is_other_map(calibration, localizer)
-    return AnnotatedImages(
-        tuple(annotated),
-        axes,
-        older_axes,
-        detail,
-        tuple(missing),
-        other_map,
-        Surroundings() if localizer is None else _surroundings(calibration, localizer),
-    )
-
-
-def _surroundings(calibration: Calibration, localizer: "LearnedLocalizer") -> Surroundings:
-    """Return the map that a fixed camera was calibrated in; empty for other cameras and maps."""
-    from evercal.mapping.scene_map import SceneMap
-
-    name = calibration.source.get("scene")
-    scene = next((s for s in localizer.contents.scenes if s.name == name), None)
-    if calibration.mount != "eye_to_hand" or not isinstance(scene, SceneMap):
-        return Surroundings()
-    return Surroundings.of(scene) if scene.unit_known else Surroundings()
 
 
 def select_images(
@@ -187,77 +107,108 @@ def _spread(files: list[ImageFile], count: int = MAX_IMAGES) -> list[ImageFile]:
     return [files[i] for i in np.unique(chosen)]
 
 
-def _annotate(
+def annotate_images(
     calibration: Calibration,
-    file: ImageFile,
+    files: Sequence[ImageFile],
+    older: Calibration | None = None,
+    localizer: "LearnedLocalizer | None" = None,
+    boards: Mapping[str, BoardSeen] | None = None,
+    on_image: Callable[[], object] = lambda: None,
+) -> AnnotatedImages:
+    """Draw a calibration into some of its images.
+
+    The axes by the older calibration are pale; the localizer detects landmarks. Corners of boards
+    are drawn by name of the image.
+    """
+    camera = calibration.camera
+    if camera is None:
+        return AnnotatedImages(missing=("No pictures: the calibration holds no intrinsics.",))
+    annotated: dict[str, LandmarkPicture] = {}
+    missing = []
+    for file in files:
+        try:
+            image = _fitting(file.path, camera)
+        except InputError as error:
+            missing.append(f"One picture is missing: {error}.")
+            continue
+        board = boards.get(file.use.name) if boards and file.use is not None else None
+        drawn = _with_evidence(calibration, camera, image, board or localizer)
+        picture = drawn.image
+        if older is not None:
+            pose = older.parent_from_child.inverse()
+            picture = draw_axes(picture, camera, pose, pale=True)
+        pose = calibration.parent_from_child.inverse()
+        picture = draw_axes(picture, camera, pose)
+        summary = "; ".join(filter(None, [_use(file.use), drawn.summary]))
+        annotated[str(file.path)] = LandmarkPicture(picture, drawn.landmarks, summary)
+        on_image()
+    if annotated and localizer is None and not boards:
+        missing.append("No landmarks: pass --store to draw them.")
+    if localizer is None:
+        return AnnotatedImages(annotated, tuple(missing))
+    other, around = _is_other_map(calibration, localizer), _surroundings(calibration, localizer)
+    return AnnotatedImages(annotated, tuple(missing), other, around)
+
+
+def _fitting(path: Path, camera: Camera) -> Image:
+    image = read_image(path)
+    height, width = image.shape[:2]
+    if not camera.fits(width, height):
+        raise InputError(
+            f"{path} is {width}x{height}, which does not fit the camera,"
+            f" {camera.width}x{camera.height}"
+        )
+    return image
+
+
+def _with_evidence(
+    calibration: Calibration,
+    camera: Camera,
     image: Image,
-    axes: tuple[AxesInView, AxesInView | None],
     evidence: "LearnedLocalizer | BoardSeen | None",
-) -> AnnotatedImage:
-    """Resize an image to the page width and draw corners or landmarks, and axes."""
-    import cv2
-
-    assert calibration.camera is not None, "annotate_images requires intrinsics"
-    height = max(1, round(image.shape[0] * _WIDTH_PX / image.shape[1]))
-    method = cv2.INTER_AREA if image.shape[1] > _WIDTH_PX else cv2.INTER_CUBIC
-    large = cv2.resize(image, (_WIDTH_PX, height), interpolation=method).astype(np.uint8)
-    summary, count = _use(file.use), None
+) -> LandmarkPicture:
+    """Enlarge an image and draw corners or landmarks."""
+    large = resized(image, PICTURE_PX)
+    if evidence is None:
+        return LandmarkPicture(large, 0, "")
     if isinstance(evidence, BoardSeen):
-        large, detection = _with_corners(calibration.camera, large, evidence)
-        summary = f"{summary}; {detection}"
-    elif evidence is not None:
-        large, detection, count = _with_landmarks(calibration, image, large, evidence)
-        summary = f"{summary}; {detection}"
-    scale, frame = _WIDTH_PX / calibration.camera.width, calibration.parent_frame
-    now, before = axes
-    drawn = draw_axes(large, now.scaled(scale), frame)
-    if before is not None:
-        drawn = draw_axes(drawn, before.scaled(scale), older=True)
-    if now.outside:
-        drawn = draw_directions(drawn, now, frame)
-    return AnnotatedImage(str(file.path), drawn, summary, count)
-
-
-def _with_landmarks(
-    calibration: Calibration, image: Image, large: Image, localizer: "LearnedLocalizer"
-) -> tuple[Image, str, int]:
-    """The enlarged image with landmarks, a summary of them and their number."""
-    estimate = localizer.localize(image, calibration.camera)
+        return _with_corners(camera, large, evidence)
+    estimate = evidence.localize(image, camera)
     scene = calibration.source.get("scene")
     if scene is not None and estimate.scene not in (None, scene):
-        return large, f"shows {estimate.scene}, not {scene}", 0
+        return LandmarkPicture(large, 0, f"shows {estimate.scene}, not {scene}")
     # A camera on the gripper moves, so its images are compared with their own poses.
     pose = calibration.parent_from_child if calibration.mount == "eye_to_hand" else None
-    errors = landmark_errors(estimate, localizer, calibration.camera, pose)
-    if errors is None:
-        return large, estimate.reason or estimate.status.replace("_", " "), 0
-    own = image.shape[0] / errors.height
-    residuals = own * errors.errors_px
-    drawn, times = draw_residuals(large, errors, own)
-    median = float(np.nanmedian(residuals)) if np.isfinite(residuals).any() else np.nan
-    summary = (
-        f"{len(residuals)} landmarks, median residual {median:.2f} px, lines {times} times as long"
-    )
-    return drawn, summary, len(residuals)
+    return draw_landmarks(image, estimate, evidence, camera, pose)
 
 
-def _with_corners(camera: Camera, large: Image, board: BoardSeen) -> tuple[Image, str]:
-    """The enlarged image with corners and residual vectors, and a summary."""
+def _with_corners(camera: Camera, large: Image, board: BoardSeen) -> LandmarkPicture:
     enlarged = large.shape[1] / camera.width
     errors = board.projected(camera) - board.view.pixels
     pixels = resize_pixels(board.view.pixels, enlarged)
     lengths = np.linalg.norm(errors, axis=1)
-    limits = (0.0, max(1.0, float(np.nanpercentile(lengths, 90))))
-    drawn = overlay_points(large, pixels, lengths, 2.5, limits, "residual (px)")
-    drawn, times = overlay_vectors(drawn, pixels, enlarged * errors)
+    largest = max(1.0, float(np.nanpercentile(lengths, 90)))
+    drawn, times = draw_residuals(large, pixels, enlarged * errors, lengths, largest)
     rms = float(np.sqrt(np.nanmean(lengths**2)))
-    return drawn, f"{len(pixels)} corners, {rms:.2f} px rms, lines {times} times as long"
+    summary = f"{len(pixels)} corners, {rms:.2f} px rms, lines {times} times as long"
+    return LandmarkPicture(drawn, 0, summary)
 
 
 def _use(use: ImageUse | None) -> str:
     if use is None:
         return "not an image of the calibration"
     return "used" if use.used else f"rejected: {use.reason}"
+
+
+def _surroundings(calibration: Calibration, localizer: "LearnedLocalizer") -> Surroundings:
+    """The map that a fixed camera was calibrated in; empty for other cameras and maps."""
+    from evercal.mapping.scene_map import SceneMap
+
+    name = calibration.source.get("scene")
+    scene = next((s for s in localizer.contents.scenes if s.name == name), None)
+    if calibration.mount != "eye_to_hand" or not isinstance(scene, SceneMap):
+        return Surroundings()
+    return Surroundings.of(scene) if scene.unit_known else Surroundings()
 
 
 def _is_other_map(calibration: Calibration, localizer: "LearnedLocalizer") -> bool:
@@ -268,3 +219,29 @@ def _is_other_map(calibration: Calibration, localizer: "LearnedLocalizer") -> bo
     from evercal.localization.localizer import Localizer
 
     return not isinstance(localizer, Localizer) or map_digest(localizer, str(scene)) != digest
+
+
+def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:
+    """Return the board in each image of a calibration by name; empty without corners.
+
+    Args:
+        calibration: By `evercal solve`.
+        folder: Folder of its file.
+    """
+    poses = calibration.checks.get("camera_from_board")
+    given = Path(str(calibration.source.get("camera_poses", "")))
+    file = next((f for f in (folder / given, given, folder / given.name) if f.is_file()), None)
+    if not isinstance(poses, dict) or file is None:
+        return {}
+    try:
+        board = read_board_poses(file)
+    except InputError:  # poses by other programs have no corners
+        return {}
+    views = {(file.parent / image.name).resolve(): image.view for image in board.images}
+    scale, seen = float(calibration.checks.get("scale", 1.0)), {}
+    for name, pose in poses.items():
+        view = views.get((folder / name).resolve()) or views.get((file.parent / name).resolve())
+        if view is not None:
+            camera_from_board = SE3(pose["quaternion_wxyz"], pose["translation_m"])
+            seen[name] = BoardSeen(view, camera_from_board, scale)
+    return seen

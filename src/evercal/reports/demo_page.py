@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass, field
 from statistics import median
 
 from evercal.evaluation import FrameResult, scores
-from evercal.reports.charts import error_histogram
 from evercal.reports.page import Picture, Table, Tile, render
 
 
@@ -15,17 +14,14 @@ class LearnedRoom:
     """The map of one room."""
 
     room: str
-    """Name."""
     images: int
     """Posed training images."""
     keyframes: int
     """Images in the map."""
     landmarks: int
-    """Landmarks of all keyframes."""
     residual_px: float | None
     """Median reprojection error after bundle adjustment."""
     seconds: float
-    """Wall time."""
 
 
 @dataclass(frozen=True)
@@ -33,21 +29,17 @@ class FixedCamera:
     """The calibration of a fixed camera and the check after a bump, compared with ground truth."""
 
     room: str
-    """Name of its room."""
     images: int
-    """Number of images."""
     images_used: int = 0
     """Images in the calibration; 0 if it failed."""
     error_mm: float | None = None
     """Position error of the calibration; None if it failed."""
     error_deg: float | None = None
-    """Rotation error of the calibration; None if it failed."""
     sigma_mm: float | None = None
     """Stated standard deviation of the position per axis; None if it failed."""
     shift_mm: float | None = None
     """Measured shift after the bump; None if no image was localized."""
     true_shift_mm: float = 0.0
-    """True shift."""
     bump_detected: bool = False
     """Whether the check reported a moved camera."""
 
@@ -57,7 +49,6 @@ class DemoResult:
     """All measurements of a demo."""
 
     learned: list[LearnedRoom] = field(default_factory=list)
-    """In order of learning."""
     memory_bytes: int = 0
     """Size of all maps."""
     test: list[FrameResult] = field(default_factory=list)
@@ -65,13 +56,11 @@ class DemoResult:
     changed: list[FrameResult] = field(default_factory=list)
     """Images taken after objects were moved and lamps were switched."""
     cameras: list[FixedCamera] = field(default_factory=list)
-    """One fixed camera a room."""
     unknown_images: int = 0
     """Images of rooms that had not been learned yet."""
     unknown_refused: int = 0
     """How many of them got no pose."""
     seconds: float = 0.0
-    """Wall time of the demo."""
 
     def headlines(self) -> dict[str, str]:
         """Explanation of each main result, most important first."""
@@ -105,9 +94,6 @@ class DemoResult:
 
 def demo_page(result: DemoResult, pictures: Sequence[Picture]) -> str:
     """Write the report of a demo."""
-    errors: dict[str, list[float]] = {}
-    for row in result.test:
-        errors.setdefault(row.scene, []).append(row.translation_error_m)
     (number, meaning), *others = result.headlines().items()
     return render(
         "demo.html",
@@ -116,7 +102,6 @@ def demo_page(result: DemoResult, pictures: Sequence[Picture]) -> str:
         level="",
         first=[Tile(*item) for item in others],
         result=result,
-        histogram=Picture(error_histogram(errors), "Position errors of the test images"),
         pictures=pictures,
         scores={"": scores(result.test), "after a change": scores(result.changed)},
         cameras=Table.of_records(result.cameras),

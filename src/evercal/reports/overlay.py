@@ -1,15 +1,29 @@
-"""Points and lines drawn over images; images are (H, W, 3) uint8 RGB."""
+"""Landmarks, residuals and axes drawn over images; images are (H, W, 3) uint8 RGB."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from evercal.recordings.images import encode_jpeg
+from evercal.geometry import SE3, Camera, resize_pixels
+
+if TYPE_CHECKING:
+    from evercal.localization.estimate import PoseEstimate
+    from evercal.localization.learned import LearnedLocalizer
 
 Image = NDArray[np.uint8]
+Array = NDArray[np.float64]
+Colour = tuple[int, int, int]
 
+MAX_RESIDUAL_PX = 2.0
+"""Upper end of the colour scale of residuals, pixels of the working image."""
+PICTURE_PX = 640
+"""Width of pictures in reports and videos."""
+AXES_M, _AXES_STEPS = 0.1, 32
+_AXES = ((214, 39, 40), (44, 160, 44), (31, 95, 220))
+"""x red, y green, z blue."""
+_PALE_AXES = ((237, 158, 158), (160, 212, 160), (154, 183, 239))
 _NAN_COLOUR = (160, 160, 160)
 _FRACTION_BITS = 4  # of a pixel, for OpenCV's drawing functions
 _FONT = 0  # cv2.FONT_HERSHEY_SIMPLEX; OpenCV is imported inside functions only
@@ -19,85 +33,101 @@ _VECTOR_PX = 25.0
 _VECTOR_COLOUR = (255, 140, 40)
 
 
-def overlay_points(
-    image: Image,
-    pixels: ArrayLike,
-    colours: ArrayLike,
-    radius: float = 2.0,
-    limits: tuple[float, float] | None = None,
-    legend: str | None = None,
-) -> Image:
-    """Draw points over an image.
+class LandmarkPicture(NamedTuple):
+    """An image with its landmarks."""
 
-    Later points cover earlier ones. Values are drawn over a grey copy of the image. Points outside
-    the image and points that are not finite are omitted. Pixels (n, 2) are x and y; 0 is the centre
-    of the first pixel. Colours are (n, 3) uint8 RGB, or (n,) values for the viridis colour map,
-    with NaN in grey. By default its limits are the 2nd and 98th percentile. The legend is the
-    quantity and unit of the values.
+    image: NDArray[np.uint8]
+    """(h, w, 3) RGB."""
+    landmarks: int
+    """Number of landmarks."""
+    summary: str
+    """Their number and median residual; without landmarks, the reason."""
+
+
+def draw_landmarks(
+    image: NDArray[np.uint8],
+    estimate: "PoseEstimate",
+    localizer: "LearnedLocalizer",
+    camera: Camera | None = None,
+    base_from_camera: SE3 | None = None,
+    width: int = PICTURE_PX,
+) -> LandmarkPicture:
+    """Resize an image and draw its landmarks, with lines from detections to projections.
+
+    The camera is by default that of the estimate, else that of the scene; the pose that of the
+    estimate. Residuals are in pixels of the image. Nothing is drawn without a pose or landmarks.
+    """
+    large, pose = resized(image, width), base_from_camera or estimate.base_from_camera
+    pixels, points = estimate.pixels, estimate.points_m
+    if pose is None or pixels is None or points is None or estimate.base_from_camera is None:
+        return LandmarkPicture(large, 0, estimate.reason or estimate.status.replace("_", " "))
+    scene = next(s for s in localizer.contents.scenes if s.name == estimate.scene)
+    whole = camera or estimate.camera or scene.adjusted_camera
+    working = whole.short_side_resized(localizer.contents.short_side)
+    in_camera = scene.frame.camera_among_points(pose).inverse().apply(points)
+    errors = working.project(in_camera) - pixels
+    enlarged, own = large.shape[0] / working.height, image.shape[0] / working.height
+    residuals = own * np.linalg.norm(errors, axis=1)
+    drawn, times = draw_residuals(
+        large, resize_pixels(pixels, enlarged), enlarged * errors, residuals, own * MAX_RESIDUAL_PX
+    )
+    median = float(np.nanmedian(residuals)) if np.isfinite(residuals).any() else np.nan
+    count = len(residuals)
+    words = f"{count} landmarks, median residual {median:.2f} px, lines {times} times as long"
+    return LandmarkPicture(drawn, count, words)
+
+
+def draw_residuals(
+    image: Image, pixels: Array, vectors: Array, residuals: Array, largest: float
+) -> tuple[Image, int]:
+    """Draw points and residual vectors over a grey copy of an image.
+
+    Args:
+        image: (H, W, 3).
+        pixels: (n, 2) detections, x and y; 0 is the centre of the first pixel. Those that are not
+            finite are omitted.
+        vectors: (n, 2) from detections to projections, pixels of the image.
+        residuals: (n,) of the legend, any unit of pixels; NaN without a projection.
+        largest: Upper end of the colour scale.
+
+    Returns:
+        The image, and the factor by which the vectors are exaggerated.
     """
     import cv2
 
-    points, colours = np.asarray(pixels, dtype=np.float64), np.asarray(colours)
-    drawn = np.ascontiguousarray(image).copy()
-    if colours.ndim == 1:
-        values = colours.astype(np.float64)
-        limits = limits or _limits(values)
-        colours = colour_map(values, limits)
-        drawn[:] = cv2.cvtColor(drawn, cv2.COLOR_RGB2GRAY)[..., None]
-    edge = np.array([image.shape[1] - 0.5, image.shape[0] - 0.5]) + radius
-    with np.errstate(invalid="ignore"):
-        visible = np.flatnonzero(((points > -0.5 - radius) & (points < edge)).all(axis=1))
-    centres = np.round(points[visible] * (1 << _FRACTION_BITS)).astype(int)
-    size = round(radius * (1 << _FRACTION_BITS))
-    for (x, y), colour in zip(centres.tolist(), colours[visible].tolist(), strict=True):
-        cv2.circle(drawn, (x, y), size, colour, -1, cv2.LINE_AA, _FRACTION_BITS)
-    if legend and limits is not None:
-        _draw_legend(drawn, legend, limits)
-    return drawn
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    drawn = np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
+    limits, radius = (0.0, largest), max(2.0, image.shape[1] / 180)
+    visible = (np.abs(pixels) < 1e5).all(axis=1)
+    centres = np.round(pixels[visible] * (1 << _FRACTION_BITS)).astype(int).tolist()
+    colours = colour_map(residuals, limits)[visible].tolist()
+    for centre, colour in zip(centres, colours, strict=True):
+        size = round(radius * (1 << _FRACTION_BITS))
+        cv2.circle(drawn, centre, size, colour, -1, cv2.LINE_AA, _FRACTION_BITS)
+    times = exaggeration(vectors)
+    lines = np.stack([pixels, pixels + times * vectors], 1)
+    drawn = overlay_lines(drawn, lines, [_VECTOR_COLOUR] * len(lines), 1)
+    _draw_legend(drawn, "residual (px)", limits)
+    return drawn, times
 
 
 def overlay_lines(
-    image: Image,
-    lines: Sequence[ArrayLike],
-    colours: Sequence[tuple[int, int, int]],
-    width: int = 2,
-    dash: float | None = None,
-    rims: bool = True,
+    image: Image, lines: Sequence[Array] | Array, colours: Sequence[Colour], width: int
 ) -> Image:
-    """Draw lines over an image, solid ones with a white rim and dashed ones with a black rim.
-
-    Lines are (n, 2) x and y; 0 is the centre of the first pixel. Points that are not finite
-    interrupt the line. `dash` is the length of dashes and gaps in pixels; None draws solid lines.
-    Many short lines are clearer without `rims`.
-    """
+    """Draw lines (n, 2) over an image; points that are not finite interrupt them."""
     import cv2
 
     drawn = np.ascontiguousarray(image).copy()
     for line, colour in zip(lines, colours, strict=True):
-        points = np.asarray(line, dtype=np.float64)
         # OpenCV uses 32-bit integers.
-        points = np.where(np.abs(points) < 1e6, points, np.nan)
-        pieces = [piece for piece in _finite_pieces(points) if len(piece) > 1]
-        if dash is not None:
-            pieces = [part for piece in pieces for part in _dashes(piece, dash)]
-        fixed = [np.round(piece * (1 << _FRACTION_BITS)).astype(np.int32) for piece in pieces]
-        rim = (255, 255, 255) if dash is None else (0, 0, 0)
-        for ink, thickness in ((rim, width + 2), (colour, width))[0 if rims else 1 :]:
-            cv2.polylines(drawn, fixed, False, ink, thickness, cv2.LINE_AA, _FRACTION_BITS)
+        valid = np.asarray((np.abs(line) < 1e6).all(axis=1))
+        fixed = np.round(np.where(valid[:, None], line, 0) * (1 << _FRACTION_BITS)).astype(np.int32)
+        pieces = [fixed[i : i + 2] for i in np.flatnonzero(valid[:-1] & valid[1:])]
+        cv2.polylines(drawn, pieces, False, colour, width, cv2.LINE_AA, _FRACTION_BITS)
     return drawn
 
 
-def overlay_vectors(
-    image: Image, pixels: NDArray[np.float64], vectors: NDArray[np.float64]
-) -> tuple[Image, int]:
-    """Draw residual vectors (n, 2) at pixels (n, 2); returns the factor of their length, too."""
-    times = exaggeration(vectors)
-    lines = np.stack([pixels, pixels + times * vectors], 1)
-    colours = [_VECTOR_COLOUR] * len(lines)
-    return overlay_lines(image, list(lines), colours, 1, rims=False), times
-
-
-def exaggeration(vectors: NDArray[np.float64]) -> int:
+def exaggeration(vectors: Array) -> int:
     """Factor that makes residual vectors (n, 2) visible, the same for all: 1, 2, 5, 10, ..."""
     lengths = np.linalg.norm(vectors, axis=1)
     long = float(np.nanpercentile(lengths, 90)) if np.isfinite(lengths).any() else _VECTOR_PX
@@ -105,41 +135,8 @@ def exaggeration(vectors: NDArray[np.float64]) -> int:
     return max([factor for factor in factors if factor * long <= _VECTOR_PX], default=1)
 
 
-def encode_image(image: Image, kind: Literal["png", "jpg"] = "png") -> bytes:
-    """Encode an image as PNG, or as JPEG, which is smaller but lossy."""
-    import cv2
-
-    if kind == "jpg":
-        return encode_jpeg(image, quality=88)
-    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
-
-
-def _finite_pieces(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Split a line (n, 2) at points that are not finite."""
-    finite = np.isfinite(points).all(axis=1)
-    starts = np.flatnonzero(np.diff(finite.astype(int), prepend=0)) if len(points) else []
-    return [part for part in np.split(points, starts) if len(part) and np.isfinite(part[0]).all()]
-
-
-def _dashes(points: NDArray[np.float64], length: float) -> list[NDArray[np.float64]]:
-    """Every other piece of `length` pixels along a line (n, 2)."""
-    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    dashes = []
-    for start in np.arange(0, along[-1], 2 * length):
-        end = min(start + length, along[-1])
-        stops = np.unique([start, *along[(along > start) & (along < end)], end])
-        dashes.append(np.stack([np.interp(stops, along, points[:, i]) for i in (0, 1)], axis=1))
-    return dashes
-
-
-def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
-    finite = values[np.isfinite(values)]
-    low, high = np.percentile(finite, [2, 98]).tolist() if len(finite) else (0.0, 1.0)
-    return low, high
-
-
-def colour_map(values: NDArray[np.float64], limits: tuple[float, float]) -> Image:
-    """Map values (n,) to (n, 3) RGB with viridis."""
+def colour_map(values: Array, limits: tuple[float, float]) -> Image:
+    """Map values (n,) to (n, 3) RGB with viridis; NaN is grey."""
     import cv2
 
     low, high = limits
@@ -152,23 +149,74 @@ def colour_map(values: NDArray[np.float64], limits: tuple[float, float]) -> Imag
     return colours
 
 
+def resized(image: Image, width: int) -> Image:
+    """An image with another width and the same aspect ratio."""
+    import cv2
+
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    method = cv2.INTER_AREA if image.shape[1] > width else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(image, (width, height), interpolation=method), np.uint8)
+
+
 def _draw_legend(image: Image, text: str, limits: tuple[float, float]) -> None:
-    """Draw a colour bar on white in the lower right corner."""
+    """Draw a colour bar on white in the lower right corner, if there is room."""
     import cv2
 
     scale = max(0.4, min(0.8, image.shape[1] / 1000))
-    low, high = (f"{value:.3g}" for value in limits)
-    (width, line), _ = cv2.getTextSize(f"{low}  {text}  {high}", _FONT, scale, 1)
-    width, line = min(max(width, 120), image.shape[1] - 2 * _MARGIN), line + 6
-    height = min(2 * line + 4, image.shape[0])
-    if width < 20 or height < 2 * line:
+    words = f"{limits[0]:.3g}  {text}  {limits[1]:.3g}"
+    (width, line), _ = cv2.getTextSize(words, _FONT, scale, 1)
+    width, height = width + 2 * _MARGIN, 2 * line + 3 * _MARGIN
+    if width > image.shape[1] or height > image.shape[0]:
         return
-    panel = np.full((height, width + 8, 3), 255, np.uint8)
-    ramp = np.linspace(*limits, num=width) if limits[1] > limits[0] else np.full(width, limits[0])
-    panel[4 : line - 2, 4 : 4 + width] = colour_map(ramp, limits)
-    right = cv2.getTextSize(high, _FONT, scale, 1)[0][0]
-    middle = cv2.getTextSize(text, _FONT, scale, 1)[0][0]
-    for label, x in ((low, 4), (text, 4 + (width - middle) // 2), (high, 4 + width - right)):
-        cv2.putText(panel, label, (x, 2 * line - 3), _FONT, scale, (0, 0, 0), 1, cv2.LINE_AA)
-    panel = panel[:, : image.shape[1]]
-    image[-panel.shape[0] :, -panel.shape[1] :] = panel
+    panel = image[-height:, -width:]
+    panel[:] = 255
+    ramp = colour_map(np.linspace(*limits, num=width - 2 * _MARGIN), limits)
+    panel[_MARGIN : _MARGIN + line, _MARGIN:-_MARGIN] = ramp
+    at = (image.shape[1] - width + _MARGIN, image.shape[0] - _MARGIN)
+    cv2.putText(image, words, at, _FONT, scale, (0, 0, 0), 1, cv2.LINE_AA)
+
+
+def origin_in_view(camera: Camera, camera_from_frame: SE3) -> tuple[Array, str]:
+    """Project the origin of a frame: its pixel (2,), and where it lies if outside the image."""
+    pixel = camera.project(camera_from_frame.translation_m)
+    if camera_from_frame.translation_m[2] <= 0:
+        return pixel, "behind the camera"
+    inside = (pixel > -0.5) & (pixel < (camera.width - 0.5, camera.height - 0.5))
+    return pixel, "" if inside.all() else "outside the image"
+
+
+def axes_in_view(camera: Camera, camera_from_frame: SE3, length_m: float = AXES_M) -> Array:
+    """Project the axes of a frame: (3, n, 2) pixels along x, y and z; NaN where not visible."""
+    along = np.linspace(0.0, length_m, _AXES_STEPS + 1)
+    points = np.eye(3)[:, None] * along[:, None]
+    return camera.project(camera_from_frame.apply(points))
+
+
+def draw_axes(image: Image, camera: Camera, camera_from_frame: SE3, pale: bool = False) -> Image:
+    """Draw the axes of a frame into a copy of an image of any size.
+
+    If the origin is not visible, the lower left corner shows the directions of the axes instead,
+    unless they are pale.
+    """
+    import cv2
+
+    height, width = image.shape[:2]
+    camera = camera.resized(width, height)
+    lines = axes_in_view(camera, camera_from_frame)
+    thickness = max(2, round(width / 220))
+    if pale:
+        return overlay_lines(image, lines, _PALE_AXES, thickness)
+    if origin_in_view(camera, camera_from_frame)[1]:
+        length = 0.09 * min(width, height)
+        directions = length * camera_from_frame.rotation_matrix()[:2].T
+        corner = np.array([2 * length, height - 2 * length])
+        lines = corner + np.stack([np.zeros((3, 2)), directions], 1)
+    drawn = overlay_lines(image, lines, [(255, 255, 255)] * 3, thickness + 2)
+    drawn = overlay_lines(drawn, lines, _AXES, thickness)
+    for letter, line, colour in zip("xyz", lines, _AXES, strict=True):
+        end = line[0] + 1.15 * (line[-1] - line[0])
+        if (np.abs(end) < 1e5).all():
+            at = round(float(end[0])) - 5, round(float(end[1])) + 5
+            cv2.putText(drawn, letter, at, 0, 0.6, (255, 255, 255), 5, cv2.LINE_AA)
+            cv2.putText(drawn, letter, at, 0, 0.6, colour, 2, cv2.LINE_AA)
+    return drawn

@@ -7,6 +7,11 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.recordings.images import encode_jpeg
+
 if TYPE_CHECKING:
     from jinja2 import Environment
 
@@ -21,6 +26,11 @@ class Picture:
     """Content of the image file."""
     caption: str = ""
     """Text below the picture, also its alternative text."""
+
+    @classmethod
+    def photo(cls, image: NDArray[np.uint8], caption: str = "") -> Self:
+        """An image (h, w, 3) RGB as a JPEG file."""
+        return cls(encode_jpeg(image, quality=88), caption)
 
     @property
     def kind(self) -> Literal["png", "jpeg"]:
@@ -76,11 +86,12 @@ def render(template: str, **values: object) -> str:
 
     The document has no references to other files.
     """
-    return _environment().get_template(template).render(values)
+    return environment().get_template(template).render(values)
 
 
 @functools.cache
-def _environment() -> "Environment":
+def environment() -> "Environment":
+    """The templates; undefined names raise."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     return Environment(

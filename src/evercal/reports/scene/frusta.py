@@ -11,7 +11,7 @@ from evercal.geometry import SE3, Camera, UncertainPose
 Array = NDArray[np.float64]
 
 DRAWN_M = 0.05
-"""Length of the longest half axis of an ellipsoid that `readable_scale` aims at."""
+"""Longest half axis of a drawn ellipsoid."""
 _SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 
 
@@ -31,11 +31,6 @@ class Frustum:
         fov = 2 * np.arctan2(camera.height / 2, camera.fy)
         aspect = (camera.width / camera.fx) / (camera.height / camera.fy)
         return cls(base_from_camera, float(fov), float(aspect))
-
-    def depth_of(self, size_m: float) -> float:
-        """Depth at which a drawn camera ends whose pyramid has the volume of `size_m` cubed."""
-        high = np.tan(self.fov_rad / 2)
-        return size_m / float(np.cbrt(high * high * self.aspect / 3))
 
     def corners(self, depth_m: float) -> Array:
         """(4, 3) corners of the view at a depth, in the base frame, metres."""
@@ -72,10 +67,10 @@ class Ellipsoid:
         return " / ".join(f"{1000 * axis:.2g}" for axis in self.axes_m[::-1])
 
 
-def readable_scale(ellipsoids: list[Ellipsoid]) -> int:
-    """The round factor that draws the largest ellipsoid with a half axis of about `DRAWN_M`.
+def readable_scale(ellipsoids: list[Ellipsoid], drawn_m: float = DRAWN_M) -> int:
+    """The largest round factor that draws the half axes of ellipsoids no longer than `drawn_m`.
 
     Without ellipsoids, that of a standard deviation of 1 mm.
     """
     longest = max((float(ellipsoid.axes_m[-1]) for ellipsoid in ellipsoids), default=0.001)
-    return max([scale for scale in _SCALES if scale * longest <= DRAWN_M], default=1)
+    return max([scale for scale in _SCALES if scale * longest <= drawn_m], default=1)

@@ -5,14 +5,15 @@ corrections of `mapping.map_frame`, usually about a millimetre.
 """
 
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.geometry import Camera, resize_pixels
+from evercal.geometry import Camera
 from evercal.mapping.scene_map import SceneMap
-from evercal.reports.overlay import colour_map, overlay_points
+from evercal.reports.overlay import colour_map
+from evercal.reports.overlay import resized as resized
 from evercal.reports.scene.frusta import Frustum
 
 Array = NDArray[np.floating]
@@ -23,7 +24,6 @@ MOST_POINTS = 50_000
 """Landmarks that are shown of all scenes together; more are thinned out evenly."""
 THUMBNAIL_PX = 160
 """Width of the image in a frustum."""
-_PICTURE_PX = 640
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,16 +36,12 @@ class Landmarks3D:
     """(n,) the pixel of its keyframe."""
     sigma_mm: Array
     """(n,) standard deviation along the viewing ray of its keyframe, millimetres."""
-    keyframe: NDArray[np.int64]
-    """(n,) number of its keyframe."""
-    landmark: NDArray[np.int64]
-    """(n,) its number in the keyframe."""
 
     @classmethod
     def of(cls, scene: SceneMap, most: int = MOST_POINTS) -> Self:
         """All landmarks, or `most` of them, drawn evenly from all keyframes."""
         keyframes, scale = scene.keyframes, _scale(scene)
-        points, grey, sigma, counts = [], [], [], []
+        points, grey, sigma = [np.zeros((0, 3))], [np.zeros(0, np.uint8)], [np.zeros(0)]
         for i, marks in enumerate(keyframes.landmarks):
             local = marks.surface(keyframes.cameras[i])[0]
             points.append(scene.frame.points_to_base(keyframes.base_from_camera[i].apply(local)))
@@ -54,20 +50,11 @@ class Landmarks3D:
             # The error of a depth 1 / d is sigma / d^2; along the ray it is as much longer.
             along = np.linalg.norm(local, axis=1) * marks.sigma / marks.inverse_depth
             sigma.append(1000 * scale * along)
-            counts.append(len(marks))
-        keyframe = np.repeat(np.arange(len(counts)), counts).astype(np.int64)
-        landmark = np.concatenate([np.arange(0), *map(np.arange, counts)]).astype(np.int64)
-        joined = np.concatenate([np.zeros((0, 3)), *points])
+        joined = np.concatenate(points)
         valid = np.flatnonzero(np.isfinite(joined).all(1))
         if len(valid) > most:
             valid = valid[np.linspace(0, len(valid) - 1, most).round().astype(int)]
-        return cls(
-            joined[valid],
-            np.concatenate([np.zeros(0, np.uint8), *grey])[valid],
-            np.concatenate([np.zeros(0), *sigma])[valid],
-            keyframe[valid],
-            landmark[valid],
-        )
+        return cls(joined[valid], np.concatenate(grey)[valid], np.concatenate(sigma)[valid])
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -95,17 +82,8 @@ class KeyframeView:
     """Intrinsics at the size of `image`."""
     image: Image
     """(h, w, 3) RGB at working size."""
-    pixels: Array
-    """(n, 2) its landmarks."""
     depths_m: Array
-    """(n,) their depths along the optical axis."""
-
-    @property
-    def picture(self) -> Image:
-        """The image with its landmarks, coloured by depth."""
-        large = resized(self.image, _PICTURE_PX)
-        pixels = resize_pixels(self.pixels, large.shape[1] / self.image.shape[1])
-        return overlay_points(large, pixels, self.depths_m, 2.5, legend="depth (m)")
+    """(n,) depths of its landmarks along the optical axis."""
 
     @property
     def backdrop(self) -> "Backdrop":
@@ -118,8 +96,7 @@ class KeyframeView:
         return Backdrop(self.frustum.base_from_camera.apply(depth * ahead), width, height)
 
 
-@dataclass(frozen=True, eq=False)
-class Backdrop:
+class Backdrop(NamedTuple):
     """A rectangle parallel to an image, in which a camera without distortion sees the image."""
 
     centre_m: Array
@@ -136,12 +113,8 @@ def keyframe_views(scene: SceneMap) -> list[KeyframeView]:
         if scene.frame.similarity is not None:
             pose = scene.frame.similarity.pose(pose)
         image = np.repeat(keyframes.grey(i)[..., None], 3, axis=-1)
-        depths = scale / marks.inverse_depth
-        views.append(
-            KeyframeView(
-                scene.name, i, Frustum.of(pose, camera), camera, image, marks.pixels, depths
-            )
-        )
+        frustum, depths = Frustum.of(pose, camera), scale / marks.inverse_depth
+        views.append(KeyframeView(scene.name, i, frustum, camera, image, depths))
     return views
 
 
@@ -149,15 +122,6 @@ def shares(counts: list[int], most: int = MOST_POINTS) -> list[int]:
     """How many landmarks of each scene are shown, in proportion to their numbers."""
     total = sum(counts)
     return counts if total <= most else [count * most // total for count in counts]
-
-
-def resized(image: Image, width: int) -> Image:
-    """An image with another width and the same aspect ratio."""
-    import cv2
-
-    height = max(1, round(image.shape[0] * width / image.shape[1]))
-    method = cv2.INTER_AREA if image.shape[1] > width else cv2.INTER_CUBIC
-    return np.asarray(cv2.resize(image, (width, height), interpolation=method), np.uint8)
 
 
 def _scale(scene: SceneMap) -> float:
