@@ -73,7 +73,6 @@ def test_requests_under_way_are_answered_before_the_end(
         (["--host", "0.0.0.0"], "--host 0.0.0.0: other machines could use the map; give --token"),
         (["--token", "short"], "--token: give at least 16 ASCII characters"),
         (["--port", "99999"], "--port 99999: give 0 to 65535"),
-        (["--recordings", "gone"], "--recordings gone: no such folder"),
     ],
 )
 def test_misuse_is_one_line(run: Any, hall_store: Path, words: list[str], message: str) -> None:

@@ -6,10 +6,9 @@ import http.client
 import json
 import shutil
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,14 +66,6 @@ class Running:
         finally:
             connection.close()
 
-    def job(self, key: str) -> dict[str, Any]:
-        """A job when it is finished."""
-        until = time.monotonic() + 120
-        while (job := self.ask("GET", f"/jobs/{key}").json)["status"] in ("queued", "learning"):
-            assert time.monotonic() < until
-            time.sleep(0.1)
-        return job
-
 
 Serve = Callable[..., Any]
 
@@ -82,13 +73,13 @@ Serve = Callable[..., Any]
 @contextmanager
 def running(map: Path, **options: Any) -> Iterator[Running]:
     """Serve a map."""
-    from evercal.service.server import ServeOptions, Server, bound_socket, make_app, url_of
+    from evercal.service.server import ServeOptions, bound_socket, make_app, server_of, url_of
 
     chosen = ServeOptions(map, port=0, device="cpu", **options)
     ready = threading.Event()
     with bound_socket(chosen) as listener:
-        app = make_app(chosen)
-        server = Server(app, ready.set)
+        app = make_app(chosen, lambda _: ready.set())
+        server = server_of(app)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         try:
@@ -134,13 +125,3 @@ def image(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("images") / "hall.png"
     write_image(path, hall.test[7].read_image())
     return path
-
-
-@pytest.fixture(scope="session")
-def recording(rooms: tuple[Recording, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small recording on disk, called alpha."""
-    from evercal.recordings.formats import generic
-
-    root = tmp_path_factory.mktemp("recordings")
-    generic.write(root / "alpha", replace(rooms[0], train=rooms[0].train[:16]))
-    return root / "alpha"

@@ -1,4 +1,4 @@
-"""The client has the methods of `Map` and returns the same types."""
+"""The client returns what the methods of `Map` return."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import evercal
-from evercal import Calibration, Client, InputError, LearnReport, Map
+from evercal import Calibration, Client, InputError, Map
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings import read_image, write_image
 
@@ -67,35 +67,11 @@ def test_calibrations_and_checks(
         client.calibrate(tmp_path, robot_poses=arm[:1])
 
 
-def test_scenes_are_learned_and_removed(serve: Any, copy: Path, recording: Path) -> None:
-    with serve(copy, recordings=recording.parent) as service:
-        client, steps = Client(service.url), set()
-        report = client.learn(
-            recording, name="attic", memory="40%", on_progress=lambda step, *_: steps.add(step)
-        )
-        assert isinstance(report, LearnReport)
-        assert (report.scene, report.train_frames) == ("attic", 12)
-        assert report.adjusted is not None
-        assert isinstance(report.adjusted.wrong_poses, tuple)
-        assert steps
-        assert client.scenes == ("hall", "attic")
-        with pytest.raises(InputError, match="scene 'attic': a scene of this name exists"):
-            client.learn("alpha", name="attic", on_server=True)
-        with pytest.raises(InputError, match=r"alpha/images: images: no known scene format"):
-            client.learn("alpha/images", on_server=True)
-        client.remove("attic")
-        assert client.scenes == ("hall",)
-
-
 def test_refusals_are_the_lines_of_the_service(client: Client, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"image\.png: 2x2 pixels|camera|aspect|image"):
         client.localize(np.zeros((2, 200, 3), np.uint8), evercal.Camera(4, 3, 4.0, 4.0, 2.0, 1.5))
-    with pytest.raises(InputError, match="scene 'attic': the map has no scene"):
-        client.remove("attic")
     with pytest.raises(InputError, match=r"gone\.png: cannot be read"):
         client.localize(tmp_path / "gone.png")
-    with pytest.raises(InputError, match="gone: no such folder"):
-        client.learn(tmp_path / "gone")
     with pytest.raises(InputError, match=r"127\.0\.0\.1:1: no answer"):
         _ = Client("http://127.0.0.1:1").scenes
 

@@ -23,12 +23,11 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="module")
-def narrow(hall_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """A service with a folder of recordings, and small limits."""
+def narrow(hall_store: Path) -> Iterator[Any]:
+    """A service whose images may be small only."""
     from .conftest import running
 
-    limits = Limits(unpacked_bytes=10 * 10**6)
-    with running(hall_store, limits=limits, recordings=tmp_path_factory.mktemp("r")) as service:
+    with running(hall_store, limits=Limits(pixels=10**6)) as service:
         yield service
 
 
@@ -49,14 +48,13 @@ def statuses(service: Any, seeds: range) -> Counter[int]:
     for seed in seeds:
         status, body = answer_to(service.url, malformed(seed))
         assert 400 <= status < 500, (seed, status, malformed(seed)[:200])
-        error = json.loads(body)
-        assert list(error) == ["error"], seed
-        assert "\n" not in error["error"], seed
+        if body != b"Invalid HTTP request received.":  # by the parser of HTTP
+            error = json.loads(body)
+            assert list(error) == ["error"], seed
+            assert "\n" not in error["error"], seed
         counts[status] += 1
     assert service.ask("GET", "/scenes").json == {"scenes": ["hall"]}
-    assert list(service.service.uploads.iterdir()) == []
     assert service.service.desk.waiting == 0
-    assert service.service.jobs.pending == []
     return counts
 
 

@@ -16,10 +16,11 @@ TOKEN = "EVERCAL_TOKEN"
 
 @dataclass(frozen=True)
 class Serve:
-    """Serve a map over HTTP: localize, calibrate, check, learn; see /docs of the service.
+    """Serve a map over HTTP: localize, calibrate, check, track; see /docs of the service.
 
-    It answers this machine only, unless --host names another address, which requires a token. It is
-    stopped by SIGTERM or Ctrl-C and answers what is under way before.
+    It answers this machine only, unless --host names another address, which requires a token.
+    Scenes that `evercal learn` adds meanwhile are noticed. SIGTERM or Ctrl-C stops it after the
+    requests under way.
 
     Example: evercal serve cell.evercal --port 8000
     """
@@ -33,9 +34,6 @@ class Serve:
     token: Annotated[str | None, arg(metavar="T", help_behavior_hint="")] = None
     """Requests must have it as bearer token. Default: the variable EVERCAL_TOKEN, which other users
     of the machine cannot read."""
-    recordings: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Folder whose recordings may be learned by their path. Default: only archives that are
-    sent."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object when it accepts requests."""
@@ -51,7 +49,7 @@ class Serve:
 
         token = self.token or os.environ.get(TOKEN) or None
         serve(
-            ServeOptions(self.store, self.host, self.port, token, self.recordings, self.device),
+            ServeOptions(self.store, self.host, self.port, token, self.device),
             self._ready,
         )
         return 0

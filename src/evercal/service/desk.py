@@ -8,9 +8,11 @@ from typing import Any, TypeVar
 
 import torch
 
-from evercal.service.jobs import QueueFullError
-
 Result = TypeVar("Result")
+
+
+class QueueFullError(Exception):
+    """Too many requests wait; status 429."""
 
 
 class Desk:
@@ -25,18 +27,14 @@ class Desk:
         self._most, self.waiting = most + workers, 0
         self._pool = ThreadPoolExecutor(workers, "image", torch.set_num_threads, (1,))
 
-    async def run(self, work: Callable[..., Result], *args: Any, **named: Any) -> Result:
-        """The result of a function, called in a thread.
-
-        Raises:
-            QueueFullError: Too many requests wait.
-        """
+    async def run(self, work: Callable[..., Result], *args: Any) -> Result:
+        """The result of a function, called in a thread; `QueueFullError` if too many wait."""
         if self.waiting >= self._most:
             raise QueueFullError("too many requests wait; try again")
         self.waiting += 1
         try:
             loop = asyncio.get_running_loop()
-            return await loop.run_in_executor(self._pool, partial(work, *args, **named))
+            return await loop.run_in_executor(self._pool, partial(work, *args))
         finally:
             self.waiting -= 1
 

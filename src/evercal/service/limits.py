@@ -31,18 +31,12 @@ class Limits:
 
     body_bytes: int = 128 * 10**6
     """Body of a request with images."""
-    archive_bytes: int = 4 * 10**9
-    """Body of a request with a recording."""
-    unpacked_bytes: int = 20 * 10**9
-    """Size of a recording when it is extracted."""
     pixels: int = 50 * 10**6
     """Pixels of one image."""
     images: int = 500
     """Images of one calibration."""
     queue: int = 64
     """Images that wait to be located; requests beyond are refused with status 429."""
-    jobs: int = 16
-    """Recordings that wait to be learned."""
 
 
 class TooLargeError(InputError):
@@ -53,9 +47,6 @@ def decoded(data: bytes, name: str, limits: Limits) -> np.ndarray:
     """Pixels (h, w, 3) uint8 RGB of an image file.
 
     The size in the file's header is checked before anything is decoded.
-
-    Raises:
-        InputError: No image, or one with too many pixels.
     """
     import cv2
 
@@ -91,11 +82,7 @@ def _header_size(data: bytes, name: str) -> tuple[int, int]:
 
 @lru_cache(maxsize=64)  # a robot sends the same intrinsics with every image
 def camera_of(data: bytes, size: tuple[int, int]) -> "Camera":
-    """Intrinsics in a file that `--camera` would read, for images of a size (width, height).
-
-    Raises:
-        InputError: No intrinsics, or the file is too large.
-    """
+    """Intrinsics in a file that `--camera` would read, for images of a size (width, height)."""
     from evercal.recordings.poses.camera_file import read_camera
 
     return _from_text(data, "camera", ".json", _SMALL_BYTES, lambda path: read_camera(path, size))
@@ -108,9 +95,6 @@ def poses_of(data: bytes, ending: str, images: list[str]) -> "SE3":
         data: Content of the table.
         ending: Ending of its file name.
         images: Names of the images, which rows are paired with.
-
-    Raises:
-        InputError: No pose table, or one that does not fit the images.
     """
     from evercal.recordings.poses.pairing import poses_of_images
 
@@ -121,10 +105,20 @@ def poses_of(data: bytes, ending: str, images: list[str]) -> "SE3":
     )
 
 
+def json_of(data: bytes, name: str, convert: Callable[[object], Content]) -> Content:
+    """Convert a JSON value that came over the network."""
+    return _from_text(
+        data, name, ".json", _TEXT_BYTES, lambda p: convert(json.loads(p.read_text()))
+    )
+
+
 def _from_text(
     data: bytes, name: str, ending: str, most: int, read: Callable[[Path], Content]
 ) -> Content:
-    """Read text that came over the network as a file; messages name the part of the request."""
+    """Read text that came over the network as a file.
+
+    One line for whatever a reader raises, with the name of the request's part.
+    """
     if len(data) > most:
         raise TooLargeError(f"{name}: {len(data)} bytes; at most {most}")
     if data[:2] == b"PK" or b"\0" in data:
@@ -132,28 +126,10 @@ def _from_text(
     with tempfile.TemporaryDirectory(prefix="evercal-") as folder:
         path = Path(folder, name + ending)
         path.write_bytes(data)
-        return _plainly(name, lambda: read(path), str(path))
-
-
-def json_of(
-    data: bytes, name: str, convert: Callable[[object], Content], most: int = _TEXT_BYTES
-) -> Content:
-    """Convert a JSON value that came over the network.
-
-    Raises:
-        InputError: Not JSON, too large, or `convert` raises an error.
-    """
-    if len(data) > most:
-        raise TooLargeError(f"{name}: {len(data)} bytes; at most {most}")
-    return _plainly(name, lambda: convert(json.loads(data)))
-
-
-def _plainly(name: str, read: Callable[[], Content], path: str | None = None) -> Content:
-    """One line for whatever a reader raises for values that no program of evercal wrote."""
-    try:
-        return read()
-    except InputError as error:
-        raise InputError(str(error).replace(path or name, name)) from None
-    except Exception as error:  # deep nesting, infinite numbers, wrong types
-        what = str(error).partition("\n")[0] or type(error).__name__
-        raise InputError(f"{name}: cannot be read ({what[:200]})") from None
+        try:
+            return read(path)
+        except InputError as error:
+            raise InputError(str(error).replace(str(path), name)) from None
+        except Exception as error:  # deep nesting, infinite numbers, wrong types
+            what = str(error).partition("\n")[0] or type(error).__name__
+            raise InputError(f"{name}: cannot be read ({what[:200]})") from None

@@ -2,12 +2,14 @@
 
 import json
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from fastapi import APIRouter, File, Form, Request, Response, UploadFile, WebSocket
+from fastapi import APIRouter, Depends, File, Form, Request, Response, UploadFile, WebSocket
 from fastapi.responses import PlainTextResponse
 from prometheus_client import generate_latest
 from starlette.websockets import WebSocketDisconnect
@@ -16,19 +18,19 @@ from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker
-from evercal.reports.answers import check_record, unit_known
+from evercal.reports.answers import Answer, answer_row, check_record, unit_known
 from evercal.reports.track_files import track_row
-from evercal.service.desk import Desk
+from evercal.service.desk import Desk, QueueFullError
 from evercal.service.guard import Metrics
-from evercal.service.jobs import Jobs, QueueFullError
 from evercal.service.limits import Limits, TooLargeError, camera_of, decoded, json_of, poses_of
 from evercal.service.live_map import LiveMap
 
 router = APIRouter()
-Images = Annotated[list[UploadFile], File(description="Image files, all of one camera.")]
 CameraFile = Annotated[
     UploadFile | None, File(description="Intrinsics: JSON, YAML or a 3x3 matrix as text.")
 ]
+Shots = tuple[list[tuple[str, np.ndarray]], Camera | None]
+"""Names and pixels of images, and their intrinsics."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +38,9 @@ class Service:
     """What the endpoints share."""
 
     live: LiveMap
-    jobs: Jobs
     desk: Desk
     limits: Limits
     metrics: Metrics
-    uploads: Path
-    """Folder for archives that wait to be learned."""
-    recordings: Path | None = None
-    """Folder whose recordings may be learned by their path."""
-    device: str = "auto"
 
 
 def service_of(request: Request | WebSocket) -> Service:
@@ -70,29 +66,44 @@ async def localize(
 ) -> dict[str, Any]:
     """Estimate the camera pose of one image: the row of `evercal localize --json`."""
     service, name = service_of(request), image.filename or "image"
-    lens = None if camera is None else await camera.read()
-    row = await service.desk.run(_located, service, await image.read(), name, lens)
+    data, intrinsics = await image.read(), await _content(camera)
+
+    def work() -> dict[str, Any]:
+        localizer, began = service.live.current.localizer, time.perf_counter()
+        pixels = decoded(data, name, service.limits)
+        estimate = localizer.localize(pixels, _camera(intrinsics, pixels))
+        milliseconds = 1000 * (time.perf_counter() - began)
+        known = unit_known(localizer, estimate.scene)
+        return answer_row(Answer(Path(name), estimate, milliseconds, known))
+
+    row = await service.desk.run(work)
     service.metrics.answers.labels(row["status"]).inc()
     return row
 
 
-def _located(service: Service, data: bytes, name: str, lens: bytes | None) -> dict[str, Any]:
-    def read() -> tuple[np.ndarray, Camera | None]:
-        image = decoded(data, name, service.limits)
-        return image, _camera(lens, image)
+async def _shots(
+    request: Request,
+    images: Annotated[list[UploadFile], File(description="Image files, all of one camera.")],
+    camera: CameraFile = None,
+) -> Callable[[], Shots]:
+    """Decode the images of a request and their intrinsics, later and in another thread."""
+    limits = service_of(request).limits
+    if len(images) > limits.images:
+        raise TooLargeError(f"images: {len(images)} given; at most {limits.images}")
+    files = [(image.filename or f"image {i}", await image.read()) for i, image in enumerate(images)]
+    intrinsics = await _content(camera)
 
-    return service.live.row(read, name)
+    def decode() -> Shots:
+        pixels = [(name, decoded(data, name, limits)) for name, data in files]
+        return pixels, _camera(intrinsics, pixels[0][1])
 
-
-def _camera(lens: bytes | None, image: np.ndarray) -> Camera | None:
-    return None if lens is None else camera_of(lens, (image.shape[1], image.shape[0]))
+    return decode
 
 
 @router.post("/calibrations")
 async def calibrations(
     request: Request,
-    images: Images,
-    camera: CameraFile = None,
+    shots: Annotated[Callable[[], Shots], Depends(_shots)],
     robot_poses: Annotated[
         UploadFile | None,
         File(description="base_from_gripper of every image: a table as text, or JSON."),
@@ -100,18 +111,15 @@ async def calibrations(
     mount: Annotated[Literal["eye_to_hand", "eye_in_hand"] | None, Form()] = None,
 ) -> dict[str, Any]:
     """Calibrate a camera from its images: the calibration file."""
-    service = service_of(request)
-    files, lens = await _files(service, images), None if camera is None else await camera.read()
-    table = None if robot_poses is None else await robot_poses.read()
+    service, table = service_of(request), await _content(robot_poses)
     ending = "" if robot_poses is None else Path(robot_poses.filename or "").suffix
 
     def work() -> dict[str, Any]:
-        from evercal.calibration.from_images import Images as Given
-        from evercal.calibration.from_images import calibrate
+        from evercal.calibration.from_images import Images, calibrate
 
-        pixels, lens_of_all = _decoded(service, files, lens)
-        poses = None if table is None else poses_of(table, ending, [name for name, _ in files])
-        given = Given(pixels, lens_of_all, poses)
+        pixels, camera = shots()
+        poses = None if table is None else poses_of(table, ending, [name for name, _ in pixels])
+        given = Images(pixels, camera, poses)
         return calibrate(service.live.current.localizer, given, mount).to_dict()
 
     return await service.desk.run(work)
@@ -120,46 +128,37 @@ async def calibrations(
 @router.post("/check")
 async def check(
     request: Request,
-    images: Images,
+    shots: Annotated[Callable[[], Shots], Depends(_shots)],
     calibration: Annotated[UploadFile, File(description="The calibration file of the camera.")],
-    camera: CameraFile = None,
 ) -> dict[str, Any]:
     """Test whether a fixed camera has moved: the object of `evercal check --json`."""
     service, reference = service_of(request), await calibration.read()
-    files, lens = await _files(service, images), None if camera is None else await camera.read()
 
     def work() -> dict[str, Any]:
         from evercal.calibration.calibration import Calibration
         from evercal.calibration.drift import check
 
         stated = json_of(reference, "calibration", Calibration.from_dict)
-        pixels, lens_of_all = _decoded(service, files, lens)
-        return check_record(check(service.live.current.localizer, pixels, stated, lens_of_all))
+        pixels, camera = shots()
+        return check_record(check(service.live.current.localizer, pixels, stated, camera))
 
     return await service.desk.run(work)
 
 
-async def _files(service: Service, images: list[UploadFile]) -> list[tuple[str, bytes]]:
-    if len(images) > service.limits.images:
-        raise TooLargeError(f"images: {len(images)} given; at most {service.limits.images}")
-    return [(image.filename or f"image {i}", await image.read()) for i, image in enumerate(images)]
+async def _content(file: UploadFile | None) -> bytes | None:
+    return None if file is None else await file.read()
 
 
-def _decoded(
-    service: Service, files: list[tuple[str, bytes]], lens: bytes | None
-) -> tuple[list[tuple[str, np.ndarray]], Camera | None]:
-    pixels = [(name, decoded(data, name, service.limits)) for name, data in files]
-    return pixels, _camera(lens, pixels[0][1])
+def _camera(intrinsics: bytes | None, image: np.ndarray) -> Camera | None:
+    return None if intrinsics is None else camera_of(intrinsics, image.shape[1::-1])
 
 
 @router.get("/metrics", response_class=PlainTextResponse)
 async def metrics(request: Request) -> Response:
     """Counters for Prometheus."""
     service = service_of(request)
-    gauges = service.metrics.gauges
-    gauges["scenes"].set(len(service.live.current.scenes))
-    gauges["waiting_images"].set(service.desk.waiting)
-    gauges["pending_jobs"].set(len(service.jobs.pending))
+    service.metrics.scenes.set(len(service.live.current.scenes))
+    service.metrics.waiting.set(service.desk.waiting)
     text = generate_latest(service.metrics.registry)
     return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
@@ -172,44 +171,32 @@ async def track(socket: WebSocket) -> None:
     the intrinsics of the frames that follow, as `camera` of `/localize`. A frame that cannot be
     used is answered with `{"error": ...}`.
     """
-    service, lens, number = service_of(socket), None, 0
-    followed = Followed(service)
+    service, intrinsics, number = service_of(socket), None, 0
+    tracker: Tracker | None = None
+    tracked: tuple[Localizer, bytes | None] | None = None
+
+    def row(data: bytes, name: str) -> dict[str, Any]:
+        nonlocal tracker, tracked
+        localizer = service.live.current.localizer
+        image = decoded(data, name, service.limits)
+        if tracker is None or tracked != (localizer, intrinsics):  # the map or the camera changed
+            tracker = Tracker(localizer, _camera(intrinsics, image))
+            tracked = (localizer, intrinsics)
+        frame = tracker.track(image, time.monotonic())
+        return track_row(frame, name, unit_known(localizer, frame.estimate.scene))
+
     await socket.accept()
-    try:
-        while True:
-            message = await socket.receive()
-            if message["type"] == "websocket.disconnect":
-                return
+    with suppress(WebSocketDisconnect):
+        while (message := await socket.receive())["type"] != "websocket.disconnect":
             if message.get("text") is not None:
-                lens = message["text"].encode()
+                intrinsics = message["text"].encode()
                 continue
             name, number = f"frame {number}", number + 1
             try:
-                row = await service.desk.run(followed.row, message["bytes"], name, lens)
+                answer = await service.desk.run(row, message["bytes"], name)
             except (InputError, QueueFullError) as error:
-                row = {"path": name, "error": one_line(error)}
-            await socket.send_text(json.dumps(row, allow_nan=False))
-    except WebSocketDisconnect:
-        return
-
-
-class Followed:
-    """A stream of frames; it is tracked anew when the map or the intrinsics change."""
-
-    def __init__(self, service: Service):
-        self._service = service
-        self._of: tuple[Localizer, bytes | None] | None = None
-        self._tracker: Tracker | None = None
-
-    def row(self, data: bytes, name: str, lens: bytes | None) -> dict[str, Any]:
-        """The row of the next frame, with the state of the tracking."""
-        localizer = self._service.live.current.localizer
-        image = decoded(data, name, self._service.limits)
-        if self._tracker is None or self._of != (localizer, lens):
-            self._tracker = Tracker(localizer, _camera(lens, image))
-            self._of = (localizer, lens)
-        frame = self._tracker.track(image, time.monotonic())
-        return track_row(frame, name, unit_known(localizer, frame.estimate.scene))
+                answer = {"path": name, "error": one_line(error)}
+            await socket.send_text(json.dumps(answer, allow_nan=False))
 
 
 def one_line(error: object) -> str:

@@ -1,0 +1,65 @@
+"""Changes that other processes make to the map are noticed."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from evercal.map import Map
+
+
+def test_changes_by_other_processes_are_noticed(serve: Any, copy: Path, image: Path) -> None:
+    parts = [("image", (image.name, image.read_bytes()))]
+    with serve(copy) as service:
+        assert service.ask("POST", "/localize", parts).json["scene"] == "hall"
+        Map.open(copy, device="cpu").rename("hall", "lobby")
+        until = time.monotonic() + 10
+        while service.ask("GET", "/scenes").json["scenes"] != ["lobby"]:
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        assert service.ask("POST", "/localize", parts).json["scene"] == "lobby"
+        (copy / "manifest.json").write_text("{")
+        time.sleep(0.7)
+        assert service.ask("POST", "/localize", parts).json["scene"] == "lobby"
+
+
+def test_no_answer_mixes_two_states(serve: Any, copy: Path, image: Path, tmp_path: Path) -> None:
+    """A scene of the same place under two names replaces itself while images are located."""
+    parts = [("image", (image.name, image.read_bytes()))]
+    with serve(copy) as service:
+        expected = service.ask("POST", "/localize", parts).json["base_from_camera"]
+        stop = threading.Event()
+
+        def rename() -> None:
+            names = ["hall", "lobby"]
+            while not stop.is_set():
+                Map.open(copy, device="cpu").rename(*names)
+                service.service.live.refresh()
+                names.reverse()
+
+        changing = threading.Thread(target=rename)
+        changing.start()
+        try:
+            rows = [service.ask("POST", "/localize", parts).json for _ in range(25)]
+        finally:
+            stop.set()
+            changing.join()
+        assert {row["scene"] for row in rows} <= {"hall", "lobby"}
+        assert all(row["base_from_camera"] == expected for row in rows)
+
+
+def test_a_service_without_a_map_waits_for_its_first_scene(
+    serve: Any, tmp_path: Path, hall_store: Path, image: Path
+) -> None:
+    parts = [("image", (image.name, image.read_bytes()))]
+    with serve(tmp_path / "new") as service:
+        assert service.ask("GET", "/scenes").json == {"scenes": []}
+        got = service.ask("POST", "/localize", parts)
+        assert got.status == 400
+        assert "no scene learned yet" in got.json["error"]
+        assert not (tmp_path / "new").exists()
+        Map.open(tmp_path / "new", device="cpu").merge(hall_store)
+        service.service.live.refresh()
+        assert service.ask("POST", "/localize", parts).json["scene"] == "hall"
