@@ -12,8 +12,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
 
-from evercal.continual.pretraining import contrastive
-from evercal.continual.pretraining.contrastive import (
+from evercal.errors import InputError
+from evercal.features.encoder import LocalEncoder
+from training import contrastive
+from training.contrastive import (
     Batch,
     PairStream,
     PretrainData,
@@ -23,9 +25,7 @@ from evercal.continual.pretraining.contrastive import (
     sample_features,
     train_encoder,
 )
-from evercal.continual.pretraining.pairs import HEIGHT, WIDTH, RoomViews, cell_pixels, leaf_picture
-from evercal.errors import InputError
-from evercal.features.encoder import LocalEncoder
+from training.pairs import HEIGHT, WIDTH, RoomViews, cell_pixels, leaf_picture
 
 OPTIONS = PretrainOptions(steps=6, room_pairs=2, furnished_pairs=0, leaf_pairs=1, points=64)
 FAR = torch.tensor([[0.0, 0.0], [100.0, 0.0]])
@@ -213,6 +213,7 @@ def test_training_lowers_the_loss(data: PretrainData, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("small")
+@pytest.mark.slow
 def test_training_starts_from_an_earlier_run(
     data: PretrainData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from evercal.continual.pretraining.contrastive import PretrainOptions, make_data, train_encoder
-from evercal.continual.pretraining.places import train_descriptor
 from evercal.features.weights_file import network_bytes
 from evercal.storage.atomic import write_bytes
+from training.contrastive import PretrainOptions, make_data, train_encoder
+from training.places import train_descriptor
 
 
 def pretrain(out: Path, work: Path, options: PretrainOptions) -> None:
@@ -31,7 +31,7 @@ def pretrain(out: Path, work: Path, options: PretrainOptions) -> None:
     def log(line: str) -> None:
         with path.open("a") as file:
             file.write(line + "\n")
-        print(line, file=sys.stderr, flush=True)  # noqa: T201
+        print(line, file=sys.stderr, flush=True)
 
     def seconds() -> str:
         return f"{time.perf_counter() - began:.0f} s"

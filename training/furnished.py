@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from evercal.continual.pretraining.pairs import HEIGHT, PER_ANCHOR, WIDTH, pinhole
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.simulation.box_room import look_at
@@ -17,6 +16,7 @@ from evercal.simulation.furnished.renderer import Renderer, RenderOptions
 from evercal.simulation.furnished.rooms import KINDS, Room, room
 from evercal.storage import write_bytes
 from evercal.storage.settings import lock_settings
+from training.pairs import HEIGHT, PER_ANCHOR, WIDTH, pinhole
 
 SAMPLES = 8
 OCCLUSION = 0.02

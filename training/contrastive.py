@@ -15,8 +15,13 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import DataLoader, IterableDataset
 
-from evercal.continual.pretraining.furnished import cached_furnished_views
-from evercal.continual.pretraining.pairs import (
+from evercal.errors import InputError
+from evercal.features.encoder import LocalEncoder
+from evercal.features.precision import autocast
+from evercal.simulation.furnished.renderer import mitsuba
+from evercal.storage.atomic import write_bytes
+from training.furnished import cached_furnished_views
+from training.pairs import (
     END_ROOM_SEED,
     FIRST_ROOM_SEED,
     HEIGHT,
@@ -32,11 +37,6 @@ from evercal.continual.pretraining.pairs import (
     room_views,
     view_pair,
 )
-from evercal.errors import InputError
-from evercal.features.encoder import LocalEncoder
-from evercal.features.precision import autocast
-from evercal.simulation.furnished.renderer import mitsuba
-from evercal.storage.atomic import write_bytes
 
 CHECKPOINT = "encoder.pt"
 CHECKPOINT_STEPS = 250

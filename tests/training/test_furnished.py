@@ -9,19 +9,23 @@ import numpy as np
 import pytest
 import torch
 
-from evercal.continual.pretraining import contrastive, furnished
-from evercal.continual.pretraining.contrastive import (
+from evercal.errors import InputError
+from evercal.geometry import SE3, Camera
+from evercal.simulation.cell import SUITES
+from evercal.simulation.furnished.rooms import RESERVED
+from training import contrastive, furnished
+from training.contrastive import (
     PairStream,
     PretrainData,
     PretrainOptions,
     make_data,
 )
-from evercal.continual.pretraining.furnished import (
+from training.furnished import (
     FurnishedViews,
     cached_furnished_views,
     furnished_views,
 )
-from evercal.continual.pretraining.pairs import (
+from training.pairs import (
     END_ROOM_SEED,
     FIRST_ROOM_SEED,
     HEIGHT,
@@ -30,10 +34,6 @@ from evercal.continual.pretraining.pairs import (
     WIDTH,
     view_pair,
 )
-from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
-from evercal.simulation.cell import SUITES
-from evercal.simulation.furnished.rooms import RESERVED
 
 CAMERA = Camera(WIDTH, HEIGHT, 200.0, 200.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
@@ -110,6 +110,7 @@ def test_batch_contains_furnished_rooms() -> None:
     assert (across[:, None] - torch.tensor([0.0, 10.0, 20.0])).abs().min(1).values.max() < 1e-2
 
 
+@pytest.mark.slow
 def test_rendered_pairs_correspond_and_are_cached(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
     views = furnished_views(1001, anchors=1)

@@ -12,18 +12,18 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from evercal.continual.networks.descriptor import load_descriptor
-from evercal.continual.pretraining import make, places
-from evercal.continual.pretraining.contrastive import PretrainData, PretrainOptions
-from evercal.continual.pretraining.make import pretrain
-from evercal.continual.pretraining.pairs import RoomViews, leaf_picture
-from evercal.continual.pretraining.places import (
+from evercal.features.encoder import LocalEncoder, load_encoder
+from evercal.simulation.box_room import BoxRoom, default_camera
+from training import make, places
+from training.contrastive import PretrainData, PretrainOptions
+from training.make import pretrain
+from training.pairs import RoomViews, leaf_picture
+from training.places import (
     place_accuracy,
     place_loss,
     random_crop,
     train_descriptor,
 )
-from evercal.features.encoder import LocalEncoder, load_encoder
-from evercal.simulation.box_room import BoxRoom, default_camera
 
 T = places.TEMPERATURE
 
@@ -172,6 +172,7 @@ def ranks(seeds: range, gallery: int, queries: int) -> np.ndarray:
     return np.concatenate(actual)
 
 
+@pytest.mark.slow
 def test_shipped_descriptor_separates_three_new_rooms() -> None:
     assert (ranks(range(300, 303), gallery=12, queries=4) == 0).mean() >= 0.8
 

@@ -8,16 +8,16 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from evercal.continual.networks.descriptor import GlobalDescriptor
-from evercal.continual.pretraining.contrastive import PretrainData, PretrainOptions
-from evercal.continual.pretraining.pairs import (
+from evercal.features.encoder import Encoder
+from evercal.features.precision import autocast
+from training.contrastive import PretrainData, PretrainOptions
+from training.pairs import (
     PER_ANCHOR,
     VALIDATION_ROOM_SEED,
     Views,
     photometric,
     room_views,
 )
-from evercal.features.encoder import Encoder
-from evercal.features.precision import autocast
 
 PLACES_PER_BATCH = 64
 TEMPERATURE = 0.07

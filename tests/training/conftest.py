@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from evercal.continual.pretraining import contrastive, pairs, places
-from evercal.continual.pretraining.pairs import RoomViews, room_views
 from evercal.simulation.box_room import BoxRoom
+from training import contrastive, pairs, places
+from training.pairs import RoomViews, room_views
 
 SEED = 420
 

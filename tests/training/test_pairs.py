@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from evercal.continual.pretraining.pairs import (
+from evercal.simulation.box_room import BoxRoom
+from training.pairs import (
     HEIGHT,
     WIDTH,
     RoomViews,
@@ -15,7 +16,6 @@ from evercal.continual.pretraining.pairs import (
     random_homography,
     view_pair,
 )
-from evercal.simulation.box_room import BoxRoom
 
 from .conftest import SEED
 
