@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from evercal.continual.learning.frame_depths import frame_depths
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.features.encoder import Encoder
 from evercal.features.weights_file import network_bytes
 from evercal.geometry import SE3
-from evercal.mapping.frame_depths import frame_depths
 from evercal.recordings.frame import Frame, stated_poses
 from evercal.storage import write_bytes
 
@@ -62,7 +62,7 @@ def surface_points(
     Args:
         buffer: Rows of plain and augmented views of the frames.
         frames: Frames in the order in which they were encoded.
-        depths: Depths of each frame, see `mapping.frame_depths`.
+        depths: Depths of each frame, see `frame_depths`.
         stride: Pixels per cell.
 
     Returns:

@@ -7,11 +7,9 @@ a class and the mean over an image as its feature. All return sorted indices.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 
-ROUNDING = 1e-9
 GSS_COMPARED = 10
 """Buffered frames with which gradient-based selection compares a new frame."""
 
@@ -28,27 +26,6 @@ def select_reservoir(count: int, capacity: int, rng: np.random.Generator) -> np.
         if slot < capacity:
             selected[slot] = frame
     return np.sort(np.array(selected, dtype=np.int64))
-
-
-def select_hybrid(features: np.ndarray, capacity: int, rng: np.random.Generator) -> np.ndarray:
-    """Reservoir of novel frames, after the hybrid replay of Bahadir et al. (MVA 2024).
-
-    Only novel frames enter the reservoir's stream: their distance to the last novel frame exceeds
-    the median distance of neighbouring frames. The measure is ours, because only the abstract of
-    the original was available. If too few frames are novel, a reservoir of the others fills the
-    rest. The rows of features (n, c) are scaled to unit length.
-    """
-    unit = _unit(features)
-    step = 1 - (unit[1:] * unit[:-1]).sum(1)
-    floor = float(np.median(step)) if len(step) else 0.0
-    novel: list[int] = []
-    for frame in range(len(unit)):
-        if not novel or 1 - float(unit[frame] @ unit[novel[-1]]) > floor + ROUNDING:
-            novel.append(frame)
-    selected = np.array(novel, dtype=np.int64)[select_reservoir(len(novel), capacity, rng)]
-    others = np.setdiff1d(np.arange(len(unit)), novel)
-    more = select_reservoir(len(others), capacity - len(selected), rng)
-    return np.sort(np.concatenate([selected, others[more]]))
 
 
 def select_herding(features: np.ndarray, capacity: int) -> np.ndarray:
@@ -96,23 +73,19 @@ def select_leverage(
 
 
 def select_coverage(
-    visible: Sequence[np.ndarray],
-    capacity: int,
-    rng: np.random.Generator,
-    victim: Literal["random", "redundant"] = "random",
+    visible: Sequence[np.ndarray], capacity: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Coverage score of Buff-CS (Wang et al., ICCV 2021) inside one scene.
 
     Frames arrive in random order and are appended until the buffer is full. Later a frame enters if
     it shows a part of the scene that no buffered frame shows. Otherwise it enters with probability
-    m / n as in a reservoir (m buffered, n earlier frames). Each entering frame replaces another.
+    m / n as in a reservoir (m buffered, n earlier frames). Each entering frame replaces a random
+    one, as in the released code.
 
     Args:
         visible: Numbers of the parts that each frame shows.
         capacity: Frames to select.
         rng: Source of the order and the random draws.
-        victim: Frame to replace: a random one as in the released code, or the one that shares most
-            parts with the others, which that code computes but does not use.
     """
     count = 1 + max((int(parts.max()) for parts in visible if len(parts)), default=-1)
     shows = np.zeros((len(visible), count), dtype=bool)
@@ -125,15 +98,8 @@ def select_coverage(
             continue
         novel = bool((shows[frame] & ~shows[selected].any(0)).any())
         if selected and (novel or rng.random() <= len(selected) / earlier):
-            selected[_replaced(shows[selected], rng, victim)] = frame
+            selected[int(rng.integers(len(selected)))] = frame
     return np.sort(np.array(selected, dtype=np.int64))
-
-
-def _replaced(shows: np.ndarray, rng: np.random.Generator, victim: str) -> int:
-    if victim == "random":
-        return int(rng.integers(len(shows)))
-    signed = np.where(shows, 1.0, -1.0)
-    return int((signed @ signed.T).sum(1).argmax())
 
 
 def select_gradients(gradients: np.ndarray, capacity: int, rng: np.random.Generator) -> np.ndarray:

@@ -9,7 +9,6 @@ from evercal.continual.selection.selection_by_features import (
     select_coverage,
     select_gradients,
     select_herding,
-    select_hybrid,
     select_leverage,
     select_reservoir,
 )
@@ -20,12 +19,8 @@ Select = Callable[[FrameStatistics, int], np.ndarray]
 
 SELECTORS: dict[str, Select] = {
     "reservoir": lambda f, capacity: select_reservoir(len(f), capacity, f.rng()),
-    "hybrid": lambda f, capacity: select_hybrid(f.features(), capacity, f.rng()),
     "herding": lambda f, capacity: select_herding(f.features(), capacity),
     "coverage": lambda f, capacity: select_coverage(f.visible_parts(), capacity, f.rng()),
-    "coverage_redundant": lambda f, capacity: select_coverage(
-        f.visible_parts(), capacity, f.rng(), "redundant"
-    ),
     "leverage": lambda f, capacity: select_leverage(f.features(), capacity, f.rng()),
     "gradients": lambda f, capacity: select_gradients(f.gradients(), capacity, f.rng()),
     "sars": lambda f, capacity: select_sars(f.positions_m, f.quaternions_wxyz, capacity),

@@ -1,6 +1,6 @@
-"""GEM, A-GEM and GEC: steps that may not raise the losses of remembered scenes.
+"""GEC: steps that may not raise the losses of remembered scenes.
 
-The originals project the gradient, and plain SGD takes the step. AdamW and Shampoo can move against
+The original projects the gradient, and plain SGD takes the step. AdamW and Shampoo can move against
 the memory even if the gradient does not, because of their momentum, scales and decay. So the change
 of the weights is projected after the optimisers. To first order, a change u alters the loss of
 scene t by <g_t, u>, with g_t the gradient of that loss.
@@ -13,7 +13,6 @@ from typing import ClassVar
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from evercal.continual.methods.method import FinishedScene, StageStart
 from evercal.continual.methods.penalties import Reprojection
@@ -27,92 +26,7 @@ REFERENCE_ROWS = 8192
 
 
 @dataclass(frozen=True)
-class ConstrainedStep(EpisodicMemory):
-    """Base of methods that constrain the losses of remembered scenes."""
-
-    clamp_px: float = 50.0
-    """Fixed soft clamp of remembered losses, pixels. A fixed clamp makes losses of different steps
-    comparable; a wide one leaves forgotten rows a gradient."""
-
-    def begin(self, start: StageStart) -> TrainingHooks:
-        """Constrain the steps, from the second scene on."""
-        return ConstraintHooks(self, start) if start.memories else TrainingHooks()
-
-    def constrained(self, losses: list[Tensor]) -> list[Tensor]:
-        """Compute the constrained losses from the losses of the remembered scenes."""
-        return losses
-
-    def edit(self, changes: Tensor, g: Tensor) -> Tensor:
-        """Find the nearest change (p,) that raises no loss, given the gradients (t, p)."""
-        return nearest_change(changes, g, g.new_zeros(len(g)))
-
-    def loss(self, output: HeadOutput, rows: Rows) -> Tensor:
-        """Compute the mean loss of remembered rows with the fixed clamp."""
-        cost, _ = fixed_clamp_loss(output.points, rows.target, self.clamp_px)
-        return cost.mean()
-
-
-class ConstraintHooks(MemoryHooks):
-    """Collects the gradient of every remembered scene and applies the method's rule."""
-
-    edits_steps = True
-
-    def __init__(self, method: ConstrainedStep, start: StageStart):
-        super().__init__(start)
-        self._rule = method
-
-    def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
-        """Compute the constrained losses."""
-        each = len(rows.scene) // len(self.memories)  # rows are ordered by scene
-        parts = [slice(i * each, (i + 1) * each) for i in range(len(self.memories))]
-        losses = [self._rule.loss(output.part(part), rows.part(part)) for part in parts]
-        return self._rule.constrained(losses)
-
-    def edit_step(self, proposed: ProposedStep) -> None:
-        """Project the step."""
-        sizes = [change.numel() for change in proposed.changes.values()]
-        g = torch.stack([_flat(constraint) for constraint in proposed.constraints])
-        allowed = self.allowed(_flat(proposed.changes), g, proposed)
-        for name, part in zip(proposed.changes, allowed.split(sizes), strict=True):
-            proposed.changes[name] = part.view_as(proposed.changes[name])
-
-    def allowed(self, changes: Tensor, g: Tensor, proposed: ProposedStep) -> Tensor:
-        """Apply the method's rule to the change (p,)."""
-        return self._rule.edit(changes, g)
-
-
-@dataclass(frozen=True)
-class AveragedGem(ConstrainedStep):
-    """A-GEM: a step may not raise the mean of the remembered losses."""
-
-    citation: ClassVar[str] = "Chaudhry et al., Efficient lifelong learning with A-GEM, ICLR 2019"
-
-    def constrained(self, losses: list[Tensor]) -> list[Tensor]:
-        """Return the mean loss."""
-        return [torch.stack(losses).mean()]
-
-
-@dataclass(frozen=True)
-class Gem(ConstrainedStep):
-    """GEM: a step may not raise the loss of any remembered scene.
-
-    The original keeps the dual variables above a margin, in units of SGD's gradient. Here every
-    step is first moved down each remembered loss by a share of its own length. A constraint holds
-    to first order only, and without a margin second-order effects accumulate.
-    """
-
-    citation: ClassVar[str] = "Lopez-Paz and Ranzato, Gradient episodic memory, NeurIPS 2017"
-    margin: float = 1.0
-    """Length added against every gradient g_t, as a share of the step's length."""
-
-    def edit(self, changes: Tensor, g: Tensor) -> Tensor:
-        """Return the nearest change with <g_t, u> <= 0 for every scene, after the margin."""
-        margin = self.margin * changes.norm() * F.normalize(g, dim=1).sum(0)
-        return super().edit(changes - margin, g)
-
-
-@dataclass(frozen=True)
-class EpisodicConstraint(ConstrainedStep):
+class EpisodicConstraint(EpisodicMemory):
     """GEC with several constraints and the references of its appendix.
 
     With h_t = loss_t - (1 + slack) reference_t, the original requires <v, g_t> >= alpha h_t of a
@@ -125,6 +39,9 @@ class EpisodicConstraint(ConstrainedStep):
     """
 
     citation: ClassVar[str] = "Lai et al., GEC, NeurIPS 2025, several constraints"
+    clamp_px: float = 50.0
+    """Fixed soft clamp of remembered losses, pixels. A fixed clamp makes losses of different steps
+    comparable; a wide one leaves forgotten rows a gradient."""
     alpha: float = 512.0
     """Share of h_t that a step of unit length recovers (no unit)."""
     eta: float = 0.03
@@ -136,28 +53,29 @@ class EpisodicConstraint(ConstrainedStep):
     a short gradient; without this limit the required step would destroy the network."""
     warm_steps: int = 5
     """Steps of plain replay at the start of a stage."""
-    moving: bool = False
-    """Compare with the losses of the previous step, as the original's Algorithm 1 does. Then no
-    single step may raise a loss by more than the slack, but many small rises are allowed."""
 
     def begin(self, start: StageStart) -> TrainingHooks:
         """Constrain the steps after the warm-up, from the second scene on."""
-        return _EpisodicHooks(self, start) if start.memories else TrainingHooks()
+        return _ConstraintHooks(self, start) if start.memories else TrainingHooks()
+
+    def loss(self, output: HeadOutput, rows: Rows) -> Tensor:
+        """Compute the mean loss of remembered rows with the fixed clamp."""
+        cost, _ = fixed_clamp_loss(output.points, rows.target, self.clamp_px)
+        return cost.mean()
 
     def edit_step(
         self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
     ) -> Tensor:
         """Return the nearest change with <g_t, u> <= -alpha eta h_t for every scene.
 
-        The (t,) references are losses right after learning the scenes; NaN if unknown.
+        The (t,) references are losses right after learning the scenes.
         """
         if proposed.step < self.warm_steps:
             return changes
         h = proposed.losses - (1 + self.slack) * references
         # The bound follows the learning rate, which ends at zero.
         most = -self.alpha * self.eta * proposed.schedule * h
-        finite = torch.isfinite(h)
-        added = nearest_change(changes, g[finite], most[finite]) - changes
+        added = nearest_change(changes, g, most) - changes
         limit = self.longest * changes.norm() / added.norm().clamp(min=1e-12)
         return changes + limit.clamp(max=1.0) * added
 
@@ -173,14 +91,16 @@ class EpisodicConstraint(ConstrainedStep):
             return {"reference": self.loss(output, rows).cpu()}
 
 
-class _EpisodicHooks(ConstraintHooks):
+class _ConstraintHooks(MemoryHooks):
+    """Collects the gradient of every remembered scene and edits the step."""
+
+    edits_steps = True
+
     def __init__(self, method: EpisodicConstraint, start: StageStart):
-        super().__init__(method, start)
+        super().__init__(start)
         self._method, self._steps = method, 0
         references = [start.states[memory.scene]["reference"] for memory in self.memories]
         self._references = torch.stack(references)
-        if method.moving:
-            self._references = torch.full_like(self._references, torch.nan)
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         """Compute plain replay in the first steps, averaged over the scenes."""
@@ -188,18 +108,20 @@ class _EpisodicHooks(ConstraintHooks):
             return None
         return Reprojection()(output, None, rows, tau_px)
 
-    def allowed(self, changes: Tensor, g: Tensor, proposed: ProposedStep) -> Tensor:
-        change = self._method.edit_step(changes, g, proposed, self._references.to(g))
+    def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
+        """Compute the loss of each remembered scene."""
+        each = len(rows.scene) // len(self.memories)  # rows are ordered by scene
+        parts = [slice(i * each, (i + 1) * each) for i in range(len(self.memories))]
+        return [self._method.loss(output.part(part), rows.part(part)) for part in parts]
+
+    def edit_step(self, proposed: ProposedStep) -> None:
+        changes = _flat(proposed.changes)
+        g = torch.stack([_flat(constraint) for constraint in proposed.constraints])
+        allowed = self._method.edit_step(changes, g, proposed, self._references.to(g))
         self._steps = proposed.step + 1
-        if self._method.moving:
-            self._references = proposed.losses
-        return change
-
-    def state(self) -> dict[str, Tensor]:
-        return {"steps": torch.tensor(self._steps, device="cpu"), "references": self._references}
-
-    def load(self, state: Mapping[str, Tensor]) -> None:
-        self._steps, self._references = int(state["steps"]), state["references"]
+        sizes = [change.numel() for change in proposed.changes.values()]
+        for name, part in zip(proposed.changes, allowed.split(sizes), strict=True):
+            proposed.changes[name] = part.view_as(proposed.changes[name])
 
 
 def nearest_change(changes: Tensor, g: Tensor, most: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ import numpy as np
 
 from evercal.features.encoder import load_encoder
 from evercal.features.views import ideal_cell_pixels
-from evercal.mapping.frame_depths import frame_depths
+from evercal.continual.learning.frame_depths import frame_depths
 from evercal.recordings.frame import Frame
 from evercal.simulation.box_room import BoxRoom
 
