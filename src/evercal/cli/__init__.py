@@ -34,7 +34,7 @@ _GROUPS = {
     "Boards and pose pairs": ("detect", "solve"),
     "Results": ("export", "report"),
     "Recordings": ("inspect", "convert", "reconstruct", "simulate", "demo"),
-    "Networks": ("bench", "bench-report", "pretrain"),
+    "Networks": ("bench", "pretrain"),
 }
 """Verbs by purpose, in the order of the help."""
 
@@ -114,7 +114,6 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.align import Align
     from evercal.cli.audit import Audit
     from evercal.cli.bench import Bench
-    from evercal.cli.bench_report import BenchReport
     from evercal.cli.calibrate import Calibrate
     from evercal.cli.check import Check
     from evercal.cli.convert import Convert
@@ -167,7 +166,6 @@ def _verbs(first: str) -> dict[str, Any]:
         "reconstruct": Reconstruct,
         "simulate": Simulate,
         "bench": Bench,
-        "bench-report": BenchReport,
         "pretrain": pretrain_with_options() if first == "pretrain" else Pretrain,
     }
 

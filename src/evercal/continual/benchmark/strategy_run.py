@@ -1,25 +1,26 @@
 """One run: a strategy with a seed over a sequence of scenes, resumed where it was interrupted."""
 
 import json
+import math
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from filelock import FileLock
 
 from evercal.continual.benchmark.results import (
     NETWORK,
     UNALIGNED,
-    SceneResult,
+    StageResults,
+    frame_row,
     record_environment,
-    scene_result,
+    scene_row,
 )
-from evercal.continual.benchmark.scene_views import keep_views
 from evercal.continual.learning.finish_scene import (
     Learned,
     correct_lens,
@@ -76,15 +77,6 @@ class RunOptions:
     """Device of the networks, see `features.device.device_of`."""
 
 
-class StageResults(NamedTuple):
-    """Results after one stage."""
-
-    stage: int
-    """Number of the stage, from 0."""
-    results: tuple[SceneResult, ...]
-    """Results of all scenes learned so far; empty before the last stage of joint training."""
-
-
 def run_strategy(
     strategy: Strategy, scenes: Sequence[Recording], options: RunOptions, on_event: OnEvent | None
 ) -> Iterator[StageResults]:
@@ -127,7 +119,7 @@ class _Run:
             opened = NetworkStore.open(self.store)
             seconds = float(opened.reports()[-1]["seconds"])
             scenes = self._prepared(opened.contents)
-            yield StageResults(number, self._evaluated(scenes, number, seconds))
+            yield self._evaluated(scenes, number, seconds)
         self._remove()
 
     def jointly(self) -> Iterator[StageResults]:
@@ -146,8 +138,9 @@ class _Run:
             learned.scenes[number] = with_fitted_threshold(learned, split.held_out, number)
         seconds = time.perf_counter() - began
         last = len(self.scenes) - 1
-        yield from (StageResults(number, ()) for number in range(last))
-        yield StageResults(last, self._evaluated(learned, last, seconds))
+        nothing = pd.DataFrame()
+        yield from (StageResults(number, nothing, nothing) for number in range(last))
+        yield self._evaluated(learned, last, seconds)
         self._remove()
 
     def _remove(self) -> None:
@@ -219,25 +212,46 @@ class _Run:
 
         return rows
 
-    def _evaluated(
-        self, scenes: LearnedScenes, number: int, seconds: float
-    ) -> tuple[SceneResult, ...]:
+    def _evaluated(self, scenes: LearnedScenes, number: int, seconds: float) -> StageResults:
         """Evaluate all scenes learned so far.
 
         A map is also evaluated without alignment. A network beside a map is also evaluated alone.
         """
-        name, localizer = self.strategy.name, localizer_of(scenes, NETWORK_LOCALIZE)
-        results = self._results(name, localizer, scenes, number, seconds)
-        if number == len(self.scenes) - 1:
-            keep_views(self.options.out, name, localizer, self.scenes)
-        if not self.strategy.builds_map:
-            return results
-        if self.strategy.method is None:
+        name = self.strategy.name
+        judged: list[tuple[str, LearnedLocalizer, LearnedScenes]] = [
+            (name, localizer_of(scenes, NETWORK_LOCALIZE), scenes)
+        ]
+        if self.strategy.builds_map and self.strategy.method is None:
             unaligned = Localizer(scenes.map_contents(), LocalizeOptions(align=False))
-            return results + self._results(name + UNALIGNED, unaligned, scenes, number, seconds)
-        network = self._without_map(scenes, self.strategy.method.replays)
-        alone = NetworkLocalizer(network, NETWORK_LOCALIZE)
-        return results + self._results(name + NETWORK, alone, network, number, seconds)
+            judged.append((name + UNALIGNED, unaligned, scenes))
+        elif self.strategy.builds_map and self.strategy.method is not None:
+            network = self._without_map(scenes, self.strategy.method.replays)
+            alone = NetworkLocalizer(network, NETWORK_LOCALIZE)
+            judged.append((name + NETWORK, alone, network))
+        results, frames = [], []
+        for judged_name, localizer, learned in judged:
+            run = {"strategy": judged_name, "seed": self.stage.seed, "stage": number}
+            costs = self._costs(learned, number, seconds)
+            evaluated = evaluate(localizer, {s.name: s for s in self.scenes[: number + 1]})
+            for scene in self.scenes[: number + 1]:
+                of_scene = [frame for frame in evaluated if frame.scene == scene.name]
+                newest = learned.keyframes[number] if scene is self.scenes[number] else None
+                coverage = _coverage(newest, scene)
+                results.append({**run, **scene_row(of_scene), **costs, **coverage})
+                frames += [{**run, **frame_row(frame)} for frame in of_scene]
+        table = pd.DataFrame(frames).drop(columns="stage")
+        last = number == len(self.scenes) - 1
+        return StageResults(number, pd.DataFrame(results), table if last else table[:0])
+
+    def _costs(self, learned: LearnedScenes, number: int, seconds: float) -> dict[str, object]:
+        keyframes = learned.keyframes[number]
+        return {
+            "seconds": seconds,
+            "memory_bytes": memory_bytes(learned, self.strategy),
+            "head_bytes": sum(head_bytes(head) for head in learned.heads),
+            "frames_kept": len(keyframes.images) if keyframes else 0,
+            "environment": record_environment(self.options.out),
+        }
 
     def _without_map(self, scenes: LearnedScenes, replays: bool) -> LearnedScenes:
         """Return the network without maps; a method that replays keeps the keyframe images.
@@ -265,34 +279,6 @@ class _Run:
         ]
         return network
 
-    def _results(
-        self,
-        name: str,
-        localizer: LearnedLocalizer,
-        learned: LearnedScenes,
-        number: int,
-        seconds: float,
-    ) -> tuple[SceneResult, ...]:
-        scenes = self.scenes[: number + 1]
-        frames = evaluate(localizer, {scene.name: scene for scene in scenes})
-        environment = record_environment(self.options.out)
-        keyframes = learned.keyframes[number]
-        return tuple(
-            scene_result(
-                [frame for frame in frames if frame.scene == scene.name],
-                strategy=name,
-                seed=self.stage.seed,
-                stage=number,
-                seconds=seconds,
-                memory_bytes=memory_bytes(learned, self.strategy),
-                head_bytes=sum(head_bytes(head) for head in learned.heads),
-                frames_kept=len(keyframes.images) if keyframes else 0,
-                environment=environment,
-                **(_coverage(keyframes, scene) if scene is scenes[-1] else {}),
-            )
-            for scene in scenes
-        )
-
 
 def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOptions:
     """Add the centres of all scenes to options that need them in advance."""
@@ -303,10 +289,15 @@ def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOpti
     return replace(stage, grid_scenes=len(scenes), fixed_centres_m=centres)
 
 
-def _coverage(keyframes: Keyframes | None, scene: Recording) -> dict[str, object]:
-    """Measure how the remembered frames of a scene cover its training frames."""
+def _coverage(keyframes: Keyframes | None, scene: Recording) -> dict[str, float]:
+    """Measure how the remembered frames of a scene cover its training frames, in SARS's metric.
+
+    Returns:
+        The largest distance from a training frame to a remembered one, and the smallest distance
+        between two remembered frames; NaN without remembered frames.
+    """
     if keyframes is None or not keyframes.images:
-        return {}
+        return {"covering_radius": math.nan, "min_spacing": math.nan}
     poses = stated_poses(split_held_out(scene.train).train)
     positions = keyframes.base_from_camera.translation_m
     distances = np.linalg.norm(poses.translation_m[:, None] - positions[None], axis=-1)
@@ -314,8 +305,5 @@ def _coverage(keyframes: Keyframes | None, scene: Recording) -> dict[str, object
     space = PoseSpace.of(poses.translation_m, poses.rotation_wxyz)
     gaps = np.stack([space.distances(int(i)) for i in selected])
     pairs = gaps[:, selected][np.triu_indices(len(selected), 1)]
-    return {
-        "keyframe_positions_m": tuple(tuple(round(float(v), 4) for v in p) for p in positions),
-        "covering_radius": float(gaps.min(0).max()),
-        "min_spacing": float(pairs.min(initial=np.inf)),
-    }
+    smallest = float(pairs.min()) if len(pairs) else math.nan
+    return {"covering_radius": float(gaps.min(0).max()), "min_spacing": smallest}
