@@ -4,12 +4,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from evercal.continual.benchmark.statistics import blocks, mean_interval, seeds_interval
 from scipy.signal import lfilter
 from scipy.stats import bootstrap, norm
 from tabulate import tabulate
 from tqdm import tqdm
-
-from evercal.continual.benchmark.statistics import blocks, mean_interval, seeds_interval
 
 Scenes = list[np.ndarray]
 """Correctness (seeds, frames) of each scene."""

@@ -3,13 +3,13 @@
 from pathlib import Path
 
 import numpy as np
+from evercal.continual.benchmark.published import read_published
+from evercal.continual.benchmark.statistics import seeds_interval
 from tyro.conf import Positional
 
 from benchmarks.publish import FOLDER
 from benchmarks.tables import published_runs
 from evercal.continual.benchmark.comparison import by_strategy
-from evercal.continual.benchmark.published import read_published
-from evercal.continual.benchmark.statistics import seeds_interval
 from evercal.reports.charts import COLOURS, new_figure, tidy
 
 OUT = FOLDER.parent / "docs" / "networks.svg"

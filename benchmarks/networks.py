@@ -9,11 +9,11 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from evercal.continual.benchmark.rows import read_rows
 from tyro.conf import Positional
 
 from benchmarks.trainer import step_seconds
 from benchmarks.tuning import DERIVED
-from evercal.continual.benchmark.rows import read_rows
 from evercal.continual.learning.presets import PAPER_SIM_STEPS, preset
 from evercal.errors import InputError
 from evercal.storage import write_json

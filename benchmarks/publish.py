@@ -5,9 +5,9 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from evercal.continual.benchmark.published import Published, Row, from_bench, write_published
 from tyro.conf import Positional
 
-from evercal.continual.benchmark.published import Published, Row, from_bench, write_published
 from evercal.errors import InputError
 
 FOLDER = Path(__file__).resolve().parent.parent / "results"

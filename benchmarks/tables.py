@@ -15,9 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from evercal.continual.benchmark.ablation import ablation_rows
+from evercal.continual.benchmark.published import Published, read_published
 
 from benchmarks.publish import FOLDER
-from evercal.continual.benchmark.ablation import ablation_rows
 from evercal.continual.benchmark.comparison import (
     AREA,
     Run,
@@ -32,7 +33,6 @@ from evercal.continual.benchmark.comparison import (
     selector_rows,
     threshold_rows,
 )
-from evercal.continual.benchmark.published import Published, read_published
 from evercal.errors import InputError
 from evercal.evaluation.metrics import CHI2_6, COARSE, FINE, FINEST
 

@@ -60,7 +60,7 @@ def _trainer(options: HeadOptions, fit: FitOptions, device: torch.device) -> Hea
     pose = torch.eye(4)[:3].clone()
     pose[2, 3] = 3.0
     descriptors = torch.randn(VIEWS, descriptor.width, generator=generator)
-    buffer.restore(
+    buffer.extend(
         {
             "features": torch.randn(ROWS, encoder.width, generator=generator).half(),
             "pixels": 200 * torch.rand(ROWS, 2, generator=generator),

@@ -12,13 +12,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from evercal.continual.benchmark.rows import read_rows, strategy_from_row
 from tabulate import tabulate
 from tyro.conf import Positional
 
 from evercal.continual.benchmark import results
 from evercal.continual.benchmark.bench import BenchOptions, begin_bench, run_bench
 from evercal.continual.benchmark.comparison import by_strategy, runs_of
-from evercal.continual.benchmark.rows import read_rows, strategy_from_row
 from evercal.continual.benchmark.suites import load_suite, tuning_split
 from evercal.continual.learning.presets import BACKBONES, Backbone
 from evercal.continual.learning.presets import preset as preset_named

@@ -33,7 +33,7 @@ _GROUPS = {
     "Boards and pose pairs": ("detect", "solve"),
     "Results": ("export", "report"),
     "Recordings": ("inspect", "convert", "reconstruct", "simulate", "demo"),
-    "Networks": ("bench", "bench-report"),
+    "Networks": ("bench",),
 }
 """Verbs by purpose, in the order of the help."""
 
@@ -113,7 +113,6 @@ def _verbs() -> dict[str, Any]:
     from evercal.cli.align import Align
     from evercal.cli.audit import Audit
     from evercal.cli.bench import Bench
-    from evercal.cli.bench_report import BenchReport
     from evercal.cli.calibrate import Calibrate
     from evercal.cli.check import Check
     from evercal.cli.convert import Convert
@@ -165,7 +164,6 @@ def _verbs() -> dict[str, Any]:
         "reconstruct": Reconstruct,
         "simulate": Simulate,
         "bench": Bench,
-        "bench-report": BenchReport,
     }
 
 

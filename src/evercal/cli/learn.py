@@ -172,7 +172,6 @@ class Learn:
                 self.memory or "10%",
                 encoder,
                 self.device,
-                rough,
                 self.networks,
             )
             return learn_into_networks(request, recording, start, stream)

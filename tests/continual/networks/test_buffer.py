@@ -193,7 +193,7 @@ def test_resumed_encoding_equals_uninterrupted_encoding(
     assert 0 < first.views < PLAN.views_per_frame * len(frames)
     resumed = FeatureBuffer(4, ATLAS_FROM_BASE, device=device)
     for rows in saved:
-        resumed.restore(rows)
+        resumed.extend(rows)
     assert resumed.views == first.views
     assert resumed.take_new() == {}  # restored rows are already saved
     done = list(encode_frames(resumed, frames, PLAN, block_mean, describe))
@@ -240,12 +240,12 @@ def test_corrected_rows_follow_an_ideal_pinhole() -> None:
         "camera_from_atlas": torch.eye(4)[None, :3].repeat(3, 1, 1),
         "descriptors": torch.ones(3, 2),
     }
-    buffer.restore(rows)
+    buffer.extend(rows)
     each = torch.arange(60)
     # Pixels of the points in the corrected camera.
     captured, _ = reprojection_error(points, buffer.rows(each).target, correction.expand(60, 5))
     buffer = FeatureBuffer(0, SE3.identity())
-    buffer.restore({**rows, "pixels": captured})
+    buffer.extend({**rows, "pixels": captured})
     assert reprojection_error(points, buffer.rows(each).target)[0].abs().max() > 3
     buffer.correct_lens(correction)
     assert reprojection_error(points, buffer.rows(each).target)[0].abs().max() < 0.01

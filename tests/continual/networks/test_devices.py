@@ -45,7 +45,7 @@ def buffer_of(device: torch.device, scene: int = 1) -> FeatureBuffer:
     buffer = FeatureBuffer(scene, SE3.identity(), device=device)
     matrix = torch.eye(4, device="cpu")[None, :3] + 0.1 * random(2, 3, 4, seed=2)
     matrix[:, 2, 3] += 8  # most points are in front of the camera
-    buffer.restore(
+    buffer.extend(
         {
             "features": random(40, 7).half(),
             "pixels": 20 * random(40, 2, seed=1) + 50,

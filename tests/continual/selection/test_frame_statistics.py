@@ -106,7 +106,7 @@ def test_fixed_centres_all_have_gradients(
     head = Head(learned_head.features, 8, options)
     head.grow(torch.randn(6, 3) + torch.tensor([0.0, 0.0, 2.0]), seed=0)
     later = FeatureBuffer(1, buffer.atlas_from_base)
-    later.restore(dict(buffer.tensors))
+    later.extend(dict(buffer.tensors))
     gradients = FrameStatistics(rooms[0].train, head, lambda: later, 5).gradients()
     assert gradients.shape == (len(rooms[0].train), head.logit.numel() + head.offset.numel())
     assert np.abs(gradients).max() > 0

@@ -3,19 +3,16 @@
     OUT/settings.json             options that decide the results; other options are refused
     OUT/environments.json         commit, versions and processor of the runs
     OUT/strategies.json           description of each strategy: method, hyper-parameters, map
-    OUT/results.jsonl             see `benchmark.results`
-    OUT/views/                    see `benchmark.scene_views`; of each strategy's first run
+    OUT/results.csv, frames.csv   see `benchmark.results`
     OUT/features/                 encoded views, shared by all runs; may be deleted
     OUT/runs/STRATEGY-SEED/       store of a run in progress, removed when the run is complete
-    OUT/runs/STRATEGY-SEED.network.json    thresholds of its network, if it also builds a map
-    OUT/runs/first-SCENE-SEED/    the first scene, shared by strategies that learn it alike
+    OUT/runs/first-SCENE-SEED/    the first scene, shared by all networks
 
-An interrupted run resumes from the checkpoint inside its stage, as `evercal learn` does. Several
-processes may work in one folder: each takes runs that no other has.
+An interrupted run resumes after its last complete stage. Several processes may work in one folder:
+each takes runs that no other has.
 """
 
 import json
-from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -26,12 +23,10 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from evercal.continual.benchmark import results
-from evercal.continual.benchmark.results import SceneResult
+from evercal.continual.benchmark.results import Table
 from evercal.continual.benchmark.strategy_run import NETWORK_LOCALIZE, RunOptions, run_strategy
-from evercal.continual.learning.learn_scene import OnEvent
-from evercal.continual.learning.stage import StageOptions
+from evercal.continual.learning.stage import OnEvent, StageOptions
 from evercal.continual.networks.descriptor import DESCRIPTOR_FILE
-from evercal.continual.networks.distributed import of_first
 from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
 from evercal.features.encoder import ENCODER_FILE
@@ -75,8 +70,8 @@ class Step:
     """Name of the strategy."""
     seed: int
     """Seed of the run."""
-    results: tuple[SceneResult, ...]
-    """Results of all scenes learned so far; empty before the last stage of joint training."""
+    results: Table
+    """Rows of results.csv; empty before the last stage of joint training."""
     done: int
     """Complete stages, including those of earlier calls."""
     total: int
@@ -102,25 +97,18 @@ def run_bench(
     """
     total = len(options.seeds) * len(options.strategies) * len(scenes)
     missing = begin_bench(scenes, options, out)
-    # Processes that train together run the same, whatever their own folders hold.
-    to_run = of_first([(seed, strategy.name) for seed, strategy in missing])
-    named = {strategy.name: strategy for strategy in options.strategies}
-    missing = [(seed, named[name]) for seed, name in to_run]
     done = total - len(missing) * len(scenes)
     features = options.features or out / "features"
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
         how = RunOptions(options.stage(seed), options.short_side, features, out, options.device)
         with _claimed(out, strategy, seed) as free:
-            lines = results.read(out)  # another process may have added some
-            if not of_first(free and not _complete((seed, strategy), lines, len(scenes))):
+            stored = results.read(out)  # another process may have added some
+            if not free or _complete((seed, strategy), stored, len(scenes)):
                 continue
-            stored = {(r.strategy, r.seed, r.stage, r.scene) for r in lines}
-            for stage, these in run_strategy(strategy, ordered, how, on_event):
-                # An interrupted call may have stored some of the lines of a stage.
-                new = [r for r in these if (r.strategy, seed, stage, r.scene) not in stored]
-                results.append(out, new)
-                yield Step(strategy.name, seed, these, done + stage + 1, total)
+            for stage in run_strategy(strategy, ordered, how, on_event):
+                results.append(out, stage)
+                yield Step(strategy.name, seed, stage.results, done + stage.stage + 1, total)
             done += len(scenes)
 
 
@@ -160,12 +148,13 @@ def begin_bench(
     return [run for run in runs if not _complete(run, stored, len(scenes))]
 
 
-def _complete(run: tuple[int, Strategy], stored: Sequence[SceneResult], scenes: int) -> bool:
-    """Check that the last stage has a line per scene, under every name of the strategy."""
+def _complete(run: tuple[int, Strategy], stored: Table, scenes: int) -> bool:
+    """Check that the last stage has a row per scene, under every name of the strategy."""
     seed, strategy = run
-    lines = [r for r in stored if r.seed == seed and r.strategy.split(":")[0] == strategy.name]
-    last = Counter(r.strategy for r in lines if r.stage == scenes - 1)
-    return bool(lines) and all(last[r.strategy] == scenes for r in lines)
+    names = stored["strategy"].str.split(":").str[0]
+    rows = stored[(stored["seed"] == seed) & (names == strategy.name)]
+    last = rows[rows["stage"] == scenes - 1].groupby("strategy").size()
+    return len(rows) > 0 and all(last.get(name) == scenes for name in rows["strategy"].unique())
 
 
 def _record_strategies(out: Path, strategies: Sequence[Strategy]) -> None:

@@ -17,7 +17,6 @@ from evercal.recordings import (
     with_sfm_poses,
 )
 from evercal.recordings.samples import sample_rooms
-from evercal.simulation.cell import SUITES as ROOMS
 
 
 @dataclass(frozen=True)
@@ -44,17 +43,20 @@ def _packaged(data: Path | None, names: Sequence[str]) -> list[Recording]:
     return [rooms[name] for name in names]
 
 
-def _rendered(name: str) -> Suite:
-    rooms = tuple(room for room, _, _ in ROOMS[name].rooms)
-    return Suite(rooms, f"evercal simulate {name} --out DIR", _folders)
+_THREE = ("bedroom", "kitchen", "living")
+_TWELVE = tuple(f"{room}-{i}" for i in range(1, 5) for room in _THREE)
+
+
+def _rendered(name: str, scenes: tuple[str, ...] = _THREE) -> Suite:
+    return Suite(scenes, f"python -m rooms {name} --out DIR", _folders)
 
 
 SUITES: dict[str, Suite] = {
-    "sim-mini": Suite(("bedroom", "kitchen", "living"), "the package", _packaged),
+    "sim-mini": Suite(_THREE, "the package", _packaged),
     "sim": _rendered("sim"),
-    "sim-7": _rendered("sim-7"),
-    "sim-12": _rendered("sim-12"),
-    "sim-repeat": _rendered("sim-repeat"),
+    "sim-7": _rendered("sim-7", _TWELVE[:7]),
+    "sim-12": _rendered("sim-12", _TWELVE),
+    "sim-repeat": _rendered("sim-repeat", ("workshop", "canteen", "hall")),
     "sim-tune": _rendered("sim-tune"),
     "sim-unseen": _rendered("sim-unseen"),
     "real2": Suite(

@@ -1,6 +1,6 @@
 """The feature buffer: the frozen encoder runs once, then training draws rows many times."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
@@ -103,8 +103,13 @@ class FeatureBuffer:
             "camera_from_atlas": torch.from_numpy(poses.inverse().matrix()[:, :3]).float(),
             "descriptors": descriptors.float().cpu(),
         }
-        self._parts.append(part)
-        self.views, self._merged = last, None
+        self.extend(part)
+
+    def extend(self, part: Mapping[str, Tensor]) -> None:
+        """Append rows by name, as in `tensors`."""
+        self._parts.append(dict(part))
+        self.views += len(part["intrinsics"])
+        self._merged = None
 
     @property
     def tensors(self) -> dict[str, Tensor]:
