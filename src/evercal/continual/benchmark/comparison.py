@@ -115,8 +115,10 @@ def method_table(scores: Table) -> Table:
     means = grouped.mean().where(grouped.count().eq(grouped.size(), axis=0))
     runs, spread = grouped.size(), grouped[FINAL].std()
     table = formatted(means)
-    several = runs > 1
-    table.loc[several, FINAL] += [f" ± {value:.1f}" for value in spread[several]]
+    table[FINAL] = [
+        mean if np.isnan(deviation) else f"{mean} ± {deviation:.1f}"
+        for mean, deviation in zip(table[FINAL], spread, strict=True)
+    ]
     table.insert(0, "runs", runs)
     return table.loc[means[FINAL].sort_values(ascending=False, kind="stable").index]
 

@@ -54,9 +54,7 @@ def write_report(folder: Path, reference: str) -> str:
     methods, ablation = method_table(scores), ablation_table(scores, suite)
     tables = {
         "Strategies, means over runs": methods.reset_index(),
-        "Accuracy of each scene: just after learning it -> at the end": scene_table(
-            results
-        ).reset_index(),
+        "Accuracy of each scene: just after learning it -> at the end": scenes,
         "Differences on common seeds, in points": _differences(scores, reference),
         "Ablation after Table 4 of the paper": ablation,
     }

@@ -93,8 +93,7 @@ class FeatureBuffer:
         rows = features.flatten(2).transpose(1, 2)
         poses = SE3.stack([self.atlas_from_base @ view.base_from_camera for view in views])
         pixels = torch.from_numpy(np.stack([view.cell_pixels for view in views]))
-        last = self.views + len(views)
-        number = torch.arange(self.views, last, dtype=torch.int32, device="cpu")
+        number = torch.arange(self.views, self.views + len(views), dtype=torch.int32, device="cpu")
         part = {
             "features": rows[keep.to(rows.device)].half().cpu(),
             "pixels": pixels[keep],

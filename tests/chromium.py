@@ -1,4 +1,4 @@
-"""Chromium without a GPU, as the benchmark of the 3D view and the tests of the pages start it."""
+"""Chromium without a GPU, as the tests of the pages start it."""
 
 import shutil
 from collections.abc import Iterator
