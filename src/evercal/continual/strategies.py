@@ -28,11 +28,6 @@ class Strategy:
     """Source of the strategy; by default that of its method."""
 
     @property
-    def builds_map(self) -> bool:
-        """Whether learning a scene builds its map and trains nothing."""
-        return self.method is None
-
-    @property
     def citation(self) -> str:
         """Source of the strategy."""
         return self.source or (self.method.citation if self.method else "")
@@ -41,7 +36,7 @@ class Strategy:
         """Convert to plain data: method with hyper-parameters, map, joint training."""
         method = None if self.method is None else described(self.method)
         jointly = {"jointly": True} if self.jointly else {}
-        return {"method": method, "map": self.builds_map, **jointly}
+        return {"method": method, "map": self.method is None, **jointly}
 
 
 # Settings with the best mean over the suites of `benchmarks tune`; see docs/methods.md.

@@ -4,9 +4,10 @@ import itertools
 import json
 
 from evercal.continual.benchmark.ablation import ABLATIONS, ablation_rows, grid_rows
-from evercal.continual.benchmark.comparison import Run, runs_of
 from evercal.continual.benchmark.latex import paper_tables
 from evercal.continual.benchmark.rows import load_rows
+
+from evercal.continual.benchmark.comparison import Run, runs_of
 from evercal.continual.strategies import STRATEGIES
 
 from .test_comparison import lines

@@ -7,15 +7,15 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
-
-from evercal.continual.benchmark import bench_charts
 from evercal.continual.benchmark.bench_charts import (
     accuracy_against_memory,
     forgetting_curves,
     keyframe_positions,
     scene_bars,
 )
+from matplotlib.figure import Figure
+
+from evercal.continual.benchmark import bench_charts
 
 
 @pytest.fixture

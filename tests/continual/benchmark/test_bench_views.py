@@ -8,9 +8,9 @@ from typing import Any, cast
 import cv2
 import numpy as np
 import pytest
-
 from evercal.continual.benchmark.bench_views import view_pictures
 from evercal.continual.benchmark.scene_views import keep_views
+
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.learned import LearnedLocalizer

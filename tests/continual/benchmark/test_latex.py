@@ -3,9 +3,9 @@
 import math
 
 import pytest
+from evercal.continual.benchmark.latex import paper_table
 
 from evercal.continual.benchmark.comparison import runs_of
-from evercal.continual.benchmark.latex import paper_table
 from evercal.continual.benchmark.results import SceneResult
 
 

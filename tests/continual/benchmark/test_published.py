@@ -7,6 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evercal.continual.benchmark.published import (
+    COUNTED,
+    Published,
+    PublishedScene,
+    from_bench,
+    read_published,
+    write_published,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,14 +24,6 @@ from evercal.continual.benchmark.comparison import (
     method_rows,
     runs_of,
     threshold_rows,
-)
-from evercal.continual.benchmark.published import (
-    COUNTED,
-    Published,
-    PublishedScene,
-    from_bench,
-    read_published,
-    write_published,
 )
 from evercal.continual.benchmark.results import SETTINGS, SceneResult, append, read
 from evercal.errors import InputError

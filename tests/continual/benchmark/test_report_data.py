@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import pytest
+from evercal.continual.benchmark.report_data import TITLES, read_report, tables_text
 
 from evercal.continual.benchmark import results
-from evercal.continual.benchmark.report_data import TITLES, read_report, tables_text
 from evercal.continual.benchmark.results import SETTINGS, STRATEGIES
 from evercal.continual.strategies import strategy_named
 from evercal.errors import InputError

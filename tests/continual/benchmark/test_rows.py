@@ -5,9 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-
 from evercal.continual.benchmark.rows import load_rows
 from evercal.continual.methods.gradient_constraints import EpisodicConstraint
+
 from evercal.continual.methods.penalties import Distillation, OldOutput, Reprojection
 from evercal.continual.methods.replay import Replay
 from evercal.continual.methods.spdd import SpddOptions

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.stats import t
-
 from benchmarks.intervals import METHODS, Errors, coverage, students
 from evercal.continual.benchmark.statistics import (
     Interval,
@@ -13,6 +11,7 @@ from evercal.continual.benchmark.statistics import (
     mean_interval,
     seeds_interval,
 )
+from scipy.stats import t
 
 
 def numbered(*starts: int, frames: int = 40, step: int = 1) -> list[str]:

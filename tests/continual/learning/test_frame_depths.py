@@ -2,13 +2,13 @@
 
 import numpy as np
 
+from evercal.continual.learning.frame_depths import frame_depths
 from evercal.features.encoder import load_encoder
 from evercal.features.views import ideal_cell_pixels
-from evercal.continual.learning.frame_depths import frame_depths
 from evercal.recordings.frame import Frame
 from evercal.simulation.box_room import BoxRoom
 
-from ..box_world import box_room_scene
+from ...box_world import box_room_scene
 
 SIDE = 120
 

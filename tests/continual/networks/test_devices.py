@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.networks import buffer as module
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, Rows, encode_frames, join
 from evercal.continual.networks.descriptor import GlobalDescriptor
 from evercal.continual.networks.head import Head, HeadOptions, fresh_head
@@ -114,32 +113,6 @@ def test_step_is_equal_on_every_device(options: HeadOptions, cuda: torch.device)
             torch.testing.assert_close(value.cpu(), expected, atol=1e-3 * size, rtol=1e-3)
 
 
-def test_rows_are_equal_if_the_device_has_no_room(
-    device: torch.device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    expected = everything(drawn([buffer_of(device)]))
-    monkeypatch.setattr(module, "_fits", lambda *_: False)
-    buffer = buffer_of(device)
-    assert buffer.tensors["features"].device == CPU
-    for name, value in everything(drawn([buffer])).items():
-        assert value.device == device, name
-        assert torch.equal(value.nan_to_num(-7), expected[name].nan_to_num(-7)), name
-
-
-def test_quarter_of_the_gpu_memory_stays_free(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    gpu, rows = torch.device("cuda", 0), {"a": torch.zeros(100, dtype=torch.uint8)}
-    free = [125, 400]
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: tuple(free))
-    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda _: 90)
-    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda _: 15)
-    assert module._fits(rows, gpu)
-    free[0] -= 1
-    assert not module._fits(rows, gpu)
-    assert module._fits(rows, CPU)
-
-
 def networks(device: torch.device) -> tuple[LocalEncoder, GlobalDescriptor]:
     torch.manual_seed(0)
     encoder = LocalEncoder(stem=(4, 4), inner=8, blocks=1, width=8).eval()
@@ -148,12 +121,10 @@ def networks(device: torch.device) -> tuple[LocalEncoder, GlobalDescriptor]:
 
 def encoded(device: torch.device, rows_on: torch.device) -> FeatureBuffer:
     """Fill a buffer by networks on a device, reading it after every batch."""
-    buffer, taken = FeatureBuffer(0, SE3.identity(), device=rows_on), 0
-    for _ in encode_frames(buffer, FRAMES, PLAN, *networks(device)):
-        new = buffer.take_new()
-        assert all(value.device == CPU for value in new.values())
-        taken += len(new["features"])
-        assert len(buffer) == taken
+    buffer = FeatureBuffer(0, SE3.identity(), device=rows_on)
+    for done in encode_frames(buffer, FRAMES, PLAN, *networks(device)):
+        assert buffer.views == done
+        assert len(buffer) == len(buffer.tensors["features"])
     return buffer
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from evercal.continual.learning.learn import learn
 from evercal.continual.learning.stage import StageOptions
 from evercal.continual.networks.buffer import FeatureBuffer, encode_frames
 from evercal.continual.networks.head import Head, HeadOptions
@@ -15,7 +14,7 @@ from evercal.continual.selection.frame_statistics import PARTS, FrameStatistics
 from evercal.continual.strategies import STRATEGIES
 from evercal.geometry import SE3
 
-from ..stages import EmptyScenes, Rooms, outcome
+from ..stages import EmptyScenes, Rooms, learn, outcome
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,8 @@ ACC: mean accuracy over all stages and the scenes learned by then.
 TFR (total forgetting rate): mean drop from the best accuracy of a scene to its final one.
 forgetting: the same drop, with the best taken before the last stage; negative is a gain.
 BWT (backward transfer): mean change from the accuracy just after learning a scene to the end.
-s: seconds of learning, all stages. NAME:unaligned is the pose from matched keyframes, before landmarks are aligned."""
+s: seconds of learning, all stages.
+NAME:unaligned is the pose from matched keyframes, before landmarks are aligned."""
 """Definitions of the columns of `run_scores`."""
 
 

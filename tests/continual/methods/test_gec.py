@@ -3,20 +3,14 @@
 import copy
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.methods.gradient_constraints import (
-    AveragedGem,
-    ConstrainedStep,
-    EpisodicConstraint,
-    Gem,
-    nearest_change,
-)
+from evercal.continual.methods.gec import EpisodicConstraint, nearest_change
 from evercal.continual.methods.method import FinishedScene, MethodState
 from evercal.continual.networks.buffer import diffused
 from evercal.continual.networks.head import HeadOptions
@@ -94,7 +88,7 @@ class AppliedStep:
     step: int
 
 
-def steps_of(method: ConstrainedStep) -> list[AppliedStep]:
+def steps_of(method: EpisodicConstraint) -> list[AppliedStep]:
     """Train on a scene that contradicts two remembered ones, and record every step."""
     head, proposals = wave_head(3), []
     memories = [wave_buffer(i, shift_px=3.0 * i) for i in range(2)]
@@ -124,28 +118,13 @@ def excess(step: AppliedStep, g: Tensor, most: Tensor) -> float:
     return float(((g.double() @ step.taken.double() - most.double()) / size).max())
 
 
-def bounds(method: ConstrainedStep, step: AppliedStep) -> tuple[Tensor, Tensor]:
-    """Return the constraints of the original methods: gradients and allowed increases."""
-    if isinstance(method, AveragedGem):
-        return step.g.mean(0, keepdim=True), torch.zeros(1)
-    if isinstance(method, Gem):
-        return step.g, torch.zeros(len(step.g))
-    assert isinstance(method, EpisodicConstraint)
-    h = step.losses - 1.05 * torch.tensor([20.0, 11.0])
-    share = one_cycle(OPTIONS, step.step) / OPTIONS.peak_rate
-    return step.g, -0.5 * 0.03 * share * h
-
-
-METHODS = [AveragedGem(), Gem(margin=0.0), EpisodicConstraint(alpha=0.5, warm_steps=0)]
-
-
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
-def test_applied_step_satisfies_every_constraint(method: ConstrainedStep) -> None:
-    steps = steps_of(method)
+def test_applied_step_satisfies_every_constraint() -> None:
+    steps = steps_of(EpisodicConstraint(alpha=0.5, warm_steps=0))
     assert len(steps) == OPTIONS.iterations
     bound = 0
     for step in steps:
-        g, most = bounds(method, step)
+        g, h = step.g, step.losses - 1.05 * torch.tensor([20.0, 11.0])
+        most = -0.5 * 0.03 * one_cycle(OPTIONS, step.step) / OPTIONS.peak_rate * h
         assert excess(step, g, most) < 1e-5
         allowed = slow_nearest(*(v.double().numpy() for v in (step.wanted, g, most)))
         size = float(step.wanted.norm())
@@ -161,9 +140,10 @@ def test_applied_step_satisfies_every_constraint(method: ConstrainedStep) -> Non
 
 def test_constraint_gradients_are_of_the_remembered_losses() -> None:
     """Constraint gradients equal the gradients of the loss on the replayed rows."""
-    head, method = wave_head(3), Gem()
+    head, method = wave_head(3), EpisodicConstraint()
     memories = [wave_buffer(i, shift_px=3.0 * i) for i in range(2)]
-    hooks = method.begin(stage_start(head, memories))
+    states: list[MethodState] = [{"reference": torch.tensor(1.0)}] * 2
+    hooks = method.begin(stage_start(head, memories, states=states))
     before, records, parts = copy.deepcopy(head), [], []
     replayed = hooks.replayed
     hooks.replayed = lambda *words: parts.append(replayed(*words)) or parts[-1]  # type: ignore
@@ -188,7 +168,6 @@ def proposed_of(
     constraints: list[Mapping[str, Tensor]] = [{"w": torch.eye(count)[i]} for i in range(count)]
     return ProposedStep(
         {"w": torch.tensor(change)},
-        {"w": torch.zeros(count)},
         torch.tensor(losses),
         constraints,
         step,
@@ -196,12 +175,11 @@ def proposed_of(
     )
 
 
-def edited(method: ConstrainedStep, proposed: ProposedStep, references: list[float]) -> list[float]:
+def edited(
+    method: EpisodicConstraint, proposed: ProposedStep, references: list[float]
+) -> list[float]:
     g, change = torch.stack([one["w"] for one in proposed.constraints]), proposed.changes["w"]
-    if isinstance(method, EpisodicConstraint):
-        actual = method.edit_step(change, g, proposed, torch.tensor(references))
-    else:
-        actual = method.edit(change, g)
+    actual = method.edit_step(change, g, proposed, torch.tensor(references))
     return [round(float(value), 6) for value in actual]
 
 
@@ -217,35 +195,11 @@ def test_episodic_constraint_by_hand() -> None:
     assert edited(gec, proposed_of([5.0], [0.3], schedule=0.5), [2.0]) == [-0.0725]
     slack = EpisodicConstraint(alpha=1.0, eta=0.1, slack=0.5, longest=9.0)
     assert edited(slack, proposed_of([3.0], [0.3]), [2.0]) == [0.0]
-    # Warm-up steps are not edited. A scene without a reference has no constraint.
+    # Warm-up steps are not edited.
     assert edited(gec, proposed_of([5.0], [0.3], step=4), [2.0]) == [pytest.approx(0.3)]
     assert edited(gec, proposed_of([5.0], [0.3], step=5), [2.0]) == [-0.145]
-    assert edited(gec, proposed_of([5.0, 5.0], [0.3, 0.3]), [float("nan"), 2.0])[0] == 0.3
     # The added length is at most the length of the step.
     assert edited(EpisodicConstraint(), proposed_of([900.0], [0.3]), [2.0]) == [0.0]
-
-
-def test_averaged_and_single_constraints_by_hand() -> None:
-    # The mean loss has the gradient (1, 1) / 2; the component of the step along it
-    # is removed.
-    (mean,) = AveragedGem().constrained([torch.tensor(1.0), torch.tensor(3.0)])
-    assert float(mean) == 2.0
-    proposed = proposed_of([1.0, 1.0], [0.5, -0.1])
-    averaged = replace(proposed, constraints=[{"w": torch.tensor([0.5, 0.5])}])
-    assert edited(AveragedGem(), averaged, [1.0, 1.0]) == [0.3, -0.3]
-    assert edited(Gem(margin=0.0), proposed, [1.0, 1.0]) == [0.0, -0.1]
-    agreed = replace(averaged, changes={"w": torch.tensor([-0.5, 0.1])})
-    assert edited(AveragedGem(), agreed, [1.0, 1.0]) == [-0.5, 0.1]
-
-
-def test_gem_margin_lowers_every_remembered_loss() -> None:
-    # The step (0.3, -0.4) has length 0.5. A tenth of that is added against each gradient (an
-    # axis); if that is not enough, the step is also projected.
-    proposed = proposed_of([1.0, 1.0], [0.3, -0.4])
-    assert edited(Gem(margin=0.1), proposed, [1.0, 1.0]) == [0.0, pytest.approx(-0.45)]
-    harmless = proposed_of([1.0, 1.0], [-0.3, -0.4])
-    expected = [pytest.approx(-0.35), pytest.approx(-0.45)]
-    assert edited(Gem(margin=0.1), harmless, [1.0, 1.0]) == expected
 
 
 def test_first_steps_are_plain_replay() -> None:
@@ -267,32 +221,9 @@ def test_first_steps_are_plain_replay() -> None:
     assert costs[5:] == [None, None]
 
 
-def test_moving_reference_is_the_previous_step() -> None:
-    head, memories = wave_head(2), [wave_buffer(0)]
-    state: list[MethodState] = [{"reference": torch.tensor(1.0)}]
-    method = EpisodicConstraint(alpha=1.0, eta=1.0, longest=9.0, warm_steps=0, moving=True)
-    hooks = method.begin(stage_start(head, memories, states=state))
-    # The first step has no reference.
-    first = proposed_of([9.0], [0.7])
-    hooks.edit_step(first)
-    assert first.changes["w"].tolist() == pytest.approx([0.7])
-    # 9 -> 10: h = 10 - 1.05 x 9 = 0.55 must be recovered; 10 -> 10: a rise of 0.5 is allowed.
-    second, third = proposed_of([10.0], [0.7]), proposed_of([10.0], [0.7])
-    hooks.edit_step(second)
-    assert second.changes["w"].tolist() == pytest.approx([-0.55])
-    hooks.edit_step(third)
-    assert third.changes["w"].tolist() == pytest.approx([0.5])
-    # The reference survives a resume.
-    again = method.begin(stage_start(head, memories, states=state))
-    again.load(hooks.state())
-    fourth = proposed_of([11.0], [0.7])
-    again.edit_step(fourth)
-    assert fourth.changes["w"].tolist() == pytest.approx([-0.5])
-
-
 def test_reference_is_the_loss_of_replayed_rows() -> None:
     head, trained, replayed = wave_head(2), wave_buffer(1), wave_buffer(1, shift_px=20.0)
-    scene = FinishedScene(head, 1, lambda: trained, lambda: replayed, 2, [], None)
+    scene = FinishedScene(head, 1, lambda: trained, lambda: replayed)
     actual = float(EpisodicConstraint().after_scene(scene)["reference"])
 
     def mean_loss(buffer) -> tuple[float, float]:
@@ -313,7 +244,7 @@ def test_reference_includes_descriptor_noise() -> None:
     head, buffer = wave_head(2, options), wave_buffer(1)
     references = []
     for diffusion in (0.0, 5.0):
-        scene = FinishedScene(head, 1, lambda: buffer, lambda: buffer, 2, [], None, diffusion)
+        scene = FinishedScene(head, 1, lambda: buffer, lambda: buffer, diffusion)
         references.append(float(EpisodicConstraint().after_scene(scene)["reference"]))
     drawn = buffer.draw(8192, torch.Generator().manual_seed(1))
     shaken = diffused(drawn, 5.0, torch.Generator().manual_seed(1))
