@@ -109,7 +109,6 @@ class Bench:
                 "judged": "held-out training frames" if self.held_out else "test frames",
             },
             device=self.device,
-            features=self.out.absolute() / "features",
         )
         for step in self._steps(scenes, options):
             print(_progress(step), file=sys.stderr if self.json else sys.stdout, flush=True)
@@ -131,13 +130,12 @@ class Bench:
         return 0
 
     def _strategies(self) -> "tuple[Strategy, ...]":
-        from evercal.continual.benchmark.paper_tables import GROUPS, TABLE4
+        from evercal.continual.benchmark.paper_tables import TABLE4
         from evercal.continual.strategies import strategy_named
 
-        known = {strategy.name: (strategy,) for strategy in TABLE4} | GROUPS
-        named = [known.get(name) or (strategy_named(name),) for name in _words(self.strategies)]
-        # Equal strategies run once.
-        return tuple(dict.fromkeys(strategy for group in named for strategy in group))
+        words = _words(self.strategies)
+        names = [name for word in words for name in (TABLE4 if word == "table4" else (word,))]
+        return tuple(strategy_named(name) for name in dict.fromkeys(names))
 
     def _steps(self, scenes: "list[Recording]", options: "BenchOptions") -> "Iterator[Step]":
         from evercal.continual.benchmark.bench import run_bench

@@ -25,7 +25,7 @@ from filelock import FileLock, Timeout
 from evercal.continual.benchmark import results
 from evercal.continual.benchmark.results import Table
 from evercal.continual.benchmark.strategy_run import NETWORK_LOCALIZE, RunOptions, run_strategy
-from evercal.continual.learning.stage import OnEvent, StageOptions
+from evercal.continual.learning.stage import StageOptions
 from evercal.continual.networks.descriptor import DESCRIPTOR_FILE
 from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
@@ -34,7 +34,7 @@ from evercal.localization import acceptance
 from evercal.localization.query import LocalizeOptions
 from evercal.recordings import Recording
 from evercal.storage import sha256_file, write_json
-from evercal.storage.settings import lock_settings
+from evercal.storage.settings import lock_settings, read_settings
 
 Order = Literal["given", "reversed", "shuffled", "balanced"]
 
@@ -58,8 +58,6 @@ class BenchOptions:
     """Further settings that decide the results, for settings.json."""
     device: str = "auto"
     """Device of the networks, see `features.device.device_of`."""
-    features: Path | None = None
-    """Folder of encoded views. Defaults to `OUT/features`."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ class Step:
 
 
 def run_bench(
-    scenes: Sequence[Recording], options: BenchOptions, out: Path, on_event: OnEvent | None = None
+    scenes: Sequence[Recording], options: BenchOptions, out: Path
 ) -> Generator[Step, None, None]:
     """Run all runs that are not complete.
 
@@ -87,7 +85,6 @@ def run_bench(
         scenes: Two or more scenes in the order `given`.
         options: Strategies, seeds and options.
         out: Folder of results, created if missing.
-        on_event: Called with every event while a scene is learned.
 
     Raises:
         InputError: Fewer than two scenes, or the folder has results of other settings.
@@ -98,15 +95,14 @@ def run_bench(
     total = len(options.seeds) * len(options.strategies) * len(scenes)
     missing = begin_bench(scenes, options, out)
     done = total - len(missing) * len(scenes)
-    features = options.features or out / "features"
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
-        how = RunOptions(options.stage(seed), options.short_side, features, out, options.device)
+        how = RunOptions(options.stage(seed), options.short_side, out, options.device)
         with _claimed(out, strategy, seed) as free:
             stored = results.read(out)  # another process may have added some
             if not free or _complete((seed, strategy), stored, len(scenes)):
                 continue
-            for stage in run_strategy(strategy, ordered, how, on_event):
+            for stage in run_strategy(strategy, ordered, how):
                 results.append(out, stage)
                 yield Step(strategy.name, seed, stage.results, done + stage.stage + 1, total)
             done += len(scenes)
@@ -129,14 +125,7 @@ def _claimed(out: Path, strategy: Strategy, seed: int) -> Iterator[bool]:
 def begin_bench(
     scenes: Sequence[Recording], options: BenchOptions, out: Path
 ) -> list[tuple[int, Strategy]]:
-    """Check the options against the folder of results.
-
-    Returns:
-        (seed, strategy) of the runs that are not complete, in order.
-
-    Raises:
-        InputError: See `run_bench`.
-    """
+    """Check the options against the folder of results, and return the runs that are missing."""
     if len(scenes) < 2:
         raise InputError(f"{len(scenes)} scene: give two or more to measure forgetting")
     settings = _settings(scenes, options)  # bad options leave no folder behind
@@ -151,15 +140,15 @@ def begin_bench(
 def _complete(run: tuple[int, Strategy], stored: Table, scenes: int) -> bool:
     """Check that the last stage has a row per scene, under every name of the strategy."""
     seed, strategy = run
-    names = stored["strategy"].str.split(":").str[0]
-    rows = stored[(stored["seed"] == seed) & (names == strategy.name)]
+    rows = results.run_of(stored, strategy.name, seed)
     last = rows[rows["stage"] == scenes - 1].groupby("strategy").size()
     return len(rows) > 0 and all(last.get(name) == scenes for name in rows["strategy"].unique())
 
 
 def _record_strategies(out: Path, strategies: Sequence[Strategy]) -> None:
     """Add descriptions to strategies.json, and refuse a name with another description."""
-    recorded = results.read_strategies(out)
+    path = out / results.STRATEGIES
+    recorded = read_settings(path) if path.exists() else {}
     for strategy in strategies:
         now = json.loads(json.dumps(strategy.description()))
         before = recorded.setdefault(strategy.name, now)
@@ -168,7 +157,7 @@ def _record_strategies(out: Path, strategies: Sequence[Strategy]) -> None:
                 f"{out}: strategy {strategy.name!r} was {before}, now it is {now}; give it another"
                 " name or another --out"
             )
-    write_json(out / results.STRATEGIES, recorded)
+    write_json(path, recorded)
 
 
 def in_order(scenes: Sequence[Recording], order: Order, seed: int) -> list[Recording]:

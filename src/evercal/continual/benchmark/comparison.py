@@ -149,13 +149,12 @@ def contrast_table(scores: Table, pairs: Sequence[tuple[str, str]]) -> Table:
         pairs: Names of strategies.
     """
     scores = scores[[FINAL, AREA]]
+    by_name = dict(list(scores.groupby(level="strategy")))
     heads = [head for name in (FINAL, AREA) for head in (name, "bounds", "better in")]
     rows = {}
     for ours, theirs in pairs:
-        a, b = (
-            scores[scores.index.get_level_values("strategy") == name] for name in (ours, theirs)
-        )
-        gains = (a.droplevel("strategy") - b.droplevel("strategy")).dropna()
+        a, b = (by_name.get(name, scores[:0]).droplevel("strategy") for name in (ours, theirs))
+        gains = (a - b).dropna()
         cells: list[object] = [len(gains)]
         for name in (FINAL, AREA):
             low, high = seeds_interval(gains[name], len(pairs))
@@ -180,14 +179,14 @@ def seeds_interval(values: Sequence[float], comparisons: int = 1) -> tuple[float
 
     if len(values) < 2:
         return math.nan, math.nan
-    error = float(sem(values))
-    half = float(t.ppf(1 - 0.025 / comparisons, len(values) - 1)) * error
-    return float(np.mean(values)) - half, float(np.mean(values)) + half
+    mean = float(np.mean(values))
+    half = float(t.ppf(1 - 0.025 / comparisons, len(values) - 1) * sem(values))
+    return mean - half, mean + half
 
 
-def formatted(table: Table, digits: int = 1) -> Table:
-    """Format numbers; NaN becomes `-`."""
-    return table.map(lambda value: "-" if math.isnan(value) else f"{value:.{digits}f}")
+def formatted(table: Table) -> Table:
+    """Format numbers with one digit; NaN becomes `-`."""
+    return table.map(lambda value: "-" if math.isnan(value) else f"{value:.1f}")
 
 
 def summary(results: Table) -> dict[str, list[dict[str, object]]]:

@@ -17,16 +17,6 @@ from evercal.continual.benchmark.comparison import (
     run_scores,
 )
 from evercal.continual.benchmark.results import Table
-from evercal.continual.strategies import STRATEGIES
-
-_TABLE4 = (
-    *("icarl", "sars_old_output", "sars_spdd"),
-    *("er", "sars_reprojection", "reservoir_spdd"),
-)
-TABLE4 = tuple(STRATEGIES[name] for name in _TABLE4)
-"""Strategies of `ABLATIONS`."""
-GROUPS = {"table4": TABLE4}
-"""Lists of strategies by name."""
 
 ABLATIONS: Mapping[str, tuple[tuple[str, str], ...]] = {
     "as printed": (
@@ -50,6 +40,8 @@ ABLATIONS: Mapping[str, tuple[tuple[str, str], ...]] = {
 As printed, the first step changes the selector and keeps iCaRL's penalty, which uses true poses.
 The second step replaces it by a penalty without true poses.
 """
+TABLE4 = tuple(dict.fromkeys(name for steps in ABLATIONS.values() for _, name in steps))
+"""Strategies of `ABLATIONS`."""
 PUBLISHED_ABLATION = {"i7s": (65.2, 72.0, 74.9), "i12s": (66.0, 90.9, 91.8)}
 """Published final accuracies of the rows as printed, by suite."""
 PUBLISHED: Mapping[str, Mapping[str, tuple[float, float]]] = {
@@ -106,10 +98,9 @@ def paper_table(results: Table, suite: str = "") -> Table:
         totals["Mean, published"] = {name: pair[0] for name, pair in PUBLISHED[suite].items()}
         totals["TFR, published"] = {name: pair[1] for name, pair in PUBLISHED[suite].items()}
     for title, values in totals.items():
-        table.loc[title] = [
-            values.get(name, math.nan) if column == "Acc, %" else math.nan
-            for name, column in table.columns
-        ]
+        table.loc[title] = math.nan
+        for name in names:
+            table.loc[title, (name, "Acc, %")] = values.get(name, math.nan)
     table.index.name = None
     return table.rename_axis(columns=[None, None])
 

@@ -1,7 +1,7 @@
 """Runs of a benchmark on many machines, through Ray (extra `ray`).
 
-The folder of results lies on a disk that all machines share. A failed run is retried from its last
-checkpoint there, on any machine.
+The folder of results lies on a disk that all machines share. A failed run is retried after its last
+stage, on any machine.
 
     OUT/runs/shared    lets a worker check that it sees the folder
 """
@@ -9,7 +9,7 @@ checkpoint there, on any machine.
 import pickle
 import sys
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -47,48 +47,34 @@ class Job:
         return f"{self.strategy}-{self.options.seeds[0]}"
 
 
-@dataclass(frozen=True)
-class Failure:
-    """Why a task failed."""
-
-    cause: str
-    """One line."""
-    permanent: bool = False
-    """Whether a retry would fail in the same way."""
-
-
 def run_on_ray(
     scenes: Sequence[Recording],
     options: BenchOptions,
     out: Path,
     address: str,
     plugin: Path | None = None,
-    on_failure: Callable[[str], None] | None = None,
 ) -> Iterator[Step]:
     """Run all runs that are not complete, one task per strategy and seed; see `run_bench`.
 
     Results, recordings and plugin must lie under the same paths on all machines.
 
     Args:
-        scenes: Two or more scenes.
+        scenes: See `run_bench`.
         options: Options of the benchmark; `device` is that of the workers: auto, cpu or cuda.
         out: Folder of results.
         address: Address of a running Ray cluster, or `local` to start one on this machine.
         plugin: Python file of further strategies, loaded by the workers.
-        on_failure: Called with a line about every failure. Defaults to printing on stderr.
 
     Raises:
-        InputError: The extra is missing, there is no cluster at the address, as `run_bench`, or,
-            after all other runs, a run failed permanently.
+        InputError: The extra is missing, there is no cluster at the address, or, after all other
+            runs, a run failed permanently.
 
     Yields:
         A `Step` for every stage, run by run as they finish.
     """
-    ray = _ray()
-    missing = begin_bench(scenes, options, out)
-    report = on_failure or (lambda line: print(line, file=sys.stderr, flush=True))  # noqa: T201
-    _join(ray, address)
+    ray = _joined(address)
     try:
+        missing = begin_bench(scenes, options, out)
         token = uuid.uuid4().hex
         write_bytes(out / "runs" / "shared", token.encode())
         jobs = [
@@ -105,13 +91,12 @@ def run_on_ray(
         total = len(options.seeds) * len(options.strategies) * len(scenes)
         done = total - len(missing) * len(scenes)
         failed: list[str] = []
-        for job, failure in _finished(ray, list(scenes), jobs, _gpus(ray, options.device), report):
-            if failure is not None:
-                failed.append(f"{job.name} ({failure.cause})")
+        for job, error in _finished(ray, list(scenes), jobs, _gpus(ray, options.device)):
+            if error:
+                failed.append(f"{job.name} ({error})")
                 continue
-            rows = results.read(out)
-            names, (seed,) = rows["strategy"].str.split(":").str[0], job.options.seeds
-            rows = rows[(names == job.strategy) & (rows["seed"] == seed)]
+            (seed,) = job.options.seeds
+            rows = results.run_of(results.read(out), job.strategy, seed)
             for stage in range(len(scenes)):
                 done += 1
                 yield Step(job.strategy, seed, rows[rows["stage"] == stage], done, total)
@@ -124,14 +109,6 @@ def run_on_ray(
         )
 
 
-def _join(ray, address: str) -> None:
-    cluster = None if address == "local" else address
-    try:
-        ray.init(address=cluster, ignore_reinit_error=True, log_to_driver=False)
-    except (ConnectionError, ValueError) as error:
-        raise InputError(f"--ray {address}: no cluster at this address ({error})") from error
-
-
 def _gpus(ray, device: str) -> int:
     """Return the GPUs a task requests. Ray hides all GPUs from a task that requests none."""
     available = ray.cluster_resources().get("GPU", 0) >= 1
@@ -141,10 +118,10 @@ def _gpus(ray, device: str) -> int:
 
 
 def _finished(
-    ray, scenes: list[Recording], jobs: Sequence[Job], gpus: int, report: Callable[[str], None]
-) -> Iterator[tuple[Job, Failure | None]]:
-    """Yield jobs as they succeed or fail permanently; other failures are retried."""
-    # Ray's own retries would not resume from a checkpoint.
+    ray, scenes: list[Recording], jobs: Sequence[Job], gpus: int
+) -> Iterator[tuple[Job, str]]:
+    """Yield jobs with their final error, empty after success; other failures are retried."""
+    # Ray's own retries would not be reported.
     task = ray.remote(max_retries=0, num_gpus=gpus)(_one_run)
     shared_scenes = ray.put(scenes)
     tasks = {task.remote(shared_scenes, job): (job, 1) for job in jobs}
@@ -152,21 +129,26 @@ def _finished(
         (ready,), _ = ray.wait(list(tasks), num_returns=1)
         job, tries = tasks.pop(ready)
         try:
-            failure = ray.get(ready)
-        except Exception as error:  # the worker died, or was killed for its memory
-            failure = Failure(_line(error))
-        if failure is not None:
-            final = failure.permanent or tries == TRIES
-            action = "given up" if final else "resuming from its last checkpoint"
-            report(f"run {job.name}, attempt {tries} of {TRIES}: {failure.cause}; {action}")
+            error, permanent = ray.get(ready)
+        except Exception as crash:  # the worker died, or was killed for its memory
+            error, permanent = _line(crash), False
+        if error:
+            final = permanent or tries == TRIES
+            action = "given up" if final else "resuming after its last stage"
+            text = f"run {job.name}, attempt {tries} of {TRIES}: {error}; {action}"
+            print(text, file=sys.stderr, flush=True)  # noqa: T201
             if not final:
                 tasks[task.remote(shared_scenes, job)] = job, tries + 1
                 continue
-        yield job, failure
+        yield job, error
 
 
-def _one_run(scenes: list[Recording], job: Job) -> Failure | None:
-    """Run one strategy with one seed; this is the Ray task."""
+def _one_run(scenes: list[Recording], job: Job) -> tuple[str, bool]:
+    """Run one strategy with one seed; this is the Ray task.
+
+    Returns:
+        The error in one line, empty after success, and whether a retry would fail alike.
+    """
     try:
         token = job.out / "runs" / "shared"
         if not token.is_file() or token.read_text() != job.token:
@@ -177,8 +159,8 @@ def _one_run(scenes: list[Recording], job: Job) -> Failure | None:
         for _ in run_bench(scenes, options, job.out):
             pass
     except Exception as error:
-        return Failure(_line(error), permanent=isinstance(error, InputError))
-    return None
+        return _line(error), isinstance(error, InputError)
+    return "", False
 
 
 def _line(error: Exception) -> str:
@@ -187,9 +169,15 @@ def _line(error: Exception) -> str:
     return f"{type(error).__name__}: {lines[-1].strip()}"
 
 
-def _ray():
+def _joined(address: str):
+    """Join the cluster at an address and return the module of Ray."""
     try:
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise InputError("--ray needs Ray: pip install 'evercal[ray]'") from None
+        raise InputError("--ray needs Ray: pip install 'ray>=2.50'") from None
+    cluster = None if address == "local" else address
+    try:
+        ray.init(address=cluster, ignore_reinit_error=True, log_to_driver=False)
+    except (ConnectionError, ValueError) as error:
+        raise InputError(f"--ray {address}: no cluster at this address ({error})") from error
     return ray

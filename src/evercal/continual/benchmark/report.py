@@ -40,9 +40,6 @@ def write_report(folder: Path, reference: str) -> str:
 
     Returns:
         The tables as Markdown.
-
-    Raises:
-        InputError: The folder has no results.
     """
     results = stored.read(folder)
     if results.empty:
@@ -52,10 +49,12 @@ def write_report(folder: Path, reference: str) -> str:
     scores = run_scores(results)
     scenes = scene_table(results).reset_index()
     methods, ablation = method_table(scores), ablation_table(scores, suite)
+    others = methods.index.drop(reference, errors="ignore")
+    contrasts = contrast_table(scores, [(reference, name) for name in others])
     tables = {
         "Strategies, means over runs": methods.reset_index(),
         "Accuracy of each scene: just after learning it -> at the end": scenes,
-        "Differences on common seeds, in points": _differences(scores, reference),
+        "Differences on common seeds, in points": contrasts[contrasts["runs"] > 0].reset_index(),
         "Ablation after Table 4 of the paper": ablation,
     }
     text = "\n\n".join(
@@ -70,12 +69,6 @@ def write_report(folder: Path, reference: str) -> str:
     write_bytes(folder / LATEX, paper.encode())
     _figure(results, methods.index[:_LINES], folder / FIGURE)
     return text
-
-
-def _differences(scores: Table, reference: str) -> Table:
-    others = scores.index.unique("strategy").drop(reference, errors="ignore")
-    table = contrast_table(scores, [(reference, name) for name in others])
-    return table[table["runs"] > 0].reset_index()
 
 
 def _figure(results: Table, strategies: Table, path: Path) -> None:

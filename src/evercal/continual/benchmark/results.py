@@ -7,6 +7,8 @@ Accuracy matrices, forgetting and intervals are derived from these. Either file 
 (`frames.csv.gz`).
 """
 
+import hashlib
+import json
 import math
 import os
 from collections.abc import Sequence
@@ -18,7 +20,7 @@ import numpy as np
 import pandas as pd
 from filelock import FileLock
 
-from evercal.continual.benchmark.environment import environment, environment_key
+from evercal.continual.benchmark.environment import environment
 from evercal.errors import InputError
 from evercal.evaluation.metrics import (
     CHI2_6,
@@ -132,21 +134,19 @@ def _append(path: Path, rows: Table) -> None:
         os.fsync(file.fileno())
 
 
-def read(folder: Path) -> Table:
-    """Read the results of a folder; without any, an empty table.
+def run_of(results: Table, strategy: str, seed: int) -> Table:
+    """Return the rows of a run, under every name of its strategy (`NAME:PART`)."""
+    names = results["strategy"].str.split(":").str[0]
+    return results[(names == strategy) & (results["seed"] == seed)]
 
-    Raises:
-        InputError: A row is incomplete or a column is missing.
-    """
+
+def read(folder: Path) -> Table:
+    """Read the results of a folder; without any, an empty table."""
     return _read(folder, RESULTS, _REQUIRED).drop_duplicates(KEY, keep="last")
 
 
 def read_frames(folder: Path) -> Table:
-    """Read the test frames of a folder; without any, an empty table.
-
-    Raises:
-        InputError: See `read`.
-    """
+    """Read the test frames of a folder after the last stage; without any, an empty table."""
     frames = _read(folder, FRAMES, {*_FRAME_KEY, "error_mm", "error_deg", "outcome"})
     return frames.drop_duplicates(_FRAME_KEY, keep="last")
 
@@ -181,7 +181,8 @@ def _remove_incomplete_line(folder: Path, path: Path) -> None:
 def record_environment(folder: Path) -> str:
     """Add the record of this process to environments.json and return its key."""
     record = environment()
-    key = environment_key(record)
+    text = json.dumps(record, sort_keys=True)
+    key = hashlib.blake2b(text.encode(), digest_size=4).hexdigest()
     with locked(folder):
         before = read_environments(folder)
         if key not in before:
@@ -189,13 +190,7 @@ def record_environment(folder: Path) -> str:
     return key
 
 
-def read_environments(folder: Path) -> dict[str, dict[str, str]]:
+def read_environments(folder: Path) -> dict[str, Any]:
     """Read the records of a folder by key; empty without the file."""
     path = folder / ENVIRONMENTS
-    return read_settings(path) if path.exists() else {}  # pyright: ignore[reportReturnType]
-
-
-def read_strategies(folder: Path) -> dict[str, dict[str, object]]:
-    """Read `Strategy.description` of each strategy of a folder; empty without the file."""
-    path = folder / STRATEGIES
-    return read_settings(path) if path.exists() else {}  # pyright: ignore[reportReturnType]
+    return read_settings(path) if path.exists() else {}

@@ -1,6 +1,5 @@
 """One run: a strategy with a seed over a sequence of scenes, resumed where it was interrupted."""
 
-import math
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -8,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 from filelock import FileLock
 from torch import nn
@@ -23,7 +21,7 @@ from evercal.continual.benchmark.results import (
 from evercal.continual.learning.finish_scene import correct_lens, finished_stage
 from evercal.continual.learning.learn import learn_jointly
 from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
-from evercal.continual.learning.stage import OnEvent, StageOptions, unobserved
+from evercal.continual.learning.stage import StageOptions, unobserved
 from evercal.continual.learning.stage_rows import encode_rows, scene_buffer, view_plan
 from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer
 from evercal.continual.networks.atlas import combined_centres
@@ -40,7 +38,6 @@ from evercal.localization.learned import LearnedLocalizer
 from evercal.localization.localizer import Localizer
 from evercal.localization.query import LocalizeOptions
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.selection import PoseSpace
 from evercal.mapping.store import MapStore
 from evercal.recordings import Frame, Recording, stated_poses
 from evercal.recordings.held_out import split_held_out
@@ -59,48 +56,34 @@ class RunOptions:
     """Options for learning a scene, with the seed of the run."""
     short_side: int
     """Working size of images, pixels."""
-    features: Path
-    """Folder of encoded views, shared by all runs."""
     out: Path
-    """Folder of results; its subfolder `runs` has the stores of runs in progress."""
+    """Folder of results; `runs` has the stores of runs in progress, `features` encoded views."""
     device: str = "cpu"
     """Device of the networks, see `features.device.device_of`."""
 
 
 def run_strategy(
-    strategy: Strategy, scenes: Sequence[Recording], options: RunOptions, on_event: OnEvent | None
+    strategy: Strategy, scenes: Sequence[Recording], options: RunOptions
 ) -> Iterator[StageResults]:
     """Learn the scenes in turn and evaluate all scenes learned so far after each.
-
-    Args:
-        strategy: Strategy to run.
-        scenes: Scenes in order of learning.
-        options: Options of the run.
-        on_event: Called with every event while a scene is learned.
 
     Yields:
         Results of the stages that were not complete before.
     """
     if strategy.method is None:
-        return _MapRun(strategy, scenes, options, on_event).stages()
-    run = _NetworkRun(strategy, scenes, options, on_event)
+        return _MapRun(strategy, scenes, options).stages()
+    run = _NetworkRun(strategy, scenes, options)
     return run.jointly() if strategy.jointly else run.stages()
 
 
 class _Run:
     """A strategy over a sequence of scenes; the store of the run is removed at its end."""
 
-    def __init__(
-        self,
-        strategy: Strategy,
-        scenes: Sequence[Recording],
-        options: RunOptions,
-        on_event: OnEvent | None,
-    ):
+    def __init__(self, strategy: Strategy, scenes: Sequence[Recording], options: RunOptions):
         self.strategy, self.scenes = strategy, scenes
-        self.on_event = on_event or unobserved
         self.device = device_of(options.device)
         self.options, self.stage = options, _with_centres(options.stage, scenes)
+        self.features = options.out.absolute() / "features"
         self.store = options.out / "runs" / f"{strategy.name}-{options.stage.seed}"
 
     def _remove(self) -> None:
@@ -123,9 +106,7 @@ class _Run:
             evaluated = evaluate(localizer, {s.name: s for s in self.scenes[: number + 1]})
             for scene in self.scenes[: number + 1]:
                 of_scene = [frame for frame in evaluated if frame.scene == scene.name]
-                coverage = _coverage(newest if scene is self.scenes[number] else None, scene)
-                row = {**run, **scene_row(of_scene), **costs, "environment": environment}
-                results.append({**row, **coverage})
+                results.append({**run, **scene_row(of_scene), **costs, "environment": environment})
                 frames += [{**run, **frame_row(frame)} for frame in of_scene]
         table = pd.DataFrame(frames).drop(columns="stage")
         last = number == len(self.scenes) - 1
@@ -143,25 +124,17 @@ class _MapRun(_Run):
             opened = self._opened()
             contents = opened.contents.to(self.device)
             assert isinstance(contents.encoder, nn.Module)
-            cache_features(contents.encoder, self.options.features)
+            cache_features(contents.encoder, self.features)
             if number >= len(opened.stages):
                 memory = self.stage.memory
                 size = memory.bytes or f"{100 * memory.share:g}%"
                 scene, report = learn_scene(self.scenes[number], contents, size)
                 opened.commit(scene, asdict(report))
-            aligned, unaligned = Localizer(contents), LocalizeOptions(align=False)
-            name = self.strategy.name
-            costs = {
-                "seconds": float(opened.reports()[-1]["seconds"]),
-                "memory_bytes": contents.memory_bytes,
-                "head_bytes": 0,
-            }
-            yield self._evaluated(
-                {name: aligned, name + UNALIGNED: Localizer(contents, unaligned)},
-                number,
-                contents.scenes[-1].keyframes,
-                costs,
-            )
+            name, unaligned = self.strategy.name, LocalizeOptions(align=False)
+            named = {name: Localizer(contents), name + UNALIGNED: Localizer(contents, unaligned)}
+            seconds = float(opened.reports()[-1]["seconds"])
+            costs = {"seconds": seconds, "memory_bytes": contents.memory_bytes, "head_bytes": 0}
+            yield self._evaluated(named, number, contents.scenes[-1].keyframes, costs)
         self._remove()
 
     def _opened(self) -> MapStore:
@@ -191,7 +164,7 @@ class _NetworkRun(_Run):
         splits = [split_held_out(scene.train) for scene in self.scenes]
         train = [replace(s, train=t.train) for s, t in zip(self.scenes, splits, strict=True)]
         began = time.perf_counter()
-        learned = learn_jointly(empty, train, self.stage, self.on_event).scenes
+        learned = learn_jointly(empty, train, self.stage, unobserved).scenes
         for number, split in enumerate(splits):
             learned.scenes[number] = fit_threshold(learned, split.held_out, number)
         seconds = time.perf_counter() - began
@@ -206,9 +179,9 @@ class _NetworkRun(_Run):
             stage=self.stage,
             short_side=self.options.short_side,
             device=str(self.device),
-            cache=self.options.features,
+            cache=self.features,
         )
-        learn_networks(store, scene, options, self.on_event)
+        learn_networks(store, scene, options, unobserved)
 
     def _new_store(self) -> NetworkStore:
         return NetworkStore.create(self.store, self.strategy.name, self.options.short_side)
@@ -216,8 +189,8 @@ class _NetworkRun(_Run):
     def _prepared(self, scenes: LearnedScenes) -> LearnedScenes:
         """Move to the device of the run and share encoded views with other runs."""
         scenes.to(self.device)
-        cache_features(scenes.encoder, self.options.features)  # pyright: ignore[reportArgumentType]
-        scenes.cache = self.options.features
+        cache_features(scenes.encoder, self.features)  # pyright: ignore[reportArgumentType]
+        scenes.cache = self.features
         return scenes
 
     def _begin(self) -> None:
@@ -276,23 +249,3 @@ def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOpti
     positions = [stated_poses(split_held_out(scene.train).train).translation_m for scene in scenes]
     centres = combined_centres(positions, stage.head.centres_per_scene, stage.seed)
     return replace(stage, grid_scenes=len(scenes), fixed_centres_m=centres)
-
-
-def _coverage(keyframes: Keyframes | None, scene: Recording) -> dict[str, float]:
-    """Measure how the remembered frames of a scene cover its training frames, in SARS's metric.
-
-    Returns:
-        The largest distance from a training frame to a remembered one, and the smallest distance
-        between two remembered frames; NaN without remembered frames.
-    """
-    if keyframes is None or not keyframes.images:
-        return {"covering_radius": math.nan, "min_spacing": math.nan}
-    poses = stated_poses(split_held_out(scene.train).train)
-    positions = keyframes.base_from_camera.translation_m
-    distances = np.linalg.norm(poses.translation_m[:, None] - positions[None], axis=-1)
-    selected = distances.argmin(0)
-    space = PoseSpace.of(poses.translation_m, poses.rotation_wxyz)
-    gaps = np.stack([space.distances(int(i)) for i in selected])
-    pairs = gaps[:, selected][np.triu_indices(len(selected), 1)]
-    smallest = float(pairs.min()) if len(pairs) else math.nan
-    return {"covering_radius": float(gaps.min(0).max()), "min_spacing": smallest}
