@@ -1,12 +1,10 @@
 """Rows of numbers from results of frames and poses, shared by the measurements."""
 
-import json
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import TypeVar
+from collections.abc import Sequence
 
 import numpy as np
 
+from benchmarks.rows import Row
 from evercal.evaluation.metrics import (
     COARSE,
     FINE,
@@ -17,14 +15,9 @@ from evercal.evaluation.metrics import (
     share_inside,
 )
 from evercal.geometry import SE3, UncertainPose, pose_distance_mm_deg
-from evercal.storage import write_bytes
 
 BOUNDS = {"5 cm/5 deg": COARSE, "2 cm/2 deg": MIDDLE, "1 cm/1 deg": FINE, "0.5 cm/0.5 deg": FINEST}
 """Thresholds in metres and radians, by the name of their column."""
-
-Row = dict[str, str | float]
-"""A flat row of a measurement."""
-Rows = TypeVar("Rows", Row, list[Row])
 
 WRONG_MM, WRONG_SIGMAS = 10.0, 5.0
 """A wrong answer is off by more than both: millimetres, and its own standard deviations."""
@@ -50,14 +43,6 @@ def accuracy_row(name: str, results: Sequence[FrameResult]) -> Row:
     }
 
 
-def mean_row(name: str, rows: Sequence[Row]) -> Row:
-    """Average the numbers of rows, ignoring NaN."""
-    import pandas
-
-    means = pandas.DataFrame(list(rows)).mean(numeric_only=True)
-    return {"scene": name, **{str(key): float(value) for key, value in means.items()}}
-
-
 def pose_error(estimate: UncertainPose, truth: SE3) -> Row:
     """Return the error of a pose, its standard deviation per axis, and its Mahalanobis distance."""
     mm, deg = pose_distance_mm_deg(estimate.pose, truth)
@@ -73,10 +58,3 @@ def pose_error(estimate: UncertainPose, truth: SE3) -> Row:
 def wrong(mm: np.ndarray, squared_mahalanobis: np.ndarray) -> np.ndarray:
     """Return which answers (n,) are wrong; NaN is not, infinity is."""
     return (mm > WRONG_MM) & (squared_mahalanobis > WRONG_SIGMAS**2)
-
-
-def once(path: Path, measure: Callable[[], Rows]) -> Rows:
-    """Measure one or more rows and write them to a file, or read the file if it exists."""
-    if not path.exists():
-        write_bytes(path, json.dumps(measure(), indent=1).encode())
-    return json.loads(path.read_text())

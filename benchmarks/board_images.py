@@ -129,9 +129,3 @@ def _texture(board: Board) -> tuple[np.ndarray, float, np.ndarray]:
         i, j = np.nonzero(down)[0], np.nonzero(along)[0]
         covered[i[0] : i[-1] + 1, j[0] : j[-1] + 1] += np.outer(down[i], along[j])
     return (225 - 200 * covered).astype(np.float32), per_m, start
-
-
-def _covered(start: float, end: float, count: int) -> np.ndarray:
-    """Return the share (count,) of each pixel of a line that an interval covers."""
-    pixel = np.arange(count)
-    return np.clip(np.minimum(end, pixel + 1) - np.maximum(start, pixel), 0, 1)

@@ -1,6 +1,5 @@
 """Detection of rendered boards at known poses, beside the finders of OpenCV on the same images."""
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -8,10 +7,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from tabulate import tabulate
 from tqdm import tqdm
 
 from benchmarks.board_images import CAMERA, CHARUCO, CHESSBOARD, LARGE, TAG, Photo, render
+from benchmarks.rows import save
 from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.boards.detection import Board, dictionary_of, find_board
 from evercal.geometry import Camera
@@ -116,7 +115,7 @@ def _ordered(pixels: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return min(pixels, pixels[::-1], key=lambda p: float(np.abs(p - truth).sum()))
 
 
-def run(images: int = 30, out: Path = Path("runs/boards.json")) -> None:
+def run(images: int = 30, out: Path = Path("runs/boards.csv")) -> None:
     """Detection of rendered boards at tilts of 0 to 60 degrees, beside OpenCV's finders.
 
     Args:
@@ -126,8 +125,6 @@ def run(images: int = 30, out: Path = Path("runs/boards.json")) -> None:
     cv2.setNumThreads(1)
     cases = [(b, t) for b in (LARGE, CHESSBOARD, CHARUCO, TAG) for t in (0.0, 30.0, 45.0, 60.0)]
     rows: list[dict[str, object]] = []
-    out.parent.mkdir(parents=True, exist_ok=True)
     for board, tilt in tqdm(cases, unit="case"):
         rows += measure(board, tilt, images)
-        out.write_text(json.dumps({"settings": {"images": images}, "rows": rows}, indent=1))
-    print(tabulate(rows, headers="keys", floatfmt=".3g", tablefmt="github"))
+    save(out, rows, {"images": images})

@@ -1,6 +1,5 @@
 """Accuracy of cameras calibrated from images: on the arm, fixed, and after bumps."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -10,11 +9,11 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
-from tabulate import tabulate
 from tqdm import tqdm
 from tyro.conf import Positional
 
-from benchmarks.accuracy import Row, once, pose_error
+from benchmarks.accuracy import pose_error
+from benchmarks.rows import Row, once, save
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
@@ -56,8 +55,7 @@ def run(
     else:
         localizer = Localizer.open(store or learned(folders, out / "rooms.evercal"))
         rows = (fixed if what == "fixed" else bumps)(folders, localizer, draws)
-    (out / f"{what}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    print(tabulate(rows, headers="keys", floatfmt=".3f"))
+    save(out / f"{what}.csv", rows)
     print(summary(rows))
 
 

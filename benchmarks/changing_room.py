@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from tabulate import tabulate
 from tqdm import tqdm
 
+from benchmarks.rows import save
 from evercal.evaluation.metrics import share_inside
 from evercal.features.encoder import Encoder, load_encoder
 from evercal.geometry import pose_distance
@@ -25,7 +25,6 @@ from evercal.recordings.held_out import split_held_out
 from evercal.recordings.images import write_jpeg
 from evercal.recordings.samples import sample_rooms
 from evercal.simulation.box_room import default_camera
-from evercal.storage import write_json
 from rooms.changed import moved_item, rearranged, relit
 from rooms.panda import panda_meshes
 from rooms.paths import sweep_shots
@@ -118,7 +117,7 @@ VARIANTS: tuple[str, ...] = (
 def run(
     data: tuple[Path, ...] = (Path("runs/changing-room"),),
     keyframes: int = 16,
-    out: Path = Path("runs/refresh.json"),
+    out: Path = Path("runs/refresh.csv"),
 ) -> None:
     """A map in a room that changes: as it was learned, refreshed after every change, learned anew.
 
@@ -132,9 +131,7 @@ def run(
     rows: list[dict[str, object]] = []
     for root in data:
         rows += _rounds(root, keyframes)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(out, {"settings": {"keyframes": keyframes}, "rows": rows})
-    print(tabulate(rows, headers="keys", floatfmt=".3g", tablefmt="github", missingval=""))
+    save(out, rows, {"keyframes": keyframes})
 
 
 def _rounds(root: Path, keyframes: int) -> list[dict[str, object]]:

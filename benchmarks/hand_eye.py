@@ -2,14 +2,15 @@
 
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tabulate import tabulate
 from tqdm import tqdm
 from tyro.conf import arg
 
+from benchmarks.rows import save
 from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve
@@ -146,12 +147,17 @@ def trials(setting: Setting, count: int, first_seed: int = 0) -> dict[str, float
     }
 
 
-def run(count: Annotated[int, arg(name="trials")] = 1000, thorough: bool = False) -> None:
+def run(
+    count: Annotated[int, arg(name="trials")] = 1000,
+    thorough: bool = False,
+    out: Path = Path("runs/handeye.csv"),
+) -> None:
     """Solve simulated pose pairs: errors, 95 % ellipsoids, outliers, scale, time.
 
     Args:
         count: Trials of each setting.
         thorough: Add noise on robot poses and on both, about near and far points.
+        out: File of the rows.
     """
     settings = [
         Setting(mount=mount, path=path, outliers=outliers)
@@ -175,5 +181,4 @@ def run(count: Annotated[int, arg(name="trials")] = 1000, thorough: bool = False
             **trials(setting, count),
         }
         rows.append(row)
-    print(f"{count} trials each, {settings[0].poses} poses, 2 mm and 0.2 deg per axis")
-    print(tabulate(rows, headers="keys", floatfmt=".3g", tablefmt="github", missingval=""))
+    save(out, rows, {"trials": count, "poses": settings[0].poses})

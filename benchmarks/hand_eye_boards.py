@@ -5,7 +5,6 @@ heavy-tailed noise, the arm has noise of its own. Every solver gets the same cor
 calibrated from them first, as most people do.
 """
 
-import json
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from tabulate import tabulate
 from tqdm import tqdm
 from tyro.conf import arg
 
 from benchmarks.hand_eye import pose, rotations
+from benchmarks.rows import save
 from evercal.calibration.boards.corners import BoardView, board_pose
 from evercal.calibration.boards.intrinsics import calibrate_camera
 from evercal.calibration.boards.lens import lens_vector, moved_camera
@@ -306,7 +305,7 @@ def measure(name: str, count: int, references: int) -> dict[str, object]:
 def run(
     count: Annotated[int, arg(name="trials")] = 300,
     references: int = 30,
-    out: Path = Path("runs/handeye-boards.json"),
+    out: Path = Path("runs/handeye-boards.csv"),
 ) -> None:
     """Simulated boards through a distorted lens that is found from the same images.
 
@@ -317,8 +316,6 @@ def run(
         out: File of the rows.
     """
     rows: list[dict[str, object]] = []
-    out.parent.mkdir(parents=True, exist_ok=True)
     for name in tqdm(CONDITIONS, unit="condition"):
         rows.append(measure(name, count, references))
-        out.write_text(json.dumps({"settings": {"trials": count}, "rows": rows}, indent=1))
-    print(tabulate(rows, headers="keys", floatfmt=".3g", tablefmt="github", missingval=""))
+    save(out, rows, {"trials": count})

@@ -1,6 +1,5 @@
 """Accuracy of maps: sequences of scenes, changed rooms, fixed cameras, wrong input."""
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -9,11 +8,11 @@ from typing import Literal
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tabulate import tabulate
 from tqdm import tqdm
 from tyro.conf import Positional
 
-from benchmarks.accuracy import Row, accuracy_row, mean_row
+from benchmarks.accuracy import accuracy_row
+from benchmarks.rows import Row, mean_row, save
 from evercal.calibration.from_images import Images, calibrate
 from evercal.errors import InputError
 from evercal.evaluation import evaluate
@@ -67,8 +66,7 @@ def run(
         rows = {"mini": mini, "fixed": fixed, "badposes": wrong_poses}[what](out, memory)
     options = MapOptions(MemoryBudget(memory))
     settings = {"map": asdict(options), "localize": asdict(LocalizeOptions())}
-    (out / f"{what}.json").write_text(json.dumps({"rows": rows, "settings": settings}, indent=1))
-    print(tabulate([list(row.values()) for row in rows], list(rows[0]), "github", floatfmt=".3g"))
+    save(out / f"{what}.csv", rows, settings)
 
 
 def learned(store: Path, scenes: Sequence[Recording], memory: float) -> list[LearnReport]:

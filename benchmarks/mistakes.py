@@ -6,10 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from tabulate import tabulate
 from tqdm import tqdm
 
 from benchmarks.hand_eye_boards import BoardSetting, corner_pairs, pose_pairs, record
+from benchmarks.rows import save
 from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pairs import PoseNumbers, PosePairs
 from evercal.calibration.pose_pairs.solve import solve
@@ -20,7 +20,6 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
     poses_from_numbers,
 )
-from evercal.storage import write_json
 
 Mistake = Callable[[PosePairs], PosePairs]
 _FLIP = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
@@ -167,7 +166,7 @@ def origins(draws: int) -> dict[str, object]:
     return {"draws": draws, "largest_change_sigma": largest, "largest_change_of_sigma": spread}
 
 
-def run(draws: int = 20, clean: int = 100, out: Path = Path("runs/mistakes.json")) -> None:
+def run(draws: int = 20, clean: int = 100, out: Path = Path("runs/mistakes.csv")) -> None:
     """Mistakes in pose files, recordings without mistakes, and other origins of the board.
 
     Args:
@@ -175,16 +174,13 @@ def run(draws: int = 20, clean: int = 100, out: Path = Path("runs/mistakes.json"
         clean: Recordings without a mistake, of each mount, with and without corners.
         out: File of the rows.
     """
-    out.parent.mkdir(parents=True, exist_ok=True)
     mounts: tuple[Mount, ...] = ("eye_in_hand", "eye_to_hand")
     settings: dict[str, object] = {"draws": draws, "clean": clean}
     rows: list[dict[str, object]] = []
     for name in tqdm(MISTAKES, unit="mistake"):
         rows += [measure(mount, name, draws) for mount in mounts]
-        write_json(out, {"settings": settings, "rows": rows})
     for mount in mounts:
         rows += [false_alarms(mount, corners, clean) for corners in (False, True)]
     settings |= origins(draws)
-    write_json(out, {"settings": settings, "rows": rows})
-    print(tabulate(rows, headers="keys", floatfmt=".3g", tablefmt="github", missingval=""))
+    save(out, rows, settings)
     print(settings)

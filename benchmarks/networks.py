@@ -1,210 +1,143 @@
-"""The experiments of docs/experiments/protocol.md, from rendering to tables and figure.
+"""The experiments of research/protocol.md: `evercal bench` with tuned strategies.
 
-Every command resumes where it was interrupted. The same call in a second terminal shares the runs.
+Every experiment resumes where it was interrupted. The same call in a second terminal shares the
+runs. To publish one, copy its folder without `runs` and `features` to results/.
 """
 
-import subprocess
-import sys
-import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tyro.conf import Positional
 
-from benchmarks.trainer import step_seconds
-from benchmarks.tuning import DERIVED
-from evercal.continual.benchmark.rows import read_rows
-from evercal.continual.learning.presets import PAPER_SIM_STEPS, preset
+from evercal.cli.bench import Bench
+from evercal.continual.learning.presets import preset
+from evercal.continual.methods.gec import EpisodicConstraint
+from evercal.continual.methods.penalties import BoundedByTeacher, Distillation, OldOutput
+from evercal.continual.methods.replay import Replay
+from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.errors import InputError
-from evercal.storage import write_json
 
-ROOT = Path(__file__).resolve().parent.parent
-ROWS = "results/tuned-converged.json"
-PAPER_HEAD_ROWS = "results/tuned-paper-head.json"
-CONTROLS = "evercal,evercal_network,joint,isolation,finetune"
-SELECTED = ("er", "sars_reprojection", "reservoir_spdd", "sars_spdd")
-SELECTIONS: Mapping[str, Sequence[str]] = {
-    "networks-contrasts.json": (*SELECTED, "icarl", "buff_cs", "sars_old_output"),
-    "networks-filled.json": (*SELECTED, "sars_spdd_filled"),
-}
-"""Files of some tuned rows, in the folder of runs."""
-CONTRASTS, FILLED = SELECTIONS
 STEPS = preset("converged").fit.iterations
 """Steps a room of `a`. Joint training needs twice as many in `c` and `real`, and four times as many
 with the paper's head."""
 SEEDS = "0,1,2,3,4,5"
-"""All orders of three rooms (`--order balanced`)."""
+"""All orders of three rooms."""
 MORE_SEEDS = "0,1,2,3,4,5,6,7,8,9,10,11"
 FEW_SEEDS = "0,1,2"
 """Three orders: each room is first, second and last once."""
-SHARES = (1, 3, 30)
-"""Memory, per cent of the frames; `a` has 10."""
-PAPER_STAGES = 14
-"""Stages of three rooms: joint training counts three, the first room is shared."""
-
-Command = Sequence[str]
 
 
-def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
-    """Return the commands of every experiment, in order."""
+def tuned(spdd: float) -> dict[str, Strategy]:
+    """Return the tuned strategies (results/tuned-converged.csv and tuned-paper-head.csv).
 
-    def rooms(suite: str) -> Command:
-        return "rooms", suite, "--sweep-only", "--out", str(data / suite)
+    Args:
+        spdd: Scale of SPDD: 10 for our network, 1 for the paper's head.
+    """
+    penalty = Distillation(scale=spdd)
+    methods = {
+        "er": Replay(weight=3.0),
+        "icarl": Replay("herding", OldOutput(), weight=1.0),
+        "buff_cs": Replay("coverage", BoundedByTeacher(), weight=1.0),
+        "sars_spdd": Replay("sars", penalty),
+        "gec": EpisodicConstraint(alpha=512.0),
+        "sars_old_output": Replay("sars", OldOutput(), weight=1.0),
+        "sars_reprojection": Replay("sars", weight=3.0),
+        "reservoir_spdd": Replay("reservoir", penalty),
+        "sars_spdd_filled": Replay("sars_filled", penalty),
+    }
+    return {name: Strategy(name, method) for name, method in methods.items()}
 
-    def bench(suite: str, name: str, *options: str) -> Command:
-        folders = ("--data", str(data / suite), "--out", str(out / name))
-        return "evercal", "bench", suite, *folders, *options
 
-    def tune(
-        file: str, folder: str, methods: Command, rows: Command, *options: str
-    ) -> Sequence[Command]:
-        trials = (
-            *("benchmarks", "tune", "sim-tune", "--data", str(data / "sim-tune")),
-            *("--methods", *methods, "--rows", *rows),
-            *("--file", file, "--out", str(out / folder), *options),
-        )
-        outcomes = file.replace(".json", ".outcomes.json")
-        return [rooms("sim-tune"), trials, ("benchmarks", "publish", outcomes, Path(file).stem)]
+@dataclass(frozen=True)
+class Experiment(Bench):
+    """`evercal bench` with given strategies."""
 
-    def gated(suite: str, name: str, rows: Command, *options: str) -> Sequence[Command]:
-        joint = ("--strategies", "joint", "--seeds", FEW_SEEDS)
-        others = (*rows, "--strategies", "joint,finetune", "--seeds", FEW_SEEDS)
-        return [bench(suite, name, *options, *joint), bench(suite, name, *options, *others)]
+    given: tuple[Strategy, ...] = ()
+    """Strategies, the first of which the others are compared with."""
 
-    def publish(name: str) -> Command:
-        return "benchmarks", "publish", str(out / name), name
+    def _strategies(self) -> tuple[Strategy, ...]:
+        return self.given
 
-    tuned = ("--preset", "converged", "--order", "balanced")
-    doubled = (*tuned, "--steps", str(2 * STEPS))
-    head = ("--backbone", "paper_head")
-    methods = ("er", "icarl", "buff_cs", "sars_spdd", "gec")
-    rows = (*methods, "sars_old_output", "sars_reprojection", "reservoir_spdd")
+
+def experiments(data: Path, out: Path, device: str) -> Mapping[str, Sequence[Experiment]]:
+    """Return the calls of every experiment, in order."""
+    ours, paper_head = tuned(10.0), tuned(1.0)
+    compared = ("sars_spdd", "er", "sars_reprojection", "reservoir_spdd")
+    contrasts = (*compared, "icarl", "buff_cs", "sars_old_output")
+    filled = (*compared, "sars_spdd_filled")
+    controls = ("evercal", "evercal_network", "joint", "isolation", "finetune")
+
+    def chosen(names: Sequence[str], known: Mapping[str, Strategy] = ours) -> tuple[Strategy, ...]:
+        return tuple(known.get(name) or STRATEGIES[name] for name in names)
+
+    def bench(suite: str, name: str, names: Sequence[str], seeds: str) -> Experiment:
+        common = Experiment(suite, data=data / suite, out=out / name, order="balanced")
+        return replace(common, preset="converged", seeds=seeds, given=chosen(names), device=device)
+
+    gate = bench("sim-mini", "networks-a", ["joint"], SEEDS)
+    head = replace(
+        bench("sim-mini", "networks-b", ["joint"], FEW_SEEDS),
+        steps=4 * STEPS,
+        backbone="paper_head",
+    )
+    unseen = replace(bench("sim-unseen", "networks-c", filled, FEW_SEEDS), steps=2 * STEPS)
+    paper = ("sars_spdd", "joint", "finetune", "icarl", "buff_cs", "gec")
     return {
-        "tune": tune(ROWS, "tune", methods, rows),
-        "gate": [
-            rooms("sim-mini"),
-            bench("sim-mini", "networks-a", *tuned, "--strategies", "joint", "--seeds", SEEDS),
-        ],
+        "gate": [gate],
         "a": [
-            rooms("sim-mini"),
-            bench(
-                *("sim-mini", "networks-a", *tuned, "--rows", ROWS),
-                *("--strategies", CONTROLS, "--seeds", SEEDS),
-            ),
-            bench(
-                *("sim-mini", "networks-a", *tuned, "--rows", str(out / CONTRASTS)),
-                *("--seeds", MORE_SEEDS),
-            ),
-            publish("networks-a"),
+            replace(gate, given=chosen([*controls, *ours.keys() - {"sars_spdd_filled"}])),
+            replace(gate, given=chosen(contrasts), seeds=MORE_SEEDS),
         ],
         "memory": [
-            rooms("sim-mini"),
-            *(
-                command
-                for share in SHARES
-                for name in [f"networks-memory-{share}"]
-                for command in (
-                    bench(
-                        *("sim-mini", name, *tuned, "--rows", str(out / FILLED)),
-                        *("--memory", f"{share}%", "--seeds", FEW_SEEDS),
-                    ),
-                    publish(name),
-                )
-            ),
+            replace(
+                bench("sim-mini", f"networks-memory-{share}", filled, FEW_SEEDS),
+                memory=f"{share}%",
+            )
+            for share in (1, 3, 30)
         ],
-        "b": [
-            *tune(
-                *(PAPER_HEAD_ROWS, "tune-paper-head", ("er", "sars_spdd"), SELECTED, *head),
-                *("--steps", str(STEPS // 2)),
-            ),
-            rooms("sim-mini"),
-            *gated(
-                *("sim-mini", "networks-b", ("--rows", PAPER_HEAD_ROWS)),
-                *(*tuned, "--steps", str(4 * STEPS), *head),
-            ),
-            publish("networks-b"),
-        ],
+        "b": [head, replace(head, given=chosen([*compared, "finetune"], paper_head))],
         "c": [
-            rooms("sim-unseen"),
-            *gated("sim-unseen", "networks-c", ("--rows", str(out / FILLED)), *doubled),
-            bench(
-                *("sim-unseen", "networks-c", *doubled, "--strategies", "evercal", "--seeds", "0")
-            ),
-            publish("networks-c"),
+            replace(unseen, given=chosen([*filled, "joint", "finetune"])),
+            replace(unseen, given=chosen(["evercal"]), seeds="0"),
         ],
         "real": [
-            bench(
-                *("real2", "networks-real", *doubled, "--rows", str(out / FILLED)),
-                *("--strategies", "joint,finetune", "--seeds", FEW_SEEDS),
-            ),
-            publish("networks-real"),
+            replace(
+                bench("real2", "networks-real", [*filled, "joint", "finetune"], FEW_SEEDS),
+                steps=2 * STEPS,
+            )
         ],
         "paper": [
-            rooms("sim-unseen"),
-            bench(
-                *("sim-unseen", "networks-paper", "--preset", "paper"),
-                *("--strategies", "joint,finetune,icarl,buff_cs,gec,sars_spdd", "--seeds", "0"),
-            ),
-            publish("networks-paper"),
+            replace(
+                Experiment("sim-unseen", data=data / "sim-unseen", out=out / "networks-paper"),
+                preset="paper",
+                seeds="0",
+                given=tuple(STRATEGIES[name] for name in paper),
+                device=device,
+            )
         ],
-        "tables": [("benchmarks", "tables"), ("benchmarks", "network-figure", "networks-a")],
     }
 
 
 def run(
-    experiments: Positional[tuple[str, ...]],
+    names: Positional[tuple[str, ...]],
     data: Path = Path("runs"),
     out: Path = Path("runs"),
-    dry: bool = False,
     device: str = "auto",
 ) -> int:
-    """Run experiments of docs/experiments/protocol.md; each resumes.
+    """Run experiments of research/protocol.md; each resumes.
 
     Args:
-        experiments: gate (joint training of `a`, whose accuracy decides whether the others are
-            run), tune, a, memory, b, c, real (needs the recordings), paper (needs a GPU) and
-            tables, in this order.
-        data: Folder of the rendered rooms.
-        out: Folder of runs and results.
-        dry: Print the commands, and for `paper` the estimated hours, and run nothing.
+        names: gate (joint training of `a`, whose accuracy decides whether the others are run), a,
+            memory, b, c, real (needs the recordings) and paper (needs a GPU).
+        data: Folder of the rooms, rendered with `python -m rooms SUITE --out DATA/SUITE`.
+        out: Folder of results.
         device: Device of the networks: auto, cpu or cuda.
     """
-    known = commands(data, out)
-    unknown = [name for name in experiments if name not in known]
-    if unknown or not experiments:
+    known = experiments(data, out, device)
+    unknown = [name for name in names if name not in known]
+    if unknown or not names:
         raise InputError(f"{' '.join(unknown) or 'no experiment'}: choose of {', '.join(known)}")
-    if "paper" in experiments:
-        print(f"paper: about {paper_hours(device):.1f} hours of training on this machine")
-    for command in (command for name in experiments for command in known[name]):
-        print(" ".join(command), flush=True)
-        if dry:
-            continue
-        for name, rows in SELECTIONS.items():
-            if str(out / name) in command:
-                write_json(out / name, _tuned(rows))
-        began = time.perf_counter()
-        code = subprocess.run(_words(command, device), cwd=ROOT, check=False).returncode
-        print(f"{time.perf_counter() - began:.0f} s", flush=True)
-        if code:
-            return code
+    for experiment in (experiment for name in names for experiment in known[name]):
+        experiment.run()
     return 0
-
-
-def paper_hours(device: str) -> float:
-    """Estimate the hours of training of `paper`, from some steps with random rows."""
-    options = preset("paper")
-    seconds = step_seconds(options.head, options.fit, device=device)
-    return seconds * PAPER_SIM_STEPS * PAPER_STAGES / 3600
-
-
-def _tuned(names: Sequence[str]) -> list[dict]:
-    """Return tuned rows by name; `DERIVED` ones take the setting of another."""
-    rows = {row["name"]: row for row in read_rows(str(ROOT / ROWS))}
-    return [{**rows[DERIVED[n]], "name": n, "of": n} if n in DERIVED else rows[n] for n in names]
-
-
-def _words(command: Command, device: str) -> list[str]:
-    """Return the words of a process."""
-    first, *rest = command
-    chosen = ("--device", device) if rest[0] == "bench" else ()
-    return [sys.executable, "-m", first, *rest, *chosen]

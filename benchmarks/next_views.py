@@ -6,21 +6,20 @@ noise for all views, not the truth. The deviation is that of the best linear est
 `simulated` estimates draws of noise and compares.
 """
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from benchmarks.rows import Row, save, show
 from evercal.calibration.next_views import NextViewOptions, next_views
 from evercal.calibration.view_information import HandEyeViews, ScenePoints, ViewNoise
-from evercal.errors import InputError
-from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
+from evercal.geometry import SE3, pose_distance
 from evercal.geometry.uncertain_pose import axis_deviation
-from evercal.map import Map
-from evercal.recordings import Frame, Recording
 from evercal.simulation.box_room import default_camera
 from evercal.simulation.cell_room import WORK_AREA_M
 from evercal.simulation.virtual_cell import VirtualCell, nominal_mount
@@ -169,77 +168,34 @@ ORDERS: dict[str, Order] = {
 }
 
 
-def learned_mm_deg(seed: int, poses: SE3) -> tuple[float, float]:
-    """Error of gripper_from_camera from images of the virtual cell at some poses."""
-    cell = VirtualCell(seed)
-    frames = []
-    for i, pose in enumerate(poses):
-        cell.robot.move_to(pose)
-        image = cell.wrist_camera.read()[1]
-        stated = cell.robot.base_from_gripper()
-        frames.append(Frame(f"{i:04d}", image, cell.intrinsics, None, stated))
-    with tempfile.TemporaryDirectory() as folder:
-        report = Map.open(folder, device="cpu").learn(Recording("wrist", tuple(frames), ()))
-    assert report.hand_eye is not None
-    estimate = report.hand_eye.gripper_from_camera.pose
-    return pose_distance_mm_deg(estimate, cell.truth.gripper_from_camera)
-
-
-def _print_images(cells: int, pool: int, count: int) -> None:
-    print(f"{cells} cells, {count} rendered images each; error of gripper_from_camera")
-    for name in ("random", "farthest in rotation", "A-optimal"):
-        errors, refused = [], 0
-        for seed in range(1, cells + 1):
-            draw = trial(seed, pool)
-            try:
-                errors.append(learned_mm_deg(seed, draw.reachable[ORDERS[name](draw)[:count]]))
-            except InputError as error:
-                print(f"  {name}, cell {seed}: {error}")
-                refused += 1
-        millimetres, degrees = np.array(errors).T
-        rms = np.sqrt(np.mean(millimetres**2)), np.sqrt(np.mean(degrees**2))
-        print(
-            f"| {name} | {rms[0]:.2f} mm, {rms[1]:.3f} deg (root mean square) |"
-            f" {millimetres.max():.2f} mm | {refused} refused |",
-            flush=True,
-        )
-
-
 def run(
     draws: int = 10,
     pool: int = 200,
     sigmas_mm: tuple[float, ...] = (0.3, 0.2, 0.15),
     noise_draws: int = 20,
     at: int = 15,
-    images: int = 0,
+    out: Path = Path("runs/next-views.csv"),
 ) -> None:
-    """Print the poses that each order needs.
+    """Count the poses that each order needs.
 
     Args:
-        draws: cells and mounts.
-        pool: reachable poses.
-        sigmas_mm: standard deviations per axis to reach.
-        noise_draws: draws of noise of the simulated estimates.
-        at: poses of the simulated estimates.
-        images: cells whose images are rendered and learned with `at` poses, instead of the above.
+        draws: Cells and mounts.
+        pool: Reachable poses.
+        sigmas_mm: Standard deviations per axis to reach.
+        noise_draws: Draws of noise of the simulated estimates.
+        at: Poses of the simulated estimates.
+        out: File of the rows: every draw of every order.
     """
-    if images:
-        _print_images(images, pool, at)
-        return
-    print(f"{draws} draws, {pool} reachable poses; median (least to most) poses until sigma")
-    names = " | ".join(f"{sigma:g} mm" for sigma in sigmas_mm)
-    print(f"| order | {names} | sigma at {at} | simulated |")
-    rows: dict[str, list[list[float]]] = {name: [] for name in ORDERS}
+    rows: list[Row] = []
     for seed in range(draws):
         draw = trial(seed, pool)
         for name, order in ORDERS.items():
             index = order(draw)
             sigma = axis_deviation(covariances(draw, index)[at - 1])[0]
-            counts = [reached(draw, index, limit) for limit in sigmas_mm]
-            rows[name].append([*counts, sigma, simulated_mm(draw, index[:at], noise_draws)])
-    for name, values in rows.items():
-        low, middle, high = np.quantile(values, [0, 0.5, 1], axis=0)
-        cells = " | ".join(
-            f"{middle[i]:g} ({low[i]:g} to {high[i]:g})" for i in range(len(sigmas_mm))
-        )
-        print(f"| {name} | {cells} | {middle[-2]:.3f} mm | {middle[-1]:.3f} mm |", flush=True)
+            counts = {f"{limit:g} mm": reached(draw, index, limit) for limit in sigmas_mm}
+            simulated = simulated_mm(draw, index[:at], noise_draws)
+            sigmas = {f"sigma_mm at {at}": sigma, "simulated_mm": simulated}
+            rows.append({"order": name, "draw": seed, **counts, **sigmas})
+    save(out, rows, {"pool": pool, "at": at})
+    medians = pd.DataFrame(rows).drop(columns="draw").groupby("order", sort=False).median()
+    show(medians.reset_index())

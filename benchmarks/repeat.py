@@ -1,6 +1,5 @@
 """Wrist recordings before repeated texture: a chessboard on a curtain, drawn with exact poses."""
 
-import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -9,10 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tabulate import tabulate
 from tqdm import tqdm
 
-from benchmarks.accuracy import Row, pose_error, wrong
+from benchmarks.accuracy import pose_error, wrong
+from benchmarks.rows import Row, save, show
 from evercal.errors import InputError
 from evercal.evaluation.metrics import CHI2_6
 from evercal.geometry import SE3, Camera
@@ -55,9 +54,9 @@ def run(
             mount, rows = _fold(recording, truth, fold, store)
             mounts.append({"seed": seed, "fold": fold, **mount})
             located += [{"seed": seed, "fold": fold, **row} for row in rows]
-    (out / "repeat.json").write_text(json.dumps({"mounts": mounts, "images": located}, indent=1))
-    print(tabulate(mounts, headers="keys", floatfmt=".2f"))
-    print(tabulate([summary(mounts, located)], headers="keys", floatfmt=".2f"))
+    save(out / "mounts.csv", mounts)
+    save(out / "images.csv", located)
+    show([summary(mounts, located)])
 
 
 def summary(mounts: list[Row], located: list[Row]) -> Row:

@@ -5,17 +5,16 @@ point. Maps are learned from the middle of each image, so that views of the same
 cameras fit into it.
 """
 
-import json
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from tabulate import tabulate
 
 from benchmarks.accuracy import wrong
 from benchmarks.lenses import View, cropped
+from benchmarks.rows import save
 from evercal.geometry import Camera, UncertainPose
 from evercal.localization.parallel import in_parallel
 from evercal.map import Map
@@ -33,7 +32,7 @@ INSIDE_95 = 7.815
 """95 % quantile of a squared deviation in three dimensions (chi-squared)."""
 
 
-def run(out: Path = Path("runs/same-model.json"), cameras: int = 8, every: int = 3) -> None:
+def run(out: Path = Path("runs/same-model.csv"), cameras: int = 8, every: int = 3) -> None:
     """Locate test images of the packaged rooms as other cameras of the same model see them.
 
     The images are of the recording's own camera and of others. No camera is stated, or the
@@ -74,9 +73,7 @@ def run(out: Path = Path("runs/same-model.json"), cameras: int = 8, every: int =
                 first = [of[0] for of in views]
                 rows.append({"answer": "fixed camera", **what, **_summary(poses, first)})
     settings = {"cameras": cameras, "every": every, "draws": draws.round(5).tolist()}
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps({"rows": rows, "settings": settings}, indent=1))
-    print(tabulate(rows, "keys", floatfmt=".3g"))
+    save(out, rows, settings)
 
 
 def _seen(frame: Frame, change: np.ndarray) -> Frame:

@@ -1,6 +1,5 @@
 """Time of learning, of localization, of SARS and of import."""
 
-import json
 import subprocess
 import sys
 import tempfile
@@ -10,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tabulate import tabulate
 
+from benchmarks.rows import save
 from evercal.localization.parallel import in_parallel
 from evercal.map import Map
 from evercal.mapping.selection import SarsOptions, select_sars
@@ -21,7 +20,7 @@ _WARM = 5
 """Images located before the first one that counts."""
 
 
-def run(out: Path = Path("runs/speed.json"), repeat: int = 3) -> None:
+def run(out: Path = Path("runs/speed.csv"), repeat: int = 3) -> None:
     """Time learning of the packaged rooms and localization of their test images.
 
     Images are decoded before. Also timed: SARS on 10,000 poses, and import.
@@ -66,9 +65,7 @@ def run(out: Path = Path("runs/speed.json"), repeat: int = 3) -> None:
                 }
             )
     settings = {"threads": torch.get_num_threads(), "scenes": len(rooms), "repeat": repeat}
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps({"rows": rows, "settings": settings}, indent=1))
-    print(tabulate(rows, "keys", floatfmt=".3g"))
+    save(out, rows, settings)
     _others()
 
 

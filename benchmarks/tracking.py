@@ -5,9 +5,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from tabulate import tabulate
 from tqdm import tqdm
 
+from benchmarks.rows import save
 from evercal.features.encoder import load_encoder
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.estimate import PoseEstimate
@@ -20,7 +20,6 @@ from evercal.mapping.scene_map import MapContents
 from evercal.recordings.frame import Frame
 from evercal.recordings.held_out import split_held_out
 from evercal.simulation.box_room import BoxRoom, default_camera, look_at
-from evercal.storage import write_json
 
 RATE = 15.0
 COVERED = ((150, 180), (500, 515))
@@ -55,7 +54,7 @@ def run(
     count: int = 900,
     width: int = 320,
     at_most: float | None = None,
-    out: Path = Path("runs/tracking.json"),
+    out: Path = Path("runs/tracking.csv"),
 ) -> None:
     """Tracking over a recording with holes: time, errors, states.
 
@@ -118,8 +117,7 @@ def run(
         "per_second": 1000 / float(np.mean(ms)),
         "single_ms_p50": float(np.median(single_ms)),
     }
-    write_json(out, {"settings": {"seed": seed}, "rows": [row]})
-    print(tabulate(row.items(), floatfmt=".3g"))
+    save(out, [row], {"seed": seed})
 
 
 def _learned(room: BoxRoom, lens: Camera) -> MapContents:

@@ -1,6 +1,5 @@
 """Whether answers can be trusted: other lenses, few images, an arm that is not accurate."""
 
-import json
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -11,12 +10,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import Rotation
-from tabulate import tabulate
 from tqdm import tqdm
 from tyro.conf import Positional
 
-from benchmarks.accuracy import Row, once, pose_error
+from benchmarks.accuracy import pose_error, wrong
 from benchmarks.arm_noise import grippers, with_arm_errors
 from benchmarks.calibration import (
     PACKAGED,
@@ -26,9 +25,11 @@ from benchmarks.calibration import (
     learned_mount,
 )
 from benchmarks.lenses import LENSES, ROLLS_DEG, View, rolled
-from benchmarks.trust_tables import arm_tables, few_tables, lens_tables
+from benchmarks.rows import Row, once, save, show
 from evercal.calibration.from_images import Images, calibrate
+from evercal.continual.benchmark.results import Table
 from evercal.errors import InputError
+from evercal.evaluation.metrics import CHI2_6
 from evercal.evaluation.protocol import evaluate
 from evercal.geometry import SE3, Camera, average_poses, pose_distance_mm_deg
 from evercal.localization.estimate import PoseEstimate
@@ -55,7 +56,7 @@ def run(
 ) -> None:
     """Measure errors, and whether stated deviations contain them, under adverse conditions.
 
-    Rows go to OUT/WHAT.jsonl. Each draw has a file in OUT/WHAT and is not repeated: give another
+    Rows go to OUT/WHAT.csv. Each draw has a file in OUT/WHAT and is not repeated: give another
     --out to measure another version.
 
     Args:
@@ -74,9 +75,29 @@ def run(
     else:
         count = DRAWS[what] if draws is None else draws
         rows = few(folders, out, count, sizes) if what == "few" else arm(folders, out, count)
-    (out / f"{what}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    for table in {"lens": lens_tables, "few": few_tables, "arm": arm_tables}[what](rows):
-        print(tabulate(table, headers="keys", floatfmt=".3f", missingval="-"), end="\n\n")
+    save(out / f"{what}.csv", rows)
+    show(summary(rows, {"lens": ["what", "case"], "few": ["images"], "arm": ["room"]}[what]))
+
+
+def summary(rows: Sequence[Row], by: Sequence[str]) -> Table:
+    """Summarize groups of answers: errors, stated deviations, wrong and missing answers."""
+    table: Table = pd.DataFrame(list(rows))
+    table["wrong"] = wrong(table["mm"], table["squared_mahalanobis"])
+    table["inside"] = 100.0 * (table["squared_mahalanobis"] < CHI2_6)
+    table["1 cm/1 deg %"] = 100.0 * ((table["mm"] < 10) & (table["deg"] < 1))
+    of, answered = table.groupby(by, sort=False), table[table["status"] == "ok"]
+    located = answered.groupby(by, sort=False)
+    columns = {"n": of.size(), "located": located.size()}
+    for unit in ("mm", "deg"):
+        columns[f"median {unit}"] = located[unit].median()
+        # A mean of neighbours is not defined for infinity.
+        columns[f"95 % {unit}"] = located[unit].quantile(0.95, interpolation="higher")
+        columns[f"worst {unit}"] = located[unit].max()
+        if f"sigma_{unit}" in table:
+            columns[f"sigma {unit}"] = located[f"sigma_{unit}"].median()
+    columns["in ellipsoid %"] = located["inside"].mean()
+    columns["1 cm/1 deg %"], columns["wrong"] = of["1 cm/1 deg %"].mean(), of["wrong"].sum()
+    return pd.DataFrame(columns, index=of.size().index).reset_index()
 
 
 @dataclass(frozen=True)

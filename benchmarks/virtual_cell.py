@@ -3,8 +3,9 @@
 import tempfile
 from pathlib import Path
 
-import numpy as np
+import pandas as pd
 
+from benchmarks.rows import save, show
 from evercal.geometry import pose_distance_mm_deg
 from evercal.map import Map
 from evercal.simulation.cell_recording import WRIST_IMAGES, record_cell
@@ -33,23 +34,21 @@ def run(
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10),
     images: int = WRIST_IMAGES,
     size: tuple[int, int] = (640, 480),
+    out: Path = Path("runs/virtual-cell.csv"),
 ) -> None:
-    """Print the errors of every cell, their medians and the largest.
+    """Measure the errors of every cell, their medians and the largest.
 
     Args:
-        seeds: of the cells.
-        images: wrist images of each.
-        size: width and height, pixels.
+        seeds: Seeds of the cells.
+        images: Wrist images of each.
+        size: Width and height, pixels.
+        out: File of the rows.
     """
     options = CellOptions(width=size[0], height=size[1])
-    print("| cell | gripper_from_camera | base_from_tripod |\n|---|---:|---:|")
-    rows = []
-    for seed in seeds:
-        rows.append(errors_of(seed, images, options))
-        _print_row(str(seed), np.array(rows[-1]))
-    _print_row("median", np.median(rows, axis=0))
-    _print_row("largest", np.max(rows, axis=0))
-
-
-def _print_row(name: str, row: np.ndarray) -> None:
-    print(f"| {name} | {row[0]:.2f} mm, {row[1]:.3f} deg | {row[2]:.2f} mm, {row[3]:.3f} deg |")
+    keys = ("mount_mm", "mount_deg", "tripod_mm", "tripod_deg")
+    rows = [
+        {"cell": seed, **dict(zip(keys, errors_of(seed, images, options), strict=True))}
+        for seed in seeds
+    ]
+    save(out, rows, {"images": images, "size": size})
+    show(pd.DataFrame(rows)[list(keys)].agg(["median", "max"]).reset_index())

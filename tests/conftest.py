@@ -27,7 +27,7 @@ os.environ["EVERCAL_PRECISION"] = "float32"
 # not for the products of numpy or of child processes.
 os.environ |= {"OPENBLAS_CORETYPE": "", "MKL_CBWR": ""}
 
-from benchmarks.browser import CHROMIUM, chromium
+from .chromium import CHROMIUM, chromium
 
 if TYPE_CHECKING:
     import torch

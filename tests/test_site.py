@@ -60,7 +60,7 @@ def test_site_holds_the_reference(site: Path) -> None:
         module = getattr(evercal, name).__module__
         assert f'id="{module}.{name}"' in python
     verbs = (site / "reference" / "command-line.html").read_text(encoding="utf-8")
-    for verb in ("learn", "localize", "pretrain"):
+    for verb in ("learn", "localize", "bench"):
         assert f'id="evercal-{verb}"' in verbs
         assert f"usage: evercal {verb}" in verbs
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from PIL import Image
 
 import evercal
-from benchmarks.browser import chromium
 from evercal.service.viewer.page import Page, ViewOptions
+from tests.chromium import chromium
 
 OUT = Path(__file__).parents[1] / "view.jpg"
 

@@ -69,7 +69,7 @@ class Map:
         Args:
             path: folder of the map.
             device: `auto` (a CUDA device if there is one), `cpu` or `cuda`.
-            encoder: for a new map, a weights file of `evercal pretrain`; or a module of the
+            encoder: for a new map, a weights file of `training`; or a module of the
                 caller's own, which then must be given every time. Default: the shipped encoder.
             options: effort and thresholds of localization.
 

@@ -5,9 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks import trust
-from benchmarks.accuracy import Row
 from benchmarks.arm_noise import ARM_DEG, ARM_MM, arm_errors, grippers, with_arm_errors
-from benchmarks.trust_tables import few_tables, lens_tables
+from benchmarks.rows import Row
 from evercal.geometry import SE3, Camera, pose_distance, pose_distance_mm_deg
 from evercal.recordings import Frame, Recording
 
@@ -73,20 +72,18 @@ def test_the_fitted_frame_undoes_a_motion_of_the_base() -> None:
 
 def test_summaries_count_wrong_answers_and_refusals() -> None:
     nothing = {"mm": np.nan, "deg": np.nan, "squared_mahalanobis": np.nan}
-    common: Row = {"case": "own camera", "what": "image", "status": "ok"}
-    images: list[Row] = [
+    common: Row = {"case": "own camera", "status": "ok"}
+    rows: list[Row] = [
         common | {"mm": 2.0, "deg": 0.1, "squared_mahalanobis": 3.0},
         common | {"mm": 20.0, "deg": 0.1, "squared_mahalanobis": 30.0},
         common | {"mm": np.inf, "deg": np.inf, "squared_mahalanobis": np.inf},
         common | nothing | {"status": "failed"},
+        common | nothing | {"case": "refused", "status": "failed"},
     ]
-    ((row,), cameras) = lens_tables(images)
-    assert (row["n"], row["located %"], row["1 cm/1 deg %"], row["wrong"]) == (4, 75.0, 25.0, 2)
-    assert row["median mm"] == 20.0
-    assert cameras == []
-    refused: list[Row] = [
-        {"images": 8, "status": "refused", "reason": f"only {n} pairs"} for n in (3, 4)
-    ]
-    sizes, reasons = few_tables(refused)
-    assert sizes == [{"images": 8, "n": 2, "refused": 2}]
-    assert reasons == [{"images": 8, "reason": "only N pairs", "refused": 2}]
+    summary = trust.summary(rows, ["case"]).set_index("case")
+    own, refused = summary.loc["own camera"], summary.loc["refused"]
+    assert own[["n", "located", "1 cm/1 deg %", "wrong"]].tolist() == [4, 3, 25.0, 2]
+    assert own["median mm"] == 20.0
+    assert np.isinf(own["95 % mm"])
+    assert own["in ellipsoid %"] == pytest.approx(100 / 3)
+    assert refused[["n", "wrong"]].tolist() == [1, 0]

@@ -32,7 +32,7 @@ VERBS = {
     "Boards and pose pairs": ["detect", "solve"],
     "Results": ["export", "report"],
     "Recordings": ["inspect", "convert", "reconstruct", "simulate", "demo"],
-    "Networks": ["bench", "bench-report", "pretrain"],
+    "Networks": ["bench", "bench-report"],
 }
 ALL = [verb for verbs in VERBS.values() for verb in verbs]
 OTHER_PROGRAMS = {"--once", "--frame-id", "--child-frame-id", "--qw", "--qx", "--qy", "--qz"}
@@ -161,7 +161,6 @@ def test_unusable_arguments_are_an_error_object(run: Any, words: list[str], mess
         (["demo", "--copy-samples", "FILE"], "FILE: is a file; name a new folder"),
         (["simulate", "cell", "--out", "FILE/x"], "FILE/x"),
         (["bench", "sim-mini", "--out", "FILE/x"], "FILE/x"),
-        (["pretrain", "--out", "FILE/x"], "FILE/x"),
     ],
 )
 def test_output_paths_are_refused_before_the_work(

@@ -49,7 +49,7 @@ def learnable(box: BoxRoom) -> Learnable:
             view = View(grey, pixels.astype(np.float32), valid, intrinsics, pose)
             descriptor = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(1, 6))))
             every = torch.ones(1, 300, dtype=torch.bool)
-            buffer.append(buffer.part(buffer.views, [view], (grid, descriptor), every))
+            buffer.append([view], (grid, descriptor), every)
             everything.append(torch.from_numpy(ATLAS_FROM_BASE.apply(points)).float())
         return buffer, torch.cat(everything)
 

@@ -40,15 +40,14 @@ def first_stages(
     empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions
 ) -> dict[str, LearnedScenes]:
     """Every strategy that learns scene by scene after the first room."""
-    from evercal.continual.learning.learn import learn
     from evercal.continual.strategies import STRATEGIES
 
-    from .stages import outcome
+    from .stages import learn, outcome
 
     return {
         name: outcome(learn(empty_scenes(name), strategy, rooms[0], quick))
         for name, strategy in STRATEGIES.items()
-        if not strategy.jointly
+        if strategy.method is not None and not strategy.jointly
     }
 
 
@@ -57,13 +56,12 @@ def three_stages(
     first_stages: dict[str, LearnedScenes], rooms: Rooms, quick: StageOptions
 ) -> dict[str, list[LearnedScenes]]:
     """By strategy: what is learned after one, two and three rooms."""
-    from evercal.continual.learning.learn import learn
     from evercal.continual.strategies import STRATEGIES
 
-    from .stages import outcome
+    from .stages import learn, outcome
 
     stages: dict[str, list[LearnedScenes]] = {}
-    for name in ("evercal_network", "evercal_hybrid", "isolation"):
+    for name in ("evercal_network", "isolation"):
         stages[name] = [first_stages[name].copy_for_training()]
         for room in rooms[1:]:
             stages[name].append(outcome(learn(stages[name][-1], STRATEGIES[name], room, quick)))
@@ -78,17 +76,13 @@ def three_stages(
 @pytest.fixture(scope="session")
 def make_store() -> MakeStore:
     """Make a store of given stages, as `learn_networks` does."""
-    import torch
-
-    from evercal.continual.store import Checkpoint, NetworkStore
+    from evercal.continual.store import NetworkStore
 
     def make(root: Path, stages: Sequence[LearnedScenes]) -> NetworkStore:
         first = stages[0]
         empty = replace(first, heads=[], scenes=[], keyframes=[], method_states=[])
         store = NetworkStore(root, empty)
         for scenes in stages:
-            store.begin({"scene": scenes.scenes[-1].name})
-            store.checkpoint(Checkpoint({"a": torch.zeros(3)}, {"b": torch.ones(2)}))
             store.commit(scenes, {"scene": scenes.scenes[-1].name, "seconds": 1.5})
         return store
 
@@ -124,13 +118,12 @@ def arc_scenes(
     arcs: tuple[Recording, Recording], arc_stage: StageOptions
 ) -> tuple[LearnedScenes, LearnedScenes]:
     """Networks after the first arc, and after both."""
-    from evercal.continual.learning.learn import learn
     from evercal.continual.networks.descriptor import load_descriptor
     from evercal.continual.scenes import LearnedScenes
     from evercal.continual.strategies import STRATEGIES
     from evercal.features.encoder import load_encoder
 
-    from .stages import outcome
+    from .stages import learn, outcome
 
     strategy = STRATEGIES["evercal_network"]
     empty = LearnedScenes(load_encoder(), load_descriptor(), strategy.name, 120)

@@ -1,17 +1,17 @@
-"""Run stages to their end, and compare their outcomes."""
+"""Run stages by the name of a strategy, and compare their outcomes."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from evercal.continual.learning.learn import learn
-from evercal.continual.learning.stage import Event, Stage, StageOptions
+from evercal.continual.learning.learn import learn as learn_by_method
+from evercal.continual.learning.stage import OnEvent, Stage, StageOptions, unobserved
 from evercal.continual.networks.head import Head
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.store import NetworkStore, Resume
-from evercal.continual.strategies import STRATEGIES
+from evercal.continual.store import NetworkStore
+from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.recordings.frame import Recording
 
 EmptyScenes = Callable[[str], LearnedScenes]
@@ -21,16 +21,28 @@ Rooms = tuple[Recording, Recording, Recording]
 Tree = Callable[[Path], dict[str, str]]
 
 
-def finished(events: Iterable[Event]) -> Stage:
-    """The last event of a stage."""
-    *_, stage = events
-    assert isinstance(stage, Stage)
-    return stage
+def learn(
+    scenes: LearnedScenes,
+    strategy: Strategy,
+    recording: Recording,
+    options: StageOptions,
+    on_event: OnEvent = unobserved,
+) -> Stage:
+    """Learn a scene by the method of a strategy."""
+    assert strategy.method is not None
+    return learn_by_method(scenes, strategy.method, recording, options, on_event)
 
 
-def outcome(events: Iterable[Event]) -> LearnedScenes:
+def second_stage(
+    scenes: LearnedScenes, rooms: Rooms, options: StageOptions, on_event: OnEvent = unobserved
+) -> Stage:
+    """Learn the second room with the strategy of the first."""
+    return learn(scenes, STRATEGIES[scenes.strategy], rooms[1], options, on_event)
+
+
+def outcome(stage: Stage) -> LearnedScenes:
     """What is learned after a stage."""
-    return finished(events).scenes
+    return stage.scenes
 
 
 def weights(head: Head) -> dict[str, Tensor]:
@@ -43,10 +55,3 @@ def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
     assert a.keys() == b.keys()
     for name, value in a.items():
         torch.testing.assert_close(value, b[name], rtol=0, atol=1e-7, equal_nan=False)
-
-
-def second_stage(
-    scenes: LearnedScenes, rooms: Rooms, options: StageOptions, resume: Resume | None = None
-) -> Iterator[Event]:
-    """Learn the second room with the strategy of the first."""
-    return learn(scenes, STRATEGIES[scenes.strategy], rooms[1], options, resume)

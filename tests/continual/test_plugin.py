@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evercal.continual.learning.learn import learn
 from evercal.continual.learning.stage import StageOptions
 from evercal.continual.methods.penalties import OldOutput
 from evercal.continual.plugin import load_plugin
 from evercal.continual.strategies import STRATEGIES, strategy_named
 from evercal.errors import InputError
 
-from .stages import EmptyScenes, Rooms, outcome, weights
+from .stages import EmptyScenes, Rooms, learn, outcome, weights
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "my_strategy.py"
 
@@ -85,11 +84,10 @@ def test_existing_names_are_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match="'finetune' exists"):
         load_plugin(path)
-    with pytest.raises(InputError, match="no such file"):
-        load_plugin(tmp_path / "none.py")
     (tmp_path / "mine.txt").write_text("")
-    with pytest.raises(InputError, match=r"ends in \.py"):
-        load_plugin(tmp_path / "mine.txt")
+    for name in ("none.py", "mine.txt"):
+        with pytest.raises(InputError, match=r"ends in \.py"):
+            load_plugin(tmp_path / name)
 
 
 def test_example_learns_two_scenes(

@@ -1,14 +1,12 @@
 """The list of strategies and their descriptions."""
 
 import json
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import pytest
 
-from evercal.continual.methods.controls import FineTuning
-from evercal.continual.methods.method import described
+from evercal.continual.methods.method import FineTuning, described
 from evercal.continual.methods.penalties import Distillation
-from evercal.continual.methods.preconditioning import PreconditionedReplay
 from evercal.continual.methods.replay import Replay
 from evercal.continual.selection.selectors import SELECTORS
 from evercal.continual.strategies import STRATEGIES, Strategy, strategy_named
@@ -20,7 +18,6 @@ def test_strategies_are_consistent(name: str, strategy: Strategy) -> None:
     assert strategy.name == name
     assert name.isidentifier()
     assert len(strategy.citation.split()) >= 4
-    assert strategy.method is not None or strategy.builds_map
     if isinstance(strategy.method, Replay):
         assert strategy.method.selector in SELECTORS
         assert strategy.method.replays
@@ -33,7 +30,7 @@ def test_strategies_are_consistent(name: str, strategy: Strategy) -> None:
 def test_description_contains_all_hyper_parameters(strategy: Strategy) -> None:
     records = strategy.description()
     assert json.loads(json.dumps(records)) == records
-    assert records["map"] == strategy.builds_map
+    assert records["map"] == (strategy.method is None)
     assert records.get("jointly", False) == strategy.jointly
     if strategy.method is None:
         assert records["method"] is None
@@ -60,13 +57,6 @@ def test_description_includes_penalties() -> None:
     assert penalty["options"]["active_centres"] == 50
 
 
-def test_hybrid_is_network_and_map() -> None:
-    ours, network, both = (STRATEGIES[f"evercal{tail}"] for tail in ("", "_network", "_hybrid"))
-    assert (ours.method, ours.builds_map) == (None, True)
-    assert network.method == PreconditionedReplay()
-    assert replace(both, name=network.name, builds_map=False) == network
-
-
 def test_sars_spdd_has_the_settings_of_the_paper() -> None:
     """SARS with the fixed radius, SPDD with weights 1, tau 2 and 50 active centres."""
     method = STRATEGIES["sars_spdd"].method
@@ -81,5 +71,5 @@ def test_sars_spdd_has_the_settings_of_the_paper() -> None:
 def test_unknown_strategy_is_refused() -> None:
     assert strategy_named("er") is STRATEGIES["er"]
     for name in ("nonsense", "sars+spdd", "er@0.3", ""):
-        with pytest.raises(InputError, match=r"unknown; choose one of evercal, .* joint_map"):
+        with pytest.raises(InputError, match=r"unknown; choose one of evercal, .* joint"):
             strategy_named(name)

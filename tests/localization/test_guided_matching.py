@@ -106,7 +106,7 @@ def test_matches_project_near_their_pixels(
     camera, truth = frame.camera, truth_of(frame)
 
     def distances(near: SE3 | None) -> np.ndarray:
-        matches = localizer._matches(query, KEYFRAMES, camera, near)
+        matches = localizer._matcher.matches(query, KEYFRAMES, camera, near)
         assert np.isfinite(matches.points_m).all()
         projected = camera.project(truth.inverse().apply(matches.points_m))
         return np.linalg.norm(projected - matches.pixels, axis=1)
@@ -115,7 +115,9 @@ def test_matches_project_near_their_pixels(
     assert near.max() < LocalizeOptions().guided_px < np.nanmax(anywhere)
     assert (near < 4).sum() >= (anywhere < 4).sum()
     behind = truth @ SE3.exp([0, 0, 0, 0, np.pi, 0])
-    assert len(localizer._matches(query, KEYFRAMES, camera, behind).pixels) < 0.5 * len(near)
+    assert len(localizer._matcher.matches(query, KEYFRAMES, camera, behind).pixels) < 0.5 * len(
+        near
+    )
 
 
 def with_pose(pose: SE3) -> Hypothesis:

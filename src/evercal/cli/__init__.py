@@ -1,7 +1,6 @@
 """The command line: one verb per file; `main` runs a verb and prints errors as one line.
 
-No verb imports torch before it runs, so that help and argument errors appear at once. The exception
-is `pretrain`, whose options are those of the training.
+No verb imports torch before it runs, so that help and argument errors appear at once.
 """
 
 import contextlib
@@ -34,7 +33,7 @@ _GROUPS = {
     "Boards and pose pairs": ("detect", "solve"),
     "Results": ("export", "report"),
     "Recordings": ("inspect", "convert", "reconstruct", "simulate", "demo"),
-    "Networks": ("bench", "bench-report", "pretrain"),
+    "Networks": ("bench",),
 }
 """Verbs by purpose, in the order of the help."""
 
@@ -109,12 +108,11 @@ def _complain(message: str, as_json: bool) -> int:
     return 2
 
 
-def _verbs(first: str) -> dict[str, Any]:
+def _verbs() -> dict[str, Any]:
     """All verbs by name."""
     from evercal.cli.align import Align
     from evercal.cli.audit import Audit
     from evercal.cli.bench import Bench
-    from evercal.cli.bench_report import BenchReport
     from evercal.cli.calibrate import Calibrate
     from evercal.cli.check import Check
     from evercal.cli.convert import Convert
@@ -127,7 +125,6 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.learn import Learn
     from evercal.cli.localize import Localize
     from evercal.cli.map import Maps
-    from evercal.cli.pretrain import Pretrain, pretrain_with_options
     from evercal.cli.reconstruct import Reconstruct
     from evercal.cli.refresh import Refresh
     from evercal.cli.report import Report
@@ -167,14 +164,12 @@ def _verbs(first: str) -> dict[str, Any]:
         "reconstruct": Reconstruct,
         "simulate": Simulate,
         "bench": Bench,
-        "bench-report": BenchReport,
-        "pretrain": pretrain_with_options() if first == "pretrain" else Pretrain,
     }
 
 
 def _help() -> str:
     """The overview of `evercal --help`: verbs by purpose, one line each."""
-    verbs = _verbs("")
+    verbs = _verbs()
     lines = ["usage: evercal VERB ...", ""]
     lines.append("Camera poses in the robot base frame from single images; hand-eye calibration.")
     for group, names in _GROUPS.items():
@@ -203,7 +198,7 @@ def _parse(words: list[str], as_json: bool) -> Command | int:
     if words in ([], ["--help"], ["-h"]):
         print(_help())
         return 0 if words else 2
-    verbs = _verbs(words[0])
+    verbs = _verbs()
     if not words[0].startswith("-") and words[0] not in verbs:
         similar = difflib.get_close_matches(words[0], verbs, 1)
         hint = f"did you mean '{similar[0]}'?" if similar else "'evercal --help' lists all verbs"

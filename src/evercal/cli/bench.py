@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.bench_report import show_report
+from evercal.cli.console import print_json, print_next
 from evercal.cli.device import Device
 from evercal.errors import InputError
 
@@ -29,24 +29,21 @@ LEAST_BATCH = 64
 class Bench:
     """Compare strategies on a sequence of scenes; the same command resumes.
 
-    Under torchrun, several processes share every training.
+    Given a folder of results, print its tables again.
 
     Example: evercal bench sim-mini --strategies evercal,finetune,er --seeds 0
     """
 
     suite: Annotated[Positional[str], arg(metavar="SUITE")]
     """One of sim-mini (packaged), sim, sim-7, sim-12, sim-tune, sim-unseen, sim-repeat,
-    real2, i7s, i12s, custom, regions."""
+    real2, i7s, i12s, custom, regions; or a folder of results."""
     recordings: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="[DIR...]", help_behavior_hint="")
     ] = ()
     """Recordings of the suite custom, in order of learning; one recording for regions."""
-    strategies: Annotated[str | None, arg(metavar="A,B", help_behavior_hint="")] = None
-    """Comma-separated strategies; the others are compared with the first. Defaults to those of
-    --rows, or to evercal,joint,finetune,er,sars_spdd."""
-    rows: Annotated[str | None, arg(metavar="NAME|FILE.json", help_behavior_hint="")] = None
-    """Strategies derived from others: table4, spdd-sweep, with-map, or your own file (see
-    `evercal.continual.benchmark.rows`)."""
+    strategies: Annotated[str, arg(metavar="A,B")] = "evercal,joint,finetune,er,sars_spdd"
+    """Comma-separated strategies; the others are compared with the first. table4 stands for those
+    of the paper's Table 4."""
     seeds: Annotated[str, arg(metavar="0,1")] = "0,1,2"
     """Comma-separated seeds; every strategy runs once with each."""
     order: Literal["given", "reversed", "shuffled", "balanced"] = "given"
@@ -89,18 +86,15 @@ class Bench:
 
     def run(self) -> int:
         """Run what is missing and print the tables."""
+        if Path(self.suite).is_dir():
+            return self._show(Path(self.suite))
         seeds = _numbers(self.seeds)
         from evercal.continual.benchmark.bench import BenchOptions
         from evercal.continual.learning.presets import short_side
-        from evercal.continual.networks.distributed import join_processes, rank, wait_for_all
         from evercal.continual.plugin import load_plugin
 
         if self.plugin is not None:
             load_plugin(self.plugin)
-        # Workers of a cluster have GPUs of their own.
-        device = self.device if self.ray else str(join_processes(self.device))
-        out = _own_folder(self.out)
-        wait_for_all()
         strategies = self._strategies()  # refused before recordings are read
         scenes = self._scenes()
         options = BenchOptions(
@@ -114,34 +108,42 @@ class Bench:
                 "poses": "sfm" if self.poses else "original",
                 "judged": "held-out training frames" if self.held_out else "test frames",
             },
-            device=device,
-            features=self.out.absolute() / "features",
+            device=self.device,
         )
-        for step in self._steps(scenes, options, out):
-            if rank() == 0:
-                print(_progress(step), file=sys.stderr if self.json else sys.stdout, flush=True)
-        return 0 if rank() else show_report(self.out, options.strategies[0].name, self.json)
+        for step in self._steps(scenes, options):
+            print(_progress(step), file=sys.stderr if self.json else sys.stdout, flush=True)
+        return self._show(self.out, strategies[0].name)
+
+    def _show(self, folder: Path, reference: str = "") -> int:
+        """Write tables and figure of a folder of results, and print the tables."""
+        from evercal.continual.benchmark import report, results
+        from evercal.continual.benchmark.comparison import LEGEND, summary
+
+        text = report.write_report(folder, reference or _words(self.strategies)[0])
+        if self.json:
+            print_json({"strategies": summary(results.read(folder))})
+            return 0
+        print(
+            f"{text}\n\n{LEGEND}\nwrote {folder / report.TABLES}, {report.LATEX}, {report.FIGURE}"
+        )
+        print_next("evercal", "bench", folder)
+        return 0
 
     def _strategies(self) -> "tuple[Strategy, ...]":
-        from evercal.continual.benchmark.rows import load_rows
+        from evercal.continual.benchmark.paper_tables import TABLE4
         from evercal.continual.strategies import strategy_named
 
-        names = self.strategies
-        if names is None:
-            names = "" if self.rows else "evercal,joint,finetune,er,sars_spdd"
-        named = [strategy_named(name) for name in _words(names)]
-        # Equal strategies run once. Different strategies of one name are refused later.
-        return tuple(dict.fromkeys((*named, *(load_rows(self.rows) if self.rows else ()))))
+        words = _words(self.strategies)
+        names = [name for word in words for name in (TABLE4 if word == "table4" else (word,))]
+        return tuple(strategy_named(name) for name in dict.fromkeys(names))
 
-    def _steps(
-        self, scenes: "list[Recording]", options: "BenchOptions", out: Path
-    ) -> "Iterator[Step]":
+    def _steps(self, scenes: "list[Recording]", options: "BenchOptions") -> "Iterator[Step]":
         from evercal.continual.benchmark.bench import run_bench
         from evercal.continual.benchmark.ray_runs import run_on_ray
 
         if self.ray is None:
-            return run_bench(scenes, options, out)
-        return run_on_ray(scenes, options, out, self.ray, self.plugin)
+            return run_bench(scenes, options, self.out)
+        return run_on_ray(scenes, options, self.out, self.ray, self.plugin)
 
     def _scenes(self) -> "list[Recording]":
         from evercal.continual.benchmark.suites import tuning_split
@@ -192,50 +194,14 @@ class Bench:
 
 def _progress(step: "Step") -> str:
     """Describe a stage: accuracy of each scene, under every name that the strategy is judged by."""
-    shares: dict[str, list[str]] = {}
-    for result in step.results:
-        part = f"{result.scene} {100 * result.accuracy():.1f}"
-        shares.setdefault(result.strategy, []).append(part)
-    names = [f"{name} seed {step.seed}: {', '.join(parts)}" for name, parts in shares.items()]
-    text = "; ".join(names) or f"{step.strategy} seed {step.seed}: no results before the last stage"
-    seconds = f" ({step.results[0].seconds:.0f} s)" if step.results else ""
-    return f"[{step.done}/{step.total}] {text} % within 5 cm, 5 deg{seconds}"
-
-
-def _own_folder(out: Path) -> Path:
-    """Return the folder in which this process works.
-
-    The first process works in `out`. A process that trains along has a folder whose results are not
-    used. It starts with a copy of what is complete, so that all processes run the same.
-
-    Raises:
-        InputError: The process does not see the files of the first one.
-    """
-    import atexit
-    import shutil
-    import socket
-    import tempfile
-
-    from evercal.continual.benchmark.results import RESULTS, SETTINGS
-    from evercal.continual.networks.distributed import of_first, rank
-
-    files = [out / SETTINGS, out / RESULTS, *(out / "runs").rglob("*")]
-    seen = sorted(str(file.relative_to(out)) for file in files if file.is_file())
-    if of_first(seen) != seen:
-        raise InputError(
-            f"{out}: process {rank()} on {socket.gethostname()} sees other files than the first"
-            " process; give --out on a file system that all machines share"
-        )
-    if rank() == 0:
-        return out
-    folder = Path(tempfile.mkdtemp(prefix="evercal-bench-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    for name in (SETTINGS, RESULTS):
-        if (out / name).exists():
-            shutil.copy(out / name, folder / name)
-    if (out / "runs").exists():
-        shutil.copytree(out / "runs", folder / "runs")
-    return folder
+    start = f"[{step.done}/{step.total}] "
+    if step.results.empty:
+        return f"{start}{step.strategy} seed {step.seed}: no results before the last stage"
+    shares = 100 * step.results["within_5cm_5deg"] / step.results["frames"]
+    parts = step.results["scene"] + shares.map(" {:.1f}".format)
+    names = parts.groupby(step.results["strategy"], sort=False).agg(", ".join)
+    text = "; ".join(f"{name} seed {step.seed}: {of}" for name, of in names.items())
+    return f"{start}{text} % within 5 cm, 5 deg ({step.results['seconds'].iloc[0]:.0f} s)"
 
 
 def _words(text: str) -> tuple[str, ...]:

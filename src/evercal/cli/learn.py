@@ -50,7 +50,7 @@ class Learn:
     gripper_from_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """A rough gripper_from_camera to compare the estimate with: 4x4 matrix or calibration file."""
     encoder: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Encoder weights from 'evercal pretrain', for a new store. Default: the shipped weights."""
+    """Encoder weights from 'python -m training', for a new store. Default: the shipped weights."""
     strategy: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """evercal builds a map; every other strategy trains a network. Default: that of the store."""
     reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
@@ -172,7 +172,6 @@ class Learn:
                 self.memory or "10%",
                 encoder,
                 self.device,
-                rough,
                 self.networks,
             )
             return learn_into_networks(request, recording, start, stream)

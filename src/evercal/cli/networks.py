@@ -13,7 +13,6 @@ from evercal.errors import InputError
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-    from evercal.geometry import SE3
     from evercal.learning.scene import LearnReport
     from evercal.recordings import Recording
 
@@ -52,7 +51,6 @@ class LearnRequest:
     memory: str
     encoder: Path | None
     device: str
-    gripper_from_camera: "SE3 | None"
     options: NetworkOptions
 
 
@@ -67,7 +65,7 @@ def learn_into_networks(
         start: a line to print when learning begins.
         stream: where the line goes.
     """
-    from evercal.continual.learning.learn_scene import NetworkLearnOptions, learn_networks
+    from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
 
     given = request.options
     if given.centres is not None and given.centres < 1:
@@ -80,7 +78,6 @@ def learn_into_networks(
         memory=request.memory,
         centres=given.centres,
         encoder=request.encoder,
-        gripper_from_camera=request.gripper_from_camera,
         device=request.device,
         seed=given.seed,
     )
@@ -132,7 +129,6 @@ class Bars:
 
     def event(self, event: object) -> None:
         """Show an event of network training."""
-        from evercal.continual.learning.learn_scene import MapProgress
         from evercal.continual.learning.stage import Encoding
         from evercal.continual.networks.trainer import Progress
 
@@ -142,8 +138,6 @@ class Bars:
             bar.set_postfix_str(text, refresh=event.step == event.total)
         elif isinstance(event, Encoding):
             self.step("encoding", event.done, event.total)
-        elif isinstance(event, MapProgress):
-            self.step(event.step, event.done, event.total)
 
     def _close(self) -> None:
         if self._bar is not None:

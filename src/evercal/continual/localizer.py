@@ -1,4 +1,4 @@
-"""Localization by networks: predicted scene coordinates and PnP, alone or beside a map."""
+"""Localization by networks: predicted scene coordinates and PnP."""
 
 import time
 from collections.abc import Sequence
@@ -14,15 +14,12 @@ from evercal.errors import InputError
 from evercal.features.device import device_of
 from evercal.features.encode import encode_image
 from evercal.features.precision import autocast
-from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.geometry import Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import cameras_in_scenes
-from evercal.localization.learned import LearnedLocalizer
-from evercal.localization.localizer import Localizer
 from evercal.localization.matching import strided_patches
-from evercal.localization.parallel import in_parallel
 from evercal.localization.pnp import PnpOptions, PnpResult, solve_pnp
-from evercal.localization.query import Candidate, Hypothesis, LocalizeOptions, Matches, Query
+from evercal.localization.query import Hypothesis, Matches, Query
 from evercal.recordings.images import as_rgb
 
 
@@ -43,12 +40,8 @@ class NetworkLocalizeOptions:
     answer for every image, scores all poses."""
 
 
-def open_networks(path: Path, device: str = "auto") -> LearnedLocalizer:
-    """A localizer for a store of networks.
-
-    Args:
-        path: folder of the store.
-        device: `auto` (a CUDA device if there is one), `cpu` or `cuda`.
+def open_networks(path: Path, device: str = "auto") -> "NetworkLocalizer":
+    """A localizer for a store of networks; `device` as for `device_of`.
 
     Raises:
         InputError: Not a store, an empty one, or a damaged file; no such device.
@@ -57,23 +50,7 @@ def open_networks(path: Path, device: str = "auto") -> LearnedLocalizer:
     scenes = NetworkStore.open(path).contents
     if not scenes.scenes:
         raise InputError(f"store {path}: no scene learned yet; run 'evercal learn' first")
-    return localizer_of(scenes.to(where))
-
-
-def localizer_of(
-    scenes: LearnedScenes, options: NetworkLocalizeOptions | None = None
-) -> LearnedLocalizer:
-    """The localizer for what a strategy learns: a map, networks, or both.
-
-    Args:
-        scenes: networks and scenes.
-        options: of networks without a map.
-    """
-    if not scenes.heads:
-        return Localizer(scenes.map_contents())
-    if scenes.scenes[-1].map is not None:
-        return HybridLocalizer(scenes)
-    return NetworkLocalizer(scenes, options)
+    return NetworkLocalizer(scenes.to(where))
 
 
 class NetworkLocalizer:
@@ -110,13 +87,6 @@ class NetworkLocalizer:
         assert best is not None, "at least one scene is tried"
         return self._answer(best, 1000 * (time.perf_counter() - began))
 
-    def localize_batch(
-        self, images: Sequence[np.ndarray], cameras: Sequence[Camera | None]
-    ) -> list[PoseEstimate]:
-        """`localize` for many images in parallel; the answers are the same to the last bit."""
-        pairs = list(zip(images, cameras, strict=True))
-        return list(in_parallel(lambda pair: self.localize(*pair), pairs))
-
     @property
     def _decides_scene(self) -> bool:
         """Whether the network itself decides the scene (condition `descriptor`)."""
@@ -142,18 +112,46 @@ class NetworkLocalizer:
         camera = cameras[scene]
         assert camera is not None, "only scenes whose camera fits are tried"
         small = camera.short_side_resized(self.contents.short_side)
-        matches, patches = predicted_matches(self.contents, query, scene, small, 1)
+        matches, patches = self._predicted(query, scene, small)
         rough = solve_pnp(matches.pixels, matches.points_m, small, self.options.pnp)
         if rough is None:
             return Hypothesis(scene)
         if self._decides_scene and not moved:
             other = self._scene_of(rough, scene)
+            if cameras[other] not in (None, camera):
+                # The pose lies in the cell of a scene with another camera: solve once more.
+                return self._hypothesis(query, other, cameras, moved=True)
             if other != scene:
-                if cameras[other] not in (None, camera):
-                    # The pose lies in the cell of a scene with another camera: solve once more.
-                    return self._hypothesis(query, other, cameras, moved=True)
-                return _moved(rough, matches, patches, self.contents.scenes, scene, other)
-        return _from_pnp(rough, matches, patches, scene)
+                cells = [self.contents.scenes[i].cell.atlas_from_base for i in (other, scene)]
+                across = cells[0].inverse() @ cells[1]
+                rough = PnpResult(across @ rough.pose, rough.inliers)
+                matches = Matches(matches.pixels, across.apply(matches.points_m))
+                scene = other
+        return Hypothesis(
+            scene,
+            rough.pose,
+            pixels=matches.pixels[rough.inliers],
+            points_m=matches.points_m[rough.inliers],
+            expected=patches,
+        )
+
+    @torch.inference_mode()
+    def _predicted(self, query: Query, scene: int, camera: Camera) -> tuple[Matches, int]:
+        """Scene coordinates of patches in a scene's base frame, and the number of patches.
+
+        The camera is at the encoder's working size.
+        """
+        scenes = self.contents
+        patches, pixels = strided_patches(query, camera, scenes.encoder.stride, 1)
+        head, local = scenes.head_for(scene)
+        features = query.features.flatten(1).T.to(head.device)
+        descriptor = scenes.descriptor(query.features[None])[0].to(head.device)
+        with autocast(head.device):
+            output = head(features, local, descriptor.expand(len(features), -1))
+        points = output.points.cpu().double().numpy()
+        points = scenes.scenes[scene].cell.atlas_from_base.inverse().apply(points)[patches]
+        valid = np.isfinite(points).all(1)
+        return Matches(pixels[valid], points[valid]), len(patches)
 
     def _scene_of(self, rough: PnpResult, scene: int) -> int:
         """The scene in whose cell of the atlas a pose lies."""
@@ -203,61 +201,6 @@ class NetworkLocalizer:
         return "ok", ""
 
 
-class HybridLocalizer(Localizer):
-    """A map's localizer whose first pose also uses the points that a network predicts.
-
-    Args:
-        scenes: networks and scenes with maps.
-        options: effort and thresholds.
-    """
-
-    def __init__(self, scenes: LearnedScenes, options: LocalizeOptions | None = None):
-        super().__init__(scenes.map_contents(), options)
-        self.networks = scenes
-        for head in scenes.heads:
-            head.eval()
-
-    def _matches(
-        self, query: Query, candidate: Candidate, camera: Camera, near: SE3 | None
-    ) -> Matches:
-        """Matches to keyframes and predicted points, at the encoder's working size."""
-        matched = super()._matches(query, candidate, camera, near)
-        stride = candidate.match_stride if self.options.align else 1
-        predicted, _ = predicted_matches(self.networks, query, candidate.scene, camera, stride)
-        return Matches(
-            np.concatenate([matched.pixels, predicted.pixels]),
-            np.concatenate([matched.points_m, predicted.points_m]),
-        )
-
-
-@torch.inference_mode()
-def predicted_matches(
-    scenes: LearnedScenes, query: Query, scene: int, camera: Camera, stride: int
-) -> tuple[Matches, int]:
-    """Scene coordinates that the network predicts for patches of an image.
-
-    Args:
-        scenes: with the networks.
-        query: the image.
-        scene: index of the scene.
-        camera: intrinsics of the image at the encoder's working size.
-        stride: every n-th row and column of patches.
-
-    Returns:
-        Matches in the scene's base frame, and the number of patches.
-    """
-    patches, pixels = strided_patches(query, camera, scenes.encoder.stride, stride)
-    head, local = scenes.head_for(scene)
-    features = query.features.flatten(1).T.to(head.device)
-    descriptor = scenes.descriptor(query.features[None])[0].to(head.device)
-    with autocast(head.device):
-        output = head(features, local, descriptor.expand(len(features), -1))
-    points = output.points.cpu().double().numpy()
-    points = scenes.scenes[scene].cell.atlas_from_base.inverse().apply(points)[patches]
-    valid = np.isfinite(points).all(1)
-    return Matches(pixels[valid], points[valid]), len(patches)
-
-
 def _fitting_cameras(
     camera: Camera | None, image: np.ndarray, scenes: Sequence[SceneRecord]
 ) -> list[Camera | None]:
@@ -291,29 +234,3 @@ def _fitting_cameras(
 
 def _support(hypothesis: Hypothesis) -> float:
     return hypothesis.inlier_ratio * hypothesis.inliers**0.5
-
-
-def _from_pnp(rough: PnpResult, matches: Matches, patches: int, scene: int) -> Hypothesis:
-    inliers = rough.inliers
-    return Hypothesis(
-        scene,
-        rough.pose,
-        pixels=matches.pixels[inliers],
-        points_m=matches.points_m[inliers],
-        expected=patches,
-    )
-
-
-def _moved(
-    rough: PnpResult,
-    matches: Matches,
-    patches: int,
-    records: Sequence[SceneRecord],
-    source: int,
-    target: int,
-) -> Hypothesis:
-    """Move a pose from the base frame of one scene into that of another."""
-    across = records[target].cell.atlas_from_base.inverse() @ records[source].cell.atlas_from_base
-    pose: UncertainPose = across @ rough.pose
-    moved = Matches(matches.pixels, across.apply(matches.points_m))
-    return _from_pnp(PnpResult(pose, rough.inliers), moved, patches, target)

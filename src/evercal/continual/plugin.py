@@ -9,10 +9,7 @@ from evercal.errors import InputError
 
 
 def load_plugin(path: Path) -> tuple[str, ...]:
-    """Run a Python file and add its strategies to `STRATEGIES`.
-
-    Args:
-        path: File that defines a dict `STRATEGIES` from names to `Strategy` records.
+    """Run a Python file and add the strategies of its dict `STRATEGIES` (name -> Strategy).
 
     Returns:
         The added names.
@@ -20,10 +17,8 @@ def load_plugin(path: Path) -> tuple[str, ...]:
     Raises:
         InputError: The file is missing, fails, defines no such dict, or reuses a name.
     """
-    if not path.is_file():
-        raise InputError(f"plugin {path}: no such file")
     spec = importlib.util.spec_from_file_location(f"evercal_plugin_{path.stem}", path)
-    if spec is None or spec.loader is None:
+    if not path.is_file() or spec is None or spec.loader is None:
         raise InputError(f"plugin {path}: not a Python file; give one that ends in .py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses and pickle look up the module

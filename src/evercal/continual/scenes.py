@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
@@ -18,7 +18,6 @@ from evercal.features.encoder import Encoder
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
-from evercal.mapping.scene_map import MapContents, SceneMap
 
 MAX_PROTOTYPES = 256
 
@@ -43,20 +42,16 @@ class SceneRecord:
     """Poses with a smaller inlier ratio are rejected; fitted to held-out training frames."""
     covariance_scale: float = 1.0
     """Factor on covariances, fitted to held-out training frames."""
-    map: SceneMap | None = None
-    """The map of the scene, for strategies that build one."""
 
     @property
     def adjusted_camera(self) -> Camera:
         """Intrinsics for images of the camera that recorded the scene."""
-        if self.map is not None:
-            return self.map.adjusted_camera
         return self.refined_camera or self.camera
 
     @property
     def frame(self) -> MapFrame:
-        """Relation of its scene points to the base frame."""
-        return MapFrame() if self.map is None else self.map.frame
+        """Relation of its scene points to the base frame: none, networks learn stated poses."""
+        return MapFrame()
 
 
 @dataclass
@@ -72,7 +67,7 @@ class LearnedScenes:
     short_side: int
     """Working size of images, pixels."""
     heads: list[Head] = field(default_factory=list)
-    """One head, or one per scene; empty for strategies without a network."""
+    """One head, or one per scene."""
     scenes: list[SceneRecord] = field(default_factory=list)
     """In order of arrival; the index is the scene index of head and atlas."""
     keyframes: list[Keyframes | None] = field(default_factory=list)
@@ -105,17 +100,8 @@ class LearnedScenes:
             value.nbytes for state in self.method_states for value in state.values()
         )
 
-    def map_contents(self) -> MapContents:
-        """The maps of all scenes, for strategies that build them."""
-        maps = [record.map for record in self.scenes if record.map is not None]
-        return MapContents(self.encoder, self.short_side, maps)
-
     def atlas(self, grid_scenes: int = 0) -> Atlas:
-        """Cells of the scenes learned so far.
-
-        Args:
-            grid_scenes: of the paper's layout; 0 for the open one.
-        """
+        """Cells of the scenes learned so far; `grid_scenes` of the paper's layout, 0: open."""
         atlas = Atlas("paper", grid_scenes) if grid_scenes else Atlas()
         atlas.cells = [record.cell for record in self.scenes]
         return atlas
@@ -126,18 +112,14 @@ class LearnedScenes:
             return self.heads[0], scene
         return self.heads[scene], 0
 
-    def copy_for_training(self) -> "LearnedScenes":
+    def copy_for_training(self) -> Self:
         """A copy whose heads can be trained without changing these."""
-        return LearnedScenes(
-            self.encoder,
-            self.descriptor,
-            self.strategy,
-            self.short_side,
-            copy.deepcopy(self.heads),
-            list(self.scenes),
-            list(self.keyframes),
-            list(self.method_states),
-            self.cache,
+        return replace(
+            self,
+            heads=copy.deepcopy(self.heads),
+            scenes=list(self.scenes),
+            keyframes=list(self.keyframes),
+            method_states=list(self.method_states),
         )
 
 

@@ -1,21 +1,15 @@
-"""Strategies by name; a strategy is a method that trains the network, a map, or both."""
+"""Strategies by name."""
 
 from dataclasses import dataclass
 
-from evercal.continual.methods.controls import FineTuning, Isolation
-from evercal.continual.methods.gradient_constraints import AveragedGem, EpisodicConstraint, Gem
+from evercal.continual.methods.ewc import ElasticWeightConsolidation
+from evercal.continual.methods.gec import EpisodicConstraint
 from evercal.continual.methods.learning_without_forgetting import LearningWithoutForgetting
-from evercal.continual.methods.method import Method, described
+from evercal.continual.methods.method import FineTuning, Isolation, Method, described
 from evercal.continual.methods.mir import MaximallyInterferedRetrieval
 from evercal.continual.methods.penalties import BoundedByTeacher, Distillation, OldOutput, Relations
 from evercal.continual.methods.preconditioning import PreconditionedReplay
-from evercal.continual.methods.projection import GradientProjectionMemory
-from evercal.continual.methods.replay import DarkExperienceReplay, Replay
-from evercal.continual.methods.weight_regularization import (
-    ElasticWeightConsolidation,
-    MemoryAwareSynapses,
-    SynapticIntelligence,
-)
+from evercal.continual.methods.replay import Replay
 from evercal.errors import InputError
 
 
@@ -26,9 +20,7 @@ class Strategy:
     name: str
     """Name in stores and results."""
     method: Method | None = None
-    """Method that trains the network; None for a map alone."""
-    builds_map: bool = False
-    """Whether a map with landmarks is built from the keyframes."""
+    """Method that trains the network; None for a map."""
     jointly: bool = False
     """Whether all scenes are trained at once, as a reference for the others."""
     source: str = ""
@@ -43,25 +35,18 @@ class Strategy:
         """Convert to plain data: method with hyper-parameters, map, joint training."""
         method = None if self.method is None else described(self.method)
         jointly = {"jointly": True} if self.jointly else {}
-        return {"method": method, "map": self.builds_map, **jointly}
+        return {"method": method, "map": self.method is None, **jointly}
 
 
 # Settings with the best mean over the suites of `benchmarks tune`; see docs/methods.md.
 _ALL = (
     Strategy(
         "evercal",
-        builds_map=True,
         source="this project: a map of keyframes and sub-pixel landmarks, nothing trained",
     ),
     Strategy("evercal_network", PreconditionedReplay()),
-    Strategy("evercal_hybrid", PreconditionedReplay(), builds_map=True),
     Strategy("finetune", FineTuning()),
     Strategy("er", Replay(weight=0.3)),
-    Strategy(
-        "hybrid",
-        Replay("hybrid", weight=0.3),
-        source="Bahadir et al., continual hand-eye calibration, Mach. Vis. Appl. 2024 (abstract)",
-    ),
     Strategy(
         "icarl",
         Replay("herding", OldOutput()),
@@ -83,21 +68,13 @@ _ALL = (
         source="Aljundi et al., Gradient based sample selection, NeurIPS 2019",
     ),
     Strategy("mir", MaximallyInterferedRetrieval(weight=0.3)),
-    Strategy("der", DarkExperienceReplay(weight=0.3)),
     Strategy(
         "co2l",
         Replay("reservoir", Relations()),
         source="Cha et al., Co2L's relation distillation, ICCV 2021, ported to points",
     ),
-    Strategy("agem", AveragedGem(clamp_px=100.0)),
-    Strategy("gem", Gem()),
     Strategy("gec", EpisodicConstraint()),
-    Strategy("gec_moving", EpisodicConstraint(moving=True, alpha=32.0)),
     Strategy("ewc", ElasticWeightConsolidation()),
-    Strategy("ewc_online", ElasticWeightConsolidation(running=True)),
-    Strategy("si", SynapticIntelligence()),
-    Strategy("mas", MemoryAwareSynapses()),
-    Strategy("gpm", GradientProjectionMemory()),
     Strategy("lwf", LearningWithoutForgetting()),
     Strategy(
         "sars_spdd",
@@ -114,15 +91,23 @@ _ALL = (
         Replay("sars_filled", Distillation()),
         source="the same with the largest radius that fills the memory",
     ),
+    Strategy(
+        "reservoir_spdd",
+        Replay("reservoir", Distillation()),
+        source="Li et al., SPDD on a reservoir of frames",
+    ),
+    Strategy(
+        "sars_old_output",
+        Replay("sars", OldOutput()),
+        source="Li et al., SARS with the distillation of iCaRL",
+    ),
+    Strategy(
+        "sars_reprojection",
+        Replay("sars", weight=0.3),
+        source="Li et al., SARS with reprojection alone",
+    ),
     Strategy("isolation", Isolation()),
     Strategy("joint", FineTuning(), jointly=True, source="all frames of all scenes at once"),
-    Strategy(
-        "joint_map",
-        FineTuning(),
-        builds_map=True,
-        jointly=True,
-        source="all frames of all scenes at once, beside the map",
-    ),
 )
 STRATEGIES: dict[str, Strategy] = {strategy.name: strategy for strategy in _ALL}
 

@@ -19,7 +19,7 @@ ACCEPTANCE_FRACTION = 1 / 6
 
 
 def fit_threshold(scenes: LearnedScenes, held_out: Sequence[Frame], index: int = -1) -> SceneRecord:
-    """Fit the inlier threshold and covariance scale of a scene.
+    """Fit the inlier threshold and covariance scale of a scene, by default the newest.
 
     Positives are held-out training frames; negatives are views of box rooms that were never
     learned. The threshold lies a sixth of the way from the 95 % quantile of the negatives to the
@@ -27,13 +27,8 @@ def fit_threshold(scenes: LearnedScenes, held_out: Sequence[Frame], index: int =
     have fewer inliers. The scale gives well-located frames the median squared Mahalanobis error of
     six Gaussian dimensions.
 
-    Args:
-        scenes: with the scene.
-        held_out: training frames that were held out.
-        index: of the scene; the newest by default.
-
     Returns:
-        The record with its threshold and scale.
+        The scene's record with its threshold and scale.
     """
     # A threshold that was fitted before must not count twice.
     records = list(scenes.scenes)
@@ -63,7 +58,6 @@ def fit_threshold(scenes: LearnedScenes, held_out: Sequence[Frame], index: int =
 
 @lru_cache(maxsize=4)
 def _negative_views(width: int, height: int) -> list[np.ndarray]:
-    """Views of rooms that are in no scene."""
     plain, images = default_camera(width, height), []
     for seed in range(NEGATIVE_ROOM_SEED, NEGATIVE_ROOM_SEED + 4):
         room = BoxRoom(seed, texture_px=192)

@@ -1,6 +1,6 @@
 """The frozen local encoder: one feature vector for every cell of 8x8 pixels.
 
-The shipped weights are trained on procedural images alone (`evercal pretrain`). Weight files in
+The shipped weights are trained on procedural images alone (`python -m training`). Weight files in
 ACE's published layout can be read, too, and any module with `stride` and `width` can be used.
 """
 
@@ -217,7 +217,7 @@ def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
     """Load an encoder for inference.
 
     Args:
-        path: a safetensors file of `evercal pretrain`, or ACE's published weight file, a torch
+        path: a safetensors file of `training`, or ACE's published weight file, a torch
             state dict that is read with `weights_only`. Default: the shipped encoder.
 
     Raises:
@@ -246,7 +246,7 @@ def ace_encoder_from_state(state: object, name: str) -> AceEncoder:
     if not isinstance(state, dict) or "res2_skip.weight" not in state:
         raise InputError(
             f"encoder {name}: not ACE's layout (no tensor 'res2_skip.weight'); "
-            "use ACE's published encoder file or a file of 'evercal pretrain'"
+            "use ACE's published encoder file or a file of 'python -m training'"
         )
     shape = getattr(state["res2_skip.weight"], "shape", ())
     encoder = AceEncoder(int(shape[0]) if len(shape) == 4 else 512)

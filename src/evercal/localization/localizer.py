@@ -345,7 +345,7 @@ class Localizer:
         small = now.short_side_resized(self.contents.short_side)
         where = None if near is None or near.pose is None else near.pose.pose
         sigma = self._prior(query, candidate)
-        matches = matches or self._matches(query, candidate, small, where)
+        matches = matches or self._matcher.matches(query, candidate, small, where)
         best: _Rough | None = None
         for factor in FOCAL_FACTORS if sigma is UNKNOWN and near is None else (1.0,):
             tried = small.zoomed(factor)
@@ -353,12 +353,6 @@ class Localizer:
             if found and (best is None or found.inliers.sum() > best.pnp.inliers.sum()):
                 best = _Rough(matches, found, change + np.log(factor) * _ALONG_FOCAL)
         return best
-
-    def _matches(
-        self, query: Query, candidate: Candidate, camera: Camera, near: SE3 | None
-    ) -> Matches:
-        """2D-3D matches in one scene, at the encoder's working size."""
-        return self._matcher.matches(query, candidate, camera, near)
 
     def _settled(
         self, query: Query, best: Hypothesis, cameras: Sequence[Camera]

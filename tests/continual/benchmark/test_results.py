@@ -1,77 +1,95 @@
-"""Result lines survive a round trip, and an interruption costs at most the last line."""
+"""Rows survive a round trip, and an interruption costs at most the last line."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from evercal.continual.benchmark.results import RESULTS, SceneResult, append, read
+from evercal.continual.benchmark.results import (
+    FRAMES,
+    RESULTS,
+    StageResults,
+    append,
+    frame_row,
+    read,
+    read_frames,
+    run_of,
+    scene_row,
+)
 from evercal.errors import InputError
+from evercal.evaluation.metrics import CHI2_6
+
+from .results_by_hand import OURS, frame
+
+RUN = {"strategy": "er", "seed": 0}
+FIRST, LAST = OURS[:1], OURS[1:3]
+TESTS = pd.DataFrame([{**RUN, **frame_row(frame("b", str(i), 0.01 * i))} for i in range(3)])
 
 
-def result(stage: int = 0, scene: str = "a", **changed: object) -> SceneResult:
-    fields: dict[str, object] = {
-        "strategy": "evercal",
-        "seed": 0,
-        "stage": stage,
-        "scene": scene,
-        "frames": ("f1", "f2", "f3"),
-        "translation_m": (0.01, math.inf, 0.05),
-        "rotation_rad": (0.02, math.inf, 0.001),
-        "wrong_scene": (False, True, False),
-        "near_training_frame": (True, False, False),
-        "seconds": 1.5,
-        "memory_bytes": 10,
-        "head_bytes": 20,
-        "frames_kept": 3,
-    }
-    return SceneResult(**{**fields, **changed})  # pyright: ignore[reportArgumentType]
+def stage(number: int) -> StageResults:
+    return StageResults(number, (FIRST, LAST)[number], TESTS if number else TESTS[:0])
 
 
 def test_results_round_trip(tmp_path: Path) -> None:
-    assert read(tmp_path) == []
-    covered = result(
-        keyframe_positions_m=((0.5, 1.0, -2.0), (1.5, 0.0, 0.25)), covering_radius=0.75
-    )
-    append(tmp_path, [result()])
-    append(tmp_path, [result(1, "b"), covered])
-    assert read(tmp_path) == [result(), result(1, "b"), covered]
+    assert read(tmp_path).empty
+    assert read_frames(tmp_path).empty
+    append(tmp_path, stage(0))
+    append(tmp_path, stage(1))
+    pd.testing.assert_frame_equal(read(tmp_path), OURS[:3].reset_index(drop=True))
+    pd.testing.assert_frame_equal(read_frames(tmp_path), TESTS)
+    assert len(run_of(read(tmp_path), "ours", 0)) == 3
+    assert run_of(read(tmp_path), "ours", 1).empty
 
 
-def test_squared_errors_round_trip_if_there_are_any(tmp_path: Path) -> None:
-    squared = (3.25, math.nan, math.nan)
-    with_squared = result(squared_mahalanobis=squared, wrong_scene=(False, False, False))
-    append(tmp_path, [with_squared, result()])
-    first, second = read(tmp_path)
-    assert first.squared_mahalanobis[0] == 3.25
-    assert np.isnan(first.squared_mahalanobis[1:]).all()
-    assert first.refused.tolist() == [False, True, False]
-    assert second.squared_mahalanobis == ()
-    assert "squared" not in (tmp_path / RESULTS).read_text().splitlines()[1]
+def test_compressed_files_are_read(tmp_path: Path) -> None:
+    TESTS.to_csv(tmp_path / f"{FRAMES}.gz", index=False)
+    pd.testing.assert_frame_equal(read_frames(tmp_path), TESTS)
 
 
 @pytest.mark.parametrize("cut", [1, 40])
-def test_incomplete_last_line_is_removed(tmp_path: Path, cut: int) -> None:
-    append(tmp_path, [result(), result(1)])
+def test_incomplete_last_line_is_removed_and_written_again(tmp_path: Path, cut: int) -> None:
+    append(tmp_path, stage(0))
+    append(tmp_path, stage(1))
     path = tmp_path / RESULTS
     path.write_bytes(path.read_bytes()[:-cut])
-    assert read(tmp_path) == [result()]
-    append(tmp_path, [result(1)])
-    assert read(tmp_path) == [result(), result(1)]
+    assert len(read(tmp_path)) == 2
+    append(tmp_path, stage(1))
+    assert len(read(tmp_path)) == 3
+    assert len(read_frames(tmp_path)) == 3, "frames are not doubled"
 
 
-@pytest.mark.parametrize("line", ["nonsense", "[1]", '{"strategy": "evercal"}'])
-def test_invalid_line_is_refused(tmp_path: Path, line: str) -> None:
-    append(tmp_path, [result()])
-    with open(tmp_path / RESULTS, "a", encoding="utf-8") as file:
-        file.write(line + "\n")
-    with pytest.raises(InputError, match=r"results\.jsonl: line 2 is not a result"):
+def test_other_tables_are_refused(tmp_path: Path) -> None:
+    (tmp_path / RESULTS).write_text("strategy,seed\ner,0\n")
+    with pytest.raises(InputError, match=r"results\.csv: no columns environment, frames"):
         read(tmp_path)
 
 
-def test_correct_frames_are_strictly_below_both_thresholds() -> None:
-    assert result().correct((0.05, 1.0)).tolist() == [True, False, False]
-    assert result().correct((0.06, 1.0)).tolist() == [True, False, True]
-    assert result().correct((0.06, 0.01)).tolist() == [False, False, True]
-    assert not np.any(result().correct((math.inf, 0.0)))
+def test_frames_are_counted_strictly_below_both_thresholds() -> None:
+    frames = [frame("a", "0", 0.049), frame("a", "1", 0.05), frame("a", "2", math.inf)]
+    frames.append(replace(frame("a", "3", 0.001), rotation_error_rad=math.radians(5)))
+    row = scene_row(frames)
+    assert (row["frames"], row["within_5cm_5deg"], row["within_10cm_10deg"]) == (4, 1, 3)
+    assert row["median_mm"] == 50.0
+    assert (row["wrong_scene"], row["refused"]) == (1, 0)
+    # 75.5 %, 75 %, nothing and 99.5 % of the area to 20 cm
+    assert row["area_20cm"] == pytest.approx(62.5)
+
+
+def test_outcomes_of_frames_add_up_to_those_of_the_scene() -> None:
+    refused = replace(frame("a", "3", math.inf), status="unknown_scene", found_scene=None)
+    frames = [
+        frame("a", "0", 0.01, CHI2_6 - 0.1),
+        frame("a", "1", 0.01, CHI2_6 + 0.1),
+        frame("a", "2", math.inf),
+        refused,
+        frame("a", "4", 0.01),
+    ]
+    outcomes = [frame_row(each)["outcome"] for each in frames]
+    assert outcomes == ["inside", "outside", "wrong scene", "refused", "no covariance"]
+    row = scene_row(frames)
+    counts = [row[key] for key in ("wrong_scene", "refused", "with_covariance", "inside_95")]
+    assert counts == [1, 1, 2, 1]
+    assert np.isinf(frame_row(refused)["error_mm"])  # pyright: ignore[reportArgumentType]

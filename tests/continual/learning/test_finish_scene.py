@@ -12,28 +12,26 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.learning.finish_scene import memory_bytes
-from evercal.continual.learning.learn import learn
 from evercal.continual.learning.stage import StageOptions
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.scenes import LearnedScenes
 from evercal.continual.selection.frame_statistics import FrameStatistics
 from evercal.continual.store import NetworkStore
-from evercal.continual.strategies import STRATEGIES, Strategy
+from evercal.continual.strategies import Strategy
 from evercal.recordings.frame import stated_poses
 
 from ..stages import (
     EmptyScenes,
     MakeStore,
     Rooms,
-    assert_same,
+    learn,
     outcome,
     second_stage,
     weights,
 )
 
-STATEFUL = ["gec", "der", "ewc", "ewc_online", "si", "mas", "gpm"]
+STATEFUL = ["gec", "ewc"]
 
 
 @dataclass(frozen=True)
@@ -77,10 +75,8 @@ def test_arguments_of_a_method(
         if start.teacher is not None:
             before = weights(heads[number - 1])
             assert all(torch.equal(v, before[k]) for k, v in weights(start.teacher).items())
-        assert (end.number, end.keyframes) == (number, 2)
-        assert [float(state["number"]) for state in end.earlier[:number]] == list(range(number))
+        assert end.number == number
         assert end.rows().views == 60
-        assert end.hooks is not None
         # These rows are replayed in the next stage, to the last digit.
         remembered = end.remembered().tensors
         for later in method.starts[number + 1 :]:
@@ -118,35 +114,10 @@ def test_states_are_stored_and_count_as_memory(
         assert torch.equal(stored[key], value)
 
 
-def test_only_states_that_later_stages_read_count_as_memory(
+def test_states_change_the_next_stage(
     first_stages: dict[str, LearnedScenes], rooms: Rooms, quick: StageOptions
 ) -> None:
-    """EWC reads the state of every scene, methods with a running sum only the newest."""
-    sizes = {}
-    for name in ("ewc", "ewc_online", "si", "mas", "gpm"):
-        strategy = STRATEGIES[name]
-        second = outcome(second_stage(first_stages[name], rooms, quick))
-        states = [sum(v.nbytes for v in state.values()) for state in second.method_states]
-        sizes[name] = memory_bytes(second, strategy) / states[-1]
-        assert memory_bytes(first_stages[name], strategy) == first_stages[name].memory_bytes
-        if name == "ewc":
-            continue
-        assert memory_bytes(second, strategy) == states[-1]
-        without = second.copy_for_training()
-        without.method_states[0] = {}
-        third, again = (
-            outcome(learn(scenes, strategy, rooms[2], quick)) for scenes in (second, without)
-        )
-        assert_same(weights(third.heads[0]), weights(again.heads[0]))
-    assert sizes.pop("ewc") > 1.8  # the head has grown a little
-    assert set(sizes.values()) == {1.0}
-
-
-@pytest.mark.parametrize("name", ["ewc", "ewc_online", "si", "mas", "gpm", "der"])
-def test_states_change_the_next_stage(
-    name: str, first_stages: dict[str, LearnedScenes], rooms: Rooms, quick: StageOptions
-) -> None:
-    changed = first_stages[name].copy_for_training()
+    changed = first_stages["ewc"].copy_for_training()
 
     def random(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
         generator = torch.Generator().manual_seed(1)
@@ -155,7 +126,7 @@ def test_states_change_the_next_stage(
     changed.method_states = [random(state) for state in changed.method_states]
     heads = [
         outcome(second_stage(scenes, rooms, quick)).heads[0]
-        for scenes in (first_stages[name], changed)
+        for scenes in (first_stages["ewc"], changed)
     ]
     key = "first.1.weight"
     assert not torch.allclose(weights(heads[0])[key], weights(heads[1])[key], atol=1e-5)

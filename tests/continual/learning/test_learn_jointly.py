@@ -8,37 +8,27 @@ from itertools import groupby
 import pytest
 import torch
 
-from evercal.continual.learning.learn_jointly import learn_jointly
-from evercal.continual.learning.stage import Encoding, Event, Stage, StageOptions
+from evercal.continual.learning.learn import learn_jointly
+from evercal.continual.learning.stage import Encoding, StageOptions
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.strategies import STRATEGIES
 from evercal.recordings.frame import stated_poses
 
-from ..stages import EmptyScenes, Rooms, finished, outcome, weights
-
-JOINT = STRATEGIES["joint"]
+from ..stages import EmptyScenes, Rooms, weights
 
 
 @pytest.fixture(scope="module")
-def events(empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions) -> list[Event]:
-    """Events of three rooms."""
-    return list(learn_jointly(empty_scenes("joint"), JOINT, rooms, quick))
-
-
-@pytest.fixture(scope="module")
-def scenes(events: list[Event]) -> LearnedScenes:
-    return outcome(events)
-
-
-def test_steps_are_those_of_three_stages(events: list[Event]) -> None:
+def scenes(empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions) -> LearnedScenes:
+    """Three rooms, learned with the steps of three stages."""
+    events: list[Encoding | Progress] = []
+    stage = learn_jointly(empty_scenes("joint"), rooms, quick, events.append)
     kinds = [kind for kind, _ in groupby(type(event) for event in events)]
-    assert kinds == [Encoding, Progress, Stage]
+    assert kinds == [Encoding, Progress]
     steps = [event.step for event in events if isinstance(event, Progress)]
     assert steps == list(range(1, 3 * 8 + 1))
-    last = finished(events)
-    assert (last.iterations, last.frames_kept) == (24, 0)
+    assert (stage.iterations, stage.frames_kept) == (24, 0)
+    return stage.scenes
 
 
 @pytest.mark.parametrize(("count", "rows"), [(1, 64), (2, 96), (3, 96)])
@@ -61,7 +51,7 @@ def test_steps_have_the_rows_of_learning_and_replay(
 
     monkeypatch.setattr(Head, "forward", recorded)
     short = replace(quick, fit=replace(quick.fit, iterations=2))
-    list(learn_jointly(empty_scenes("joint"), JOINT, rooms[:count], short))
+    learn_jointly(empty_scenes("joint"), rooms[:count], short)
     assert len(batches) == 2 * count
     for batch in batches:
         assert torch.bincount(batch, minlength=count).tolist() == [rows // count] * count
@@ -90,27 +80,12 @@ def test_every_scene_is_trained(
 ) -> None:
     empty = empty_scenes("joint")
     untrained = replace(quick, fit=replace(quick.fit, iterations=0))
-    start = outcome(learn_jointly(empty, JOINT, rooms, untrained))
+    start = learn_jointly(empty, rooms, untrained).scenes
     assert empty.scenes == empty.heads == []
     change = scenes.heads[0].code - start.heads[0].code
     assert bool((change.abs().amax((1, 2)) > 1e-4).all())
     # The whitening is fitted to the rows of all scenes before the first step.
     for name in ("feature_mean", "feature_map"):
         assert torch.equal(weights(start.heads[0])[name], weights(scenes.heads[0])[name])
-    one = outcome(learn_jointly(empty_scenes("joint"), JOINT, rooms[:1], untrained))
+    one = learn_jointly(empty_scenes("joint"), rooms[:1], untrained).scenes
     assert not torch.equal(one.heads[0].feature_mean, start.heads[0].feature_mean)
-
-
-def test_joint_map_also_builds_maps(
-    empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions
-) -> None:
-    short = replace(quick, fit=replace(quick.fit, iterations=1))
-    empty, strategy = empty_scenes("joint_map"), STRATEGIES["joint_map"]
-    scenes = outcome(learn_jointly(empty, strategy, rooms[:2], short))
-    for record, keyframes in zip(scenes.scenes, scenes.keyframes, strict=True):
-        assert keyframes is not None
-        assert len(keyframes) == 3
-        assert record.map is not None
-        assert record.map.landmarks == sum(map(len, keyframes.landmarks)) > 0
-        assert record.refined_camera is None
-    assert scenes.memory_bytes == sum(k.bytes for k in scenes.keyframes if k is not None)

@@ -1,4 +1,4 @@
-"""`learn_networks`: its report, what it refuses, and how an interrupted call continues."""
+"""`learn_networks`: its report, what it refuses, and what a killed call leaves."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pickle
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -16,14 +16,12 @@ import pytest
 import torch
 
 from evercal.continual import threshold
-from evercal.continual.learning import stage_rows
-from evercal.continual.learning.learn_scene import MapProgress, NetworkLearnOptions, learn_networks
+from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
 from evercal.continual.learning.stage import Encoding, StageOptions
-from evercal.continual.localizer import HybridLocalizer, open_networks
+from evercal.continual.localizer import open_networks
 from evercal.continual.networks.trainer import Progress
-from evercal.continual.store import Checkpoint, NetworkStore, head_bytes
+from evercal.continual.store import NetworkStore, head_bytes
 from evercal.errors import InputError
-from evercal.geometry import SE3
 from evercal.learning.scene import LearnReport
 from evercal.recordings import generic
 
@@ -61,13 +59,6 @@ def learned(
     return Learned(root, reports, events)
 
 
-@pytest.fixture
-def untimed(tree: Tree) -> Tree:
-    """Checksums of a store without the files that contain durations."""
-    timed = ("manifest.json", "report.json")
-    return lambda root: {k: sha for k, sha in tree(root).items() if not k.endswith(timed)}
-
-
 def test_reports_describe_the_store(learned: Learned) -> None:
     store = NetworkStore.open(learned.root)
     contents = store.contents
@@ -88,24 +79,7 @@ def test_reports_describe_the_store(learned: Learned) -> None:
     first, last = learned.reports
     assert first.memory_bytes < last.memory_bytes == contents.memory_bytes
     assert last.head_bytes == head_bytes(contents.heads[0])
-    assert {type(event) for event in learned.events} == {Encoding, Checkpoint, Progress}
-    assert not (learned.root / "learning").exists()
-
-
-def test_hybrid_also_builds_a_map(
-    rooms: Rooms, options: NetworkLearnOptions, tmp_path: Path
-) -> None:
-    root, events = tmp_path / "store", []
-    hybrid = replace(options, strategy="evercal_hybrid")
-    report = learn_networks(root, rooms[0], hybrid, events.append)
-    assert MapProgress in {type(event) for event in events}
-    record = NetworkStore.open(root).contents.scenes[0]
-    assert record.map is not None
-    assert report.landmarks == record.map.landmarks > 0
-    assert report.min_support == record.map.min_support > 0
-    assert report.adjusted is not None
-    assert report.iterations == 8
-    assert isinstance(open_networks(root, "cpu"), HybridLocalizer)
+    assert {type(event) for event in learned.events} == {Encoding, Progress}
 
 
 def test_bad_input_is_refused_and_leaves_the_store_unchanged(
@@ -121,6 +95,7 @@ def test_bad_input_is_refused_and_leaves_the_store_unchanged(
         (gamma, {"strategy": "finetune"}, r"'finetune'.*'evercal_network'"),
         (gamma, {"strategy": "nonsense"}, "'nonsense'"),
         (gamma, {"strategy": "joint"}, r"'joint'.*evercal bench"),
+        (gamma, {"strategy": "evercal"}, r"'evercal'.*scene by scene"),
         (gamma, {"encoder": Path("encoder.safetensors")}, "keeps the encoder"),
         (gamma, {"stage": None, "memory": "auto"}, "memory auto"),
         (gamma, {"stage": None, "centres": 0}, "--centres 0"),
@@ -140,79 +115,12 @@ def test_bad_input_is_refused_and_leaves_the_store_unchanged(
     assert (tmp_path / "thesis.tex").read_text() == "x"
 
 
-class Interrupted(Exception):
-    """Raised within a call to end it."""
-
-
-def stop_at(kind: str, number: int) -> Callable[[object], None]:
-    """Interrupt at the n-th checkpoint of `rows` or of the `trainer`."""
-    count = [0]
-
-    def watch(event: object) -> None:
-        if isinstance(event, Checkpoint) and getattr(event, kind):
-            count[0] += 1
-            if count[0] == number:
-                raise Interrupted
-
-    return watch
-
-
 def steps_of(events: list[object]) -> list[int]:
     return [event.step for event in events if isinstance(event, Progress)]
 
 
-@pytest.mark.parametrize(("kind", "number"), [("rows", 1), ("rows", 3), ("trainer", 5)])
-def test_interrupted_call_continues_where_it_stopped(
-    kind: str,
-    number: int,
-    learned: Learned,
-    rooms: Rooms,
-    options: NetworkLearnOptions,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    untimed: Tree,
-) -> None:
-    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
-    store = tmp_path / "store"
-    for room in rooms[:2]:
-        with pytest.raises(Interrupted):
-            learn_networks(store, room, options, stop_at(kind, number))
-        events: list[object] = []
-        learn_networks(store, room, options, events.append)
-        views = [event.done for event in events if isinstance(event, Encoding)]
-        assert kind == "trainer" or views[0] > 8
-        assert steps_of(events)[0] == (number + 1 if kind == "trainer" else 1)
-    assert untimed(store) == untimed(learned.root)
-
-
-def test_er_interrupted_between_encoding_and_training(
-    rooms: Rooms, options: NetworkLearnOptions, tmp_path: Path, untimed: Tree
-) -> None:
-    er, whole, store = replace(options, strategy="er"), tmp_path / "whole", tmp_path / "store"
-
-    def stop(event: object) -> None:
-        if isinstance(event, Progress):
-            raise Interrupted
-
-    for room in rooms[:2]:
-        learn_networks(whole, room, er)
-        with pytest.raises(Interrupted):
-            learn_networks(store, room, er, stop)
-        events: list[object] = []
-        learn_networks(store, room, er, events.append)
-        # All views of the new scene are restored from the checkpoint; only replayed ones follow.
-        views = {event.total for event in events if isinstance(event, Encoding)}
-        assert views == (set() if room is rooms[0] else {4})
-        assert steps_of(events) == list(range(1, 9))
-    assert untimed(store) == untimed(whole)
-
-
 def test_second_writer_is_refused(
-    learned: Learned,
-    rooms: Rooms,
-    options: NetworkLearnOptions,
-    tmp_path: Path,
-    untimed: Tree,
+    rooms: Rooms, options: NetworkLearnOptions, tmp_path: Path
 ) -> None:
     store, messages = tmp_path / "store", []
 
@@ -224,78 +132,16 @@ def test_second_writer_is_refused(
 
     learn_networks(store, rooms[0], options, intrude)
     assert len(messages) == 1
-    learn_networks(store, rooms[1], options)
-    assert untimed(store) == untimed(learned.root)
-
-
-def test_other_stages_are_not_resumed(
-    learned: Learned,
-    rooms: Rooms,
-    options: NetworkLearnOptions,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    untimed: Tree,
-) -> None:
-    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
-    store, alpha = tmp_path / "store", rooms[0]
-    first, motion = alpha.train[0], SE3.exp(np.array([0.01, 0, 0, 0, 0, 0]))
-    assert first.base_from_camera is not None
-    moved = replace(first, base_from_camera=motion @ first.base_from_camera)
-    assert options.stage is not None
-    for recording, other in (
-        (replace(alpha, name="other"), options),
-        (replace(alpha, train=(moved, *alpha.train[1:])), options),
-        (alpha, replace(options, stage=replace(options.stage, seed=3))),
-        (alpha, replace(options, short_side=40)),
-    ):
-        with pytest.raises(Interrupted):
-            learn_networks(store, recording, other, stop_at("trainer", 2))
-        views: list[int] = []
-        stop = stop_at("rows", 1)
-
-        def watch(
-            event: object, views: list[int] = views, stop: Callable[[object], None] = stop
-        ) -> None:
-            views += [event.done] if isinstance(event, Encoding) else []
-            stop(event)
-
-        with pytest.raises(Interrupted):
-            learn_networks(store, alpha, options, watch)
-        assert views[0] <= 8
-    for room in rooms[:2]:
-        learn_networks(store, room, options)
-    assert untimed(store) == untimed(learned.root)
-
-
-CHILD = """
-import pickle, sys, time
-from pathlib import Path
-from evercal.continual.learning import stage_rows
-from evercal.continual.learning.learn_scene import learn_networks
-from evercal.continual.networks.trainer import Progress
-from evercal.recordings import generic
-def wait(event):
-    if isinstance(event, Progress) and event.step == 6:
-        print("now", flush=True)
-        time.sleep(600)
-stage_rows.CHECKPOINT_SECONDS = 0.0
-store, recording, options = map(Path, sys.argv[1:])
-learn_networks(store, generic.load(recording), pickle.loads(options.read_bytes()), wait)
-"""
 
 
 def test_kill_nine(
-    learned: Learned,
-    rooms: Rooms,
-    options: NetworkLearnOptions,
-    tmp_path: Path,
-    tree: Tree,
+    learned: Learned, rooms: Rooms, options: NetworkLearnOptions, tmp_path: Path, tree: Tree
 ) -> None:
+    """A call that is killed in the second scene leaves the first, and can be repeated."""
     generic.write(tmp_path / "beta", rooms[1])
     beta, store = generic.load(tmp_path / "beta"), tmp_path / "store"
     learn_networks(store, rooms[0], options)
-    image = rooms[0].train[0].read_image()
-    before, expected = tree(store), open_networks(store, "cpu").localize(image)
+    before = tree(store)
     (tmp_path / "options").write_bytes(pickle.dumps(options))
     paths = [str(path) for path in (store, tmp_path / "beta", tmp_path / "options")]
     command = [sys.executable, "-c", CHILD, *paths]
@@ -304,16 +150,24 @@ def test_kill_nine(
         assert child.stdout.readline() == "now\n"
         child.send_signal(signal.SIGKILL)
         assert child.wait(60) == -signal.SIGKILL
-    after = tree(store)
-    assert {name: after.get(name) for name in before} == before
-    assert all(name.startswith("learning/") for name in after.keys() - before.keys())
-    localizer = open_networks(store, "cpu")
-    assert localizer.scenes == ("alpha",)
-    estimate = localizer.localize(image)
-    assert (estimate.status, estimate.inliers) == (expected.status, expected.inliers)
-    events: list[object] = []
-    learn_networks(store, beta, options, events.append)
-    assert steps_of(events) == [6, 7, 8]
+    assert tree(store) == before
+    assert open_networks(store, "cpu").scenes == ("alpha",)
+    learn_networks(store, beta, options)
     heads = [NetworkStore.open(root).contents.heads[0] for root in (store, learned.root)]
     for name, value in heads[0].state_dict().items():
         torch.testing.assert_close(value, heads[1].state_dict()[name], rtol=0, atol=2e-3)
+
+
+CHILD = """
+import pickle, sys, time
+from pathlib import Path
+from evercal.continual.learning.learn_networks import learn_networks
+from evercal.continual.networks.trainer import Progress
+from evercal.recordings import generic
+def wait(event):
+    if isinstance(event, Progress) and event.step == 6:
+        print("now", flush=True)
+        time.sleep(600)
+store, recording, options = map(Path, sys.argv[1:])
+learn_networks(store, generic.load(recording), pickle.loads(options.read_bytes()), wait)
+"""

@@ -10,19 +10,15 @@ import pytest
 import torch
 
 from evercal.continual.localizer import (
-    HybridLocalizer,
     NetworkLocalizeOptions,
     NetworkLocalizer,
-    localizer_of,
     open_networks,
 )
-from evercal.continual.scenes import LearnedScenes
 from evercal.errors import InputError
 from evercal.geometry import Camera, pose_distance
-from evercal.localization.localizer import Localizer
 from evercal.simulation.box_room import default_camera
 
-from .world import CAMERA, everything, make_world, patch_centres
+from .world import CAMERA, make_world, patch_centres
 
 WIDE = Camera(640, 480, 400.0, 410.0, 300.0, 250.0)
 
@@ -76,22 +72,6 @@ def test_only_scenes_of_the_image_aspect_ratio_are_tried() -> None:
     assert world.head.scenes_asked == [1]
     with pytest.raises(InputError, match=r"image 160x90.*scene-0 160x120.*scene-1 120x160"):
         NetworkLocalizer(world.scenes).localize(np.zeros((90, 160, 3), np.uint8))
-
-
-def test_batches_equal_single_images(two_threads: None) -> None:
-    portrait = Camera(120, 160, 130.0, 130.0, 60.0, 80.0)
-    cameras = (CAMERA, portrait, CAMERA)
-    world = make_world(cameras)
-    images = [world.view(i % 3, cameras[i % 3], correct=0.4) for i in range(21)]
-    images.append(np.full((120, 160, 3), 255, np.uint8))
-    given = [None if i % 2 else cameras[i % 3] for i in range(21)] + [None]
-    localizer = NetworkLocalizer(world.scenes)
-    single = [localizer.localize(image, c) for image, c in zip(images, given, strict=True)]
-    batch = localizer.localize_batch(images, given)
-    assert [everything(a) for a in batch] == [everything(a) for a in single]
-    assert [estimate.scene for estimate in batch[:21]] == [f"scene-{i % 3}" for i in range(21)]
-    assert batch[21].status != "ok"
-    assert localizer.localize_batch([], []) == []
 
 
 def test_noise_is_not_located() -> None:
@@ -242,10 +222,3 @@ def test_folders_without_networks_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "missing"):
         with pytest.raises(InputError, match=str(path)):
             open_networks(path, "cpu")
-
-
-def test_strategies_have_their_localizer(three_stages: dict[str, list[LearnedScenes]]) -> None:
-    network, hybrid = three_stages["evercal_network"][0], three_stages["evercal_hybrid"][0]
-    assert isinstance(localizer_of(network), NetworkLocalizer)
-    assert isinstance(localizer_of(hybrid), HybridLocalizer)
-    assert type(localizer_of(replace(hybrid, heads=[]))) is Localizer

@@ -174,12 +174,3 @@ def make_world(
         LevelEncoder(), descriptor, "evercal_network", SHORT_SIDE, [head], records
     )
     return World(scenes, head)
-
-
-def everything(estimate: PoseEstimate) -> list[bytes | object]:
-    """An estimate without its time."""
-    arrays = [estimate.covariance, estimate.pixels, estimate.points_m]
-    if estimate.base_from_camera is not None:
-        arrays.append(estimate.base_from_camera.matrix())
-    plain = [estimate.status, estimate.reason, estimate.scene, estimate.inliers, estimate.support]
-    return [*plain, *(None if array is None else array.tobytes() for array in arrays)]

@@ -50,7 +50,7 @@ def wave_buffer(scene: int, views: int = 4, shift_px: float = 0.0, few: int = 0)
     if few:
         points = points[:few].repeat(len(points) // few + 1, 1)[: len(points)]
     buffer = FeatureBuffer(scene, SE3.identity())
-    buffer.restore(
+    buffer.extend(
         {
             "features": normalize(torch.cat([points.sin(), points.cos(), points], 1)).half(),
             "pixels": 100 * points[:, :2] / points[:, 2:] + 50 + torch.tensor([shift_px, 0.0]),

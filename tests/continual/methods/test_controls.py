@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import pytest
 import torch
 
-from evercal.continual.methods.controls import FineTuning, Isolation
+from evercal.continual.methods.method import FineTuning, Isolation
 from evercal.continual.networks.hooks import TrainingHooks
 
-from ..stages import outcome, second_stage, weights
+from ..stages import learn, outcome, second_stage, weights
 from .by_hand import stage_start, wave_head
 
 if TYPE_CHECKING:
@@ -46,7 +46,6 @@ def test_new_head_starts_from_the_shared_weights_of_the_last(
     quick: StageOptions,
 ) -> None:
     """Without training, the second head differs from the first only in the scene's parameters."""
-    from evercal.continual.learning.learn import learn
     from evercal.continual.strategies import STRATEGIES
 
     isolation = STRATEGIES["isolation"]

@@ -27,9 +27,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 METHODS = {
-    name: strategy.method
-    for name, strategy in STRATEGIES.items()
-    if strategy.method is not None and not strategy.builds_map
+    name: strategy.method for name, strategy in STRATEGIES.items() if strategy.method is not None
 }
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 IMAGE = np.zeros((3, 4, 3), np.uint8)
@@ -50,16 +48,14 @@ def learned(
     pose = SE3.identity()
     frames = [Frame(str(i), IMAGE, CAMERA, pose) for i in range(own.views)]
     with context:
-        alone = method.begin(stage_start(teacher, []))
-        first = FinishedScene(teacher, 0, lambda: memory, lambda: memory, 2, [], alone, 0.1)
+        first = FinishedScene(teacher, 0, lambda: memory, lambda: memory, 0.1)
         states: list[MethodState] = [method.after_scene(first)]
         start = stage_start(head, [memory], teacher=teacher, states=states, replay_rows=48)
         hooks = method.begin(start)
         trainer = HeadTrainer(head, [own], FIT, 0, hooks)
         list(trainer.run())
-        trainer.load(trainer.state())
         chosen = method.select(FrameStatistics(frames, head, lambda: own, 0), 2)
-        last = FinishedScene(head, 1, lambda: own, lambda: memory, 2, states, hooks, 0.1)
+        last = FinishedScene(head, 1, lambda: own, lambda: memory, 0.1)
         selected = method.after_scene(last)
     return dict(head.state_dict()) | {f"state.{k}": v for k, v in selected.items()}, chosen
 

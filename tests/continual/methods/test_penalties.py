@@ -15,7 +15,6 @@ from evercal.continual.methods.penalties import (
     Penalty,
     Relations,
     Reprojection,
-    StoredOutput,
 )
 from evercal.continual.methods.spdd import SpddOptions, spdd_loss
 from evercal.continual.networks.head import HeadOutput
@@ -27,7 +26,6 @@ WITH_TRUTH: list[Penalty] = [
     Reprojection(),
     OldOutput(),
     BoundedByTeacher(),
-    StoredOutput(),
     Relations(),
     AnchoredReprojection(),
 ]
@@ -68,14 +66,6 @@ def test_teacher_bounds_only_a_worse_student() -> None:
     truth = (math.tanh(3.0) + math.tanh(1.0)) / 2
     expected = 0.5 * truth + 0.5 * PX_PER_M * 0.04 / 2
     assert cost(BoundedByTeacher(), student, teacher, rows(2), 1.0) == pytest.approx(expected)
-
-
-def test_stored_output_by_hand() -> None:
-    # Two rows with errors of 3 px (6 cm). The stored point of the first is correct, the second has
-    # no stored point and is excluded from the mean distance.
-    records = replace(rows(2), known=torch.tensor([off_by(0.0), [math.nan] * 3]))
-    actual = cost(StoredOutput(), head_output([off_by(3.0)] * 2), None, records, 1.0)
-    assert actual == pytest.approx(0.5 * math.tanh(3.0) + 0.5 * PX_PER_M * 0.06, rel=1e-5)
 
 
 def test_relations_by_hand() -> None:

@@ -7,10 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.methods.method import FinishedScene
 from evercal.continual.methods.penalties import OldOutput, Penalty, Reprojection
 from evercal.continual.methods.replay import (
-    DarkExperienceReplay,
     Replay,
     ReplayHooks,
 )
@@ -83,49 +81,3 @@ def test_teacher_runs_only_if_needed() -> None:
         assert isinstance(hooks, ReplayHooks)
         hooks.cost(output, some, 0.5)
         assert len(calls) == times
-
-
-def test_stored_points_are_the_output_for_plain_views() -> None:
-    """The first two of four views are plain."""
-    head, buffer = wave_head(2), wave_buffer(1, views=4)
-    scene = FinishedScene(head, 1, lambda: buffer, lambda: buffer, 2, [], None)
-    state = DarkExperienceReplay().after_scene(scene)
-    assert state["points"].dtype == torch.half
-    assert len(state["points"]) == 100
-    some = buffer.rows(torch.arange(100))
-    with torch.no_grad():
-        lines = head(some.features.float(), 1, some.descriptor).points
-    spread = float((lines - lines.mean(0)).abs().max())
-    selected = state["points"].float() + state["origin"]
-    torch.testing.assert_close(selected, lines, atol=spread * 2**-10, rtol=0)
-
-
-def test_stored_points_return_to_their_rows() -> None:
-    """Drawn rows of augmented views have no stored point."""
-    head = wave_head(3)
-    buffers = [wave_buffer(i, views=4) for i in range(2)]
-    method, states = DarkExperienceReplay(), []
-    for i, keyframes in ((0, 2), (1, 3)):
-        scene = FinishedScene(
-            head, i, lambda: buffers[0], lambda i=i: buffers[i], keyframes, [], None
-        )
-        states.append(method.after_scene(scene))
-    memories = [wave_buffer(i, views=4) for i in range(2)]
-    start = stage_start(head, memories, states=states, replay_rows=400)
-    parts = drawn(method.begin(start))
-    for part, plain in zip(parts, (100, 150), strict=True):
-        assert part.known is not None
-        with torch.no_grad():
-            lines = head(part.features.float(), part.scene, part.descriptor).points
-        learned_head = part.index < plain
-        assert 0.3 < float(learned_head.float().mean()) < 0.9
-        torch.testing.assert_close(part.known[learned_head], lines[learned_head], atol=5e-3, rtol=0)
-        assert bool(part.known[~learned_head].isnan().all())
-    # An unchanged student has only the reprojection loss.
-    replayed = join(parts)
-    output = head(replayed.features.float(), replayed.scene, replayed.descriptor)
-    hooks = method.begin(start)
-    truth = 2 * 0.5 * float(Reprojection()(output, None, replayed, 0.5).detach())
-    actual = hooks.cost(output, replayed, 0.5)
-    assert actual is not None
-    assert float(actual.detach()) == pytest.approx(truth, abs=2 * 0.5 * 50 * 3 * 5e-3)

@@ -1,8 +1,7 @@
-"""The feature buffer: projections of its rows, checkpoints and draws."""
+"""The feature buffer: projections of its rows, and draws."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import islice
 
 import cv2
 import numpy as np
@@ -177,31 +176,6 @@ def test_augmented_views_have_the_planned_number_of_valid_cells(
         assert count == valid.sum() <= len(valid)
 
 
-@pytest.mark.parametrize("stop", [1, 2, 3])
-def test_resumed_encoding_equals_uninterrupted_encoding(
-    frames: list[Frame],
-    filled: Filled,
-    block_mean: Encoder,
-    describe: GlobalDescriptor,
-    device: torch.device,
-    stop: int,
-) -> None:
-    """Like checkpoints, call `take_new` after every batch."""
-    first, saved = FeatureBuffer(4, ATLAS_FROM_BASE, device=device), []
-    for _ in islice(encode_frames(first, frames, PLAN, block_mean, describe), stop):
-        saved.append(first.take_new())
-    assert 0 < first.views < PLAN.views_per_frame * len(frames)
-    resumed = FeatureBuffer(4, ATLAS_FROM_BASE, device=device)
-    for rows in saved:
-        resumed.restore(rows)
-    assert resumed.views == first.views
-    assert resumed.take_new() == {}  # restored rows are already saved
-    done = list(encode_frames(resumed, frames, PLAN, block_mean, describe))
-    assert done[-1] == PLAN.views_per_frame * len(frames)
-    assert list(encode_frames(resumed, frames, PLAN, block_mean, describe)) == []
-    assert same(resumed, filled())
-
-
 def test_draws_are_reproducible_and_cover_the_buffer(filled: Filled) -> None:
     buffer = filled(replace(PLAN, views_per_frame=1))
     seeded = torch.Generator().manual_seed(3)
@@ -240,13 +214,12 @@ def test_corrected_rows_follow_an_ideal_pinhole() -> None:
         "camera_from_atlas": torch.eye(4)[None, :3].repeat(3, 1, 1),
         "descriptors": torch.ones(3, 2),
     }
-    buffer.restore(rows)
+    buffer.extend(rows)
     each = torch.arange(60)
     # Pixels of the points in the corrected camera.
     captured, _ = reprojection_error(points, buffer.rows(each).target, correction.expand(60, 5))
     buffer = FeatureBuffer(0, SE3.identity())
-    buffer.restore({**rows, "pixels": captured})
+    buffer.extend({**rows, "pixels": captured})
     assert reprojection_error(points, buffer.rows(each).target)[0].abs().max() > 3
     buffer.correct_lens(correction)
     assert reprojection_error(points, buffer.rows(each).target)[0].abs().max() < 0.01
-    assert buffer.take_new() == {}

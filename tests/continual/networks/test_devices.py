@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.networks import buffer as module
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, Rows, encode_frames, join
 from evercal.continual.networks.descriptor import GlobalDescriptor
 from evercal.continual.networks.head import Head, HeadOptions, fresh_head
@@ -41,11 +40,11 @@ def head_of(options: HeadOptions, device: torch.device) -> Head:
 
 
 def buffer_of(device: torch.device, scene: int = 1) -> FeatureBuffer:
-    """Create forty rows of two views, with stored points for the first thirty."""
+    """Create forty rows of two views with known points."""
     buffer = FeatureBuffer(scene, SE3.identity(), device=device)
     matrix = torch.eye(4, device="cpu")[None, :3] + 0.1 * random(2, 3, 4, seed=2)
     matrix[:, 2, 3] += 8  # most points are in front of the camera
-    buffer.restore(
+    buffer.extend(
         {
             "features": random(40, 7).half(),
             "pixels": 20 * random(40, 2, seed=1) + 50,
@@ -55,7 +54,7 @@ def buffer_of(device: torch.device, scene: int = 1) -> FeatureBuffer:
             "descriptors": torch.nn.functional.normalize(random(2, 4, seed=3)),
         }
     )
-    buffer.known = random(30, 3, seed=4).half().to(device)
+    buffer.known = random(40, 3, seed=4).half().to(device)
     return buffer
 
 
@@ -114,32 +113,6 @@ def test_step_is_equal_on_every_device(options: HeadOptions, cuda: torch.device)
             torch.testing.assert_close(value.cpu(), expected, atol=1e-3 * size, rtol=1e-3)
 
 
-def test_rows_are_equal_if_the_device_has_no_room(
-    device: torch.device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    expected = everything(drawn([buffer_of(device)]))
-    monkeypatch.setattr(module, "_fits", lambda *_: False)
-    buffer = buffer_of(device)
-    assert buffer.tensors["features"].device == CPU
-    for name, value in everything(drawn([buffer])).items():
-        assert value.device == device, name
-        assert torch.equal(value.nan_to_num(-7), expected[name].nan_to_num(-7)), name
-
-
-def test_quarter_of_the_gpu_memory_stays_free(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    gpu, rows = torch.device("cuda", 0), {"a": torch.zeros(100, dtype=torch.uint8)}
-    free = [125, 400]
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: tuple(free))
-    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda _: 90)
-    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda _: 15)
-    assert module._fits(rows, gpu)
-    free[0] -= 1
-    assert not module._fits(rows, gpu)
-    assert module._fits(rows, CPU)
-
-
 def networks(device: torch.device) -> tuple[LocalEncoder, GlobalDescriptor]:
     torch.manual_seed(0)
     encoder = LocalEncoder(stem=(4, 4), inner=8, blocks=1, width=8).eval()
@@ -148,12 +121,10 @@ def networks(device: torch.device) -> tuple[LocalEncoder, GlobalDescriptor]:
 
 def encoded(device: torch.device, rows_on: torch.device) -> FeatureBuffer:
     """Fill a buffer by networks on a device, reading it after every batch."""
-    buffer, taken = FeatureBuffer(0, SE3.identity(), device=rows_on), 0
-    for _ in encode_frames(buffer, FRAMES, PLAN, *networks(device)):
-        new = buffer.take_new()
-        assert all(value.device == CPU for value in new.values())
-        taken += len(new["features"])
-        assert len(buffer) == taken
+    buffer = FeatureBuffer(0, SE3.identity(), device=rows_on)
+    for done in encode_frames(buffer, FRAMES, PLAN, *networks(device)):
+        assert buffer.views == done
+        assert len(buffer) == len(buffer.tensors["features"])
     return buffer
 
 

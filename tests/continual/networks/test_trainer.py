@@ -1,9 +1,8 @@
-"""The training loop: schedule, seeds, resuming, hooks, and learning."""
+"""The training loop: schedule, seeds, hooks, and learning."""
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import islice
 
 import pytest
 import torch
@@ -13,7 +12,7 @@ from evercal.continual.networks.buffer import FeatureBuffer, Rows
 from evercal.continual.networks.head import Head, HeadOptions, HeadOutput, fresh_head
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 from evercal.continual.networks.loss import LossOptions, clamp_px, reprojection_error
-from evercal.continual.networks.trainer import FitOptions, HeadTrainer, Progress, one_cycle
+from evercal.continual.networks.trainer import FitOptions, HeadTrainer, one_cycle
 from evercal.features.views import cell_centres
 from evercal.geometry import SE3, Camera
 
@@ -47,32 +46,6 @@ class Replayed(TrainingHooks):
         return self.penalty(output, rows, tau_px)
 
 
-class Counted(Replayed):
-    """Replays and scales each step by the number of steps."""
-
-    edits_steps = True
-
-    def __init__(self, memories: list[FeatureBuffer], penalty: Cost):
-        super().__init__(memories, penalty)
-        self.count = 0
-
-    def edit_step(self, proposed: ProposedStep) -> None:
-        self.count += 1
-        for change in proposed.changes.values():
-            change *= 1 / (1 + self.count)
-
-    def state(self) -> dict[str, Tensor]:
-        return {"count": torch.tensor(self.count)}
-
-    def load(self, state: Mapping[str, Tensor]) -> None:
-        self.count = int(state["count"])
-
-
-def numbers(steps: list[Progress]) -> list[tuple[int, float, float]]:
-    """Return the fields of progress as numbers."""
-    return [(step.step, step.loss, step.inlier_share) for step in steps]
-
-
 def head_for(buffers: list[FeatureBuffer], options: HeadOptions | None = None) -> Head:
     head = fresh_head(CHANNELS, DESCRIPTOR, options or HeadOptions(width=32), seed=0)
     for buffer in buffers:
@@ -80,10 +53,6 @@ def head_for(buffers: list[FeatureBuffer], options: HeadOptions | None = None) -
         atlas_from_camera = SE3.from_matrix(matrix).inverse()
         head.grow(torch.from_numpy(atlas_from_camera.translation_m[:3]).float(), seed=buffer.scene)
     return head
-
-
-def snapshot(trainer: HeadTrainer) -> dict[str, Tensor]:
-    return {key: value.clone() for key, value in trainer.state().items()}
 
 
 @pytest.mark.parametrize(("iterations", "warm"), [(100, 0.05), (1000, 0.3), (40, 0.5)])
@@ -108,52 +77,6 @@ def test_rate_follows_one_cycle_of_torch(iterations: int, warm: float) -> None:
     assert one_cycle(options, 0) == pytest.approx(2e-3 / 25)
     assert one_cycle(options, rise) == pytest.approx(2e-3)
     assert one_cycle(options, iterations) == pytest.approx(0.0, abs=1e-12)
-
-
-@pytest.mark.parametrize("stop", [3, 10, 17])
-@pytest.mark.parametrize("condition", ["code", "descriptor"])
-@pytest.mark.parametrize("kind", [Replayed, Counted])
-def test_resumed_training_equals_uninterrupted_training(
-    learnable: Learnable, stop: int, condition: str, kind: type[Replayed]
-) -> None:
-    """Twenty steps of one trainer, and of two trainers that share only the saved state."""
-    fresh, _ = learnable(1, correctable=True)
-    past, _ = learnable(0)
-    shape = HeadOptions(width=32, condition=condition)  # pyright: ignore[reportArgumentType]
-    head = head_for([past, fresh], shape)
-    twin, third = copy.deepcopy(head), copy.deepcopy(head)
-
-    def hooks() -> Replayed:
-        return kind([past], lambda output, rows, tau_px: output.points.abs().mean())
-
-    whole = HeadTrainer(head, [fresh], OPTIONS, 3, hooks())
-    expected = list(whole.run())
-    first = HeadTrainer(twin, [fresh], OPTIONS, 3, hooks())
-    actual = list(islice(first.run(), stop))
-    saved = snapshot(first)
-    second = HeadTrainer(third, [fresh], OPTIONS, 3, hooks())
-    second.load(saved)
-    actual += list(second.run())
-
-    assert [p.step for p in actual] == list(range(1, 21))
-    assert numbers(actual) == numbers(expected)
-    for (name, value), other in zip(
-        head.state_dict().items(), third.state_dict().values(), strict=True
-    ):
-        assert torch.equal(value, other), name
-    assert torch.equal(whole.correction, second.correction)
-    assert (whole.correction != 0).any()
-    assert not third.training
-
-
-def test_state_is_a_copy(learnable: Learnable) -> None:
-    buffer, _ = learnable()
-    trainer = HeadTrainer(head_for([buffer]), [buffer], OPTIONS, seed=0)
-    list(islice(trainer.run(), 4))
-    state = trainer.state()
-    before = {key: value.clone() for key, value in state.items()}
-    list(islice(trainer.run(), 4))
-    assert all(torch.equal(state[key], value) for key, value in before.items())
 
 
 def test_replay_cost_is_minimised_on_even_shares(learnable: Learnable) -> None:
@@ -314,5 +237,3 @@ def test_constraints_are_not_minimised(
         used = gradient["code"].abs().sum((1, 2)) > 0
         assert used.tolist() == [number == scene for number in range(3)]
         assert float(gradient["first.1.weight"].abs().max()) > 0
-    # Only the loss of the new scene is minimised.
-    assert (hooks.last.gradients["code"].abs().sum((1, 2)) > 0).tolist() == [False, False, True]

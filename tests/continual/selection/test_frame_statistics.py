@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from evercal.continual.learning.learn import learn
 from evercal.continual.learning.stage import StageOptions
 from evercal.continual.networks.buffer import FeatureBuffer, encode_frames
 from evercal.continual.networks.head import Head, HeadOptions
@@ -15,7 +14,7 @@ from evercal.continual.selection.frame_statistics import PARTS, FrameStatistics
 from evercal.continual.strategies import STRATEGIES
 from evercal.geometry import SE3
 
-from ..stages import EmptyScenes, Rooms, outcome
+from ..stages import EmptyScenes, Rooms, learn, outcome
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +105,7 @@ def test_fixed_centres_all_have_gradients(
     head = Head(learned_head.features, 8, options)
     head.grow(torch.randn(6, 3) + torch.tensor([0.0, 0.0, 2.0]), seed=0)
     later = FeatureBuffer(1, buffer.atlas_from_base)
-    later.restore(dict(buffer.tensors))
+    later.extend(dict(buffer.tensors))
     gradients = FrameStatistics(rooms[0].train, head, lambda: later, 5).gradients()
     assert gradients.shape == (len(rooms[0].train), head.logit.numel() + head.offset.numel())
     assert np.abs(gradients).max() > 0

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from evercal.continual.selection.selection_by_features import (
+from evercal.continual.selection.selectors import (
     leverage_scores,
     select_coverage,
     select_gradients,
     select_herding,
-    select_hybrid,
     select_leverage,
     select_reservoir,
 )
@@ -24,20 +23,6 @@ def test_reservoir_is_uniform() -> None:
     share = np.bincount(selected, minlength=20) / runs
     # Five standard deviations of a share of 1/4.
     assert np.abs(share - 0.25).max() < 5 * np.sqrt(0.25 * 0.75 / runs)
-
-
-def test_hybrid_prefers_novel_frames() -> None:
-    # The camera rotates by 0, 20, 0, 0, 30, 0, 40, 0 degrees.
-    angles = np.deg2rad([0.0, 0, 20, 20, 20, 50, 50, 90, 90])
-    features = 3.0 * np.stack([np.cos(angles), np.sin(angles)], 1)
-    for seed in range(10):
-        assert select_hybrid(features, 4, rng(seed)).tolist() == [0, 2, 5, 7]
-        assert set(select_hybrid(features, 3, rng(seed))) < {0, 2, 5, 7}
-        assert {0, 2, 5, 7} < set(select_hybrid(features, 6, rng(seed)))
-        assert len(select_hybrid(features, 6, rng(seed))) == 6
-    # A plain reservoir has no preference.
-    plain = [select_reservoir(9, 4, rng(seed)).tolist() for seed in range(20)]
-    assert [0, 2, 5, 7] not in plain
 
 
 def test_herding_by_hand() -> None:
@@ -89,26 +74,14 @@ def test_leverage_prefers_the_isolated_frame() -> None:
     assert lone == pytest.approx(0.5, abs=5 * 0.5 / np.sqrt(runs))  # 1/20 by chance
 
 
-@pytest.mark.parametrize("victim", ["random", "redundant"])
-def test_coverage_selects_frames_with_new_parts(victim: str) -> None:
+def test_coverage_selects_frames_with_new_parts() -> None:
     # Forty frames show part 0, one frame also part 1.
     visible = [np.array([0])] * 40 + [np.array([0, 1])]
     runs = 300
-    covered = sum(40 in select_coverage(visible, 4, rng(s), victim) for s in range(runs))  # pyright: ignore[reportArgumentType]
+    covered = sum(40 in select_coverage(visible, 4, rng(s)) for s in range(runs))
     chance = sum(40 in select_reservoir(41, 4, rng(s)) for s in range(runs))
     assert chance < 0.2 * runs
     assert covered > 2 * chance
-
-
-def test_redundant_frame_is_replaced() -> None:
-    # Frames 0 and 1 show the same parts; a later frame with a new part replaces one of them.
-    visible = [np.array([0, 1]), np.array([0, 1]), np.array([2]), np.array([3])]
-    for seed in range(20):
-        order = rng(seed).permutation(4).tolist()
-        if {0, 1} <= set(order[:3]):
-            selected = select_coverage(visible, 3, rng(seed), "redundant").tolist()
-            assert len({0, 1} & set(selected)) == 1
-            assert {2, 3} <= set(selected)
 
 
 def test_opposed_gradient_replaces_a_frame() -> None:

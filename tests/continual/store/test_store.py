@@ -1,8 +1,8 @@
-"""A store of networks opens as it was written, and returns the checkpoints of a stage."""
+"""A store of networks opens as it was written."""
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,8 @@ from torch import Tensor
 from evercal.continual.localizer import NetworkLocalizer
 from evercal.continual.networks.head import Head
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.store import Checkpoint, NetworkStore, head_bytes
+from evercal.continual.store import NetworkStore, head_bytes
 from evercal.errors import InputError
-from evercal.features.encoder import load_encoder
-from evercal.features.vlad import vlad_for
 from evercal.geometry import pose_distance
 from evercal.recordings.frame import Recording
 from evercal.storage import verify
@@ -25,7 +23,7 @@ from ..stages import MakeStore, Tree
 
 Stages = dict[str, list[LearnedScenes]]
 
-STRATEGIES = pytest.mark.parametrize("strategy", ["evercal_network", "evercal_hybrid", "isolation"])
+STRATEGIES = pytest.mark.parametrize("strategy", ["evercal_network", "isolation"])
 
 
 def stored(head: Head) -> dict[str, Tensor]:
@@ -54,12 +52,8 @@ def test_store_opens_as_it_was_written(
         assert all(torch.equal(value, state[name]) for name, value in a.state_dict().items())
     for a, b in zip(contents.scenes, scenes.scenes, strict=True):
         assert torch.equal(a.prototypes, b.prototypes)
-        others = [f.name for f in fields(a) if f.name not in ("prototypes", "map")]
+        others = [f.name for f in fields(a) if f.name != "prototypes"]
         assert [getattr(a, name) for name in others] == [getattr(b, name) for name in others]
-        assert (a.map is not None) == (strategy == "evercal_hybrid")
-        if a.map is not None and b.map is not None:
-            assert a.map.adjusted_camera == b.map.adjusted_camera
-            assert a.map.landmarks == b.map.landmarks
     for a, b in zip(contents.keyframes, scenes.keyframes, strict=True):
         assert (a is None) == (b is None)
         if a is not None and b is not None:
@@ -113,7 +107,6 @@ def test_of_a_shared_head_only_the_newest_file_remains(
     assert [path.parent.name[:4] for path in files] == [f"{number:04d}" for number in heads]
     counted = head_bytes(store.contents.heads[-1])
     assert counted < files[-1].stat().st_size < counted + 3000  # the file adds its header
-    assert not (tmp_path / "learning").exists()
     assert verify(tmp_path) == []
 
 
@@ -142,7 +135,7 @@ def test_other_folders_are_refused(tmp_path: Path, tree: Tree) -> None:
     (tmp_path / "file").write_text("x")
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_text("x")
-    (tmp_path / "mixed" / "learning").mkdir(parents=True)
+    (tmp_path / "mixed" / "stages").mkdir(parents=True)
     (tmp_path / "mixed" / "thesis.tex").write_text("x")
     before = tree(tmp_path)
     for name in ("file", "photos", "mixed", ""):
@@ -153,37 +146,3 @@ def test_other_folders_are_refused(tmp_path: Path, tree: Tree) -> None:
     NetworkStore.create(tmp_path / "new", "evercal_network")
     assert tree(tmp_path) == before
     assert not (tmp_path / "new").exists()
-
-
-def test_checkpoints_belong_to_one_stage(
-    three_stages: Stages, tmp_path: Path, make_store: MakeStore
-) -> None:
-    store = make_store(tmp_path, three_stages["evercal_network"][:1])
-    identity = {"scene": "beta", "options": {"seed": 0, "size": (1, 2)}}
-    assert store.begin(identity) is None
-    assert NetworkStore.open(tmp_path).begin(identity) is None  # nothing is encoded yet
-    rows = [{"x": torch.arange(i, i + 3)} for i in range(12)]
-    for part in rows:
-        store.checkpoint(Checkpoint(part, {}))
-    for step in (4, 7):
-        store.checkpoint(Checkpoint({}, {"step": torch.tensor(step)}))
-    for _ in range(2):
-        resume = NetworkStore.open(tmp_path).begin(identity)
-        assert resume is not None
-        assert [part["x"].tolist() for part in resume.rows] == [part["x"].tolist() for part in rows]
-        assert int(resume.trainer["step"]) == 7
-    assert store.begin({**identity, "scene": "gamma"}) is None
-    assert store.begin(identity) is None
-
-
-def test_centroids_of_an_unshipped_encoder_are_stored_with_maps(
-    three_stages: Stages, tmp_path: Path, make_store: MakeStore
-) -> None:
-    hybrid, network = three_stages["evercal_hybrid"][0], three_stages["evercal_network"][0]
-    make_store(tmp_path / "hybrid", [hybrid])
-    encoder = NetworkStore.open(tmp_path / "hybrid").contents.encoder
-    assert torch.equal(vlad_for(encoder).centroids, vlad_for(hybrid.encoder).centroids)
-    make_store(tmp_path / "shipped", [replace(hybrid, encoder=load_encoder())])
-    make_store(tmp_path / "network", [network])
-    for name, files in (("hybrid", 1), ("shipped", 0), ("network", 0)):
-        assert len(list((tmp_path / name).glob("vlad-*"))) == files

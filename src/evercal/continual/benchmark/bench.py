@@ -3,19 +3,16 @@
     OUT/settings.json             options that decide the results; other options are refused
     OUT/environments.json         commit, versions and processor of the runs
     OUT/strategies.json           description of each strategy: method, hyper-parameters, map
-    OUT/results.jsonl             see `benchmark.results`
-    OUT/views/                    see `benchmark.scene_views`; of each strategy's first run
+    OUT/results.csv, frames.csv   see `benchmark.results`
     OUT/features/                 encoded views, shared by all runs; may be deleted
     OUT/runs/STRATEGY-SEED/       store of a run in progress, removed when the run is complete
-    OUT/runs/STRATEGY-SEED.network.json    thresholds of its network, if it also builds a map
-    OUT/runs/first-SCENE-SEED/    the first scene, shared by strategies that learn it alike
+    OUT/runs/first-SCENE-SEED/    the first scene, shared by all networks
 
-An interrupted run resumes from the checkpoint inside its stage, as `evercal learn` does. Several
-processes may work in one folder: each takes runs that no other has.
+An interrupted run resumes after its last complete stage. Several processes may work in one folder:
+each takes runs that no other has.
 """
 
 import json
-from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -26,12 +23,10 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from evercal.continual.benchmark import results
-from evercal.continual.benchmark.results import SceneResult
+from evercal.continual.benchmark.results import Table
 from evercal.continual.benchmark.strategy_run import NETWORK_LOCALIZE, RunOptions, run_strategy
-from evercal.continual.learning.learn_scene import OnEvent
 from evercal.continual.learning.stage import StageOptions
 from evercal.continual.networks.descriptor import DESCRIPTOR_FILE
-from evercal.continual.networks.distributed import of_first
 from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
 from evercal.features.encoder import ENCODER_FILE
@@ -39,7 +34,7 @@ from evercal.localization import acceptance
 from evercal.localization.query import LocalizeOptions
 from evercal.recordings import Recording
 from evercal.storage import sha256_file, write_json
-from evercal.storage.settings import lock_settings
+from evercal.storage.settings import lock_settings, read_settings
 
 Order = Literal["given", "reversed", "shuffled", "balanced"]
 
@@ -63,8 +58,6 @@ class BenchOptions:
     """Further settings that decide the results, for settings.json."""
     device: str = "auto"
     """Device of the networks, see `features.device.device_of`."""
-    features: Path | None = None
-    """Folder of encoded views. Defaults to `OUT/features`."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +68,8 @@ class Step:
     """Name of the strategy."""
     seed: int
     """Seed of the run."""
-    results: tuple[SceneResult, ...]
-    """Results of all scenes learned so far; empty before the last stage of joint training."""
+    results: Table
+    """Rows of results.csv; empty before the last stage of joint training."""
     done: int
     """Complete stages, including those of earlier calls."""
     total: int
@@ -84,7 +77,7 @@ class Step:
 
 
 def run_bench(
-    scenes: Sequence[Recording], options: BenchOptions, out: Path, on_event: OnEvent | None = None
+    scenes: Sequence[Recording], options: BenchOptions, out: Path
 ) -> Generator[Step, None, None]:
     """Run all runs that are not complete.
 
@@ -92,7 +85,6 @@ def run_bench(
         scenes: Two or more scenes in the order `given`.
         options: Strategies, seeds and options.
         out: Folder of results, created if missing.
-        on_event: Called with every event while a scene is learned.
 
     Raises:
         InputError: Fewer than two scenes, or the folder has results of other settings.
@@ -102,25 +94,17 @@ def run_bench(
     """
     total = len(options.seeds) * len(options.strategies) * len(scenes)
     missing = begin_bench(scenes, options, out)
-    # Processes that train together run the same, whatever their own folders hold.
-    to_run = of_first([(seed, strategy.name) for seed, strategy in missing])
-    named = {strategy.name: strategy for strategy in options.strategies}
-    missing = [(seed, named[name]) for seed, name in to_run]
     done = total - len(missing) * len(scenes)
-    features = options.features or out / "features"
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
-        how = RunOptions(options.stage(seed), options.short_side, features, out, options.device)
+        how = RunOptions(options.stage(seed), options.short_side, out, options.device)
         with _claimed(out, strategy, seed) as free:
-            lines = results.read(out)  # another process may have added some
-            if not of_first(free and not _complete((seed, strategy), lines, len(scenes))):
+            stored = results.read(out)  # another process may have added some
+            if not free or _complete((seed, strategy), stored, len(scenes)):
                 continue
-            stored = {(r.strategy, r.seed, r.stage, r.scene) for r in lines}
-            for stage, these in run_strategy(strategy, ordered, how, on_event):
-                # An interrupted call may have stored some of the lines of a stage.
-                new = [r for r in these if (r.strategy, seed, stage, r.scene) not in stored]
-                results.append(out, new)
-                yield Step(strategy.name, seed, these, done + stage + 1, total)
+            for stage in run_strategy(strategy, ordered, how):
+                results.append(out, stage)
+                yield Step(strategy.name, seed, stage.results, done + stage.stage + 1, total)
             done += len(scenes)
 
 
@@ -141,14 +125,7 @@ def _claimed(out: Path, strategy: Strategy, seed: int) -> Iterator[bool]:
 def begin_bench(
     scenes: Sequence[Recording], options: BenchOptions, out: Path
 ) -> list[tuple[int, Strategy]]:
-    """Check the options against the folder of results.
-
-    Returns:
-        (seed, strategy) of the runs that are not complete, in order.
-
-    Raises:
-        InputError: See `run_bench`.
-    """
+    """Check the options against the folder of results, and return the runs that are missing."""
     if len(scenes) < 2:
         raise InputError(f"{len(scenes)} scene: give two or more to measure forgetting")
     settings = _settings(scenes, options)  # bad options leave no folder behind
@@ -160,17 +137,18 @@ def begin_bench(
     return [run for run in runs if not _complete(run, stored, len(scenes))]
 
 
-def _complete(run: tuple[int, Strategy], stored: Sequence[SceneResult], scenes: int) -> bool:
-    """Check that the last stage has a line per scene, under every name of the strategy."""
+def _complete(run: tuple[int, Strategy], stored: Table, scenes: int) -> bool:
+    """Check that the last stage has a row per scene, under every name of the strategy."""
     seed, strategy = run
-    lines = [r for r in stored if r.seed == seed and r.strategy.split(":")[0] == strategy.name]
-    last = Counter(r.strategy for r in lines if r.stage == scenes - 1)
-    return bool(lines) and all(last[r.strategy] == scenes for r in lines)
+    rows = results.run_of(stored, strategy.name, seed)
+    last = rows[rows["stage"] == scenes - 1].groupby("strategy").size()
+    return len(rows) > 0 and all(last.get(name) == scenes for name in rows["strategy"].unique())
 
 
 def _record_strategies(out: Path, strategies: Sequence[Strategy]) -> None:
     """Add descriptions to strategies.json, and refuse a name with another description."""
-    recorded = results.read_strategies(out)
+    path = out / results.STRATEGIES
+    recorded = read_settings(path) if path.exists() else {}
     for strategy in strategies:
         now = json.loads(json.dumps(strategy.description()))
         before = recorded.setdefault(strategy.name, now)
@@ -179,7 +157,7 @@ def _record_strategies(out: Path, strategies: Sequence[Strategy]) -> None:
                 f"{out}: strategy {strategy.name!r} was {before}, now it is {now}; give it another"
                 " name or another --out"
             )
-    write_json(out / results.STRATEGIES, recorded)
+    write_json(path, recorded)
 
 
 def in_order(scenes: Sequence[Recording], order: Order, seed: int) -> list[Recording]:

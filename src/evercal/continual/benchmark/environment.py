@@ -1,7 +1,5 @@
 """Where a result was measured: commit, versions, processor."""
 
-import hashlib
-import json
 import platform
 import subprocess
 from functools import cache
@@ -33,11 +31,6 @@ def environment() -> dict[str, str]:
         "threads": str(torch.get_num_threads()),
         "gpu": torch.cuda.get_device_name() if gpu else "none",
     }
-
-
-def environment_key(record: dict[str, str]) -> str:
-    """Return eight characters that identify a record."""
-    return hashlib.blake2b(json.dumps(record, sort_keys=True).encode(), digest_size=4).hexdigest()
 
 
 def _commit() -> str:

@@ -1,109 +1,110 @@
-"""Results of a benchmark on disk: one JSON line per strategy, seed, stage and scene.
+"""Results of a benchmark as two tables, written and read with pandas.
 
-Accuracy matrices, forgetting, tables and intervals are derived from these lines.
+    OUT/results.csv    a row per strategy, seed, stage and scene: correct frames, errors, memory
+    OUT/frames.csv     a row per test frame after the last stage: errors and what became of it
+
+Accuracy matrices, forgetting and intervals are derived from these. Either file may be compressed
+(`frames.csv.gz`).
 """
 
+import hashlib
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from filelock import FileLock
 
-from evercal.continual.benchmark.environment import environment, environment_key
+from evercal.continual.benchmark.environment import environment
 from evercal.errors import InputError
-from evercal.evaluation.metrics import COARSE, FrameResult
+from evercal.evaluation.metrics import (
+    CHI2_6,
+    COARSE,
+    FINE,
+    FINEST,
+    MIDDLE,
+    FrameResult,
+    recall_area,
+)
 from evercal.storage import write_json
 from evercal.storage.settings import read_settings
 
-RESULTS, SETTINGS, STRATEGIES = "results.jsonl", "settings.json", "strategies.json"
+Table = Any
+"""A DataFrame of pandas, whose methods pyright cannot check without stubs."""
+RESULTS, FRAMES = "results.csv", "frames.csv"
+SETTINGS, STRATEGIES = "settings.json", "strategies.json"
 ENVIRONMENTS = "environments.json"
-NETWORK, UNALIGNED = ":network", ":unaligned"
-"""Suffixes of a strategy's name for additional results of the same run: by the network without the
-map, and by the first pose from matched keyframes, before landmarks are aligned."""
+UNALIGNED = ":unaligned"
+"""Suffix of a strategy's name for additional results of the same run: by the first pose from
+matched keyframes, before landmarks are aligned."""
+WITHIN = {
+    "within_10cm_10deg": (0.10, math.radians(10.0)),
+    "within_5cm_5deg": COARSE,
+    "within_2cm_2deg": MIDDLE,
+    "within_1cm_1deg": FINE,
+    "within_5mm_05deg": FINEST,
+}
+"""Columns that count correct frames: metres and radians, both errors strictly below."""
+KEY = ["strategy", "seed", "stage", "scene"]
+"""Columns that identify a row of results.csv."""
+_FRAME_KEY = ["strategy", "seed", "scene", "frame"]
+_REQUIRED = {*KEY, "frames", *WITHIN, "seconds", "memory_bytes", "head_bytes", "environment"}
 
 
-@dataclass(frozen=True)
-class SceneResult:
-    """Results of one scene's test frames after one stage of one run."""
+@dataclass(frozen=True, eq=False)
+class StageResults:
+    """Results of all scenes learned so far, after one stage of a run."""
 
-    strategy: str
-    """Name of the strategy; strategies.json describes it."""
-    seed: int
-    """Seed of the run."""
     stage: int
-    """Scenes learned before this stage."""
-    scene: str
-    """Scene of the test frames."""
-    frames: tuple[str, ...]
-    """Names of the test frames in recorded order."""
-    translation_m: tuple[float, ...]
-    """Error of each frame; infinite without a pose in the right scene."""
-    rotation_rad: tuple[float, ...]
-    """Error of each frame; infinite without a pose in the right scene."""
-    wrong_scene: tuple[bool, ...]
-    """Frames with a pose in another scene."""
-    near_training_frame: tuple[bool, ...]
-    """Frames with a training frame within 5 cm and 5 deg."""
-    seconds: float
-    """Wall time of the stage; a first stage that strategies share counts for each of them."""
-    memory_bytes: int
-    """Bytes remembered of all scenes."""
-    head_bytes: int
-    """Bytes of all heads."""
-    frames_kept: int
-    """Frames remembered of the stage's scene."""
-    keyframe_positions_m: tuple[tuple[float, float, float], ...] = ()
-    """Camera positions of these in the base frame; given for the scene that was just learned."""
-    covering_radius: float = math.nan
-    """Largest distance from a training frame to a remembered one, in the metric of SARS."""
-    min_spacing: float = math.nan
-    """Smallest distance between two remembered frames, in the metric of SARS."""
-    squared_mahalanobis: tuple[float, ...] = ()
-    """Squared error of each pose in units of its covariance. NaN without a pose in the right scene
-    or without a covariance; empty if no frame has one."""
-    environment: str = ""
-    """Key of the record in environments.json: commit, versions, processor."""
-
-    @property
-    def refused(self) -> np.ndarray:
-        """Frames without a pose, bool, shape (frames,)."""
-        return ~np.isfinite(self.translation_m) & ~np.array(self.wrong_scene, bool)
-
-    def accuracy(self, thresholds: tuple[float, float] = COARSE) -> float:
-        """Return the share of correct frames, 0 to 1."""
-        return float(self.correct(thresholds).mean())
-
-    def correct(self, thresholds: tuple[float, float] = COARSE) -> np.ndarray:
-        """Return which frames have errors strictly below (metres, radians), shape (frames,)."""
-        metres, radians = thresholds
-        return (np.array(self.translation_m) < metres) & (np.array(self.rotation_rad) < radians)
+    """Number of the stage, from 0."""
+    results: Table
+    """Rows of results.csv; empty before the last stage of joint training."""
+    frames: Table
+    """Rows of frames.csv; empty before the last stage."""
 
 
-_FIELDS = {item.name for item in fields(SceneResult)}
-_REQUIRED = {item.name for item in fields(SceneResult) if item.default is MISSING}
+def scene_row(frames: Sequence[FrameResult]) -> dict[str, object]:
+    """Summarize the test frames of one scene: columns of results.csv that depend on them."""
+    metres = np.array([frame.translation_error_m for frame in frames])
+    radians = np.array([frame.rotation_error_rad for frame in frames])
+    squared = np.array([frame.squared_mahalanobis for frame in frames])
+    wrong = np.array([frame.wrong_scene for frame in frames])
+    middle = len(frames) // 2  # a mean of the two middle errors may include infinity
+    return {
+        "scene": frames[0].scene,
+        "frames": len(frames),
+        **{name: int(((metres < m) & (radians < r)).sum()) for name, (m, r) in WITHIN.items()},
+        "median_mm": round(1000 * float(np.sort(metres)[middle]), 3),
+        "median_deg": round(math.degrees(np.sort(radians)[middle]), 4),
+        "area_20cm": round(recall_area(metres), 4),
+        "wrong_scene": int(wrong.sum()),
+        "refused": int((~np.isfinite(metres) & ~wrong).sum()),
+        "with_covariance": int((~np.isnan(squared)).sum()),
+        "inside_95": int((squared < CHI2_6).sum()),
+    }
 
 
-def scene_result(results: Sequence[FrameResult], **run: object) -> SceneResult:
-    """Collect the results of one scene's frames.
-
-    Args:
-        results: Results of the test frames in recorded order.
-        **run: The other fields of `SceneResult`.
-    """
-    return SceneResult(
-        scene=results[0].scene,
-        frames=tuple(r.frame for r in results),
-        translation_m=tuple(r.translation_error_m for r in results),
-        rotation_rad=tuple(r.rotation_error_rad for r in results),
-        wrong_scene=tuple(r.wrong_scene for r in results),
-        near_training_frame=tuple(r.near_training_frame for r in results),
-        squared_mahalanobis=tuple(r.squared_mahalanobis for r in results),
-        **run,  # pyright: ignore[reportArgumentType]
-    )
+def frame_row(frame: FrameResult) -> dict[str, object]:
+    """Return the columns of frames.csv that depend on the frame."""
+    outcome = "inside" if frame.squared_mahalanobis < CHI2_6 else "outside"
+    if frame.wrong_scene:
+        outcome = "wrong scene"
+    elif not math.isfinite(frame.translation_error_m):
+        outcome = "refused"
+    elif math.isnan(frame.squared_mahalanobis):
+        outcome = "no covariance"
+    return {
+        "scene": frame.scene,
+        "frame": frame.frame,
+        "error_mm": round(1000 * frame.translation_error_m, 3),
+        "error_deg": round(math.degrees(frame.rotation_error_rad), 4),
+        "outcome": outcome,
+    }
 
 
 def locked(folder: Path) -> FileLock:
@@ -112,99 +113,84 @@ def locked(folder: Path) -> FileLock:
     return FileLock(folder / ".results.lock")
 
 
-def append(folder: Path, results: Iterable[SceneResult]) -> None:
-    """Append lines to the results of a folder and flush them to disk."""
-    lines = [json.dumps(_to_record(result), allow_nan=False) + "\n" for result in results]
-    with locked(folder), open(folder / RESULTS, "a", encoding="utf-8") as file:
-        file.write("".join(lines))
+def append(folder: Path, stage: StageResults) -> None:
+    """Append the rows of a stage that a folder lacks, and flush them to disk."""
+    before = read(folder)
+    new = stage.results
+    if len(before) and len(new):  # an interrupted call may have stored some rows of the stage
+        stored = pd.MultiIndex.from_frame(before[KEY])
+        new = new[~pd.MultiIndex.from_frame(new[KEY]).isin(stored)]
+    with locked(folder):
+        # Frames come first: a stage whose results are complete has its frames.
+        for name, rows in ((FRAMES, stage.frames), (RESULTS, new)):
+            if len(rows):
+                _append(folder / name, rows)
+
+
+def _append(path: Path, rows: Table) -> None:
+    with open(path, "a", encoding="utf-8") as file:
+        rows.to_csv(file, header=file.tell() == 0, index=False)
         file.flush()
         os.fsync(file.fileno())
 
 
-def read(folder: Path) -> list[SceneResult]:
-    """Read all results of a folder. An incomplete last line is removed from the file.
+def run_of(results: Table, strategy: str, seed: int) -> Table:
+    """Return the rows of a run, under every name of its strategy (`NAME:PART`)."""
+    names = results["strategy"].str.split(":").str[0]
+    return results[(names == strategy) & (results["seed"] == seed)]
 
-    Raises:
-        InputError: A complete line is not a result.
-    """
-    path = folder / RESULTS
-    if not path.exists():
-        return []
-    with locked(folder):
-        data = path.read_bytes()
-        complete = data.rfind(b"\n") + 1
-        if complete < len(data):
-            with open(path, "r+b") as file:
-                file.truncate(complete)
-    results = []
-    for number, line in enumerate(data[:complete].splitlines(), start=1):
-        try:
-            results.append(_from_record(json.loads(line)))
-        except (ValueError, TypeError, KeyError) as error:
-            raise InputError(f"{path}: line {number} is not a result ({error!r})") from error
-    return results
+
+def read(folder: Path) -> Table:
+    """Read the results of a folder; without any, an empty table."""
+    return _read(folder, RESULTS, _REQUIRED).drop_duplicates(KEY, keep="last")
+
+
+def read_frames(folder: Path) -> Table:
+    """Read the test frames of a folder after the last stage; without any, an empty table."""
+    frames = _read(folder, FRAMES, {*_FRAME_KEY, "error_mm", "error_deg", "outcome"})
+    return frames.drop_duplicates(_FRAME_KEY, keep="last")
+
+
+def _read(folder: Path, name: str, required: set[str]) -> Table:
+    path = next(iter(sorted(folder.glob(f"{name}*"))), None)
+    if path is None:
+        return pd.DataFrame(columns=sorted(required))
+    if path.name == name:
+        _remove_incomplete_line(folder, path)
+    try:
+        table = pd.read_csv(
+            path,
+            dtype=dict.fromkeys(("strategy", "scene", "frame", "environment"), "str"),
+            keep_default_na=False,  # a scene may be called `nan`
+            na_values=[""],
+        )
+    except (ValueError, OSError) as error:
+        raise InputError(f"{path}: not a table of results ({error})") from error
+    if missing := required - set(table):
+        raise InputError(f"{path}: no columns {', '.join(sorted(missing))}")
+    return table
+
+
+def _remove_incomplete_line(folder: Path, path: Path) -> None:
+    """Remove a last line that an interrupted call left incomplete."""
+    with locked(folder), open(path, "r+b") as file:
+        data = file.read()
+        file.truncate(data.rfind(b"\n") + 1)
 
 
 def record_environment(folder: Path) -> str:
     """Add the record of this process to environments.json and return its key."""
     record = environment()
-    key = environment_key(record)
-    add_environments(folder, {key: record})
+    text = json.dumps(record, sort_keys=True)
+    key = hashlib.blake2b(text.encode(), digest_size=4).hexdigest()
+    with locked(folder):
+        before = read_environments(folder)
+        if key not in before:
+            write_json(folder / ENVIRONMENTS, before | {key: record})
     return key
 
 
-def add_environments(folder: Path, records: Mapping[str, dict[str, str]]) -> None:
-    """Add records by key to environments.json, unless it has all of them."""
-    with locked(folder):
-        before = read_environments(folder)
-        after = before | dict(records)
-        if after != before:
-            write_json(folder / ENVIRONMENTS, after)
-
-
-def read_environments(folder: Path) -> dict[str, dict[str, str]]:
-    """Read the records of a folder by key; empty without the file.
-
-    Raises:
-        InputError: The file is not JSON.
-    """
+def read_environments(folder: Path) -> dict[str, Any]:
+    """Read the records of a folder by key; empty without the file."""
     path = folder / ENVIRONMENTS
-    return read_settings(path) if path.exists() else {}  # pyright: ignore[reportReturnType]
-
-
-def read_strategies(folder: Path) -> dict[str, dict[str, object]]:
-    """Read `Strategy.description` of each strategy of a folder; empty without the file.
-
-    Raises:
-        InputError: The file is not JSON.
-    """
-    path = folder / STRATEGIES
-    return read_settings(path) if path.exists() else {}  # pyright: ignore[reportReturnType]
-
-
-def _to_record(result: SceneResult) -> dict[str, object]:
-    record = asdict(result)
-    for name in ("translation_m", "rotation_rad"):
-        record[name] = [round(v, 6) if math.isfinite(v) else None for v in record[name]]
-    squared = record.pop("squared_mahalanobis")
-    if not all(map(math.isnan, squared)):
-        record["squared_mahalanobis"] = [
-            None if math.isnan(value) else float(f"{value:.4g}") for value in squared
-        ]
-    for name in ("covering_radius", "min_spacing"):
-        record[name] = record[name] if math.isfinite(record[name]) else None
-    return record
-
-
-def _from_record(record: object) -> SceneResult:
-    if not isinstance(record, dict) or not _REQUIRED <= record.keys() <= _FIELDS:
-        raise KeyError("other fields")
-    for name, value in record.items():
-        missing = math.nan if name == "squared_mahalanobis" else math.inf
-        if name == "keyframe_positions_m":
-            record[name] = tuple(map(tuple, value))
-        elif isinstance(value, list):
-            record[name] = tuple(missing if v is None else v for v in value)
-        elif value is None:
-            record[name] = math.nan
-    return SceneResult(**record)
+    return read_settings(path) if path.exists() else {}

@@ -1,41 +1,29 @@
 """One run: a strategy with a seed over a sequence of scenes, resumed where it was interrupted."""
 
-import json
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
-import numpy as np
+import pandas as pd
 from filelock import FileLock
+from torch import nn
 
 from evercal.continual.benchmark.results import (
-    NETWORK,
     UNALIGNED,
-    SceneResult,
+    StageResults,
+    frame_row,
     record_environment,
-    scene_result,
+    scene_row,
 )
-from evercal.continual.benchmark.scene_views import keep_views
-from evercal.continual.learning.finish_scene import (
-    Learned,
-    correct_lens,
-    finished_stage,
-    memory_bytes,
-)
-from evercal.continual.learning.learn_jointly import learn_jointly
-from evercal.continual.learning.learn_scene import (
-    NetworkLearnOptions,
-    OnEvent,
-    learn_networks,
-    with_fitted_threshold,
-)
-from evercal.continual.learning.stage import Stage, StageOptions
-from evercal.continual.learning.stage_rows import encoded, scene_buffer, view_plan
-from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer, localizer_of
+from evercal.continual.learning.finish_scene import correct_lens, finished_stage
+from evercal.continual.learning.learn import learn_jointly
+from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
+from evercal.continual.learning.stage import StageOptions, unobserved
+from evercal.continual.learning.stage_rows import encode_rows, scene_buffer, view_plan
+from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer
 from evercal.continual.networks.atlas import combined_centres
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.feature_cache import cache_features
@@ -45,14 +33,14 @@ from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.continual.threshold import fit_threshold
 from evercal.evaluation.protocol import evaluate
 from evercal.features.device import device_of
+from evercal.learning.scene import learn_scene
 from evercal.localization.learned import LearnedLocalizer
 from evercal.localization.localizer import Localizer
 from evercal.localization.query import LocalizeOptions
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.selection import PoseSpace
+from evercal.mapping.store import MapStore
 from evercal.recordings import Frame, Recording, stated_poses
 from evercal.recordings.held_out import split_held_out
-from evercal.storage import write_json
 from evercal.storage.stages import is_store
 
 NETWORK_LOCALIZE = NetworkLocalizeOptions(refuses=False)
@@ -68,55 +56,95 @@ class RunOptions:
     """Options for learning a scene, with the seed of the run."""
     short_side: int
     """Working size of images, pixels."""
-    features: Path
-    """Folder of encoded views, shared by all runs."""
     out: Path
-    """Folder of results; its subfolder `runs` has the stores of runs in progress."""
+    """Folder of results; `runs` has the stores of runs in progress, `features` encoded views."""
     device: str = "cpu"
     """Device of the networks, see `features.device.device_of`."""
 
 
-class StageResults(NamedTuple):
-    """Results after one stage."""
-
-    stage: int
-    """Number of the stage, from 0."""
-    results: tuple[SceneResult, ...]
-    """Results of all scenes learned so far; empty before the last stage of joint training."""
-
-
 def run_strategy(
-    strategy: Strategy, scenes: Sequence[Recording], options: RunOptions, on_event: OnEvent | None
+    strategy: Strategy, scenes: Sequence[Recording], options: RunOptions
 ) -> Iterator[StageResults]:
     """Learn the scenes in turn and evaluate all scenes learned so far after each.
-
-    Args:
-        strategy: Strategy to run.
-        scenes: Scenes in order of learning.
-        options: Options of the run.
-        on_event: Called with every event while a scene is learned.
 
     Yields:
         Results of the stages that were not complete before.
     """
-    run = _Run(strategy, scenes, options, on_event)
+    if strategy.method is None:
+        return _MapRun(strategy, scenes, options).stages()
+    run = _NetworkRun(strategy, scenes, options)
     return run.jointly() if strategy.jointly else run.stages()
 
 
 class _Run:
-    def __init__(
-        self,
-        strategy: Strategy,
-        scenes: Sequence[Recording],
-        options: RunOptions,
-        on_event: OnEvent | None,
-    ):
+    """A strategy over a sequence of scenes; the store of the run is removed at its end."""
+
+    def __init__(self, strategy: Strategy, scenes: Sequence[Recording], options: RunOptions):
         self.strategy, self.scenes = strategy, scenes
-        self.on_event: OnEvent = on_event or (lambda _: None)
         self.device = device_of(options.device)
         self.options, self.stage = options, _with_centres(options.stage, scenes)
+        self.features = options.out.absolute() / "features"
         self.store = options.out / "runs" / f"{strategy.name}-{options.stage.seed}"
-        self._network_fits = self.store.with_name(f"{self.store.name}.network.json")
+
+    def _remove(self) -> None:
+        shutil.rmtree(self.store, ignore_errors=True)
+        self.store.with_name(f".{self.store.name}.lock").unlink(missing_ok=True)
+
+    def _evaluated(
+        self,
+        localizers: Mapping[str, LearnedLocalizer],
+        number: int,
+        newest: Keyframes | None,
+        costs: Mapping[str, object],
+    ) -> StageResults:
+        """Evaluate all scenes learned so far by localizers, each by the name of its results."""
+        results, frames = [], []
+        environment = record_environment(self.options.out)
+        costs = {**costs, "frames_kept": len(newest.images) if newest else 0}
+        for name, localizer in localizers.items():
+            run = {"strategy": name, "seed": self.stage.seed, "stage": number}
+            evaluated = evaluate(localizer, {s.name: s for s in self.scenes[: number + 1]})
+            for scene in self.scenes[: number + 1]:
+                of_scene = [frame for frame in evaluated if frame.scene == scene.name]
+                results.append({**run, **scene_row(of_scene), **costs, "environment": environment})
+                frames += [{**run, **frame_row(frame)} for frame in of_scene]
+        table = pd.DataFrame(frames).drop(columns="stage")
+        last = number == len(self.scenes) - 1
+        return StageResults(number, pd.DataFrame(results), table if last else table[:0])
+
+
+class _MapRun(_Run):
+    """Builds a map; it is also evaluated without alignment."""
+
+    def stages(self) -> Iterator[StageResults]:
+        """Learn scene after scene into a map; see `run_strategy`."""
+        if not is_store(self.store):
+            self._remove()  # left by an interrupted commit
+        for number in range(max(0, len(self._opened().stages) - 1), len(self.scenes)):
+            opened = self._opened()
+            contents = opened.contents.to(self.device)
+            assert isinstance(contents.encoder, nn.Module)
+            cache_features(contents.encoder, self.features)
+            if number >= len(opened.stages):
+                memory = self.stage.memory
+                size = memory.bytes or f"{100 * memory.share:g}%"
+                scene, report = learn_scene(self.scenes[number], contents, size)
+                opened.commit(scene, asdict(report))
+            name, unaligned = self.strategy.name, LocalizeOptions(align=False)
+            named = {name: Localizer(contents), name + UNALIGNED: Localizer(contents, unaligned)}
+            seconds = float(opened.reports()[-1]["seconds"])
+            costs = {"seconds": seconds, "memory_bytes": contents.memory_bytes, "head_bytes": 0}
+            yield self._evaluated(named, number, contents.scenes[-1].keyframes, costs)
+        self._remove()
+
+    def _opened(self) -> MapStore:
+        if is_store(self.store):
+            return MapStore.open(self.store)
+        return MapStore.create(self.store, short_side=self.options.short_side)
+
+
+class _NetworkRun(_Run):
+    """Trains a network."""
 
     def stages(self) -> Iterator[StageResults]:
         """Learn scene after scene into a store; see `run_strategy`."""
@@ -126,34 +154,24 @@ class _Run:
                 self._learn(self.store, self.scenes[number], self.strategy)
             opened = NetworkStore.open(self.store)
             seconds = float(opened.reports()[-1]["seconds"])
-            scenes = self._prepared(opened.contents)
-            yield StageResults(number, self._evaluated(scenes, number, seconds))
+            yield self._located(self._prepared(opened.contents), number, seconds)
         self._remove()
 
     def jointly(self) -> Iterator[StageResults]:
         """Learn all scenes at once; see `run_strategy`. An interrupted run starts again."""
         self._remove()
-        learned = self._prepared(self._new_store().contents)
+        empty = self._prepared(self._new_store().contents)
         splits = [split_held_out(scene.train) for scene in self.scenes]
         train = [replace(s, train=t.train) for s, t in zip(self.scenes, splits, strict=True)]
         began = time.perf_counter()
-        for event in learn_jointly(learned, self.strategy, train, self.stage):
-            if isinstance(event, Stage):
-                learned = event.scenes
-            else:
-                self.on_event(event)
+        learned = learn_jointly(empty, train, self.stage, unobserved).scenes
         for number, split in enumerate(splits):
-            learned.scenes[number] = with_fitted_threshold(learned, split.held_out, number)
+            learned.scenes[number] = fit_threshold(learned, split.held_out, number)
         seconds = time.perf_counter() - began
         last = len(self.scenes) - 1
-        yield from (StageResults(number, ()) for number in range(last))
-        yield StageResults(last, self._evaluated(learned, last, seconds))
-        self._remove()
-
-    def _remove(self) -> None:
-        shutil.rmtree(self.store, ignore_errors=True)
-        self.store.with_name(f".{self.store.name}.lock").unlink(missing_ok=True)
-        self._network_fits.unlink(missing_ok=True)
+        nothing = pd.DataFrame()
+        yield from (StageResults(number, nothing, nothing) for number in range(last))
+        yield self._located(learned, last, seconds)
 
     def _learn(self, store: Path, scene: Recording, strategy: Strategy) -> None:
         options = NetworkLearnOptions(
@@ -161,9 +179,9 @@ class _Run:
             stage=self.stage,
             short_side=self.options.short_side,
             device=str(self.device),
-            cache=self.options.features,
+            cache=self.features,
         )
-        learn_networks(store, scene, options, self.on_event)
+        learn_networks(store, scene, options, unobserved)
 
     def _new_store(self) -> NetworkStore:
         return NetworkStore.create(self.store, self.strategy.name, self.options.short_side)
@@ -171,24 +189,20 @@ class _Run:
     def _prepared(self, scenes: LearnedScenes) -> LearnedScenes:
         """Move to the device of the run and share encoded views with other runs."""
         scenes.to(self.device)
-        cache_features(scenes.encoder, self.options.features)  # pyright: ignore[reportArgumentType]
-        scenes.cache = self.options.features
+        cache_features(scenes.encoder, self.features)  # pyright: ignore[reportArgumentType]
+        scenes.cache = self.features
         return scenes
 
     def _begin(self) -> None:
         """Learn the first scene, unless the store has it.
 
-        Strategies that learn the first scene alike share its network. Each selects the frames to
-        remember from the same head.
+        All strategies share its network. Each selects the frames to remember from the same head.
         """
         if is_store(self.store):
             return
         self._remove()  # left by an interrupted commit
         scene, method = self.scenes[0], self.strategy.method
-        # Beside a map, the network learns frames with the poses and camera that the map adjusted.
-        if self.strategy.builds_map or method is None or not method.first_scene_alike:
-            self._learn(self.store, scene, self.strategy)
-            return
+        assert method is not None, "a network has a method"
         shared = self.store.with_name(f"first-{scene.name}-{self.stage.seed}")
         # Another process may be learning it.
         with FileLock(shared.with_name(f"{shared.name}.claim")):
@@ -199,8 +213,7 @@ class _Run:
         scenes = self._prepared(first.contents.copy_for_training())
         scenes.strategy, scenes.keyframes, scenes.method_states = self.strategy.name, [], []
         train = split_held_out(scene.train).train
-        learned = Learned(train, self._rows(scenes, train))
-        stage = finished_stage(scenes, method, learned, self.stage)
+        stage = finished_stage(scenes, method, train, self._rows(scenes, train), self.stage)
         report = first.reports()[-1]
         report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
         report["frames_kept"] = stage.frames_kept
@@ -212,86 +225,21 @@ class _Run:
         @cache
         def rows() -> FeatureBuffer:
             buffer = scene_buffer(0, scenes.scenes[0].cell, train, scenes.device)
-            for _ in encoded(buffer, train, view_plan(self.stage, scenes.short_side), scenes):
-                pass
+            encode_rows(buffer, train, view_plan(self.stage, scenes.short_side), scenes)
             correct_lens(buffer, scenes.scenes[0])
             return buffer
 
         return rows
 
-    def _evaluated(
-        self, scenes: LearnedScenes, number: int, seconds: float
-    ) -> tuple[SceneResult, ...]:
-        """Evaluate all scenes learned so far.
-
-        A map is also evaluated without alignment. A network beside a map is also evaluated alone.
-        """
-        name, localizer = self.strategy.name, localizer_of(scenes, NETWORK_LOCALIZE)
-        results = self._results(name, localizer, scenes, number, seconds)
-        if number == len(self.scenes) - 1:
-            keep_views(self.options.out, name, localizer, self.scenes)
-        if not self.strategy.builds_map:
-            return results
-        if self.strategy.method is None:
-            unaligned = Localizer(scenes.map_contents(), LocalizeOptions(align=False))
-            return results + self._results(name + UNALIGNED, unaligned, scenes, number, seconds)
-        network = self._without_map(scenes, self.strategy.method.replays)
-        alone = NetworkLocalizer(network, NETWORK_LOCALIZE)
-        return results + self._results(name + NETWORK, alone, network, number, seconds)
-
-    def _without_map(self, scenes: LearnedScenes, replays: bool) -> LearnedScenes:
-        """Return the network without maps; a method that replays keeps the keyframe images.
-
-        As without a map, thresholds are fitted once, when a scene is learned.
-        """
-        network, path = scenes.copy_for_training(), self._network_fits
-        for i, keyframes in enumerate(network.keyframes):
-            assert keyframes is not None, "a map has keyframes"
-            images = Keyframes(keyframes.images, keyframes.cameras, keyframes.base_from_camera)
-            network.keyframes[i] = images if replays else None
-            record = network.scenes[i]
-            # Training took the camera that the map adjusted.
-            network.scenes[i] = replace(record, map=None, refined_camera=record.adjusted_camera)
-        fits: list[list[float]] = json.loads(path.read_text()) if path.exists() else []
-        for i in range(len(fits), len(network.scenes)):
-            held_out = split_held_out(self.scenes[i].train).held_out
-            record = fit_threshold(network, held_out, i)
-            fits.append([record.inlier_threshold, record.covariance_scale])
-        path.parent.mkdir(parents=True, exist_ok=True)  # joint training commits no store
-        write_json(path, fits)
-        network.scenes = [
-            replace(record, inlier_threshold=threshold, covariance_scale=scale)
-            for record, (threshold, scale) in zip(network.scenes, fits, strict=True)
-        ]
-        return network
-
-    def _results(
-        self,
-        name: str,
-        localizer: LearnedLocalizer,
-        learned: LearnedScenes,
-        number: int,
-        seconds: float,
-    ) -> tuple[SceneResult, ...]:
-        scenes = self.scenes[: number + 1]
-        frames = evaluate(localizer, {scene.name: scene for scene in scenes})
-        environment = record_environment(self.options.out)
-        keyframes = learned.keyframes[number]
-        return tuple(
-            scene_result(
-                [frame for frame in frames if frame.scene == scene.name],
-                strategy=name,
-                seed=self.stage.seed,
-                stage=number,
-                seconds=seconds,
-                memory_bytes=memory_bytes(learned, self.strategy),
-                head_bytes=sum(head_bytes(head) for head in learned.heads),
-                frames_kept=len(keyframes.images) if keyframes else 0,
-                environment=environment,
-                **(_coverage(keyframes, scene) if scene is scenes[-1] else {}),
-            )
-            for scene in scenes
-        )
+    def _located(self, scenes: LearnedScenes, number: int, seconds: float) -> StageResults:
+        costs = {
+            "seconds": seconds,
+            "memory_bytes": scenes.memory_bytes,
+            "head_bytes": sum(head_bytes(head) for head in scenes.heads),
+        }
+        localizer = NetworkLocalizer(scenes, NETWORK_LOCALIZE)
+        named = {self.strategy.name: localizer}
+        return self._evaluated(named, number, scenes.keyframes[number], costs)
 
 
 def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOptions:
@@ -301,21 +249,3 @@ def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOpti
     positions = [stated_poses(split_held_out(scene.train).train).translation_m for scene in scenes]
     centres = combined_centres(positions, stage.head.centres_per_scene, stage.seed)
     return replace(stage, grid_scenes=len(scenes), fixed_centres_m=centres)
-
-
-def _coverage(keyframes: Keyframes | None, scene: Recording) -> dict[str, object]:
-    """Measure how the remembered frames of a scene cover its training frames."""
-    if keyframes is None or not keyframes.images:
-        return {}
-    poses = stated_poses(split_held_out(scene.train).train)
-    positions = keyframes.base_from_camera.translation_m
-    distances = np.linalg.norm(poses.translation_m[:, None] - positions[None], axis=-1)
-    selected = distances.argmin(0)
-    space = PoseSpace.of(poses.translation_m, poses.rotation_wxyz)
-    gaps = np.stack([space.distances(int(i)) for i in selected])
-    pairs = gaps[:, selected][np.triu_indices(len(selected), 1)]
-    return {
-        "keyframe_positions_m": tuple(tuple(round(float(v), 4) for v in p) for p in positions),
-        "covering_radius": float(gaps.min(0).max()),
-        "min_spacing": float(pairs.min(initial=np.inf)),
-    }

@@ -1,6 +1,6 @@
 """Suites: named sequences of scenes for comparing strategies."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,50 +27,31 @@ class Suite:
     """Names in order of learning; each is a folder of the data."""
     source: str
     """Source of the data, for messages."""
-    load: Callable[[Path | None, Sequence[str]], list[Recording]]
-    """Loads scenes, given the folder of the data and their names."""
-
-
-def _folders(data: Path | None, names: Sequence[str]) -> list[Recording]:
-    if data is None:
-        raise InputError("this suite needs recordings: give their folder with --data")
-    # Names of scenes have no slashes: apt1/kitchen becomes apt1-kitchen.
-    return [load_recording(data / name, name=name.replace("/", "-")) for name in names]
-
-
-def _packaged(data: Path | None, names: Sequence[str]) -> list[Recording]:
-    rooms = {room.scene.name: room.scene for room in sample_rooms()}
-    return [rooms[name] for name in names]
 
 
 _THREE = ("bedroom", "kitchen", "living")
+_TWELVE = tuple(f"{room}-{i}" for i in range(1, 5) for room in _THREE)
 
 
-def _rendered(name: str, rooms: tuple[str, ...]) -> Suite:
-    return Suite(rooms, f"python -m rooms {name} --out DIR in a checkout", _folders)
-
-
-def _numbered(count: int) -> tuple[str, ...]:
-    return tuple(f"{_THREE[i % 3]}-{i // 3 + 1}" for i in range(count))
+def _rendered(name: str, scenes: tuple[str, ...] = _THREE) -> Suite:
+    return Suite(scenes, f"python -m rooms {name} --out DIR")
 
 
 SUITES: dict[str, Suite] = {
-    "sim-mini": Suite(_THREE, "the package", _packaged),
-    "sim": _rendered("sim", _THREE),
-    "sim-7": _rendered("sim-7", _numbered(7)),
-    "sim-12": _rendered("sim-12", _numbered(12)),
+    "sim-mini": Suite(_THREE, "the package"),
+    "sim": _rendered("sim"),
+    "sim-7": _rendered("sim-7", _TWELVE[:7]),
+    "sim-12": _rendered("sim-12", _TWELVE),
     "sim-repeat": _rendered("sim-repeat", ("workshop", "canteen", "hall")),
-    "sim-tune": _rendered("sim-tune", _THREE),
-    "sim-unseen": _rendered("sim-unseen", _THREE),
+    "sim-tune": _rendered("sim-tune"),
+    "sim-unseen": _rendered("sim-unseen"),
     "real2": Suite(
         ("redkitchen", "fr1_rpy"),
         "7-Scenes (Shotton et al., CVPR 2013) and TUM RGB-D (Sturm et al., IROS 2012)",
-        _folders,
     ),
     "i7s": Suite(
         ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs"),
         "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/",
-        _folders,
     ),
     "i12s": Suite(
         (
@@ -80,7 +61,6 @@ SUITES: dict[str, Suite] = {
             *(f"office2/{room}" for room in ("5a", "5b")),
         ),
         "https://graphics.stanford.edu/projects/reloc/",
-        _folders,
     ),
 }
 
@@ -96,9 +76,6 @@ def load_suite(
         only: Names of the scenes to load. Defaults to all.
         poses: Folder of structure-from-motion poses (Brachmann et al., ICCV 2021) for i7s or i12s.
             Defaults to the original poses.
-
-    Raises:
-        InputError: Unknown suite or scene, a missing folder, or poses for another suite.
     """
     if name not in SUITES:
         names = ", ".join([*SUITES, "custom", "regions"])
@@ -112,14 +89,19 @@ def load_suite(
             f"scene {unknown[0]!r}: not in suite {name}; choose from {', '.join(suite.scenes)}"
         )
     names = [scene for scene in suite.scenes if not only or scene in only]
-    if data is not None and suite.load is _folders:
-        missing = [scene for scene in names if not (data / scene).is_dir()]
-        if missing:
-            raise InputError(
-                f"suite {name}: {data / missing[0]} is missing; get it from {suite.source}, or"
-                " select other scenes with --scenes"
-            )
-    scenes = suite.load(data, names)
+    if name == "sim-mini":
+        rooms = {room.scene.name: room.scene for room in sample_rooms()}
+        return [rooms[scene] for scene in names]
+    if data is None:
+        raise InputError("this suite needs recordings: give their folder with --data")
+    missing = [scene for scene in names if not (data / scene).is_dir()]
+    if missing:
+        raise InputError(
+            f"suite {name}: {data / missing[0]} is missing; get it from {suite.source}, or select"
+            " other scenes with --scenes"
+        )
+    # Names of scenes have no slashes: apt1/kitchen becomes apt1-kitchen.
+    scenes = [load_recording(data / scene, name=scene.replace("/", "-")) for scene in names]
     if poses is None:
         return scenes
     folders = [scene.replace("/", "_") for scene in names]
@@ -130,9 +112,6 @@ def tuning_split(scene: Recording) -> Recording:
     """Split training frames for choosing settings; the test frames are not used.
 
     Of ten equal runs of training frames, the third and the eighth become test frames.
-
-    Raises:
-        InputError: Too few posed training frames remain.
     """
     frames = posed_frames(scene.train)
     tenth = [10 * i // len(frames) for i in range(len(frames))]
@@ -152,9 +131,6 @@ def regions(scene: Recording, parts: int) -> list[Recording]:
     Regions are k-means clusters of the points one metre in front of the training cameras, in the
     order in which the recording first reaches them. Test frames belong to the nearest cluster. All
     regions share one base frame, so a pose in a neighbouring region counts.
-
-    Raises:
-        InputError: Fewer than two parts, or a region with too few frames.
     """
     from scipy.cluster.vq import kmeans2, vq
 

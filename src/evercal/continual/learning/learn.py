@@ -1,136 +1,105 @@
-"""`learn`: one more scene, as a generator of progress, checkpoints and the finished stage."""
+"""`learn`: one more scene; `learn_jointly`: all frames of all scenes at once, as a reference."""
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
-import torch
-
-from evercal.continual.learning.finish_scene import (
-    Learned,
-    correct_lens,
-    finished_stage,
-    trained_record,
-)
-from evercal.continual.learning.stage import Event, Stage, StageOptions
-from evercal.continual.learning.stage_head import head_for_scene, whiten
+from evercal.continual.learning.finish_scene import correct_lens, finished_stage, trained_record
+from evercal.continual.learning.stage import OnEvent, Stage, StageOptions, unobserved
+from evercal.continual.learning.stage_head import head_for_all, head_for_scene, whiten
 from evercal.continual.learning.stage_rows import (
-    Pacer,
     add_surfaces,
-    encoded,
+    encode_rows,
     remembered,
     scene_buffer,
     view_plan,
 )
-from evercal.continual.methods.method import StageStart
-from evercal.continual.networks.distributed import broadcast
+from evercal.continual.methods.method import Method, StageStart
 from evercal.continual.networks.trainer import HeadTrainer
-from evercal.continual.scenes import LearnedScenes, SceneRecord
-from evercal.continual.store import Checkpoint, Resume
-from evercal.continual.strategies import Strategy
-from evercal.mapping.build import BuiltMap, OnProgress, build_map
-from evercal.recordings.frame import Frame, Recording, stated_poses
+from evercal.continual.scenes import LearnedScenes
+from evercal.recordings.frame import Recording, stated_poses
 
 
 def learn(
     scenes: LearnedScenes,
-    strategy: Strategy,
+    method: Method,
     recording: Recording,
     options: StageOptions,
-    resume: Resume | None = None,
-    on_progress: OnProgress = lambda *_: None,
-) -> Iterator[Event]:
+    on_event: OnEvent = unobserved,
+) -> Stage:
     """Learn one more scene.
 
     Args:
         scenes: what was learned before; not changed.
-        strategy: a method, a map or both; a joint strategy has its own function, `learn_jointly`.
+        method: how the network is trained.
         recording: its training frames are learned, its test frames are not read.
         options: of the stage.
-        resume: checkpoints of an interrupted run of the same call.
-        on_progress: called while a map is built.
-
-    Yields:
-        `Encoding` and `Progress`, a `Checkpoint` every 10 seconds, and a `Stage` at the end.
+        on_event: called for progress bars.
     """
-    method = strategy.method
-    if method is None:
-        yield _learn_map(scenes, recording, options, on_progress)
-        return
-    after, frames, built = scenes.copy_for_training(), recording.train, None
-    if strategy.builds_map:
-        built = build_scene_map(scenes, recording, options, on_progress)
-        frames = adjusted_frames(built, frames)
+    after, frames = scenes.copy_for_training(), recording.train
     teacher = copy.deepcopy(after.heads[-1]).eval() if after.heads else None
     positions = stated_poses(frames).translation_m
     cell = after.atlas(options.grid_scenes).place(positions)
     in_atlas = cell.atlas_from_base.apply(positions)
     head, local = head_for_scene(after, method.head_per_scene, options, in_atlas)
-    buffer, pacer = scene_buffer(local, cell, frames, scenes.device), Pacer()
-    plan = view_plan(options, scenes.short_side)
-    yield from encoded(buffer, frames, plan, scenes, resume, pacer)
+    buffer = scene_buffer(local, cell, frames, scenes.device)
+    encode_rows(buffer, frames, view_plan(options, scenes.short_side), scenes, on_event)
     if options.fit.surface_weight > 0:
-        yield from add_surfaces(buffer, frames, scenes)
+        add_surfaces(buffer, frames, scenes)
     if teacher is None:
         whiten(head, [buffer], options.seed)
-    memories = (yield from remembered(scenes, options)) if method.replays else []
+    memories = remembered(scenes, options, on_event) if method.replays else []
     rows, states = options.fit.replay_batch, scenes.method_states
-    # Hooks may derive values from the weights, which must be equal in all processes.
-    broadcast([*head.parameters(), *head.buffers()])
     hooks = method.begin(StageStart(head, teacher, memories, states, rows, options.seed))
-    fit = options.fit if built is None else options.fit.with_known_lens()
-    trainer = HeadTrainer(head, [buffer], fit, options.seed, hooks)
-    if resume is not None and resume.trainer:
-        trainer.load(dict(resume.trainer))
+    trainer = HeadTrainer(head, [buffer], options.fit, options.seed, hooks)
     for progress in trainer.run():
-        yield progress
-        if pacer.due():
-            yield Checkpoint({}, trainer.state())
-    after.scenes.append(trained_record(recording, cell, trainer, 0, len(frames)))
+        on_event(progress)
+    after.scenes.append(trained_record(recording, cell, trainer, 0))
     correct_lens(buffer, after.scenes[-1])
-    done = Learned(frames, lambda: buffer, hooks, built)
-    yield finished_stage(after, method, done, options)
+    return finished_stage(after, method, frames, lambda: buffer, options)
 
 
-def build_scene_map(
-    scenes: LearnedScenes, recording: Recording, options: StageOptions, on_progress: OnProgress
-) -> BuiltMap:
-    """Build the map of a scene with a stage's options."""
-    sized = options.map_options(scenes.short_side)
-    return build_map(recording.name, recording.train, scenes.encoder, sized, on_progress)
+def learn_jointly(
+    start: LearnedScenes,
+    recordings: Sequence[Recording],
+    options: StageOptions,
+    on_event: OnEvent = unobserved,
+) -> Stage:
+    """Train one head on several scenes, with the steps and rows of the same number of stages.
 
-
-def adjusted_frames(built: BuiltMap, frames: Sequence[Frame]) -> list[Frame]:
-    """Frames with the poses and intrinsics of their map, so that a network learns the same points.
-
-    Frames that the map excludes are left out.
+    A step has the rows of one that learns a scene and replays others.
 
     Args:
-        built: the map of the recording.
-        frames: the posed frames that it was built from, in recorded order.
+        start: without scenes; not changed.
+        recordings: their training frames are learned.
+        options: of one stage.
+        on_event: called for progress bars.
+
+    Returns:
+        The stage of all scenes.
     """
-    scene, adjusted = built.scene, []
-    for frame in frames:
-        excluded = (*built.adjusted.wrong_poses, *built.adjusted.untracked)
-        if frame.name in excluded or frame.base_from_camera is None:
-            continue
-        camera = scene.adjusted_camera if frame.camera == scene.camera else frame.camera
-        pose = scene.frame.from_base(frame.base_from_camera)
-        adjusted.append(replace(frame, base_from_camera=pose, camera=camera))
-    return adjusted
-
-
-def _learn_map(
-    scenes: LearnedScenes, recording: Recording, options: StageOptions, on_progress: OnProgress
-) -> Stage:
-    """Learn a scene by building its map; nothing is trained."""
-    after, frames = scenes.copy_for_training(), recording.train
-    built = build_scene_map(scenes, recording, options, on_progress)
-    cell = after.atlas(options.grid_scenes).place(stated_poses(frames).translation_m)
-    empty = torch.zeros(0, after.descriptor.width).half()
-    after.scenes.append(
-        SceneRecord(recording.name, frames[0].camera, cell, empty, len(frames), map=built.scene)
-    )
-    after.keyframes.append(built.scene.keyframes)
-    after.method_states.append({})
-    return Stage(after, 0, len(built.scene.keyframes), built)
+    after, fit = start.copy_for_training(), options.fit
+    plan = view_plan(options, start.short_side)
+    cells, positions, buffers = [], [], []
+    atlas = after.atlas(options.grid_scenes)
+    for number, recording in enumerate(recordings):
+        cameras = stated_poses(recording.train).translation_m
+        cells.append(atlas.place(cameras))
+        positions.append(cells[-1].atlas_from_base.apply(cameras))
+        buffers.append(scene_buffer(number, cells[-1], recording.train, start.device))
+        encode_rows(buffers[-1], recording.train, plan, start, on_event)
+        if fit.surface_weight > 0:
+            add_surfaces(buffers[-1], recording.train, start)
+    head = head_for_all(after, options, positions)
+    whiten(head, buffers, options.seed)
+    rows = fit.batch + (fit.replay_batch if len(recordings) > 1 else 0)
+    whole = replace(fit, iterations=fit.iterations * len(recordings), batch=rows)
+    trainer = HeadTrainer(head, buffers, whole, options.seed)
+    for progress in trainer.run():
+        on_event(progress)
+    for number, recording in enumerate(recordings):
+        after.scenes.append(trained_record(recording, cells[number], trainer, number))
+        rows_of = partial(buffers.__getitem__, number)
+        finished_stage(after, Method(), recording.train, rows_of, options)
+    return Stage(after, whole.iterations, 0)

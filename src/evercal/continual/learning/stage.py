@@ -1,13 +1,12 @@
-"""Options of one stage (learning one scene), and its events."""
+"""Options of one stage (learning one scene), its events, and its outcome."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from evercal.continual.networks.buffer import EncodePlan
 from evercal.continual.networks.head import HeadOptions
 from evercal.continual.networks.trainer import FitOptions, Progress
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.store import Checkpoint
-from evercal.mapping.build import BuiltMap, MapOptions
 from evercal.mapping.memory_budget import MemoryBudget
 
 
@@ -30,19 +29,12 @@ class StageOptions:
     grid_scenes: int = 0
     """Scenes of the combined grid (`Atlas` layout `paper`); 0 gives each scene the next free
     cell."""
-    map: MapOptions = field(default_factory=MapOptions)
-    """Options of the map, for strategies that build one."""
     seed: int = 0
     """Random seed."""
 
     def with_memory(self, memory: str | int) -> "StageOptions":
         """The same options with a memory budget such as `10%` or `5MB`."""
         return replace(self, memory=MemoryBudget.parse(memory))
-
-    def map_options(self, short_side: int) -> MapOptions:
-        """Options of the map at the working size of a store."""
-        size = replace(self.map.size, cells=short_side)
-        return replace(self.map, memory=self.memory, size=size)
 
 
 @dataclass
@@ -55,6 +47,13 @@ class Encoding:
     """Views to encode."""
 
 
+OnEvent = Callable[[Encoding | Progress], object]
+
+
+def unobserved(event: Encoding | Progress) -> None:
+    """Ignore an event."""
+
+
 @dataclass
 class Stage:
     """A finished stage."""
@@ -65,8 +64,3 @@ class Stage:
     """Optimiser steps."""
     frames_kept: int
     """Keyframes of this scene."""
-    built: BuiltMap | None = None
-    """The map of the scene, for strategies that build one."""
-
-
-Event = Encoding | Progress | Checkpoint | Stage

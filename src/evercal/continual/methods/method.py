@@ -50,13 +50,7 @@ class FinishedScene:
     rows: Callable[[], FeatureBuffer]
     """Returns the rows of the scene's training frames."""
     remembered: Callable[[], FeatureBuffer]
-    """Returns the rows of the scene's keyframes as they will be replayed, plain views first."""
-    keyframes: int
-    """Number of keyframes, and of plain views at the start of these rows."""
-    earlier: Sequence[MethodState]
-    """States of all earlier scenes in order."""
-    hooks: TrainingHooks | None
-    """Hooks of the stage; None if the scene was learned by plain training."""
+    """Returns the rows of the scene's keyframes as they will be replayed."""
     diffusion: float = 0.0
     """Noise on the descriptors of replayed rows; 0 if the head has no descriptor input."""
 
@@ -75,8 +69,6 @@ class Method:
     """Whether training needs the rows of remembered keyframes."""
     head_per_scene: ClassVar[bool] = False
     """Whether every scene gets its own head."""
-    first_scene_alike: ClassVar[bool] = True
-    """Whether training on the first scene is the same for all such methods."""
 
     def select(self, frames: FrameStatistics, capacity: int) -> np.ndarray | None:
         """Select the keyframes: sorted indices into the recorded frames, or None for no memory."""
@@ -90,9 +82,20 @@ class Method:
         """Compute what is stored beside the keyframes of a finished scene."""
         return {}
 
-    def needed(self, states: Sequence[MethodState]) -> Sequence[MethodState]:
-        """Select the states that later stages use; only these count as memory."""
-        return states
+
+@dataclass(frozen=True)
+class FineTuning(Method):
+    """Trains on each new scene from the weights after the last one."""
+
+    citation: ClassVar[str] = "control: the same head and steps, no replay"
+
+
+@dataclass(frozen=True)
+class Isolation(Method):
+    """A head per scene, initialised from the last one; scenes share no weights."""
+
+    citation: ClassVar[str] = "after ESAC (Brachmann and Rother, ICCV 2019): an expert per scene"
+    head_per_scene: ClassVar[bool] = True
 
 
 def described(record: object) -> dict[str, object]:

@@ -1,7 +1,6 @@
 """Maximally interfered retrieval: replay of views that a step on new rows harms most."""
 
 import copy
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,7 +10,6 @@ from torch import Tensor
 from evercal.continual.methods.method import StageStart
 from evercal.continual.methods.replay import Replay, ReplayHooks
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
-from evercal.continual.networks.distributed import broadcast
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.networks.loss import fixed_clamp_loss
@@ -56,8 +54,6 @@ class _MirHooks(ReplayHooks):
                 interfered_views(self._options, self._head, fresh, memory, rate, generator)
                 for memory in self.memories
             ]
-            # Rounding may order equal losses otherwise in another process.
-            broadcast(self._views)
         rows = []
         for memory, views in zip(self.memories, self._views, strict=True):
             view = memory.tensors["view"]
@@ -65,12 +61,6 @@ class _MirHooks(ReplayHooks):
             drawn = torch.randint(len(where), (self.each,), generator=generator, device="cpu")
             rows.append(memory.rows(where[drawn.to(where.device)]))
         return rows
-
-    def state(self) -> dict[str, Tensor]:
-        return {f"views.{i}": views for i, views in enumerate(self._views)}
-
-    def load(self, state: Mapping[str, Tensor]) -> None:
-        self._views = [state[f"views.{i}"] for i in range(len(state))]
 
 
 def interfered_views(

@@ -89,26 +89,6 @@ class BoundedByTeacher(Penalty):
 
 
 @dataclass(frozen=True)
-class StoredOutput(Penalty):
-    """DER++ for points: reprojection loss, and distance to the points stored with a scene.
-
-    Points are stored for plain views of remembered frames. Rows of augmented views have the
-    reprojection loss only.
-    """
-
-    needs_teacher: ClassVar[bool] = False
-    px_per_m: float = PX_PER_M
-    """Weight of the distance to the stored points, pixels per metre."""
-
-    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
-        assert rows.known is not None, "the method stores points when a scene is finished"
-        has_point = ~rows.known[:, 0].isnan()
-        distance = (student.points[has_point] - rows.known[has_point]).abs().sum(-1)
-        distance = distance.sum() / max(len(distance), 1)
-        return 0.5 * _reprojection(student, rows, tau_px) + 0.5 * self.px_per_m * distance
-
-
-@dataclass(frozen=True)
 class Relations(Penalty):
     """Co2L for points: reprojection loss, and similarity between rows.
 

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evercal.continual.methods.method import FinishedScene, Method, StageStart
-from evercal.continual.methods.penalties import Penalty, Reprojection, StoredOutput
+from evercal.continual.methods.method import Method, StageStart
+from evercal.continual.methods.penalties import Penalty, Reprojection
 from evercal.continual.networks.buffer import Rows
 from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
@@ -85,31 +85,3 @@ def teacher_output(teacher: Head, rows: Rows) -> HeadOutput:
     """Apply a frozen head to rows."""
     with torch.no_grad(), autocast(rows.features.device):
         return teacher(rows.features.float(), rows.scene, rows.descriptor)
-
-
-@dataclass(frozen=True)
-class DarkExperienceReplay(Replay):
-    """DER++ for points (Buzzega et al., NeurIPS 2020): stores output points of the keyframes."""
-
-    citation: ClassVar[str] = "Buzzega et al., Dark experience (DER++), NeurIPS 2020"
-    penalty: Penalty = field(default_factory=StoredOutput)
-
-    def begin(self, start: StageStart) -> TrainingHooks:
-        """Replay with the stored points of plain views."""
-        for memory in start.memories:
-            state = start.states[memory.scene]
-            memory.known = (state["points"].float() + state["origin"]).to(memory.device)
-        return super().begin(start)
-
-    def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
-        """Return `points` (m, 3) of plain views in half precision, and their mean `origin` (3,).
-
-        Points are stored relative to the origin, where half precision is sufficient.
-        """
-        buffer = scene.remembered()
-        plain = int((buffer.tensors["view"] < scene.keyframes).sum())
-        rows = buffer.rows(torch.arange(plain, device="cpu"))
-        with torch.no_grad():
-            points = scene.output(rows).points
-        origin = points.mean(0)
-        return {"points": (points - origin).half().cpu(), "origin": origin.cpu()}

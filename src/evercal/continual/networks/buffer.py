@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from evercal.continual.networks.descriptor import Descriptor, encode
-from evercal.continual.networks.distributed import gather, processes, rank, shared_out
 from evercal.continual.networks.loss import MAX_RADIUS2, Target
 from evercal.features.encode import ENCODE_BATCH
 from evercal.features.encoder import Encoder
@@ -19,8 +18,6 @@ from evercal.geometry.se3 import SE3
 from evercal.recordings.frame import Frame
 
 UNDISTORT_STEPS = 10
-RESERVED_SHARE = 0.25
-"""Share of a GPU's memory that rows may not fill: room for weights, activations, the encoder."""
 
 
 @dataclass
@@ -38,18 +35,11 @@ class Rows:
     index: Tensor
     """(n,) position in the buffer."""
     known: Tensor | None = None
-    """(n, 3) points of the atlas that are known in advance, from depths or an earlier head; NaN for
-    rows without one."""
+    """(n, 3) points of the atlas that are known from depths; NaN for rows without one."""
 
     def part(self, where: slice | Tensor) -> "Rows":
         """Return the rows of a slice, or at indices (m,)."""
         return _combined([self], lambda values: values[0][where])
-
-    def to(self, device: torch.device) -> "Rows":
-        """Copy to a device; copies from pinned memory to a GPU are asynchronous."""
-        if self.features.device == device:
-            return self
-        return _combined([self], lambda v: v[0].to(device, non_blocking=device.type == "cuda"))
 
 
 _TARGET = "target.pixels", "target.intrinsics", "target.camera_from_atlas"
@@ -68,8 +58,7 @@ def _combined(parts: Sequence[Rows], change: Callable[[list[Tensor]], Tensor]) -
 class FeatureBuffer:
     """Feature rows of one scene, with poses and cameras in a side table (one entry per view).
 
-    Added rows accumulate on the CPU. On first use all rows move to `device`. If a GPU has no room
-    for them, they stay on the CPU and drawn rows are copied.
+    Added rows accumulate on the CPU. On first use all rows move to `device`.
 
     Args:
         scene: Index of the scene in the head.
@@ -89,15 +78,12 @@ class FeatureBuffer:
         self.correctable, self.device = correctable, torch.device(device)
         self.views = 0
         self.known: Tensor | None = None
-        """(m, 3) known points of the first m rows, on the buffer's device, see `Rows.known`."""
+        """(rows, 3) known points, on the buffer's device, see `Rows.known`."""
         self._parts: list[dict[str, Tensor]] = []
-        self._saved = 0  # leading parts that `take_new` has returned
         self._merged: dict[str, Tensor] | None = None
 
-    def part(
-        self, first: int, views: Sequence[View], encoded: tuple[Tensor, Tensor], keep: Tensor
-    ) -> dict[str, Tensor]:
-        """Return the rows of views by name, on the CPU; `first` is the first view's number.
+    def append(self, views: Sequence[View], encoded: tuple[Tensor, Tensor], keep: Tensor) -> None:
+        """Append rows of views.
 
         `encoded` are features (b, channels, h, w) and descriptors (b, width) on any device. The
         mask `keep` (b, cells) selects rows.
@@ -106,8 +92,8 @@ class FeatureBuffer:
         rows = features.flatten(2).transpose(1, 2)
         poses = SE3.stack([self.atlas_from_base @ view.base_from_camera for view in views])
         pixels = torch.from_numpy(np.stack([view.cell_pixels for view in views]))
-        number = torch.arange(first, first + len(views), dtype=torch.int32, device="cpu")
-        return {
+        number = torch.arange(self.views, self.views + len(views), dtype=torch.int32, device="cpu")
+        part = {
             "features": rows[keep.to(rows.device)].half().cpu(),
             "pixels": pixels[keep],
             "view": number.repeat_interleave(keep.sum(1)),
@@ -115,34 +101,24 @@ class FeatureBuffer:
             "camera_from_atlas": torch.from_numpy(poses.inverse().matrix()[:, :3]).float(),
             "descriptors": descriptors.float().cpu(),
         }
+        self.extend(part)
 
-    def append(self, part: dict[str, Tensor]) -> None:
-        """Append the result of `part`."""
-        self._parts.append(part)
+    def extend(self, part: Mapping[str, Tensor]) -> None:
+        """Append rows by name, as in `tensors`."""
+        self._parts.append(dict(part))
         self.views += len(part["intrinsics"])
         self._merged = None
 
-    def take_new(self) -> dict[str, Tensor]:
-        """Return the rows added since the last call for a checkpoint, on the CPU; may be empty."""
-        parts, self._saved = self._parts[self._saved :], len(self._parts)
-        return _merge(parts) if parts else {}
-
-    def restore(self, rows: Mapping[str, Tensor]) -> None:
-        """Append rows that `take_new` returned."""
-        self.append(dict(rows))
-        self._saved = len(self._parts)
-
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name, on the buffer's device, or on the CPU if the device has no room."""
+        """All tensors by name, on the buffer's device."""
         if self._merged is None:
-            halves = self._parts[: self._saved], self._parts[self._saved :]
-            self._parts = [_merge(half) for half in halves if half]
-            self._saved = min(self._saved, 1)
-            merged = _merge(self._parts)
-            self._merged = _moved(merged, self.device) if _fits(merged, self.device) else merged
-            if len(self._parts) == 1:
-                self._parts = [self._merged]  # one copy in memory
+            names = self._parts[0]
+            self._merged = {
+                name: torch.cat([part[name].cpu() for part in self._parts]).to(self.device)
+                for name in names
+            }
+            self._parts = [self._merged]  # one copy in memory
         return self._merged
 
     def __len__(self) -> int:
@@ -162,7 +138,7 @@ class FeatureBuffer:
             plane = distorted / (1 + k1 * radius2 + k2 * radius2 * radius2)
         pixels, intrinsics = plane * focals[view] + centres[view], torch.cat([focals, centres], -1)
         self._merged = {**t, "pixels": pixels, "intrinsics": intrinsics}
-        self._parts, self._saved = [self._merged], 1
+        self._parts = [self._merged]
 
     def draw(self, count: int, generator: torch.Generator) -> Rows:
         """Draw `count` random rows with replacement, equal on every device."""
@@ -171,51 +147,14 @@ class FeatureBuffer:
     def rows(self, index: Tensor) -> Rows:
         """Return the rows at `index` (n,), which may be on any device."""
         t = self.tensors
-        held = t["view"].device
-        index = index.to(held)
+        index = index.to(t["view"].device)
         view = t["view"][index].long()
-
-        def at(name: str, where: Tensor) -> Tensor:
-            return t[name][where] if held == self.device else _pinned(t[name], where)
-
-        target = Target(at("pixels", index), at("intrinsics", view), at("camera_from_atlas", view))
-        scene = torch.full((len(index),), self.scene, device=held)
-        features, descriptors = at("features", index), at("descriptors", view)
-        rows = Rows(features, scene, descriptors, target, index).to(self.device)
+        target = Target(t["pixels"][index], t["intrinsics"][view], t["camera_from_atlas"][view])
+        scene = torch.full((len(index),), self.scene, device=index.device)
+        rows = Rows(t["features"][index], scene, t["descriptors"][view], target, index)
         if self.known is not None:
-            last = len(self.known) - 1
-            points = self.known[rows.index.clamp(max=last)].float()
-            rows.known = torch.where((rows.index <= last)[:, None], points, torch.nan)
+            rows.known = self.known[index].float()
         return rows
-
-
-def _merge(parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Concatenate parts on the CPU."""
-    parts = [_moved(part, torch.device("cpu")) for part in parts]
-    if len(parts) == 1:
-        return parts[0]
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-
-
-def _moved(part: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
-    return {name: value.to(device) for name, value in part.items()}
-
-
-def _fits(part: Mapping[str, Tensor], device: torch.device) -> bool:
-    """Return whether a device has room for tensors beside its reserved share."""
-    if device.type != "cuda":
-        return True
-    free, total = torch.cuda.mem_get_info(device)
-    # Memory that the allocator caches is free too.
-    free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return sum(value.nbytes for value in part.values()) <= free - RESERVED_SHARE * total
-
-
-def _pinned(values: Tensor, index: Tensor) -> Tensor:
-    """Select rows of a CPU tensor into pinned memory, from which a GPU copies asynchronously."""
-    shape = (len(index), *values.shape[1:])
-    out = torch.empty(shape, dtype=values.dtype, device="cpu", pin_memory=True)
-    return torch.index_select(values, 0, index, out=out)
 
 
 def join(parts: Sequence[Rows]) -> Rows:
@@ -242,15 +181,6 @@ def diffused(rows: Rows, deviation: float, generator: torch.Generator) -> Rows:
     return replace(rows, descriptor=descriptor)
 
 
-def own_share(rows: Rows) -> Rows:
-    """Select this process's rows of a batch; every process gets the same number."""
-    count = processes()
-    if count == 1:
-        return rows
-    whole = len(rows.scene) // count * count
-    return rows.part(slice(rank(), whole, count))
-
-
 @dataclass(frozen=True)
 class EncodePlan:
     """How a buffer is filled."""
@@ -274,37 +204,27 @@ def encode_frames(
 ) -> Iterator[int]:
     """Encode every frame `plan.views_per_frame` times into a buffer.
 
-    Views already in the buffer (after an interruption) are skipped. With several processes
-    (`networks.distributed`), each encodes its share of the batches and receives all rows. All must
-    make the same call, and the result equals that of a single process.
-
     Pass 0 shows the frames unchanged, later passes augmented. A view and its cells depend only on
     (seed, pass, frame).
 
     Yields:
         The number of views in the buffer.
     """
-    batches = encode_batches(frames, plan, buffer.views)
-    for batch in shared_out(batches, rank(), processes()):
-        part = None
-        if batch is not None:
-            planned = [_view(frames, number, plan, encoder.stride) for number in batch]
-            views, keep = [view for view, _ in planned], torch.stack([mask for _, mask in planned])
-            part = buffer.part(batch[0], views, encode(views, encoder, descriptor), keep)
-        for received in gather(part):
-            buffer.append(received)
+    for batch in encode_batches(frames, plan):
+        planned = [_view(frames, number, plan, encoder.stride) for number in batch]
+        views, keep = [view for view, _ in planned], torch.stack([mask for _, mask in planned])
+        buffer.append(views, encode(views, encoder, descriptor), keep)
         yield buffer.views
 
 
-def encode_batches(frames: Sequence[Frame], plan: EncodePlan, done: int = 0) -> list[list[int]]:
+def encode_batches(frames: Sequence[Frame], plan: EncodePlan) -> list[list[int]]:
     """Group consecutive views of equal size into batches for the encoder.
 
-    View n shows frame n mod len(frames) in pass n // len(frames). The first `done` views are
-    already encoded and left out.
+    View n shows frame n mod len(frames) in pass n // len(frames).
     """
     batches: list[list[int]] = []
     last = None
-    for number in range(done, plan.views_per_frame * len(frames)):
+    for number in range(plan.views_per_frame * len(frames)):
         small = frames[number % len(frames)].camera.short_side_resized(plan.view.short_side)
         size = small.width, small.height
         if size != last or len(batches[-1]) == ENCODE_BATCH:

@@ -3,7 +3,6 @@
 import contextlib
 import hashlib
 import os
-import shutil
 import uuid
 from pathlib import Path
 
@@ -15,29 +14,24 @@ from torch import Tensor, nn
 def cache_features(encoder: nn.Module, folder: Path) -> None:
     """Make a frozen encoder read and write its features in a folder.
 
-    Features get half precision, cached or not, so results do not depend on the cache. Unreadable
-    files are replaced. The folder may be deleted at any time. Half of the disk space that is free
-    now stays free, and writing stops on a full disk. The encoder is changed in place.
+    Features get half precision, cached or not, so results do not depend on the cache. The folder
+    may be deleted at any time. The encoder is changed in place.
     """
     weights = hashlib.blake2b(digest_size=8)
     for value in encoder.state_dict().values():
         weights.update(value.detach().cpu().float().numpy().tobytes())
     folder = folder / weights.hexdigest()
     folder.mkdir(parents=True, exist_ok=True)
-    compute, writing = encoder.forward, True
-    spare = shutil.disk_usage(folder).free // 2
+    compute = encoder.forward
 
     def forward(grey: Tensor) -> Tensor:
-        nonlocal writing
-        names = [_name(image) for image in grey]
-        features = [_read(folder / name) for name in names]
+        paths = [folder / _name(image) for image in grey]
+        features = [_read(path) for path in paths]
         missing = [i for i, value in enumerate(features) if value is None]
         if missing:
-            encoded = compute(grey[missing]).half().cpu()
-            for i, value in zip(missing, encoded, strict=True):
+            for i, value in zip(missing, compute(grey[missing]).half().cpu(), strict=True):
                 features[i] = value
-                if writing and shutil.disk_usage(folder).free - spare > value.nbytes:
-                    writing = _written(folder / names[i], value)
+                _write(paths[i], value)
         return torch.stack([value.float() for value in features if value is not None]).to(
             grey.device
         )
@@ -60,15 +54,12 @@ def _read(path: Path) -> Tensor | None:
         return None
 
 
-def _written(path: Path, features: Tensor) -> bool:
-    # Atomic but not synced, because features lost in a power failure are encoded again.
-    temporary = path.with_name(f".{uuid.uuid4().hex[:8]}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            np.save(file, features.contiguous().numpy())
-        os.replace(temporary, path)
-    except OSError:  # usually a full disk
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        return False
-    return True
+def _write(path: Path, features: Tensor) -> None:
+    # Not synced, because features lost in a power failure are encoded again.
+    temporary = path.with_name(f".{uuid.uuid4().hex[:8]}.npy")
+    with contextlib.suppress(OSError):  # usually a full disk
+        try:
+            np.save(temporary, features.contiguous().numpy())
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)

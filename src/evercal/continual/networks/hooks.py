@@ -16,8 +16,6 @@ class ProposedStep:
 
     changes: dict[str, Tensor]
     """By parameter name: the change of the parameter. Hooks edit these in place."""
-    gradients: Mapping[str, Tensor]
-    """By parameter name: gradient of the minimised loss."""
     losses: Tensor
     """(t,) losses of `TrainingHooks.constraints` before the step."""
     constraints: Sequence[Mapping[str, Tensor]]
@@ -60,10 +58,3 @@ class TrainingHooks:
 
     def edit_step(self, proposed: ProposedStep) -> None:
         """Edit a step after the optimisers, so that constraints hold for the applied step."""
-
-    def state(self) -> dict[str, Tensor]:
-        """Return named tensors from which `load` resumes."""
-        return {}
-
-    def load(self, state: Mapping[str, Tensor]) -> None:
-        """Restore the result of `state()`."""

@@ -1,14 +1,13 @@
 """The training loop of a head; a method takes part through hooks."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from evercal.continual.networks.buffer import FeatureBuffer, Rows, diffused, join, own_share
-from evercal.continual.networks.distributed import average, broadcast, processes
+from evercal.continual.networks.buffer import FeatureBuffer, Rows, diffused, join
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 from evercal.continual.networks.loss import LossOptions, clamp_px, reprojection_loss, surface_loss
@@ -52,10 +51,6 @@ class FitOptions:
     loss: LossOptions = field(default_factory=LossOptions)
     """Reprojection loss on the scenes being learned."""
 
-    def with_known_lens(self) -> "FitOptions":
-        """Return a copy that does not correct the camera."""
-        return replace(self, intrinsics_rate=0.0)
-
 
 @dataclass
 class Progress:
@@ -83,11 +78,10 @@ class Progress:
 
 
 class HeadTrainer:
-    """Trains a head on feature rows; can stop after any step and resume from `state()`.
+    """Trains a head on feature rows.
 
-    The rows of a step depend only on the seed and the step number, so a resumed run draws the same
-    rows as an uninterrupted one. The head is trained in place on its device, where the buffers must
-    return their rows. All processes start with the weights of the first.
+    The rows of a step depend only on the seed and the step number. The head is trained in place on
+    its device, where the buffers must return their rows.
     """
 
     def __init__(
@@ -101,7 +95,6 @@ class HeadTrainer:
         self.head, self.buffers = head, buffers
         self.options, self.seed, self.step = options, seed, 0
         self.hooks = TrainingHooks() if hooks is None else hooks
-        broadcast([*head.parameters(), *head.buffers()])
         self.correction = torch.nn.Parameter(torch.zeros(len(buffers), 5, device=head.device))
         correctable = [[float(buffer.correctable)] for buffer in buffers]
         self._correctable = torch.tensor(correctable, device=head.device)
@@ -140,26 +133,23 @@ class HeadTrainer:
         losses = self.hooks.constraints(replayed, remembered)
         constraints = [self._gradients(constraint) for constraint in losses]
         loss.backward()
-        parameters = [*self.head.parameters(), self.correction]
-        average([parameter.grad for parameter in parameters if parameter.grad is not None])
-        average([gradient for constraint in constraints for gradient in constraint.values()])
         self._take_step(losses, constraints, rate / options.peak_rate)
         self.step += 1
         return Progress(self.step, options.iterations, costs.detach(), errors)
 
     def _rows(self, rate: float) -> tuple[Rows, int]:
-        """Draw this process's rows of the step; return them and the number of new rows."""
+        """Draw the rows of the step; return them and the number of new rows."""
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
         share = self.options.batch // len(self.buffers)
         parts = [buffer.draw(share, generator) for buffer in self.buffers]
         fresh = len(parts)
         parts += self.hooks.replayed(join(parts), self.step, rate, generator)
         if self.head.options.condition == "descriptor":
-            # Drawn on the device of the rows, and before they are shared among processes.
+            # Drawn on the device of the rows.
             seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
             noise = torch.Generator(self.head.device).manual_seed(seed)
             parts = [diffused(part, self.options.diffusion, noise) for part in parts]
-        return join([own_share(part) for part in parts]), fresh * (share // processes())
+        return join(parts), fresh * share
 
     def _fresh_costs(self, points: Tensor, rows: Rows, tau_px: float) -> tuple[Tensor, Tensor]:
         """Compute loss and error in pixels of the new rows."""
@@ -195,46 +185,10 @@ class HeadTrainer:
         with torch.no_grad():
             empty = torch.zeros(0, device=self.head.device)
             values = torch.stack([loss.detach() for loss in losses]) if losses else empty
-            average([values])
             changes = {name: value - before[name] for name, value in named.items()}
-            gradients = {
-                k: torch.zeros_like(v) if v.grad is None else v.grad for k, v in named.items()
-            }
-            self.hooks.edit_step(
-                ProposedStep(changes, gradients, values, constraints, self.step, schedule)
-            )
+            self.hooks.edit_step(ProposedStep(changes, values, constraints, self.step, schedule))
             for name, value in named.items():
                 value.copy_(before[name] + changes[name])
-
-    def state(self) -> dict[str, Tensor]:
-        """Return named tensors from which `load` resumes."""
-        state = {f"head.{k}": v for k, v in self.head.state_dict().items()}
-        state["correction"] = self.correction.detach()
-        state |= {f"hooks.{k}": v for k, v in self.hooks.state().items()}
-        for number, optimiser in enumerate(self._optimisers):
-            for i, slots in optimiser.state_dict()["state"].items():
-                state |= {f"optimiser.{number}.{i}.{name}": v for name, v in slots.items()}
-        # Copies, because training may continue while they are written.
-        copies = {k: v.detach().cpu().clone() for k, v in state.items()}
-        return copies | {"step": torch.tensor(self.step, device="cpu")}
-
-    def load(self, state: Mapping[str, Tensor]) -> None:
-        """Restore the result of `state()`; the head must have the same shape."""
-        self.step = int(state["step"])
-        self.head.load_state_dict(_without_prefix("head.", state))
-        self.correction.data.copy_(state["correction"])
-        self.hooks.load(_without_prefix("hooks.", state))
-        for number, optimiser in enumerate(self._optimisers):
-            slots: dict[int, dict[str, Tensor]] = {}
-            for key, value in _without_prefix(f"optimiser.{number}.", state).items():
-                i, name = key.split(".")
-                slots.setdefault(int(i), {})[name] = value
-            groups = optimiser.state_dict()["param_groups"]
-            optimiser.load_state_dict({"state": slots, "param_groups": groups})
-
-
-def _without_prefix(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
 
 
 def _optimisers(

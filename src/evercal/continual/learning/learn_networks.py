@@ -1,0 +1,160 @@
+"""`learn_networks`: what the command line calls to learn a scene into a store of networks."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from torch import nn
+
+from evercal.continual.learning.learn import learn
+from evercal.continual.learning.presets import preset, short_side
+from evercal.continual.learning.stage import OnEvent, StageOptions, unobserved
+from evercal.continual.networks.feature_cache import cache_features
+from evercal.continual.store import NetworkStore, head_bytes
+from evercal.continual.strategies import Strategy, strategy_named
+from evercal.continual.threshold import fit_threshold
+from evercal.errors import InputError
+from evercal.features.device import device_of
+from evercal.learning.scene import LearnReport
+from evercal.recordings.frame import Frame, Recording, posed_recording
+from evercal.recordings.held_out import (
+    lacks_camera_poses,
+    named_recording,
+    require_frames,
+    split_held_out,
+)
+from evercal.storage.stages import is_store
+
+
+@dataclass(frozen=True)
+class NetworkLearnOptions:
+    """How a scene is learned into a store of networks."""
+
+    strategy: str | Strategy = "evercal_network"
+    """The strategy or its name; a store keeps the one it was made with."""
+    preset: str = "fast"
+    """Amount of training, see `presets`."""
+    memory: str | int = "10%"
+    """Keyframes of a scene, see `MemoryBudget.parse`."""
+    centres: int | None = None
+    """Cluster centres that a scene adds; those of the preset by default."""
+    encoder: Path | None = None
+    """A weights file for a new store."""
+    device: str = "auto"
+    """Device of the networks, see `device_of`."""
+    seed: int = 0
+    """Seed of everything that is drawn at random."""
+    stage: StageOptions | None = None
+    """Options of the stage in place of preset, memory and centres."""
+    short_side: int | None = None
+    """Working size of images in a new store, pixels; that of the preset by default."""
+    cache: Path | None = None
+    """Folder for features of views, for many runs over the same frames."""
+
+    def stage_options(self) -> StageOptions:
+        """Options of the stage."""
+        if self.stage is not None:
+            return self.stage
+        stage = preset(self.preset, self.seed).with_memory(self.memory)
+        if self.centres is None:
+            return stage
+        if self.centres < 1:
+            raise InputError(f"--centres {self.centres}: give a number >= 1")
+        return replace(stage, head=replace(stage.head, centres_per_scene=self.centres))
+
+
+def learn_networks(
+    store: Path,
+    recording: Recording,
+    options: NetworkLearnOptions,
+    on_event: OnEvent = unobserved,
+) -> LearnReport:
+    """Learn a scene into a store; an interrupted call leaves the store at its last scene.
+
+    Args:
+        store: folder of the store; created if it is missing.
+        recording: its training frames are learned; a few are held out to fit the threshold.
+        options: strategy and amount of training.
+        on_event: called with every event, for progress bars.
+
+    Raises:
+        InputError: No such device or strategy, too few frames, a name that is taken, another
+            strategy than the store's, or another process is writing into the store.
+    """
+    began = time.perf_counter()
+    named, stage = options.strategy, options.stage_options()
+    strategy = named if isinstance(named, Strategy) else strategy_named(named)
+    if strategy.method is None or strategy.jointly:
+        raise InputError(
+            f"strategy {strategy.name!r}: does not train a network scene by scene; use another"
+            " strategy, or compare it with 'evercal bench'"
+        )
+    opened = _opened(store, strategy, stage, options, recording.train)
+    with opened.writing():
+        contents = opened.contents.to(device_of(options.device))
+        names = [record.name for record in contents.scenes]
+        recording = named_recording(recording, None, names)
+        if lacks_camera_poses(recording):
+            raise InputError(
+                f"scene {recording.name!r}: only gripper poses are stated, and strategy"
+                f" {strategy.name!r} builds no map to estimate the camera on the gripper; use"
+                " strategy evercal"
+            )
+        recording = posed_recording(recording)
+        require_frames(recording)
+        if options.cache is not None and isinstance(contents.encoder, nn.Module):
+            cache_features(contents.encoder, options.cache)
+            contents.cache = options.cache
+        split = split_held_out(recording.train)
+        train = replace(recording, train=split.train)
+        done = learn(contents, strategy.method, train, stage, on_event)
+        record = fit_threshold(done.scenes, split.held_out)
+        done.scenes.scenes[-1] = record
+        report = LearnReport(
+            scene=recording.name,
+            seconds=time.perf_counter() - began,
+            memory_bytes=done.scenes.memory_bytes,
+            frames_kept=done.frames_kept,
+            train_frames=len(split.train),
+            held_out_frames=len(split.held_out),
+            min_support=record.inlier_threshold,
+            iterations=done.iterations,
+            head_bytes=sum(head_bytes(head) for head in done.scenes.heads),
+        )
+        opened.commit(done.scenes, asdict(report))
+    return report
+
+
+def _opened(
+    store: Path,
+    strategy: Strategy,
+    stage: StageOptions,
+    options: NetworkLearnOptions,
+    frames: Sequence[Frame],
+) -> NetworkStore:
+    """The store, checked against the options."""
+    if stage.memory.auto:
+        raise InputError("memory auto: only a map selects its keyframes; give a share or bytes")
+    if not is_store(store):
+        side = options.short_side or short_side(options.preset, frames)
+        return NetworkStore.create(store, strategy.name, side, options.encoder)
+    if options.encoder is not None:
+        raise InputError(
+            f"encoder {options.encoder}: store {store} keeps the encoder it was made with"
+        )
+    opened = NetworkStore.open(store)
+    if opened.contents.strategy != strategy.name:
+        raise InputError(
+            f"strategy {strategy.name!r}: the store was made with {opened.contents.strategy!r};"
+            " use that one or start a new store"
+        )
+    heads, method = opened.contents.heads, strategy.method
+    shared = method is not None and not method.head_per_scene and heads
+    if shared and options.centres not in (None, heads[-1].options.centres_per_scene):
+        raise InputError(
+            f"--centres {options.centres}: {store} was made with"
+            f" {heads[-1].options.centres_per_scene} per scene; leave the option out or start a new"
+            " store"
+        )
+    return opened

@@ -1,0 +1,156 @@
+"""GEC: steps that may not raise the losses of remembered scenes.
+
+The original projects the gradient, and plain SGD takes the step. AdamW and Shampoo can move against
+the memory even if the gradient does not, because of their momentum, scales and decay. So the change
+of the weights is projected after the optimisers. To first order, a change u alters the loss of
+scene t by <g_t, u>, with g_t the gradient of that loss.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from evercal.continual.methods.method import FinishedScene, StageStart
+from evercal.continual.methods.penalties import Reprojection
+from evercal.continual.methods.replay import EpisodicMemory, MemoryHooks
+from evercal.continual.networks.buffer import Rows, diffused
+from evercal.continual.networks.head import HeadOutput
+from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
+from evercal.continual.networks.loss import fixed_clamp_loss
+
+REFERENCE_ROWS = 8192
+
+
+@dataclass(frozen=True)
+class EpisodicConstraint(EpisodicMemory):
+    """GEC with several constraints and the references of its appendix.
+
+    With h_t = loss_t - (1 + slack) reference_t, the original requires <v, g_t> >= alpha h_t of a
+    gradient v and steps by -eta v. A step u therefore has <g_t, u> <= -alpha eta h_t. A scene whose
+    loss exceeds its reference by more than the slack must improve, other scenes may get worse. Both
+    sides are changes of a loss, so no normalisation is needed.
+
+    The first steps are plain replay. The original's look-ahead step before each g_t is omitted: it
+    has no natural size when the learning rate changes in every step.
+    """
+
+    citation: ClassVar[str] = "Lai et al., GEC, NeurIPS 2025, several constraints"
+    clamp_px: float = 50.0
+    """Fixed soft clamp of remembered losses, pixels. A fixed clamp makes losses of different steps
+    comparable; a wide one leaves forgotten rows a gradient."""
+    alpha: float = 512.0
+    """Share of h_t that a step of unit length recovers (no unit)."""
+    eta: float = 0.03
+    """The original's learning rate; here it only scales alpha."""
+    slack: float = 0.05
+    """Share by which a remembered loss may rise."""
+    longest: float = 1.0
+    """Largest added length, as a share of the step's length. A forgotten scene has a large loss and
+    a short gradient; without this limit the required step would destroy the network."""
+    warm_steps: int = 5
+    """Steps of plain replay at the start of a stage."""
+
+    def begin(self, start: StageStart) -> TrainingHooks:
+        """Constrain the steps after the warm-up, from the second scene on."""
+        return _ConstraintHooks(self, start) if start.memories else TrainingHooks()
+
+    def loss(self, output: HeadOutput, rows: Rows) -> Tensor:
+        """Compute the mean loss of remembered rows with the fixed clamp."""
+        cost, _ = fixed_clamp_loss(output.points, rows.target, self.clamp_px)
+        return cost.mean()
+
+    def edit_step(
+        self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
+    ) -> Tensor:
+        """Return the nearest change with <g_t, u> <= -alpha eta h_t for every scene.
+
+        The (t,) references are losses right after learning the scenes.
+        """
+        if proposed.step < self.warm_steps:
+            return changes
+        h = proposed.losses - (1 + self.slack) * references
+        # The bound follows the learning rate, which ends at zero.
+        most = -self.alpha * self.eta * proposed.schedule * h
+        added = nearest_change(changes, g, most) - changes
+        limit = self.longest * changes.norm() / added.norm().clamp(min=1e-12)
+        return changes + limit.clamp(max=1.0) * added
+
+    def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
+        """Return `reference`, the loss on remembered rows as they are replayed."""
+        buffer = scene.remembered()
+        rows = buffer.draw(REFERENCE_ROWS, torch.Generator().manual_seed(scene.number))
+        if scene.diffusion:
+            noise = torch.Generator(rows.features.device).manual_seed(scene.number)
+            rows = diffused(rows, scene.diffusion, noise)
+        with torch.no_grad():
+            output = scene.output(rows)
+            return {"reference": self.loss(output, rows).cpu()}
+
+
+class _ConstraintHooks(MemoryHooks):
+    """Collects the gradient of every remembered scene and edits the step."""
+
+    edits_steps = True
+
+    def __init__(self, method: EpisodicConstraint, start: StageStart):
+        super().__init__(start)
+        self._method, self._steps = method, 0
+        references = [start.states[memory.scene]["reference"] for memory in self.memories]
+        self._references = torch.stack(references)
+
+    def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
+        """Compute plain replay in the first steps, averaged over the scenes."""
+        if self._steps >= self._method.warm_steps:
+            return None
+        return Reprojection()(output, None, rows, tau_px)
+
+    def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
+        """Compute the loss of each remembered scene."""
+        each = len(rows.scene) // len(self.memories)  # rows are ordered by scene
+        parts = [slice(i * each, (i + 1) * each) for i in range(len(self.memories))]
+        return [self._method.loss(output.part(part), rows.part(part)) for part in parts]
+
+    def edit_step(self, proposed: ProposedStep) -> None:
+        changes = _flat(proposed.changes)
+        g = torch.stack([_flat(constraint) for constraint in proposed.constraints])
+        allowed = self._method.edit_step(changes, g, proposed, self._references.to(g))
+        self._steps = proposed.step + 1
+        sizes = [change.numel() for change in proposed.changes.values()]
+        for name, part in zip(proposed.changes, allowed.split(sizes), strict=True):
+            proposed.changes[name] = part.view_as(proposed.changes[name])
+
+
+def nearest_change(changes: Tensor, g: Tensor, most: Tensor) -> Tensor:
+    """Find the change u nearest to a given one with <g_t, u> <= most_t for every t.
+
+    u = changes - sum_t lambda_t g_t with lambda >= 0. The dual, min 1/2 l'Gl - l'b with G = g g'
+    and b = g changes - most, is a non-negative least-squares problem in the root of G. Constraints
+    are first divided by the length of their gradient, which does not change the solution.
+
+    Args:
+        changes: (p,) change of all weights.
+        g: (t, p) gradients.
+        most: (t,) largest increase of each loss.
+    """
+    size = g.norm(dim=1)
+    some = size > 0  # no change affects a loss without a gradient
+    g, most = g[some] / size[some, None], most.to(g)[some] / size[some]
+    over = (g @ changes - most).double().cpu().numpy()
+    if (over <= 0).all():
+        return changes
+    from scipy.optimize import nnls
+
+    gram = (g @ g.T).double().cpu().numpy()
+    values, vectors = np.linalg.eigh(gram)
+    # G is singular for parallel constraints; the offset keeps the solution finite.
+    root = np.sqrt(np.maximum(values, 0) + 1e-9 * max(values.max(), 1e-12))
+    weights, _ = nnls((vectors * root).T, (vectors / root).T @ over)
+    return changes - torch.from_numpy(weights).to(g) @ g
+
+
+def _flat(named: Mapping[str, Tensor]) -> Tensor:
+    return torch.cat([value.flatten() for value in named.values()])
