@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar, require_writable
-from evercal.cli.device import Device
+from evercal.cli.options import Device, Store, Verb
 from evercal.cli.stores import open_localizer
 from evercal.errors import InputError
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class Evaluate(Verb):
     """Measure the localization accuracy on the test frames of scenes.
 
     Example: evercal evaluate cell.evercal kitchen/ --report report.html
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    store: Store
     """Folder of the store."""
     scenes: Annotated[
         Positional[tuple[str, ...]], arg(metavar="[NAME=]SCENE...", help_behavior_hint="")
@@ -31,8 +31,6 @@ class Evaluate:
     report: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
     """HTML report with error curves, trajectories and the worst frames."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Evaluate and print a table."""

@@ -3,26 +3,23 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-from tyro.conf import Positional, arg
+from typing import Any
 
 from evercal.cli.console import print_json, print_next, size
+from evercal.cli.options import Store, Verb
 
 MEMORY_FILES = ("keyframes.safetensors", "state.safetensors")
 
 
 @dataclass(frozen=True)
-class Info:
+class Info(Verb):
     """Describe a store: its scenes, its size, and what bundle adjustment changed.
 
     Example: evercal info cell.evercal
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    store: Store
     """Folder of the store."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Open the store and describe it."""

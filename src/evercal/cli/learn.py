@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, require_writable, size
-from evercal.cli.device import Device
 from evercal.cli.networks import Bars, LearnRequest, NetworkOptions, learn_into_networks
+from evercal.cli.options import Device, File, Name, Store, Verb
 from evercal.cli.reading import Reading
 from evercal.cli.stores import MAP, strategy_of
 from evercal.errors import InputError
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Learn:
+class Learn(Verb):
     """Learn a scene from a recording; scenes learned before do not change.
 
     A recording with gripper poses and no camera poses also yields gripper_from_camera. Several
@@ -34,24 +34,24 @@ class Learn:
     Example: evercal learn cell.evercal wrist_recording/ --calibration wrist.json
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    store: Store
     """Folder of the map; created if it is missing."""
     recordings: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="RECORDING...", help_behavior_hint="")
     ] = ()
     """Folders of recordings, or files of bags."""
-    name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    name: Name = None
     """Name of the scene. Default: the recording's own name."""
     memory: Annotated[str | None, arg(metavar="SHARE|BYTES|auto", help_behavior_hint="")] = None
     """Keyframes to keep: a share of the frames (10%), a size (5MB), or auto for the fewest that
     locate the recording's other frames well. Default: 10%, at least eight."""
-    calibration: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    calibration: File = None
     """Output file for the estimated gripper_from_camera, for 'evercal export'."""
-    gripper_from_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    gripper_from_camera: File = None
     """A rough gripper_from_camera to compare the estimate with: 4x4 matrix or calibration file."""
-    encoder: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    encoder: File = None
     """Encoder weights from 'evercal pretrain', for a new store. Default: the shipped weights."""
-    strategy: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    strategy: Name = None
     """evercal builds a map; every other strategy trains a network. Default: that of the store."""
     reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
     """How the recording is read."""
@@ -60,8 +60,6 @@ class Learn:
     workers: Annotated[int, arg(metavar="N")] = 1
     """Recordings that are learned at once; the threads of this machine are shared."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Learn and print a summary."""

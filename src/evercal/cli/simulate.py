@@ -9,11 +9,12 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.options import Count, Verb
 from evercal.errors import InputError
 
 
 @dataclass(frozen=True)
-class Simulate:
+class Simulate(Verb):
     """Render furnished rooms with an arm (extra `sim`), or record a virtual robot cell.
 
     Example: evercal simulate cell --out cell/
@@ -40,14 +41,14 @@ class Simulate:
     seconds and without the extra."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Output folder. The same command continues an interrupted run."""
-    frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    frames: Count = None
     """Training and test frames of each room, or wrist images of a cell; default: as the suite
     defines."""
     size: Annotated[str | None, arg(metavar="WxH", help_behavior_hint="")] = None
     """Image size in pixels, such as 640x480; default: as the suite defines."""
     seed: int = 0
     """Seed of the camera paths and the noise, and of the whole cell. Rooms do not depend on it."""
-    samples: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    samples: Count = None
     """Light paths per pixel; more is slower and more exact. Default: as the suite defines."""
     exposure_ev: float = 0.0
     """Exposure in stops; positive is brighter."""
@@ -58,8 +59,6 @@ class Simulate:
     sweep_only: bool = False
     """Render training and test frames only, without calibration recordings and changed frames. The
     same command without this option adds them."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Render the missing frames."""
