@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from evercal.cli.console import print_json, print_next, progress_bar, require_folder, size
+from evercal.cli.console import Bars, print_json, print_next, progress_bar, require_folder, size
 from evercal.cli.options import Device, Folder, Verb
 from evercal.errors import InputError
 
@@ -143,7 +143,6 @@ def _open(store: Path, device: str) -> "Localizer":
 
 def _learn(store: Path, scene: "Recording", device: str, result: "DemoResult") -> None:
     """Add a room to the store."""
-    from evercal.cli.networks import Bars
     from evercal.map import Map
     from evercal.reports.demo_page import LearnedRoom
 

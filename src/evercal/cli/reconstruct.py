@@ -7,8 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next
-from evercal.cli.networks import Bars
+from evercal.cli.console import Bars, print_json, print_next
 from evercal.cli.options import Verb
 
 _CONNECTED = 0.8

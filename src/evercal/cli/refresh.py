@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, size
+from evercal.cli.console import Bars, print_json, print_next, size
 from evercal.cli.image_words import camera_for, stated_camera
-from evercal.cli.networks import Bars
 from evercal.cli.options import Device, File, Store, Verb
 from evercal.errors import InputError
 
@@ -62,7 +61,7 @@ class Refresh(Verb):
             return 0
         recording = _recording(self.images)
         stream = sys.stderr if self.json else sys.stdout
-        with Bars("", stream) as bars:
+        with Bars(stream) as bars:
             if recording is not None:
                 first = recording.train[0].camera
                 camera = stated_camera(self.camera, (first.width, first.height))
