@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import pickle
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -18,6 +19,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from filelock import FileLock
 from hypothesis import settings
 
 os.environ["OMP_NUM_THREADS"] = "1"
@@ -72,6 +74,25 @@ def _room(
         frames.append(Frame(f"{name}-{i:03d}", room.render(camera, pose), camera, pose))
     train = tuple(frames[::every])
     return Recording(name, train, tuple(f for i, f in enumerate(frames) if i % every))
+
+
+Shared = Callable[[str, Callable[[], Any]], Any]
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
+    """Makes something once for all processes of a test run; it is kept on disk."""
+    root = tmp_path_factory.getbasetemp()
+    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
+
+    def get(name: str, make: Callable[[], Any]) -> Any:
+        file = root / f"{name}.pickle"
+        with FileLock(root / f"{name}.lock"):
+            if not file.exists():
+                file.write_bytes(pickle.dumps(make()))
+        return pickle.loads(file.read_bytes())
+
+    return get
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
@@ -144,7 +165,7 @@ def hall_room() -> BoxRoom:
 
 
 @pytest.fixture(scope="session")
-def hall_built(hall: Recording) -> BuiltMap:
+def hall_built(hall: Recording, shared: Shared) -> BuiltMap:
     """The map of `hall` with 7 keyframes; its acceptance is fitted to three test frames."""
     from evercal.features.encoder import load_encoder
     from evercal.localization.fit_acceptance import fit_acceptance
@@ -152,10 +173,13 @@ def hall_built(hall: Recording) -> BuiltMap:
     from evercal.mapping.memory_budget import MemoryBudget
     from evercal.mapping.scene_map import MapContents
 
-    encoder, options = load_encoder(), MapOptions(memory=MemoryBudget(share=0.25))
-    built = build_map("hall", hall.train, encoder, options)
-    contents = MapContents(encoder, options.size.cells, [built.scene])
-    return replace(built, scene=fit_acceptance(contents, hall.test[::10]))
+    def build() -> BuiltMap:
+        encoder, options = load_encoder(), MapOptions(memory=MemoryBudget(share=0.25))
+        built = build_map("hall", hall.train, encoder, options)
+        contents = MapContents(encoder, options.size.cells, [built.scene])
+        return replace(built, scene=fit_acceptance(contents, hall.test[::10]))
+
+    return shared("hall", build)
 
 
 @pytest.fixture(scope="session")

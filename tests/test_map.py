@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,10 +38,12 @@ def learned(
 
 
 @pytest.fixture(scope="module")
-def hall_only(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> Map:
-    """A map of the hall with a quarter of its frames."""
-    opened = Map.open(str(tmp_path_factory.mktemp("hall") / "map"), device="cpu")
-    opened.learn(hall, memory="25%")
+def hall_only(learned: tuple[Map, tuple[LearnReport, LearnReport]], tmp_path_factory: Any) -> Map:
+    """A map of the hall."""
+    file = tmp_path_factory.mktemp("hall") / "map.zip"
+    learned[0].pack(file)
+    opened = Map.unpack(file, file.parent / "map", device="cpu")
+    opened.remove("arc")
     return opened
 
 
@@ -109,15 +112,15 @@ def test_fixed_camera_from_a_folder_files_and_arrays(
     calls: list[int] = []
     calibrations = [
         hall_only.calibrate(source, on_image=lambda: calls.append(1))
-        for source in (tmp_path, str(tmp_path), files, images, np.stack(images))
+        for source in (str(tmp_path), files, np.stack(images))
     ]
-    assert len(calls) == 5 * 5
+    assert len(calls) == 3 * 5
     for calibration in calibrations:
         assert calibration.mount == "eye_to_hand"
         assert pose_distance(calibration.parent_from_child, truth_of(frame))[0] < 0.004
         expected = calibrations[0].parent_from_child.matrix()
         np.testing.assert_array_equal(calibration.parent_from_child.matrix(), expected)
-    assert [use.name for use in calibrations[2].images] == list(map(str, files))
+    assert [use.name for use in calibrations[1].images] == list(map(str, files))
     [use] = hall_only.calibrate(files[0], camera=frame.camera).images
     assert use.used
 
@@ -163,12 +166,12 @@ def test_calibration_is_written_and_exported(calibration: Calibration, tmp_path:
 
 
 def test_evaluate(hall_only: Map, hall: Recording, tmp_path: Path) -> None:
-    few = replace(hall, test=hall.test[::5])
+    few = replace(hall, test=hall.test[::10])
     scores = hall_only.evaluate(few)
     assert scores.scenes["hall"].frames == len(few.test)
     assert scores.scenes["hall"].median_translation_cm < 0.5
     generic.write(tmp_path / "hall", few)
-    others = [hall_only.evaluate(each) for each in ({"hall": few}, [few], tmp_path / "hall")]
+    others = [hall_only.evaluate(each) for each in ({"hall": few}, tmp_path / "hall")]
     for other in others:
         assert other.scenes["hall"].median_translation_cm == pytest.approx(
             scores.scenes["hall"].median_translation_cm
@@ -196,22 +199,21 @@ def test_memory_that_cannot_be_used_is_refused(
     assert not (tmp_path / "map").exists()
 
 
-def test_memory_in_megabytes_and_auto(
-    hall: Recording, arcs: tuple[Recording, Recording], tmp_path: Path
-) -> None:
+def test_memory_in_megabytes_and_auto(arcs: tuple[Recording, Recording], tmp_path: Path) -> None:
     opened = Map.open(tmp_path / "map", device="cpu")
     one = opened.learn(arcs[0], name="one", memory="0.1MB")
     assert 0 < one.memory_bytes <= 100_000
-    auto = opened.learn(hall, name="two", memory="auto")
-    assert 1 <= auto.frames_kept <= 7
-    estimate = Map.open(tmp_path / "map", device="cpu").localize(hall.test[9].read_image())
+    auto = opened.learn(arcs[0], name="two", memory="auto")
+    assert 1 <= auto.frames_kept <= 8
+    frame = arcs[0].test[9]
+    estimate = Map.open(tmp_path / "map", device="cpu").localize(frame.read_image())
     assert estimate.base_from_camera is not None
-    assert pose_distance(estimate.base_from_camera, truth_of(hall.test[9]))[0] < 0.01
+    assert pose_distance(estimate.base_from_camera, truth_of(frame))[0] < 0.03
 
 
 @pytest.mark.parametrize("step", ["encoding", "adjusting"])
 def test_interrupted_learning_leaves_the_map_unchanged(
-    step: str, hall_only: Map, arcs: tuple[Recording, Recording], hall: Recording, tree: Tree
+    step: str, hall_only: Map, rooms: tuple[Recording, ...], hall: Recording, tree: Tree
 ) -> None:
     def interrupt(name: str, done: int, total: int) -> None:
         if name == step:
@@ -219,7 +221,7 @@ def test_interrupted_learning_leaves_the_map_unchanged(
 
     before = tree(hall_only.path)
     with pytest.raises(KeyboardInterrupt):
-        hall_only.learn(arcs[0], on_progress=interrupt)
+        hall_only.learn(rooms[0], on_progress=interrupt)
     assert tree(hall_only.path) == before
     assert hall_only.scenes == Map.open(hall_only.path, device="cpu").scenes == ("hall",)
     assert hall_only.localize(hall.test[9].read_image()).status == "ok"
@@ -275,13 +277,13 @@ def test_stores_of_networks_and_other_folders_are_refused(hall_only: Map, tmp_pa
 
 
 def test_a_second_object_of_one_map_does_not_overwrite_its_scenes(
-    hall_only: Map, arcs: tuple[Recording, Recording], hall: Recording, tmp_path: Path
+    rooms: tuple[Recording, ...], tmp_path: Path
 ) -> None:
     first, second = (Map.open(tmp_path / "map", device="cpu") for _ in range(2))
-    first.learn(arcs[0])
+    first.learn(rooms[0])
     with pytest.raises(InputError, match="another process has changed it"):
-        second.learn(arcs[1])
-    assert Map.open(tmp_path / "map", device="cpu").scenes == ("one",)
+        second.learn(rooms[1])
+    assert Map.open(tmp_path / "map", device="cpu").scenes == ("alpha",)
 
 
 def test_a_merged_map_gives_the_answers_of_one_that_learned_in_turn(
@@ -293,7 +295,7 @@ def test_a_merged_map_gives_the_answers_of_one_that_learned_in_turn(
     turn = Map.open(learned[0].path, device="cpu")
     turn.pack(tmp_path / "turn.zip")
     Map.unpack(tmp_path / "turn.zip", tmp_path / "hall", device="cpu").remove("arc")
-    Map.open(tmp_path / "arc", device="cpu").learn(arcs[0], name="arc", memory="300kB")
+    Map.unpack(tmp_path / "turn.zip", tmp_path / "arc", device="cpu").remove("hall")
     merged = Map.open(tmp_path / "merged", device="cpu")
     joined = merged.merge(tmp_path / "hall", tmp_path / "arc")
     assert joined.added == merged.scenes == turn.scenes == ("hall", "arc")

@@ -1,10 +1,12 @@
 """The command line: one verb per file; `main` runs a verb and prints errors as one line.
 
-No verb imports torch before it runs, so that help and argument errors appear at once.
+Only the module of the verb is loaded, and no verb loads torch before it runs, so that help and
+argument errors appear at once.
 """
 
 import contextlib
 import difflib
+import importlib
 import io
 import os
 import platform
@@ -12,43 +14,46 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 from evercal.errors import InputError
 
-_GROUPS = {
-    "Map": (
-        "learn",
-        "localize",
-        "track",
-        "view",
-        "refresh",
-        "evaluate",
-        "info",
-        "verify",
-        "map",
-        "serve",
-    ),
-    "Calibrate": ("studio", "calibrate", "check", "watch", "audit", "align"),
-    "Boards and pose pairs": ("detect", "solve"),
-    "Results": ("export", "report"),
-    "Recordings": ("inspect", "convert", "reconstruct", "simulate", "demo"),
-    "Networks": ("bench",),
+VERBS = {
+    "Map": {
+        "learn": "Learn",
+        "localize": "Localize",
+        "track": "Track",
+        "view": "View",
+        "refresh": "Refresh",
+        "evaluate": "Evaluate",
+        "info": "Info",
+        "map": "Maps",
+        "serve": "Serve",
+    },
+    "Calibrate": {
+        "studio": "Studio",
+        "calibrate": "Calibrate",
+        "check": "Check",
+        "watch": "Watch",
+        "audit": "Audit",
+        "align": "Align",
+    },
+    "Boards and pose pairs": {"detect": "Detect", "solve": "Solve"},
+    "Results": {"export": "Export", "report": "Report"},
+    "Recordings": {
+        "inspect": "Inspect",
+        "convert": "Convert",
+        "reconstruct": "Reconstruct",
+        "simulate": "Simulate",
+        "demo": "Demo",
+    },
+    "Networks": {"bench": "Bench"},
 }
-"""Verbs by purpose, in the order of the help."""
-
+"""Class of each verb, in the file of the verb's name; by purpose, in the order of the help."""
 
 _X86 = ("x86_64", "AMD64")
 _SAME_ARITHMETIC = {"OPENBLAS_CORETYPE": "Haswell", "MKL_CBWR": "COMPATIBLE"}
 """Matrix products by kernels that every x86 processor with AVX2 has, for `EVERCAL_PRECISION`."""
-
-
-class Command(Protocol):
-    """A verb with its arguments."""
-
-    def run(self) -> int:
-        """Run and return the exit code."""
-        ...
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: words after `evercal`. Default: those of the process.
 
     Returns:
-        The exit code: 0 done, 1 the answer is no, 2 misuse or bad input, 130 interrupted.
+        The exit code: 0 done, 1 negative result, 2 misuse or bad input, 130 interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     as_json = "--json" in words
@@ -108,89 +113,32 @@ def _complain(message: str, as_json: bool) -> int:
     return 2
 
 
-def _verbs() -> dict[str, Any]:
-    """All verbs by name."""
-    from evercal.cli.align import Align
-    from evercal.cli.audit import Audit
-    from evercal.cli.bench import Bench
-    from evercal.cli.calibrate import Calibrate
-    from evercal.cli.check import Check
-    from evercal.cli.convert import Convert
-    from evercal.cli.demo import Demo
-    from evercal.cli.detect import Detect
-    from evercal.cli.evaluate import Evaluate
-    from evercal.cli.export import ExportCalibration
-    from evercal.cli.info import Info
-    from evercal.cli.inspect import Inspect
-    from evercal.cli.learn import Learn
-    from evercal.cli.localize import Localize
-    from evercal.cli.map import Maps
-    from evercal.cli.reconstruct import Reconstruct
-    from evercal.cli.refresh import Refresh
-    from evercal.cli.report import Report
-    from evercal.cli.serve import Serve
-    from evercal.cli.simulate import Simulate
-    from evercal.cli.solve import Solve
-    from evercal.cli.studio import Studio
-    from evercal.cli.track import Track
-    from evercal.cli.verify import Verify
-    from evercal.cli.view import View
-    from evercal.cli.watch import Watch
-
-    return {
-        "demo": Demo,
-        "learn": Learn,
-        "localize": Localize,
-        "studio": Studio,
-        "calibrate": Calibrate,
-        "check": Check,
-        "watch": Watch,
-        "audit": Audit,
-        "align": Align,
-        "detect": Detect,
-        "solve": Solve,
-        "export": ExportCalibration,
-        "report": Report,
-        "track": Track,
-        "refresh": Refresh,
-        "evaluate": Evaluate,
-        "info": Info,
-        "verify": Verify,
-        "map": Maps,
-        "serve": Serve,
-        "view": View,
-        "inspect": Inspect,
-        "convert": Convert,
-        "reconstruct": Reconstruct,
-        "simulate": Simulate,
-        "bench": Bench,
-    }
+def verb_class(name: str) -> Any:
+    """The class of a verb."""
+    kind = next(verbs[name] for verbs in VERBS.values() if name in verbs)
+    return getattr(importlib.import_module(f"evercal.cli.{name}"), kind)
 
 
 def _help() -> str:
     """The overview of `evercal --help`: verbs by purpose, one line each."""
-    verbs = _verbs()
     lines = ["usage: evercal VERB ...", ""]
     lines.append("Camera poses in the robot base frame from single images; hand-eye calibration.")
-    for group, names in _GROUPS.items():
+    for group, names in VERBS.items():
         lines += ["", f"{group}:"]
         for name in names:
-            summary = " ".join((verbs[name].__doc__ or "").split("\n\n")[0].split())
-            lines.append(f"  {name:13s} {summary.split('; ')[0].rstrip('.')}")
+            summary = " ".join((verb_class(name).__doc__ or "").split("\n\n")[0].split())
+            lines.append(f"  {name:11s} {summary.split('; ')[0].rstrip('.')}")
     lines += [
         "",
         "'evercal VERB --help' lists the options of a verb. Every verb has --json.",
-        "Exit codes: 0 done, 1 the answer is no, 2 misuse or bad input.",
-        "'evercal --version' prints the version.",
-        "Shell completion: evercal --tyro-print-completion bash|zsh|tcsh.",
+        "Exit codes: 0 done, 1 negative result (not located, moved, not good enough),",
+        "2 misuse or bad input. 'evercal --version' prints the version.",
     ]
     return "\n".join(lines)
 
 
-def _parse(words: list[str], as_json: bool) -> Command | int:
+def _parse(words: list[str], as_json: bool) -> Any:
     """The command that the words make, or an exit code."""
-    import tyro
-
     if words == ["--version"]:
         # `evercal` is loaded before its folders, which do not import it.
         print(f"evercal {sys.modules['evercal'].__version__}")
@@ -198,26 +146,27 @@ def _parse(words: list[str], as_json: bool) -> Command | int:
     if words in ([], ["--help"], ["-h"]):
         print(_help())
         return 0 if words else 2
-    verbs = _verbs()
-    if not words[0].startswith("-") and words[0] not in verbs:
+    verbs = [name for names in VERBS.values() for name in names]
+    if words[0] not in verbs:
         similar = difflib.get_close_matches(words[0], verbs, 1)
         hint = f"did you mean '{similar[0]}'?" if similar else "'evercal --help' lists all verbs"
         raise InputError(f"{words[0]}: no such verb; {hint}")
+    import tyro
+
     caught = io.StringIO()
     # tyro draws frames only on a stream whose encoding has them.
     shown = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding, write_through=True)
     try:
         with contextlib.redirect_stderr(caught), contextlib.redirect_stdout(shown):
-            return tyro.extras.subcommand_cli_from_dict(
-                verbs,
-                prog="evercal",
-                args=words,
+            return tyro.cli(
+                verb_class(words[0]),
+                prog=f"evercal {words[0]}",
+                args=words[1:],
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
     except SystemExit as stop:
         shown.seek(0)
-        page = shown.read()
-        sys.stdout.write(_wrapped(page) if {"-h", "--help"} & {*words} else page)
+        sys.stdout.write(_wrapped(shown.read()))
         sys.stderr.write(caught.getvalue())
         code = 0 if stop.code in (0, None) else 2
         if code and as_json:
@@ -238,11 +187,5 @@ def _wrapped(text: str) -> str:
 
 def _box_text(box: str) -> str:
     """The first paragraph of tyro's framed message as one line."""
-    paragraphs = [""]
-    for line in box.splitlines()[1:]:
-        text = line.strip("│╭╮╰╯─ ")
-        if text.strip("-"):
-            paragraphs[-1] += f" {text}"
-        else:
-            paragraphs.append("")
-    return next((text.strip() for text in paragraphs if text), "unusable arguments")
+    text = " ".join(line.strip("│ ") for line in box.splitlines()[1:])
+    return " ".join(text.partition("──")[0].split()) or "unusable arguments"

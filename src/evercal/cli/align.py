@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next
-from evercal.cli.device import Device
 from evercal.cli.image_words import read_images
+from evercal.cli.options import Device, File, Name, Store, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Align:
+class Align(Verb):
     """Transform a scene that was learned in a frame of its own to the robot's base frame.
 
     Give images of a camera on the gripper with --robot-poses, or points that the tool has touched
@@ -28,7 +28,7 @@ class Align:
     Example: evercal align cell.evercal cell wrist/ --robot-poses poses.csv
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    store: Store
     """Folder of the map."""
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
     """Name of the scene."""
@@ -36,23 +36,21 @@ class Align:
         Positional[tuple[Path, ...]], arg(metavar="[IMAGE...]", help_behavior_hint="")
     ] = ()
     """Images of a camera on the gripper, or a folder of them."""
-    robot_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    robot_poses: File = None
     """base_from_gripper of every image."""
-    convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    convention: Name = None
     """Format of the robot poses, if the file does not state it."""
-    board_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    board_poses: File = None
     """Board poses from 'evercal detect', for a fixed camera that observes a board in the
     gripper."""
-    points: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    points: File = None
     """Touched points in the base frame: lines of name, x, y, z in metres."""
-    picks: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    picks: File = None
     """Points in images: lines of image, name, u, v in pixels; images relative to this file."""
     unknown_scale: bool = False
     """Estimate the scale, for a scene that was not learned in metres. Default where the unit of
     length of its recording is unknown."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Align the scene and print the uncertainty."""

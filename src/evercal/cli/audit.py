@@ -8,13 +8,13 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, progress_bar
-from evercal.cli.device import Device
+from evercal.cli.options import Device, File, Store, Verb
 from evercal.cli.stores import open_map
 from evercal.errors import InputError
 
 
 @dataclass(frozen=True)
-class Audit:
+class Audit(Verb):
     """List recorded episodes whose stated camera pose disagrees with their images.
 
     Exit code 1 if there are any.
@@ -22,12 +22,12 @@ class Audit:
     Example: evercal audit cell.evercal episodes/ --calibration tripod.json
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    store: Store
     """Folder of the map."""
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder whose folders are the episodes: recorded scenes, or images beside a calibration.json
     or a 4x4 matrix base_from_camera.txt."""
-    calibration: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    calibration: File = None
     """Pose of the camera in episodes that state none themselves."""
     images: Annotated[int, arg(metavar="N")] = 5
     """Images per episode that are located."""
@@ -36,8 +36,6 @@ class Audit:
     most_deg: Annotated[float, arg(metavar="DEG")] = 0.5
     """Tolerance of the rotation."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Audit every episode and print a table."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next
-from evercal.cli.device import Device
+from evercal.cli.options import Device
 from evercal.errors import InputError
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar, require_writable
-from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for, read_images
+from evercal.cli.options import Device, File, Name, Store, Verb
 from evercal.cli.point_words import Point, point_dict, point_of, point_text
 from evercal.cli.stores import open_map
 from evercal.errors import InputError
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Calibrate:
+class Calibrate(Verb):
     """Calibrate a camera from images of a mapped scene; no marker is needed.
 
     A fixed camera gives base_from_camera. With --robot-poses, a camera on the gripper gives
@@ -32,14 +32,14 @@ class Calibrate:
     Example: evercal calibrate cell.evercal tripod/ --camera camera.json --out tripod.json
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    store: Store
     """Folder of the map."""
     images: Annotated[Positional[tuple[str, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
     """Image files or folders of them, all of one camera; or NAME=FOLDER for each camera of a
     rig."""
-    robot_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    robot_poses: File = None
     """base_from_gripper of every image: a pose table, JSON, NPY or NPZ."""
-    convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    convention: Name = None
     """Format of the robot poses, if the file does not state it."""
     mount: Annotated[
         Literal["eye_to_hand", "eye_in_hand"] | None,
@@ -47,7 +47,7 @@ class Calibrate:
     ] = None
     """eye_to_hand for a fixed camera, eye_in_hand for one on the gripper. Default: decided from
     the camera's motion."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    camera: File = None
     """Intrinsics of these images. Default: those of the camera that recorded the scene."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("calibration.json")
     """Output file."""
@@ -55,8 +55,6 @@ class Calibrate:
     """A point in the camera frame (x right, y down, z forward; metres), such as an object that the
     camera sees: print its standard deviation in the base or gripper frame."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Calibrate, write the file and print the verdict."""

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
-from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for, read_images
+from evercal.cli.options import Device, File, Store, Verb
 from evercal.cli.stores import open_map
 from evercal.reports.answers import check_record
 
@@ -17,23 +17,21 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Check:
+class Check(Verb):
     """Test whether a fixed camera has moved since it was calibrated; exit code 1 if it has.
 
     Example: evercal check cell.evercal now.png --reference tripod.json
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    store: Store
     """Folder of the map."""
     images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
     """New images of one camera, or a folder of them; five or more reveal smaller shifts."""
     reference: Annotated[Path, arg(metavar="FILE")]
     """The camera's calibration from 'evercal calibrate'."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    camera: File = None
     """Intrinsics. Default: those of the reference."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Compare and print the shift."""

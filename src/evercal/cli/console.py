@@ -4,8 +4,9 @@ import json
 import os
 import shlex
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 from evercal.errors import InputError
 
@@ -14,11 +15,7 @@ if TYPE_CHECKING:
 
 
 def print_json(record: object) -> None:
-    """Print one JSON object on one line of stdout.
-
-    Raises:
-        ValueError: It contains inf or nan, which JSON cannot represent.
-    """
+    """Print one JSON object on one line of stdout."""
     print(json.dumps(record, allow_nan=False), flush=True)
 
 
@@ -43,6 +40,72 @@ def progress_bar(what: str, total: int, unit: str, done: int = 0) -> "tqdm":
     )
 
 
+class Bars:
+    """Progress bars of learning on stderr, one after the other; a context that closes the last.
+
+    Args:
+        stream: Where lines go.
+        start: A line to print before the first bar.
+    """
+
+    def __init__(self, stream: TextIO | None = None, start: str = ""):
+        self._start, self._stream = start, stream or sys.stdout
+        self._bar: tqdm | None = None
+        self._step = ""
+
+    def __enter__(self) -> "Bars":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+
+    def step(self, name: str, done: int, total: int) -> "tqdm":
+        """Show that part of a step is done; a new step gets a new bar."""
+        if self._start:
+            print(self._start, file=self._stream, flush=True)
+            self._start = ""
+        bar = self._bar
+        if bar is None or name != self._step or total != bar.total or done < bar.n:
+            self._close()
+            # A resumed step starts where it stopped, so that its speed is measured from there.
+            first = done if done > 8 else 0
+            self._step, bar = name, progress_bar(name, total, _UNITS.get(name, "step"), first)
+            self._bar = bar
+        bar.update(done - bar.n)
+        if done >= total:
+            self._close()
+        return bar
+
+    def write(self, text: str) -> None:
+        """Print lines above the bar."""
+        from tqdm import tqdm
+
+        tqdm.write(text, file=self._stream)
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+
+_UNITS = {
+    "encoding": "image",
+    "learning": "scene",
+    "mapping": "keyframe",
+    "matching": "pair",
+    "adjusting": "round",
+}
+
+
+def print_table(rows: Sequence[Mapping[str, object]]) -> None:
+    """Print rows under the names of their columns; nothing without a row."""
+    from tabulate import tabulate
+
+    if rows:
+        align = ("left", *("right" for _ in list(rows[0])[1:]))
+        print(tabulate(list(rows), headers="keys", colalign=align, disable_numparse=True))
+
+
 def size(count: float) -> str:
     """Format bytes: 1.2 MB."""
     for unit in ("B", "kB", "MB"):
@@ -58,9 +121,6 @@ def require_writable(path: Path | None, option: str) -> None:
     Args:
         path: the file; None if the option was omitted.
         option: its name, for the message.
-
-    Raises:
-        InputError: The path is a folder, or its folder is missing or not writable.
     """
     if path is None:
         return
@@ -74,11 +134,7 @@ def require_writable(path: Path | None, option: str) -> None:
 
 
 def require_folder(path: Path | None, option: str) -> None:
-    """Create an output folder, before any work is done.
-
-    Raises:
-        InputError: It cannot be created or written.
-    """
+    """Create an output folder, before any work is done."""
     if path is None:
         return
     try:

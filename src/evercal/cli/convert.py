@@ -7,12 +7,13 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.options import Name, Verb
 from evercal.cli.reading import Reading
 from evercal.errors import InputError
 
 
 @dataclass(frozen=True)
-class Convert:
+class Convert(Verb):
     """Convert a recording of any format to evercal's own: one scene.json and the images.
 
     Example: evercal convert recording.mcap kitchen/
@@ -24,12 +25,10 @@ class Convert:
     """Output folder; created if it is missing."""
     reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
     """How the recording is read."""
-    name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    name: Name = None
     """Name of the scene. Default: the recording's own name."""
     hard_link: bool = False
     """Link image files instead of copying them; changes then affect both."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Read, write and print a summary."""

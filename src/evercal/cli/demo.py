@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from evercal.cli.console import print_json, print_next, progress_bar, require_folder, size
-from evercal.cli.device import Device
+from evercal.cli.console import Bars, print_json, print_next, progress_bar, require_folder, size
+from evercal.cli.options import Device, Folder, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ PICTURES = 3
 
 
 @dataclass(frozen=True)
-class Demo:
+class Demo(Verb):
     """Map three rendered rooms, localize images, calibrate cameras and detect a bump.
 
     With --copy-samples, only copy the recordings of these rooms and of a robot cell.
@@ -44,11 +44,9 @@ class Demo:
 
     out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-demo")
     """Folder for report.html, the store and a query image."""
-    copy_samples: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    copy_samples: Folder = None
     """New or empty folder to copy the packaged recordings to, instead of running the demo."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Run the demo; takes about a minute on two cores."""
@@ -145,7 +143,6 @@ def _open(store: Path, device: str) -> "Localizer":
 
 def _learn(store: Path, scene: "Recording", device: str, result: "DemoResult") -> None:
     """Add a room to the store."""
-    from evercal.cli.networks import Bars
     from evercal.map import Map
     from evercal.reports.demo_page import LearnedRoom
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar, require_writable
+from evercal.cli.options import File, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ _DICTIONARIES = {"chessboard": "", "charuco": "4X4_50", "apriltag": "APRILTAG_36
 
 
 @dataclass(frozen=True)
-class Detect:
+class Detect(Verb):
     """Detect a printed board in images and estimate its pose in each, for 'evercal solve'.
 
     Without --camera the intrinsics are estimated from the board.
@@ -48,7 +49,7 @@ class Detect:
     """Dictionary of markers or tags, OpenCV's name without DICT_."""
     tag: Annotated[int | None, arg(metavar="ID", help_behavior_hint="(default: any)")] = None
     """Number of the tag."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    camera: File = None
     """File of the intrinsics; if omitted, they are estimated from the board."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("board.json")
     """File of poses and corners to write."""
@@ -56,8 +57,6 @@ class Detect:
     """Write the board at true size, to print; detect nothing."""
     paper: Annotated[str, arg(metavar="NAME")] = "a4"
     """Paper of --make-board: a4, letter, a3, tabloid, a2, a1 or a0."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Detect the board in every image and write the poses, or print a board."""

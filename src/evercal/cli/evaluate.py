@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
-from evercal.cli.device import Device
+from evercal.cli.options import Device, Store, Verb
 from evercal.cli.stores import open_localizer
 from evercal.errors import InputError
 
@@ -16,21 +16,19 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class Evaluate(Verb):
     """Measure the localization accuracy on the test frames of scenes.
 
     Example: evercal evaluate cell.evercal kitchen/
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    store: Store
     """Folder of the store."""
     scenes: Annotated[
         Positional[tuple[str, ...]], arg(metavar="[NAME=]SCENE...", help_behavior_hint="")
     ]
     """Folders of recorded scenes. NAME is the scene's name in the store, if it differs."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Evaluate and print a table."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next
+from evercal.cli.options import File, Frame, Name, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ExportCalibration:
+class Export(Verb):
     """Write a calibration in the format of another program; `--format list` lists all formats.
 
     Without `--out` the text is printed. The pose is parent_from_child: the camera in the robot base
@@ -28,17 +29,17 @@ class ExportCalibration:
         Positional[Path | None], arg(metavar="[CALIBRATION.json]", help_behavior_hint="")
     ] = None
     """Calibration file."""
-    format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    format: Name = None
     """Format, such as easy_handeye2, urdf, opencv or kuka; `list` lists all."""
-    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    out: File = None
     """File to write; a new folder for colmap."""
-    parent: Annotated[str | None, arg(metavar="FRAME", help_behavior_hint="")] = None
+    parent: Frame = None
     """New name of the parent frame: the robot base or the gripper."""
-    child: Annotated[str | None, arg(metavar="FRAME", help_behavior_hint="")] = None
+    child: Frame = None
     """New name of the child frame: the camera's optical frame."""
-    via: Annotated[str | None, arg(metavar="FRAME", help_behavior_hint="")] = None
+    via: Frame = None
     """Export this root frame of the camera driver, such as camera_link."""
-    via_transform: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    via_transform: File = None
     """With --via: output of `ros2 topic echo --once /tf_static`, or a TransformStamped."""
     via_offset: Annotated[
         tuple[float, float, float] | None, arg(metavar="X Y Z", help_behavior_hint="")
@@ -46,16 +47,14 @@ class ExportCalibration:
     """With --via: offset of the optical frame (forward, left, up), metres."""
     via_optical: bool = False
     """With --via: both frames have the same origin."""
-    robot_frame: Annotated[str | None, arg(metavar="FRAME", help_behavior_hint="")] = None
+    robot_frame: Frame = None
     """For easy_handeye: gripper frame of a fixed camera, else base frame."""
-    robot_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    robot_poses: File = None
     """Gripper pose of every image: moveit_samples, or tum, colmap, nerfstudio on the arm."""
-    target_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    target_poses: File = None
     """Board pose in the camera for every image, for moveit_samples."""
-    convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    convention: Name = None
     """Pose convention of --robot-poses if its header does not state it: ur, kuka, fanuc, ..."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Read all inputs before writing the output."""

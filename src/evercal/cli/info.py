@@ -2,35 +2,35 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from tyro.conf import Positional, arg
-
-from evercal.cli.console import print_json, print_next, size
+from evercal.cli.console import print_json, print_next, print_table, size
+from evercal.cli.options import Store, Verb
 
 MEMORY_FILES = ("keyframes.safetensors", "state.safetensors")
 
 
 @dataclass(frozen=True)
-class Info:
-    """Describe a store: its scenes, its size, and what bundle adjustment changed.
+class Info(Verb):
+    """Describe a map: its scenes, its size, and what bundle adjustment changed.
 
     Example: evercal info cell.evercal
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
-    """Folder of the store."""
-    json: bool = False
-    """Print one JSON object."""
+    store: Store
+    """Folder of the map."""
+    check: bool = False
+    """Compare every file with its checksum; exit code 1 if one is damaged."""
 
     def run(self) -> int:
         """Open the store and describe it."""
+        if self.check:
+            return self._check()
         from evercal.cli.stores import MAP, strategy_of
 
         strategy = strategy_of(self.store)
         if strategy in (MAP, None):
-            scenes, short_side, heads, sizes = _map(self.store)
+            scenes, short_side, heads, sizes = _map(self)
         else:
             from evercal.continual.store import describe
 
@@ -56,18 +56,33 @@ class Info:
         )
         network = f"networks {size(heads)}, " if heads else ""
         print(f"{size(total)} in all: keyframes {size(memory)}, {network}the rest is the encoder")
-        for lines in (_content_table(scenes), _adjusted_table(scenes)):
-            if lines:
-                print(lines)
-        print_next("evercal", "verify", self.store)
+        print_table([_content(scene) for scene in scenes])
+        print_table([_adjusted(scene) for scene in scenes if scene.get("adjusted")])
+        print_next("evercal", "info", self.store, "--check")
+        return 0
+
+    def _check(self) -> int:
+        from evercal.storage import verify
+
+        problems = verify(self.store)
+        if self.json:
+            print_json({"store": str(self.store), "ok": not problems, "problems": problems})
+            return 1 if problems else 0
+        for problem in problems:
+            print(problem)
+        if problems:
+            files = "1 file is" if len(problems) == 1 else f"{len(problems)} files are"
+            print(f"{files} damaged; restore from a copy of the map")
+            return 1
+        print(f"{self.store}: all files match their checksums")
         return 0
 
 
-def _map(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]]:
+def _map(given: Info) -> tuple[Sequence[dict[str, Any]], int, int, dict[str, int]]:
     """Scenes for JSON, working size, size of networks, and files with their sizes."""
     from evercal.mapping.store import MapStore
 
-    store = MapStore.open(path)
+    store = MapStore.open(given.store)
     scenes = [
         {
             "name": scene.name,
@@ -78,71 +93,46 @@ def _map(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]]:
             "landmarks": scene.landmarks,
             "min_support": scene.min_support,
             "adjusted": report.get("adjusted"),
+            "hand_eye": report.get("hand_eye"),
         }
         for scene, report in zip(store.contents.scenes, store.reports(), strict=True)
     ]
     return scenes, store.contents.short_side, 0, store.size_bytes()
 
 
-def _content_table(scenes: Sequence[dict[str, Any]]) -> str:
-    maps = any("landmarks" in scene for scene in scenes)
-    rows = [
-        [
-            scene["name"],
-            scene["train_frames"],
-            scene["keyframes"],
-            *([scene.get("landmarks", "")] if maps else []),
-            size(scene["memory_bytes"]),
-            _threshold(scene),
-            f"{scene['camera']['width']}x{scene['camera']['height']}",
-        ]
-        for scene in scenes
-    ]
-    header = ["scene", "frames", "keyframes", *(["landmarks"] if maps else [])]
-    return _table([*header, "memory", "rejected below", "camera"], rows)
+def _content(scene: dict[str, Any]) -> dict[str, object]:
+    threshold = (
+        f"support {scene['min_support']:.2f}"
+        if "min_support" in scene
+        else f"{100 * scene['inlier_threshold']:.0f} % inliers"
+    )
+    landmarks = {"landmarks": scene["landmarks"]} if "landmarks" in scene else {}
+    return {
+        "scene": scene["name"],
+        "frames": scene["train_frames"],
+        "keyframes": scene["keyframes"],
+        **landmarks,
+        "memory": size(scene["memory_bytes"]),
+        "rejected below": threshold,
+        "camera": f"{scene['camera']['width']}x{scene['camera']['height']}",
+    }
 
 
-def _threshold(scene: dict[str, Any]) -> str:
-    """Threshold of acceptance."""
-    if "min_support" in scene:
-        return f"support {scene['min_support']:.2f}"
-    return f"{100 * scene['inlier_threshold']:.0f} % inliers"
-
-
-def _adjusted_table(scenes: Sequence[dict[str, Any]]) -> str:
-    """Changes by bundle adjustment; empty if no scene was adjusted."""
-    rows = []
-    for scene in scenes:
-        adjusted = scene.get("adjusted")
-        if not adjusted:
-            continue
-        shift, rotation = (
-            sum(x * x for x in adjusted[key]) ** 0.5
-            for key in ("common_translation_mm", "common_rotation_deg")
-        )
-        rows.append(
-            [
-                scene["name"],
-                _pixels(adjusted["residual_px"]),
-                f"{adjusted['pose_sigma_mm']:.2f} mm, {adjusted['pose_sigma_deg']:.3f} deg",
-                f"{shift:.2f} mm, {rotation:.3f} deg",
-                f"{adjusted['focal_percent']:+.2f} %",
-                str(len(adjusted["wrong_poses"])),
-                str(len(adjusted.get("untracked", ()))),
-            ]
-        )
-    if not rows:
-        return ""
-    header = ["bundle adjustment", "median residual", "error of stated poses", "common transform"]
-    return "\n" + _table([*header, "focal length", "wrong poses", "untracked"], rows)
-
-
-def _pixels(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f} px"
-
-
-def _table(header: list[str], rows: list[list[Any]]) -> str:
-    from tabulate import tabulate
-
-    align = ("left", *("right" for _ in header[1:]))
-    return tabulate(rows, headers=header, colalign=align, disable_numparse=True)
+def _adjusted(scene: dict[str, Any]) -> dict[str, object]:
+    """Changes by bundle adjustment."""
+    adjusted = scene["adjusted"]
+    shift, rotation = (
+        sum(x * x for x in adjusted[key]) ** 0.5
+        for key in ("common_translation_mm", "common_rotation_deg")
+    )
+    residual = adjusted["residual_px"]
+    sigma = f"{adjusted['pose_sigma_mm']:.2f} mm, {adjusted['pose_sigma_deg']:.3f} deg"
+    return {
+        "bundle adjustment": scene["name"],
+        "median residual": "-" if residual is None else f"{residual:.2f} px",
+        "error of stated poses": sigma,
+        "common transform": f"{shift:.2f} mm, {rotation:.3f} deg",
+        "focal length": f"{adjusted['focal_percent']:+.2f} %",
+        "wrong poses": len(adjusted["wrong_poses"]),
+        "untracked": len(adjusted.get("untracked", ())),
+    }

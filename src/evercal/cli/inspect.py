@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next
+from evercal.cli.options import File, Verb
 from evercal.cli.reading import Reading
 from evercal.errors import InputError
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Inspect:
+class Inspect(Verb):
     """Check a recording before it is learned: frames, cameras, motion, and likely mistakes.
 
     Example: evercal inspect wrist_recording/ --coverage --next reachable.csv
@@ -34,11 +35,9 @@ class Inspect:
     """Gripper poses that the robot can reach; prints those whose images would help most."""
     count: Annotated[int, arg(metavar="N")] = 5
     """Number of poses for --next."""
-    gripper_from_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    gripper_from_camera: File = None
     """A rough gripper_from_camera for --coverage and --next: 4x4 matrix or calibration file.
     Without it, axes are those of the gripper."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Read the recording and some of its images."""

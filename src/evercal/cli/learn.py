@@ -4,116 +4,117 @@ import dataclasses
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, require_writable, size
-from evercal.cli.device import Device
-from evercal.cli.networks import Bars, LearnRequest, NetworkOptions, learn_into_networks
+from evercal.cli.console import Bars, print_json, print_next, require_writable, size
+from evercal.cli.networks import NetworkOptions, learn_into_networks
+from evercal.cli.options import Device, File, Name, Store, Verb
 from evercal.cli.reading import Reading
 from evercal.cli.stores import MAP, strategy_of
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
     from evercal.calibration.eye_in_hand import HandEyeReport
-    from evercal.geometry import SE3
     from evercal.learning.scene import LearnReport
     from evercal.mapping.build import Adjusted
     from evercal.recordings import Recording
 
 
 @dataclass(frozen=True)
-class Learn:
+class Learn(Verb):
     """Learn a scene from a recording; scenes learned before do not change.
 
     A recording with gripper poses and no camera poses also yields gripper_from_camera. Several
-    recordings become one scene each, several at once with --workers. Training of a network
-    continues where it was stopped.
+    recordings become one scene each, several at once with --workers.
 
     Example: evercal learn cell.evercal wrist_recording/ --calibration wrist.json
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    store: Store
     """Folder of the map; created if it is missing."""
     recordings: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="RECORDING...", help_behavior_hint="")
     ] = ()
     """Folders of recordings, or files of bags."""
-    name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    name: Name = None
     """Name of the scene. Default: the recording's own name."""
     memory: Annotated[str | None, arg(metavar="SHARE|BYTES|auto", help_behavior_hint="")] = None
     """Keyframes to keep: a share of the frames (10%), a size (5MB), or auto for the fewest that
     locate the recording's other frames well. Default: 10%, at least eight."""
-    calibration: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Output file for the estimated gripper_from_camera, for 'evercal export'."""
-    gripper_from_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    calibration: File = None
+    """Also write the estimated gripper_from_camera to a file. The map keeps it in any case."""
+    gripper_from_camera: File = None
     """A rough gripper_from_camera to compare the estimate with: 4x4 matrix or calibration file."""
-    encoder: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Encoder weights from 'python -m training', for a new store. Default: the shipped weights."""
-    strategy: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    encoder: File = None
+    """Encoder weights from 'python -m training', for a new map. Default: the shipped weights."""
+    strategy: Name = None
     """evercal builds a map; every other strategy trains a network. Default: that of the store."""
     reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
     """How the recording is read."""
     networks: Annotated[NetworkOptions, arg(name="")] = field(default_factory=NetworkOptions)
     """Strategies that train a network."""
     workers: Annotated[int, arg(metavar="N")] = 1
-    """Recordings that are learned at once; the threads of this machine are shared."""
+    """Recordings to learn in parallel."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Learn and print a summary."""
         if not self.recordings:
             raise InputError("no RECORDING given; name the folder of one or more")
-        if self.workers < 1:
-            raise InputError(f"--workers {self.workers}: give a number >= 1")
-        return self._run_one(self.recordings[0]) if len(self.recordings) == 1 else self._run_many()
+        single = len(self.recordings) == 1
+        if self.workers < 1 or (single and self.workers > 1):
+            raise InputError(f"--workers {self.workers}: give 1 to the number of recordings")
+        require_writable(self.calibration, "--calibration")
+        if self.encoder is not None and not self.encoder.is_file():
+            raise InputError(f"--encoder {self.encoder}: no such file")
+        from evercal.mapping.memory_budget import MemoryBudget
 
-    def _run_many(self) -> int:
-        """Learn several recordings; print a summary of each."""
+        try:
+            MemoryBudget.parse(self.memory)
+        except InputError as error:
+            raise InputError(f"--{error}") from None
+        made_with = strategy_of(self.store)
+        strategy = self.strategy or made_with or MAP
+        if strategy != (made_with or strategy):
+            raise InputError(
+                f"--strategy {strategy}: {self.store} was made with {made_with}; omit the option or"
+                " start a new store"
+            )
+        if strategy == MAP:
+            self.networks.refuse()
+        return self._run_one(self.recordings[0], strategy) if single else self._run_many(strategy)
+
+    def _run_many(self, strategy: str) -> int:
         self._refuse(
             "several recordings are learned; omit the option or give one recording",
             name=self.name,
             calibration=self.calibration,
             gripper_from_camera=self.gripper_from_camera,
         )
-        if (self.strategy or strategy_of(self.store) or MAP) != MAP:
+        if strategy != MAP:
             raise InputError("several recordings: a network learns one at a time; give one")
-        self._require_parsed_memory()
-        self.networks.refuse()
         from evercal.map import Map
 
         loaded = [self.reading.recording(path, None) for path in self.recordings]
-        cell = Map.open(self.store, device=self.device, encoder=self._encoder())
-        stream = sys.stderr if self.json else sys.stdout
-        with Bars(f"{len(loaded)} recordings, {self.workers} at once", stream) as bars:
-
-            def show(report: "LearnReport") -> None:
-                bars.write("\n".join(summary(report)))
-
+        cell = Map.open(self.store, device=self.device, encoder=self.encoder)
+        with Bars(self._stream, f"{len(loaded)} recordings, {self.workers} at once") as bars:
             reports = cell.learn_many(
                 loaded,
                 workers=self.workers,
                 memory=self.memory,
-                on_scene=show,
+                on_scene=lambda report: bars.write("\n".join(summary(report))),
                 on_progress=bars.step,
             )
         if self.json:
             print_json({"scenes": [dataclasses.asdict(report) for report in reports]})
-            return 0
-        print_next("evercal", "localize", self.store, "IMAGE")
+        else:
+            print_next("evercal", "localize", self.store, "IMAGE")
         return 0
 
-    def _run_one(self, path: Path) -> int:
-        if self.workers > 1:
-            raise InputError(f"--workers {self.workers}: one recording is learned; omit the option")
-        require_writable(self.calibration, "--calibration")
-        self._require_parsed_memory()
-        from evercal.calibration.eye_in_hand import lacks_camera_poses
-        from evercal.recordings import posed_recording
-        from evercal.recordings.held_out import split_held_out
+    def _run_one(self, path: Path, strategy: str) -> int:
+        from evercal.recordings.frame import lacks_camera_poses
 
         recording = self.reading.recording(path, self.name)
         if not lacks_camera_poses(recording):
@@ -123,27 +124,44 @@ class Learn:
                 gripper_from_camera=self.gripper_from_camera,
                 calibration=self.calibration,
             )
-            recording = posed_recording(recording)
-        held_out = len(split_held_out(recording.train).held_out)
-        start = (
-            f"{recording.name}: {len(recording.train)} training frames ({recording.untracked}"
-            f" without a pose omitted), {held_out} held out to fit acceptance"
-        )
         try:
-            report = self._learn(recording, start)
+            report = self._learned(recording, strategy)
         except KeyboardInterrupt:
-            print("stopped; the same command continues or starts again", file=sys.stderr)
+            print("stopped; the same command starts again", file=sys.stderr)
             return 130
-        if self.calibration is not None and report.hand_eye is not None:
-            self._write_hand_eye(report)
         if self.json:
             print_json(dataclasses.asdict(report))
             return 0
-        for line in summary(report):
-            print(line)
+        print("\n".join(summary(report)))
+        self._print_next(recording, report, path)
+        return 0
+
+    def _learned(self, recording: "Recording", strategy: str) -> "LearnReport":
+        from evercal.calibration.calibration import read_transform
+
+        rough = (
+            None if self.gripper_from_camera is None else read_transform(self.gripper_from_camera)
+        )
+        frames = f"{len(recording.train)} training frames"
+        with Bars(self._stream, f"{recording.name}: {frames}") as bars:
+            if strategy != MAP:
+                return learn_into_networks(self, strategy, recording, bars)
+            from evercal.map import Map
+
+            cell = Map.open(self.store, device=self.device, encoder=self.encoder)
+            report = cell.learn(
+                recording, memory=self.memory, gripper_from_camera=rough, on_progress=bars.step
+            )
+        if self.calibration is not None:
+            cell.calibration(report.scene).write(self.calibration)
+        return report
+
+    def _print_next(self, recording: "Recording", report: "LearnReport", path: Path) -> None:
         if self.calibration is not None:
             print(f"wrote {self.calibration}")
             print_next("evercal", "export", self.calibration, "--format", "easy_handeye2")
+        elif report.hand_eye is not None:
+            print_next("evercal", "export", self.store, "--format", "easy_handeye2")
         elif not recording.metric:
             align = ("evercal", "align", self.store, report.scene)
             print_next(*align, "IMAGE...", "--robot-poses", "FILE")
@@ -152,57 +170,10 @@ class Learn:
             print_next("evercal", "evaluate", self.store, scene)
         else:
             print_next("evercal", "localize", self.store, "IMAGE")
-        return 0
 
-    def _learn(self, recording: "Recording", start: str) -> "LearnReport":
-        stream = sys.stderr if self.json else sys.stdout
-        made_with = strategy_of(self.store)
-        strategy = self.strategy or made_with or MAP
-        if made_with is not None and strategy != made_with:
-            raise InputError(
-                f"--strategy {strategy}: {self.store} was made with {made_with}; omit the option or"
-                " start a new store"
-            )
-        encoder = self._encoder()
-        rough = self._rough()
-        if strategy != MAP:
-            request = LearnRequest(
-                self.store,
-                strategy,
-                self.memory or "10%",
-                encoder,
-                self.device,
-                self.networks,
-            )
-            return learn_into_networks(request, recording, start, stream)
-        self.networks.refuse()
-        from evercal.map import Map
-
-        cell = Map.open(self.store, device=self.device, encoder=encoder)
-        with Bars(start, stream) as bars:
-            return cell.learn(
-                recording, memory=self.memory, gripper_from_camera=rough, on_progress=bars.step
-            )
-
-    def _rough(self) -> "SE3 | None":
-        if self.gripper_from_camera is None:
-            return None
-        from evercal.calibration.calibration import read_transform
-
-        return read_transform(self.gripper_from_camera)
-
-    def _encoder(self) -> Path | None:
-        if self.encoder is not None and not self.encoder.is_file():
-            raise InputError(f"--encoder {self.encoder}: no such file")
-        return self.encoder
-
-    def _require_parsed_memory(self) -> None:
-        from evercal.mapping.memory_budget import MemoryBudget
-
-        try:
-            MemoryBudget.parse(self.memory)
-        except InputError as error:
-            raise InputError(f"--{error}") from None
+    @property
+    def _stream(self) -> Any:
+        return sys.stderr if self.json else sys.stdout
 
     @staticmethod
     def _refuse(why: str, **options: object) -> None:
@@ -210,18 +181,6 @@ class Learn:
         for name, value in options.items():
             if value is not None:
                 raise InputError(f"--{name.replace('_', '-')} {value}: {why}")
-
-    def _write_hand_eye(self, report: "LearnReport") -> None:
-        from evercal.cli.stores import open_localizer
-        from evercal.localization.localizer import Localizer
-
-        localizer = open_localizer(self.store, "cpu")
-        assert isinstance(localizer, Localizer), "only a map estimates gripper_from_camera"
-        assert report.hand_eye is not None, "checked by the caller"
-        assert self.calibration is not None, "checked by the caller"
-        camera = localizer.contents.scenes[-1].adjusted_camera
-        calibration = report.hand_eye.calibration(camera, report.scene, report.train_frames)
-        calibration.write(self.calibration)
 
 
 def summary(report: "LearnReport") -> list[str]:

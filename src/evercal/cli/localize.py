@@ -15,8 +15,8 @@ from evercal.cli.console import (
     require_folder,
     require_writable,
 )
-from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for
+from evercal.cli.options import Device, File, Folder, Store, Verb
 from evercal.cli.point_words import Point, point_dict, point_of, point_text
 from evercal.cli.stores import open_localizer
 from evercal.reports.answers import Answer, answer_row, budget_of, finite_pose, unit_known
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Localize:
+class Localize(Verb):
     """Estimate the camera pose of images, in the base frame of the scene they show.
 
     Exit code 1 if no image was located.
@@ -38,14 +38,14 @@ class Localize:
     Example: evercal localize cell.evercal image.jpg --overlay overlays/
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    store: Store
     """Folder of the store."""
     images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
     """Image files or folders of them."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    camera: File = None
     """Intrinsics: 3x3 matrix as text, JSON, YAML, NPZ, ROS camera_info or OpenCV's storage.
     Default: those of the camera that recorded the scene."""
-    overlay: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    overlay: Folder = None
     """Output folder for copies of the images with their landmarks and residuals."""
     video: Annotated[Path | None, arg(metavar="FILE.mp4", help_behavior_hint="")] = None
     """A video of the sequence: each image with its landmarks and residuals, beside the map seen
@@ -54,8 +54,6 @@ class Localize:
     """A point in the camera frame (x right, y down, z forward; metres), such as an object that the
     camera sees: print its standard deviation in the base frame."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Locate every image; nothing is printed before all of them were read."""

@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from evercal.cli.console import print_json, print_next, size
+from evercal.cli.options import Store, Verb
 
 if TYPE_CHECKING:
     from evercal.map import Map
 
-Folder = Annotated[Positional[Path], arg(metavar="STORE")]
+Folder = Store
 
 
 @dataclass(frozen=True)
-class List:
+class List(Verb):
     """List the scenes of a map with their size.
 
     Example: evercal map list cell.evercal
@@ -24,8 +25,6 @@ class List:
 
     store: Folder
     """Folder of the map."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Open the map and print a line for each scene."""
@@ -54,7 +53,7 @@ class List:
 
 
 @dataclass(frozen=True)
-class Remove:
+class Remove(Verb):
     """Remove scenes from a map, all in one step.
 
     Example: evercal map remove cell.evercal kitchen
@@ -64,8 +63,6 @@ class Remove:
     """Folder of the map."""
     names: Annotated[Positional[tuple[str, ...]], arg(metavar="SCENE...", help_behavior_hint="")]
     """Scenes to remove."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Remove the scenes."""
@@ -75,7 +72,7 @@ class Remove:
 
 
 @dataclass(frozen=True)
-class Rename:
+class Rename(Verb):
     """Give a scene of a map another name.
 
     Example: evercal map rename cell.evercal kitchen kitchen-2025
@@ -87,8 +84,6 @@ class Rename:
     """Name of the scene."""
     new: Annotated[Positional[str], arg(metavar="NEW")]
     """Its new name."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Rename the scene."""
@@ -98,7 +93,7 @@ class Rename:
 
 
 @dataclass(frozen=True)
-class Merge:
+class Merge(Verb):
     """Add the scenes of other maps to a map, all in one step; a new folder becomes a new map.
 
     All maps must have one encoder and one image size.
@@ -113,8 +108,6 @@ class Merge:
     on_clash: Literal["refuse", "rename", "skip", "replace"] = "refuse"
     """For a scene whose name is taken: refuse the merge, rename it to NAME-2, skip it, or replace
     the scene of the map."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Merge the maps."""
@@ -130,7 +123,7 @@ class Merge:
 
 
 @dataclass(frozen=True)
-class Pack:
+class Pack(Verb):
     """Write a map into one file, a zip archive with checksums.
 
     Example: evercal map pack cell.evercal cell.zip
@@ -140,8 +133,6 @@ class Pack:
     """Folder of the map."""
     file: Annotated[Positional[Path], arg(metavar="FILE")]
     """Output file; an existing one is replaced."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Pack the map."""
@@ -160,7 +151,7 @@ class Pack:
 
 
 @dataclass(frozen=True)
-class Unpack:
+class Unpack(Verb):
     """Extract a map from a file of 'evercal map pack'; every file is checked.
 
     Example: evercal map unpack cell.zip cell.evercal
@@ -170,8 +161,6 @@ class Unpack:
     """The archive."""
     store: Folder
     """New folder for the map."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Unpack the map."""

@@ -1,18 +1,15 @@
-"""`evercal learn --strategy NAME`: options and progress bars of strategies that train a network."""
+"""`evercal learn --strategy NAME`: strategies that train a network."""
 
-import sys
 from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TextIO
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
-from evercal.cli.console import progress_bar
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from tqdm import tqdm
-
+    from evercal.cli.console import Bars
+    from evercal.cli.learn import Learn
     from evercal.learning.scene import LearnReport
     from evercal.recordings import Recording
 
@@ -29,11 +26,7 @@ class NetworkOptions:
     """Random seed."""
 
     def refuse(self) -> None:
-        """Refuse options that a map does not have.
-
-        Raises:
-            InputError: An option was given.
-        """
+        """Refuse options that a map does not have."""
         for field in fields(self):
             if (value := getattr(self, field.name)) != field.default:
                 raise InputError(
@@ -42,113 +35,37 @@ class NetworkOptions:
                 )
 
 
-@dataclass(frozen=True)
-class LearnRequest:
-    """What `evercal learn` passes on."""
-
-    store: Path
-    strategy: str
-    memory: str
-    encoder: Path | None
-    device: str
-    options: NetworkOptions
-
-
 def learn_into_networks(
-    request: LearnRequest, recording: "Recording", start: str, stream: TextIO
+    given: "Learn", strategy: str, recording: "Recording", bars: "Bars"
 ) -> "LearnReport":
-    """Train a network on a recording, with progress bars.
-
-    Args:
-        request: store and options.
-        recording: to learn.
-        start: a line to print when learning begins.
-        stream: where the line goes.
-    """
+    """Train a network on a recording."""
     from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
 
-    given = request.options
-    if given.centres is not None and given.centres < 1:
-        raise InputError(f"--centres {given.centres}: give a number >= 1")
-    if given.seed < 0:
-        raise InputError(f"--seed {given.seed}: give a number >= 0")
+    wanted = given.networks
+    if wanted.centres is not None and wanted.centres < 1:
+        raise InputError(f"--centres {wanted.centres}: give a number >= 1")
+    if wanted.seed < 0:
+        raise InputError(f"--seed {wanted.seed}: give a number >= 0")
     options = NetworkLearnOptions(
-        strategy=request.strategy,
-        preset=given.preset,
-        memory=request.memory,
-        centres=given.centres,
-        encoder=request.encoder,
-        device=request.device,
-        seed=given.seed,
+        strategy=strategy,
+        preset=wanted.preset,
+        memory=given.memory or "10%",
+        centres=wanted.centres,
+        encoder=given.encoder,
+        device=given.device,
+        seed=wanted.seed,
     )
-    with Bars(start, stream) as bars:
-        return learn_networks(request.store, recording, options, bars.event)
+    return learn_networks(given.store, recording, options, lambda event: _show(bars, event))
 
 
-class Bars:
-    """Progress bars of learning on stderr, one after the other; a context that closes the last.
+def _show(bars: "Bars", event: object) -> None:
+    """Show an event of network training."""
+    from evercal.continual.learning.stage import Encoding
+    from evercal.continual.networks.trainer import Progress
 
-    Args:
-        start: a line to print before the first bar.
-        stream: where the line goes; stdout by default.
-    """
-
-    def __init__(self, start: str = "", stream: TextIO | None = None):
-        self._start, self._stream = start, stream or sys.stdout
-        self._bar: tqdm | None = None
-        self._step = ""
-
-    def __enter__(self) -> "Bars":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._close()
-
-    def step(self, name: str, done: int, total: int) -> "tqdm":
-        """Show that part of a step is done; a new step gets a new bar."""
-        if self._start:
-            print(self._start, file=self._stream, flush=True)
-            self._start = ""
-        bar = self._bar
-        if bar is None or name != self._step or total != bar.total or done < bar.n:
-            self._close()
-            # A resumed step starts where it stopped, so that its speed is measured from there.
-            first = done if done > 8 else 0
-            self._step, bar = name, progress_bar(name, total, _UNITS.get(name, "step"), first)
-            self._bar = bar
-        bar.update(done - bar.n)
-        if done >= total:
-            self._close()
-        return bar
-
-    def write(self, text: str) -> None:
-        """Print lines above the bar."""
-        from tqdm import tqdm
-
-        tqdm.write(text, file=self._stream)
-
-    def event(self, event: object) -> None:
-        """Show an event of network training."""
-        from evercal.continual.learning.stage import Encoding
-        from evercal.continual.networks.trainer import Progress
-
-        if isinstance(event, Progress):
-            bar = self.step("training", event.step, event.total)
-            text = f"loss {event.loss:.1f}, {100 * event.inlier_share:.0f} % inliers"
-            bar.set_postfix_str(text, refresh=event.step == event.total)
-        elif isinstance(event, Encoding):
-            self.step("encoding", event.done, event.total)
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
-
-
-_UNITS = {
-    "encoding": "image",
-    "learning": "scene",
-    "mapping": "keyframe",
-    "matching": "pair",
-    "adjusting": "round",
-}
+    if isinstance(event, Progress):
+        bar = bars.step("training", event.step, event.total)
+        text = f"loss {event.loss:.1f}, {100 * event.inlier_share:.0f} % inliers"
+        bar.set_postfix_str(text, refresh=event.step == event.total)
+    elif isinstance(event, Encoding):
+        bars.step("encoding", event.done, event.total)

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
+from evercal.cli.options import File, Name
+
 if TYPE_CHECKING:
     from evercal.recordings import Recording
 
@@ -14,24 +16,24 @@ if TYPE_CHECKING:
 class Reading:
     """How the recording is read; options that do not apply to its format are refused."""
 
-    format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    format: Name = None
     """Format of the recording: generic, 7scenes, 12scenes, nerfstudio, colmap, wrist, lerobot or
     rosbag. Default: recognised from its files."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    camera: File = None
     """Intrinsics of all images, if the recording has none: 3x3 matrix as text, JSON, YAML,
     NPZ, ROS camera_info or OpenCV's storage."""
     image_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None
     """Images of a bag or a LeRobot dataset; required if there are several topics."""
     pose_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None
     """tf or joint states of a bag; required if there are several topics."""
-    base_frame: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    base_frame: Name = None
     """The robot's base, a tf frame of a bag or a link of the URDF."""
-    gripper_frame: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    gripper_frame: Name = None
     """The gripper: a tf frame of a bag, a link of the URDF, or a feature or arm of a LeRobot
     dataset."""
-    urdf: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    urdf: File = None
     """URDF of the robot, for recordings with joint angles."""
-    pose_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    pose_convention: Name = None
     """Format of the gripper poses, if the file's header does not state it; rad or deg for joint
     angles."""
     metres: bool = False

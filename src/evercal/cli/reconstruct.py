@@ -7,15 +7,15 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next
-from evercal.cli.networks import Bars
+from evercal.cli.console import Bars, print_json, print_next
+from evercal.cli.options import Verb
 
 _CONNECTED = 0.8
 """Share of the frames in one part below which the video does not hold together."""
 
 
 @dataclass(frozen=True)
-class Reconstruct:
+class Reconstruct(Verb):
     """Estimate camera poses from a plain video or images, to learn a map from.
 
     The unit of length is arbitrary until 'evercal align'. Exit code 1 if less than 80 % of the
@@ -32,8 +32,6 @@ class Reconstruct:
     """Motion from one chosen frame of a video to the next, parts of its width."""
     most: Annotated[int, arg(metavar="N")] = 300
     """Frames, at most."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Reconstruct and print a summary."""

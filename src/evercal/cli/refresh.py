@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, size
-from evercal.cli.device import Device
+from evercal.cli.console import Bars, print_json, print_next, size
 from evercal.cli.image_words import camera_for, stated_camera
-from evercal.cli.networks import Bars
+from evercal.cli.options import Device, File, Store, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,7 +22,7 @@ _LISTED = 5
 
 
 @dataclass(frozen=True)
-class Refresh:
+class Refresh(Verb):
     """Follow a changed room: new images replace what is gone, in the same memory.
 
     The images need no poses: they are located in the map. What was moved or removed leaves the map,
@@ -32,19 +31,17 @@ class Refresh:
     Example: evercal refresh cell.evercal images/
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    store: Store
     """Folder of the map."""
     images: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="[RECORDING|IMAGE...]", help_behavior_hint="")
     ] = ()
     """Images of one camera, a folder of them, or a recording."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    camera: File = None
     """File of the intrinsics. Default: those of the camera that recorded the scene."""
     undo: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="")] = None
     """Bring back the state of a scene before its last refresh."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Refresh, or undo the last refresh."""
@@ -64,7 +61,7 @@ class Refresh:
             return 0
         recording = _recording(self.images)
         stream = sys.stderr if self.json else sys.stdout
-        with Bars("", stream) as bars:
+        with Bars(stream) as bars:
             if recording is not None:
                 first = recording.train[0].camera
                 camera = stated_camera(self.camera, (first.width, first.height))

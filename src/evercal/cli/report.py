@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar, require_writable
-from evercal.cli.device import Device
+from evercal.cli.options import Device
 from evercal.cli.point_words import point_dict, point_of, point_text
 from evercal.cli.stores import open_localizer
 

@@ -8,7 +8,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json
-from evercal.cli.device import Device
+from evercal.cli.options import Device
 from evercal.errors import InputError
 
 TOKEN = "EVERCAL_TOKEN"

@@ -8,11 +8,12 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.options import Count, Verb
 from evercal.errors import InputError
 
 
 @dataclass(frozen=True)
-class Simulate:
+class Simulate(Verb):
     """Record a virtual robot cell: a wrist camera, a fixed camera, and the truth.
 
     Example: evercal simulate cell --out cell/
@@ -22,7 +23,7 @@ class Simulate:
     """What is simulated: cell. Furnished rooms are rendered by 'python -m rooms' in a checkout."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Output folder, which is new or empty."""
-    frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    frames: Count = None
     """Images of the wrist camera. Default: 25."""
     size: Annotated[str | None, arg(metavar="WxH", help_behavior_hint="")] = None
     """Image size in pixels. Default: 640x480."""
@@ -30,8 +31,6 @@ class Simulate:
     """Seed of the cell, the motion and the noise."""
     noise: Annotated[float | None, arg(metavar="SHARE", help_behavior_hint="")] = None
     """Sensor noise as a fraction of full scale. Default: 0.008."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Record the cell."""

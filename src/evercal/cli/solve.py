@@ -9,6 +9,7 @@ from tyro.conf import arg
 
 from evercal.cli.calibrate import calibration_lines
 from evercal.cli.console import print_json, print_next, require_writable
+from evercal.cli.options import Name, Verb
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
@@ -18,7 +19,7 @@ _BY_IMAGE = ("camera_from_board", "leave_one_out_mm", "information_percent")
 
 
 @dataclass(frozen=True)
-class Solve:
+class Solve(Verb):
     """Calibrate a camera on the gripper or beside the robot from pairs of poses.
 
     Both unknown transforms are estimated jointly, robust to outliers, with their uncertainty.
@@ -36,9 +37,9 @@ class Solve:
     """unknown: estimate the scale of the camera poses, for structure from motion."""
     time_offset: bool = False
     """Estimate the offset between the clocks of robot and camera; both files need times."""
-    robot_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    robot_convention: Name = None
     """Pose convention of robot poses without a header: ur, kuka, xyzw:mm, ..."""
-    camera_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    camera_convention: Name = None
     """Pose convention of camera poses without a header."""
     invert: Annotated[
         Literal["robot", "camera", "both"] | None,
@@ -47,8 +48,6 @@ class Solve:
     """Invert the poses of a file: robot, camera or both."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("calibration.json")
     """Calibration file to write."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
         """Solve, write the calibration and print it."""

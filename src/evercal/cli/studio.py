@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json
-from evercal.cli.device import Device
+from evercal.cli.options import Device
 from evercal.cli.view import until_stopped
 from evercal.errors import InputError
 from evercal.service.hosts import is_local

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, require_writable
-from evercal.cli.device import Device
+from evercal.cli.options import Count, Device, File, Store
 from evercal.cli.stores import open_map
 from evercal.errors import InputError
 from evercal.reports.answers import unit_known
@@ -31,7 +31,7 @@ class Track:
     Example: evercal track cell.evercal video.mp4 --out track.tum
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    store: Store
     """Folder of the map."""
     source: Annotated[Positional[str], arg(metavar="SOURCE")]
     """Number (0) or device of a camera, an address (rtsp://...), a video file or a folder."""
@@ -39,7 +39,7 @@ class Track:
         tuple[Path, ...], arg(metavar="FILE...", help_behavior_hint="(default: none)")
     ] = ()
     """Files to write: .jsonl (JSON lines), .tum or .txt (TUM)."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    camera: File = None
     """Intrinsics. Default: those of the camera that recorded the scene."""
     at_most: Annotated[float | None, arg(metavar="MS", help_behavior_hint="")] = None
     """Time for a frame, milliseconds. What was left out is in the answer (`omitted`)."""
@@ -47,7 +47,7 @@ class Track:
     """Time constant of smoothed poses; 0 writes measurements. A jump is followed at once."""
     rate: Annotated[float, arg(metavar="HZ")] = 15.0
     """Frames per second of a folder without times in its file names."""
-    most: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    most: Count = None
     """Stop after so many frames."""
     device: Device = "auto"
     json: bool = False

@@ -14,7 +14,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json
-from evercal.cli.device import Device
+from evercal.cli.options import Device
 from evercal.cli.stores import open_map
 from evercal.errors import InputError
 from evercal.service.hosts import is_local

@@ -15,8 +15,8 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.check import shift_line
 from evercal.cli.console import print_json
-from evercal.cli.device import Device
 from evercal.cli.image_words import stated_camera
+from evercal.cli.options import Device, File, Store
 from evercal.cli.stores import open_map
 from evercal.errors import InputError
 from evercal.reports.answers import shift_dict
@@ -38,7 +38,7 @@ class Watch:
     Example: evercal watch cell.evercal incoming/ --reference tripod.json
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    store: Store
     """Folder of the map."""
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder that images arrive in."""
@@ -50,7 +50,7 @@ class Watch:
     """Interval between scans of the folder."""
     idle: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None
     """Stop with exit code 0 after this time without a new image. Default: never."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    camera: File = None
     """Intrinsics. Default: those of the reference."""
     device: Device = "auto"
     json: bool = False
