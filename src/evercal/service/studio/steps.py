@@ -1,121 +1,70 @@
 """The five steps: which are open, which are done, and what to do next."""
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from evercal.live.coverage import Coverage
+if TYPE_CHECKING:
+    from evercal.service.studio.studio import Studio
 
 Step = Literal["connect", "record", "learn", "fixed", "export"]
-Status = Literal["locked", "open", "done"]
-STEPS: tuple[Step, ...] = ("connect", "record", "learn", "fixed", "export")
-TITLES: dict[Step, str] = {
-    "connect": "Connect",
-    "record": "Record",
-    "learn": "Learn",
-    "fixed": "Fixed camera",
-    "export": "Export",
-}
+State = tuple[Literal["locked", "open", "done"], str]
+"""Status of a step, and what was found or what to do in one to three sentences."""
 
 
-@dataclass(frozen=True, eq=False)
-class Facts:
-    """What the steps depend on."""
-
-    connected: bool
-    """Whether images and poses arrive."""
-    connection_problem: str
-    """Reason why not."""
-    coverage: Coverage
-    """Of the samples."""
-    mount_verdict: str | None
-    """Of the camera on the gripper; None if it is not calibrated."""
-    samples_changed: bool
-    """Whether samples were added or removed since it was."""
-    scenes: int
-    """Scenes of the map."""
-    has_fixed: bool
-    """Whether there is a fixed camera."""
-    fixed_images: int
-    fixed_verdict: str | None
-    """Of the fixed camera; None if it is not calibrated."""
-    exported: int
-    """Files that were exported."""
-
-
-@dataclass(frozen=True)
-class StepState:
-    """A step, and what it says."""
-
-    step: Step
-    status: Status
-    says: str
-    """What was found, or what to do; one to three sentences."""
-
-    @property
-    def title(self) -> str:
-        """Number and name."""
-        return f"{STEPS.index(self.step) + 1} {TITLES[self.step]}"
-
-
-def step_states(facts: Facts) -> tuple[StepState, ...]:
+def step_states(studio: "Studio") -> dict[Step, State]:
     """All steps in order."""
-    return (_connect(facts), _record(facts), _learn(facts), _fixed(facts), _export(facts))
+    return {
+        "connect": _connect(studio),
+        "record": _record(studio),
+        "learn": _learn(studio),
+        "fixed": _fixed(studio),
+        "export": _export(studio),
+    }
 
 
-def current_step(states: tuple[StepState, ...]) -> Step:
-    """The first step that is open, or the last one."""
-    for state in states:
-        if state.status == "open":
-            return state.step
-    return "export"
+def _connect(studio: "Studio") -> State:
+    if studio.connection.complete:
+        return "done", "Images and gripper poses arrive."
+    problems = studio.connection.problems
+    return "open", problems.get("wrist") or problems.get("robot") or "Waiting for image and pose."
 
 
-def _connect(facts: Facts) -> StepState:
-    if facts.connected:
-        return StepState("connect", "done", "Images and gripper poses arrive.")
-    return StepState("connect", "open", facts.connection_problem or "Waiting for image and pose.")
+def _record(studio: "Studio") -> State:
+    covered = studio.samples.coverage()
+    if covered.samples:
+        return "done" if covered.ready else "open", covered.verdict
+    if not studio.connection.complete:
+        return "locked", "Connect the camera and the robot first."
+    return "open", "Move the arm until the camera sees the work area; take the first sample."
 
 
-def _record(facts: Facts) -> StepState:
-    covered = facts.coverage
-    if not facts.connected and not covered.samples:
-        return StepState("record", "locked", "Connect the camera and the robot first.")
-    if not covered.samples:
-        return StepState(
-            "record",
-            "open",
-            "Move the arm to where the camera sees the work area, and take the first sample.",
-        )
-    return StepState("record", "done" if covered.ready else "open", covered.verdict)
+def _learn(studio: "Studio") -> State:
+    found, covered = studio.calibrations.get("wrist"), studio.samples.coverage()
+    if found is not None and not studio.samples_changed:
+        return "done", found.verdict
+    if not covered.ready:
+        return "locked", "The recording cannot be learned yet."
+    if found is not None:
+        return "open", "The samples have changed since: learn them again."
+    return "open", f"{len(covered.samples)} images are ready to be learned."
 
 
-def _learn(facts: Facts) -> StepState:
-    if facts.mount_verdict is not None and not facts.samples_changed:
-        return StepState("learn", "done", facts.mount_verdict)
-    if not facts.coverage.ready:
-        return StepState("learn", "locked", "The recording cannot be learned yet.")
-    if facts.mount_verdict is not None:
-        return StepState("learn", "open", "The samples have changed since: learn them again.")
-    count = len(facts.coverage.samples)
-    return StepState("learn", "open", f"{count} images are ready to be learned.")
+def _fixed(studio: "Studio") -> State:
+    images, found = len(studio.fixed_images), studio.calibrations.get("fixed")
+    if not studio.cell.scenes:
+        return "locked", "Learn the scene first."
+    if found is not None:
+        return "done", found.verdict.replace("--camera", "--fixed-intrinsics")
+    if studio.connection.devices.fixed_camera is None:
+        return "locked", "No fixed camera was given; restart with --fixed SOURCE, or go on."
+    if not images:
+        return "open", "Take images of the scene, 5 to 10."
+    return "open", f"{images} images; take more, or calibrate."
 
 
-def _fixed(facts: Facts) -> StepState:
-    if not facts.scenes:
-        return StepState("fixed", "locked", "Learn the scene first.")
-    if facts.fixed_verdict is not None:
-        return StepState("fixed", "done", facts.fixed_verdict)
-    if not facts.has_fixed:
-        says = "No fixed camera was given; start the studio with --fixed SOURCE, or go on."
-        return StepState("fixed", "locked", says)
-    if not facts.fixed_images:
-        return StepState("fixed", "open", "Take images of the scene, 5 to 10.")
-    return StepState("fixed", "open", f"{facts.fixed_images} images; take more, or calibrate.")
-
-
-def _export(facts: Facts) -> StepState:
-    if facts.mount_verdict is None and facts.fixed_verdict is None:
-        return StepState("export", "locked", "There is no calibration to export yet.")
-    if facts.exported:
-        return StepState("export", "done", f"{facts.exported} files were exported.")
-    return StepState("export", "open", "Choose a camera and a format.")
+def _export(studio: "Studio") -> State:
+    if not studio.calibrations:
+        return "locked", "There is no calibration to export yet."
+    exported = len(list((studio.out / "export").glob("*")))
+    return (
+        ("done", f"{exported} files were exported.") if exported else ("open", "Choose a format.")
+    )

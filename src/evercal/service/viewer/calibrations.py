@@ -1,85 +1,72 @@
-"""What is shown of a calibration: its camera in the base frame, or the reason why not."""
+"""Calibrations in the scene: cameras, labels and ellipsoids of their positions."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping
 
-from evercal.calibration.calibration import Calibration, read_calibration
-from evercal.geometry import SE3, Camera, UncertainPose
-from evercal.reports.scene.frusta import Ellipsoid, Frustum
+import viser
 
-
-@dataclass(frozen=True, eq=False)
-class CalibrationView:
-    """A calibration, and where it is."""
-
-    name: str
-    """Name of the file."""
-    calibration: Calibration
-    camera: Camera
-    """Its intrinsics; those of the map where it states none."""
-
-    @property
-    def scene(self) -> str | None:
-        """The scene in whose frame it is; None if the file names none."""
-        scene = self.calibration.source.get("scene")
-        return None if scene is None else str(scene)
-
-    @property
-    def on_gripper(self) -> bool:
-        """Whether the gripper carries the camera."""
-        return self.calibration.mount == "eye_in_hand"
-
-    def base_from_camera(self, base_from_gripper: SE3 | None) -> UncertainPose | None:
-        """The camera in the base frame; None for one on the gripper without a gripper pose."""
-        if not self.on_gripper:
-            return self.calibration.uncertain_pose
-        if base_from_gripper is None:
-            return None
-        return base_from_gripper @ self.calibration.uncertain_pose
-
-    def shapes(self, base_from_gripper: SE3 | None) -> tuple[Frustum, Ellipsoid] | None:
-        """Frustum and ellipsoid in the base frame, or None as `base_from_camera`."""
-        pose = self.base_from_camera(base_from_gripper)
-        return None if pose is None else (Frustum.of(pose.pose, self.camera), Ellipsoid.of(pose))
-
-    def label(self, scale: float) -> str:
-        """Name, standard deviation, and the scale of the ellipsoid."""
-        sigma = self.calibration.sigma_mm
-        return f"{self.name}: {sigma:.2g} mm (1 sigma), ellipsoid x {scale:g}"
-
-    def rows(self) -> list[tuple[str, str]]:
-        """Names and values for the panel."""
-        calibration = self.calibration
-        where = "on the gripper" if self.on_gripper else "fixed"
-        x, y, z = 1000 * calibration.parent_from_child.translation_m
-        principal = Ellipsoid.of(calibration.uncertain_pose).sigmas_mm
-        rows = [
-            ("mount", where),
-            (f"in {calibration.parent_frame}", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"),
-            ("1 sigma per axis", f"{calibration.sigma_mm:.2g} mm, {calibration.sigma_deg:.2g}°"),
-            ("principal axes", f"{principal} mm"),
-        ]
-        if self.scene is not None:
-            rows.append(("scene", self.scene))
-        if self.on_gripper:
-            rows.append(("drawn", "where --recording or --urdf states the gripper's pose"))
-        return rows
+from evercal.calibration.calibration import Calibration
+from evercal.geometry import SE3, Camera
+from evercal.reports.scene.frusta import Ellipsoid, Frustum, readable_scale
+from evercal.service.viewer.drawing import add_frustum, place
+from evercal.service.viewer.html import MAGENTA
 
 
-def read_views(paths: Sequence[Path], default: Camera) -> list[CalibrationView]:
-    """Read calibration files; `default` are intrinsics for files without.
-
-    Raises:
-        InputError: A file is missing or holds no calibration.
-    """
-    calibrations = [read_calibration(path) for path in paths]
-    names = [path.stem for path in paths]
-    # Two files of one name from two folders stay apart.
-    unique = [
-        name if names.count(name) == 1 else f"{name} ({i + 1})" for i, name in enumerate(names)
-    ]
+def calibration_rows(calibration: Calibration) -> list[tuple[str, str]]:
+    """Names and values for a panel."""
+    x, y, z = 1000 * calibration.parent_from_child.translation_m
+    principal = Ellipsoid.of(calibration.uncertain_pose).sigmas_mm
     return [
-        CalibrationView(name, calibration, calibration.camera or default)
-        for name, calibration in zip(unique, calibrations, strict=True)
+        ("mount", "on the gripper" if calibration.mount == "eye_in_hand" else "fixed"),
+        (f"in {calibration.parent_frame}", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"),
+        ("1 sigma per axis", f"{calibration.sigma_mm:.2g} mm, {calibration.sigma_deg:.2g}°"),
+        ("principal axes", f"{principal} mm"),
     ]
+
+
+class DrawnCalibrations:
+    """Cameras of calibrations, in place of those drawn before; one on the gripper moves with it."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        calibrations: Mapping[str, Calibration],
+        default: Camera,
+        size_m: float,
+    ):
+        self._given = list(calibrations.values())
+        ellipsoids = [Ellipsoid.of(found.uncertain_pose) for found in self._given]
+        scale = readable_scale(ellipsoids)
+        server.scene.remove_by_name("/calibrations")
+        self._parents = []
+        for i, (name, found) in enumerate(calibrations.items()):
+            node, ellipsoid = f"/calibrations/{i}", ellipsoids[i]
+            # Camera and ellipsoid are children of the gripper or of the base.
+            self._parents.append(server.scene.add_frame(node, show_axes=False))
+            frustum = Frustum.of(found.parent_from_child, found.camera or default)
+            add_frustum(server, f"{node}/camera", frustum, size_m, MAGENTA)
+            x, y, z = (max(float(scale * axis), 1e-6) for axis in ellipsoid.axes_m)
+            server.scene.add_icosphere(
+                f"{node}/ellipsoid",
+                scale=(x, y, z),
+                color=MAGENTA,
+                opacity=0.35,
+                wxyz=ellipsoid.rotation_wxyz,
+                position=ellipsoid.centre_m,
+                cast_shadow=False,
+            )
+            words = f"{name}: {found.sigma_mm:.2g} mm (1 sigma), ellipsoid x {scale:g}"
+            server.scene.add_label(f"{node}/label", words, position=ellipsoid.centre_m)
+        self.show(None, None)
+
+    def show(self, scene: str | None, base_from_gripper: SE3 | None) -> None:
+        """Show the calibrations of a scene, or of all for None.
+
+        One on the gripper is shown where the gripper's pose is known, in every scene.
+        """
+        for parent, found in zip(self._parents, self._given, strict=True):
+            if found.mount == "eye_in_hand":
+                parent.visible = base_from_gripper is not None
+                place(parent, base_from_gripper or SE3.identity())
+            else:
+                own = found.source.get("scene")
+                parent.visible = scene is None or own in (None, scene)

@@ -1,0 +1,26 @@
+"""Texts of the panels; names of files and scenes are escaped."""
+
+from collections.abc import Sequence
+from html import escape
+
+GREEN, AMBER, RED, GREY = (22, 163, 74), (217, 119, 6), (220, 38, 38), (107, 114, 128)
+BLUE, MAGENTA = (37, 99, 235), (192, 38, 211)
+Colour = tuple[int, int, int]
+_TEXT = "padding:2px 12px 6px;font-size:0.85em;line-height:1.4;overflow-wrap:anywhere"
+
+
+def chip_html(words: str, colour: Colour, text: str = "") -> str:
+    """Words on a coloured ground, and a sentence below them."""
+    style = f"background:rgb{colour};color:white;border-radius:4px;padding:1px 8px;font-weight:600"
+    chip = f'<span style="{style}">{escape(words)}</span>'
+    return f'<div style="{_TEXT}">{chip}<div>{escape(text)}</div></div>'
+
+
+def rows_html(rows: Sequence[tuple[str, str]]) -> str:
+    """Names and values, one pair a line."""
+    cells = "".join(
+        f'<tr><td style="width:40%;vertical-align:top">{escape(name)}</td>'
+        f"<td>{escape(value)}</td></tr>"
+        for name, value in rows
+    )
+    return f'<div style="{_TEXT}"><table style="width:100%">{cells}</table></div>' if rows else ""
