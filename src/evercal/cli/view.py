@@ -1,5 +1,6 @@
 """`evercal view`."""
 
+import contextlib
 import shlex
 import signal
 import socket
@@ -7,7 +8,6 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Annotated
 
 from tyro.conf import Positional, arg
@@ -92,19 +92,10 @@ def warn_of_network(host: str, danger: str) -> None:
 
 def wait_until_stopped(url: str, words: str | None) -> None:
     """Print words, or the address as JSON, and wait for SIGTERM or Ctrl-C."""
-    stopped = threading.Event()
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        stopped.set()
-
-    ends = (signal.SIGTERM, signal.SIGINT)
-    before = [signal.signal(number, stop) for number in ends]
-    try:
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with contextlib.suppress(KeyboardInterrupt):
         if words is None:
             print_json({"url": url})
         else:
             print(f"{words}; Ctrl-C ends it", flush=True)
-        stopped.wait()
-    finally:
-        for number, handler in zip(ends, before, strict=True):
-            signal.signal(number, handler)
+        threading.Event().wait()

@@ -1,7 +1,6 @@
 """What the studio is connected to, and the newest image and pose of each."""
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -57,8 +56,6 @@ class Connection:
         self.problems: dict[str, str] = {}
         """Reasons why a camera or the `robot` gives nothing now."""
         self.base_from_gripper: SE3 | None = None
-        self.still_since = 0.0
-        """Time of the last change of the pose, seconds of the monotonic clock."""
         self._lock = threading.Lock()
 
     @property
@@ -67,20 +64,16 @@ class Connection:
         have = "wrist" in self.images and self.base_from_gripper is not None
         return have and not self.problems.keys() & {"wrist", "robot"}
 
-    def rests(self, seconds: float) -> bool:
-        """Whether the arm has stood still for so long, while image and pose arrive."""
-        return self.complete and time.monotonic() - self.still_since > seconds
-
     def look(self, which: Which | None = "wrist") -> None:
         """Read the pose and an image of one camera, or none; failures are kept in `problems`."""
-        reads = {"robot": self._pose}
-        if which is not None:
-            reads[which] = lambda: self.image(which)
-        for name, read in reads.items():
+        for name in ("robot", which):
             try:
-                read()
+                if name == "robot":
+                    self._pose()
+                elif which is not None:
+                    self.image(which)
             except (InputError, OSError) as error:
-                self.problems[name] = str(error)
+                self.problems[str(name)] = str(error)
 
     def image(self, which: Which) -> Image:
         """Read an image."""
@@ -102,9 +95,7 @@ class Connection:
 
     def _pose(self) -> SE3:
         pose = self.devices.robot.base_from_gripper()
-        # The first pose at a place stays, so that a slow motion is no rest.
-        if self.base_from_gripper is None or _moved(self.base_from_gripper, pose):
-            self.base_from_gripper, self.still_since = pose, time.monotonic()
+        self.base_from_gripper = pose
         self.problems.pop("robot", None)
         return pose
 

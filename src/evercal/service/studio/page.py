@@ -3,36 +3,46 @@
 import logging
 import threading
 import time
+from collections.abc import Callable
+from typing import Any
 
-from evercal.service.studio.controls import Controls
-from evercal.service.studio.devices import Which
-from evercal.service.studio.drawing import Drawing
-from evercal.service.studio.steps import Step, step_states
+import numpy as np
+import viser
+
+from evercal.calibration.next_views import NextViews
+from evercal.geometry import SE3
+from evercal.reports.scene.frusta import Frustum
+from evercal.reports.scene.map_parts import THUMBNAIL_PX, resized
+from evercal.service.studio.controls import Controls, Tasks
 from evercal.service.studio.studio import Studio
-from evercal.service.studio.tasks import Tasks
-from evercal.service.viewer.server import address_of, start_server
+from evercal.service.viewer.drawing import (
+    DrawnMap,
+    add_base,
+    add_calibrations,
+    add_frustum,
+    place,
+)
+from evercal.service.viewer.html import AMBER, BLUE, GREEN, RED
+from evercal.service.viewer.page import address_of, start_server
 
-_LIVE_S, _REFRESH_S, _REST_S = 0.25, 0.5, 0.8
-"""Between live images, between reports of progress, and until an arm that stands is at rest."""
+_LIVE_S, _REFRESH_S = 0.25, 0.5
+"""Between live images, and between reports of progress."""
+
+
+_SIZE_M = 0.045
+"""Length of a drawn camera."""
 
 
 class StudioPage:
-    """A page that is being served; `close` ends it.
-
-    Raises:
-        InputError: The port cannot be used.
-    """
+    """A page that is being served; `close` ends it."""
 
     def __init__(self, studio: Studio, host: str, port: int):
         self.studio, self.tasks = studio, Tasks(self._progressed)
         self.server = start_server(host, port, "evercal studio")
         self._closed, self._lock, self._refreshed = threading.Event(), threading.RLock(), 0.0
-        self.controls = Controls(self.server, studio, self.tasks, self.refresh)
-        self._drawing = Drawing(self.server, studio, self.controls.choose)
-        states = step_states(studio)
-        left: list[Step] = [step for step, (status, _) in states.items() if status == "open"]
-        first = next((step for step in left if step != "connect"), "export")
-        self.controls.go(first if studio.samples.names else "connect")
+        self.controls = Controls(self.server, studio, self.tasks)
+        self._drawing = _Drawing(self.server, studio, self.controls.choose)
+        self.refresh()
         self._live = threading.Thread(target=self._run, daemon=True)
         self._live.start()
 
@@ -52,7 +62,7 @@ class StudioPage:
         """Show what has changed."""
         with self._lock, self.server.atomic():
             self._refreshed = time.monotonic()
-            view = self.studio.samples.next_view()
+            view = self.studio.next_view()
             self.controls.show(view)
             self._drawing.show_samples(view)
             if not self.tasks.busy:
@@ -64,32 +74,92 @@ class StudioPage:
             self.refresh()
 
     def _run(self) -> None:
-        """Show live images while the page is open somewhere; take samples at rest if wanted."""
-        connection, complete, sampled = self.studio.connection, False, 0.0
+        """Show live images while the page is open somewhere."""
+        connection, complete = self.studio.connection, False
         while not self._closed.wait(_LIVE_S):
-            # Learning needs the processor more than the picture does.
-            if not self.server.get_clients() or (self.tasks.busy and self.controls.step == "learn"):
+            if not self.server.get_clients():
                 continue
             try:
                 self._look()
                 if connection.complete != complete:
                     complete = connection.complete
                     self.refresh()
-                since = connection.still_since
-                if self.controls.auto.value and since != sampled and connection.rests(_REST_S):
-                    sampled = since
-                    gripper = connection.base_from_gripper
-                    if gripper is not None and not self.studio.samples.taken_at(gripper):
-                        self.tasks.start("taking a sample", self.studio.take_sample)
             except Exception:  # the next image may be better
                 logging.getLogger(__name__).exception("a live image was not shown")
 
     def _look(self) -> None:
-        """Read pose and image, and show them."""
-        connection, devices = self.studio.connection, self.studio.connection.devices
-        fixed = self.controls.step == "fixed" and devices.fixed_camera is not None
-        which: Which = "fixed" if fixed else "wrist"
-        connection.look(which if devices.live or which not in connection.images else None)
+        """Read pose and image, and show them; learning needs the processor more than pictures."""
+        connection, which = self.studio.connection, self.controls.which
+        wanted = connection.devices.live and not self.tasks.message.startswith("learn")
+        connection.look(which if wanted or which not in connection.images else None)
         with self._lock, self.server.atomic():
-            self.controls.show_live(which)
+            self.controls.show_live()
             self._drawing.show_live()
+
+
+class _Drawing:
+    """The scene of the page; `on_sample` is called with the name of a sample that is clicked."""
+
+    def __init__(self, server: viser.ViserServer, studio: Studio, on_sample: Callable[[str], Any]):
+        self._server, self._studio, self._on_sample = server, studio, on_sample
+        self._samples: dict[str, viser.CameraFrustumHandle] = {}
+        self._drawn: tuple[object, ...] = ()
+        self._gripper = add_base(server, 3.0)
+        nowhere = Frustum.of(SE3.identity(), studio.connection.devices.intrinsics)
+        self._live = add_frustum(server, "/live", nowhere, 1.3 * _SIZE_M, BLUE)
+        self._next = add_frustum(server, "/next", nowhere, 1.3 * _SIZE_M, AMBER)
+        server.scene.add_label("/next/label", "next view")
+        self._live.visible = False
+        camera = server.initial_camera
+        camera.position, camera.look_at = (1.15, -0.8, 0.85), (0.35, 0.0, 0.3)
+
+    def show_live(self) -> None:
+        """Draw arm and camera where they are."""
+        connection = self._studio.connection
+        gripper, arm = connection.base_from_gripper, connection.devices.arm
+        if gripper is None:
+            return
+        place(self._gripper, gripper)
+        place(self._live, gripper @ self._mount())
+        if "wrist" in connection.images:
+            self._live.image = resized(connection.images["wrist"], THUMBNAIL_PX)
+        if arm is not None:
+            joints = np.vstack([np.zeros(3), arm()])
+            pairs = np.stack([joints[:-1], joints[1:]], axis=1).astype(np.float32)
+            self._server.scene.add_line_segments(
+                "/arm", pairs, (203, 213, 225), thickness=8.0, thickness_units="screen"
+            )
+
+    def show_samples(self, next_view: NextViews | None) -> None:
+        """Draw the samples, the bad ones in red, and the next view."""
+        frames, bad = self._studio.recorder.frames, self._studio.bad_samples()
+        for name in self._samples.keys() - {frame.name for frame in frames}:
+            self._samples.pop(name).remove()
+        for frame in frames:
+            name, gripper = frame.name, frame.base_from_gripper
+            assert gripper is not None, "a wrist recording"
+            if name not in self._samples:
+                node, frustum = f"/samples/{name}", Frustum.of(gripper, frame.camera)
+                image = frame.read_image()
+                drawn = add_frustum(self._server, node, frustum, _SIZE_M, GREEN, image)
+                drawn.on_click(lambda _, name=name: self._on_sample(name))
+                self._samples[name] = drawn
+            place(self._samples[name], gripper @ self._mount())
+            self._samples[name].color = RED if name in bad else GREEN
+        place(self._next, next_view and next_view.poses[0] @ self._mount())
+
+    def show_results(self) -> None:
+        """Draw the map and the calibrations, if they have changed."""
+        studio = self._studio
+        found = {str(which): calibration for which, calibration in studio.calibrations.items()}
+        drawn = (studio.cell.scenes, *found.values())
+        if studio.cell.scenes and drawn != self._drawn:
+            scenes = studio.cell.localizer.contents.scenes
+            shown = DrawnMap(self._server, scenes)
+            shown.show(studio.scene or scenes[0].name)
+            camera, size_m = scenes[0].adjusted_camera, 1.3 * _SIZE_M
+            add_calibrations(self._server, found, shown, camera, size_m)
+            self._drawn = drawn
+
+    def _mount(self) -> SE3:
+        return self._studio.mount or SE3.identity()

@@ -8,48 +8,47 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.calibration.export.formats import FORMATS, export_files
+from evercal.calibration.next_views import NextViews
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.live.coverage import CoverageOptions
-from evercal.live.recorder import JPEG_QUALITY, POSES
+from evercal.live.coverage import Coverage, CoverageOptions
+from evercal.live.recorder import JPEG_QUALITY, POSES, WristRecorder
 from evercal.live.robot import MovingRobot
 from evercal.map import Map
 from evercal.recordings.images import write_jpeg
 from evercal.recordings.poses.camera_file import read_camera
 from evercal.service.studio.devices import Connection, Devices, Which
-from evercal.service.studio.samples import Samples
+from evercal.service.studio.samples import covered, next_view
 from evercal.storage import write_json
 
 FIXED_IMAGES = 8
 """Images of a series of the fixed camera."""
 
+Step = Literal["connect", "record", "learn", "fixed", "export"]
+State = tuple[Literal["waits", "to do", "done"], str]
+"""Status of a step, and what was found or what to do in one to three sentences."""
+
 OnStep = Callable[[str, float, float], Any]
 
 
 class Studio:
-    """The state of the way to a calibration.
+    """The way to a calibration, in a folder; its map is `out/map` if none is given.
 
-    Its actions return what was done, in one line, and raise `InputError` if it cannot be done.
-
-    Args:
-        devices: cameras and robot.
-        out: folder of recordings, calibrations and exports.
-        map: folder of the map; `out/map` if omitted.
-        device: `auto`, `cpu` or `cuda`, for the map.
-
-    Raises:
-        InputError: The folder holds another recording, or something that cannot be read.
+    Actions return what was done, in one line, and raise `InputError` if it cannot be done.
     """
 
     def __init__(self, devices: Devices, out: Path, map: Path | None = None, device: str = "auto"):
         self.connection, self.out = Connection(devices), out
         out.mkdir(parents=True, exist_ok=True)
         self.cell = Map.open(map or out / "map", device=device)
-        self.samples = Samples(out / "wrist", devices)
+        self.recorder = WristRecorder(out / "wrist", devices.intrinsics)
+        self.mount = devices.rough
+        """gripper_from_camera, rough or calibrated; None if nothing is known."""
+        self._refused: list[SE3] = []
         self._fixed_camera = out / "fixed_camera.json"
         if devices.fixed_intrinsics is not None:
             write_json(self._fixed_camera, asdict(devices.fixed_intrinsics))
@@ -86,16 +85,29 @@ class Studio:
         """Images of the fixed camera, in order."""
         return sorted((self.out / "fixed").glob("*.jpg"))
 
+    def coverage(self) -> Coverage:
+        """What the samples cover."""
+        return covered(self.recorder.frames, self.mount)
+
+    def bad_samples(self) -> list[str]:
+        """Names of the samples with problems."""
+        return [row.name for row in self.coverage().samples if row.problems]
+
+    def next_view(self) -> NextViews | None:
+        """The next best view of the camera on the gripper."""
+        reachable = self.connection.devices.reachable
+        return next_view(self.recorder.frames, self.mount, reachable, self._refused)
+
     def take_sample(self) -> str:
         """Record image and pose."""
-        name = self.samples.add(*self.connection.sample())
-        bad = "; ".join(self.samples.coverage().samples[-1].problems)
+        name = self.recorder.add(*self.connection.sample()).name
+        bad = "; ".join(self.coverage().samples[-1].problems)
         return f"Took sample {name}{f', {bad}: better remove it' if bad else ''}."
 
     def remove(self, *names: str) -> str:
         """Remove samples."""
         for name in names:
-            self.samples.remove(name)
+            self.recorder.remove(name)
         return f"Removed {', '.join(names)}." if names else "There is no bad sample."
 
     def move_to(self, base_from_gripper: SE3) -> str:
@@ -106,7 +118,7 @@ class Studio:
         try:
             robot.move_to(base_from_gripper)
         except InputError:
-            self.samples.refuse(base_from_gripper)
+            self._refused.append(base_from_gripper)
             raise
         time.sleep(self.connection.devices.settle_s)
         self.connection.look(None)
@@ -115,12 +127,12 @@ class Studio:
     def record(self, on_step: OnStep, stopping: Callable[[], bool] = lambda: False) -> str:
         """Move from one best view to the next and take samples until nothing is missing."""
         wanted = CoverageOptions().images
-        if not self.samples.names:
+        if not self.recorder.frames:
             self.take_sample()
         while not stopping():
-            covered, view = self.samples.coverage(), self.samples.next_view()
-            good = sum(not row.problems for row in covered.samples)
-            if not covered.missing or view is None or good >= 2 * wanted:
+            reached, view = self.coverage(), self.next_view()
+            good = sum(not row.problems for row in reached.samples)
+            if not reached.missing or view is None or good >= 2 * wanted:
                 break
             on_step(f"recording, {good} good images", min(good, wanted), wanted)
             try:
@@ -128,7 +140,7 @@ class Studio:
             except InputError:  # out of reach, and never proposed again
                 continue
             self.take_sample()
-        return f"{len(self.samples.names)} samples are recorded."
+        return f"{len(self.recorder.frames)} samples are recorded."
 
     def learn(self, on_step: OnStep) -> str:
         """Learn the recording and calibrate the camera on the gripper.
@@ -160,11 +172,12 @@ class Studio:
 
     def take_fixed_series(self, on_step: OnStep, move: bool) -> str:
         """Take several images; the arm may go to poses of samples, so that it hides other parts."""
-        poses = list(self.samples.poses) if move else []
+        poses = [frame.base_from_gripper for frame in self.recorder.frames] if move else []
         for i in range(FIXED_IMAGES):
             on_step("taking images", i, FIXED_IMAGES)
-            if poses:
-                self.move_to(poses[i * len(poses) // FIXED_IMAGES])
+            pose = poses[i * len(poses) // FIXED_IMAGES] if poses else None
+            if pose is not None:
+                self.move_to(pose)
             self.take_fixed()
         return f"Took {FIXED_IMAGES} images."
 
@@ -223,10 +236,70 @@ class Studio:
     def _keep(self, which: Which, calibration: Calibration) -> None:
         self.calibrations[which] = calibration
         if which == "wrist":
-            self.samples.mount = calibration.parent_from_child
+            self.mount = calibration.parent_from_child
 
 
 def _free_name(name: str, taken: tuple[str, ...]) -> str:
     """A name that no scene has: `name`, or `name-2` and so on."""
     numbered = (f"{name}-{number}" for number in range(2, len(taken) + 2))
     return name if name not in taken else next(free for free in numbered if free not in taken)
+
+
+def step_states(studio: Studio) -> dict[Step, State]:
+    """All steps in order."""
+    return {
+        "connect": _connect(studio),
+        "record": _record(studio),
+        "learn": _learn(studio),
+        "fixed": _fixed(studio),
+        "export": _export(studio),
+    }
+
+
+def _connect(studio: Studio) -> State:
+    if studio.connection.complete:
+        return "done", "Images and gripper poses arrive."
+    problems = studio.connection.problems
+    return "to do", problems.get("wrist") or problems.get("robot") or "Waiting for image and pose."
+
+
+def _record(studio: Studio) -> State:
+    covered = studio.coverage()
+    if covered.samples:
+        return "done" if covered.ready else "to do", covered.verdict
+    if not studio.connection.complete:
+        return "waits", "Connect the camera and the robot first."
+    return "to do", "Move the arm until the camera sees the work area; take the first sample."
+
+
+def _learn(studio: Studio) -> State:
+    found, covered = studio.calibrations.get("wrist"), studio.coverage()
+    if found is not None and not studio.samples_changed:
+        return "done", found.verdict
+    if not covered.ready:
+        return "waits", "The recording cannot be learned yet."
+    if found is not None:
+        return "to do", "The samples have changed since: learn them again."
+    return "to do", f"{len(covered.samples)} images are ready to be learned."
+
+
+def _fixed(studio: Studio) -> State:
+    images, found = len(studio.fixed_images), studio.calibrations.get("fixed")
+    if not studio.cell.scenes:
+        return "waits", "Learn the scene first."
+    if found is not None:
+        return "done", found.verdict.replace("--camera", "--fixed-intrinsics")
+    if studio.connection.devices.fixed_camera is None:
+        return "waits", "No fixed camera was given; restart with --fixed SOURCE, or go on."
+    if not images:
+        return "to do", "Take images of the scene, 5 to 10."
+    return "to do", f"{images} images; take more, or calibrate."
+
+
+def _export(studio: Studio) -> State:
+    if not studio.calibrations:
+        return "waits", "There is no calibration to export yet."
+    exported = len(list((studio.out / "export").glob("*")))
+    return (
+        ("done", f"{exported} files were exported.") if exported else ("to do", "Choose a format.")
+    )

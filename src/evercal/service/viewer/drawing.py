@@ -1,4 +1,4 @@
-"""Cameras and maps in the scene of a page."""
+"""Cameras, maps and calibrations in the scene of a page."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import viser
 
-from evercal.geometry import SE3
+from evercal.calibration.calibration import Calibration
+from evercal.geometry import SE3, Camera
 from evercal.mapping.scene_map import SceneMap
-from evercal.reports.scene.frusta import Frustum
+from evercal.reports.scene.frusta import Ellipsoid, Frustum, readable_scale
 from evercal.reports.scene.map_parts import (
     THUMBNAIL_PX,
     ColourBy,
@@ -18,9 +19,11 @@ from evercal.reports.scene.map_parts import (
     resized,
     shares,
 )
-from evercal.service.viewer.html import GREY, Colour
+from evercal.service.viewer.html import GREY, MAGENTA, Colour
 
 OnKeyframe = Callable[[KeyframeView, viser.ClientHandle], Any]
+GRIPPER = "/gripper"
+"""Node of what moves with the gripper."""
 
 
 def add_frustum(
@@ -43,29 +46,25 @@ def add_frustum(
         image=None if image is None else resized(image, THUMBNAIL_PX),
         wxyz=frustum.base_from_camera.rotation_wxyz,
         position=frustum.base_from_camera.translation_m,
-        cast_shadow=False,
-        receive_shadow=False,
     )
 
 
-def place(node: viser.SceneNodeHandle, base_from_node: SE3) -> None:
-    """Move a node of the scene."""
-    node.wxyz, node.position = base_from_node.rotation_wxyz, base_from_node.translation_m
+def place(node: viser.SceneNodeHandle, base_from_node: SE3 | None) -> None:
+    """Move a node of the scene; None hides it."""
+    node.visible = base_from_node is not None
+    if base_from_node is not None:
+        node.wxyz, node.position = base_from_node.rotation_wxyz, base_from_node.translation_m
 
 
-def add_base(server: viser.ViserServer, side_m: float) -> None:
-    """Add the axes of the robot base, and a floor with cells of 10 cm."""
+def add_base(server: viser.ViserServer, side_m: float) -> viser.FrameHandle:
+    """Add the axes of the robot base and a floor; returns the hidden node of the gripper."""
     server.scene.add_frame("/base", axes_length=0.05 * side_m, axes_radius=0.0015 * side_m)
     server.scene.add_label("/base/label", "robot base")
+    grey, dark = (80, 87, 99), (60, 66, 76)
     server.scene.add_grid(
-        "/floor",
-        side_m,
-        side_m,
-        cell_size=0.1,
-        cell_color=(60, 66, 76),
-        section_color=(80, 87, 99),
-        shadow_opacity=0.0,
+        "/floor", side_m, side_m, cell_size=0.1, cell_color=dark, section_color=grey
     )
+    return server.scene.add_frame(GRIPPER, show_axes=False, visible=False)
 
 
 class DrawnMap:
@@ -75,80 +74,83 @@ class DrawnMap:
         self,
         server: viser.ViserServer,
         scenes: Sequence[SceneMap],
-        on_keyframe: OnKeyframe = lambda *_: None,
+        on_keyframe: OnKeyframe | None = None,
     ):
-        self._server, self._on_keyframe = server, on_keyframe
-        self.names = [scene.name for scene in scenes]
-        most = shares([scene.landmarks for scene in scenes])
-        self.landmarks = [Landmarks3D.of(scene, n) for scene, n in zip(scenes, most, strict=True)]
-        self.keyframes = [keyframe_views(scene) for scene in scenes]
-        self.extent_m = _extent(self.landmarks[0].points_m)
-        self._frames: list[viser.FrameHandle] = []
-        self._clouds: list[viser.PointCloudHandle] = []
-        self._cameras: list[viser.CameraFrustumHandle] = []
-        server.scene.remove_by_name("/scenes")
+        self.landmarks = {
+            scene.name: Landmarks3D.of(scene, most)
+            for scene, most in zip(scenes, shares([s.landmarks for s in scenes]), strict=True)
+        }
+        self.keyframes = {scene.name: keyframe_views(scene) for scene in scenes}
+        # Twice the median distance of landmarks from their median.
+        points = self.landmarks[scenes[0].name].points_m
+        away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+        self.extent_m = max(2 * float(np.median(away)), 0.05)
+        self.frustum_m = 0.03 * self.extent_m
+        self._nodes: dict[str, viser.FrameHandle] = {}
+        self._clouds: dict[str, viser.PointCloudHandle] = {}
+        server.scene.remove_by_name("/map")
         with server.atomic():
-            for number in range(len(scenes)):
-                self._add(number)
-        self.show(self.names[0])
+            for scene in scenes:
+                self._add(server, scene.name, on_keyframe)
+        self.show(scenes[0].name)
 
-    @property
-    def frustum_m(self) -> float:
-        """Size of a drawn camera."""
-        return 0.03 * self.extent_m
+    def node(self, scene: object) -> str:
+        """Node of a scene; that of the base for what belongs to none."""
+        return self._nodes[str(scene)].name if str(scene) in self._nodes else "/base"
 
-    def show(self, scene: str | None) -> None:
-        """Show one scene, or all of them for None."""
-        for name, frame in zip(self.names, self._frames, strict=True):
-            frame.visible = scene in (None, name)
+    def show(self, scene: str) -> None:
+        """Show one scene; visitors show others in the scene tree of viser's settings."""
+        for name, node in self._nodes.items():
+            node.visible = name == scene
 
     def colour_by(self, by: ColourBy) -> None:
         """Colour the landmarks."""
-        for cloud, landmarks in zip(self._clouds, self.landmarks, strict=True):
-            cloud.colors = landmarks.colours(by)
+        for name, cloud in self._clouds.items():
+            cloud.colors = self.landmarks[name].colours(by)
 
-    def resize_points(self, size_mm: float) -> None:
-        """Draw landmarks with a diameter in millimetres."""
-        for cloud in self._clouds:
-            cloud.point_size = size_mm / 1000
-
-    def show_keyframes(self, visible: bool) -> None:
-        """Show or hide the keyframes."""
-        for camera in self._cameras:
-            camera.visible = visible
-
-    def look_from_behind(self) -> None:
-        """Begin above and behind the keyframes of the first scene."""
-        poses = SE3.stack([view.frustum.base_from_camera for view in self.keyframes[0]])
-        ahead = poses.rotation_matrix()[:, :, 2].mean(0) * (1, 1, 0)
-        target = poses.translation_m.mean(0)
-        camera = self._server.initial_camera
-        camera.position = target + self.extent_m * (np.array([0, 0, 0.6]) - ahead)
-        camera.look_at = target
-
-    def _add(self, number: int) -> None:
-        # Nodes are numbered, since names of scenes may hold a slash.
-        name, scene, landmarks = f"/scenes/{number}", self._server.scene, self.landmarks[number]
-        self._frames.append(scene.add_frame(name, show_axes=False))
-        cloud = scene.add_point_cloud(
-            f"{name}/landmarks",
+    def _add(self, server: viser.ViserServer, name: str, on_keyframe: OnKeyframe | None) -> None:
+        landmarks, node = self.landmarks[name], f"/map/{name.replace('/', '_')}"
+        self._nodes[name] = server.scene.add_frame(node, show_axes=False)
+        self._clouds[name] = server.scene.add_point_cloud(
+            f"{node}/landmarks",
             landmarks.points_m.astype(np.float32),
             landmarks.colours("image"),
             point_size=0.003 * self.extent_m,
             point_shape="circle",
             precision="float32",
         )
-        self._clouds.append(cloud)
-        for view in self.keyframes[number]:
-            node, size = f"{name}/{view.number}", self.frustum_m
-            camera = add_frustum(self._server, node, view.frustum, size, GREY, view.image)
-            camera.on_click(lambda event, view=view: self._on_keyframe(view, event.client))
-            self._cameras.append(camera)
+        if on_keyframe is None:
+            return
+        for view in self.keyframes[name]:
+            keyframe = f"{node}/keyframes/{view.number}"
+            camera = add_frustum(server, keyframe, view.frustum, self.frustum_m, GREY, view.image)
+            camera.on_click(lambda event, view=view: on_keyframe(view, event.client))
 
 
-def _extent(points_m: np.ndarray) -> float:
-    """Size of a scene: twice the median distance of its points from their median, metres."""
-    if not len(points_m):
-        return 1.0
-    away = np.linalg.norm(points_m - np.median(points_m, axis=0), axis=1)
-    return max(2 * float(np.median(away)), 0.05)
+def add_calibrations(
+    server: viser.ViserServer,
+    calibrations: dict[str, Calibration],
+    drawn: DrawnMap,
+    default: Camera,
+    size_m: float,
+) -> None:
+    """Add cameras in their scenes or on the gripper, with ellipsoids of their positions."""
+    scale = readable_scale([Ellipsoid.of(c.uncertain_pose) for c in calibrations.values()])
+    for name, found in calibrations.items():
+        ellipsoid = Ellipsoid.of(found.uncertain_pose)
+        on_gripper = found.mount == "eye_in_hand"
+        parent = GRIPPER if on_gripper else drawn.node(found.source.get("scene"))
+        node = f"{parent}/{name.replace('/', '_')}"
+        frustum = Frustum.of(found.parent_from_child, found.camera or default)
+        add_frustum(server, node, frustum, size_m, MAGENTA)
+        x, y, z = (max(float(scale * axis), 1e-6) for axis in ellipsoid.axes_m)
+        server.scene.add_icosphere(
+            f"{node} ellipsoid",
+            scale=(x, y, z),
+            color=MAGENTA,
+            opacity=0.35,
+            wxyz=ellipsoid.rotation_wxyz,
+            position=ellipsoid.centre_m,
+        )
+        words = f"{name}: {found.sigma_mm:.2g} mm (1 sigma), ellipsoid x {scale:g}"
+        server.scene.add_label(f"{node}/label", words)

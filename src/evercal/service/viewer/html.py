@@ -3,6 +3,9 @@
 from collections.abc import Sequence
 from html import escape
 
+from evercal.calibration.calibration import Calibration
+from evercal.reports.scene.frusta import Ellipsoid
+
 GREEN, AMBER, RED, GREY = (22, 163, 74), (217, 119, 6), (220, 38, 38), (107, 114, 128)
 BLUE, MAGENTA = (37, 99, 235), (192, 38, 211)
 Colour = tuple[int, int, int]
@@ -24,3 +27,15 @@ def rows_html(rows: Sequence[tuple[str, str]]) -> str:
         for name, value in rows
     )
     return f'<div style="{_TEXT}"><table style="width:100%">{cells}</table></div>' if rows else ""
+
+
+def calibration_rows(calibration: Calibration) -> list[tuple[str, str]]:
+    """Names and values of a calibration."""
+    x, y, z = 1000 * calibration.parent_from_child.translation_m
+    principal = Ellipsoid.of(calibration.uncertain_pose).sigmas_mm
+    return [
+        ("mount", "on the gripper" if calibration.mount == "eye_in_hand" else "fixed"),
+        (f"in {calibration.parent_frame}", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"),
+        ("1 sigma per axis", f"{calibration.sigma_mm:.2g} mm, {calibration.sigma_deg:.2g}°"),
+        ("principal axes", f"{principal} mm"),
+    ]

@@ -1,40 +1,42 @@
 """The page of `evercal view`: a map with calibrations, the arm and a tracked camera."""
 
+import contextlib
+import io
+import socket
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import viser
 
 from evercal.calibration.calibration import Calibration, read_calibration
+from evercal.errors import InputError
+from evercal.geometry import SE3
 from evercal.live.camera import StreamCamera
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker
 from evercal.recordings.poses.camera_file import read_camera
-from evercal.reports.scene.map_parts import ColourBy, KeyframeView
-from evercal.service.viewer.calibrations import DrawnCalibrations, calibration_rows
-from evercal.service.viewer.drawing import DrawnMap, add_base
-from evercal.service.viewer.html import rows_html
-from evercal.service.viewer.live import Live
-from evercal.service.viewer.robot import Robot
-from evercal.service.viewer.server import address_of, start_server
+from evercal.reports.answers import unit_known
+from evercal.reports.scene.frusta import Frustum
+from evercal.reports.scene.map_parts import THUMBNAIL_PX, ColourBy, KeyframeView, resized
+from evercal.service.viewer.drawing import (
+    DrawnMap,
+    add_base,
+    add_calibrations,
+    add_frustum,
+    place,
+)
+from evercal.service.viewer.html import GREEN, RED, calibration_rows, chip_html, rows_html
+from evercal.service.viewer.robot import add_arm
 
-ALL = "all scenes"
 _THROUGH = "/through"
+_IDLE_S = 0.1
 
 
 class Page:
-    """A page that is being served; `close` ends it.
-
-    Args:
-        localizer: The map.
-        calibrations: Files of calibrations.
-        urdf: The arm.
-        address: Host and port; 0 for any free port.
-
-    Raises:
-        InputError: A file that cannot be read, or a port that cannot be used.
-    """
+    """A page of a map that is being served; `close` ends it. Port 0 is any free one."""
 
     def __init__(
         self,
@@ -43,20 +45,20 @@ class Page:
         urdf: Path | None = None,
         address: tuple[str, int] = ("127.0.0.1", 0),
     ):
-        self._localizer, scenes = localizer, localizer.contents.scenes
-        self._given = _read_calibrations(calibrations)
+        self._localizer, self._closed = localizer, threading.Event()
+        given = _read_calibrations(calibrations)
         self.server = start_server(*address, "evercal view")
-        self._robot: Robot | None = None
-        self._live: Live | None = None
         try:
-            self.map = DrawnMap(self.server, scenes, self.look_through)
-            self.map.look_from_behind()
-            add_base(self.server, 2.5 * self.map.extent_m)
+            scenes, server = localizer.contents.scenes, self.server
+            self.map = DrawnMap(server, scenes, self.look_through)
+            gripper = add_base(server, 2.5 * self.map.extent_m)
             default, size_m = scenes[0].adjusted_camera, self.map.frustum_m
-            self._calibrations = DrawnCalibrations(self.server, self._given, default, size_m)
-            self._add_controls()
-            self._robot = None if urdf is None else Robot(self.server, urdf, self._draw)
-            self._draw()
+            add_calibrations(server, given, self.map, default, size_m)
+            self._begin_behind(scenes[0].name)
+            self._add_controls(given)
+            if urdf is not None:
+                hands = [c.parent_frame for c in given.values() if c.mount == "eye_in_hand"]
+                add_arm(server, urdf, gripper, hands)
         except BaseException:
             self.close()
             raise
@@ -66,20 +68,18 @@ class Page:
         """Address of the page."""
         return address_of(self.server)
 
+    def close(self) -> None:
+        """Stop tracking and the server."""
+        self._closed.set()
+        self.server.stop()
+
     def track(self, source: str, intrinsics: Path | None = None) -> None:
         """Show a camera, a video or a folder as it is tracked; by default with the map's camera."""
         camera = StreamCamera(source)
         height, width = camera.read()[1].shape[:2]
         given = None if intrinsics is None else read_camera(intrinsics, (width, height))
-        size_m = 1.3 * self.map.frustum_m
         tracker = Tracker(self._localizer, given)
-        self._live = Live(self.server, camera, tracker, size_m, self._follow)
-
-    def close(self) -> None:
-        """Stop the stream and the server."""
-        if self._live is not None:
-            self._live.close()
-        self.server.stop()
+        threading.Thread(target=self._track, args=(camera, tracker), daemon=True).start()
 
     def look_through(self, view: KeyframeView, client: viser.ClientHandle) -> None:
         """Show a visitor what a keyframe shows: its image stands behind its landmarks."""
@@ -95,7 +95,6 @@ class Page:
             )
             client.camera.position, client.camera.wxyz = pose.translation_m, pose.rotation_wxyz
             client.camera.fov = view.frustum.fov_rad
-        self._keyframes.value = False
 
     def look_from_above(self, client: viser.ClientHandle) -> None:
         """Bring a visitor back to the first view."""
@@ -104,40 +103,99 @@ class Page:
             client.scene.remove_by_name(_THROUGH)
             client.camera.up_direction, client.camera.fov = (0.0, 0.0, 1.0), first.fov
             client.camera.position, client.camera.look_at = first.position, first.look_at
-        self._keyframes.value = True
 
-    def _add_controls(self) -> None:
+    def _begin_behind(self, scene: str) -> None:
+        """Begin above and behind the keyframes of a scene."""
+        poses = SE3.stack([view.frustum.base_from_camera for view in self.map.keyframes[scene]])
+        ahead = poses.rotation_matrix()[:, :, 2].mean(0) * (1, 1, 0)
+        camera, middle = self.server.initial_camera, poses.translation_m.mean(0)
+        camera.position = middle + self.map.extent_m * (np.array([0, 0, 0.6]) - ahead)
+        camera.look_at = middle
+
+    def _add_controls(self, given: dict[str, Calibration]) -> None:
         gui, drawn = self.server.gui, self.map
-        keyframes, landmarks = sum(map(len, drawn.keyframes)), sum(map(len, drawn.landmarks))
+        keyframes = sum(map(len, drawn.keyframes.values()))
+        landmarks = sum(map(len, drawn.landmarks.values()))
         with gui.add_folder("Map"):
-            counts = [("keyframes", f"{keyframes}"), ("landmarks", f"{landmarks:,}")]
+            counts = [("keyframes", f"{keyframes}, click one"), ("landmarks", f"{landmarks:,}")]
             gui.add_html(rows_html(counts))
-            self._scene = gui.add_dropdown("Scene", [*drawn.names, ALL])
+            scene = gui.add_dropdown("Scene", tuple(drawn.keyframes))
             colour = gui.add_dropdown("Colour", get_args(ColourBy))
-            points = gui.add_slider("Points, mm", 1, 30, 1, min(1 + int(3 * drawn.extent_m), 30))
-            self._keyframes = gui.add_checkbox("Keyframes", True, hint="click one to look through")
             back = gui.add_button("Back to the overview")
-        self._scene.on_update(lambda _: self._draw())
+        scene.on_update(lambda _: drawn.show(scene.value))
         colour.on_update(lambda _: drawn.colour_by(colour.value))
-        points.on_update(lambda _: drawn.resize_points(points.value))
-        self._keyframes.on_update(lambda _: drawn.show_keyframes(self._keyframes.value))
         back.on_click(lambda event: event.client and self.look_from_above(event.client))
-        for name, calibration in self._given.items():
+        for name, calibration in given.items():
             with gui.add_folder(name):
                 gui.add_html(rows_html(calibration_rows(calibration)))
 
-    def _follow(self, scene: str) -> None:
-        """Show the scene of an answer."""
-        if self._scene.value not in (scene, ALL):
-            self._scene.value = scene
+    def _track(self, camera: StreamCamera, tracker: Tracker) -> None:
+        """Show where a camera is, while the page is open somewhere."""
+        server, scenes = self.server, self._localizer.contents.scenes
+        frustum = Frustum.of(SE3.identity(), tracker.camera or scenes[0].adjusted_camera)
+        node = add_frustum(server, "/live", frustum, 1.3 * self.map.frustum_m, GREEN)
+        place(node, None)
+        with server.gui.add_folder("Live"):
+            text = server.gui.add_html("")
+        while not self._closed.is_set():
+            if not server.get_clients():
+                self._closed.wait(_IDLE_S)
+                continue
+            try:
+                stamp_s, image = camera.read()
+                tracked = tracker.track(image, stamp_s)
+            except InputError as error:  # such as the end of a video
+                text.content += chip_html("ended", RED, str(error))
+                break
+            estimate = tracked.estimate
+            pose = estimate.uncertain_pose if estimate.status == "ok" else None
+            place(node, pose and pose.pose)
+            rows = [("time", f"{estimate.milliseconds:.0f} ms")]
+            if pose is not None:
+                self.map.show(str(estimate.scene))
+                node.image = resized(image, THUMBNAIL_PX)
+                rows.append(("scene", str(estimate.scene)))
+                if unit_known(self._localizer, estimate.scene):
+                    x, y, z = 1000 * pose.pose.translation_m
+                    rows.append(("position", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"))
+                    rows.append(("1 sigma per axis", f"{pose.sigma_mm:.2g} mm"))
+            chip = chip_html(tracked.state, RED if pose is None else GREEN, estimate.reason)
+            text.content = chip + rows_html(rows)
+        camera.close()
 
-    def _draw(self) -> None:
-        """Show the scene that is chosen, and cameras on the gripper where its link is."""
-        scene = None if self._scene.value == ALL else self._scene.value
-        self.map.show(scene)
-        hands = [found for found in self._given.values() if found.mount == "eye_in_hand"]
-        links = [self._robot.base_from_link(c.parent_frame) for c in hands] if self._robot else []
-        self._calibrations.show(scene, next((link for link in links if link is not None), None))
+
+class _Server(viser.ViserServer):
+    """A server that is not shared over viser's public relay, whatever a visitor asks for."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        return None
+
+
+def start_server(host: str, port: int, label: str) -> viser.ViserServer:
+    """An empty page with z up.
+
+    Raises:
+        InputError: The address cannot be used; viser alone would take the next free port.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        socket.create_server((host, port), family=family).close()
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or "give a port from 0 to 65535"
+        raise InputError(f"--host {host} --port {port}: {reason}") from None
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a frame with its address
+        server = _Server(host, port, label=label, verbose=False)
+    server.gui.configure_theme(
+        dark_mode=True, show_logo=False, show_share_button=False, control_width="large"
+    )
+    return server
+
+
+def address_of(server: viser.ViserServer) -> str:
+    """Address that a browser on this machine opens."""
+    host = server.get_host() or "127.0.0.1"
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
 
 
 def _read_calibrations(paths: Sequence[Path]) -> dict[str, Calibration]:
