@@ -7,14 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.device import Device
-from evercal.cli.view import require_viser, wait_until_stopped, warn_of_network
+from evercal.cli.view import prepare_page, wait_until_stopped
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
     from evercal.service.studio.devices import Devices
-
-_REACHABLE = 200
-"""Poses that the virtual arm can reach."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +62,16 @@ class Studio:
     def run(self) -> int:
         """Serve the page until Ctrl-C or SIGTERM."""
         self._refuse()
-        require_viser()
+        prepare_page(self.host, "can use the cameras and move the arm")
         from evercal.service.studio.page import StudioPage
         from evercal.service.studio.studio import Studio as Session
 
-        warn_of_network(self.host, "can use the cameras and move the arm")
         devices = self._virtual() if self.virtual else self._real()
         session = Session(devices, self.out, self.map, self.device)
         page = StudioPage(session, self.host, self.port)
         try:
-            words = f"studio in {self.out} at {page.url}, where the same command continues"
-            wait_until_stopped(page.url, None if self.json else words)
+            words = f"studio in {self.out} at {page.server.url}, where the same command continues"
+            wait_until_stopped(page.server.url, None if self.json else words)
         finally:
             page.close()
         return 0
@@ -106,7 +102,7 @@ class Studio:
             intrinsics=cell.intrinsics,
             robot=cell.robot,
             fixed_camera=cell.tripod_camera,  # of the same make, so it has the same intrinsics
-            reachable=cell.reachable_poses(_REACHABLE),
+            reachable=cell.reachable_poses(200),
             rough=nominal_mount(),
             settle_s=0.0,
             arm=lambda: joint_frames(np.array(cell.robot.joints_rad()))[:, :3, 3],

@@ -54,40 +54,32 @@ class View:
         """Serve the page until Ctrl-C or SIGTERM."""
         if self.camera is not None and self.live is None:
             raise InputError("--camera: is that of --live, which is missing")
-        require_viser()
+        prepare_page(self.host, "sees the map and the images")
         from evercal.service.viewer.page import Page
 
-        warn_of_network(self.host, "sees the map and the images")
         address = (self.host, self.port)
         page = Page(open_map(self.store, self.device), self.calibrations, self.urdf, address)
         try:
             if self.live is not None:
                 page.track(self.live, self.camera)
-            port = page.url.rpartition(":")[2]
+            port = page.server.url.rpartition(":")[2]
             tunnel = shlex.join(["ssh", "-L", f"{port}:127.0.0.1:{port}", socket.gethostname()])
-            words = f"view of {self.store} at {page.url} (from another machine: {tunnel})"
-            wait_until_stopped(page.url, None if self.json else words)
+            words = f"view of {self.store} at {page.server.url} (from another machine: {tunnel})"
+            wait_until_stopped(page.server.url, None if self.json else words)
         finally:
             page.close()
         return 0
 
 
-def require_viser() -> None:
-    """Raise `InputError` if the extra `view` is not installed."""
+def prepare_page(host: str, danger: str) -> None:
+    """Require the extra `view`, and warn if other machines can open the page."""
     try:
         import viser  # noqa: F401
     except ImportError as error:
         raise InputError(f"the page needs {error.name}; run: pip install 'evercal[view]'") from None
-
-
-def warn_of_network(host: str, danger: str) -> None:
-    """Warn if other machines can open the page."""
     if not is_local(host):
-        print(
-            f"warning: --host {host}: the page has no password; whoever reaches this machine"
-            f" {danger}",
-            file=sys.stderr,
-        )
+        who = "the page has no password; whoever reaches this machine"
+        print(f"warning: --host {host}: {who} {danger}", file=sys.stderr)
 
 
 def wait_until_stopped(url: str, words: str | None) -> None:

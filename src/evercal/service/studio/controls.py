@@ -13,7 +13,7 @@ from evercal.calibration.next_views import NextViews
 from evercal.errors import InputError
 from evercal.live.coverage import CoverageOptions
 from evercal.service.studio.devices import Which
-from evercal.service.studio.studio import FIXED_IMAGES, Step, Studio, step_states
+from evercal.service.studio.studio import FIXED_IMAGES, STEPS, Studio
 from evercal.service.viewer.html import (
     BLUE,
     GREEN,
@@ -24,7 +24,6 @@ from evercal.service.viewer.html import (
     rows_html,
 )
 
-_STATUS = {"waits": GREY, "to do": BLUE, "done": GREEN}
 _CAMERAS: dict[str, Which] = {"camera on the gripper": "wrist", "fixed camera": "fixed"}
 
 
@@ -85,26 +84,16 @@ class Controls:
         bar = gui.add_progress_bar(0.0, animated=True)
         self._keep(bar, visible=lambda: tasks.busy, value=lambda: 100 * tasks.progress)
         tabs = gui.add_tab_group()
-        steps: dict[Step, tuple[str, Callable[[], None]]] = {
-            "connect": ("1 Connect", self._connect),
-            "record": ("2 Record", self._record),
-            "learn": ("3 Learn", self._learn),
-            "fixed": ("4 Fixed", self._fixed),
-            "export": ("5 Export", self._export),
-        }
-        for step, (title, contents) in steps.items():
+        contents = (self._connect, self._record, self._learn, self._fixed, self._export)
+        for (title, state), add in zip(STEPS.items(), contents, strict=True):
             with tabs.add_tab(title):
-                self._keep(gui.add_html(""), content=lambda step=step: self._state(step))
-                contents()
+                self._keep(gui.add_html(""), content=lambda state=state: _state(*state(studio)))
+                add()
 
     @property
     def which(self) -> Which:
         """The camera whose picture is shown."""
         return _CAMERAS[self._camera.value]
-
-    def choose(self, name: str) -> None:
-        """Choose a sample in the list."""
-        self._sample.value = name
 
     def show(self, next_view: NextViews | None) -> None:
         """Show the state of the steps and of the task that runs."""
@@ -193,11 +182,6 @@ class Controls:
             return "There is no next view."
         return self._studio.move_to(self._view.poses[0])
 
-    def _state(self, step: Step) -> str:
-        """Status of a step, and what to do."""
-        status, says = step_states(self._studio)[step]
-        return chip_html(status, _STATUS[status], says)
-
     def _message(self) -> str:
         """What the last task did, or what the running one does."""
         tasks = self._tasks
@@ -229,3 +213,7 @@ class Controls:
         if found is not None:
             rows += [*calibration_rows(found), ("file", str(self._studio.calibration_file(which)))]
         return rows_html(rows)
+
+
+def _state(status: str, says: str) -> str:
+    return chip_html(status, {"waits": GREY, "to do": BLUE, "done": GREEN}[status], says)

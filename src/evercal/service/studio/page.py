@@ -3,8 +3,6 @@
 import logging
 import threading
 import time
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import viser
@@ -15,20 +13,12 @@ from evercal.reports.scene.frusta import Frustum
 from evercal.reports.scene.map_parts import THUMBNAIL_PX, resized
 from evercal.service.studio.controls import Controls, Tasks
 from evercal.service.studio.studio import Studio
-from evercal.service.viewer.drawing import (
-    DrawnMap,
-    add_base,
-    add_calibrations,
-    add_frustum,
-    place,
-)
+from evercal.service.viewer.drawing import DrawnMap, add_base, add_calibrations, add_frustum, place
 from evercal.service.viewer.html import AMBER, BLUE, GREEN, RED
-from evercal.service.viewer.page import address_of, start_server
+from evercal.service.viewer.page import start_server
 
 _LIVE_S, _REFRESH_S = 0.25, 0.5
 """Between live images, and between reports of progress."""
-
-
 _SIZE_M = 0.045
 """Length of a drawn camera."""
 
@@ -41,15 +31,10 @@ class StudioPage:
         self.server = start_server(host, port, "evercal studio")
         self._closed, self._lock, self._refreshed = threading.Event(), threading.RLock(), 0.0
         self.controls = Controls(self.server, studio, self.tasks)
-        self._drawing = _Drawing(self.server, studio, self.controls.choose)
+        self._drawing = _Drawing(self.server, studio)
         self.refresh()
         self._live = threading.Thread(target=self._run, daemon=True)
         self._live.start()
-
-    @property
-    def url(self) -> str:
-        """Address of the page."""
-        return address_of(self.server)
 
     def close(self) -> None:
         """Stop threads and server."""
@@ -88,9 +73,9 @@ class StudioPage:
                 logging.getLogger(__name__).exception("a live image was not shown")
 
     def _look(self) -> None:
-        """Read pose and image, and show them; learning needs the processor more than pictures."""
+        """Read pose and image, and show them; a task takes its own images."""
         connection, which = self.studio.connection, self.controls.which
-        wanted = connection.devices.live and not self.tasks.message.startswith("learn")
+        wanted = connection.devices.live and not self.tasks.busy
         connection.look(which if wanted or which not in connection.images else None)
         with self._lock, self.server.atomic():
             self.controls.show_live()
@@ -98,10 +83,10 @@ class StudioPage:
 
 
 class _Drawing:
-    """The scene of the page; `on_sample` is called with the name of a sample that is clicked."""
+    """The scene of the page."""
 
-    def __init__(self, server: viser.ViserServer, studio: Studio, on_sample: Callable[[str], Any]):
-        self._server, self._studio, self._on_sample = server, studio, on_sample
+    def __init__(self, server: viser.ViserServer, studio: Studio):
+        self._server, self._studio = server, studio
         self._samples: dict[str, viser.CameraFrustumHandle] = {}
         self._drawn: tuple[object, ...] = ()
         self._gripper = add_base(server, 3.0)
@@ -142,7 +127,6 @@ class _Drawing:
                 node, frustum = f"/samples/{name}", Frustum.of(gripper, frame.camera)
                 image = frame.read_image()
                 drawn = add_frustum(self._server, node, frustum, _SIZE_M, GREEN, image)
-                drawn.on_click(lambda _, name=name: self._on_sample(name))
                 self._samples[name] = drawn
             place(self._samples[name], gripper @ self._mount())
             self._samples[name].color = RED if name in bad else GREEN

@@ -1,8 +1,4 @@
-"""`Studio`: everything that the page can do, without the page.
-
-Samples, images and results are written when they are made. A studio that is opened on the same
-folder continues with them.
-"""
+"""`Studio`: everything that the page can do, without the page."""
 
 import time
 from collections.abc import Callable
@@ -28,7 +24,6 @@ from evercal.storage import write_json
 FIXED_IMAGES = 8
 """Images of a series of the fixed camera."""
 
-Step = Literal["connect", "record", "learn", "fixed", "export"]
 State = tuple[Literal["waits", "to do", "done"], str]
 """Status of a step, and what was found or what to do in one to three sentences."""
 
@@ -36,7 +31,7 @@ OnStep = Callable[[str, float, float], Any]
 
 
 class Studio:
-    """The way to a calibration, in a folder; its map is `out/map` if none is given.
+    """The way to a calibration, in a folder that a later studio continues with.
 
     Actions return what was done, in one line, and raise `InputError` if it cannot be done.
     """
@@ -192,12 +187,11 @@ class Studio:
         files, given = self.fixed_images, self._fixed_camera
         if not files:
             raise InputError("no image of the fixed camera yet; take one first")
-        done = iter(range(1, len(files) + 1))
+        on_step("locating images", 0, len(files))
         found = self.cell.calibrate(
             files,
             camera=read_camera(given) if given.is_file() else None,
             mount="eye_to_hand",
-            on_image=lambda: on_step("locating images", next(done, len(files)), len(files)),
         )
         found = replace(found, source={**found.source, "store": str(self.cell.path)})
         found.write(self.calibration_file("fixed"))
@@ -206,7 +200,7 @@ class Studio:
 
     def check_fixed(self) -> str:
         """Test with a new image whether the fixed camera has moved."""
-        reference, image = self.calibration("fixed"), self.connection.image("fixed")
+        reference, image = self._made("fixed"), self.connection.image("fixed")
         shift = self.cell.check([image], reference)
         size = f"{shift.translation_mm:.2f} mm and {shift.rotation_deg:.3f} deg"
         if not shift.moved:
@@ -214,15 +208,9 @@ class Studio:
         sure = f"{100 * shift.confidence:.1f} %"
         return f"The camera has moved by {size} (confidence {sure}). Calibrate it again."
 
-    def calibration(self, which: Which) -> Calibration:
-        """A calibration that was made."""
-        if which not in self.calibrations:
-            raise InputError(f"the {which} camera is not calibrated yet")
-        return self.calibrations[which]
-
     def export(self, which: Which, format: str) -> str:
         """Export a calibration in a format of `evercal export`."""
-        calibration, folder = self.calibration(which), self.out / "export"
+        calibration, folder = self._made(which), self.out / "export"
         folder.mkdir(exist_ok=True)
         # Formats share endings; easy_handeye2 looks files up by their name.
         name = which if format == "easy_handeye2" else f"{which}_{format}"
@@ -232,6 +220,11 @@ class Studio:
         path = folder / f"{name}{FORMATS[format].ending}"
         files = export_files(calibration, format, path, **options).files
         return f"Wrote {', '.join(map(str, files))}."
+
+    def _made(self, which: Which) -> Calibration:
+        if which not in self.calibrations:
+            raise InputError(f"the {which} camera is not calibrated yet")
+        return self.calibrations[which]
 
     def _keep(self, which: Which, calibration: Calibration) -> None:
         self.calibrations[which] = calibration
@@ -243,17 +236,6 @@ def _free_name(name: str, taken: tuple[str, ...]) -> str:
     """A name that no scene has: `name`, or `name-2` and so on."""
     numbered = (f"{name}-{number}" for number in range(2, len(taken) + 2))
     return name if name not in taken else next(free for free in numbered if free not in taken)
-
-
-def step_states(studio: Studio) -> dict[Step, State]:
-    """All steps in order."""
-    return {
-        "connect": _connect(studio),
-        "record": _record(studio),
-        "learn": _learn(studio),
-        "fixed": _fixed(studio),
-        "export": _export(studio),
-    }
 
 
 def _connect(studio: Studio) -> State:
@@ -300,6 +282,16 @@ def _export(studio: Studio) -> State:
     if not studio.calibrations:
         return "waits", "There is no calibration to export yet."
     exported = len(list((studio.out / "export").glob("*")))
-    return (
-        ("done", f"{exported} files were exported.") if exported else ("to do", "Choose a format.")
-    )
+    if exported:
+        return "done", f"{exported} files were exported."
+    return "to do", "Choose a camera and a format."
+
+
+STEPS: dict[str, Callable[[Studio], State]] = {
+    "1 Connect": _connect,
+    "2 Record": _record,
+    "3 Learn": _learn,
+    "4 Fixed": _fixed,
+    "5 Export": _export,
+}
+"""All steps in order, each with its state."""

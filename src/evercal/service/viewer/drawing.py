@@ -17,7 +17,6 @@ from evercal.reports.scene.map_parts import (
     Landmarks3D,
     keyframe_views,
     resized,
-    shares,
 )
 from evercal.service.viewer.html import GREY, MAGENTA, Colour
 
@@ -76,10 +75,7 @@ class DrawnMap:
         scenes: Sequence[SceneMap],
         on_keyframe: OnKeyframe | None = None,
     ):
-        self.landmarks = {
-            scene.name: Landmarks3D.of(scene, most)
-            for scene, most in zip(scenes, shares([s.landmarks for s in scenes]), strict=True)
-        }
+        self.landmarks = {scene.name: Landmarks3D.of(scene) for scene in scenes}
         self.keyframes = {scene.name: keyframe_views(scene) for scene in scenes}
         # Twice the median distance of landmarks from their median.
         points = self.landmarks[scenes[0].name].points_m

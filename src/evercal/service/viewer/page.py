@@ -21,13 +21,7 @@ from evercal.recordings.poses.camera_file import read_camera
 from evercal.reports.answers import unit_known
 from evercal.reports.scene.frusta import Frustum
 from evercal.reports.scene.map_parts import THUMBNAIL_PX, ColourBy, KeyframeView, resized
-from evercal.service.viewer.drawing import (
-    DrawnMap,
-    add_base,
-    add_calibrations,
-    add_frustum,
-    place,
-)
+from evercal.service.viewer.drawing import DrawnMap, add_base, add_calibrations, add_frustum, place
 from evercal.service.viewer.html import GREEN, RED, calibration_rows, chip_html, rows_html
 from evercal.service.viewer.robot import add_arm
 
@@ -46,7 +40,7 @@ class Page:
         address: tuple[str, int] = ("127.0.0.1", 0),
     ):
         self._localizer, self._closed = localizer, threading.Event()
-        given = _read_calibrations(calibrations)
+        given = {str(path): read_calibration(path) for path in calibrations}
         self.server = start_server(*address, "evercal view")
         try:
             scenes, server = localizer.contents.scenes, self.server
@@ -62,11 +56,6 @@ class Page:
         except BaseException:
             self.close()
             raise
-
-    @property
-    def url(self) -> str:
-        """Address of the page."""
-        return address_of(self.server)
 
     def close(self) -> None:
         """Stop tracking and the server."""
@@ -165,13 +154,24 @@ class Page:
 
 
 class _Server(viser.ViserServer):
-    """A server that is not shared over viser's public relay, whatever a visitor asks for."""
+    """A silent server that is not shared over viser's public relay, whatever a visitor asks."""
+
+    @property
+    def url(self) -> str:
+        """Address that a browser on this machine opens."""
+        host = self.get_host()
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.get_port()}"
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
 
+    def stop(self) -> None:
+        with contextlib.redirect_stdout(io.StringIO()):
+            super().stop()
 
-def start_server(host: str, port: int, label: str) -> viser.ViserServer:
+
+def start_server(host: str, port: int, label: str) -> _Server:
     """An empty page with z up.
 
     Raises:
@@ -189,19 +189,3 @@ def start_server(host: str, port: int, label: str) -> viser.ViserServer:
         dark_mode=True, show_logo=False, show_share_button=False, control_width="large"
     )
     return server
-
-
-def address_of(server: viser.ViserServer) -> str:
-    """Address that a browser on this machine opens."""
-    host = server.get_host() or "127.0.0.1"
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-    return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
-
-
-def _read_calibrations(paths: Sequence[Path]) -> dict[str, Calibration]:
-    """Calibrations by name; two files of one name from two folders stay apart."""
-    calibrations: dict[str, Calibration] = {}
-    for path in paths:
-        name = str(path) if path.stem in calibrations else path.stem
-        calibrations[name] = read_calibration(path)
-    return calibrations
