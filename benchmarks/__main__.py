@@ -30,7 +30,6 @@ VERBS = {
     "memory": "memory of a service and of a tracker over many images",
     "many-recordings": "recordings learned at once, beside one after the other",
     "faults": "commands that are killed, full disks and read-only folders",
-    "view": "a large map in the browser: seconds until it is shown, bytes, frames per second",
     "intervals": "coverage of confidence intervals",
     "publish": "write results to results/NAME.jsonl",
     "tables": "generate the tables of the docs from results/",

@@ -67,8 +67,7 @@ class Studio:
         from evercal.service.studio.studio import Studio as Session
 
         devices = self._virtual() if self.virtual else self._real()
-        session = Session(devices, self.out, self.map, self.device)
-        page = StudioPage(session, self.host, self.port)
+        page = StudioPage(Session(devices, self.out, self.map, self.device), self.host, self.port)
         try:
             words = f"studio in {self.out} at {page.server.url}, where the same command continues"
             wait_until_stopped(page.server.url, None if self.json else words)

@@ -72,8 +72,9 @@ class Studio:
     @property
     def samples_changed(self) -> bool:
         """Whether samples were added or removed since they were learned."""
-        poses, calibration = self.out / "wrist" / POSES, self.calibration_file("wrist")
-        return not poses.is_file() or poses.stat().st_mtime_ns > calibration.stat().st_mtime_ns
+        files = self.out / "wrist" / POSES, self.calibration_file("wrist")
+        times = [file.stat().st_mtime_ns for file in files if file.is_file()]
+        return len(times) < 2 or times[0] > times[1]
 
     @property
     def fixed_images(self) -> list[Path]:

@@ -26,7 +26,6 @@ from evercal.service.viewer.html import GREEN, RED, calibration_rows, chip_html,
 from evercal.service.viewer.robot import add_arm
 
 _THROUGH = "/through"
-_IDLE_S = 0.1
 
 
 class Page:
@@ -128,7 +127,7 @@ class Page:
             text = server.gui.add_html("")
         while not self._closed.is_set():
             if not server.get_clients():
-                self._closed.wait(_IDLE_S)
+                self._closed.wait(0.1)
                 continue
             try:
                 stamp_s, image = camera.read()
@@ -177,12 +176,13 @@ def start_server(host: str, port: int, label: str) -> _Server:
     Raises:
         InputError: The address cannot be used; viser alone would take the next free port.
     """
+    if not 0 <= port <= 65_535:
+        raise InputError(f"--port {port}: give 0 to 65535")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         socket.create_server((host, port), family=family).close()
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or "give a port from 0 to 65535"
-        raise InputError(f"--host {host} --port {port}: {reason}") from None
+    except OSError as error:
+        raise InputError(f"--host {host} --port {port}: {error.strerror or error}") from None
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints a frame with its address
         server = _Server(host, port, label=label, verbose=False)
     server.gui.configure_theme(
