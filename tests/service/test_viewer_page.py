@@ -113,8 +113,8 @@ def test_calibrations_have_their_place_and_ellipsoid() -> None:
     """The standard deviations 1, 2 and 3 mm are drawn ten times as large."""
     server, drawn = MagicMock(), MagicMock()
     drawn.node = lambda scene: f"/map/{scene}"
-    given = {"w/rist": calibration("eye_in_hand"), "tripod": calibration("eye_to_hand")}
-    given["tripod"].source["scene"] = "hall"
+    fixed = calibration("eye_to_hand", source={"scene": "hall"})
+    given = {"w/rist": calibration("eye_in_hand"), "tripod": fixed}
     add_calibrations(server, given, drawn, Camera(64, 48, 50.0, 50.0, 31.5, 23.5), 0.1)
     cameras = server.scene.add_camera_frustum.call_args_list
     assert [call.args[0] for call in cameras] == [f"{GRIPPER}/w_rist", "/map/hall/tripod"]
@@ -143,7 +143,7 @@ def test_a_keyframe_is_looked_through_until_back(localizer: Localizer) -> None:
 
 
 def test_names_of_files_are_no_markup() -> None:
-    page = rows_html([("<b>", "&")]) + chip_html("<i>", (1, 2, 3), "<script>")
+    page = rows_html([("<b>", "&")]) + chip_html("<i>", "<script>")
     assert "&lt;b&gt;" in page
     assert "&lt;script&gt;" in page
     assert "<script>" not in page

@@ -15,10 +15,6 @@ from evercal.live.coverage import CoverageOptions
 from evercal.service.studio.devices import Which
 from evercal.service.studio.studio import FIXED_IMAGES, STEPS, Studio
 from evercal.service.viewer.html import (
-    BLUE,
-    GREEN,
-    GREY,
-    RED,
     calibration_rows,
     chip_html,
     rows_html,
@@ -87,7 +83,7 @@ class Controls:
         contents = (self._connect, self._record, self._learn, self._fixed, self._export)
         for (title, state), add in zip(STEPS.items(), contents, strict=True):
             with tabs.add_tab(title):
-                self._keep(gui.add_html(""), content=lambda state=state: _state(*state(studio)))
+                self._keep(gui.add_html(""), content=lambda state=state: chip_html(*state(studio)))
                 add()
 
     @property
@@ -186,8 +182,7 @@ class Controls:
         """What the last task did, or what the running one does."""
         tasks = self._tasks
         kind = "failed" if tasks.failed else "working" if tasks.busy else "done"
-        colour = {"failed": RED, "working": BLUE, "done": GREEN}[kind]
-        return chip_html(kind, colour, tasks.message) if tasks.message else ""
+        return chip_html(kind, tasks.message) if tasks.message else ""
 
     def _coverage(self) -> str:
         """Spread of the good samples, the next view, and the bad samples."""
@@ -213,7 +208,3 @@ class Controls:
         if found is not None:
             rows += [*calibration_rows(found), ("file", str(self._studio.calibration_file(which)))]
         return rows_html(rows)
-
-
-def _state(status: str, says: str) -> str:
-    return chip_html(status, {"waits": GREY, "to do": BLUE, "done": GREEN}[status], says)

@@ -59,27 +59,23 @@ class StudioPage:
             self.refresh()
 
     def _run(self) -> None:
-        """Show live images while the page is open somewhere."""
+        """Show live images while the page is open somewhere; a task takes its own images."""
         connection, complete = self.studio.connection, False
         while not self._closed.wait(_LIVE_S):
             if not self.server.get_clients():
                 continue
             try:
-                self._look()
+                which = self.controls.which
+                wanted = connection.devices.live and not self.tasks.busy
+                connection.look(which if wanted or which not in connection.images else None)
+                with self._lock, self.server.atomic():
+                    self.controls.show_live()
+                    self._drawing.show_live()
                 if connection.complete != complete:
                     complete = connection.complete
                     self.refresh()
             except Exception:  # the next image may be better
                 logging.getLogger(__name__).exception("a live image was not shown")
-
-    def _look(self) -> None:
-        """Read pose and image, and show them; a task takes its own images."""
-        connection, which = self.studio.connection, self.controls.which
-        wanted = connection.devices.live and not self.tasks.busy
-        connection.look(which if wanted or which not in connection.images else None)
-        with self._lock, self.server.atomic():
-            self.controls.show_live()
-            self._drawing.show_live()
 
 
 class _Drawing:

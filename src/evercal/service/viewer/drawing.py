@@ -59,10 +59,8 @@ def add_base(server: viser.ViserServer, side_m: float) -> viser.FrameHandle:
     """Add the axes of the robot base and a floor; returns the hidden node of the gripper."""
     server.scene.add_frame("/base", axes_length=0.05 * side_m, axes_radius=0.0015 * side_m)
     server.scene.add_label("/base/label", "robot base")
-    grey, dark = (80, 87, 99), (60, 66, 76)
-    server.scene.add_grid(
-        "/floor", side_m, side_m, cell_size=0.1, cell_color=dark, section_color=grey
-    )
+    lines = {"cell_size": 0.1, "cell_color": (60, 66, 76), "section_color": (80, 87, 99)}
+    server.scene.add_grid("/floor", side_m, side_m, shadow_opacity=0.0, **lines)
     return server.scene.add_frame(GRIPPER, show_axes=False, visible=False)
 
 
@@ -84,6 +82,7 @@ class DrawnMap:
         self.frustum_m = 0.03 * self.extent_m
         self._nodes: dict[str, viser.FrameHandle] = {}
         self._clouds: dict[str, viser.PointCloudHandle] = {}
+        self._cameras: list[viser.CameraFrustumHandle] = []
         server.scene.remove_by_name("/map")
         with server.atomic():
             for scene in scenes:
@@ -98,6 +97,11 @@ class DrawnMap:
         """Show one scene; visitors show others in the scene tree of viser's settings."""
         for name, node in self._nodes.items():
             node.visible = name == scene
+
+    def show_keyframes(self, visible: bool) -> None:
+        """Show or hide the keyframes."""
+        for camera in self._cameras:
+            camera.visible = visible
 
     def colour_by(self, by: ColourBy) -> None:
         """Colour the landmarks."""
@@ -121,6 +125,7 @@ class DrawnMap:
             keyframe = f"{node}/keyframes/{view.number}"
             camera = add_frustum(server, keyframe, view.frustum, self.frustum_m, GREY, view.image)
             camera.on_click(lambda event, view=view: on_keyframe(view, event.client))
+            self._cameras.append(camera)
 
 
 def add_calibrations(

@@ -9,13 +9,16 @@ from evercal.reports.scene.frusta import Ellipsoid
 GREEN, AMBER, RED, GREY = (22, 163, 74), (217, 119, 6), (220, 38, 38), (107, 114, 128)
 BLUE, MAGENTA = (37, 99, 235), (192, 38, 211)
 Colour = tuple[int, int, int]
+_COLOURS = {"waits": GREY, "to do": BLUE, "working": BLUE, "failed": RED, "lost": RED, "ended": RED}
+"""Of states; those of all others are green."""
 _TEXT = "padding:2px 12px 6px;font-size:0.85em;line-height:1.4;overflow-wrap:anywhere"
 
 
-def chip_html(words: str, colour: Colour, text: str = "") -> str:
-    """Words on a coloured ground, and a sentence below them."""
+def chip_html(state: str, text: str = "") -> str:
+    """A state on its colour, and a sentence below it."""
+    colour = _COLOURS.get(state, GREEN)
     style = f"background:rgb{colour};color:white;border-radius:4px;padding:1px 8px;font-weight:600"
-    chip = f'<span style="{style}">{escape(words)}</span>'
+    chip = f'<span style="{style}">{escape(state)}</span>'
     return f'<div style="{_TEXT}">{chip}<div>{escape(text)}</div></div>'
 
 

@@ -22,7 +22,7 @@ from evercal.reports.answers import unit_known
 from evercal.reports.scene.frusta import Frustum
 from evercal.reports.scene.map_parts import THUMBNAIL_PX, ColourBy, KeyframeView, resized
 from evercal.service.viewer.drawing import DrawnMap, add_base, add_calibrations, add_frustum, place
-from evercal.service.viewer.html import GREEN, RED, calibration_rows, chip_html, rows_html
+from evercal.service.viewer.html import GREEN, calibration_rows, chip_html, rows_html
 from evercal.service.viewer.robot import add_arm
 
 _THROUGH = "/through"
@@ -83,6 +83,7 @@ class Page:
             )
             client.camera.position, client.camera.wxyz = pose.translation_m, pose.rotation_wxyz
             client.camera.fov = view.frustum.fov_rad
+        self.map.show_keyframes(False)  # they stand before the landmarks
 
     def look_from_above(self, client: viser.ClientHandle) -> None:
         """Bring a visitor back to the first view."""
@@ -91,13 +92,14 @@ class Page:
             client.scene.remove_by_name(_THROUGH)
             client.camera.up_direction, client.camera.fov = (0.0, 0.0, 1.0), first.fov
             client.camera.position, client.camera.look_at = first.position, first.look_at
+        self.map.show_keyframes(True)
 
     def _begin_behind(self, scene: str) -> None:
         """Begin above and behind the keyframes of a scene."""
         poses = SE3.stack([view.frustum.base_from_camera for view in self.map.keyframes[scene]])
         ahead = poses.rotation_matrix()[:, :, 2].mean(0) * (1, 1, 0)
         camera, middle = self.server.initial_camera, poses.translation_m.mean(0)
-        camera.position = middle + self.map.extent_m * (np.array([0, 0, 0.6]) - ahead)
+        camera.position = middle + self.map.extent_m * (np.array([0, 0, 0.4]) - 0.6 * ahead)
         camera.look_at = middle
 
     def _add_controls(self, given: dict[str, Calibration]) -> None:
@@ -133,7 +135,7 @@ class Page:
                 stamp_s, image = camera.read()
                 tracked = tracker.track(image, stamp_s)
             except InputError as error:  # such as the end of a video
-                text.content += chip_html("ended", RED, str(error))
+                text.content += chip_html("ended", str(error))
                 break
             estimate = tracked.estimate
             pose = estimate.uncertain_pose if estimate.status == "ok" else None
@@ -147,7 +149,7 @@ class Page:
                     x, y, z = 1000 * pose.pose.translation_m
                     rows.append(("position", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"))
                     rows.append(("1 sigma per axis", f"{pose.sigma_mm:.2g} mm"))
-            chip = chip_html(tracked.state, RED if pose is None else GREEN, estimate.reason)
+            chip = chip_html(tracked.state, estimate.reason)
             text.content = chip + rows_html(rows)
         camera.close()
 
