@@ -1,7 +1,7 @@
-"""Draw the picture of docs/view.md: python docs/_site/view.py cell.evercal tripod.json RECORDING.
+"""Draw the picture of docs/view.md: python docs/_site/view.py cell.evercal tripod.json IMAGES.
 
-Map, calibration and recording are those of the README: samples/cell/tripod is located frame by
-frame. Needs Chromium and the extras `view` and `dev`.
+Map and calibration are those of the README; a folder of images is tracked, such as
+samples/cell/wrist/images. Needs Chromium and the extras `view` and `dev`.
 """
 
 import io
@@ -12,21 +12,21 @@ from pathlib import Path
 from PIL import Image
 
 import evercal
-from evercal.service.viewer.page import Page, ViewOptions
+from evercal.service.viewer.page import Page
 from tests.chromium import chromium
 
 OUT = Path(__file__).parents[1] / "view.jpg"
 
 
-def main(store: Path, calibration: Path, recording: Path) -> None:
+def main(store: Path, calibration: Path, images: Path) -> None:
     """Open the page and keep what it shows."""
-    options = ViewOptions(port=0, calibrations=(calibration,), recording=recording)
-    page = Page(evercal.Map.open(store).localizer, options)
+    page = Page(evercal.Map.open(store).localizer, [calibration])
     try:
         with chromium() as browser:
             visit = browser.new_page(viewport={"width": 1200, "height": 720})
-            visit.goto(page.url)
+            visit.goto(page.server.url)
             visit.wait_for_selector("canvas", timeout=120_000)
+            page.track(str(images))
             # viser's notice that WebGL runs in software
             visit.add_style_tag(content=".mantine-Notifications-root {display: none}")
             time.sleep(20)  # all parts have arrived

@@ -37,7 +37,6 @@ VERBS = {
 ALL = [verb for verbs in VERBS.values() for verb in verbs]
 OTHER_PROGRAMS = {"--once", "--frame-id", "--child-frame-id", "--qw", "--qx", "--qy", "--qz"}
 OTHER_PROGRAMS |= {"--nproc-per-node", "--tyro-print-completion", "--version"}
-OTHER_PROGRAMS |= {"--mantine-color-dimmed"}  # a colour of the viewer
 """Options in messages that are not those of a verb."""
 SOLVE = ("--robot-poses", "R", "--camera-poses", "C", "--mount", "eye_in_hand")
 

@@ -1,25 +1,17 @@
 """`evercal studio`: joins cameras and robot, real or virtual, with the page."""
 
-import shlex
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json
 from evercal.cli.options import Device
-from evercal.cli.view import until_stopped
+from evercal.cli.view import prepare_page, wait_until_stopped
 from evercal.errors import InputError
-from evercal.service.hosts import is_local
 
 if TYPE_CHECKING:
-    from evercal.geometry import Camera
     from evercal.service.studio.devices import Devices
-
-_REACHABLE = 200
-"""Poses that the virtual arm can reach."""
 
 
 @dataclass(frozen=True)
@@ -70,47 +62,26 @@ class Studio:
     def run(self) -> int:
         """Serve the page until Ctrl-C or SIGTERM."""
         self._refuse()
-        try:
-            from evercal.service.studio.page import StudioPage
-        except ImportError as error:
-            raise InputError(
-                f"the studio needs {error.name}; run: pip install 'evercal[view]'"
-            ) from None
-        from evercal.service.studio.folders import Folders
+        prepare_page(self.host, "can use the cameras and move the arm")
+        from evercal.service.studio.page import StudioPage
         from evercal.service.studio.studio import Studio as Session
 
-        if not is_local(self.host):
-            print(
-                f"warning: --host {self.host}: the page has no password; whoever reaches this"
-                " machine can use the cameras and move the arm",
-                file=sys.stderr,
-            )
-        folders = Folders(self.out, self.map or self.out / "map")
         devices = self._virtual() if self.virtual else self._real()
-        session = Session(devices, folders, self.device)
-        page = StudioPage(session, self.host, self.port, self._command())
+        page = StudioPage(Session(devices, self.out, self.map, self.device), self.host, self.port)
         try:
-            until_stopped(lambda: self._ready(page.url))
+            words = f"studio in {self.out} at {page.server.url}, where the same command continues"
+            wait_until_stopped(page.server.url, None if self.json else words)
         finally:
             page.close()
         return 0
 
     def _refuse(self) -> None:
-        own = {
-            "--camera": self.camera,
-            "--intrinsics": self.intrinsics,
-            "--poses": self.poses,
-            "--fixed": self.fixed,
-            "--reachable": self.reachable,
-            "--gripper-from-camera": self.gripper_from_camera,
-            "--pose-convention": self.pose_convention,
-            "--most-age": self.most_age,
-        }
-        if self.virtual:
-            given = next((name for name, value in own.items() if value is not None), None)
-            if given is not None:
-                raise InputError(f"{given}: the virtual cell has its own; omit it or --virtual")
-        elif self.camera is None or self.poses is None:
+        names = "camera intrinsics poses pose_convention most_age reachable gripper_from_camera"
+        given = [name for name in (*names.split(), "fixed") if getattr(self, name) is not None]
+        if self.virtual and given:
+            option = f"--{given[0].replace('_', '-')}"
+            raise InputError(f"{option}: the virtual cell has its own; omit it or --virtual")
+        if not self.virtual and (self.camera is None or self.poses is None):
             missing = "--camera SOURCE" if self.camera is None else "--poses FILE"
             raise InputError(f"no {missing} given; give both, or --virtual to try it without")
         if self.fixed_intrinsics is not None and self.fixed is None:
@@ -130,7 +101,7 @@ class Studio:
             intrinsics=cell.intrinsics,
             robot=cell.robot,
             fixed_camera=cell.tripod_camera,  # of the same make, so it has the same intrinsics
-            reachable=cell.reachable_poses(_REACHABLE),
+            reachable=cell.reachable_poses(200),
             rough=nominal_mount(),
             settle_s=0.0,
             arm=lambda: joint_frames(np.array(cell.robot.joints_rad()))[:, :3, 3],
@@ -142,68 +113,30 @@ class Studio:
         from evercal.live.camera import StreamCamera
         from evercal.live.robot import PoseFileRobot
         from evercal.recordings import read_robot_poses
+        from evercal.recordings.poses.camera_file import read_camera
         from evercal.recordings.streams import is_live
         from evercal.service.studio.devices import Devices
 
         assert self.camera is not None, "checked before"
         assert self.poses is not None, "checked before"
-        rough, fixed = self.gripper_from_camera, self.fixed
+        convention, fixed = self.pose_convention, self.fixed
+        rough, fixed_intrinsics = self.gripper_from_camera, self.fixed_intrinsics
+        wrist_camera = StreamCamera(self.camera)
+        before = self.out / "wrist" / "camera.json"
+        intrinsics = self.intrinsics or (before if before.is_file() else None)
+        if intrinsics is None:
+            raise InputError("no --intrinsics FILE given: a new recording needs the intrinsics")
         reachable = None
         if self.reachable is not None:
-            convention = self.pose_convention
-            reachable = read_robot_poses(
-                self.reachable, convention, option="--pose-convention"
-            ).poses
+            poses = read_robot_poses(self.reachable, convention, option="--pose-convention")
+            reachable = poses.poses
         return Devices(
-            wrist_camera=StreamCamera(self.camera),
-            intrinsics=self._intrinsics(),
-            robot=PoseFileRobot(self.poses, self.pose_convention, self.most_age),
+            wrist_camera=wrist_camera,
+            intrinsics=read_camera(intrinsics),
+            robot=PoseFileRobot(self.poses, convention, self.most_age),
             fixed_camera=None if fixed is None else StreamCamera(fixed),
-            fixed_intrinsics=_camera(self.fixed_intrinsics),
+            fixed_intrinsics=fixed_intrinsics and read_camera(fixed_intrinsics),
             reachable=reachable,
-            rough=None if rough is None else read_transform(rough),
+            rough=rough and read_transform(rough),
             live=is_live(self.camera) and (fixed is None or is_live(fixed)),
         )
-
-    def _intrinsics(self) -> "Camera":
-        before = self.out / "wrist" / "camera.json"
-        file = self.intrinsics or (before if before.is_file() else None)
-        camera = _camera(file)
-        if camera is None:
-            raise InputError("no --intrinsics FILE given: a new recording needs the intrinsics")
-        return camera
-
-    def _command(self) -> str:
-        words: list[object] = ["evercal", "studio", *([self.map] if self.map else [])]
-        options = {
-            "--camera": self.camera,
-            "--intrinsics": self.intrinsics,
-            "--poses": self.poses,
-            "--pose-convention": self.pose_convention,
-            "--reachable": self.reachable,
-            "--gripper-from-camera": self.gripper_from_camera,
-            "--fixed": self.fixed,
-            "--fixed-intrinsics": self.fixed_intrinsics,
-            "--seed": self.seed or None,
-            "--out": self.out,
-        }
-        words += ["--virtual"] if self.virtual else []
-        for name, value in options.items():
-            words += [] if value is None else [name, value]
-        return shlex.join(map(str, words))
-
-    def _ready(self, url: str) -> None:
-        if self.json:
-            print_json({"url": url})
-            return
-        print(f"studio in {self.out} at {url}; Ctrl-C ends it, the same command continues")
-        sys.stdout.flush()
-
-
-def _camera(file: Path | None) -> "Camera | None":
-    """The intrinsics in a file that states the size of the images."""
-    if file is None:
-        return None
-    from evercal.recordings.poses.camera_file import read_camera
-
-    return read_camera(file)

@@ -1,14 +1,13 @@
 """`evercal view`."""
 
+import contextlib
 import shlex
 import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Annotated
 
 from tyro.conf import Positional, arg
@@ -27,7 +26,7 @@ class View:
     It is stopped by Ctrl-C or SIGTERM. The page has no password and is served on 127.0.0.1, unless
     --host names another address.
 
-    Example: evercal view cell.evercal tripod.json --recording samples/cell/wrist
+    Example: evercal view cell.evercal tripod.json --live 0
     """
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
@@ -43,8 +42,6 @@ class View:
     """Intrinsics of the live camera. Default: those of the camera that recorded the scene."""
     urdf: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Robot description of the arm; its base link is at the robot base."""
-    recording: Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="")] = None
-    """Recording whose frames are located, one after another."""
     host: Annotated[str, arg(metavar="H")] = "127.0.0.1"
     """Address to listen on."""
     port: Annotated[int, arg(metavar="P")] = 8080
@@ -57,59 +54,40 @@ class View:
         """Serve the page until Ctrl-C or SIGTERM."""
         if self.camera is not None and self.live is None:
             raise InputError("--camera: is that of --live, which is missing")
+        prepare_page(self.host, "sees the map and the images")
+        from evercal.service.viewer.page import Page
+
+        address = (self.host, self.port)
+        page = Page(open_map(self.store, self.device), self.calibrations, self.urdf, address)
         try:
-            from evercal.service.viewer.page import Page, ViewOptions
-        except ImportError as error:
-            raise InputError(
-                f"the view needs {error.name}; run: pip install 'evercal[view]'"
-            ) from None
-        if not is_local(self.host):
-            print(
-                f"warning: --host {self.host}: the page has no password; whoever reaches this"
-                " machine sees the map and the images",
-                file=sys.stderr,
-            )
-        options = ViewOptions(
-            calibrations=self.calibrations,
-            live=self.live,
-            camera=self.camera,
-            urdf=self.urdf,
-            recording=self.recording,
-            host=self.host,
-            port=self.port,
-        )
-        try:
-            page = Page(open_map(self.store, self.device), options)
-            try:
-                until_stopped(lambda: self._ready(page.url))
-            finally:
-                page.close()
-        except KeyboardInterrupt:
-            pass
+            if self.live is not None:
+                page.track(self.live, self.camera)
+            port = page.server.url.rpartition(":")[2]
+            tunnel = shlex.join(["ssh", "-L", f"{port}:127.0.0.1:{port}", socket.gethostname()])
+            words = f"view of {self.store} at {page.server.url} (from another machine: {tunnel})"
+            wait_until_stopped(page.server.url, None if self.json else words)
+        finally:
+            page.close()
         return 0
 
-    def _ready(self, url: str) -> None:
-        if self.json:
-            print_json({"url": url})
-            return
-        port = url.rpartition(":")[2]
-        tunnel = shlex.join(["ssh", "-L", f"{port}:127.0.0.1:{port}", socket.gethostname()])
-        print(f"view of {self.store} at {url} (from another machine: {tunnel}); Ctrl-C ends it")
-        sys.stdout.flush()
 
-
-def until_stopped(ready: Callable[[], object]) -> None:
-    """Call `ready` and return at SIGTERM or Ctrl-C."""
-    stopped = threading.Event()
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        stopped.set()
-
-    ends = (signal.SIGTERM, signal.SIGINT)
-    before = [signal.signal(number, stop) for number in ends]
+def prepare_page(host: str, danger: str) -> None:
+    """Require the extra `view`, and warn if other machines can open the page."""
     try:
-        ready()
-        stopped.wait()
-    finally:
-        for number, handler in zip(ends, before, strict=True):
-            signal.signal(number, handler)
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise InputError(f"the page needs {error.name}; run: pip install 'evercal[view]'") from None
+    if not is_local(host):
+        who = "the page has no password; whoever reaches this machine"
+        print(f"warning: --host {host}: {who} {danger}", file=sys.stderr)
+
+
+def wait_until_stopped(url: str, words: str | None) -> None:
+    """Print words, or the address as JSON, and wait for SIGTERM or Ctrl-C."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with contextlib.suppress(KeyboardInterrupt):
+        if words is None:
+            print_json({"url": url})
+        else:
+            print(f"{words}; Ctrl-C ends it", flush=True)
+        threading.Event().wait()

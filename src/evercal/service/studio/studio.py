@@ -1,243 +1,298 @@
-"""`Studio`: everything that the page can do, without the page.
-
-Samples, images and results are written when they are made. A studio that is opened on the same
-folder continues with them.
-"""
+"""`Studio`: everything that the page can do, without the page."""
 
 import time
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from evercal.calibration.calibration import Calibration, read_calibration
+from evercal.calibration.export.formats import FORMATS, export_files
+from evercal.calibration.next_views import NextViews
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.live.coverage import CoverageOptions
-from evercal.live.recorder import pose_rows
+from evercal.live.coverage import Coverage, CoverageOptions
+from evercal.live.recorder import JPEG_QUALITY, POSES, WristRecorder
 from evercal.live.robot import MovingRobot
 from evercal.map import Map
-from evercal.service.studio import results
-from evercal.service.studio.book import Proposal, SampleBook
+from evercal.recordings.images import write_jpeg
+from evercal.recordings.poses.camera_file import read_camera
 from evercal.service.studio.devices import Connection, Devices, Which
-from evercal.service.studio.fixed import FixedCamera, option_of_studio, shift_words
-from evercal.service.studio.folders import Folders
-from evercal.service.studio.steps import Facts, StepState, step_states
-from evercal.service.studio.wrist import LearnedSamples, OnStep, learn_mount, read_learned
-from evercal.storage import write_bytes
+from evercal.service.studio.samples import covered, next_view
+from evercal.storage import write_json
 
 FIXED_IMAGES = 8
 """Images of a series of the fixed camera."""
-_MOST_REFUSED = 20
-"""Proposed poses in a row that the arm may refuse."""
+
+State = tuple[Literal["waits", "to do", "done"], str]
+"""Status of a step, and what was found or what to do in one to three sentences."""
+
+OnStep = Callable[[str, float, float], Any]
 
 
 class Studio:
-    """The state of the way to a calibration.
+    """The way to a calibration, in a folder that a later studio continues with.
 
-    Args:
-        devices: cameras and robot.
-        folders: where everything is kept.
-        device: `auto`, `cpu` or `cuda`, for the map.
-
-    Raises:
-        InputError: The folder holds another recording, or something that cannot be read.
+    Actions return what was done, in one line, and raise `InputError` if it cannot be done.
     """
 
-    def __init__(self, devices: Devices, folders: Folders, device: str = "auto"):
-        self.connection, self.folders = Connection(devices), folders
-        folders.out.mkdir(parents=True, exist_ok=True)
-        self.cell = Map.open(folders.map, device=device)
-        self.book = SampleBook(folders.wrist, devices)
-        self.fixed = FixedCamera(folders, devices.fixed_intrinsics)
-        self.learned = read_learned(folders.settings)
+    def __init__(self, devices: Devices, out: Path, map: Path | None = None, device: str = "auto"):
+        self.connection, self.out = Connection(devices), out
+        out.mkdir(parents=True, exist_ok=True)
+        self.cell = Map.open(map or out / "map", device=device)
+        self.recorder = WristRecorder(out / "wrist", devices.intrinsics)
+        self.mount = devices.rough
+        """gripper_from_camera, rough or calibrated; None if nothing is known."""
+        self._refused: list[SE3] = []
+        self._fixed_camera = out / "fixed_camera.json"
+        if devices.fixed_intrinsics is not None:
+            write_json(self._fixed_camera, asdict(devices.fixed_intrinsics))
         self.calibrations: dict[Which, Calibration] = {}
-        if devices.reachable is not None:
-            write_bytes(folders.reachable, pose_rows(devices.reachable).encode())
         for which in ("wrist", "fixed"):
-            self._read(which)
+            path = self.calibration_file(which)
+            found = read_calibration(path) if path.is_file() else None
+            if found is not None and found.source.get("scene") in self.cell.scenes:
+                self._keep(which, found)
+
+    def calibration_file(self, which: Which) -> Path:
+        """Calibration of a camera."""
+        return self.out / f"{which}.json"
 
     @property
-    def devices(self) -> Devices:
-        """Cameras and robot."""
-        return self.connection.devices
+    def can_move(self) -> bool:
+        """Whether the arm moves on request."""
+        return isinstance(self.connection.devices.robot, MovingRobot)
 
     @property
-    def gripper_from_camera(self) -> SE3 | None:
-        """The mount, calibrated or rough."""
+    def scene(self) -> str | None:
+        """The scene that was learned from the recording; None before."""
         found = self.calibrations.get("wrist")
-        return self.devices.rough if found is None else found.parent_from_child
+        return None if found is None else str(found.source["scene"])
 
     @property
-    def scene(self) -> str:
-        """Name of the scene that the recording is learned as."""
-        return self.folders.wrist.name if self.learned is None else self.learned.scene
+    def samples_changed(self) -> bool:
+        """Whether samples were added or removed since they were learned."""
+        files = self.out / "wrist" / POSES, self.calibration_file("wrist")
+        times = [file.stat().st_mtime_ns for file in files if file.is_file()]
+        return len(times) < 2 or times[0] > times[1]
 
-    def facts(self) -> Facts:
-        """What the steps depend on."""
-        seen = self.connection.seen
-        verdicts = {which: found.verdict for which, found in self.calibrations.items()}
-        learned = self.learned
-        return Facts(
-            connected=seen.complete,
-            connection_problem=seen.camera_problem or seen.robot_problem,
-            coverage=self.book.coverage(self.gripper_from_camera),
-            mount_verdict=verdicts.get("wrist"),
-            samples_changed=learned is None or set(learned.samples) != set(self.book.names),
-            scenes=len(self.cell.scenes),
-            has_fixed=self.devices.fixed_camera is not None,
-            fixed_images=len(self.fixed.files),
-            fixed_verdict=option_of_studio(verdicts.get("fixed")),
-            exported=len(list((self.folders.out / "export").glob("*"))),
-        )
+    @property
+    def fixed_images(self) -> list[Path]:
+        """Images of the fixed camera, in order."""
+        return sorted((self.out / "fixed").glob("*.jpg"))
 
-    def steps(self) -> tuple[StepState, ...]:
-        """All steps in order."""
-        return step_states(self.facts())
+    def coverage(self) -> Coverage:
+        """What the samples cover."""
+        return covered(self.recorder.frames, self.mount)
+
+    def bad_samples(self) -> list[str]:
+        """Names of the samples with problems."""
+        return [row.name for row in self.coverage().samples if row.problems]
+
+    def next_view(self) -> NextViews | None:
+        """The next best view of the camera on the gripper."""
+        reachable = self.connection.devices.reachable
+        return next_view(self.recorder.frames, self.mount, reachable, self._refused)
 
     def take_sample(self) -> str:
-        """Record image and pose; returns what was done, as all of the following methods.
-
-        Raises:
-            InputError: No image or pose, or the arm moves.
-        """
-        frame = self.book.add(*self.connection.sample())
-        row = self.book.coverage().samples[-1]
-        problems = f", {'; '.join(row.problems)}: better remove it" if row.problems else ""
-        return f"Took sample {frame.name}{problems}."
+        """Record image and pose."""
+        name = self.recorder.add(*self.connection.sample()).name
+        bad = "; ".join(self.coverage().samples[-1].problems)
+        return f"Took sample {name}{f', {bad}: better remove it' if bad else ''}."
 
     def remove(self, *names: str) -> str:
         """Remove samples."""
         for name in names:
-            self.book.remove(name)
+            self.recorder.remove(name)
         return f"Removed {', '.join(names)}." if names else "There is no bad sample."
 
-    def proposal(self) -> Proposal | None:
-        """The next best view."""
-        return self.book.proposal(self.gripper_from_camera)
-
     def move_to(self, base_from_gripper: SE3) -> str:
-        """Move the arm.
-
-        Raises:
-            InputError: The pose is out of reach, or this robot does not move on request.
-        """
-        robot = self.devices.robot
+        """Move the arm."""
+        robot = self.connection.devices.robot
         if not isinstance(robot, MovingRobot):
             raise InputError("this robot does not move on request; move it by hand")
         try:
             robot.move_to(base_from_gripper)
         except InputError:
-            self.book.refuse(base_from_gripper)
+            self._refused.append(base_from_gripper)
             raise
-        time.sleep(self.devices.settle_s)
+        time.sleep(self.connection.devices.settle_s)
         self.connection.look(None)
         return "The arm is there."
 
     def record(self, on_step: OnStep, stopping: Callable[[], bool] = lambda: False) -> str:
         """Move from one best view to the next and take samples until nothing is missing."""
-        refused, wanted = 0, CoverageOptions().images
-        if not self.book.frames:
+        wanted = CoverageOptions().images
+        if not self.recorder.frames:
             self.take_sample()
         while not stopping():
-            covered, proposal = self.book.coverage(self.gripper_from_camera), self.proposal()
-            good = sum(not row.problems for row in covered.samples)
-            if not covered.missing or proposal is None or good >= 2 * wanted:
+            reached, view = self.coverage(), self.next_view()
+            good = sum(not row.problems for row in reached.samples)
+            if not reached.missing or view is None or good >= 2 * wanted:
                 break
             on_step(f"recording, {good} good images", min(good, wanted), wanted)
             try:
-                self.move_to(proposal.base_from_gripper)
-            except InputError:
-                refused += 1
-                if refused > _MOST_REFUSED:
-                    raise
+                self.move_to(view.poses[0])
+            except InputError:  # out of reach, and never proposed again
                 continue
-            refused = 0
             self.take_sample()
-        return f"{len(self.book.frames)} samples are recorded."
+        return f"{len(self.recorder.frames)} samples are recorded."
 
     def learn(self, on_step: OnStep) -> str:
         """Learn the recording and calibrate the camera on the gripper.
 
-        Raises:
-            InputError: The recording cannot be used.
+        The scene that the studio learned before is replaced once the new one is in the map.
         """
-        names = self.book.names
-        found, scene = learn_mount(self.cell, self.folders, self.learned, on_step)
-        self.learned = LearnedSamples(scene, names)
-        self.learned.write(self.folders.settings)
-        self.calibrations["wrist"] = found
-        return f"Learned {len(names)} images; wrote {self.folders.calibration('wrist')}."
+        old, cell, path = self.scene, self.cell, self.calibration_file("wrist")
+        scene = _free_name("wrist", cell.scenes)
+        report = cell.learn(self.out / "wrist", name=scene, on_progress=on_step)
+        if old is not None:
+            cell.remove(old)
+            cell.rename(scene, old)
+            scene = old
+        assert report.hand_eye is not None, "the recording states gripper poses"
+        scenes = cell.localizer.contents.scenes
+        camera = next(found.adjusted_camera for found in scenes if found.name == scene)
+        calibration = report.hand_eye.calibration(camera, scene, report.train_frames)
+        calibration.write(path)
+        self._keep("wrist", calibration)
+        return f"Learned {report.train_frames} images; wrote {path}."
 
     def take_fixed(self) -> str:
-        """Take an image of the fixed camera.
-
-        Raises:
-            InputError: There is no fixed camera, or no image.
-        """
-        return f"Took image {self.fixed.add(self.connection.image('fixed')).name}."
+        """Take an image of the fixed camera."""
+        image, folder = self.connection.image("fixed"), self.out / "fixed"
+        folder.mkdir(exist_ok=True)
+        number = max((int(path.stem) for path in self.fixed_images), default=-1) + 1
+        write_jpeg(folder / f"{number:04d}.jpg", image, JPEG_QUALITY)
+        return f"Took image {number:04d}.jpg."
 
     def take_fixed_series(self, on_step: OnStep, move: bool) -> str:
         """Take several images; the arm may go to poses of samples, so that it hides other parts."""
-        poses = list(self.book.poses) if move else []
+        poses = [frame.base_from_gripper for frame in self.recorder.frames] if move else []
         for i in range(FIXED_IMAGES):
             on_step("taking images", i, FIXED_IMAGES)
-            if poses:
-                self.move_to(poses[i * len(poses) // FIXED_IMAGES])
+            pose = poses[i * len(poses) // FIXED_IMAGES] if poses else None
+            if pose is not None:
+                self.move_to(pose)
             self.take_fixed()
         return f"Took {FIXED_IMAGES} images."
 
-    def calibrate_fixed(self, on_step: OnStep) -> str:
-        """Calibrate the fixed camera.
+    def clear_fixed(self) -> str:
+        """Remove all images of the fixed camera, such as after it was moved."""
+        for path in self.fixed_images:
+            path.unlink()
+        return "Removed all images."
 
-        Raises:
-            InputError: No image, or none was located.
-        """
-        total, done = len(self.fixed.files), iter(range(1, len(self.fixed.files) + 1))
-        on_step("locating images", 0, total)
-        found = self.fixed.calibrate(
-            self.cell, lambda: on_step("locating images", next(done, total), total)
+    def calibrate_fixed(self, on_step: OnStep) -> str:
+        """Calibrate the fixed camera."""
+        files, given = self.fixed_images, self._fixed_camera
+        if not files:
+            raise InputError("no image of the fixed camera yet; take one first")
+        on_step("locating images", 0, len(files))
+        found = self.cell.calibrate(
+            files,
+            camera=read_camera(given) if given.is_file() else None,
+            mount="eye_to_hand",
         )
-        self.calibrations["fixed"] = found
-        return f"Calibrated the fixed camera; wrote {self.folders.calibration('fixed')}."
+        found = replace(found, source={**found.source, "store": str(self.cell.path)})
+        found.write(self.calibration_file("fixed"))
+        self._keep("fixed", found)
+        return f"Calibrated the fixed camera; wrote {self.calibration_file('fixed')}."
 
     def check_fixed(self) -> str:
-        """Test with a new image whether the fixed camera has moved.
+        """Test with a new image whether the fixed camera has moved."""
+        reference, image = self._made("fixed"), self.connection.image("fixed")
+        shift = self.cell.check([image], reference)
+        size = f"{shift.translation_mm:.2f} mm and {shift.rotation_deg:.3f} deg"
+        if not shift.moved:
+            return f"The camera has not moved: it is within {size} of its calibration."
+        sure = f"{100 * shift.confidence:.1f} %"
+        return f"The camera has moved by {size} (confidence {sure}). Calibrate it again."
 
-        Raises:
-            InputError: It is not calibrated, or the image was not located.
-        """
-        reference, image = self.calibration("fixed"), self.connection.image("fixed")
-        return shift_words(self.fixed.check(self.cell, image, reference))
+    def export(self, which: Which, format: str) -> str:
+        """Export a calibration in a format of `evercal export`."""
+        calibration, folder = self._made(which), self.out / "export"
+        folder.mkdir(exist_ok=True)
+        # Formats share endings; easy_handeye2 looks files up by their name.
+        name = which if format == "easy_handeye2" else f"{which}_{format}"
+        options: dict[str, Any] = {}
+        if which == "wrist" and FORMATS[format].per_image:
+            options["robot_poses"] = self.out / "wrist" / POSES
+        path = folder / f"{name}{FORMATS[format].ending}"
+        files = export_files(calibration, format, path, **options).files
+        return f"Wrote {', '.join(map(str, files))}."
 
-    def calibration(self, which: Which) -> Calibration:
-        """A calibration that was made.
-
-        Raises:
-            InputError: There is none.
-        """
+    def _made(self, which: Which) -> Calibration:
         if which not in self.calibrations:
             raise InputError(f"the {which} camera is not calibrated yet")
         return self.calibrations[which]
 
-    def export(self, which: Which, format: str) -> str:
-        """Export a calibration in a format of `evercal export`.
+    def _keep(self, which: Which, calibration: Calibration) -> None:
+        self.calibrations[which] = calibration
+        if which == "wrist":
+            self.mount = calibration.parent_from_child
 
-        Raises:
-            InputError: The format needs something that the studio does not have.
-        """
-        files = results.export(self.folders, which, self.calibration(which), format)
-        return f"Wrote {', '.join(map(str, files))}."
 
-    def report(self, which: Which) -> str:
-        """Write the HTML report of a calibration."""
-        localizer: Any = self.cell.localizer if self.cell.scenes else None
-        path = results.report(self.folders, which, self.calibration(which), localizer)
-        return f"Wrote {path}."
+def _free_name(name: str, taken: tuple[str, ...]) -> str:
+    """A name that no scene has: `name`, or `name-2` and so on."""
+    numbered = (f"{name}-{number}" for number in range(2, len(taken) + 2))
+    return name if name not in taken else next(free for free in numbered if free not in taken)
 
-    def _read(self, which: Which) -> None:
-        """Continue with a calibration of an earlier session whose scene is in the map."""
-        path: Path = self.folders.calibration(which)
-        if path.is_file():
-            found = read_calibration(path)
-            if found.source.get("scene") in self.cell.scenes:
-                self.calibrations[which] = found
+
+def _connect(studio: Studio) -> State:
+    if studio.connection.complete:
+        return "done", "Images and gripper poses arrive."
+    problems = studio.connection.problems
+    return "to do", problems.get("wrist") or problems.get("robot") or "Waiting for image and pose."
+
+
+def _record(studio: Studio) -> State:
+    covered = studio.coverage()
+    if covered.samples:
+        return "done" if covered.ready else "to do", covered.verdict
+    if not studio.connection.complete:
+        return "waits", "Connect the camera and the robot first."
+    return "to do", "Move the arm until the camera sees the work area; take the first sample."
+
+
+def _learn(studio: Studio) -> State:
+    found, covered = studio.calibrations.get("wrist"), studio.coverage()
+    if found is not None and not studio.samples_changed:
+        return "done", found.verdict
+    if not covered.ready:
+        return "waits", "The recording cannot be learned yet."
+    if found is not None:
+        return "to do", "The samples have changed since: learn them again."
+    return "to do", f"{len(covered.samples)} images are ready to be learned."
+
+
+def _fixed(studio: Studio) -> State:
+    images, found = len(studio.fixed_images), studio.calibrations.get("fixed")
+    if not studio.cell.scenes:
+        return "waits", "Learn the scene first."
+    if found is not None:
+        return "done", found.verdict.replace("--camera", "--fixed-intrinsics")
+    if studio.connection.devices.fixed_camera is None:
+        return "waits", "No fixed camera was given; restart with --fixed SOURCE, or go on."
+    if not images:
+        return "to do", "Take images of the scene, 5 to 10."
+    return "to do", f"{images} images; take more, or calibrate."
+
+
+def _export(studio: Studio) -> State:
+    if not studio.calibrations:
+        return "waits", "There is no calibration to export yet."
+    exported = len(list((studio.out / "export").glob("*")))
+    if exported:
+        return "done", f"{exported} files were exported."
+    return "to do", "Choose a camera and a format."
+
+
+STEPS: dict[str, Callable[[Studio], State]] = {
+    "1 Connect": _connect,
+    "2 Record": _record,
+    "3 Learn": _learn,
+    "4 Fixed": _fixed,
+    "5 Export": _export,
+}
+"""All steps in order, each with its state."""

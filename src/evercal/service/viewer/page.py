@@ -1,156 +1,178 @@
-"""The page: a server of viser with the map, calibrations, robot, recording and stream."""
+"""The page of `evercal view`: a map with calibrations, the arm and a tracked camera."""
 
 import contextlib
 import io
 import socket
-from dataclasses import dataclass
+import threading
+from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
 
+import numpy as np
 import viser
 
-from evercal.calibration.calibration import Calibration
+from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.live.camera import StreamCamera
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker
-from evercal.recordings import load_recording
-from evercal.recordings.frame import Frame
 from evercal.recordings.poses.camera_file import read_camera
-from evercal.reports.scene.frusta import Ellipsoid, readable_scale
-from evercal.service.viewer.calibrations import read_views
-from evercal.service.viewer.drawn import DrawnCalibrations
-from evercal.service.viewer.live import Live, open_source
-from evercal.service.viewer.names import add_names
-from evercal.service.viewer.panel import CalibrationPanel, KeyframePanel, MapPanel
-from evercal.service.viewer.playback import Playback
-from evercal.service.viewer.robot import Robot
-from evercal.service.viewer.stage import Stage
+from evercal.reports.answers import unit_known
+from evercal.reports.scene.frusta import Frustum
+from evercal.reports.scene.map_parts import THUMBNAIL_PX, ColourBy, KeyframeView, resized
+from evercal.service.viewer.drawing import DrawnMap, add_base, add_calibrations, add_frustum, place
+from evercal.service.viewer.html import GREEN, calibration_rows, chip_html, rows_html
+from evercal.service.viewer.robot import add_arm
+
+_THROUGH = "/through"
 
 
-@dataclass(frozen=True)
-class ViewOptions:
-    """What is shown beside the map, and where the page is."""
+class Page:
+    """A page of a map that is being served; `close` ends it. Port 0 is any free one."""
 
-    calibrations: tuple[Path, ...] = ()
-    """Calibration files."""
-    live: str | None = None
-    """Source that is tracked, as for `recordings.streams.stream`."""
-    camera: Path | None = None
-    """Intrinsics of the live camera; those of the scene if omitted."""
-    urdf: Path | None = None
-    """The arm."""
-    recording: Path | None = None
-    """Recording whose frames are located."""
-    host: str = "127.0.0.1"
-    """Address to listen on."""
-    port: int = 8080
-    """0 for any free port."""
+    def __init__(
+        self,
+        localizer: Localizer,
+        calibrations: Sequence[Path] = (),
+        urdf: Path | None = None,
+        address: tuple[str, int] = ("127.0.0.1", 0),
+    ):
+        self._localizer, self._closed = localizer, threading.Event()
+        given = {str(path): read_calibration(path) for path in calibrations}
+        self.server = start_server(*address, "evercal view")
+        try:
+            scenes, server = localizer.contents.scenes, self.server
+            self.map = DrawnMap(server, scenes, self.look_through)
+            gripper = add_base(server, 2.5 * self.map.extent_m)
+            default, size_m = scenes[0].adjusted_camera, self.map.frustum_m
+            add_calibrations(server, given, self.map, default, size_m)
+            self._begin_behind(scenes[0].name)
+            self._add_controls(given)
+            if urdf is not None:
+                hands = [c.parent_frame for c in given.values() if c.mount == "eye_in_hand"]
+                add_arm(server, urdf, gripper, hands)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Stop tracking and the server."""
+        self._closed.set()
+        self.server.stop()
+
+    def track(self, source: str, intrinsics: Path | None = None) -> None:
+        """Show a camera, a video or a folder as it is tracked; by default with the map's camera."""
+        camera = StreamCamera(source)
+        height, width = camera.read()[1].shape[:2]
+        given = None if intrinsics is None else read_camera(intrinsics, (width, height))
+        tracker = Tracker(self._localizer, given)
+        threading.Thread(target=self._track, args=(camera, tracker), daemon=True).start()
+
+    def look_through(self, view: KeyframeView, client: viser.ClientHandle) -> None:
+        """Show a visitor what a keyframe shows: its image stands behind its landmarks."""
+        backdrop, pose = view.backdrop, view.frustum.base_from_camera
+        with client.atomic():
+            client.scene.add_image(
+                _THROUGH,
+                view.image,
+                backdrop.width_m,
+                backdrop.height_m,
+                wxyz=pose.rotation_wxyz,
+                position=backdrop.centre_m,
+            )
+            client.camera.position, client.camera.wxyz = pose.translation_m, pose.rotation_wxyz
+            client.camera.fov = view.frustum.fov_rad
+        self.map.show_keyframes(False)  # they stand before the landmarks
+
+    def look_from_above(self, client: viser.ClientHandle) -> None:
+        """Bring a visitor back to the first view."""
+        first = self.server.initial_camera
+        with client.atomic():
+            client.scene.remove_by_name(_THROUGH)
+            client.camera.up_direction, client.camera.fov = (0.0, 0.0, 1.0), first.fov
+            client.camera.position, client.camera.look_at = first.position, first.look_at
+        self.map.show_keyframes(True)
+
+    def _begin_behind(self, scene: str) -> None:
+        """Begin above and behind the keyframes of a scene."""
+        poses = SE3.stack([view.frustum.base_from_camera for view in self.map.keyframes[scene]])
+        ahead = poses.rotation_matrix()[:, :, 2].mean(0) * (1, 1, 0)
+        camera, middle = self.server.initial_camera, poses.translation_m.mean(0)
+        camera.position = middle + self.map.extent_m * (np.array([0, 0, 0.4]) - 0.6 * ahead)
+        camera.look_at = middle
+
+    def _add_controls(self, given: dict[str, Calibration]) -> None:
+        gui, drawn = self.server.gui, self.map
+        keyframes = sum(map(len, drawn.keyframes.values()))
+        landmarks = sum(map(len, drawn.landmarks.values()))
+        with gui.add_folder("Map"):
+            counts = [("keyframes", f"{keyframes}, click one"), ("landmarks", f"{landmarks:,}")]
+            gui.add_html(rows_html(counts))
+            scene = gui.add_dropdown("Scene", tuple(drawn.keyframes))
+            colour = gui.add_dropdown("Colour", get_args(ColourBy))
+            back = gui.add_button("Back to the overview")
+        scene.on_update(lambda _: drawn.show(scene.value))
+        colour.on_update(lambda _: drawn.colour_by(colour.value))
+        back.on_click(lambda event: event.client and self.look_from_above(event.client))
+        for name, calibration in given.items():
+            with gui.add_folder(name):
+                gui.add_html(rows_html(calibration_rows(calibration)))
+
+    def _track(self, camera: StreamCamera, tracker: Tracker) -> None:
+        """Show where a camera is, while the page is open somewhere."""
+        server, scenes = self.server, self._localizer.contents.scenes
+        frustum = Frustum.of(SE3.identity(), tracker.camera or scenes[0].adjusted_camera)
+        node = add_frustum(server, "/live", frustum, 1.3 * self.map.frustum_m, GREEN)
+        place(node, None)
+        with server.gui.add_folder("Live"):
+            text = server.gui.add_html("")
+        while not self._closed.is_set():
+            if not server.get_clients():
+                self._closed.wait(0.1)
+                continue
+            try:
+                stamp_s, image = camera.read()
+                tracked = tracker.track(image, stamp_s)
+            except InputError as error:  # such as the end of a video
+                text.content += chip_html("ended", str(error))
+                break
+            estimate = tracked.estimate
+            pose = estimate.uncertain_pose if estimate.status == "ok" else None
+            place(node, pose and pose.pose)
+            rows = [("time", f"{estimate.milliseconds:.0f} ms")]
+            if pose is not None:
+                self.map.show(str(estimate.scene))
+                node.image = resized(image, THUMBNAIL_PX)
+                rows.append(("scene", str(estimate.scene)))
+                if unit_known(self._localizer, estimate.scene):
+                    x, y, z = 1000 * pose.pose.translation_m
+                    rows.append(("position", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"))
+                    rows.append(("1 sigma per axis", f"{pose.sigma_mm:.2g} mm"))
+            chip = chip_html(tracked.state, estimate.reason)
+            text.content = chip + rows_html(rows)
+        camera.close()
 
 
 class _Server(viser.ViserServer):
-    """A server that is not shared over viser's public relay, whatever a visitor asks for."""
+    """A silent server that is not shared over viser's public relay, whatever a visitor asks."""
+
+    @property
+    def url(self) -> str:
+        """Address that a browser on this machine opens."""
+        host = self.get_host()
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.get_port()}"
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
 
-
-class Page:
-    """A page that is being served; `close` ends it.
-
-    Args:
-        localizer: The map.
-        options: What is shown.
-
-    Raises:
-        InputError: A file that cannot be read, a source that cannot be opened, or a port that
-            cannot be used.
-    """
-
-    def __init__(self, localizer: Localizer, options: ViewOptions):
-        scenes = localizer.contents.scenes
-        views = read_views(options.calibrations, scenes[0].adjusted_camera)
-        recording = None if options.recording is None else load_recording(options.recording)
-        source = None if options.live is None else open_source(options.live)
-        self.server = start_server(options.host, options.port)
-        try:
-            self._robot = None if options.urdf is None else Robot(self.server, options.urdf)
-            self.stage = stage = Stage(self.server, scenes)
-            scale = readable_scale([Ellipsoid.of(v.calibration.uncertain_pose) for v in views])
-            self._calibrations = DrawnCalibrations(stage, views, scale)
-            self._parts: list[Playback | Live] = []
-            panel = MapPanel(stage, self._redraw)
-            if source is not None and options.live is not None:
-                frames, size = source
-                camera = None if options.camera is None else read_camera(options.camera, size)
-                tracker = Tracker(localizer, camera)
-                self._parts.append(Live(stage, options.live, frames, tracker, panel.follow))
-            if recording is not None:
-                hand = gripper_from_camera([view.calibration for view in views])
-                self._parts.append(
-                    Playback(stage, recording, localizer, hand, panel.follow, self._move)
-                )
-            KeyframePanel(stage, panel)
-            CalibrationPanel(stage, self._calibrations, scale, self._resize)
-            self._resize(scale)
-            self._calibrations.move(self._gripper(None))
-        except BaseException:
-            self.close()
-            raise
-        for part in self._parts:
-            part.start()
-
-    @property
-    def url(self) -> str:
-        """Address of the page."""
-        return address_of(self.server)
-
-    def close(self) -> None:
-        """Stop threads and server."""
-        for part in getattr(self, "_parts", ()):
-            part.close()
+    def stop(self) -> None:
         with contextlib.redirect_stdout(io.StringIO()):
-            self.server.stop()
-
-    def _resize(self, scale: float) -> None:
-        self._calibrations.resize(scale)
-        for part in self._parts:
-            part.panel.resize(scale)
-
-    def _redraw(self) -> None:
-        self._calibrations.show()
-        for part in self._parts:
-            part.panel.redraw()
-
-    def _move(self, frame: Frame) -> None:
-        """Put arm and gripper where they were at a frame."""
-        if self._robot is not None:
-            self._robot.move(frame.joints_rad)
-        self._calibrations.move(self._gripper(frame))
-
-    def _gripper(self, frame: Frame | None) -> SE3 | None:
-        """Pose of the gripper: stated by the frame, or that of the link that calibrations name."""
-        if frame is not None and frame.base_from_gripper is not None:
-            return frame.base_from_gripper
-        names = {v.calibration.parent_frame for v in self._calibrations.views if v.on_gripper}
-        links = [self._robot.base_from_link(name) for name in names] if self._robot else []
-        return next((link for link in links if link is not None), None)
+            super().stop()
 
 
-def gripper_from_camera(calibrations: list[Calibration]) -> SE3 | None:
-    """The camera on the gripper, if exactly one calibration is of one."""
-    hands = [c.parent_from_child for c in calibrations if c.mount == "eye_in_hand"]
-    return hands[0] if len(hands) == 1 else None
-
-
-def address_of(server: viser.ViserServer) -> str:
-    """Address that a browser on this machine opens."""
-    host = server.get_host()
-    host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, host)
-    host = f"[{host}]" if ":" in host and not host.startswith("[") else host
-    return f"http://{host}:{server.get_port()}"
-
-
-def start_server(host: str, port: int, label: str = "evercal view") -> viser.ViserServer:
+def start_server(host: str, port: int, label: str) -> _Server:
     """An empty page with z up.
 
     Raises:
@@ -158,28 +180,14 @@ def start_server(host: str, port: int, label: str = "evercal view") -> viser.Vis
     """
     if not 0 <= port <= 65_535:
         raise InputError(f"--port {port}: give 0 to 65535")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM
-        )[0]
-        with socket.socket(family, kind, protocol) as trial:
-            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            trial.bind(address)
+        socket.create_server((host, port), family=family).close()
     except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"--host {host} --port {port}: {reason}; give another one") from None
+        raise InputError(f"--host {host} --port {port}: {error.strerror or error}") from None
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints a frame with its address
         server = _Server(host, port, label=label, verbose=False)
-    if port and server.get_port() != port:
-        with contextlib.redirect_stdout(io.StringIO()):
-            server.stop()
-        raise InputError(f"--host {host} --port {port}: Address already in use; give another one")
     server.gui.configure_theme(
-        dark_mode=True,
-        show_logo=False,
-        show_share_button=False,
-        control_width="large",
-        brand_color=(37, 99, 235),
+        dark_mode=True, show_logo=False, show_share_button=False, control_width="large"
     )
-    add_names(server, label)
     return server

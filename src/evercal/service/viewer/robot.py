@@ -1,68 +1,49 @@
 """The arm in the scene, by its URDF (extra `urdf`)."""
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import viser
 
 from evercal.errors import InputError
-from evercal.geometry import SE3
 from evercal.recordings.poses.kinematics import RobotModel
+from evercal.service.viewer.drawing import place
 
 
-class Robot:
-    """An arm whose base link is at the robot base.
+def add_arm(
+    server: viser.ViserServer, path: Path, gripper: viser.FrameHandle, links: Sequence[str]
+) -> list[viser.GuiSliderHandle[float]]:
+    """Add an arm at the robot base, and a slider for each joint, which are returned.
 
-    Args:
-        server: The page.
-        path: The URDF; meshes are searched beside it.
+    `gripper` is a node that moves with the first of `links` that the arm has.
 
     Raises:
-        InputError: The extra `urdf` is not installed, the file is missing or no URDF, or a mesh
-            cannot be read.
+        InputError: The extra `urdf` is not installed, or the URDF or a mesh cannot be read.
     """
+    model = RobotModel(path)  # reports what is wrong in the file
+    from viser.extras import ViserUrdf
 
-    def __init__(self, server: viser.ViserServer, path: Path):
-        model = RobotModel(path)  # reports what is wrong with the file
-        import yourdfpy  # pyright: ignore[reportMissingImports]
-        from viser.extras import ViserUrdf
+    link = next((link for link in links if link in model.links), None)
+    server.scene.add_frame("/robot", show_axes=False)
+    try:
+        shown = ViserUrdf(server, path, root_node_name="/robot")
+    except Exception as error:  # trimesh raises many types for broken meshes
+        text = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise InputError(f"{path}: cannot be drawn ({text}); check its meshes") from None
+    limits, sliders = shown.get_actuated_joint_limits(), []
 
-        self.path, self.links = path, model.links
-        handler = partial(yourdfpy.filename_handler_magic, dir=path.parent)
-        try:
-            self._urdf: Any = yourdfpy.URDF.load(str(path), filename_handler=handler)
-            server.scene.add_frame("/robot", show_axes=False)
-            self._shown = ViserUrdf(server, self._urdf, root_node_name="/robot")
-        except Exception as error:  # trimesh raises many types for broken meshes
-            text = " ".join(str(error).split())[:200]
-            raise InputError(
-                f"{path}: cannot be drawn ({type(error).__name__}: {text}); check its meshes"
-            ) from None
-        self.joints: tuple[str, ...] = tuple(self._urdf.actuated_joint_names)
-        self.move(None)
+    def move() -> None:
+        values = np.array([slider.value for slider in sliders])
+        shown.update_cfg(values)
+        if link is not None:
+            place(gripper, model.poses(tuple(limits), values[None], None, link)[0][0])
 
-    def move(self, joints_rad: Sequence[float] | None) -> None:
-        """Put the arm at joint values, in the order of the URDF.
-
-        Joints without a value, such as fingers, and all joints for None, are at 0.
-
-        Raises:
-            InputError: More values than joints.
-        """
-        values = np.zeros(len(self.joints))
-        given = () if joints_rad is None else joints_rad
-        if len(given) > len(values):
-            raise InputError(
-                f"{self.path}: has {len(values)} joints, the recording states {len(given)}"
-            )
-        values[: len(given)] = given
-        self._shown.update_cfg(values)
-
-    def base_from_link(self, link: str) -> SE3 | None:
-        """Pose of a link at the current joints; None if there is none of this name."""
-        if link not in self.links:
-            return None
-        return SE3.from_matrix(self._urdf.get_transform(link, self._urdf.base_link))
+    with server.gui.add_folder("Arm", expand_by_default=False):
+        for name, (low, high) in limits.items():
+            least, most = -np.pi if low is None else low, np.pi if high is None else high
+            start = min(max(0.0, least), most)
+            sliders.append(server.gui.add_slider(name, least, most, 0.01, start))
+            sliders[-1].on_update(lambda _: move())
+    move()
+    return sliders

@@ -1,10 +1,8 @@
-"""Points, colours and shapes of the 3D view, against the geometry that defines them."""
+"""Points, colours and shapes of scenes in 3D, against the geometry that defines them."""
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +17,6 @@ from evercal.reports.scene.map_parts import (
     Landmarks3D,
     keyframe_views,
     resized,
-    shares,
 )
 
 SIMILARITY = Similarity(SE3.exp([0.3, -0.2, 0.5, 0.4, -0.8, 0.2]), 2.5)
@@ -73,11 +70,6 @@ def test_colours_by_a_value_rise_with_it(hall_map: MapContents) -> None:
         green = colours[:, 1].astype(int)  # of viridis, it never falls
         assert (np.diff(green[np.argsort(values)]) >= 0).all()
     assert len(Landmarks3D.of(hall_map.scenes[0], 0).colours("height")) == 0
-
-
-def test_shares_are_proportional_and_fit() -> None:
-    assert shares([10, 30], 100) == [10, 30]
-    assert shares([100, 300], 100) == [25, 75]
 
 
 def test_backdrop_shows_each_pixel_where_the_camera_sees_it() -> None:
@@ -142,40 +134,3 @@ def test_the_scale_is_round_and_draws_at_most_five_centimetres(mm: float, scale:
 def test_resizing_keeps_the_aspect_ratio() -> None:
     assert resized(np.zeros((48, 64, 3), np.uint8), 640).shape == (480, 640, 3)
     assert resized(np.zeros((480, 640, 3), np.uint8), 160).shape == (120, 160, 3)
-
-
-def test_the_nearest_camera_on_a_ray_is_chosen() -> None:
-    pytest.importorskip("viser")
-    from evercal.service.viewer.camera_set import first_hit, pyramid
-
-    ahead = [Frustum(SE3.from_translation((0, 0, z)), 1.0, 1.3) for z in (2.0, 1.0, 3.0)]
-    points = np.stack([pyramid(frustum, 0.1) for frustum in ahead])
-    hit = first_hit(points, np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    assert hit is not None
-    assert hit[1] == 1
-    np.testing.assert_allclose(hit[0], 1.0, atol=1e-6)
-    assert first_hit(points, np.zeros(3), np.array([0.0, 1.0, 0.0])) is None
-
-
-def test_images_of_one_texture_keep_their_places() -> None:
-    from evercal.service.viewer.glb import MOST_PX, atlas, images_glb
-
-    colours = [(250, 0, 0), (0, 250, 0), (0, 0, 250), (90, 90, 90), (250, 250, 0)]
-    images = [np.full((60, 80, 3), colour, np.uint8) for colour in colours]
-    whole, places = atlas(images, 40)
-    assert whole.shape == (60, 120, 3)
-    for colour, corners in zip(colours, places, strict=True):
-        left, top = corners[0] * whole.shape[1::-1]
-        right, bottom = corners[2] * whole.shape[1::-1]
-        part = whole[int(top) : int(bottom), int(left) : int(right)]
-        assert (part == colour).all()
-    many, _ = atlas([np.zeros((3, 4, 3), np.uint8)] * 1000, 160)
-    assert max(many.shape) <= MOST_PX
-    trimesh: Any = pytest.importorskip("trimesh")
-
-    corners_m = np.random.default_rng(0).normal(size=(5, 4, 3)).astype(np.float32)
-    file = io.BytesIO(images_glb(corners_m, images, 40))
-    (mesh,) = trimesh.load_scene(file, file_type="glb").geometry.values()
-    np.testing.assert_array_equal(mesh.vertices, corners_m.reshape(-1, 3))
-    assert mesh.faces.shape == (10, 3)
-    np.testing.assert_allclose(mesh.visual.uv[:, 0], places.reshape(-1, 2)[:, 0], atol=1e-6)

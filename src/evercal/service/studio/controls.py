@@ -1,0 +1,210 @@
+"""The panel beside the scene: a picture, the outcome of tasks, and a tab for each step."""
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+
+from evercal.calibration.export.formats import FORMATS
+from evercal.calibration.next_views import NextViews
+from evercal.errors import InputError
+from evercal.live.coverage import CoverageOptions
+from evercal.service.studio.devices import Which
+from evercal.service.studio.studio import FIXED_IMAGES, STEPS, Studio
+from evercal.service.viewer.html import (
+    calibration_rows,
+    chip_html,
+    rows_html,
+)
+
+_CAMERAS: dict[str, Which] = {"camera on the gripper": "wrist", "fixed camera": "fixed"}
+
+
+class Tasks:
+    """Runs one task at a time in a thread, and calls `changed` when there is something to show."""
+
+    def __init__(self, changed: Callable[[], Any]):
+        self._changed, self._running = changed, threading.Lock()
+        self.stop = threading.Event()
+        """Asks the running task to stop after its present step."""
+        self.message, self.failed, self.progress = "", False, 0.0
+
+    @property
+    def busy(self) -> bool:
+        """Whether a task runs."""
+        return self._running.locked()
+
+    def start(self, what: str, task: Callable[[], str]) -> bool:
+        """Run a task, which returns what it did in one line; False if another one runs."""
+        if not self._running.acquire(blocking=False):
+            return False
+        self.stop.clear()
+        self.message, self.failed, self.progress = what, False, 0.0
+        threading.Thread(target=self._run, args=(task,), daemon=True).start()
+        return True
+
+    def step(self, what: str, done: float, total: float) -> None:
+        """Report progress from inside a task."""
+        self.message, self.progress = what, min(done / total, 1.0) if total else 0.0
+        self._changed()
+
+    def _run(self, task: Callable[[], str]) -> None:
+        self._changed()
+        try:
+            self.message = task()
+        except (InputError, OSError) as error:
+            self.message, self.failed = " ".join(str(error).split()), True
+        except Exception as error:
+            logging.getLogger(__name__).exception("a task of the studio failed")
+            self.message, self.failed = f"internal error, {type(error).__name__}: {error}", True
+        self._running.release()
+        self._changed()
+
+
+class Controls:
+    """The panel."""
+
+    def __init__(self, server: viser.ViserServer, studio: Studio, tasks: Tasks):
+        self._gui, self._studio, self._tasks = server.gui, studio, tasks
+        self._view: NextViews | None = None
+        self._updates: list[Callable[[], None]] = []
+        """Calls that bring single controls up to date."""
+        gui = self._gui
+        gui.main_panel.dock_right()
+        self._camera = gui.add_dropdown("Camera", tuple(_CAMERAS))
+        self._picture = gui.add_image(np.zeros((3, 4, 3), np.uint8))
+        self._keep(gui.add_html(""), content=self._message)
+        bar = gui.add_progress_bar(0.0, animated=True)
+        self._keep(bar, visible=lambda: tasks.busy, value=lambda: 100 * tasks.progress)
+        tabs = gui.add_tab_group()
+        contents = (self._connect, self._record, self._learn, self._fixed, self._export)
+        for (title, state), add in zip(STEPS.items(), contents, strict=True):
+            with tabs.add_tab(title):
+                self._keep(gui.add_html(""), content=lambda state=state: chip_html(*state(studio)))
+                add()
+
+    @property
+    def which(self) -> Which:
+        """The camera whose picture is shown."""
+        return _CAMERAS[self._camera.value]
+
+    def show(self, next_view: NextViews | None) -> None:
+        """Show the state of the steps and of the task that runs."""
+        self._view = next_view
+        for update in self._updates:
+            update()
+
+    def show_live(self) -> None:
+        """Show what arrives from the chosen camera and the robot."""
+        connection = self._studio.connection
+        if self.which in connection.images:
+            self._picture.image = connection.images[self.which]
+        rows = [(f"{name}: no data", problem) for name, problem in connection.problems.items()]
+        if connection.base_from_gripper is not None:
+            x, y, z = 1000 * connection.base_from_gripper.translation_m
+            rows.append(("gripper", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"))
+        self._arrives.content = rows_html(rows)
+
+    def _connect(self) -> None:
+        self._arrives = self._gui.add_html("")
+
+    def _record(self) -> None:
+        studio, gui, tasks = self._studio, self._gui, self._tasks
+        self._button("Take sample", studio.take_sample, key="T")
+        if studio.can_move:
+            self._button("Move there", self._move, key="M")
+            self._button("Record by itself", lambda: studio.record(tasks.step, tasks.stop.is_set))
+            gui.add_button("Stop", color="red").on_click(lambda _: tasks.stop.set())
+        self._keep(gui.add_html(""), content=self._coverage)
+        self._sample: Any = gui.add_dropdown("Sample", ("-",))
+        self._updates.append(self._show_names)
+        self._button("Remove", lambda: studio.remove(self._sample.value))
+        self._button("Remove the bad ones", lambda: studio.remove(*studio.bad_samples()))
+
+    def _learn(self) -> None:
+        self._button("Learn the recording", lambda: self._studio.learn(self._tasks.step))
+        self._keep(self._gui.add_html(""), content=lambda: self._numbers("wrist"))
+
+    def _fixed(self) -> None:
+        studio, gui, step = self._studio, self._gui, self._tasks.step
+        moves = studio.can_move
+        move = gui.add_checkbox("Move the arm between images", moves, visible=moves)
+        series = f"Take {FIXED_IMAGES} images"
+        self._button("Take image", studio.take_fixed)
+        self._button(series, lambda: studio.take_fixed_series(step, move.value))
+        self._button("Calibrate", lambda: studio.calibrate_fixed(step))
+        self._button("Check", studio.check_fixed)
+        self._button("Remove all images", studio.clear_fixed)
+        self._keep(gui.add_html(""), content=lambda: self._numbers("fixed"))
+
+    def _export(self) -> None:
+        camera = self._gui.add_dropdown("Calibration", tuple(_CAMERAS))
+        format = self._gui.add_dropdown("Format", tuple(FORMATS))
+        self._button(
+            "Export file", lambda: self._studio.export(_CAMERAS[camera.value], format.value)
+        )
+
+    def _keep(self, handle: Any, **properties: Callable[[], Any]) -> None:
+        """Set properties of a control whenever something changes."""
+
+        def update() -> None:
+            for name, value in properties.items():
+                setattr(handle, name, value())
+
+        self._updates.append(update)
+
+    def _button(self, label: str, task: Callable[[], str], key: Any = None) -> None:
+        """Add a button, and a key, that runs a task; it is disabled while one runs."""
+
+        def start(_: object) -> None:
+            self._tasks.start(f"{label.lower()} ...", task)
+
+        button = self._gui.add_button(label, hint=key and f"Key {key}")
+        button.on_click(start)
+        self._keep(button, disabled=lambda: self._tasks.busy)
+        if key is not None:
+            self._gui.add_command(label, hotkey=key).on_trigger(start)
+
+    def _show_names(self) -> None:
+        names = tuple(frame.name for frame in reversed(self._studio.recorder.frames)) or ("-",)
+        if names != self._sample.options:
+            self._sample.options, self._sample.value = names, names[0]  # the one taken last
+
+    def _move(self) -> str:
+        if self._view is None:
+            return "There is no next view."
+        return self._studio.move_to(self._view.poses[0])
+
+    def _message(self) -> str:
+        """What the last task did, or what the running one does."""
+        tasks = self._tasks
+        kind = "failed" if tasks.failed else "working" if tasks.busy else "done"
+        return chip_html(kind, tasks.message) if tasks.message else ""
+
+    def _coverage(self) -> str:
+        """Spread of the good samples, the next view, and the bad samples."""
+        covered, options, rows = self._studio.coverage(), CoverageOptions(), []
+        axes = [(axis, "°", options.rotation_deg) for axis in covered.rotations]
+        axes += [(axis, " mm", options.position_mm) for axis in covered.positions]
+        for axis, unit, wanted in axes:
+            enough = "✓" if axis.covered else f"of {wanted:.0f}{unit}"
+            rows.append((axis.name, f"{axis.spread:.0f}{unit} {enough}"))
+        if self._view is not None:
+            x, y, z = 1000 * self._view.poses[0].translation_m
+            now, then = self._view.sigma_mm[:2]
+            rows.append(("next view (amber)", f"gripper at {x:+.0f} {y:+.0f} {z:+.0f} mm"))
+            rows.append(("expected 1 sigma", f"{now:.3f} mm → {then:.3f} mm"))
+        bad = [(row.name, "; ".join(row.problems)) for row in covered.samples if row.problems]
+        return rows_html(rows + bad)
+
+    def _numbers(self, which: Which) -> str:
+        """Images and calibration of a camera, as far as there are any."""
+        found, rows = self._studio.calibrations.get(which), []
+        if which == "fixed":
+            rows.append(("images", str(len(self._studio.fixed_images))))
+        if found is not None:
+            rows += [*calibration_rows(found), ("file", str(self._studio.calibration_file(which)))]
+        return rows_html(rows)

@@ -1,0 +1,157 @@
+"""Cameras, maps and calibrations in the scene of a page."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import viser
+
+from evercal.calibration.calibration import Calibration
+from evercal.geometry import SE3, Camera
+from evercal.mapping.scene_map import SceneMap
+from evercal.reports.scene.frusta import Ellipsoid, Frustum, readable_scale
+from evercal.reports.scene.map_parts import (
+    THUMBNAIL_PX,
+    ColourBy,
+    KeyframeView,
+    Landmarks3D,
+    keyframe_views,
+    resized,
+)
+from evercal.service.viewer.html import GREY, MAGENTA, Colour
+
+OnKeyframe = Callable[[KeyframeView, viser.ClientHandle], Any]
+GRIPPER = "/gripper"
+"""Node of what moves with the gripper."""
+
+
+def add_frustum(
+    server: viser.ViserServer,
+    name: str,
+    frustum: Frustum,
+    size_m: float,
+    colour: Colour,
+    image: np.ndarray | None = None,
+) -> viser.CameraFrustumHandle:
+    """Add a camera with its image to the scene."""
+    return server.scene.add_camera_frustum(
+        name,
+        frustum.fov_rad,
+        frustum.aspect,
+        scale=size_m,
+        thickness=2.0,
+        thickness_units="screen",
+        color=colour,
+        image=None if image is None else resized(image, THUMBNAIL_PX),
+        wxyz=frustum.base_from_camera.rotation_wxyz,
+        position=frustum.base_from_camera.translation_m,
+    )
+
+
+def place(node: viser.SceneNodeHandle, base_from_node: SE3 | None) -> None:
+    """Move a node of the scene; None hides it."""
+    node.visible = base_from_node is not None
+    if base_from_node is not None:
+        node.wxyz, node.position = base_from_node.rotation_wxyz, base_from_node.translation_m
+
+
+def add_base(server: viser.ViserServer, side_m: float) -> viser.FrameHandle:
+    """Add the axes of the robot base and a floor; returns the hidden node of the gripper."""
+    server.scene.add_frame("/base", axes_length=0.05 * side_m, axes_radius=0.0015 * side_m)
+    server.scene.add_label("/base/label", "robot base")
+    lines = {"cell_size": 0.1, "cell_color": (60, 66, 76), "section_color": (80, 87, 99)}
+    server.scene.add_grid("/floor", side_m, side_m, shadow_opacity=0.0, **lines)
+    return server.scene.add_frame(GRIPPER, show_axes=False, visible=False)
+
+
+class DrawnMap:
+    """Landmarks and keyframes of all scenes; a map that was drawn before is replaced."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        scenes: Sequence[SceneMap],
+        on_keyframe: OnKeyframe | None = None,
+    ):
+        self.landmarks = {scene.name: Landmarks3D.of(scene) for scene in scenes}
+        self.keyframes = {scene.name: keyframe_views(scene) for scene in scenes}
+        # Twice the median distance of landmarks from their median.
+        points = self.landmarks[scenes[0].name].points_m
+        away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+        self.extent_m = max(2 * float(np.median(away)), 0.05)
+        self.frustum_m = 0.03 * self.extent_m
+        self._nodes: dict[str, viser.FrameHandle] = {}
+        self._clouds: dict[str, viser.PointCloudHandle] = {}
+        self._cameras: list[viser.CameraFrustumHandle] = []
+        server.scene.remove_by_name("/map")
+        with server.atomic():
+            for scene in scenes:
+                self._add(server, scene.name, on_keyframe)
+        self.show(scenes[0].name)
+
+    def node(self, scene: object) -> str:
+        """Node of a scene; that of the base for what belongs to none."""
+        return self._nodes[str(scene)].name if str(scene) in self._nodes else "/base"
+
+    def show(self, scene: str) -> None:
+        """Show one scene; visitors show others in the scene tree of viser's settings."""
+        for name, node in self._nodes.items():
+            node.visible = name == scene
+
+    def show_keyframes(self, visible: bool) -> None:
+        """Show or hide the keyframes."""
+        for camera in self._cameras:
+            camera.visible = visible
+
+    def colour_by(self, by: ColourBy) -> None:
+        """Colour the landmarks."""
+        for name, cloud in self._clouds.items():
+            cloud.colors = self.landmarks[name].colours(by)
+
+    def _add(self, server: viser.ViserServer, name: str, on_keyframe: OnKeyframe | None) -> None:
+        landmarks, node = self.landmarks[name], f"/map/{name.replace('/', '_')}"
+        self._nodes[name] = server.scene.add_frame(node, show_axes=False)
+        self._clouds[name] = server.scene.add_point_cloud(
+            f"{node}/landmarks",
+            landmarks.points_m.astype(np.float32),
+            landmarks.colours("image"),
+            point_size=0.003 * self.extent_m,
+            point_shape="circle",
+            precision="float32",
+        )
+        if on_keyframe is None:
+            return
+        for view in self.keyframes[name]:
+            keyframe = f"{node}/keyframes/{view.number}"
+            camera = add_frustum(server, keyframe, view.frustum, self.frustum_m, GREY, view.image)
+            camera.on_click(lambda event, view=view: on_keyframe(view, event.client))
+            self._cameras.append(camera)
+
+
+def add_calibrations(
+    server: viser.ViserServer,
+    calibrations: dict[str, Calibration],
+    drawn: DrawnMap,
+    default: Camera,
+    size_m: float,
+) -> None:
+    """Add cameras in their scenes or on the gripper, with ellipsoids of their positions."""
+    scale = readable_scale([Ellipsoid.of(c.uncertain_pose) for c in calibrations.values()])
+    for name, found in calibrations.items():
+        ellipsoid = Ellipsoid.of(found.uncertain_pose)
+        on_gripper = found.mount == "eye_in_hand"
+        parent = GRIPPER if on_gripper else drawn.node(found.source.get("scene"))
+        node = f"{parent}/{name.replace('/', '_')}"
+        frustum = Frustum.of(found.parent_from_child, found.camera or default)
+        add_frustum(server, node, frustum, size_m, MAGENTA)
+        x, y, z = (max(float(scale * axis), 1e-6) for axis in ellipsoid.axes_m)
+        server.scene.add_icosphere(
+            f"{node} ellipsoid",
+            scale=(x, y, z),
+            color=MAGENTA,
+            opacity=0.35,
+            wxyz=ellipsoid.rotation_wxyz,
+            position=ellipsoid.centre_m,
+        )
+        words = f"{name}: {found.sigma_mm:.2g} mm (1 sigma), ellipsoid x {scale:g}"
+        server.scene.add_label(f"{node}/label", words)

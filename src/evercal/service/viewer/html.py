@@ -1,0 +1,44 @@
+"""Texts of the panels; names of files and scenes are escaped."""
+
+from collections.abc import Sequence
+from html import escape
+
+from evercal.calibration.calibration import Calibration
+from evercal.reports.scene.frusta import Ellipsoid
+
+GREEN, AMBER, RED, GREY = (22, 163, 74), (217, 119, 6), (220, 38, 38), (107, 114, 128)
+BLUE, MAGENTA = (37, 99, 235), (192, 38, 211)
+Colour = tuple[int, int, int]
+_COLOURS = {"waits": GREY, "to do": BLUE, "working": BLUE, "failed": RED, "lost": RED, "ended": RED}
+"""Of states; those of all others are green."""
+_TEXT = "padding:2px 12px 6px;font-size:0.85em;line-height:1.4;overflow-wrap:anywhere"
+
+
+def chip_html(state: str, text: str = "") -> str:
+    """A state on its colour, and a sentence below it."""
+    colour = _COLOURS.get(state, GREEN)
+    style = f"background:rgb{colour};color:white;border-radius:4px;padding:1px 8px;font-weight:600"
+    chip = f'<span style="{style}">{escape(state)}</span>'
+    return f'<div style="{_TEXT}">{chip}<div>{escape(text)}</div></div>'
+
+
+def rows_html(rows: Sequence[tuple[str, str]]) -> str:
+    """Names and values, one pair a line."""
+    cells = "".join(
+        f'<tr><td style="width:40%;vertical-align:top">{escape(name)}</td>'
+        f"<td>{escape(value)}</td></tr>"
+        for name, value in rows
+    )
+    return f'<div style="{_TEXT}"><table style="width:100%">{cells}</table></div>' if rows else ""
+
+
+def calibration_rows(calibration: Calibration) -> list[tuple[str, str]]:
+    """Names and values of a calibration."""
+    x, y, z = 1000 * calibration.parent_from_child.translation_m
+    principal = Ellipsoid.of(calibration.uncertain_pose).sigmas_mm
+    return [
+        ("mount", "on the gripper" if calibration.mount == "eye_in_hand" else "fixed"),
+        (f"in {calibration.parent_frame}", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"),
+        ("1 sigma per axis", f"{calibration.sigma_mm:.2g} mm, {calibration.sigma_deg:.2g}°"),
+        ("principal axes", f"{principal} mm"),
+    ]
