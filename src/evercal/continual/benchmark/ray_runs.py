@@ -76,6 +76,7 @@ def run_on_ray(
     try:
         missing = begin_bench(scenes, options, out)
         token = uuid.uuid4().hex
+        (out / "runs").mkdir(exist_ok=True)
         write_bytes(out / "runs" / "shared", token.encode())
         jobs = [
             Job(

@@ -117,7 +117,7 @@ def append(folder: Path, stage: StageResults) -> None:
     """Append the rows of a stage that a folder lacks, and flush them to disk."""
     before = read(folder)
     new = stage.results
-    if len(before):  # an interrupted call may have stored some rows of the stage
+    if len(before) and len(new):  # an interrupted call may have stored some rows of the stage
         stored = pd.MultiIndex.from_frame(before[KEY])
         new = new[~pd.MultiIndex.from_frame(new[KEY]).isin(stored)]
     with locked(folder):
