@@ -31,7 +31,7 @@ class Job:
     strategy: str
     """Name of the strategy."""
     pickled: bytes
-    """The strategy. It is unpickled after the plugin is loaded, which may define its class."""
+    """The strategy, unpickled after the plugin that may define its class."""
     options: BenchOptions
     """Options with one seed and no strategies."""
     plugin: Path | None

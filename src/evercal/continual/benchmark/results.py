@@ -124,14 +124,10 @@ def append(folder: Path, stage: StageResults) -> None:
         # Frames come first: a stage whose results are complete has its frames.
         for name, rows in ((FRAMES, stage.frames), (RESULTS, new)):
             if len(rows):
-                _append(folder / name, rows)
-
-
-def _append(path: Path, rows: Table) -> None:
-    with open(path, "a", encoding="utf-8") as file:
-        rows.to_csv(file, header=file.tell() == 0, index=False)
-        file.flush()
-        os.fsync(file.fileno())
+                with open(folder / name, "a", encoding="utf-8") as file:
+                    rows.to_csv(file, header=file.tell() == 0, index=False)
+                    file.flush()
+                    os.fsync(file.fileno())
 
 
 def run_of(results: Table, strategy: str, seed: int) -> Table:
