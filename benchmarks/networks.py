@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from evercal.continual.methods.gec import EpisodicConstraint
 from tyro.conf import Positional
 
 from evercal.cli.bench import Bench
 from evercal.continual.learning.presets import preset
+from evercal.continual.methods.gec import EpisodicConstraint
 from evercal.continual.methods.penalties import BoundedByTeacher, Distillation, OldOutput
 from evercal.continual.methods.replay import Replay
 from evercal.continual.strategies import STRATEGIES, Strategy

@@ -5,8 +5,7 @@ from dataclasses import fields
 
 import pytest
 
-from evercal.continual.methods.controls import FineTuning
-from evercal.continual.methods.method import described
+from evercal.continual.methods.method import FineTuning, described
 from evercal.continual.methods.penalties import Distillation
 from evercal.continual.methods.replay import Replay
 from evercal.continual.selection.selectors import SELECTORS

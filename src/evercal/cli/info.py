@@ -32,7 +32,7 @@ class Info:
         if strategy in (MAP, None):
             scenes, short_side, heads, sizes = _map(self.store)
         else:
-            from evercal.continual.info import describe
+            from evercal.continual.store import describe
 
             scenes, short_side, heads, sizes = describe(self.store)
         total = sum(file.stat().st_size for file in self.store.rglob("*") if file.is_file())

@@ -14,7 +14,7 @@ from evercal.errors import InputError
 from evercal.features.device import device_of
 from evercal.features.encode import encode_image
 from evercal.features.precision import autocast
-from evercal.geometry import Camera, UncertainPose
+from evercal.geometry import Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.localization.matching import strided_patches
@@ -118,12 +118,22 @@ class NetworkLocalizer:
             return Hypothesis(scene)
         if self._decides_scene and not moved:
             other = self._scene_of(rough, scene)
+            if cameras[other] not in (None, camera):
+                # The pose lies in the cell of a scene with another camera: solve once more.
+                return self._hypothesis(query, other, cameras, moved=True)
             if other != scene:
-                if cameras[other] not in (None, camera):
-                    # The pose lies in the cell of a scene with another camera: solve once more.
-                    return self._hypothesis(query, other, cameras, moved=True)
-                return _moved(rough, matches, patches, self.contents.scenes, scene, other)
-        return _from_pnp(rough, matches, patches, scene)
+                cells = [self.contents.scenes[i].cell.atlas_from_base for i in (other, scene)]
+                across = cells[0].inverse() @ cells[1]
+                rough = PnpResult(across @ rough.pose, rough.inliers)
+                matches = Matches(matches.pixels, across.apply(matches.points_m))
+                scene = other
+        return Hypothesis(
+            scene,
+            rough.pose,
+            pixels=matches.pixels[rough.inliers],
+            points_m=matches.points_m[rough.inliers],
+            expected=patches,
+        )
 
     @torch.inference_mode()
     def _predicted(self, query: Query, scene: int, camera: Camera) -> tuple[Matches, int]:
@@ -224,29 +234,3 @@ def _fitting_cameras(
 
 def _support(hypothesis: Hypothesis) -> float:
     return hypothesis.inlier_ratio * hypothesis.inliers**0.5
-
-
-def _from_pnp(rough: PnpResult, matches: Matches, patches: int, scene: int) -> Hypothesis:
-    inliers = rough.inliers
-    return Hypothesis(
-        scene,
-        rough.pose,
-        pixels=matches.pixels[inliers],
-        points_m=matches.points_m[inliers],
-        expected=patches,
-    )
-
-
-def _moved(
-    rough: PnpResult,
-    matches: Matches,
-    patches: int,
-    records: Sequence[SceneRecord],
-    source: int,
-    target: int,
-) -> Hypothesis:
-    """Move a pose from the base frame of one scene into that of another."""
-    across = records[target].cell.atlas_from_base.inverse() @ records[source].cell.atlas_from_base
-    pose: UncertainPose = across @ rough.pose
-    moved = Matches(matches.pixels, across.apply(matches.points_m))
-    return _from_pnp(PnpResult(pose, rough.inliers), moved, patches, target)

@@ -15,20 +15,19 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from torch import Tensor, nn
 
 from evercal.continual.networks.atlas import Cell
 from evercal.continual.networks.descriptor import (
-    PooledDescriptor,
     descriptor_for,
     load_descriptor,
 )
 from evercal.continual.networks.head import Head, HeadOptions
 from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.errors import InputError
-from evercal.features.encoder import checked_encoder, load_encoder, own_encoder
+from evercal.features.encoder import load_encoder
 from evercal.features.weights_file import network_bytes
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
@@ -64,11 +63,7 @@ class NetworkStore(StageStore):
 
     @classmethod
     def create(
-        cls,
-        root: Path,
-        strategy: str,
-        short_side: int = 240,
-        encoder: Path | nn.Module | None = None,
+        cls, root: Path, strategy: str, short_side: int = 240, encoder: Path | None = None
     ) -> Self:
         """An empty store; nothing is written before the first `commit`.
 
@@ -76,8 +71,8 @@ class NetworkStore(StageStore):
             root: folder of the store to be.
             strategy: how scenes are learned into it.
             short_side: working size of images, pixels.
-            encoder: a weights file (its sibling `descriptor.safetensors` is used, if it fits) or
-                any module that is an `Encoder`. Default: the shipped weights.
+            encoder: a weights file; its sibling `descriptor.safetensors` is used, if it fits.
+                Default: the shipped weights.
 
         Raises:
             InputError: `root` holds something that is not a store, or a bad encoder.
@@ -86,20 +81,14 @@ class NetworkStore(StageStore):
             raise InputError(f"store {root}: exists and is not an evercal store; give another path")
         if encoder is None:
             networks = load_encoder(), load_descriptor()
-        elif isinstance(encoder, Path):
+        else:
             local = load_encoder(encoder)
             networks = local, descriptor_for(encoder, local.width)
-        else:
-            networks = checked_encoder(encoder), PooledDescriptor(checked_encoder(encoder).width)
         return cls(root, LearnedScenes(*networks, strategy, short_side))
 
     @classmethod
-    def open(cls, root: Path, encoder: nn.Module | None = None) -> Self:
+    def open(cls, root: Path) -> Self:
         """Open a store at its last complete scene.
-
-        Args:
-            root: folder of the store.
-            encoder: the module of a store that was made with a module of the caller's own.
 
         Raises:
             InputError: Not a store, or a file is missing or was changed.
@@ -109,9 +98,8 @@ class NetworkStore(StageStore):
             payload = manifest.payload
             # Stores of earlier versions may list centroids in between.
             first, *_, descriptor = (str(name) for name in payload["networks"])
-            path = root / first
             scenes = LearnedScenes(
-                load_encoder(path) if encoder is None else own_encoder(encoder, path),
+                load_encoder(root / first),
                 load_descriptor(root / descriptor),
                 str(payload["strategy"]),
                 int(payload["short_side"]),
@@ -173,6 +161,26 @@ class NetworkStore(StageStore):
         name = f"descriptor-{hashlib.sha256(data).hexdigest()[:12]}.safetensors"
         write_bytes(self.root / name, data)
         return (*names, name)
+
+
+def describe(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]]:
+    """Scenes for JSON, working size, size of networks, and files with their sizes."""
+    store = NetworkStore.open(path)
+    contents = store.contents
+    scenes: list[dict[str, Any]] = [
+        {
+            "name": record.name,
+            "train_frames": record.train_frames,
+            "memory_bytes": keyframes.bytes if keyframes is not None else 0,
+            "keyframes": len(keyframes) if keyframes is not None else 0,
+            "camera": record.camera.to_dict(),
+            "inlier_threshold": record.inlier_threshold,
+            "cell": asdict(record.cell),
+        }
+        for record, keyframes in zip(contents.scenes, contents.keyframes, strict=True)
+    ]
+    heads = sum(head_bytes(head) for head in contents.heads)
+    return scenes, contents.short_side, heads, store.size_bytes()
 
 
 def _is_free(root: Path) -> bool:

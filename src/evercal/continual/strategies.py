@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass
 
-from evercal.continual.methods.controls import FineTuning, Isolation
 from evercal.continual.methods.ewc import ElasticWeightConsolidation
 from evercal.continual.methods.gec import EpisodicConstraint
 from evercal.continual.methods.learning_without_forgetting import LearningWithoutForgetting
-from evercal.continual.methods.method import Method, described
+from evercal.continual.methods.method import FineTuning, Isolation, Method, described
 from evercal.continual.methods.mir import MaximallyInterferedRetrieval
 from evercal.continual.methods.penalties import BoundedByTeacher, Distillation, OldOutput, Relations
 from evercal.continual.methods.preconditioning import PreconditionedReplay
@@ -92,9 +91,21 @@ _ALL = (
         Replay("sars_filled", Distillation()),
         source="the same with the largest radius that fills the memory",
     ),
-    Strategy("reservoir_spdd", Replay("reservoir", Distillation()), source="SPDD without SARS"),
-    Strategy("sars_old_output", Replay("sars", OldOutput()), source="SARS without SPDD: iCaRL's"),
-    Strategy("sars_reprojection", Replay("sars", weight=0.3), source="SARS without distillation"),
+    Strategy(
+        "reservoir_spdd",
+        Replay("reservoir", Distillation()),
+        source="Li et al., SPDD on a reservoir of frames",
+    ),
+    Strategy(
+        "sars_old_output",
+        Replay("sars", OldOutput()),
+        source="Li et al., SARS with the distillation of iCaRL",
+    ),
+    Strategy(
+        "sars_reprojection",
+        Replay("sars", weight=0.3),
+        source="Li et al., SARS with reprojection alone",
+    ),
     Strategy("isolation", Isolation()),
     Strategy("joint", FineTuning(), jointly=True, source="all frames of all scenes at once"),
 )

@@ -8,7 +8,7 @@ from itertools import groupby
 import pytest
 import torch
 
-from evercal.continual.learning.learn_jointly import learn_jointly
+from evercal.continual.learning.learn import learn_jointly
 from evercal.continual.learning.stage import Encoding, StageOptions
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.trainer import Progress

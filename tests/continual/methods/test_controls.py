@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 import torch
 
-from evercal.continual.methods.controls import FineTuning, Isolation
+from evercal.continual.methods.method import FineTuning, Isolation
 from evercal.continual.networks.hooks import TrainingHooks
 
 from ..stages import learn, outcome, second_stage, weights

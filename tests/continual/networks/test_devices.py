@@ -40,7 +40,7 @@ def head_of(options: HeadOptions, device: torch.device) -> Head:
 
 
 def buffer_of(device: torch.device, scene: int = 1) -> FeatureBuffer:
-    """Create forty rows of two views, with stored points for the first thirty."""
+    """Create forty rows of two views with known points."""
     buffer = FeatureBuffer(scene, SE3.identity(), device=device)
     matrix = torch.eye(4, device="cpu")[None, :3] + 0.1 * random(2, 3, 4, seed=2)
     matrix[:, 2, 3] += 8  # most points are in front of the camera
@@ -54,7 +54,7 @@ def buffer_of(device: torch.device, scene: int = 1) -> FeatureBuffer:
             "descriptors": torch.nn.functional.normalize(random(2, 4, seed=3)),
         }
     )
-    buffer.known = random(30, 3, seed=4).half().to(device)
+    buffer.known = random(40, 3, seed=4).half().to(device)
     return buffer
 
 

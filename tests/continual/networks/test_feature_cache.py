@@ -89,6 +89,5 @@ def test_full_disk_only_stops_caching(
         patch.setattr(np if call == "save" else os, call, full)
         actual = encoder(images)
     torch.testing.assert_close(actual, plain(images), atol=1e-3, rtol=0)
-    encoder(images)
-    assert len(tries) == 6
+    assert len(tries) == 3
     assert len([path for path in tmp_path.rglob("*") if path.is_file()]) == 1

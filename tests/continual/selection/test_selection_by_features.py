@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evercal.continual.selection.selection_by_features import (
+from evercal.continual.selection.selectors import (
     leverage_scores,
     select_coverage,
     select_gradients,

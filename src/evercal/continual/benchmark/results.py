@@ -177,8 +177,7 @@ def _remove_incomplete_line(folder: Path, path: Path) -> None:
 def record_environment(folder: Path) -> str:
     """Add the record of this process to environments.json and return its key."""
     record = environment()
-    text = json.dumps(record, sort_keys=True)
-    key = hashlib.blake2b(text.encode(), digest_size=4).hexdigest()
+    key = hashlib.blake2b(json.dumps(record, sort_keys=True).encode(), digest_size=4).hexdigest()
     with locked(folder):
         before = read_environments(folder)
         if key not in before:

@@ -19,7 +19,7 @@ from evercal.continual.benchmark.results import (
     scene_row,
 )
 from evercal.continual.learning.finish_scene import correct_lens, finished_stage
-from evercal.continual.learning.learn_jointly import learn_jointly
+from evercal.continual.learning.learn import learn_jointly
 from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
 from evercal.continual.learning.stage import StageOptions, unobserved
 from evercal.continual.learning.stage_rows import encode_rows, scene_buffer, view_plan

@@ -39,8 +39,8 @@ class NetworkLearnOptions:
     """Keyframes of a scene, see `MemoryBudget.parse`."""
     centres: int | None = None
     """Cluster centres that a scene adds; those of the preset by default."""
-    encoder: Path | nn.Module | None = None
-    """A weights file for a new store, or a module of the caller's own."""
+    encoder: Path | None = None
+    """A weights file for a new store."""
     device: str = "auto"
     """Device of the networks, see `device_of`."""
     seed: int = 0
@@ -139,11 +139,11 @@ def _opened(
     if not is_store(store):
         side = options.short_side or short_side(options.preset, frames)
         return NetworkStore.create(store, strategy.name, side, options.encoder)
-    if isinstance(options.encoder, Path):
+    if options.encoder is not None:
         raise InputError(
             f"encoder {options.encoder}: store {store} keeps the encoder it was made with"
         )
-    opened = NetworkStore.open(store, options.encoder)
+    opened = NetworkStore.open(store)
     if opened.contents.strategy != strategy.name:
         raise InputError(
             f"strategy {strategy.name!r}: the store was made with {opened.contents.strategy!r};"

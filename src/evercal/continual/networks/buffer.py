@@ -35,8 +35,7 @@ class Rows:
     index: Tensor
     """(n,) position in the buffer."""
     known: Tensor | None = None
-    """(n, 3) points of the atlas that are known in advance, from depths or an earlier head; NaN for
-    rows without one."""
+    """(n, 3) points of the atlas that are known from depths; NaN for rows without one."""
 
     def part(self, where: slice | Tensor) -> "Rows":
         """Return the rows of a slice, or at indices (m,)."""
@@ -79,7 +78,7 @@ class FeatureBuffer:
         self.correctable, self.device = correctable, torch.device(device)
         self.views = 0
         self.known: Tensor | None = None
-        """(m, 3) known points of the first m rows, on the buffer's device, see `Rows.known`."""
+        """(rows, 3) known points, on the buffer's device, see `Rows.known`."""
         self._parts: list[dict[str, Tensor]] = []
         self._merged: dict[str, Tensor] | None = None
 
@@ -154,9 +153,7 @@ class FeatureBuffer:
         scene = torch.full((len(index),), self.scene, device=index.device)
         rows = Rows(t["features"][index], scene, t["descriptors"][view], target, index)
         if self.known is not None:
-            last = len(self.known) - 1
-            points = self.known[rows.index.clamp(max=last)].float()
-            rows.known = torch.where((rows.index <= last)[:, None], points, torch.nan)
+            rows.known = self.known[index].float()
         return rows
 
 
