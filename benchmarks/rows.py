@@ -34,7 +34,8 @@ def save(
 
 def show(rows: Sequence[Mapping[str, object]] | pd.DataFrame) -> None:
     """Print rows as Markdown."""
-    table = pd.DataFrame(rows)
+    table = pd.DataFrame(rows).astype(object)
+    table = table.where(table.notna(), None)
     print(table.to_markdown(index=False, floatfmt=".3g", missingval=""), flush=True)
 
 

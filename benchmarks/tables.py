@@ -47,7 +47,7 @@ def _rows(columns: str, *names: str) -> Callable[[], Table]:
     """Return a table of rows as they are; columns are separated by commas."""
 
     def table() -> Table:
-        rows = pd.concat([rows_of(name) for name in names])[columns.split(",")]
+        rows: Table = pd.concat([rows_of(name) for name in names])[columns.split(",")]
         cells = rows.map(lambda v: f"{v:.3g}" if isinstance(v, float) else str(v))
         return cells.replace("nan", "").rename(columns=lambda name: name.replace("_", " "))
 

@@ -1,4 +1,4 @@
-"""`evercal bench` and `bench-report`: tables, one JSON object, and refused input."""
+"""`evercal bench`: tables, one JSON object, a folder of results, and refused input."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from evercal.cli import bench as verb
-from evercal.continual.benchmark.results import RESULTS, STRATEGIES
+from evercal.continual.benchmark.results import STRATEGIES, read, read_frames
 from evercal.continual.learning.presets import short_side
 from evercal.recordings import generic
 
@@ -25,13 +25,13 @@ def small(monkeypatch: pytest.MonkeyPatch, quick: StageOptions) -> None:
     monkeypatch.setattr(verb.Bench, "_stage", lambda self, seed: replace(quick, seed=seed))
 
 
-def test_bench_and_its_report(
+def test_bench_and_its_tables(
     run: Any, small: None, arcs: tuple[Recording, Recording], tmp_path: Path
 ) -> None:
     folders = []
     for scene in arcs:
         folders.append(tmp_path / scene.name)
-        generic.write(folders[-1], replace(scene, train=scene.train[:20], test=scene.test[:8]))
+        generic.write(folders[-1], replace(scene, train=scene.train[:18], test=scene.test[:4]))
     words = ["custom", *folders, "--strategies", "evercal,finetune", "--seeds", "0"]
     first = run("bench", *words, "--out", tmp_path / "out")
     assert first.code == 0, first.err
@@ -46,15 +46,12 @@ def test_bench_and_its_report(
     (summary,) = json.loads(again.out)["strategies"]["evercal"]
     assert summary["scenes"] == ["one", "two"]
     assert summary["accuracy_5cm_5deg"][0][1] is None
-    report = run("bench-report", tmp_path / "out")
-    assert report.code == 0
-    assert "| evercal " in (tmp_path / "out" / "tables.md").read_text()
-    page = (tmp_path / "out" / "report.html").read_text()
-    assert page.count("<img ") == 12
-    assert "Scenes at the estimated poses" in page
-    assert "<dt>TFR</dt>" in page
-    assert "evercal - finetune" in page
-    assert r"\multicolumn{3}{c}{finetune}" in (tmp_path / "out" / "table.tex").read_text()
+    printed = run("bench", tmp_path / "out", "--strategies", "finetune")
+    assert printed.code == 0
+    assert "finetune - evercal" in printed.out
+    assert "finetune - evercal" in (tmp_path / "out" / "tables.md").read_text()
+    assert r"\multicolumn{3}{c}{finetune}" in (tmp_path / "out" / "tables.tex").read_text()
+    assert "<svg" in (tmp_path / "out" / "figure.svg").read_text()
 
 
 @pytest.mark.parametrize(
@@ -67,8 +64,6 @@ def test_bench_and_its_report(
         (["sim-mini", "--seeds", "0,one"], "--seeds 0,one: give comma-separated numbers"),
         (["sim-mini", "--seeds", ","], "--seeds ,: give comma-separated numbers"),
         (["sim-mini", "--strategies", "er@3"], "strategy 'er@3': unknown; choose one of"),
-        (["sim-mini", "--rows", "table5"], "rows table5: give spdd-sweep, table4, with-map"),
-        (["sim-mini", "--rows", "nowhere.json"], "rows nowhere.json: no such file"),
         (["sim-mini", "--steps", "0"], "--steps 0: give a number >= 1"),
         (["sim-mini", "--batch", "63"], "--batch 63: give a number >= 64"),
         (["sim-mini", "--memory", "all"], "--memory all: give a share"),
@@ -86,7 +81,7 @@ def test_unusable_input_is_refused(
 
 
 def test_folder_without_results_is_refused(run: Any, tmp_path: Path) -> None:
-    ran = run("bench-report", tmp_path)
+    ran = run("bench", tmp_path)
     assert ran.code == 2
     assert "no results here" in ran.err[0]
 
@@ -98,38 +93,37 @@ def test_held_out_frames_are_training_frames(
     for scene in arcs:
         folders.append(tmp_path / scene.name)
         generic.write(folders[-1], replace(scene, train=scene.train[:30], test=scene.test[:2]))
-    rows = tmp_path / "rows.json"
-    # Equal strategies run once.
-    rows.write_text(
-        '[{"name": "er", "of": "er"}, {"name": "er_3", "of": "er", "with": {"weight": 0.9}}]'
+    plugin = tmp_path / "mine.py"
+    plugin.write_text(
+        "from evercal.continual.methods.replay import Replay\n"
+        "from evercal.continual.strategies import Strategy\n"
+        "STRATEGIES = {'er_3': Strategy('er_3', Replay(weight=0.9))}\n"
     )
-    words = ["custom", *folders, "--strategies", "er", "--rows", rows, "--seeds", "0", "--held-out"]
-    assert run("bench", *words, "--out", tmp_path / "out").code == 0
-    lines = [json.loads(line) for line in (tmp_path / "out" / RESULTS).read_text().splitlines()]
+    # Equal strategies run once.
+    words = ["custom", *folders, "--strategies", "er_3,er_3", "--seeds", "0", "--held-out"]
+    ran = run("bench", *words, "--plugin", plugin, "--out", tmp_path / "out")
+    assert ran.code == 0, ran.err
     train = {frame.name for scene in arcs for frame in scene.train}
-    ran = [(line["strategy"], line["stage"], line["scene"]) for line in lines]
-    stages = [(0, "one"), (1, "one"), (1, "two")]
-    assert ran == [(name, *stage) for name in ("er", "er_3") for stage in stages]
+    results, frames = read(tmp_path / "out"), read_frames(tmp_path / "out")
+    stages = results[["strategy", "stage", "scene"]].itertuples(index=False, name=None)
+    assert list(stages) == [("er_3", 0, "one"), ("er_3", 1, "one"), ("er_3", 1, "two")]
     described = json.loads((tmp_path / "out" / STRATEGIES).read_text())
-    assert [described[name]["method"]["weight"] for name in ("er", "er_3")] == [0.3, 0.9]
-    assert {len(line["frames"]) for line in lines} == {6}
-    assert {name for line in lines for name in line["frames"]} <= train
+    assert described["er_3"]["method"]["weight"] == 0.9
+    assert set(results["frames"]) == {6}
+    assert set(frames["frame"]) <= train
     # Results on test frames are not mixed with these.
     refused = run("bench", *words[:-1], "--out", tmp_path / "out")
     assert refused.code == 2
     assert "now it is 'test frames'" in " ".join(refused.err)
 
 
-def test_rows_replace_the_default_strategies() -> None:
-    def names(rows: str | None = None, strategies: str | None = None) -> list[str]:
-        bench = verb.Bench("sim-mini", rows=rows, strategies=strategies)
-        return [one.name for one in bench._strategies()]
+def test_table4_stands_for_its_strategies() -> None:
+    def names(strategies: str) -> list[str]:
+        return [one.name for one in verb.Bench("sim-mini", strategies=strategies)._strategies()]
 
-    alone = names(rows="table4")
-    assert "sars_spdd" in alone
-    assert not {"evercal", "joint", "finetune"} & set(alone)
-    assert names(rows="table4", strategies="joint") == ["joint", *alone]
-    assert names() == ["evercal", "joint", "finetune", "er", "sars_spdd"]
+    ablation = names("table4")
+    assert {"icarl", "sars_old_output", "sars_spdd", "reservoir_spdd"} < set(ablation)
+    assert names("joint,table4,er") == ["joint", *ablation]
 
 
 def test_options_of_the_backbone_of_the_paper() -> None:

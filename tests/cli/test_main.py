@@ -32,7 +32,7 @@ VERBS = {
     "Boards and pose pairs": ["detect", "solve"],
     "Results": ["export", "report"],
     "Recordings": ["inspect", "convert", "reconstruct", "simulate", "demo"],
-    "Networks": ["bench", "bench-report"],
+    "Networks": ["bench"],
 }
 ALL = [verb for verbs in VERBS.values() for verb in verbs]
 OTHER_PROGRAMS = {"--once", "--frame-id", "--child-frame-id", "--qw", "--qx", "--qy", "--qz"}

@@ -31,7 +31,7 @@ class Job:
     strategy: str
     """Name of the strategy."""
     pickled: bytes
-    """The strategy. It is unpickled after the plugin is loaded, which may define its class."""
+    """The strategy, unpickled after the plugin that may define its class."""
     options: BenchOptions
     """Options with one seed and no strategies."""
     plugin: Path | None
@@ -76,6 +76,7 @@ def run_on_ray(
     try:
         missing = begin_bench(scenes, options, out)
         token = uuid.uuid4().hex
+        (out / "runs").mkdir(exist_ok=True)
         write_bytes(out / "runs" / "shared", token.encode())
         jobs = [
             Job(

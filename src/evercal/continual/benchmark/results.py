@@ -124,14 +124,10 @@ def append(folder: Path, stage: StageResults) -> None:
         # Frames come first: a stage whose results are complete has its frames.
         for name, rows in ((FRAMES, stage.frames), (RESULTS, new)):
             if len(rows):
-                _append(folder / name, rows)
-
-
-def _append(path: Path, rows: Table) -> None:
-    with open(path, "a", encoding="utf-8") as file:
-        rows.to_csv(file, header=file.tell() == 0, index=False)
-        file.flush()
-        os.fsync(file.fileno())
+                with open(folder / name, "a", encoding="utf-8") as file:
+                    rows.to_csv(file, header=file.tell() == 0, index=False)
+                    file.flush()
+                    os.fsync(file.fileno())
 
 
 def run_of(results: Table, strategy: str, seed: int) -> Table:
@@ -181,8 +177,7 @@ def _remove_incomplete_line(folder: Path, path: Path) -> None:
 def record_environment(folder: Path) -> str:
     """Add the record of this process to environments.json and return its key."""
     record = environment()
-    text = json.dumps(record, sort_keys=True)
-    key = hashlib.blake2b(text.encode(), digest_size=4).hexdigest()
+    key = hashlib.blake2b(json.dumps(record, sort_keys=True).encode(), digest_size=4).hexdigest()
     with locked(folder):
         before = read_environments(folder)
         if key not in before:

@@ -1,0 +1,72 @@
+"""Suites of scenes, and the splits of their frames."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evercal.continual.benchmark.suites import SUITES, load_suite, regions, tuning_split
+from evercal.errors import InputError
+from evercal.geometry import SE3, Camera
+from evercal.recordings import Frame, Recording
+
+CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
+
+
+def test_suites_load_their_scenes_in_order() -> None:
+    assert [scene.name for scene in load_suite("sim-mini")] == ["bedroom", "kitchen", "living"]
+    some = load_suite("sim-mini", None, ["living", "bedroom"])
+    assert [scene.name for scene in some] == ["bedroom", "living"]
+    sizes = [len(SUITES[name].scenes) for name in ("sim-7", "sim-12", "sim-repeat", "i7s", "i12s")]
+    assert sizes == [7, 12, 3, 7, 12]
+
+
+@pytest.mark.parametrize(
+    ("load", "message"),
+    [
+        (lambda _: load_suite("nonsense"), "suite 'nonsense': unknown; choose one of sim-mini"),
+        (lambda _: load_suite("sim-mini", None, ["attic"]), "scene 'attic': not in suite sim-mini"),
+        (lambda _: load_suite("real2"), "--data"),
+        (lambda data: load_suite("i7s", data), "chess is missing; get it from https://www.micro"),
+        (lambda data: load_suite("sim-mini", poses=data), "--poses are for i7s and i12s"),
+        (lambda data: load_suite("sim", data), "bedroom is missing; get it from python -m rooms"),
+    ],
+)
+def test_unavailable_suites_are_refused(
+    load: Callable[[Path], object], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=message):
+        load(tmp_path)
+
+
+def frame(name: str, x: float | None = 0.0) -> Frame:
+    """A tiny frame at x, without a pose if x is None."""
+    pose = None if x is None else SE3(np.array([1.0, 0, 0, 0]), np.array([x, 0, 0]))
+    return Frame(name, np.zeros((3, 4, 3), np.uint8), CAMERA, pose)
+
+
+def test_tuning_split_uses_training_frames_only() -> None:
+    train = (frame("-1", None), *(frame(str(i)) for i in range(30)))
+    scene = tuning_split(Recording("hall", train, (frame("99"),)))
+    test = [6, 7, 8, 21, 22, 23]
+    assert [int(f.name) for f in scene.test] == test
+    assert [int(f.name) for f in scene.train] == [i for i in range(30) if i not in test]
+    with pytest.raises(InputError, match=r"hall: 12 of 15 .* omit --held-out"):
+        tuning_split(Recording("hall", train[:16], ()))
+
+
+def test_regions_share_the_base_frame_and_split_every_frame() -> None:
+    # Three positions; the recording starts at the middle one.
+    xs = [5.0] * 20 + [0.0] * 20 + [9.0] * 20
+    train = tuple(frame(f"train-{i}", x + 0.001 * i) for i, x in enumerate(xs))
+    test = tuple(frame(f"test-{x}", x) for x in (0.2, 8.7, 5.1, 0.1))
+    parts = regions(Recording("hall", train, test), 3)
+    assert [scene.name for scene in parts] == ["hall-1", "hall-2", "hall-3"]
+    assert {scene.base for scene in parts} == {"hall"}
+    assert [scene.train for scene in parts] == [train[:20], train[20:40], train[40:]]
+    assert [len(scene.test) for scene in parts] == [1, 2, 1]
+    assert parts[0].test == test[2:3]
+    for count, message in ((1, "--parts 1"), (4, "are too few"), (61, "too few for --parts 61")):
+        with pytest.raises(InputError, match=message):
+            regions(Recording("hall", train, test), count)
