@@ -30,7 +30,7 @@ def test_reference_lists_every_public_name_and_verb() -> None:
     python = (DOCS / "reference" / "python.md").read_text(encoding="utf-8")
     assert sorted(re.findall(r"^\| `evercal\.(\w+)`", python, re.M)) == sorted(evercal._PUBLIC)
     verbs = (DOCS / "reference" / "command-line.md").read_text(encoding="utf-8")
-    grouped = [verb for group in cli._GROUPS.values() for verb in group]
+    grouped = [verb for group in cli.VERBS.values() for verb in group]
     assert re.findall(r"^\| `([\w-]+)`", verbs, re.M) == grouped
 
 

@@ -116,7 +116,7 @@ def _help_of_every_verb() -> str:
 
     os.environ["COLUMNS"] = COLUMNS
     parts = []
-    for group, verbs in cli._GROUPS.items():
+    for group, verbs in cli.VERBS.items():
         parts.append(f"## {group}")
         for verb in verbs:
             shown = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True)

@@ -17,9 +17,8 @@ from evercal.continual.threshold import fit_threshold
 from evercal.errors import InputError
 from evercal.features.device import device_of
 from evercal.learning.scene import LearnReport
-from evercal.recordings.frame import Frame, Recording, posed_recording
+from evercal.recordings.frame import Frame, Recording, lacks_camera_poses, posed_recording
 from evercal.recordings.held_out import (
-    lacks_camera_poses,
     named_recording,
     require_frames,
     split_held_out,
