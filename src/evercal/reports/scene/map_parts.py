@@ -118,12 +118,6 @@ def keyframe_views(scene: SceneMap) -> list[KeyframeView]:
     return views
 
 
-def shares(counts: list[int], most: int = MOST_POINTS) -> list[int]:
-    """How many landmarks of each scene are shown, in proportion to their numbers."""
-    total = sum(counts)
-    return counts if total <= most else [count * most // total for count in counts]
-
-
 def _scale(scene: SceneMap) -> float:
     """Metres per unit of length of the map."""
     return 1.0 if scene.frame.similarity is None else scene.frame.similarity.scale
