@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.next_views import next_views
-from evercal.calibration.view_information import HandEyeViews, looked_at
+from evercal.calibration.next_views import looked_at, next_views
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.live.coverage import Coverage, Sample, coverage
@@ -104,10 +103,11 @@ class SampleBook:
         if not good:
             return None
         mount = gripper_from_camera or self._devices.rough
-        state = HandEyeViews.recorded(SE3.stack([s.base_from_gripper for s in good]), mount)
+        recorded = SE3.stack([s.base_from_gripper for s in good])
         used = SE3.stack([*self.poses, *self._refused])
+        candidates = self._candidates(mount or SE3.identity())
         try:
-            views = next_views(state, self._candidates(mount or SE3.identity()), 1, used)
+            views = next_views(recorded, candidates, 1, mount, used)
         except InputError:
             return None
         if not len(views.poses):
