@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from evercal.calibration.calibration import Calibration
-from evercal.calibration.export import FORMATS
+from evercal.calibration.export.formats import FORMATS
 from evercal.errors import InputError
 from evercal.geometry import SE3, UncertainPose, pose_distance
 from evercal.live.camera import StreamCamera

@@ -207,10 +207,10 @@ class Calibration:
     def export(
         self, format: str, path: str | os.PathLike[str] | None = None, **options: Any
     ) -> str:
-        """Export to a format of other tools, see `export_calibration`."""
-        from evercal.calibration.export import export_calibration
+        """Export to a format of other programs and return the text, see `export_files`."""
+        from evercal.calibration.export.formats import export_files
 
-        return export_calibration(self, format, path, **options)
+        return export_files(self, format, path, **options).text
 
 
 def read_calibration(path: str | os.PathLike[str]) -> Calibration:

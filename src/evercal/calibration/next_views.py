@@ -274,9 +274,7 @@ class HostedLandmarks:
     def take(self, index: NDArray[np.integer]) -> Self:
         """The landmarks of an index, of the same keyframes."""
         rays, depth, sigma = (p[index] for p in (self.rays, self.inverse_depth, self.sigma))
-        return type(self)(
-            self.mount, self.camera, self.hosts, self.host[index], rays, depth, sigma
-        )
+        return type(self)(self.mount, self.camera, self.hosts, self.host[index], rays, depth, sigma)
 
     @property
     def size(self) -> int:
