@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from evercal.calibration.located import Located, fuse, halves_apart
+from evercal.calibration.located import ImagePose, fuse, halves_apart
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.localization.estimate import PoseEstimate
@@ -19,10 +19,10 @@ def estimate(scene: str | None, reason: str = "") -> PoseEstimate:
     return PoseEstimate(status, reason, scene, pose, np.eye(6) * 1e-6, 100, 0.5, 1.0)
 
 
-def located(poses: SE3, scenes: Sequence[str | None] | None = None) -> list[Located]:
+def located(poses: SE3, scenes: Sequence[str | None] | None = None) -> list[ImagePose]:
     names = scenes or ["room"] * len(poses)
     return [
-        Located(f"{i}.png", estimate(names[i], "too dark"), pose, np.eye(6) * 1e-6)
+        ImagePose(f"{i}.png", estimate(names[i], "too dark"), pose, np.eye(6) * 1e-6)
         for i, pose in enumerate(poses)
     ]
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.align_points import Picks, align_by_points
-from evercal.calibration.from_images import scene_named
 from evercal.calibration.located import locate
 from evercal.calibration.pose_pairs.fit import HandEyeFit
 from evercal.calibration.pose_pairs.pairs import PosePairs
@@ -71,7 +70,8 @@ def _in_own_frame(localizer: "Localizer", name: str) -> "Localizer":
     """Return a localizer that answers in the frame of a scene's landmarks."""
     from evercal.localization.localizer import Localizer
 
-    scene, contents = scene_named(localizer, name), localizer.contents
+    contents = localizer.contents
+    scene = contents.scene(name)
     own = replace(scene, frame=MapFrame(pose_sigma=scene.frame.pose_sigma))
     scenes = [own if other.name == name else other for other in contents.scenes]
     own_contents = MapContents(contents.encoder, contents.short_side, scenes)
@@ -190,7 +190,7 @@ def aligned_by_points(
         InputError: Fewer than two images were located, or there are too few points.
     """
     localizer, images = _in_own_frame(localizer, scene), []
-    own = scene_named(localizer, scene)
+    own = localizer.contents.scene(scene)
     for name, image, pixels in picks:
         [item] = locate(localizer, [(name, image)])
         if not item.is_located or item.estimate.scene != scene:

@@ -17,8 +17,8 @@ from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
 from evercal.mapping.build import Adjusted, BuiltMap, OnProgress
-from evercal.recordings.frame import Recording
-from evercal.recordings.held_out import lacks_camera_poses as lacks_camera_poses
+from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Recording
+from evercal.recordings.held_out import require_frames
 
 MOST_FOCAL_PERCENT, MOST_POSE_SIGMA_MM = 1.0, 5.0
 """Larger corrections indicate systematic errors, which the covariance does not contain."""
@@ -45,6 +45,8 @@ class HandEyeReport:
     given_deg: float | None = None
     warnings: tuple[str, ...] = ()
     """Reasons not to rely on the estimate."""
+    created: str = ""
+    """ISO 8601 time with zone."""
 
     @property
     def gripper_from_camera(self) -> UncertainPose:
@@ -62,7 +64,7 @@ class HandEyeReport:
             parent_frame="gripper",
             camera=camera,
             source={"command": "learn", "scene": scene, "frames": frames},
-            created=datetime.now(UTC).isoformat(timespec="seconds"),
+            created=self.created,
         )
         warnings = [f"Do not rely on it: {warning}." for warning in self.warnings]
         return replace(calibration, verdict=" ".join(warnings or [verdict(calibration)]))
@@ -86,9 +88,10 @@ def posed_by_gripper(
         on_progress: Called as pairs of frames are matched.
 
     Raises:
-        InputError: See `hand_eye_start`.
+        InputError: Too few frames, or see `hand_eye_start`.
     """
     frames = tuple(frame for frame in recording.train if frame.base_from_gripper is not None)
+    require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
     try:
         start = hand_eye_start(frames, encoder, on_progress=on_progress)
     except InputError as error:
@@ -119,7 +122,7 @@ def hand_eye_report(
     start_from_camera = UncertainPose(correction.start_camera_from_camera, correction.covariance)
     estimate = start.gripper_from_camera @ start_from_camera
     start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.gripper_from_camera)
-    given_mm = given_deg = None
+    given_mm, given_deg = None, None
     if given is not None:
         given_mm, given_deg = pose_distance_mm_deg(estimate.pose, given)
     return HandEyeReport(
@@ -133,6 +136,7 @@ def hand_eye_report(
         given_mm=given_mm,
         given_deg=given_deg,
         warnings=_warnings(built.adjusted),
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
 
 

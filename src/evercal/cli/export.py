@@ -27,7 +27,7 @@ class ExportCalibration:
     calibration: Annotated[
         Positional[Path | None], arg(metavar="[CALIBRATION.json]", help_behavior_hint="")
     ] = None
-    """Calibration file."""
+    """Calibration file, or a map that was learned from gripper poses (MAP or MAP:SCENE)."""
     format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Format, such as easy_handeye2, urdf, opencv or kuka; `list` lists all."""
     out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -59,9 +59,9 @@ class ExportCalibration:
 
     def run(self) -> int:
         """Read all inputs before writing the output."""
-        from evercal.calibration.calibration import read_calibration
         from evercal.calibration.export.formats import FORMATS, export_files
         from evercal.calibration.export.request import ExportOptions
+        from evercal.calibration.learned import calibration_at
 
         if self.format == "list" or (self.format is None and self.calibration is None):
             return self._list()
@@ -70,7 +70,7 @@ class ExportCalibration:
         if self.calibration is None:
             raise InputError("no calibration given; name its JSON file after 'export'")
         options = {key: getattr(self, key) for key in ExportOptions.__annotations__}
-        calibration = read_calibration(self.calibration)
+        calibration = calibration_at(self.calibration)
         self._print(export_files(calibration, self.format, self.out, **options))
         return 0
 

@@ -78,6 +78,7 @@ def _map(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]]:
             "landmarks": scene.landmarks,
             "min_support": scene.min_support,
             "adjusted": report.get("adjusted"),
+            "hand_eye": report.get("hand_eye"),
         }
         for scene, report in zip(store.contents.scenes, store.reports(), strict=True)
     ]

@@ -111,8 +111,8 @@ class Learn:
             raise InputError(f"--workers {self.workers}: one recording is learned; omit the option")
         require_writable(self.calibration, "--calibration")
         self._require_parsed_memory()
-        from evercal.calibration.eye_in_hand import lacks_camera_poses
         from evercal.recordings import posed_recording
+        from evercal.recordings.frame import lacks_camera_poses
         from evercal.recordings.held_out import split_held_out
 
         recording = self.reading.recording(path, self.name)
@@ -135,7 +135,9 @@ class Learn:
             print("stopped; the same command continues or starts again", file=sys.stderr)
             return 130
         if self.calibration is not None and report.hand_eye is not None:
-            self._write_hand_eye(report)
+            from evercal.calibration.learned import learned_calibration
+
+            learned_calibration(self.store, report.scene).write(self.calibration)
         if self.json:
             print_json(dataclasses.asdict(report))
             return 0
@@ -211,18 +213,6 @@ class Learn:
         for name, value in options.items():
             if value is not None:
                 raise InputError(f"--{name.replace('_', '-')} {value}: {why}")
-
-    def _write_hand_eye(self, report: "LearnReport") -> None:
-        from evercal.cli.stores import open_localizer
-        from evercal.localization.localizer import Localizer
-
-        localizer = open_localizer(self.store, "cpu")
-        assert isinstance(localizer, Localizer), "only a map estimates gripper_from_camera"
-        assert report.hand_eye is not None, "checked by the caller"
-        assert self.calibration is not None, "checked by the caller"
-        camera = localizer.contents.scenes[-1].adjusted_camera
-        calibration = report.hand_eye.calibration(camera, report.scene, report.train_frames)
-        calibration.write(self.calibration)
 
 
 def summary(report: "LearnReport") -> list[str]:

@@ -10,8 +10,13 @@ from evercal.mapping.build import Adjusted, MapOptions, OnProgress, build_map
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.recordings import posed_recording
-from evercal.recordings.frame import MIN_GRIPPER_FRAMES, MIN_TRAIN_FRAMES, Recording
-from evercal.recordings.held_out import lacks_camera_poses, require_frames, split_held_out
+from evercal.recordings.frame import (
+    MIN_GRIPPER_FRAMES,
+    MIN_TRAIN_FRAMES,
+    Recording,
+    lacks_camera_poses,
+)
+from evercal.recordings.held_out import require_frames, split_held_out
 
 if TYPE_CHECKING:
     from evercal.calibration.eye_in_hand import HandEyeReport

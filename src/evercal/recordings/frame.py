@@ -90,3 +90,9 @@ def posed_recording(recording: Recording) -> Recording:
     train = posed_frames(recording.train)
     lost = len(recording.train) - len(train)
     return replace(recording, train=train, untracked=recording.untracked + lost)
+
+
+def lacks_camera_poses(recording: Recording) -> bool:
+    """Whether a recording states gripper poses but no camera poses."""
+    stated = any(frame.base_from_camera is not None for frame in recording.train)
+    return not stated and any(frame.base_from_gripper is not None for frame in recording.train)

@@ -70,9 +70,3 @@ def require_frames(recording: Recording, least: int = MIN_TRAIN_FRAMES) -> None:
             f"scene {recording.name!r}: {len(recording.train)} training frames are too few; give at"
             f" least {least}"
         )
-
-
-def lacks_camera_poses(recording: Recording) -> bool:
-    """Whether a recording states gripper poses but no camera poses."""
-    stated = any(frame.base_from_camera is not None for frame in recording.train)
-    return not stated and any(frame.base_from_gripper is not None for frame in recording.train)

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, ImageUse
-from evercal.calibration.from_images import map_digest
 from evercal.errors import InputError
 from evercal.geometry import Camera, resize_pixels
 from evercal.recordings.images import read_image
@@ -267,4 +266,7 @@ def _is_other_map(calibration: Calibration, localizer: "LearnedLocalizer") -> bo
         return digest is not None
     from evercal.localization.localizer import Localizer
 
-    return not isinstance(localizer, Localizer) or map_digest(localizer, str(scene)) != digest
+    return (
+        not isinstance(localizer, Localizer)
+        or localizer.contents.scene(str(scene)).digest != digest
+    )

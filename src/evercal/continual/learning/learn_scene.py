@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torch import nn
 
-from evercal.calibration.eye_in_hand import hand_eye_report, lacks_camera_poses, posed_by_gripper
+from evercal.calibration.eye_in_hand import hand_eye_report, posed_by_gripper
 from evercal.continual.learning.finish_scene import memory_bytes
 from evercal.continual.learning.learn import learn
 from evercal.continual.learning.presets import preset, short_side
@@ -27,7 +27,7 @@ from evercal.geometry import SE3
 from evercal.learning.scene import LearnReport
 from evercal.localization.fit_acceptance import fit_acceptance
 from evercal.mapping.build import BuiltMap
-from evercal.recordings.frame import Frame, Recording, posed_recording
+from evercal.recordings.frame import Frame, Recording, lacks_camera_poses, posed_recording
 from evercal.recordings.held_out import named_recording, require_frames, split_held_out
 from evercal.storage.stages import is_store
 
