@@ -67,8 +67,7 @@ def audit(
         on_episode: Called after each episode.
 
     Raises:
-        InputError: There is no episode, an episode without a camera pose, or the scene's unit of
-            length is unknown.
+        InputError: No episode, one without a camera pose, or a scene of unknown unit of length.
     """
     audited = []
     for episode in episode_folders(folder):
@@ -118,7 +117,6 @@ def _audited(
 
 
 def _shots(episode: Path, stated: SE3 | None) -> list[_Shot]:
-    """The images of an episode, in order."""
     pose_file = next((episode / name for name in POSE_FILES if (episode / name).is_file()), None)
     pose = stated if pose_file is None else read_transform(pose_file)
     try:

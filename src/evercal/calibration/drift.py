@@ -61,19 +61,7 @@ def check(
     camera: Camera | None = None,
     on_image: Callable[[], object] = lambda: None,
 ) -> Shift:
-    """Test whether a camera has moved since its calibration.
-
-    Args:
-        localizer: Localizer of a map that holds the scene.
-        images: (name, (h, w, 3) uint8 RGB) of the camera as it is now.
-        reference: Calibration of the camera.
-        camera: Intrinsics. Default: those of the reference.
-        on_image: Called after each image.
-
-    Raises:
-        InputError: No image was located, the reference is a camera on the gripper, or the scene's
-            unit of length is unknown.
-    """
+    """Test whether a camera has moved since its calibration, see `Map.check`."""
     located = locate(localizer, images, camera or reference.camera, on_image)
     return shift_between(reference, fuse(located), located, localizer)
 

@@ -80,15 +80,10 @@ class PosedByGripper(NamedTuple):
 def posed_by_gripper(
     recording: Recording, encoder: Encoder, on_progress: OnProgress = lambda *_: None
 ) -> PosedByGripper:
-    """Estimate rough camera poses of a recording that states gripper poses.
-
-    Args:
-        recording: Frames without a gripper pose count as untracked.
-        encoder: Encoder for the similarity of frames.
-        on_progress: Called as pairs of frames are matched.
+    """Estimate rough camera poses; frames without a gripper pose count as untracked.
 
     Raises:
-        InputError: Too few frames, or see `hand_eye_start`.
+        InputError: Too few frames, too little rotation, or too few frames that show one place.
     """
     frames = tuple(frame for frame in recording.train if frame.base_from_gripper is not None)
     require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
@@ -109,12 +104,9 @@ def posed_by_gripper(
 def hand_eye_report(
     start: HandEyeStart, built: BuiltMap, given: SE3 | None = None
 ) -> HandEyeReport:
-    """Return the estimate after bundle adjustment.
+    """Return the estimate after bundle adjustment, compared with a `given` one.
 
-    Args:
-        start: First estimate.
-        built: Map that was built with `MapOptions.for_hand_eye`.
-        given: `gripper_from_camera` from another source, to compare with.
+    `built` was made with `MapOptions.for_hand_eye`.
     """
     correction = built.hand_eye
     assert correction is not None, "the map was built for a hand-eye calibration"

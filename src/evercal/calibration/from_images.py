@@ -107,16 +107,9 @@ def calibrate(
     mount: Mount | None = None,
     on_image: Callable[[], object] = lambda: None,
 ) -> Calibration:
-    """Estimate the pose of a camera from images of a mapped scene.
+    """Estimate the pose of a camera from images of a mapped scene, see `Map.calibrate`.
 
-    Args:
-        localizer: Localizer of a map that holds the scene.
-        given: Images and, for a camera on the gripper, the gripper's poses.
-        mount: Default: eye_in_hand if there are gripper poses and the camera moves.
-        on_image: Called after each image.
-
-    Returns:
-        base_from_camera for eye_to_hand, gripper_from_camera for eye_in_hand.
+    `mount` is eye_in_hand by default if there are gripper poses and the camera moves.
 
     Raises:
         InputError: No image was located, eye_in_hand without gripper poses, or the scene's unit of

@@ -28,11 +28,7 @@ _EXPECTED = "give what 'ros2 topic echo --once /tf_static' prints, or a Transfor
 
 
 def standard_link_from_optical(offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> SE3:
-    """Return the pose of an optical frame with the axes of REP 103.
-
-    Args:
-        offset_m: Origin of the optical frame in the link: forward, left, up.
-    """
+    """Return the pose of an optical frame whose origin lies forward, left, up in the link."""
     return SE3(np.array([0.5, -0.5, 0.5, -0.5]), np.array(offset_m))
 
 
@@ -47,12 +43,9 @@ def published_at(calibration: "Calibration", link: str, link_from_optical: SE3) 
 def read_link_from_optical(path: str | os.PathLike[str], link: str, optical: str) -> SE3:
     """Read the pose of the optical frame in the driver's root frame.
 
-    Args:
-        path: YAML or JSON: the output of `ros2 topic echo --once /tf_static`, a TransformStamped,
-            or an object with `parent_frame`, `child_frame`, `translation_m`, `quaternion_wxyz`.
-            Several transforms are chained in either direction.
-        link: Name of the driver's root frame.
-        optical: Name of the optical frame.
+    The file is YAML or JSON: the output of `ros2 topic echo --once /tf_static`, a TransformStamped,
+    or an object with `parent_frame`, `child_frame`, `translation_m`, `quaternion_wxyz`. Several
+    transforms are chained in either direction.
 
     Raises:
         InputError: The file is missing or broken, or its transforms do not connect the two frames.
@@ -86,7 +79,6 @@ def read_link_from_optical(path: str | os.PathLike[str], link: str, optical: str
 
 
 def _transforms(data: Any) -> _Transforms:
-    """Return the transforms of a document."""
     if isinstance(data, Mapping) and "transforms" in data:
         data = data["transforms"]
     if isinstance(data, list):

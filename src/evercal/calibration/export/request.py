@@ -113,11 +113,7 @@ def pose_numbers(poses: SE3, convention: str = "xyzw") -> NDArray[np.float64]:
 def prepare_export(
     calibration: "Calibration", name: str = "evercal", **options: Unpack[ExportOptions]
 ) -> Export:
-    """Rename the frames, move the pose to the driver's root frame, and read the files.
-
-    Raises:
-        InputError: A frame name is invalid, the options contradict each other, or a file is broken.
-    """
+    """Rename the frames, move the pose to the driver's root frame, and read the files."""
     parent = options.get("parent") or calibration.parent_frame
     child = options.get("child") or calibration.child_frame
     link, other = options.get("via"), options.get("robot_frame")
