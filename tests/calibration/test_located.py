@@ -46,14 +46,6 @@ def test_outliers_are_rejected() -> None:
     assert radians < 5e-4
 
 
-def test_order_of_images_does_not_matter() -> None:
-    _, poses = scattered(15)
-    order = np.random.default_rng(1).permutation(15)
-    one, other = fuse(located(poses)), fuse(located(poses[order]))
-    assert max(pose_distance(one.pose, other.pose)) < 1e-9
-    assert one.scatter == pytest.approx(other.scatter)
-
-
 def test_scatter_is_the_covariance_of_one_image() -> None:
     _, poses = scattered(400, sigma=1e-3)
     scatter = fuse(located(poses)).scatter

@@ -17,7 +17,7 @@ from evercal.geometry import SE3, pose_distance
 
 from .random_poses import calibration_of, poses
 
-few = settings(max_examples=40)
+few = settings(max_examples=15)
 
 
 def test_axes_follow_rep_103() -> None:

@@ -24,7 +24,7 @@ from evercal.recordings.poses.camera_file import read_camera
 from .random_poses import calibration_of, poses, quaternion_matrix
 
 poses_and_mounts = given(poses(), st.sampled_from(["eye_to_hand", "eye_in_hand"]))
-few = settings(max_examples=40)
+few = settings(max_examples=15)
 CHILD = "cam/optical-frame"
 
 
@@ -230,7 +230,7 @@ def test_invalid_frame_names_are_refused(name: str) -> None:
         calibration_of(SE3.identity()).export("urdf", child=name)
 
 
-@pytest.mark.parametrize("name", ["camera", "robot1/camera_link", "panda_link0", "0", "a.b-c"])
+@pytest.mark.parametrize("name", ["robot1/camera_link", "0", "a.b-c"])
 def test_valid_frame_names_are_written(name: str) -> None:
     text = calibration_of(SE3.identity()).export("transform_stamped", child=name)
     assert yaml.safe_load(text)["child_frame_id"] == name
