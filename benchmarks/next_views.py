@@ -16,8 +16,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.rows import Row, save, show
-from evercal.calibration.next_views import NextViewOptions, next_views
-from evercal.calibration.view_information import HandEyeViews, ScenePoints, ViewNoise
+from evercal.calibration.next_views import (
+    CAMERA_NOISE,
+    GRIPPER_NOISE,
+    PIXEL_PX,
+    next_views,
+    pixel_slopes,
+    wrist_jacobian,
+)
 from evercal.geometry import SE3, pose_distance
 from evercal.geometry.uncertain_pose import axis_deviation
 from evercal.simulation.box_room import default_camera
@@ -38,37 +44,45 @@ class Trial:
 
     reachable: SE3
     """(n,) base_from_gripper."""
-    truth: HandEyeViews
-    """The true mount with the noise of every view, before the first image."""
-    planner: HandEyeViews
-    """What is known before the first image: the drawing's mount, and nothing of the scene."""
-    aware: HandEyeViews
-    """The same with the points of the scene."""
-    added: NDArray[np.floating]
-    """(n, 12, 12) information of each pose at the truth."""
+    mount: SE3
+    """The true gripper_from_camera."""
+    image: NDArray[np.floating]
+    """(n, 6, 6) covariance of the camera pose that an image at each pose gives."""
     rng: np.random.Generator
     start: NDArray[np.int64]
     """(FIRST,) poses that every order starts with."""
+
+    @property
+    def weights(self) -> NDArray[np.floating]:
+        """(n, 6, 6) inverse covariance of the residual at each pose."""
+        to_camera = self.mount.inverse().adjoint()
+        return np.linalg.inv(to_camera @ GRIPPER_NOISE @ to_camera.T + self.image)
+
+    @property
+    def added(self) -> NDArray[np.floating]:
+        """(n, 12, 12) information of each pose at the truth."""
+        jacobian = wrist_jacobian(self.reachable, self.mount, WORK_AREA_M)
+        return np.swapaxes(jacobian, 1, 2) @ self.weights @ jacobian
 
 
 def trial(seed: int, pool: int) -> Trial:
     """Draw a cell, a mount and a start."""
     rng = np.random.default_rng([seed, 41])
     cell = VirtualCell(seed)
-    reachable = cell.reachable_poses(pool)
-    mount, noise = cell.truth.gripper_from_camera, ViewNoise()
+    reachable, mount = cell.reachable_poses(pool), cell.truth.gripper_from_camera
     points = WORK_AREA_M + rng.uniform(-1, 1, (80, 3)) * (0.3, 0.4, 0.08)
-    scene = ScenePoints(default_camera(640, 480), points)
-    truth = HandEyeViews.start(mount, WORK_AREA_M, noise, scene)
-    return Trial(
-        reachable,
-        truth,
-        HandEyeViews.start(nominal_mount(), WORK_AREA_M, noise),
-        HandEyeViews.start(nominal_mount(), WORK_AREA_M, noise, scene),
-        truth.added(reachable),
-        rng,
-        rng.choice(pool, FIRST, replace=False),
-    )
+    image = [CAMERA_NOISE + seen_covariance(pose, points) for pose in reachable @ mount]
+    return Trial(reachable, mount, np.stack(image), rng, rng.choice(pool, FIRST, replace=False))
+
+
+def seen_covariance(base_from_camera: SE3, points_m: NDArray[np.floating]) -> NDArray[np.floating]:
+    """(6, 6) covariance of a camera pose from the points that the camera sees."""
+    camera = default_camera(640, 480)
+    inside = base_from_camera.inverse().apply(points_m)
+    pixels = camera.project(inside)
+    visible = ((pixels >= 0) & (pixels <= (camera.width - 1, camera.height - 1))).all(1)
+    slopes = pixel_slopes(camera, inside[visible])[0].reshape(-1, 6)
+    return np.linalg.inv(slopes.T @ slopes + 1e-9 * np.eye(6)) * PIXEL_PX**2
 
 
 def random_order(draw: Trial) -> NDArray[np.int64]:
@@ -89,18 +103,10 @@ def farthest_order(draw: Trial) -> NDArray[np.int64]:
     return np.array(chosen)
 
 
-def planned(draw: Trial, start: HandEyeViews, options: NextViewOptions) -> NDArray[np.int64]:
-    """The poses of `next_views` after the first ones."""
+def planned(draw: Trial, mount: SE3 | None) -> NDArray[np.int64]:
+    """The poses of `next_views` after the first ones; it knows a rough mount, or none."""
     used = draw.reachable[draw.start]
-    state = start.with_views(used)
-    chosen = next_views(state, draw.reachable, LONGEST - FIRST, used, options)
-    return np.concatenate([draw.start, chosen.index])
-
-
-def unaware_order(draw: Trial) -> NDArray[np.int64]:
-    """The poses of `next_views` for a camera somewhere on the gripper."""
-    used = draw.reachable[draw.start]
-    chosen = next_views(HandEyeViews.recorded(used), draw.reachable, LONGEST - FIRST, used)
+    chosen = next_views(used, draw.reachable, LONGEST - FIRST, mount)
     return np.concatenate([draw.start, chosen.index])
 
 
@@ -119,34 +125,25 @@ def reached(draw: Trial, order: NDArray[np.int64], sigma_mm: float) -> int:
 
 def simulated_mm(draw: Trial, order: NDArray[np.int64], draws: int) -> float:
     """Root mean square error of the position per axis, from drawn noise and nonlinear estimates."""
-    truth, grippers = draw.truth, draw.reachable[order]
-    mount, scene = truth.gripper_from_camera, truth.base_from_scene
-    views, noise = len(order), truth.noise
-    cameras = scene.inverse() @ grippers @ mount
-    base_from_camera = grippers @ mount
-    assert truth.points is not None
-    image = noise.camera + np.linalg.inv(
-        truth.points.pose_information(base_from_camera, noise.pixel_px)
-    )
-    roots = np.linalg.cholesky(image)
+    grippers, views = draw.reachable[order], len(order)
+    cameras = SE3.from_translation(-WORK_AREA_M) @ grippers @ draw.mount
+    roots = np.linalg.cholesky(draw.image[order])
     errors = []
     for _ in range(draws):
-        robot = draw.rng.standard_normal((views, 6)) @ np.linalg.cholesky(noise.gripper).T
+        robot = draw.rng.standard_normal((views, 6)) @ np.linalg.cholesky(GRIPPER_NOISE).T
         seen = (roots @ draw.rng.standard_normal((views, 6, 1)))[..., 0]
         stated, measured = grippers @ SE3.exp(robot), cameras @ SE3.exp(seen)
-        estimate = _estimate(truth, stated, measured)
-        errors.append(estimate.translation_m - mount.translation_m)
+        estimate = _estimate(draw.mount, stated, measured, draw.weights[order])
+        errors.append(estimate.translation_m - draw.mount.translation_m)
     return 1000 * float(np.sqrt(np.mean(np.square(errors))))
 
 
-def _estimate(truth: HandEyeViews, stated: SE3, measured: SE3) -> SE3:
+def _estimate(mount: SE3, stated: SE3, measured: SE3, weights: NDArray[np.floating]) -> SE3:
     """Gauss-Newton from the truth; the weights are those of the model."""
-    mount, scene = truth.gripper_from_camera, truth.base_from_scene
-    weights = truth.weights(stated)
+    scene = SE3.from_translation(WORK_AREA_M)
     for _ in range(5):
         residual = ((stated @ mount).inverse() @ scene @ measured).log()
-        jacobian = np.zeros((len(stated), 6, 12))
-        jacobian[:, :3, :3], jacobian[:, 3:, 3:6] = -mount.rotation_matrix().T, -np.eye(3)
+        jacobian = wrist_jacobian(stated, mount, WORK_AREA_M)
         jacobian[:, :, 6:] = measured.inverse().adjoint()
         weighted = np.swapaxes(jacobian, 1, 2) @ weights
         normal = (weighted @ jacobian).sum(0)
@@ -161,10 +158,8 @@ def _estimate(truth: HandEyeViews, stated: SE3, measured: SE3) -> SE3:
 ORDERS: dict[str, Order] = {
     "random": random_order,
     "farthest in rotation": farthest_order,
-    "D-optimal": lambda draw: planned(draw, draw.planner, NextViewOptions(criterion="D")),
-    "A-optimal": lambda draw: planned(draw, draw.planner, NextViewOptions()),
-    "A-optimal, mount unknown": unaware_order,
-    "A-optimal, scene known": lambda draw: planned(draw, draw.aware, NextViewOptions()),
+    "next_views": lambda draw: planned(draw, nominal_mount()),
+    "next_views, mount unknown": lambda draw: planned(draw, None),
 }
 
 

@@ -10,13 +10,12 @@ if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration as Calibration
     from evercal.calibration.calibration import read_calibration as read_calibration
     from evercal.calibration.drift import Shift as Shift
-    from evercal.calibration.fixed_camera_views import FixedCameraViews as FixedCameraViews
-    from evercal.calibration.next_views import NextViewOptions as NextViewOptions
     from evercal.calibration.next_views import next_views as next_views
+    from evercal.calibration.next_views import (
+        next_views_of_fixed_camera as next_views_of_fixed_camera,
+    )
     from evercal.calibration.pose_pairs.pairs import PosePairs as PosePairs
     from evercal.calibration.pose_pairs.solve import solve as solve
-    from evercal.calibration.view_information import HandEyeViews as HandEyeViews
-    from evercal.calibration.view_information import ViewNoise as ViewNoise
     from evercal.errors import InputError as InputError
     from evercal.evaluation import Scores as Scores
     from evercal.geometry import SE3 as SE3
@@ -40,15 +39,12 @@ _PUBLIC = {
     "Calibration": "evercal.calibration.calibration",
     "Camera": "evercal.geometry",
     "Client": "evercal.service.client",
-    "FixedCameraViews": "evercal.calibration.fixed_camera_views",
     "Frame": "evercal.recordings",
-    "HandEyeViews": "evercal.calibration.view_information",
     "InputError": "evercal.errors",
     "LearnReport": "evercal.learning.scene",
     "LocalizeOptions": "evercal.localization.query",
     "Map": "evercal.map",
     "MapOptions": "evercal.mapping.build",
-    "NextViewOptions": "evercal.calibration.next_views",
     "PoseEstimate": "evercal.localization.estimate",
     "PosePairs": "evercal.calibration.pose_pairs.pairs",
     "ReadOptions": "evercal.recordings",
@@ -57,9 +53,9 @@ _PUBLIC = {
     "Scores": "evercal.evaluation",
     "Shift": "evercal.calibration.drift",
     "UncertainPose": "evercal.geometry",
-    "ViewNoise": "evercal.calibration.view_information",
     "load_recording": "evercal.recordings",
     "next_views": "evercal.calibration.next_views",
+    "next_views_of_fixed_camera": "evercal.calibration.next_views",
     "read_calibration": "evercal.calibration.calibration",
     "read_image": "evercal.recordings",
     "solve": "evercal.calibration.pose_pairs.solve",

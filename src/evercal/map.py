@@ -119,7 +119,7 @@ class Map:
         """Learn a scene; the scenes learned before do not change.
 
         A recording that states gripper poses and no camera poses also yields `gripper_from_camera`,
-        see `LearnReport.hand_eye`.
+        see `LearnReport.hand_eye` and `calibration`.
 
         Args:
             recording: a recording or its path. Training frames are learned; test frames are not
@@ -382,6 +382,19 @@ class Map:
 
         given = Images.of(images, camera, robot_poses)
         return calibrate(self.localizer, given, mount, on_image=on_image)
+
+    def calibration(self, scene: str | None = None) -> Calibration:
+        """The `gripper_from_camera` that learning a wrist recording has estimated.
+
+        Args:
+            scene: Name of the scene. Default: the only one that was learned from gripper poses.
+
+        Raises:
+            InputError: No such scene, or none or several that were learned from gripper poses.
+        """
+        from evercal.calibration.learned import learned_calibration
+
+        return learned_calibration(self.path, scene)
 
     def check(
         self,

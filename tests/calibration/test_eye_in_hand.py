@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from evercal.calibration.eye_in_hand import lacks_camera_poses
+from evercal.calibration.learned import calibration_at
 from evercal.calibration.verdict import TIERS, tier
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
@@ -17,7 +18,9 @@ from evercal.learning.scene import LearnReport
 from evercal.localization.localizer import Localizer
 from evercal.map import Map
 from evercal.mapping.scene_map import MapContents
+from evercal.mapping.store import MapStore
 from evercal.recordings import Recording, load_recording
+from evercal.recordings.frame import lacks_camera_poses
 from evercal.recordings.samples import FOLDER
 
 
@@ -45,16 +48,18 @@ def learned(
 ) -> tuple[Path, LearnReport]:
     folder = tmp_path_factory.mktemp("wrist") / "cell"
     rough = truth @ SE3.exp([0.05, 0, 0, 0, 0.2, 0])
-    report = Map.open(folder, device="cpu").learn(
-        without_camera_poses(hand), memory="30%", gripper_from_camera=rough
-    )
+    arm = without_camera_poses(hand)
+    few = replace(arm, train=arm.train[:: len(arm.train) // 14][:14])
+    report = Map.open(folder, device="cpu").learn(few, gripper_from_camera=rough)
     return folder, report
 
 
 def test_gripper_from_camera_within_its_covariance(
     learned: tuple[Path, LearnReport], truth: SE3
 ) -> None:
-    report = learned[1].hand_eye
+    whole, report = learned[1], learned[1].hand_eye
+    assert (whole.train_frames, whole.held_out_frames) == (14, 0)
+    assert whole.frames_kept >= 8
     assert report is not None
     estimate = report.gripper_from_camera
     metres, radians = pose_distance(estimate.pose, truth)
@@ -66,32 +71,49 @@ def test_gripper_from_camera_within_its_covariance(
     assert report.warnings == ()
 
 
-def test_twelve_images_are_enough(hand: Recording, truth: SE3, tmp_path: Path) -> None:
-    arm = without_camera_poses(hand)
-    few = replace(arm, train=arm.train[:: len(arm.train) // 12][:12])
-    report = Map.open(tmp_path / "cell", device="cpu").learn(few)
-    assert (report.train_frames, report.held_out_frames) == (12, 0)
-    assert report.frames_kept >= 8
+def test_the_map_keeps_the_calibration(learned: tuple[Path, LearnReport], tmp_path: Path) -> None:
+    folder, report = learned
     assert report.hand_eye is not None
-    estimate = report.hand_eye.gripper_from_camera
-    assert pose_distance(estimate.pose, truth)[0] < 0.01
-    assert estimate.squared_mahalanobis(truth) < 22.5  # 99.9 % of a chi-squared with 6 dof
-
-
-def test_report_becomes_a_calibration(learned: tuple[Path, LearnReport], hand: Recording) -> None:
-    report = learned[1].hand_eye
-    assert report is not None
-    calibration = report.calibration(hand.test[0].camera, "arm", 60)
+    shutil.copytree(folder, tmp_path / "cell")
+    cell = Map.open(tmp_path / "cell", device="cpu")
+    calibration = cell.calibration()
     assert (calibration.mount, calibration.parent_frame) == ("eye_in_hand", "gripper")
     assert tier(calibration) in TIERS
+    estimate = report.hand_eye.gripper_from_camera
+    assert max(pose_distance(calibration.parent_from_child, estimate.pose)) < 1e-12
+    np.testing.assert_array_equal(calibration.covariance, estimate.covariance)
+    assert calibration.camera == cell.localizer.contents.scenes[0].adjusted_camera
+    assert calibration.created == report.hand_eye.created != ""
+    cell.rename("arm", "bench")
+    assert calibration_at(tmp_path / "cell").to_dict() == cell.calibration("bench").to_dict()
+    assert calibration_at(f"{tmp_path / 'cell'}:bench").source["scene"] == "bench"
+    with pytest.raises(InputError, match=r"scene 'arm': map .* has only bench"):
+        calibration_at(f"{tmp_path / 'cell'}:arm")
+    cell.merge(folder)
+    with pytest.raises(InputError, match="bench, arm each have a calibration; name one"):
+        calibration_at(tmp_path / "cell")
+    file = tmp_path / "wrist.json"
+    calibration.write(file)
+    assert calibration_at(file).to_dict() == calibration.to_dict()
     # As in the report of a fixed camera: images, their residuals, and causes that sum to the whole.
     assert len(calibration.images) > 10
     assert all(0 < (image.residual_mm or 0) < 5 for image in calibration.images if image.used)
     parts = [term.translation_mm for term in calibration.error_terms]
     assert np.linalg.norm(parts) == pytest.approx(calibration.sigma_mm)
-    doubtful = replace(report, warnings=("the clocks differ",))
-    verdict = doubtful.calibration(hand.test[0].camera, "arm", 60).verdict
+    doubtful = replace(report.hand_eye, warnings=("the clocks differ",))
+    verdict = doubtful.calibration(cell.localizer.contents.scenes[0].camera, "arm", 60).verdict
     assert verdict == "Do not rely on it: the clocks differ."
+
+
+def test_a_map_without_gripper_poses_has_no_calibration(
+    hall_map: MapContents, tmp_path: Path
+) -> None:
+    store = MapStore(tmp_path / "map", MapContents(hall_map.encoder, hall_map.short_side))
+    store.commit(hall_map.scenes[0], {"hand_eye": None})
+    with pytest.raises(InputError, match="was not learned from gripper poses"):
+        calibration_at(tmp_path / "map")
+    with pytest.raises(InputError, match="map:hall: was not learned from gripper poses"):
+        Map.open(tmp_path / "map", device="cpu").calibration("hall")
 
 
 def test_images_are_located_in_the_base_frame(
@@ -129,3 +151,11 @@ def test_rotation_about_one_axis_is_refused(hand: Recording, tmp_path: Path) -> 
     with pytest.raises(InputError, match="arm: the gripper turns about one axis only"):
         Map.open(tmp_path / "map", device="cpu").learn(Recording("arm", frames, ()))
     assert not (tmp_path / "map").exists()
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_too_few_images_are_refused(count: int, hand: Recording, tmp_path: Path) -> None:
+    arm = without_camera_poses(hand)
+    few = replace(arm, train=arm.train[:count])
+    with pytest.raises(InputError, match=rf"^scene 'arm': {count} training frames are too few"):
+        Map.open(tmp_path / "map", device="cpu").learn(few)

@@ -43,7 +43,7 @@ def motions(poses: SE3, truth: SE3, noise_rad: float = 0.0, wrong: int = 0) -> l
     return pairs
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_exact_motions_give_the_exact_transform(seed: int) -> None:
     poses = grippers(12, seed)
     start = solve_motions(poses, motions(poses, TRUTH))
@@ -53,7 +53,7 @@ def test_exact_motions_give_the_exact_transform(seed: int) -> None:
     assert start.pairs == start.of_pairs
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_wrong_pairs_are_rejected(seed: int) -> None:
     poses = grippers(30, seed)
     start = solve_motions(poses, motions(poses, TRUTH, 0.005, wrong=20))

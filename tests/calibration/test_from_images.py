@@ -52,28 +52,11 @@ def truth_of(frame: Frame) -> SE3:
     return frame.base_from_camera
 
 
-def test_fixed_camera_within_its_uncertainty(
-    localizer: Localizer, hall: Recording, noisy: Draw
-) -> None:
+@pytest.fixture(scope="module")
+def fixed(localizer: Localizer, hall: Recording, noisy: Draw) -> Calibration:
+    """A fixed camera from six images."""
     frame = hall.test[3]
-    calibration = calibrate(localizer, Images(noisy(frame, 6, 0), frame.camera))
-    metres, radians = pose_distance(calibration.parent_from_child, truth_of(frame))
-    assert calibration.mount == "eye_to_hand"
-    assert calibration.parent_frame == "base"
-    assert metres < 0.004
-    assert metres < 4 * calibration.sigma_mm / 1000
-    assert radians < 4 * np.deg2rad(calibration.sigma_deg)
-    assert "will not help" in calibration.verdict
-    assert [image.used for image in calibration.images] == [True] * 6
-
-
-def test_more_images_from_one_spot_hardly_reduce_the_uncertainty(
-    localizer: Localizer, hall: Recording, noisy: Draw
-) -> None:
-    frame = hall.test[3]
-    few = calibrate(localizer, Images(noisy(frame, 2, 0), frame.camera))
-    many = calibrate(localizer, Images(noisy(frame, 12, 0), frame.camera))
-    assert many.sigma_mm > 0.7 * few.sigma_mm
+    return calibrate(localizer, Images(noisy(frame, 6, 0), frame.camera))
 
 
 def rms_variances(calibration: Calibration) -> tuple[float, float]:
@@ -82,21 +65,30 @@ def rms_variances(calibration: Calibration) -> tuple[float, float]:
     return sum(t.translation_mm**2 for t in terms), sum(t.rotation_deg**2 for t in terms)
 
 
+def test_fixed_camera_within_its_uncertainty(fixed: Calibration, hall: Recording) -> None:
+    metres, radians = pose_distance(fixed.parent_from_child, truth_of(hall.test[3]))
+    assert (fixed.mount, fixed.parent_frame) == ("eye_to_hand", "base")
+    assert metres < 0.004
+    assert metres < 4 * fixed.sigma_mm / 1000
+    assert radians < 4 * np.deg2rad(fixed.sigma_deg)
+    assert "will not help" in fixed.verdict
+    assert [image.used for image in fixed.images] == [True] * 6
+
+
 def test_terms_of_a_fixed_camera_are_its_images_causes(
-    localizer: Localizer, hall: Recording, noisy: Draw
+    fixed: Calibration, localizer: Localizer, hall: Recording, noisy: Draw
 ) -> None:
-    frame = hall.test[3]
-    images = noisy(frame, 4, 0)
-    calibration = calibrate(localizer, Images(images, frame.camera))
-    names = [term.name for term in calibration.error_terms]
-    assert names == [*CAUSES, "scatter of 4 images"]
-    assert rms_variances(calibration) == pytest.approx(
-        (calibration.sigma_mm**2, calibration.sigma_deg**2)
-    )
+    frame, rows = hall.test[3], rms_variances(fixed)
+    assert [term.name for term in fixed.error_terms] == [*CAUSES, "scatter of 6 images"]
+    assert rows == pytest.approx((fixed.sigma_mm**2, fixed.sigma_deg**2))
+    images = noisy(frame, 6, 0)
     estimates = [localizer.localize(image, frame.camera) for _, image in images]
-    for number, term in enumerate(calibration.error_terms[:-1]):
+    for number, term in enumerate(fixed.error_terms[:-1]):
         own = [estimate.terms[number].covariance for estimate in estimates]
         assert term == ErrorTerm.of(term.name, np.mean(own, axis=0))
+    # More images from one spot hardly reduce the uncertainty.
+    few = calibrate(localizer, Images(images[:2], frame.camera))
+    assert fixed.sigma_mm > 0.7 * few.sigma_mm
 
 
 def test_terms_of_a_camera_on_the_gripper_contain_the_arm(
@@ -250,43 +242,32 @@ def test_images_from_files_and_arrays(hall: Recording, tmp_path: Path) -> None:
 
 
 def test_motion_is_detected_and_rest_is_not(
-    localizer: Localizer, hall: Recording, noisy: Draw
+    fixed: Calibration, localizer: Localizer, hall: Recording, noisy: Draw
 ) -> None:
-    frame = hall.test[3]
-    reference = calibrate(localizer, Images(noisy(frame, 10, 0), frame.camera))
-    now = noisy(frame, 5, 1)
-    shift = check(localizer, now, reference)
-    assert shift.same_map
-    assert not shift.moved
+    now = noisy(hall.test[3], 4, 1)
+    own = check(localizer, now, fixed)
+    assert own.same_map
+    assert not own.moved
     for tangent in ([0.002, 0, 0, 0, 0, 0], [0, 0, 0, 0, np.deg2rad(0.1), 0]):
         # The camera has not moved; the reference states another pose.
-        pose = reference.parent_from_child @ SE3.exp(tangent)
-        shift = check(localizer, now, replace(reference, parent_from_child=pose))
+        pose = fixed.parent_from_child @ SE3.exp(tangent)
+        shift = check(localizer, now, replace(fixed, parent_from_child=pose))
         assert shift.moved
         assert shift.translation_mm == pytest.approx(1000 * np.linalg.norm(tangent[:3]), abs=0.5)
+    # A reference of another map adds its uncertainty.
+    other = check(localizer, now, replace(fixed, source={"command": "solve"}))
+    assert not other.same_map
+    assert other.sigma_mm > 1.1 * own.sigma_mm
+    with pytest.raises(InputError, match="on the gripper"):
+        check(localizer, now[:1], replace(fixed, mount="eye_in_hand"))
 
 
 def test_check_uses_the_camera_of_the_calibration(
     adjusted: Localizer, hall: Recording, noisy: Draw
 ) -> None:
     frame, camera = hall.test[3], adjusted.contents.scenes[0].camera
-    reference = calibrate(adjusted, Images(noisy(frame, 5, 0), camera))
-    now = noisy(frame, 3, 1)
-    assert not check(adjusted, now, reference).moved
-
-
-def test_reference_of_another_map_adds_its_uncertainty(
-    localizer: Localizer, hall: Recording, noisy: Draw
-) -> None:
-    frame = hall.test[3]
-    reference = calibrate(localizer, Images(noisy(frame, 5, 0), frame.camera))
-    now = noisy(frame, 5, 1)
-    own = check(localizer, now, reference)
-    other = check(localizer, now, replace(reference, source={"command": "solve"}))
-    assert not other.same_map
-    assert other.sigma_mm > 1.1 * own.sigma_mm
-    with pytest.raises(InputError, match="on the gripper"):
-        check(localizer, now, replace(reference, mount="eye_in_hand"))
+    reference = calibrate(adjusted, Images(noisy(frame, 4, 0), camera))
+    assert not check(adjusted, noisy(frame, 3, 1), reference).moved
 
 
 def test_rig_contains_relative_poses(localizer: Localizer, hall: Recording, noisy: Draw) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evercal.calibration.from_images import _from_many_spots as from_many_spots
-from evercal.calibration.located import Located, deviations, fuse, in_gripper_frame
+from evercal.calibration.located import ImagePose, deviations, fuse, in_gripper_frame
 from evercal.geometry import SE3, UncertainPose
 from evercal.localization.estimate import PoseEstimate
 
@@ -35,7 +35,7 @@ def squared_distance(seed: int, base_mm: float) -> float:
         pose = motion @ drawn(camera, rng.multivariate_normal(np.zeros(6), own))
         answer = UncertainPose(SE3.identity(), base) @ UncertainPose(pose, own)
         estimate = PoseEstimate("ok", "", "hall", pose, answer.covariance, 100, 0.5, 1.0)
-        located.append(Located(str(i), estimate, pose, answer.covariance))
+        located.append(ImagePose(str(i), estimate, pose, answer.covariance))
     moved = in_gripper_frame(located, grippers)
     fused = fuse(moved)
     covariance, terms = from_many_spots(located, moved, fused, grippers, base)

@@ -1,60 +1,133 @@
-"""Greedy designs against an exhaustive search, and how they treat duplicates."""
+"""Expected information of both mounts against numerical derivatives, and the greedy choice.
+
+The information of a camera on the gripper is also compared with the conditions of Tsai and Lenz,
+the choice with an exhaustive search.
+"""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from evercal.calibration.next_views import NextViewOptions, next_views
-from evercal.calibration.view_information import HandEyeViews
+from evercal.calibration.calibration import Calibration
+from evercal.calibration.next_views import (
+    CAMERA_NOISE,
+    GRIPPER_NOISE,
+    PIXEL_PX,
+    HostedLandmarks,
+    _chosen,
+    looked_at,
+    next_views,
+    next_views_of_fixed_camera,
+    wrist_information,
+    wrist_jacobian,
+)
 from evercal.errors import InputError
-from evercal.geometry import SE3
+from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.mapping.map_frame import MapFrame, Similarity
+from evercal.mapping.scene_map import MapContents
+from evercal.recordings import Recording
+from evercal.simulation.box_room import look_at
 
-SCENE = np.array([0.5, 0.0, 0.0])
+MOUNT = SE3.exp(np.array([0.05, -0.04, 0.03, 0.3, -0.2, 0.7]))
+SCENE = np.array([0.5, 0.1, 0.0])
+CAMERA = Camera(320, 240, 260.0, 262.0, 159.5, 119.5, (0.05, -0.02, 0.001, 0.0005))
+FIXED = look_at(np.array([0.0, 0.5, 0.7]), SCENE)
 
 
-def poses(count: int, seed: int = 0) -> SE3:
-    tangents = np.random.default_rng(seed).uniform(-0.6, 0.6, (count, 6))
-    return SE3.exp(tangents * [0.4, 0.4, 0.4, 1, 1, 1])
+def grippers(count: int, turn: tuple[float, float, float] = (0.5, 0.5, 0.5), seed: int = 1) -> SE3:
+    rng = np.random.default_rng(seed)
+    tangents = [rng.uniform(-0.3, 0.3, (count, 3)), rng.uniform(-1, 1, (count, 3)) * turn]
+    return SE3.exp(np.concatenate(tangents, 1))
 
 
-@pytest.mark.parametrize("criterion", ["A", "D"])
-def test_one_view_is_the_best_one_and_two_are_nearly_the_best_two(criterion: str) -> None:
-    options = NextViewOptions(criterion=criterion, at_m=0.0)  # type: ignore[arg-type]
-    used, reachable = poses(2, 1), poses(12)
-    state = HandEyeViews.start(SE3.identity(), SCENE).with_views(used)
+def changed(pose: SE3, step: np.ndarray) -> SE3:
+    """A pose with an error in the convention of `UncertainPose`."""
+    turned = pose.rotation_matrix() @ Rotation.from_rotvec(step[3:]).as_matrix()
+    quaternion = Rotation.from_matrix(turned).as_quat(scalar_first=True)
+    return SE3(quaternion, pose.translation_m + step[:3])
+
+
+def numerical(function: object, size: int, step: float = 1e-6) -> np.ndarray:
+    columns = []
+    for i in range(size):
+        e = step * np.eye(size)[i]
+        columns.append((function(e) - function(-e)) / (2 * step))  # type: ignore[operator]
+    return np.stack(columns, -1)
+
+
+def test_information_is_that_of_the_residuals_under_noise_on_both_poses() -> None:
+    poses, scene = grippers(3), SE3.from_translation(SCENE)
+    noise = np.zeros((12, 12))
+    noise[:6, :6], noise[6:, 6:] = GRIPPER_NOISE, CAMERA_NOISE
+    for i, gripper in enumerate(poses):
+        camera = scene.inverse() @ gripper @ MOUNT
+
+        def residual(x: np.ndarray, gripper: SE3 = gripper, camera: SE3 = camera) -> np.ndarray:
+            moved = (gripper @ SE3.exp(x[12:18]) @ changed(MOUNT, x[:6])).inverse()
+            return (moved @ scene @ SE3.exp(x[6:12]) @ camera @ SE3.exp(x[18:])).log()
+
+        slopes = numerical(residual, 24)
+        by_unknowns, by_noise = slopes[:, :12], slopes[:, 12:]
+        np.testing.assert_allclose(wrist_jacobian(poses, MOUNT, SCENE)[i], by_unknowns, atol=1e-8)
+        expected = by_unknowns.T @ np.linalg.inv(by_noise @ noise @ by_noise.T) @ by_unknowns
+        information = wrist_information(poses, MOUNT, SCENE)[i]
+        np.testing.assert_allclose(information, expected, rtol=1e-4, atol=1e-5 * expected.max())
+
+
+@pytest.mark.parametrize(
+    ("turn", "open_directions"),
+    [((0, 0, 0), 3), ((0, 0, 0.6), 1), ((0.6, 0, 0.6), 0), ((0.5, 0.5, 0.5), 0)],
+)
+def test_rotations_about_two_axes_are_needed(
+    turn: tuple[float, float, float], open_directions: int
+) -> None:
+    """The position of X stays open by as many directions as Tsai and Lenz state."""
+    added = wrist_information(grippers(8, turn), MOUNT, SCENE).sum(0)
+    # What no view decides has a standard deviation of about 30 m.
+    position = np.linalg.inv(added + 1e-3 * np.eye(12))[:3, :3]
+    assert int((np.linalg.eigvalsh(position) > 1.0).sum()) == open_directions
+
+
+def test_the_point_looked_at_is_where_the_axes_meet() -> None:
+    turned = SE3.exp(
+        np.array([[0, 0, 0, 0.4, 0, 0], [0, 0, 0, 0, 0.5, 0], [0, 0, 0, -0.2, 0.1, 1]])
+    )
+    cameras = SE3.from_translation(SCENE) @ turned @ SE3.from_translation((0, 0, -0.7))
+    np.testing.assert_allclose(looked_at(cameras), SCENE, atol=1e-2)
+    parallel = SE3.from_translation([(0.0, 0, 0), (0.2, 0, 0)])
+    np.testing.assert_allclose(looked_at(parallel), (0.1, 0, 0.5), atol=1e-6)
+
+
+def test_one_view_is_the_best_one_and_two_are_nearly_the_best_two() -> None:
+    used, reachable = grippers(2), grippers(12, seed=2)
+    known = 1e-2 * np.eye(12) + wrist_information(used, MOUNT, SCENE).sum(0)
+    added = wrist_information(reachable, MOUNT, SCENE)
 
     def cost(index: tuple[int, ...]) -> float:
-        covariance = state.with_views(reachable[list(index)]).estimate.covariance
-        if criterion == "D":
-            return float(np.linalg.slogdet(covariance)[1])
-        return float(np.trace(covariance[:3, :3]))
+        variances = np.diag(np.linalg.inv(known + added[list(index)].sum(0)))
+        return float(variances[:3].sum() + 0.09 * variances[3:6].sum())
 
-    best = min(range(12), key=lambda i: cost((i,)))
-    chosen = next_views(state, reachable, 2, used, options)
-    assert chosen.index[0] == best
+    chosen = _chosen(known, added, reachable, 2, used)
+    assert chosen.index[0] == min(range(12), key=lambda i: cost((i,)))
     pairs = sorted(map(cost, itertools.combinations(range(12), 2)))
     assert cost(tuple(chosen.index.tolist())) <= pairs[len(pairs) // 10]
+    after = np.linalg.inv(known + added[chosen.index].sum(0))
+    assert chosen.sigma_mm[-1] == pytest.approx(1000 * np.sqrt(np.diag(after)[:3].mean()))
+    assert chosen.sigma_deg[-1] == pytest.approx(np.rad2deg(np.sqrt(np.diag(after)[3:6].mean())))
 
 
-def test_expected_deviations_are_those_after_the_views() -> None:
-    state = HandEyeViews.start(SE3.identity(), SCENE).with_views(poses(3, 1))
-    found = next_views(state, poses(20), 4)
-    assert len(found.sigma_mm) == len(found.sigma_deg) == 5
-    assert list(found.sigma_mm) == sorted(found.sigma_mm, reverse=True)
-    after = state.with_views(found.poses).estimate
-    assert found.sigma_mm[-1] == pytest.approx(after.sigma_mm)
-    assert found.sigma_deg[0] == pytest.approx(state.estimate.sigma_deg)
-
-
-def test_recorded_poses_and_their_twins_are_not_proposed() -> None:
-    used = poses(4, 1)
+def test_recorded_and_excluded_poses_and_their_twins_are_not_proposed() -> None:
+    used = grippers(4)
     nudge = SE3.exp(np.array([0.003, 0, 0, 0, 0.01, 0]))
-    reachable = SE3.stack([*used, *(used @ nudge), *poses(2)])
-    state = HandEyeViews.start(SE3.identity(), SCENE).with_views(used)
-    assert sorted(next_views(state, reachable, 10, used).index) == [8, 9]
+    reachable = SE3.stack([*used, *(used @ nudge), *grippers(2, seed=2)])
+    assert sorted(next_views(used, reachable, 10).index) == [8, 9]
+    found = next_views(used, reachable, 10, excluded=SE3.stack([*used, reachable[8]]))
+    assert found.index.tolist() == [9]
     with pytest.raises(InputError, match="no reachable poses"):
-        next_views(state, SE3.identity((0,)), 1)
+        next_views(used, SE3.identity((0,)))
 
 
 def test_turning_is_proposed_before_shifting() -> None:
@@ -62,5 +135,101 @@ def test_turning_is_proposed_before_shifting() -> None:
     still = SE3.from_translation([(0.0, 0, 0), (0.1, 0, 0), (0, 0.1, 0)])
     shifted = SE3.from_translation(np.random.default_rng(0).uniform(-0.3, 0.3, (10, 3)))
     turned = SE3.exp(np.array([0.0, 0, 0, 0.5, 0, 0]))
-    state = HandEyeViews.start(SE3.identity(), SCENE).with_views(still)
-    assert next_views(state, SE3.stack([*shifted, turned]), 1).index.tolist() == [10]
+    found = next_views(still, SE3.stack([*shifted, turned]), 1, SE3.identity())
+    assert found.index.tolist() == [10]
+    assert found.sigma_mm[1] < found.sigma_mm[0]
+
+
+def wrist_views(count: int, seed: int) -> SE3:
+    """base_from_camera of views above the table."""
+    rng = np.random.default_rng(seed)
+    places = rng.uniform((0.1, -0.2, 0.5), (0.5, 0.5, 0.8), (count, 3))
+    return SE3.stack([look_at(p, SCENE, float(rng.uniform(-1, 1))) for p in places])
+
+
+def known() -> tuple[HostedLandmarks, np.ndarray]:
+    """Three keyframes with 20 landmarks each on a table, seen by the fixed camera."""
+    rng, hosts = np.random.default_rng(3), wrist_views(3, 1)
+    points = SCENE + rng.uniform(-1, 1, (60, 3)) * (0.15, 0.15, 0.04)
+    host = np.repeat([0, 1, 2], 20)
+    local = hosts[host].inverse().apply(points)
+    depth = local[:, 2]
+    rays, sigma = local / depth[:, None], np.full(60, 0.004)
+    landmarks = HostedLandmarks(MOUNT, CAMERA, hosts, host, rays, 1 / depth, sigma)
+    prior = landmarks.prior(np.eye(6) * 5e-4**2, (2e-4, 2e-4))
+    return landmarks, prior + landmarks.by_fixed_camera(CAMERA, FIXED, 0.1)
+
+
+def test_a_wrist_images_derivatives_match_numerical_ones() -> None:
+    (marks, _), view = known(), wrist_views(1, 7)[0]
+    gripper = view @ MOUNT.inverse()
+    by_pose, jacobian = marks.of_wrist_image(gripper)
+    visible = marks.visible(CAMERA, view)
+    assert len(visible) == len(jacobian) > 20
+
+    def pixels(x: np.ndarray) -> np.ndarray:
+        mount, own = changed(MOUNT, x[6:12]), x[marks.size :]
+        # A keyframe is a wrist image: its gripper pose is known, X and its own error are not.
+        errors = MOUNT @ SE3.exp(x[12:30].reshape(3, 6)) @ (MOUNT.inverse() @ mount)
+        hosts = marks.hosts @ MOUNT.inverse() @ errors
+        depths = 1 / (marks.inverse_depth + x[30 : marks.size])
+        points = hosts[marks.host].apply(marks.rays * depths[:, None])
+        camera = gripper @ mount @ SE3.exp(own)
+        return CAMERA.project(camera.inverse().apply(points))[visible]
+
+    expected = numerical(pixels, marks.size + 6)
+    whole = np.concatenate([jacobian, by_pose], 2)
+    np.testing.assert_allclose(whole, expected, atol=2e-3, rtol=1e-4)
+
+
+def test_the_images_own_pose_is_eliminated() -> None:
+    """Against the joint system with six more unknowns for the pose of the image."""
+    (marks, information), gripper = known(), wrist_views(1, 7) @ MOUNT.inverse()
+    by_pose, jacobian = marks.of_wrist_image(gripper[0])
+    rows = np.concatenate([jacobian, by_pose], 2).reshape(-1, marks.size + 6)
+    joint = rows.T @ rows / PIXEL_PX**2
+    to_camera = MOUNT.inverse().adjoint()
+    joint[-6:, -6:] += np.linalg.inv(to_camera @ GRIPPER_NOISE @ to_camera.T)
+    joint[:-6, :-6] += information
+    covariance = np.linalg.inv(joint)[:6, :6]
+    added = information + marks.by_wrist_image(gripper)[0]
+    np.testing.assert_allclose(np.linalg.inv(added)[:6, :6], covariance, rtol=1e-4)
+
+
+def test_views_that_show_the_landmarks_help_and_others_do_not() -> None:
+    marks, information = known()
+    away = look_at(np.array([0.0, 0.5, 0.7]), np.array([-3.0, 0.5, 0.7]))
+    reachable = SE3.stack([away, *wrist_views(10, 9)]) @ MOUNT.inverse()
+    added = marks.by_wrist_image(reachable)
+    assert not added[0].any()
+    found = _chosen(information, added, reachable, 11, None)
+    assert len(found.index) == 10
+    assert 0 not in found.index
+    assert list(found.sigma_mm) == sorted(found.sigma_mm, reverse=True)
+    assert found.sigma_mm[3] < 0.9 * found.sigma_mm[0]
+    now = np.linalg.inv(information)[:6, :6]
+    assert found.sigma_mm[0] == pytest.approx(1000 * np.sqrt(np.trace(now[:3, :3]) / 3))
+
+
+def test_a_fixed_camera_in_a_learned_scene(hall_map: MapContents, hall: Recording) -> None:
+    scene, frame = hall_map.scenes[0], hall.test[3]
+    assert frame.base_from_camera is not None
+    fixed = Calibration(
+        "eye_to_hand", frame.base_from_camera, 1e-6 * np.eye(6), camera=frame.camera
+    )
+    mount = UncertainPose(MOUNT, 1e-6 * np.eye(6))
+    views = [f.base_from_camera for f in hall.train if f.base_from_camera is not None]
+    reachable = SE3.stack(views) @ MOUNT.inverse()
+    found = next_views_of_fixed_camera(scene, fixed, mount, reachable, 3)
+    assert len(found.index) == 3
+    assert found.sigma_mm[3] < found.sigma_mm[0]
+    again = next_views_of_fixed_camera(scene, fixed, mount, reachable, 3, found.poses)
+    assert not set(again.index) & set(found.index)
+    with pytest.raises(InputError, match="next views need the calibration of a fixed camera"):
+        next_views_of_fixed_camera(scene, replace(fixed, camera=None), mount, reachable)
+    own = replace(scene, frame=MapFrame(similarity=Similarity(SE3.identity())))
+    with pytest.raises(InputError, match="frame of its own"):
+        next_views_of_fixed_camera(own, fixed, mount, reachable)
+    behind = replace(fixed, parent_from_child=SE3.from_translation((0.0, 0.0, 50.0)))
+    with pytest.raises(InputError, match="the fixed camera sees 0 landmarks"):
+        next_views_of_fixed_camera(scene, behind, mount, reachable)

@@ -10,7 +10,6 @@ import pytest
 import yaml
 
 from evercal.calibration.calibration import Calibration, ImageUse, Mount, read_calibration
-from evercal.calibration.export import export_calibration
 from evercal.calibration.export.driver_frame import (
     read_link_from_optical,
     standard_link_from_optical,
@@ -111,7 +110,7 @@ def test_the_driver_root_frame_is_exported(run: Any, make: Any, tmp_path: Path) 
         (["--via-transform", tf], SE3.exp([0.1, 0.2, 0.3, 0.5, 0.0, 0.2])),
     ):
         link = replace(read_calibration(file), parent_from_child=link_from_optical)
-        export_calibration(link, "transform_stamped", tf, parent="camera_link")
+        link.export("transform_stamped", tf, parent="camera_link")
         ran = run(*words, "--via", "camera_link", *options)
         assert (ran.code, ran.err) == (0, [])
         (tmp_path / "out.yaml").write_text(ran.out)

@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("viser")
 
 from evercal.calibration.calibration import Calibration
-from evercal.calibration.export import FORMATS
+from evercal.calibration.export.formats import FORMATS
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.live.camera import StreamCamera

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.align_points import Picks, align_by_points
-from evercal.calibration.from_images import scene_named
 from evercal.calibration.located import locate
 from evercal.calibration.pose_pairs.fit import HandEyeFit
 from evercal.calibration.pose_pairs.pairs import PosePairs
@@ -24,7 +23,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, axis_deviation, cross_matrix
 from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.mapping.map_frame import MapFrame, Similarity
-from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.mapping.scene_map import SceneMap
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
@@ -71,11 +70,10 @@ def _in_own_frame(localizer: "Localizer", name: str) -> "Localizer":
     """Return a localizer that answers in the frame of a scene's landmarks."""
     from evercal.localization.localizer import Localizer
 
-    scene, contents = scene_named(localizer, name), localizer.contents
+    contents, scene = localizer.contents, localizer.contents.scene(name)
     own = replace(scene, frame=MapFrame(pose_sigma=scene.frame.pose_sigma))
-    scenes = [own if other.name == name else other for other in contents.scenes]
-    own_contents = MapContents(contents.encoder, contents.short_side, scenes)
-    return Localizer(own_contents, localizer.options)
+    scenes = [own if other is scene else other for other in contents.scenes]
+    return Localizer(replace(contents, scenes=scenes), localizer.options)
 
 
 def align_by_gripper(
@@ -187,10 +185,10 @@ def aligned_by_points(
         scale_known: Whether the scene was learned in metres.
 
     Raises:
-        InputError: Fewer than two images were located, or there are too few points.
+        InputError: Fewer than two images were located, or too few points.
     """
     localizer, images = _in_own_frame(localizer, scene), []
-    own = scene_named(localizer, scene)
+    own = localizer.contents.scene(scene)
     for name, image, pixels in picks:
         [item] = locate(localizer, [(name, image)])
         if not item.is_located or item.estimate.scene != scene:

@@ -51,15 +51,10 @@ class PointAlignment:
 
 
 def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignment:
-    """Estimate the pose and scale of a map in the base frame.
-
-    Args:
-        images: Images of at least three points that are not on one line, each picked in two images
-            from different places.
-        scale_known: Whether the map is in metres.
+    """Estimate the pose and, unless it is known, the scale of a map in the base frame.
 
     Raises:
-        InputError: There are too few points, or all are on one line.
+        InputError: Fewer than three points are picked in two images, or all are on one line.
     """
     triangulated = _triangulated(images)
     if len(triangulated) < 3:
@@ -96,7 +91,6 @@ def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignmen
 
 
 def _distances(image: Picks, similarity: Similarity) -> Array:
-    """(2k,) pixels between picks and projections."""
     back = similarity.base_from_map.inverse().apply(image.points) / similarity.scale
     at = image.camera.project(image.map_from_camera.inverse().apply(back))
     return np.nan_to_num(at - image.pixels, nan=1e3).ravel()

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.calibration import read_transform
-from evercal.calibration.from_images import metric_scene
-from evercal.calibration.located import Located, deviations, fuse, length_mm_deg, locate
+from evercal.calibration.located import ImagePose, fuse, locate
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, pose_distance_mm_deg
 from evercal.recordings import load_recording, read_image
 from evercal.recordings.images import IMAGE_ENDINGS
 
@@ -68,8 +67,7 @@ def audit(
         on_episode: Called after each episode.
 
     Raises:
-        InputError: There is no episode, an episode without a camera pose, or the scene's unit of
-            length is unknown.
+        InputError: No episode, one without a camera pose, or a scene of unknown unit of length.
     """
     audited = []
     for episode in episode_folders(folder):
@@ -79,11 +77,7 @@ def audit(
 
 
 def episode_folders(folder: Path) -> list[Path]:
-    """Return the folders of the episodes, sorted by name.
-
-    Raises:
-        InputError: There is no folder.
-    """
+    """Return the folders of the episodes, sorted by name."""
     inside = sorted(p for p in folder.glob("*/") if not p.name.startswith("."))
     if not inside:
         raise InputError(f"{folder}: no folders in it; give the folder that holds the episodes")
@@ -109,22 +103,20 @@ def _audited(
         [item] = locate(localizer, [(shot.name, shot.read())], shot.camera)
         if item.is_located:
             in_stated = shot.base_from_camera.inverse() @ item.pose
-            differences.append(Located(shot.name, item.estimate, in_stated, item.covariance))
+            differences.append(ImagePose(shot.name, item.estimate, in_stated, item.covariance))
         else:
             reason = item.estimate.reason
     if not differences:
         return Episode(episode.name, "unknown", f"no image was located: {reason}")
     fused = fuse(differences)
-    metric_scene(localizer, fused.scene)
-    off = deviations(SE3.stack([fused.pose]), SE3.identity())[0]
-    millimetres, degrees = length_mm_deg(off)
+    localizer.contents.metric_scene(fused.scene)
+    millimetres, degrees = pose_distance_mm_deg(fused.pose, SE3.identity())
     wrong = millimetres > options.most_mm or degrees > options.most_deg
-    reason = f"stated pose is {millimetres:.1f} mm and {degrees:.2f} deg from where it was found"
+    reason = f"stated pose is {millimetres:.1f} mm and {degrees:.2f} deg from the images"
     return Episode(episode.name, "wrong" if wrong else "right", reason, millimetres, degrees)
 
 
 def _shots(episode: Path, stated: SE3 | None) -> list[_Shot]:
-    """The images of an episode, in order."""
     pose_file = next((episode / name for name in POSE_FILES if (episode / name).is_file()), None)
     pose = stated if pose_file is None else read_transform(pose_file)
     try:
@@ -136,17 +128,13 @@ def _shots(episode: Path, stated: SE3 | None) -> list[_Shot]:
                 f"{episode}: states no camera pose; put a {' or '.join(POSE_FILES)} there, or give"
                 " the pose of all episodes with --calibration"
             ) from None
-        shots = [
-            _Shot(path.name, partial(read_image, path), None, pose)
-            for path in files
-            if pose is not None
-        ]
+        every = [(file.name, partial(read_image, file), None, pose) for file in files]
     else:
-        shots = [
-            _Shot(frame.name, frame.read_image, frame.camera, frame.base_from_camera)
+        every = [
+            (frame.name, frame.read_image, frame.camera, frame.base_from_camera)
             for frame in (*scene.train, *scene.test)
-            if frame.base_from_camera is not None
         ]
+    shots = [_Shot(name, read, camera, at) for name, read, camera, at in every if at is not None]
     if not shots:
         raise InputError(f"{episode}: no images with a stated camera pose in it")
     return shots

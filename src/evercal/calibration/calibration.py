@@ -11,23 +11,23 @@ Metres, radians, quaternions w, x, y, z, OpenCV camera axes. `matrix`, `meaning`
 repeat other values, for people and for programs that read one of them.
 """
 
-import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Self, TypeVar, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_distance
+from evercal.recordings.text_files import read_text
 from evercal.storage import write_json
+from evercal.storage.records import of_format, read_record
 
 FORMAT, VERSION = "evercal-calibration", 1
 Mount = Literal["eye_to_hand", "eye_in_hand"]
-Content = TypeVar("Content")
 
 
 @dataclass(frozen=True)
@@ -207,10 +207,10 @@ class Calibration:
     def export(
         self, format: str, path: str | os.PathLike[str] | None = None, **options: Any
     ) -> str:
-        """Export to a format of other tools, see `export_calibration`."""
-        from evercal.calibration.export import export_calibration
+        """Export to a format of other programs and return the text, see `export_files`."""
+        from evercal.calibration.export.formats import export_files
 
-        return export_calibration(self, format, path, **options)
+        return export_files(self, format, path, **options).text
 
 
 def read_calibration(path: str | os.PathLike[str]) -> Calibration:
@@ -219,45 +219,7 @@ def read_calibration(path: str | os.PathLike[str]) -> Calibration:
     Raises:
         InputError: The file is missing or holds no calibration.
     """
-    return read_json(path, "calibration file", Calibration.from_dict)
-
-
-def of_format(
-    data: object, format: str, version: int, read: Callable[[Mapping[str, Any]], Content]
-) -> Content:
-    """Convert JSON values that state their format and version.
-
-    Raises:
-        ValueError: The format or version is another one, or an entry is missing or broken.
-    """
-    if not isinstance(data, dict) or data.get("format") != format:
-        raise ValueError(f"'format' is not {format!r}")
-    if data.get("version") != version:
-        raise ValueError(f"version {data.get('version')!r}; this evercal reads {version}")
-    try:
-        return read(data)
-    except KeyError as error:
-        raise ValueError(f"{error} is missing") from None
-    except (TypeError, AttributeError, IndexError) as error:
-        raise ValueError(f"an entry has the wrong kind of value ({error})") from None
-
-
-def read_json(
-    path: str | os.PathLike[str], what: str, convert: Callable[[object], Content]
-) -> Content:
-    """Read a JSON file that evercal wrote, and convert its values; `what` names it in messages.
-
-    Raises:
-        InputError: The file is missing, or `convert` raises ValueError.
-    """
-    try:
-        return convert(json.loads(Path(path).read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        raise InputError(f"{path}: {what} is missing; check the path") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
-        raise InputError(f"{path}: {error}; give the JSON that evercal wrote") from None
+    return read_record(path, "calibration file", Calibration.from_dict)
 
 
 def read_transform(path: str | os.PathLike[str]) -> SE3:
@@ -266,13 +228,7 @@ def read_transform(path: str | os.PathLike[str]) -> SE3:
     Raises:
         InputError: The file is missing or holds neither.
     """
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(f"{path}: file is missing; check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error})") from None
+    text = read_text(Path(path), "file")
     if text.lstrip().startswith("{"):
         return read_calibration(path).parent_from_child
     try:

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, ImageUse
-from evercal.calibration.from_images import map_digest, metric_scene
-from evercal.calibration.located import Fused, Located, deviations, fuse, length_mm_deg, locate
+from evercal.calibration.located import Fused, ImagePose, deviations, fuse, length_mm_deg, locate
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, axis_deviation
 
@@ -62,19 +61,7 @@ def check(
     camera: Camera | None = None,
     on_image: Callable[[], object] = lambda: None,
 ) -> Shift:
-    """Test whether a camera has moved since its calibration.
-
-    Args:
-        localizer: Localizer of a map that holds the scene.
-        images: (name, (h, w, 3) uint8 RGB) of the camera as it is now.
-        reference: Calibration of the camera.
-        camera: Intrinsics. Default: those of the reference.
-        on_image: Called after each image.
-
-    Raises:
-        InputError: No image was located, the reference is a camera on the gripper, or the scene's
-            unit of length is unknown.
-    """
+    """Test whether a camera has moved since its calibration, see `Map.check`."""
     located = locate(localizer, images, camera or reference.camera, on_image)
     return shift_between(reference, fuse(located), located, localizer)
 
@@ -82,18 +69,11 @@ def check(
 def shift_between(
     reference: Calibration,
     fused: Fused,
-    located: list[Located],
+    located: list[ImagePose],
     localizer: "Localizer",
     confidence: float = CONFIDENCE,
 ) -> Shift:
-    """Compare a camera with its calibration.
-
-    Args:
-        reference: base_from_camera at the time of the calibration.
-        fused: Pose of the camera now.
-        located: Images that were fused.
-        localizer: Localizer of these images.
-        confidence: Least confidence of a move.
+    """Compare `fused`, the pose of a camera now from `located` images, with its calibration.
 
     Raises:
         InputError: The reference is a camera on the gripper, or the scene's unit of length is
@@ -106,8 +86,8 @@ def shift_between(
             "the reference is a camera on the gripper, whose pose in the base changes with every"
             " move; give the calibration of a camera that stands still"
         )
-    metric_scene(localizer, fused.scene)
-    same = reference.source.get("map") == map_digest(localizer, fused.scene)
+    scene = localizer.contents.metric_scene(fused.scene)
+    same = reference.source.get("map") == scene.digest
     off = deviations(SE3.stack([fused.pose]), reference.parent_from_child)[0]
     count = int(fused.used.sum())
     floor = np.diag(_FLOOR**2)

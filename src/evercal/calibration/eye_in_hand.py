@@ -20,8 +20,8 @@ from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
 from evercal.mapping.build import Adjusted, BuiltMap, OnProgress
-from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.frame import lacks_camera_poses as lacks_camera_poses
+from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame, Recording
+from evercal.recordings.held_out import require_frames
 
 MOST_FOCAL_PERCENT, MOST_POSE_SIGMA_MM = 1.0, 5.0
 """Larger corrections indicate systematic errors, which the covariance does not contain."""
@@ -48,6 +48,8 @@ class HandEyeReport:
     given_deg: float | None = None
     warnings: tuple[str, ...] = ()
     """Reasons not to rely on the estimate."""
+    created: str = ""
+    """ISO 8601 time with zone."""
     error_terms: tuple[ErrorTerm, ...] = ()
     """Parts of the covariance by cause."""
     images: tuple[ImageUse, ...] = ()
@@ -71,7 +73,7 @@ class HandEyeReport:
             images=self.images,
             error_terms=self.error_terms,
             source={"command": "learn", "scene": scene, "frames": frames},
-            created=datetime.now(UTC).isoformat(timespec="seconds"),
+            created=self.created,
         )
         warnings = [f"Do not rely on it: {warning}." for warning in self.warnings]
         return replace(calibration, verdict=" ".join(warnings or [verdict(calibration)]))
@@ -87,17 +89,13 @@ class PosedByGripper(NamedTuple):
 def posed_by_gripper(
     recording: Recording, encoder: Encoder, on_progress: OnProgress = lambda *_: None
 ) -> PosedByGripper:
-    """Estimate rough camera poses of a recording that states gripper poses.
-
-    Args:
-        recording: Frames without a gripper pose count as untracked.
-        encoder: Encoder for the similarity of frames.
-        on_progress: Called as pairs of frames are matched.
+    """Estimate rough camera poses; frames without a gripper pose count as untracked.
 
     Raises:
-        InputError: See `hand_eye_start`.
+        InputError: Too few frames, too little rotation, or too few frames that show one place.
     """
     frames = tuple(frame for frame in recording.train if frame.base_from_gripper is not None)
+    require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
     try:
         start = hand_eye_start(frames, encoder, on_progress=on_progress)
     except InputError as error:
@@ -115,7 +113,7 @@ def posed_by_gripper(
 def hand_eye_report(
     start: HandEyeStart, built: BuiltMap, frames: Sequence[Frame], given: SE3 | None = None
 ) -> HandEyeReport:
-    """Return the estimate after bundle adjustment.
+    """Return the estimate after bundle adjustment, compared with a `given` one.
 
     Args:
         start: First estimate.
@@ -130,7 +128,7 @@ def hand_eye_report(
     start_from_camera = UncertainPose(correction.start_camera_from_camera, covariance)
     estimate = start.gripper_from_camera @ start_from_camera
     start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.gripper_from_camera)
-    given_mm = given_deg = None
+    given_mm, given_deg = None, None
     if given is not None:
         given_mm, given_deg = pose_distance_mm_deg(estimate.pose, given)
     return HandEyeReport(
@@ -149,6 +147,7 @@ def hand_eye_report(
             ErrorTerm.of("slowly varying errors of gripper poses", correction.by_drift),
         ),
         images=tuple(use for frame in frames if (use := _use(frame, built)) is not None),
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
 
 

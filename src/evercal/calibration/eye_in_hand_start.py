@@ -99,12 +99,7 @@ def hand_eye_start(
     encoder: Encoder,
     on_progress: OnProgress = lambda *_: None,
 ) -> HandEyeStart:
-    """Estimate `gripper_from_camera` from images and gripper poses.
-
-    Args:
-        frames: Frames with `base_from_gripper`; their `base_from_camera` is ignored.
-        encoder: Encoder for the similarity of frames.
-        on_progress: Called as pairs of frames are matched.
+    """Estimate `gripper_from_camera` from frames that all have `base_from_gripper`.
 
     Raises:
         InputError: Too little rotation, or too few frames that show the same place.
@@ -119,11 +114,7 @@ def hand_eye_start(
 
 
 def solve_motions(base_from_gripper: SE3, motions: Sequence[PairMotion]) -> HandEyeStart:
-    """Solve A X = X B for `gripper_from_camera`.
-
-    Args:
-        base_from_gripper: (n,).
-        motions: Motions between pairs of the n frames.
+    """Solve A X = X B for `gripper_from_camera` by motions between pairs of (n,) gripper poses.
 
     Raises:
         InputError: Too few pairs, or too few that agree.

@@ -5,9 +5,8 @@ errors of their landmarks, so that part of the covariance does not fall with the
 on the gripper (eye-in-hand) observes from many spots, and errors average over the spots.
 """
 
-import hashlib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from evercal.calibration.calibration import Calibration, ErrorTerm, Mount, largest_term
 from evercal.calibration.located import (
     Fused,
-    Located,
+    ImagePose,
     deviations,
     fuse,
     halves_apart,
@@ -31,7 +30,6 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, cross_matrix, pose_distance
 from evercal.localization.estimate import Cause
 from evercal.localization.intrinsics import STATED, cameras_in_scenes
-from evercal.mapping.scene_map import SceneMap
 from evercal.recordings import read_image
 from evercal.recordings.image_files import image_files
 from evercal.recordings.images import as_rgb
@@ -109,16 +107,9 @@ def calibrate(
     mount: Mount | None = None,
     on_image: Callable[[], object] = lambda: None,
 ) -> Calibration:
-    """Estimate the pose of a camera from images of a mapped scene.
+    """Estimate the pose of a camera from images of a mapped scene, see `Map.calibrate`.
 
-    Args:
-        localizer: Localizer of a map that holds the scene.
-        given: Images and, for a camera on the gripper, the gripper's poses.
-        mount: Default: eye_in_hand if there are gripper poses and the camera moves.
-        on_image: Called after each image.
-
-    Returns:
-        base_from_camera for eye_to_hand, gripper_from_camera for eye_in_hand.
+    `mount` is eye_in_hand by default if there are gripper poses and the camera moves.
 
     Raises:
         InputError: No image was located, eye_in_hand without gripper poses, or the scene's unit of
@@ -139,7 +130,7 @@ def calibrate(
     if mount == "eye_in_hand" and grippers is not None:
         moved = in_gripper_frame(located, grippers)
     fused = fuse(moved)
-    scene = metric_scene(localizer, fused.scene)
+    scene = localizer.contents.metric_scene(fused.scene)
     height, width = given.images[0][1].shape[:2]
     # The guess fits images of another aspect ratio, too.
     stated = cameras_in_scenes(given.camera, given.images[0][1], [scene])[0]
@@ -150,10 +141,19 @@ def calibrate(
         assert grippers is not None, "checked before"
         base = scene.frame.base_covariance
         covariance, terms = _from_many_spots(located, moved, fused, grippers, base)
+    checks: dict[str, Any] = {
+        "images_given": len(moved),
+        "images_used": int(fused.used.sum()),
+        # `check` compares it with the scatter of later images.
+        "image_scatter": fused.scatter.tolist(),
+    }
+    halves = halves_apart(SE3.stack([item.pose for item in fused.select(moved)]))
+    if halves is not None:
+        checks |= {"repeatability_mm": halves[0], "repeatability_deg": halves[1]}
     source = {
         "command": "calibrate",
         "scene": fused.scene,
-        "map": map_digest(localizer, fused.scene),
+        "map": scene.digest,
         "intrinsics": "map" if given.camera is None else "given",
     }
     calibration = Calibration(
@@ -164,19 +164,15 @@ def calibrate(
         camera=camera.resized(width, height),
         images=fused.uses,
         error_terms=terms,
-        checks=_checks(moved, fused),
+        checks=checks,
         source=source,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-    sentences = [
-        verdict(calibration),
-        *_lens_words(camera, stated),
-        *_advice(calibration, fused, camera != stated),
-    ]
+    sentences = [verdict(calibration), *_advice(calibration, fused, camera, stated)]
     return replace(calibration, verdict=" ".join(sentences))
 
 
-def estimated_camera(used: Sequence[Located], stated: Camera) -> Camera:
+def estimated_camera(used: Sequence[ImagePose], stated: Camera) -> Camera:
     """The stated intrinsics, or the median of the images' own if they contradict these."""
     cameras = [item.estimate.camera for item in used if item.estimate.camera is not None]
     if not cameras:
@@ -192,50 +188,7 @@ def estimated_camera(used: Sequence[Located], stated: Camera) -> Camera:
     return median if stated.fx * off > CONTRADICTED_PX else stated
 
 
-def _lens_words(camera: Camera, stated: Camera) -> list[str]:
-    """Both focal lengths where the images contradict the stated intrinsics."""
-    if camera == stated:
-        return []
-    return [
-        f"The stated intrinsics (focal length {stated.fx:.1f} px) do not fit the images, which"
-        f" suggest {camera.fx:.1f} px: the estimated intrinsics were used."
-    ]
-
-
-def scene_named(localizer: "Localizer", name: str) -> SceneMap:
-    """Return the map of a scene, or raise InputError."""
-    for scene in localizer.contents.scenes:
-        if scene.name == name:
-            return scene
-    raise InputError(f"scene {name!r}: the map has only {', '.join(localizer.scenes)}")
-
-
-def metric_scene(localizer: "Localizer", name: str) -> SceneMap:
-    """Return the map of a scene whose answers are in metres, or raise InputError."""
-    scene = scene_named(localizer, name)
-    if not scene.unit_known:
-        raise InputError(
-            f"scene {name}: the unit of length of its recording is unknown, so there are no"
-            " millimetres; run 'evercal align' first, with --robot-poses or with --points and"
-            " --picks"
-        )
-    return scene
-
-
-def map_digest(localizer: "Localizer", name: str) -> str:
-    """Identify a scene's map and base frame: poses with the same digest share their errors."""
-    scene = scene_named(localizer, name)
-    digest = hashlib.sha256(name.encode())
-    digest.update(scene.keyframes.base_from_camera.matrix().tobytes())
-    similarity = scene.frame.similarity
-    if similarity is not None:
-        digest.update(similarity.base_from_map.matrix().tobytes())
-        digest.update(np.float64(similarity.scale).tobytes())
-    return digest.hexdigest()[:16]
-
-
-def _stands_still(located: Sequence[Located]) -> bool:
-    """Whether the median pose is within 10 mm and 1 deg of the mean."""
+def _stands_still(located: Sequence[ImagePose]) -> bool:
     items = [item for item in located if item.is_located]
     if len(items) < 2:
         return True
@@ -244,7 +197,9 @@ def _stands_still(located: Sequence[Located]) -> bool:
     return bool(metres < 0.01 and radians < np.deg2rad(1.0))
 
 
-def _from_one_spot(located: Sequence[Located], fused: Fused) -> tuple[Array, tuple[ErrorTerm, ...]]:
+def _from_one_spot(
+    located: Sequence[ImagePose], fused: Fused
+) -> tuple[Array, tuple[ErrorTerm, ...]]:
     """Covariance of a fixed camera: that of one image, plus the scatter over their number."""
     used = fused.select(located)
     shared = np.mean([item.covariance for item in used], axis=0)
@@ -254,8 +209,8 @@ def _from_one_spot(located: Sequence[Located], fused: Fused) -> tuple[Array, tup
 
 
 def _from_many_spots(
-    located: Sequence[Located],
-    moved: Sequence[Located],
+    located: Sequence[ImagePose],
+    moved: Sequence[ImagePose],
     fused: Fused,
     base_from_gripper: SE3,
     base_covariance: Array | None,
@@ -304,7 +259,7 @@ def _by_base_motion(base_from_gripper: SE3, base_from_camera: SE3) -> Array:
     return slope
 
 
-def _by_cause(used: Sequence[Located], spots: int = 1) -> tuple[ErrorTerm, ...]:
+def _by_cause(used: Sequence[ImagePose], spots: int = 1) -> tuple[ErrorTerm, ...]:
     """The mean covariance of the images by cause, over the number of spots.
 
     The moving axes of a gripper do not matter, since a term has one deviation for three axes.
@@ -333,30 +288,21 @@ def _spots(poses: Sequence[SE3]) -> NDArray[np.int64]:
     return np.array(numbers)
 
 
-def _checks(moved: Sequence[Located], fused: Fused) -> Mapping[str, Any]:
-    """Repeatability, and the numbers that `check` compares later images with."""
-    used = fused.select(moved)
-    halves = halves_apart(SE3.stack([item.pose for item in used]))
-    checks: dict[str, Any] = {
-        "images_given": len(moved),
-        "images_used": len(used),
-        "image_scatter": fused.scatter.tolist(),
-    }
-    if halves is not None:
-        checks |= {"repeatability_mm": halves[0], "repeatability_deg": halves[1]}
-    return checks
-
-
-def _advice(calibration: Calibration, fused: Fused, contradicted: bool) -> list[str]:
-    """How to improve the result."""
-    used, lost = int(fused.used.sum()), int((~fused.used).sum())
-    advice = _lens_advice(calibration)
-    near = largest_term(calibration.error_terms)[0] in ("view", "map")
-    if calibration.source["intrinsics"] == "map" and not contradicted:
+def _advice(calibration: Calibration, fused: Fused, camera: Camera, stated: Camera) -> list[str]:
+    """What was done about the intrinsics, and how to improve the result."""
+    advice = []
+    if camera != stated:
+        advice.append(
+            f"The stated intrinsics (focal length {stated.fx:.1f} px) do not fit the images, which"
+            f" suggest {camera.fx:.1f} px: the estimated intrinsics were used."
+        )
+    advice += _lens_advice(calibration)
+    if calibration.source["intrinsics"] == "map" and camera == stated:
         advice.append(
             f"The intrinsics are those of the camera that recorded {fused.scene}: give --camera if"
             " another camera took these images."
         )
+    used, lost = int(fused.used.sum()), int((~fused.used).sum())
     if lost > used:
         advice.append(
             f"{lost} of {used + lost} images were rejected: the camera may have moved between them,"
@@ -365,6 +311,7 @@ def _advice(calibration: Calibration, fused: Fused, contradicted: bool) -> list[
     if used == 1:
         advice.append("It rests on one image: give five or more to measure their scatter.")
     elif calibration.mount == "eye_to_hand" and used >= 5:
+        near = largest_term(calibration.error_terms)[0] in ("view", "map")
         advice.append(
             "More images from this spot will not help: the remaining error is common to all of"
             " them." + (" Keyframes nearer to the camera's view would." if near else "")

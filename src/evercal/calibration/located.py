@@ -25,8 +25,8 @@ _LEAST_M, _LEAST_RAD = 0.002, np.deg2rad(0.15)
 
 
 @dataclass(frozen=True, eq=False)
-class Located:
-    """One image and its pose estimate."""
+class ImagePose:
+    """One image with its estimate, and the pose of it that is fused."""
 
     name: str
     estimate: "PoseEstimate"
@@ -64,34 +64,27 @@ def locate(
     images: Sequence[tuple[str, NDArray[np.uint8]]],
     camera: Camera | None = None,
     on_image: Callable[[], object] = lambda: None,
-) -> list[Located]:
-    """Locate every image.
-
-    Args:
-        localizer: Localizer of a map.
-        images: (name, (h, w, 3) uint8 RGB).
-        camera: Intrinsics. Default: those of the camera that recorded the scene.
-        on_image: Called after each image.
-    """
+) -> list[ImagePose]:
+    """Locate every image (name, (h, w, 3) uint8 RGB); `on_image` is called after each."""
     located = []
     for name, image in images:
         estimate = localizer.localize(image, camera)
         uncertain = estimate.uncertain_pose or UncertainPose(SE3.identity(), np.eye(6))
-        located.append(Located(name, estimate, uncertain.pose, uncertain.covariance))
+        located.append(ImagePose(name, estimate, uncertain.pose, uncertain.covariance))
         on_image()
     return located
 
 
-def in_gripper_frame(located: Sequence[Located], base_from_gripper: SE3) -> list[Located]:
+def in_gripper_frame(located: Sequence[ImagePose], base_from_gripper: SE3) -> list[ImagePose]:
     """Return the n images with `gripper_from_camera` as the pose."""
     moved = []
     for item, gripper in zip(located, base_from_gripper, strict=True):
         pose = gripper.inverse() @ UncertainPose(item.pose, item.covariance)
-        moved.append(Located(item.name, item.estimate, pose.pose, pose.covariance))
+        moved.append(ImagePose(item.name, item.estimate, pose.pose, pose.covariance))
     return moved
 
 
-def fuse(located: Sequence[Located]) -> Fused:
+def fuse(located: Sequence[ImagePose]) -> Fused:
     """Fuse poses of one transform, with a reason for every image that is rejected.
 
     Raises:
@@ -105,7 +98,7 @@ def fuse(located: Sequence[Located]) -> Fused:
             " images of a mapped scene"
         )
     scene = max(names, key=lambda name: (names[name], str(name)))
-    reasons = ["" for _ in located]
+    reasons = [""] * len(located)
     for i, item in enumerate(located):
         if not item.is_located:
             reasons[i] = f"{item.estimate.status.replace('_', ' ')}: {item.estimate.reason}"
@@ -141,7 +134,6 @@ def deviations(poses: SE3, mean: SE3) -> Array:
 
 
 def _far(off: Array) -> NDArray[np.bool_]:
-    """Return (n,) outliers among deviations."""
     distance = np.linalg.norm(off.reshape(-1, 2, 3), axis=2)
     # For three Gaussian axes the median distance is 1.54 standard deviations.
     spread = np.median(distance, axis=0) / 1.54

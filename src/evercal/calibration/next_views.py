@@ -1,38 +1,76 @@
-"""The gripper poses whose images reduce the uncertainty of a calibration most.
+"""The gripper poses whose images reduce the uncertainty of a calibration most, for both mounts.
 
-Greedy optimal design: the pose whose expected information lowers a criterion of the covariance most
-is added, and so on. D-optimality is the logarithm of the determinant. It does not depend on units,
-so it suits poses (Carrillo, Reid and Castellanos, ICRA 2012). A-optimality is the mean variance,
-here of a point in front of the camera, so that metres and radians add up.
+What is known is an information matrix of the unknowns, and every further image adds its own. The
+pose that lowers the mean variance of a point in front of the camera most is proposed, then the next
+one (A-optimality), so that metres and radians add up.
+
+**Camera on the gripper.** A view has a stated gripper pose G and a measured camera pose C in the
+scene. With X = gripper_from_camera and Z = base_from_scene, G X = Z C. The residual
+log((G X)^-1 Z C) is a tangent of the camera frame, and to first order
+
+    r = - (R_X^T dt, dr) + Ad(C^-1) dz - Ad(X^-1) g + c.
+
+(dt, dr) is the error of X in the convention of `UncertainPose`, dz that of Z on its right, g the
+noise of the gripper pose and c that of the camera pose, each on the right of its pose. Z is
+unknown, so X is seen only in differences between views: rotations about two axes are needed (Tsai
+and Lenz, IEEE T-RA 1989).
+
+**Fixed camera.** It is located by landmarks of a map that wrist images made. A further wrist image
+shows some of them again and reduces the errors of their depths, of the keyframes' poses and of X.
+The unknowns are, in this order, errors of the fixed camera's pose, of X, of each keyframe's pose
+about G X, and of the inverse depths.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.view_information import ViewModel
+from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
-from evercal.geometry import SE3, pose_distance
-from evercal.geometry.uncertain_pose import axis_deviation
+from evercal.geometry import (
+    SE3,
+    Camera,
+    UncertainPose,
+    axis_deviation,
+    cross_matrix,
+    pose_distance,
+)
+from evercal.mapping.scene_map import SceneMap
 
 Array = NDArray[np.floating]
 
 
-@dataclass(frozen=True)
-class NextViewOptions:
-    """How further views are chosen."""
+def _covariance(metres: float, radians: float) -> Array:
+    """(6, 6) of a pose with independent axes."""
+    return np.diag(np.repeat([metres, radians], 3) ** 2)
 
-    criterion: Literal["A", "D"] = "A"
-    """Optimality: mean variance (A) or determinant (D) of the covariance."""
-    at_m: float = 0.3
-    """Distance from the camera at which A-optimality asks for a point's variance, metres."""
-    apart_m: float = 0.02
-    """Poses nearer than this to another one are left out if also nearer than `apart_deg`: errors
-    of an arm repeat where its pose does."""
-    apart_deg: float = 4.0
-    """See `apart_m`."""
+
+GRIPPER_NOISE = _covariance(0.1e-3, np.deg2rad(0.02))
+"""(6, 6) covariance of a gripper pose about the stated one."""
+CAMERA_NOISE = _covariance(0.3e-3, np.deg2rad(0.03))
+"""(6, 6) covariance of a camera pose that an image gives, in the scene."""
+PIXEL_PX = 0.3
+"""Standard deviation of a landmark in an image."""
+_ROUGH = _covariance(0.05, np.deg2rad(15.0))
+"""Of a `gripper_from_camera` that is roughly known."""
+_UNKNOWN = _covariance(0.2, np.pi)
+"""Of one that is not."""
+_ANYWHERE = _covariance(1.0, np.pi)
+"""Of the pose of the scene, or of a fixed camera, before any image."""
+_AT_M = 0.3
+"""Distance from the camera of the point whose variance counts."""
+_APART_M, _APART_DEG = 0.02, 4.0
+"""Poses nearer than both are the same one: errors of an arm repeat where its pose does."""
+_AHEAD_M = 0.5
+"""Distance of the scene where the viewing directions do not show it."""
+MOST_LANDMARKS, LEAST_LANDMARKS = 80, 12
+"""Landmarks of a fixed camera that are used, and that a view must show to count."""
+MOST_TURN_DEG, MOST_ZOOM = 50.0, 2.2
+"""Largest change of viewing angle and scale at which a landmark is matched."""
+_LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 2e-5, 2e-5
+"""Least standard deviations of the pose of a keyframe."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,62 +88,291 @@ class NextViews:
 
 
 def next_views(
-    state: ViewModel,
-    reachable_poses: SE3,
+    recorded: SE3,
+    reachable: SE3,
     count: int = 1,
-    recorded: SE3 | None = None,
-    options: NextViewOptions | None = None,
+    gripper_from_camera: SE3 | None = None,
+    excluded: SE3 | None = None,
 ) -> NextViews:
-    """Choose the next gripper poses among those that the arm can reach.
+    """Choose the next gripper poses for `gripper_from_camera`.
 
     Args:
-        state: what is known: `HandEyeViews` of a wrist recording, or `FixedCameraViews`.
-        reachable_poses: (n,) base_from_gripper.
-        count: largest number of poses; fewer if no other pose adds information.
-        recorded: (m,) poses that have an image, which are not proposed again.
-        options: criterion and distances.
+        recorded: (m,) base_from_gripper of the images so far.
+        reachable: (n,) base_from_gripper that the arm can go to.
+        count: Largest number of poses; fewer if no other pose adds information.
+        gripper_from_camera: A rough one. Default: unknown, the camera at the gripper's origin.
+        excluded: Poses that are not proposed. Default: those recorded.
 
     Raises:
         InputError: No reachable poses.
     """
-    options = options or NextViewOptions()
-    if len(reachable_poses.shape) != 1 or not len(reachable_poses):
+    mount = SE3.identity() if gripper_from_camera is None else gripper_from_camera
+    prior = np.zeros((12, 12))
+    prior[:6, :6] = np.linalg.inv(_UNKNOWN if gripper_from_camera is None else _ROUGH)
+    prior[6:, 6:] = np.linalg.inv(_ANYWHERE)
+    scene_m = looked_at(recorded @ mount)
+    known = prior + wrist_information(recorded, mount, scene_m).sum(0)
+    added = wrist_information(reachable, mount, scene_m)
+    return _chosen(known, added, reachable, count, recorded if excluded is None else excluded)
+
+
+def next_views_of_fixed_camera(
+    scene: SceneMap,
+    calibration: Calibration,
+    gripper_from_camera: UncertainPose,
+    reachable: SE3,
+    count: int = 1,
+    excluded: SE3 | None = None,
+) -> NextViews:
+    """Choose the next poses of the arm whose wrist images improve a fixed camera's calibration.
+
+    Args:
+        scene: Learned from wrist images.
+        calibration: Of a fixed camera in this scene, with its intrinsics.
+        gripper_from_camera: Of the camera that recorded the wrist images, as the map gave it.
+        reachable: (n,) base_from_gripper that the arm can go to.
+        count: Largest number of poses; fewer if no other pose adds information.
+        excluded: Poses that are not proposed, such as those recorded.
+
+    Raises:
+        InputError: Not a fixed camera, a map with a frame of its own, too few landmarks, or no
+            reachable poses.
+    """
+    if calibration.mount != "eye_to_hand" or calibration.camera is None:
+        raise InputError("next views need the calibration of a fixed camera with intrinsics")
+    if scene.frame.similarity is not None:
+        raise InputError(
+            f"scene {scene.name}: has a frame of its own; next views need a scene that was"
+            " learned from wrist images"
+        )
+    pose = scene.frame.camera_among_points(calibration.parent_from_child)
+    every = HostedLandmarks.of(scene, gripper_from_camera.pose)
+    camera = calibration.camera.short_side_resized(min(every.camera.width, every.camera.height))
+    seen = every.visible(camera, pose)
+    if len(seen) < LEAST_LANDMARKS:
+        raise InputError(f"scene {scene.name}: the fixed camera sees {len(seen)} landmarks")
+    some = np.linspace(0, len(seen) - 1, min(len(seen), MOST_LANDMARKS)).round().astype(int)
+    landmarks = every.take(seen[some])
+    images = max(1, int(calibration.checks.get("images_used", 1)))
+    known = landmarks.prior(gripper_from_camera.covariance, scene.frame.pose_sigma)
+    known += landmarks.by_fixed_camera(camera, pose, PIXEL_PX / np.sqrt(images))
+    return _chosen(known, landmarks.by_wrist_image(reachable), reachable, count, excluded)
+
+
+def _chosen(
+    known: Array, added: Array, reachable: SE3, count: int, excluded: SE3 | None
+) -> NextViews:
+    """Greedy choice by information `added` (n, N, N) to `known` (N, N); the first six matter."""
+    if not len(reachable):
         raise InputError("no reachable poses; give at least one pose that the arm can go to")
-    free = np.ones(len(reachable_poses), bool)
-    for pose in recorded if recorded is not None else ():
-        free &= ~_near(pose, reachable_poses, options)
-    added, information = state.added(reachable_poses), state.information
-    free &= np.trace(added, axis1=1, axis2=2) > 0
-    now = _covariances(information, state.target)
-    sigmas, chosen = [axis_deviation(now)], []
+    free = np.trace(added, axis1=1, axis2=2) > 0
+    for pose in excluded if excluded is not None else ():
+        free &= ~_near(pose, reachable)
+    chosen: list[int] = []
+    sigmas = [axis_deviation(_of_six(known))]
     while len(chosen) < count and free.any():
         rows = np.flatnonzero(free)
-        covariances = _covariances(information + added[rows], state.target)
-        best = int(np.argmin(_cost(covariances, options)))
+        covariances = _of_six(known + added[rows])
+        variances = np.diagonal(covariances, axis1=1, axis2=2)
+        # A rotation about either axis across the viewing direction moves a point ahead.
+        cost = variances[:, :3].sum(1) + _AT_M**2 * variances[:, 3:].sum(1)
+        best = int(np.argmin(cost))
         chosen.append(int(rows[best]))
         sigmas.append(axis_deviation(covariances[best]))
-        information = information + added[chosen[-1]]
-        free &= ~_near(reachable_poses[chosen[-1]], reachable_poses, options)
+        known = known + added[chosen[-1]]
+        free &= ~_near(reachable[chosen[-1]], reachable)
     index = np.array(chosen, np.int64)
     millimetres, degrees = zip(*sigmas, strict=True)
-    return NextViews(index, reachable_poses[index], millimetres, degrees)
+    return NextViews(index, reachable[index], millimetres, degrees)
 
 
-def _covariances(information: Array, target: slice) -> Array:
-    """(..., 6, 6) of the target by matrices (..., N, N)."""
-    columns = np.eye(information.shape[-1])[:, target]
-    return np.linalg.solve(information, columns)[..., target, :]
+def _of_six(information: Array) -> Array:
+    """(..., 6, 6) covariance of the first six unknowns of matrices (..., N, N)."""
+    return np.linalg.solve(information, np.eye(information.shape[-1])[:, :6])[..., :6, :]
 
 
-def _cost(covariances: Array, options: NextViewOptions) -> Array:
-    """(n,) criterion of covariances (n, 6, 6) in the convention of `UncertainPose`."""
-    if options.criterion == "D":
-        return np.linalg.slogdet(covariances)[1]
-    variances = np.diagonal(covariances, axis1=1, axis2=2)
-    # A rotation about either axis across the viewing direction moves a point ahead.
-    return variances[:, :3].sum(1) + options.at_m**2 * variances[:, 3:].sum(1)
-
-
-def _near(pose: SE3, others: SE3, options: NextViewOptions) -> NDArray[np.bool_]:
+def _near(pose: SE3, others: SE3) -> NDArray[np.bool_]:
     metres, radians = pose_distance(pose, others)
-    return (metres < options.apart_m) & (radians < np.deg2rad(options.apart_deg))
+    return np.less(metres, _APART_M) & np.less(radians, np.deg2rad(_APART_DEG))
+
+
+def looked_at(base_from_camera: SE3) -> Array:
+    """The point (3,) nearest to the optical axes of (n,) cameras, base frame.
+
+    For parallel axes it lies half a metre ahead of them.
+    """
+    axes = base_from_camera.rotation_matrix()[..., 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    ahead = (base_from_camera.translation_m + _AHEAD_M * axes).mean(0)
+    # A weak pull towards that point decides where the axes do not.
+    weight = 1e-3 * len(axes) * np.eye(3)
+    right = np.einsum("nij,nj->i", across, base_from_camera.translation_m) + weight @ ahead
+    return np.linalg.solve(across.sum(0) + weight, right)
+
+
+def wrist_information(base_from_gripper: SE3, mount: SE3, scene_m: Array) -> Array:
+    """(n, 12, 12) information about X and Z that an image at each of (n,) gripper poses adds."""
+    jacobian = wrist_jacobian(base_from_gripper, mount, scene_m)
+    to_camera = mount.inverse().adjoint()
+    weight = np.linalg.inv(to_camera @ GRIPPER_NOISE @ to_camera.T + CAMERA_NOISE)
+    return np.swapaxes(jacobian, 1, 2) @ weight @ jacobian
+
+
+def wrist_jacobian(base_from_gripper: SE3, mount: SE3, scene_m: Array) -> Array:
+    """(n, 6, 12) derivatives of the residuals by the errors of X and Z.
+
+    `mount` is a rough X; `scene_m` (3,) is the point of the base frame about which Z rotates.
+    """
+    camera_from_scene = (base_from_gripper @ mount).inverse() @ SE3.from_translation(scene_m)
+    jacobian = np.zeros((len(base_from_gripper), 6, 12))
+    jacobian[:, :, :6] = -_of_mount(mount)
+    jacobian[:, :, 6:] = camera_from_scene.adjoint()
+    return jacobian
+
+
+def _of_mount(pose: SE3) -> Array:
+    """(6, 6) takes an error in the convention of `UncertainPose` to a tangent on the right."""
+    turned = np.eye(6)
+    turned[:3, :3] = pose.rotation_matrix().T
+    return turned
+
+
+@dataclass(frozen=True, eq=False)
+class HostedLandmarks:
+    """Landmarks on the rays of their keyframes, which a camera on the gripper recorded."""
+
+    mount: SE3
+    """X, gripper_from_camera."""
+    camera: Camera
+    """Intrinsics of the camera on the gripper."""
+    hosts: SE3
+    """(m,) base_from_camera of the keyframes."""
+    host: NDArray[np.integer]
+    """(k,) keyframe of each landmark."""
+    rays: Array
+    """(k, 3) in the keyframe, z = 1."""
+    inverse_depth: Array
+    """(k,) per metre."""
+    sigma: Array
+    """(k,) standard deviation of the inverse depth, per metre."""
+
+    @classmethod
+    def of(cls, scene: SceneMap, mount: SE3) -> Self:
+        """All landmarks of a scene."""
+        frames = scene.keyframes
+        each = list(zip(frames.landmarks, frames.cameras, strict=True))
+        return cls(
+            mount,
+            frames.cameras[0],
+            frames.base_from_camera,
+            np.repeat(np.arange(len(each)), [len(marks) for marks, _ in each]),
+            np.concatenate([camera.unproject(marks.pixels) for marks, camera in each]),
+            np.concatenate([marks.inverse_depth for marks, _ in each]).astype(float),
+            np.concatenate([marks.sigma for marks, _ in each]).astype(float),
+        )
+
+    def take(self, index: NDArray[np.integer]) -> Self:
+        """The landmarks of an index, of the same keyframes."""
+        rays, depth, sigma = (p[index] for p in (self.rays, self.inverse_depth, self.sigma))
+        return type(self)(self.mount, self.camera, self.hosts, self.host[index], rays, depth, sigma)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return 12 + 6 * len(self.hosts) + len(self.rays)
+
+    @property
+    def points_m(self) -> Array:
+        """(k, 3) base frame."""
+        return self.hosts[self.host].apply(self.rays / self.inverse_depth[:, None])
+
+    def visible(self, camera: Camera, base_from_camera: SE3) -> NDArray[np.int64]:
+        """Indices of the landmarks that a camera sees much as their keyframes do."""
+        pixels = camera.project(base_from_camera.inverse().apply(self.points_m))
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels >= 0) & (pixels <= (camera.width - 1, camera.height - 1))).all(1)
+        before = self.points_m - self.hosts[self.host].translation_m
+        now = self.points_m - base_from_camera.translation_m
+        lengths = np.linalg.norm([before, now], axis=2)
+        cosine = (before * now).sum(1) / np.maximum(lengths.prod(0), 1e-12)
+        zoom = np.abs(np.subtract(*np.log(np.maximum(lengths, 1e-9))))
+        alike = (cosine > np.cos(np.deg2rad(MOST_TURN_DEG))) & (zoom < np.log(MOST_ZOOM))
+        return np.flatnonzero(inside & alike)
+
+    def prior(self, mount_covariance: Array, pose_sigma: tuple[float, float]) -> Array:
+        """(N, N) information of the map; the fixed camera's pose is open."""
+        sigma = np.maximum(pose_sigma, (_LEAST_SIGMA_M, _LEAST_SIGMA_RAD))
+        own = np.tile(np.repeat(sigma, 3), len(self.hosts))
+        information = np.zeros((self.size, self.size))
+        information[:6, :6] = np.linalg.inv(_ANYWHERE)
+        information[6:12, 6:12] = np.linalg.inv(mount_covariance)
+        diagonal = np.concatenate([own, np.maximum(self.sigma, 1e-6)]) ** -2.0
+        information[12:, 12:] = np.diag(diagonal)
+        return information
+
+    def by_fixed_camera(self, camera: Camera, base_from_camera: SE3, pixel_px: float) -> Array:
+        """(N, N) information of the fixed camera's own images."""
+        by_pose, jacobian = self._derivatives(camera, base_from_camera)
+        jacobian[:, :, :6] = by_pose @ _of_mount(base_from_camera)
+        rows = jacobian.reshape(-1, self.size) / pixel_px
+        return rows.T @ rows
+
+    def by_wrist_image(self, base_from_gripper: SE3) -> Array:
+        """(n, N, N) information that a wrist image at each of (n,) gripper poses adds."""
+        to_camera = self.mount.inverse().adjoint()
+        own = np.linalg.inv(to_camera @ GRIPPER_NOISE @ to_camera.T)
+        added = np.zeros((len(base_from_gripper), self.size, self.size))
+        for i, gripper in enumerate(base_from_gripper):
+            by_pose, jacobian = self.of_wrist_image(gripper)
+            if len(by_pose) < LEAST_LANDMARKS:
+                continue
+            rows, moved = jacobian.reshape(-1, self.size), by_pose.reshape(-1, 6)
+            # The image's own pose is eliminated: its prior is the stated gripper pose.
+            mixed = moved.T @ rows
+            left = np.linalg.solve(PIXEL_PX**2 * own + moved.T @ moved, mixed)
+            added[i] = (rows.T @ rows - mixed.T @ left) / PIXEL_PX**2
+        return added
+
+    def of_wrist_image(self, base_from_gripper: SE3) -> tuple[Array, Array]:
+        """Derivatives of the pixels of the v visible landmarks in a wrist image.
+
+        Returns:
+            (v, 2, 6) by a tangent on the right of the image's own pose, and (v, 2, N) by the
+            unknowns.
+        """
+        by_pose, jacobian = self._derivatives(self.camera, base_from_gripper @ self.mount)
+        jacobian[:, :, 6:12] += by_pose @ _of_mount(self.mount)
+        return by_pose, jacobian
+
+    def _derivatives(self, camera: Camera, pose: SE3) -> tuple[Array, Array]:
+        """By the camera's pose (v, 2, 6), and by keyframes and depths (v, 2, N)."""
+        visible = self.visible(camera, pose)
+        by_pose, by_point = pixel_slopes(camera, pose.inverse().apply(self.points_m[visible]))
+        host, depth = self.host[visible], self.inverse_depth[visible, None]
+        local = self.rays[visible] / depth
+        by_local = by_point @ pose.rotation_matrix().T @ self.hosts[host].rotation_matrix()
+        by_host = np.concatenate([by_local, -by_local @ cross_matrix(local)], 2)
+        hosts, row = len(self.hosts), np.arange(len(visible))
+        jacobian = np.zeros((len(visible), 2, self.size))
+        # Keyframes are wrist images, too: an error of X moves all of them.
+        jacobian[:, :, 6:12] = by_host @ _of_mount(self.mount)
+        for i in range(6):
+            jacobian[row, :, 12 + 6 * host + i] = by_host[:, :, i]
+        by_depth = -np.einsum("vij,vj->vi", by_local, local) / depth
+        jacobian[row, :, 12 + 6 * hosts + visible] = by_depth
+        return by_pose, jacobian
+
+
+def pixel_slopes(camera: Camera, points_camera: Array) -> tuple[Array, Array]:
+    """Derivatives of the pixels of (v, 3) points.
+
+    Returns:
+        (v, 2, 6) by a tangent on the right of the camera's pose, and (v, 2, 3) by the point in the
+        camera frame.
+    """
+    plane, depth = points_camera[:, :2] / points_camera[:, 2:], points_camera[:, 2]
+    to_plane = np.zeros((len(points_camera), 2, 3))
+    to_plane[:, 0, 0] = to_plane[:, 1, 1] = 1 / depth
+    to_plane[:, :, 2] = -plane / depth[:, None]
+    by_point = camera.slopes(plane)[0] @ to_plane
+    return np.concatenate([-by_point, by_point @ cross_matrix(points_camera)], 2), by_point

@@ -36,14 +36,14 @@ class Rig:
             "cameras": {name: camera.to_dict() for name, camera in self.cameras.items()},
             "relative": [
                 {
-                    "parent_frame": pair.first,
-                    "child_frame": pair.second,
-                    "translation_m": pair.first_from_second.pose.translation_m.tolist(),
-                    "quaternion_wxyz": pair.first_from_second.pose.rotation_wxyz.tolist(),
-                    "matrix": pair.first_from_second.pose.matrix().tolist(),
-                    "covariance": pair.first_from_second.covariance.tolist(),
+                    "parent_frame": first,
+                    "child_frame": second,
+                    "translation_m": first_from_second.pose.translation_m.tolist(),
+                    "quaternion_wxyz": first_from_second.pose.rotation_wxyz.tolist(),
+                    "matrix": first_from_second.pose.matrix().tolist(),
+                    "covariance": first_from_second.covariance.tolist(),
                 }
-                for pair in self.relative
+                for first, second, first_from_second in self.relative
             ],
         }
 

@@ -63,7 +63,6 @@ class Align(Verb):
                 "--points: images, --convention and --board-poses belong to --robot-poses; omit"
                 " them"
             )
-        from evercal.calibration.from_images import scene_named
         from evercal.features.device import device_of
         from evercal.localization.localizer import Localizer
         from evercal.mapping.store import MapStore
@@ -73,7 +72,7 @@ class Align(Verb):
         with opened.writing():
             localizer = Localizer(opened.contents.to(where))
             alignment = self._by_points(localizer) if by_points else self._by_gripper(localizer)
-            opened.update(alignment.applied_to(scene_named(localizer, self.scene)))
+            opened.update(alignment.applied_to(localizer.contents.scene(self.scene)))
         self._print(alignment)
         return 0
 
@@ -97,9 +96,7 @@ class Align(Verb):
 
     def _metric(self, localizer: "Localizer") -> bool:
         """Whether the scale is known."""
-        from evercal.calibration.from_images import scene_named
-
-        return scene_named(localizer, self.scene).metric and not self.unknown_scale
+        return localizer.contents.scene(self.scene).metric and not self.unknown_scale
 
     def _by_points(self, localizer: "Localizer") -> "MapAlignment":
         from evercal.calibration.align import aligned_by_points

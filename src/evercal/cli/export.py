@@ -28,7 +28,7 @@ class Export(Verb):
     calibration: Annotated[
         Positional[Path | None], arg(metavar="[CALIBRATION.json]", help_behavior_hint="")
     ] = None
-    """Calibration file."""
+    """Calibration file, or a map that was learned from gripper poses (MAP or MAP:SCENE)."""
     format: Name = None
     """Format, such as easy_handeye2, urdf, opencv or kuka; `list` lists all."""
     out: File = None
@@ -58,9 +58,9 @@ class Export(Verb):
 
     def run(self) -> int:
         """Read all inputs before writing the output."""
-        from evercal.calibration.calibration import read_calibration
         from evercal.calibration.export.formats import FORMATS, export_files
         from evercal.calibration.export.request import ExportOptions
+        from evercal.calibration.learned import calibration_at
 
         if self.format == "list" or (self.format is None and self.calibration is None):
             return self._list()
@@ -69,7 +69,7 @@ class Export(Verb):
         if self.calibration is None:
             raise InputError("no calibration given; name its JSON file after 'export'")
         options = {key: getattr(self, key) for key in ExportOptions.__annotations__}
-        calibration = read_calibration(self.calibration)
+        calibration = calibration_at(self.calibration)
         self._print(export_files(calibration, self.format, self.out, **options))
         return 0
 

@@ -99,15 +99,13 @@ class Inspect(Verb):
 
     def _next_views(self, poses: "SE3", rough: "SE3 | None") -> "NextViews":
         from evercal.calibration.next_views import next_views
-        from evercal.calibration.view_information import HandEyeViews
         from evercal.recordings import read_robot_poses
 
         assert self.next is not None
         reachable = read_robot_poses(
             self.next, self.reading.pose_convention, option="--pose-convention"
         )
-        state = HandEyeViews.recorded(poses, rough)
-        return next_views(state, reachable.poses, self.count, poses)
+        return next_views(poses, reachable.poses, self.count, rough)
 
 
 def _advice_record(covered: "Coverage | None", views: "NextViews | None") -> dict[str, object]:

@@ -24,7 +24,7 @@ class Report:
     """
 
     calibration: Annotated[Positional[Path], arg(metavar="CALIBRATION.json")]
-    """Calibration file."""
+    """Calibration file, or a map that was learned from gripper poses (MAP or MAP:SCENE)."""
     store: Annotated[Path | None, arg(metavar="STORE", help_behavior_hint="")] = None
     """Folder of the store. Its landmarks are drawn with their residuals."""
     images: Annotated[
@@ -48,12 +48,13 @@ class Report:
         require_writable(self.out, "--out")
         point = point_of(self.at)
         from evercal.calibration.calibration import read_calibration
+        from evercal.calibration.learned import calibration_at
         from evercal.calibration.verdict import expected_error, tier, verdict
         from evercal.reports.calibration_images import boards_seen
         from evercal.reports.calibration_page import NamedCalibration, calibration_page, difference
         from evercal.storage import write_bytes
 
-        calibration = read_calibration(self.calibration)
+        calibration = calibration_at(self.calibration)
         older = None
         if self.against is not None:
             older = NamedCalibration(self.against.name, read_calibration(self.against))

@@ -64,11 +64,11 @@ class Watch:
             raise InputError("--window is at least 1 and --interval is above 0")
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.drift import shift_between
-        from evercal.calibration.located import Located, fuse, locate
+        from evercal.calibration.located import ImagePose, fuse, locate
 
         reference = read_calibration(self.reference)
         localizer = open_map(self.store, self.device)
-        recent: deque[Located] = deque(maxlen=self.window)
+        recent: deque[ImagePose] = deque(maxlen=self.window)
         arrivals = Arrivals(self.folder)
         tests, last = 0, time.monotonic()
         while self.idle is None or time.monotonic() - last < self.idle:

@@ -28,9 +28,8 @@ class LiveCamera(Protocol):
 class StreamCamera:
     """The frames of a camera, a network stream, a video or a folder, one for each `read`.
 
-    A thread empties the buffer of a live source, so that an image arrived after the call that asks
-    for it. It was taken earlier by the delay of the source. A video or a folder gives its next
-    frame.
+    A live image arrived after the call that asks for it; it was taken earlier by the delay of the
+    source. A video or a folder gives its next frame.
 
     Args:
         source: number or device of a camera, address, video file or folder.
@@ -81,9 +80,6 @@ class NewestFrame:
 
     Iterating gives the newest frame each time and leaves out those that arrived meanwhile. An
     error of the source is raised where the frames are used, after the frames before it.
-
-    Args:
-        frames: the stream.
     """
 
     def __init__(self, frames: Iterator[StreamFrame]):
@@ -94,11 +90,7 @@ class NewestFrame:
         self._thread.start()
 
     def __iter__(self) -> Iterator[StreamFrame]:
-        """Return frames until the stream ends.
-
-        Raises:
-            Exception: As the stream.
-        """
+        """Return frames until the stream ends."""
         last: StreamFrame | None = None
         try:
             while (frame := self._other_than(last)) is not None:
@@ -109,18 +101,10 @@ class NewestFrame:
         self._raise_error()
 
     def after(self, stamp_s: float, timeout_s: float) -> StreamFrame | None:
-        """Return the first frame at or after a time; None if the stream ends or none arrives.
-
-        Raises:
-            Exception: As the stream.
-        """
-
-        def is_new() -> bool:
-            return self._frame is not None and self._frame.stamp_s >= stamp_s
-
+        """Return the first frame at or after a time; None if the stream ends or none arrives."""
         with self._changed:
-            self._changed.wait_for(lambda: self._ended or is_new(), timeout_s)
-            if is_new():
+            self._changed.wait_for(lambda: self._ended or self._reached(stamp_s), timeout_s)
+            if self._reached(stamp_s):
                 return self._frame
         self._raise_error()
         return None
@@ -132,8 +116,10 @@ class NewestFrame:
             self._changed.notify_all()
         self._thread.join(1.0)
 
+    def _reached(self, stamp_s: float) -> bool:
+        return self._frame is not None and self._frame.stamp_s >= stamp_s
+
     def _other_than(self, last: StreamFrame | None) -> StreamFrame | None:
-        """The newest frame once it is not `last` any more; None if the stream ends before."""
         with self._changed:
             self._changed.wait_for(lambda: self._ended or self._frame is not last)
             return None if self._frame is last else self._frame

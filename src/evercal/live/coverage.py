@@ -54,14 +54,8 @@ class Sample:
 
     @classmethod
     def of(cls, frame: Frame) -> Self:
-        """Measure a frame with a gripper pose.
-
-        Raises:
-            InputError: The image cannot be read.
-            ValueError: The frame has no gripper pose.
-        """
-        if frame.base_from_gripper is None:
-            raise ValueError(f"frame {frame.name} has no gripper pose")
+        """Measure a frame with a gripper pose."""
+        assert frame.base_from_gripper is not None, "coverage is of gripper poses"
         image = frame.read_image()
         return cls(frame.name, frame.base_from_gripper, sharpness(image), clipped_share(image))
 
@@ -127,27 +121,31 @@ def coverage(
     options = options or CoverageOptions()
     rows = _sample_reports(samples, options)
     good = [s for s, row in zip(samples, rows, strict=True) if not row.problems]
-    mount = gripper_from_camera or SE3.identity()
-    mover = "gripper" if gripper_from_camera is None else "camera"
-    poses = SE3.stack([sample.base_from_gripper for sample in good]) @ mount
+    poses = SE3.stack([sample.base_from_gripper for sample in good])
+    mover = "gripper"
+    if gripper_from_camera is not None:
+        poses, mover = poses @ gripper_from_camera, "camera"
     turned, principal = _rotations_deg(poses)
     moved = 1000 * poses.translation_m.std(0) if good else np.zeros(3)
     rotations = _axes(f"about the {mover}'s", turned, options.rotation_deg)
     positions = _axes("along the base's", moved, options.position_mm)
     rank = int((principal >= options.rotation_deg).sum())
     ready = len(good) >= MIN_GRIPPER_FRAMES and rank >= 2
-    missing = _missing(len(good), rank, (rotations, positions), options)
-    return Coverage(
-        rows, rotations, positions, rank, missing, ready, _verdict(rows, ready, missing)
-    )
+    missing = _missing(len(good), rank, rotations, positions, options)
+    state = "can be learned" if ready else "cannot be learned yet"
+    verdict = f"{len(good)} of {len(rows)} images are good; the recording {state}."
+    if missing:
+        verdict += f" Missing: {'; '.join(missing[:3])}."
+    elif len(good) == len(rows):
+        verdict += " It is complete."
+    return Coverage(rows, rotations, positions, rank, missing, ready, verdict)
 
 
 def sharpness(image: NDArray[np.uint8]) -> float:
-    """Contrast of fine structure relative to coarser one, in the direction where it is least.
+    """Contrast of fine structure relative to coarser one, in the direction of motion blur.
 
-    The ratio hardly depends on what is shown. The direction is that of motion blur: the smallest
-    generalised eigenvalue of the structure tensors of two octaves. Noise of single pixels is
-    smoothed first. An image without structure has 0.
+    It is the smallest generalised eigenvalue of the structure tensors of two octaves, which hardly
+    depends on what is shown. An image without structure has 0.
     """
     import cv2
     from scipy.linalg import eigh
@@ -161,7 +159,6 @@ def sharpness(image: NDArray[np.uint8]) -> float:
 
 
 def _structure(band: Any) -> Array:
-    """(2, 2) mean structure tensor."""
     import cv2
 
     slopes = [cv2.Sobel(band, cv2.CV_32F, *order).ravel() for order in ((1, 0), (0, 1))]
@@ -181,7 +178,7 @@ def _sample_reports(
     rows = []
     for i, sample in enumerate(samples):
         relative = sample.sharpness / middle if middle > 0 else 0.0
-        problems, apart = [], None
+        problems, near = [], (None, None)
         if relative < options.sharpness:
             problems.append(f"blurred (sharpness {100 * relative:.0f} % of the median)")
         if sample.clipped > options.clipped:
@@ -191,10 +188,9 @@ def _sample_reports(
             millimetres, degrees = 1000 * metres, np.rad2deg(radians)
             scaled = np.hypot(millimetres / options.same_mm, degrees / options.same_deg)
             nearest = int(np.argmin(scaled))
-            apart = float(millimetres[nearest]), float(degrees[nearest])
-            if apart[0] < options.same_mm and apart[1] < options.same_deg:
+            near = float(millimetres[nearest]), float(degrees[nearest])
+            if near[0] < options.same_mm and near[1] < options.same_deg:
                 problems.append(f"same pose as {samples[nearest].name}")
-        near = apart or (None, None)
         rows.append(SampleReport(sample.name, relative, sample.clipped, *near, tuple(problems)))
     return tuple(rows)
 
@@ -218,37 +214,31 @@ def _axes(words: str, spreads: Array, least: float) -> tuple[AxisCoverage, ...]:
 def _missing(
     good: int,
     rank: int,
-    axes: tuple[tuple[AxisCoverage, ...], tuple[AxisCoverage, ...]],
+    rotations: Sequence[AxisCoverage],
+    positions: Sequence[AxisCoverage],
     options: CoverageOptions,
 ) -> tuple[str, ...]:
-    rotations, positions = axes
     missing = []
     if good < MIN_GRIPPER_FRAMES:
         missing.append(f"{MIN_GRIPPER_FRAMES - good} more images to start with")
-    for axis in sorted(rotations, key=lambda axis: axis.spread):
-        # Two axes are necessary, the third one makes the result better.
-        if not axis.covered:
-            missing.append(
-                f"rotations {axis.name} ({axis.spread:.0f} deg, {options.rotation_deg:.0f} wanted)"
-            )
-    for axis in sorted(positions, key=lambda axis: axis.spread):
-        if not axis.covered:
-            missing.append(
-                f"positions {axis.name} ({axis.spread:.0f} mm, {options.position_mm:.0f} wanted)"
-            )
+    # Two axes of rotation are necessary, the third one makes the result better.
+    limits = (
+        ("rotations", rotations, options.rotation_deg, "deg"),
+        (
+            "positions",
+            positions,
+            options.position_mm,
+            "mm",
+        ),
+    )
+    for what, axes, limit, unit in limits:
+        missing += [
+            f"{what} {axis.name} ({axis.spread:.0f} {unit}, {limit:.0f} wanted)"
+            for axis in sorted(axes, key=lambda axis: axis.spread)
+            if not axis.covered
+        ]
     if rank < 2 and not any("rotations" in words for words in missing):
         missing.insert(0, "rotations about a second axis: tilt and turn independently")
     if MIN_GRIPPER_FRAMES <= good < options.images:
         missing.append(f"{options.images - good} more images")
     return tuple(missing)
-
-
-def _verdict(rows: tuple[SampleReport, ...], ready: bool, missing: tuple[str, ...]) -> str:
-    bad = [row.name for row in rows if row.problems]
-    state = "can be learned" if ready else "cannot be learned yet"
-    words = f"{len(rows) - len(bad)} of {len(rows)} images are good; the recording {state}."
-    if missing:
-        words += f" Missing: {'; '.join(missing[:3])}."
-    elif not bad:
-        words += " It is complete."
-    return words

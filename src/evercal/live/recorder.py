@@ -23,7 +23,7 @@ from evercal.storage import write_bytes, write_json
 
 POSES = "base_from_gripper.csv"
 JPEG_QUALITY = 95
-_HEADER = "image,x,y,z,qw,qx,qy,qz"
+_COLUMNS = "x,y,z,qw,qx,qy,qz"
 
 
 class WristRecorder:
@@ -55,11 +55,7 @@ class WristRecorder:
         return tuple(self._frames)
 
     def add(self, image: NDArray[np.uint8], base_from_gripper: SE3) -> Frame:
-        """Write a sample and return it.
-
-        Raises:
-            InputError: The size of the image is not that of the camera.
-        """
+        """Write a sample and return it, or raise InputError for an image of another size."""
         if image.shape != (self._camera.height, self._camera.width, 3):
             raise InputError(
                 f"image of shape {image.shape}: the camera is {self._camera.width}x"
@@ -75,11 +71,7 @@ class WristRecorder:
         return frame
 
     def remove(self, name: str) -> None:
-        """Remove a sample.
-
-        Raises:
-            InputError: No such sample.
-        """
+        """Remove a sample, or raise InputError if there is none of this name."""
         left = [frame for frame in self._frames if frame.name != name]
         if len(left) == len(self._frames):
             raise InputError(f"{name}: no such sample in {self._root}")
@@ -88,20 +80,21 @@ class WristRecorder:
         (self._root / "images" / name).unlink(missing_ok=True)
 
     def _write_poses(self) -> None:
-        rows = {frame.name: frame.base_from_gripper for frame in self._frames}
         path = self._root / POSES
-        if rows:
-            poses = SE3.stack([pose for pose in rows.values() if pose is not None])
-            write_bytes(path, pose_rows(poses, tuple(rows)).encode())
+        if self._frames:
+            poses = SE3.stack([p for f in self._frames if (p := f.base_from_gripper) is not None])
+            names = tuple(frame.name for frame in self._frames)
+            write_bytes(path, pose_rows(poses, names).encode())
         else:
             path.unlink(missing_ok=True)
 
 
 def pose_rows(poses: SE3, names: tuple[str, ...] | None = None) -> str:
     """A table of (n,) poses, with a column of (n,) image names if given."""
-    header = _HEADER if names is not None else _HEADER.partition(",")[2]
-    rows = [header]
-    for i, pose in enumerate(poses):
-        numbers = (f"{number:.8f}" for number in (*pose.translation_m, *pose.rotation_wxyz))
-        rows.append(",".join([*((names[i],) if names is not None else ()), *numbers]))
-    return "\n".join(rows) + "\n"
+    first = ("image", *names) if names is not None else ("",) * (len(poses) + 1)
+    rows = [_COLUMNS]
+    for pose in poses:
+        numbers = (*pose.translation_m, *pose.rotation_wxyz)
+        rows.append(",".join(f"{number:.8f}" for number in numbers))
+    named = [f"{name},{row}" if name else row for name, row in zip(first, rows, strict=True)]
+    return "\n".join(named) + "\n"

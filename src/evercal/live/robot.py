@@ -27,11 +27,7 @@ class MovingRobot(Robot, Protocol):
     """A robot that moves on request."""
 
     def move_to(self, base_from_gripper: SE3) -> None:
-        """Move the gripper to a pose and return once it stands still.
-
-        Raises:
-            InputError: The pose is out of reach.
-        """
+        """Move to a pose and return once the gripper stands still, or raise InputError."""
         ...
 
 
@@ -53,11 +49,7 @@ class PoseFileRobot:
         self._path, self._convention, self._most_age_s = Path(path), convention, most_age_s
 
     def base_from_gripper(self) -> SE3:
-        """Read the pose of the last complete line.
-
-        Raises:
-            InputError: The file is missing, holds no complete pose, or is too old.
-        """
+        """Read the pose of the last complete line, or raise InputError if there is none."""
         pose = read_last_robot_pose(self._path, self._convention)
         if self._most_age_s is not None:
             age = time.time() - self._path.stat().st_mtime

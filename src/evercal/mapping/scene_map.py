@@ -1,5 +1,6 @@
 """`SceneMap`: the map of one scene as a robot keeps it, and the scenes of one map together."""
 
+import hashlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Self
 
@@ -8,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from evercal.errors import InputError
 from evercal.features.device import device_of_network
 from evercal.features.encoder import Encoder
 from evercal.geometry import Camera
@@ -58,6 +60,17 @@ class SceneMap:
         """Number of landmarks."""
         return sum(map(len, self.keyframes.landmarks))
 
+    @property
+    def digest(self) -> str:
+        """Identifies the map and its base frame: poses with the same digest share their errors."""
+        digest = hashlib.sha256(self.name.encode())
+        digest.update(self.keyframes.base_from_camera.matrix().tobytes())
+        similarity = self.frame.similarity
+        if similarity is not None:
+            digest.update(similarity.base_from_map.matrix().tobytes())
+            digest.update(np.float64(similarity.scale).tobytes())
+        return digest.hexdigest()[:16]
+
 
 @dataclass
 class MapContents:
@@ -89,6 +102,33 @@ class MapContents:
     def with_scene(self, scene: SceneMap) -> "MapContents":
         """The same map with one more scene."""
         return MapContents(self.encoder, self.short_side, [*self.scenes, scene])
+
+    def scene(self, name: str) -> SceneMap:
+        """The map of a scene.
+
+        Raises:
+            InputError: No such scene.
+        """
+        for scene in self.scenes:
+            if scene.name == name:
+                return scene
+        names = ", ".join(scene.name for scene in self.scenes)
+        raise InputError(f"scene {name!r}: the map has only {names}")
+
+    def metric_scene(self, name: str) -> SceneMap:
+        """The map of a scene whose answers are in metres.
+
+        Raises:
+            InputError: No such scene, or its unit of length is unknown.
+        """
+        scene = self.scene(name)
+        if not scene.unit_known:
+            raise InputError(
+                f"scene {name}: the unit of length of its recording is unknown, so there are no"
+                " millimetres; run 'evercal align' first, with --robot-poses or with --points and"
+                " --picks"
+            )
+        return scene
 
     def empty(self) -> "MapContents":
         """The same map without scenes."""

@@ -29,7 +29,14 @@ from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.storage.atomic import write_bytes, write_json
 from evercal.storage.manifest import Manifest
-from evercal.storage.stages import StageStore, is_store, read_store, write_report
+from evercal.storage.stages import (
+    REPORT,
+    STAGES,
+    StageStore,
+    is_store,
+    read_store,
+    write_report,
+)
 from evercal.storage.tensors import load_tensors, save_tensors
 
 KIND, STRATEGY = "map", "evercal"
@@ -210,6 +217,25 @@ class MapStore(StageStore):
     def payload(self) -> dict[str, object]:
         """Settings in the manifest."""
         return {"kind": KIND, "strategy": STRATEGY, "short_side": self.contents.short_side}
+
+
+def stored_scenes(root: Path) -> list[tuple[str, Camera, dict[str, Any]]]:
+    """Name, adjusted camera and report of every scene of a map; no keyframes are read.
+
+    Raises:
+        InputError: Not a map, or a file is missing or was changed.
+    """
+
+    def read(manifest: Manifest) -> list[tuple[str, Camera, dict[str, Any]]]:
+        folders = [root / STAGES / str(name) for name in require_map(root, manifest)["stages"]]
+        scenes = [json.loads((folder / SCENE).read_text()) for folder in folders]
+        reports = [json.loads((folder / REPORT).read_text()) for folder in folders]
+        return [
+            (scene["name"], Camera.from_dict(scene["adjusted_camera"]), report)
+            for scene, report in zip(scenes, reports, strict=True)
+        ]
+
+    return read_store(root, read)
 
 
 def require_map(root: Path, manifest: Manifest) -> dict[str, Any]:

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.boards.board_poses import read_board_poses
 from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.calibration import Calibration, ImageUse
-from evercal.calibration.from_images import map_digest
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, resize_pixels
 from evercal.recordings.images import read_image
@@ -218,30 +216,7 @@ def _is_other_map(calibration: Calibration, localizer: "LearnedLocalizer") -> bo
         return digest is not None
     from evercal.localization.localizer import Localizer
 
-    return not isinstance(localizer, Localizer) or map_digest(localizer, str(scene)) != digest
-
-
-def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:
-    """Return the board in each image of a calibration by name; empty without corners.
-
-    Args:
-        calibration: By `evercal solve`.
-        folder: Folder of its file.
-    """
-    poses = calibration.checks.get("camera_from_board")
-    given = Path(str(calibration.source.get("camera_poses", "")))
-    file = next((f for f in (folder / given, given, folder / given.name) if f.is_file()), None)
-    if not isinstance(poses, dict) or file is None:
-        return {}
-    try:
-        board = read_board_poses(file)
-    except InputError:  # poses by other programs have no corners
-        return {}
-    views = {(file.parent / image.name).resolve(): image.view for image in board.images}
-    scale, seen = float(calibration.checks.get("scale", 1.0)), {}
-    for name, pose in poses.items():
-        view = views.get((folder / name).resolve()) or views.get((file.parent / name).resolve())
-        if view is not None:
-            camera_from_board = SE3(pose["quaternion_wxyz"], pose["translation_m"])
-            seen[name] = BoardSeen(view, camera_from_board, scale)
-    return seen
+    return (
+        not isinstance(localizer, Localizer)
+        or localizer.contents.scene(str(scene)).digest != digest
+    )

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma
 from evercal.calibration.boards.detection import Board
-from evercal.calibration.calibration import of_format, read_json
 from evercal.geometry import SE3, Camera
 from evercal.storage import write_json
+from evercal.storage.records import of_format, read_record
 
 Array = NDArray[np.floating]
 
@@ -103,7 +103,7 @@ def read_board_poses(path: str | os.PathLike[str]) -> BoardPoses:
     Raises:
         InputError: The file is missing or does not hold board poses.
     """
-    return read_json(path, "file of camera poses", BoardPoses.from_dict)
+    return read_record(path, "file of camera poses", BoardPoses.from_dict)
 
 
 def board_poses(

@@ -11,13 +11,16 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import yaml
 
-from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
 from evercal.geometry import SE3
+
+if TYPE_CHECKING:
+    from evercal.calibration.calibration import Calibration
 
 _Transforms = dict[tuple[str, str], SE3]
 """parent_from_child by (parent, child)."""
@@ -25,15 +28,11 @@ _EXPECTED = "give what 'ros2 topic echo --once /tf_static' prints, or a Transfor
 
 
 def standard_link_from_optical(offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> SE3:
-    """Return the pose of an optical frame with the axes of REP 103.
-
-    Args:
-        offset_m: Origin of the optical frame in the link: forward, left, up.
-    """
+    """Return the pose of an optical frame whose origin lies forward, left, up in the link."""
     return SE3(np.array([0.5, -0.5, 0.5, -0.5]), np.array(offset_m))
 
 
-def published_at(calibration: Calibration, link: str, link_from_optical: SE3) -> Calibration:
+def published_at(calibration: "Calibration", link: str, link_from_optical: SE3) -> "Calibration":
     """Return the calibration of the driver's root frame `link`, with its covariance."""
     pose = calibration.uncertain_pose @ link_from_optical.inverse()
     return replace(
@@ -44,18 +43,13 @@ def published_at(calibration: Calibration, link: str, link_from_optical: SE3) ->
 def read_link_from_optical(path: str | os.PathLike[str], link: str, optical: str) -> SE3:
     """Read the pose of the optical frame in the driver's root frame.
 
-    Args:
-        path: YAML or JSON: the output of `ros2 topic echo --once /tf_static`, a TransformStamped,
-            or an object with `parent_frame`, `child_frame`, `translation_m`, `quaternion_wxyz`.
-            Several transforms are chained in either direction.
-        link: Name of the driver's root frame.
-        optical: Name of the optical frame.
+    The file is YAML or JSON: the output of `ros2 topic echo --once /tf_static`, a TransformStamped,
+    or an object with `parent_frame`, `child_frame`, `translation_m`, `quaternion_wxyz`. Several
+    transforms are chained in either direction.
 
     Raises:
         InputError: The file is missing or broken, or its transforms do not connect the two frames.
     """
-    import yaml
-
     transforms: _Transforms = {}
     try:
         for document in yaml.safe_load_all(Path(path).read_text(encoding="utf-8")):
@@ -69,8 +63,7 @@ def read_link_from_optical(path: str | os.PathLike[str], link: str, optical: str
     if not transforms:
         raise InputError(f"{path}: contains no transform; {_EXPECTED}")
     transforms |= {(child, parent): pose.inverse() for (parent, child), pose in transforms.items()}
-    link_from = {link: SE3.identity()}
-    queue = [link]
+    link_from, queue = {link: SE3.identity()}, [link]
     for frame in queue:
         for (parent, child), parent_from_child in transforms.items():
             if parent == frame and child not in link_from:
@@ -86,7 +79,6 @@ def read_link_from_optical(path: str | os.PathLike[str], link: str, optical: str
 
 
 def _transforms(data: Any) -> _Transforms:
-    """Return the transforms of a document."""
     if isinstance(data, Mapping) and "transforms" in data:
         data = data["transforms"]
     if isinstance(data, list):

@@ -1,16 +1,19 @@
-"""The table of export formats, and `export_calibration`."""
+"""The table of export formats, and `export_files`."""
 
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias, Unpack
+from typing import TYPE_CHECKING, Literal, TypeAlias, Unpack
 
-from evercal.calibration.calibration import Calibration
-from evercal.calibration.export import image_poses, numbers, ros
+from evercal.calibration.export import image_poses as images
+from evercal.calibration.export import numbers, ros
 from evercal.calibration.export.request import Export, ExportOptions, prepare_export
 from evercal.errors import InputError
 from evercal.storage import write_bytes
+
+if TYPE_CHECKING:
+    from evercal.calibration.calibration import Calibration
 
 Content: TypeAlias = str | bytes | dict[str, str]
 """Text, bytes, or the texts of a folder by file name."""
@@ -25,69 +28,39 @@ class Format:
     frame, so `via` is refused. `any`: plain numbers of either frame."""
     write: Callable[[Export], Content]
     """Writer."""
+    ending: str
+    """Usual ending of the file; empty for a folder."""
     description: str
     """One line for `--format list`."""
-    ending: str = ".txt"
-    """Usual ending of the file; empty for a folder."""
     per_image: bool = False
     """Whether a camera on the arm needs the robot's pose of every image."""
 
 
 FORMATS = {
-    "easy_handeye2": Format(
-        "tf", ros.easy_handeye2, "for ~/.ros2/easy_handeye2/calibrations", ".calib"
-    ),
-    "easy_handeye": Format(
-        "tf", ros.easy_handeye, "easy_handeye of ROS 1, ~/.ros/easy_handeye", ".yaml"
-    ),
-    "moveit_samples": Format(
-        "optical",
-        image_poses.moveit_samples,
-        "MoveIt Calibration's pose pairs (with --robot-poses and --target-poses)",
-        ".yaml",
-        per_image=True,
-    ),
-    "static_transform_publisher": Format(
-        "tf", ros.publisher_command, "shell command that publishes the transform in ROS 2", ".sh"
-    ),
-    "launch_py": Format("tf", ros.launch_py, "ROS 2 launch file with a tf publisher", ".launch.py"),
-    "ros1_launch": Format(
-        "tf", ros.ros1_launch, "ROS 1 launch file, like MoveIt Calibration", ".launch"
-    ),
-    "transform_stamped": Format(
-        "tf", ros.transform_stamped, "geometry_msgs/TransformStamped", ".yaml"
-    ),
-    "camera_info": Format("optical", ros.camera_info, "intrinsics for ROS", ".yaml"),
-    "urdf": Format("tf", ros.urdf, "fixed joint for a URDF, rpy about fixed axes", ".urdf"),
-    "opencv": Format(
-        "optical", numbers.opencv, "rvec, tvec (parent to camera), FileStorage", ".yml"
-    ),
-    "csv": Format("any", numbers.csv, "4x4 matrix, metres, one matrix row per line", ".csv"),
-    "npy": Format("any", numbers.npy, "4x4 matrix, metres, for numpy", ".npy"),
-    "json": Format(
-        "any", numbers.as_json, "matrix, quaternion w x y z, covariance, frames", ".json"
-    ),
-    "tum": Format(
-        "optical", image_poses.tum, "stamp, translation, quaternion x y z w", ".tum", per_image=True
-    ),
-    "colmap": Format(
-        "optical",
-        image_poses.colmap,
-        "cameras.txt, images.txt, points3D.txt (folder)",
-        "",
-        per_image=True,
-    ),
-    "nerfstudio": Format(
-        "optical", image_poses.nerfstudio, "transforms.json, OpenGL axes", ".json", per_image=True
-    ),
-    "zivid": Format("any", numbers.zivid, "4x4 matrix in millimetres for Zivid's SDK"),
-    "ur": Format("any", numbers.ur, "Universal Robots: p[x, y, z, rx, ry, rz]"),
-    "kuka": Format("any", numbers.kuka, "KUKA: {X, Y, Z, A, B, C}, mm and degrees"),
-    "abb": Format("any", numbers.abb, "ABB: [[x,y,z],[q1,q2,q3,q4]], mm"),
-    "fanuc": Format("any", numbers.fanuc, "FANUC: X Y Z W P R, mm and degrees"),
-    "yaskawa": Format("any", numbers.yaskawa, "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"),
-    "staubli": Format("any", numbers.staubli, "Staubli: X Y Z RX RY RZ, mm and degrees"),
-    "franka": Format("any", numbers.franka, "Franka: 16 numbers by column, metres"),
+    "easy_handeye2": Format("tf", ros.easy_handeye2, ".calib", "for ~/.ros2/easy_handeye2"),
+    "easy_handeye": Format("tf", ros.easy_handeye, ".yaml", "for ~/.ros/easy_handeye of ROS 1"),
+    "moveit_samples": Format("optical", images.moveit, ".yaml", "MoveIt Calibration's pairs", True),
+    "static_transform_publisher": Format("tf", ros.command, ".sh", "shell command for ROS 2"),
+    "launch_py": Format("tf", ros.launch_py, ".launch.py", "ROS 2 launch file with a tf publisher"),
+    "ros1_launch": Format("tf", ros.ros1_launch, ".launch", "ROS 1 launch file, like MoveIt's"),
+    "transform_stamped": Format("tf", ros.stamped, ".yaml", "geometry_msgs/TransformStamped"),
+    "camera_info": Format("optical", ros.camera_info, ".yaml", "intrinsics for ROS"),
+    "urdf": Format("tf", ros.urdf, ".urdf", "fixed joint for a URDF, rpy about fixed axes"),
+    "opencv": Format("optical", numbers.opencv, ".yml", "rvec and tvec, parent to camera"),
+    "csv": Format("any", numbers.csv, ".csv", "4x4 matrix, metres, one matrix row per line"),
+    "npy": Format("any", numbers.npy, ".npy", "4x4 matrix, metres, for numpy"),
+    "json": Format("any", numbers.as_json, ".json", "matrix, quaternion wxyz, covariance, frames"),
+    "tum": Format("optical", images.tum, ".tum", "stamp, translation, quaternion x y z w", True),
+    "colmap": Format("optical", images.colmap, "", "a model without points (folder)", True),
+    "nerfstudio": Format("optical", images.nerfstudio, ".json", "transforms.json", True),
+    "zivid": Format("any", numbers.zivid, ".txt", "4x4 matrix in millimetres for Zivid's SDK"),
+    "ur": Format("any", numbers.ur, ".txt", "Universal Robots: p[x, y, z, rx, ry, rz]"),
+    "kuka": Format("any", numbers.kuka, ".txt", "KUKA: {X, Y, Z, A, B, C}, mm and degrees"),
+    "abb": Format("any", numbers.abb, ".txt", "ABB: [[x,y,z],[q1,q2,q3,q4]], mm"),
+    "fanuc": Format("any", numbers.fanuc, ".txt", "FANUC: X Y Z W P R, mm and degrees"),
+    "yaskawa": Format("any", numbers.yaskawa, ".txt", "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"),
+    "staubli": Format("any", numbers.staubli, ".txt", "Staubli: X Y Z RX RY RZ, mm and degrees"),
+    "franka": Format("any", numbers.franka, ".txt", "Franka: 16 numbers by column, metres"),
 }
 """All formats by name."""
 
@@ -98,7 +71,7 @@ class Exported:
 
     format: Format
     """Row of the table."""
-    calibration: Calibration
+    calibration: "Calibration"
     """Calibration with the exported frames."""
     text: str
     """Exported text; empty for a binary file or a folder."""
@@ -106,12 +79,12 @@ class Exported:
     """Files that were written; empty without a path."""
 
 
-def export_calibration(
-    calibration: Calibration,
+def export_files(
+    calibration: "Calibration",
     format: str,
     path: str | os.PathLike[str] | None = None,
     **options: Unpack[ExportOptions],
-) -> str:
+) -> Exported:
     """Export a calibration to the format of another program.
 
     Args:
@@ -120,22 +93,9 @@ def export_calibration(
         path: File to write, or a new folder for COLMAP. If omitted, nothing is written.
         options: Frame names and further inputs, see `ExportOptions`.
 
-    Returns:
-        The exported text; empty for a binary file or a folder.
-
     Raises:
         InputError: The format is unknown, a required input is missing, or a frame name is invalid.
     """
-    return export_files(calibration, format, path, **options).text
-
-
-def export_files(
-    calibration: Calibration,
-    format: str,
-    path: str | os.PathLike[str] | None = None,
-    **options: Unpack[ExportOptions],
-) -> Exported:
-    """Export like `export_calibration`, and also return the written files."""
     key = format.strip().lower().replace("-", "_")
     if key not in FORMATS:
         raise InputError(f"export format {format!r} is not known; use one of {', '.join(FORMATS)}")
@@ -159,15 +119,15 @@ def export_files(
 def _write(path: Path, content: Content) -> tuple[Path, ...]:
     """Write a file, or a folder that does not yet hold such files."""
     if isinstance(content, dict):
-        files = {path / name: text for name, text in content.items()}
-        existing = next((file for file in files if file.exists()), None)
-        if existing is not None:
-            raise InputError(f"{existing}: already there; give a new folder with --out")
+        files = {path / name: text.encode() for name, text in content.items()}
+        for file in files:
+            if file.exists():
+                raise InputError(f"{file}: already there; give a new folder with --out")
         path.mkdir(parents=True, exist_ok=True)
     else:
         if not path.absolute().parent.is_dir():
             raise InputError(f"--out {path}: its folder does not exist; create it first")
-        files = {path: content}
-    for file, text in files.items():
-        write_bytes(file, text if isinstance(text, bytes) else text.encode())
+        files = {path: content.encode() if isinstance(content, str) else content}
+    for file, data in files.items():
+        write_bytes(file, data)
     return tuple(files)

@@ -19,14 +19,14 @@ from evercal.geometry import SE3
 def _image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
     """Return the names of n images and base_from_camera (n,)."""
     robot = export.robot_poses
-    if export.calibration.mount == "eye_to_hand":
+    if not export.in_hand:
         used = tuple(image.name for image in export.calibration.images if image.used)
         names = used or (f"{export.child.replace('/', '_')}.png",)
         return names, SE3.stack([export.pose] * len(names))
     if robot is None:
         raise InputError(
-            "the pose of a camera on the arm changes with each image;"
-            " give the gripper's poses with --robot-poses"
+            "the pose of a camera on the arm changes with each image; give the gripper's poses with"
+            " --robot-poses"
         )
     names = robot.names or tuple(f"{i:06d}.png" for i in range(len(robot)))
     return names, robot.poses @ export.pose
@@ -34,15 +34,13 @@ def _image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
 
 def tum(export: Export) -> str:
     """Write lines of stamp, translation in metres, quaternion x y z w: base_from_camera."""
-    rows, robot = pose_numbers(_image_poses(export)[1]).tolist(), export.robot_poses
+    rows, robot = pose_numbers(_image_poses(export)[1]), export.robot_poses
     stamps = np.arange(len(rows), dtype=np.float64)
-    if export.calibration.mount == "eye_to_hand":
+    if not export.in_hand:
         stamps, rows = stamps[:1], rows[:1]
     elif robot is not None and robot.stamps_s is not None:
         stamps = robot.stamps_s
-    lines = [
-        " ".join(map(repr, [stamp, *row])) for stamp, row in zip(stamps.tolist(), rows, strict=True)
-    ]
+    lines = [" ".join(map(repr, row)) for row in np.c_[stamps, rows].tolist()]
     return "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines, ""])
 
 
@@ -93,7 +91,7 @@ def nerfstudio(export: Export) -> str:
     return json.dumps(record, indent=1, allow_nan=False) + "\n"
 
 
-def moveit_samples(export: Export) -> str:
+def moveit(export: Export) -> str:
     """Write the pose pairs that MoveIt Calibration solves: 4x4 matrices by row, metres."""
     robot, target = export.robot_poses, export.target_poses
     if robot is None or target is None:
@@ -109,14 +107,12 @@ def moveit_samples(export: Export) -> str:
         camera_from_target = target.poses[[target.names.index(name) for name in robot.names]]
     if len(robot) != len(target):
         raise InputError(
-            f"{len(robot)} robot poses and {len(target)} target poses; give one of"
-            f" each for every image"
+            f"{len(robot)} robot poses and {len(target)} target poses; give one of each for every"
+            " image"
         )
+    rows = (pose_numbers(poses, "matrix").tolist() for poses in (robot.poses, camera_from_target))
     samples = [
-        {
-            "effector_wrt_world": (gripper.matrix() + 0.0).ravel().tolist(),
-            "object_wrt_sensor": (board.matrix() + 0.0).ravel().tolist(),
-        }
-        for gripper, board in zip(robot.poses, camera_from_target, strict=True)
+        {"effector_wrt_world": gripper, "object_wrt_sensor": board}
+        for gripper, board in zip(*rows, strict=True)
     ]
     return yaml.safe_dump(samples, sort_keys=False, default_flow_style=None, width=1000)

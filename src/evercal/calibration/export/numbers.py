@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.export.request import Export, pose_numbers
+from evercal.calibration.export.request import Export
 
 
 def opencv(export: Export) -> str:
@@ -54,37 +54,31 @@ def npy(export: Export) -> bytes:
 
 def as_json(export: Export) -> str:
     """Write matrix, quaternion, covariance and frame names; `read_robot_poses` reads them."""
-    record = {
-        "parent_frame": export.parent,
-        "child_frame": export.child,
-        "meaning": export.calibration.meaning,
-        "translation_m": export.pose.translation_m.tolist(),
-        "quaternion_wxyz": export.pose.rotation_wxyz.tolist(),
-        "matrix": export.pose.matrix().tolist(),
-        "covariance": export.calibration.covariance.tolist(),
-    }
+    names = ("parent_frame", "child_frame", "meaning", "translation_m", "quaternion_wxyz", "matrix")
+    whole = export.calibration.to_dict()
+    record = {name: whole[name] for name in (*names, "covariance")}
     return json.dumps(record, indent=1, allow_nan=False) + "\n"
 
 
 def zivid(export: Export) -> str:
     """Write the 4x4 matrix in millimetres as YAML."""
-    rows = pose_numbers(export.pose, "matrix:mm").reshape(4, 4)
-    record = {"__version__": {"serializer": 1, "data": 1}, "FloatMatrix": {"Data": rows.tolist()}}
+    rows = np.reshape(export.numbers("matrix:mm"), (4, 4)).tolist()
+    record = {"__version__": {"serializer": 1, "data": 1}, "FloatMatrix": {"Data": rows}}
     return yaml.safe_dump(record, sort_keys=False, default_flow_style=None)
 
 
 def franka(export: Export) -> str:
     """Write 16 numbers column by column in metres, like libfranka's O_T_EE, as JSON."""
-    return json.dumps(pose_numbers(export.pose, "franka").tolist()) + "\n"
+    return json.dumps(export.numbers("franka")) + "\n"
 
 
 def _controller(convention: str, text: str) -> Callable[[Export], str]:
     """Return a writer of a comment and one pose; `text` has a slot for each number."""
 
     def write(export: Export) -> str:
-        numbers = pose_numbers(export.pose, convention).tolist()
         # Nine decimals and no exponents, which some controllers cannot parse.
-        return text.format(*(f"{round(value, 9) + 0.0:.9f}" for value in numbers), c=export.comment)
+        numbers = [f"{round(value, 9) + 0.0:.9f}" for value in export.numbers(convention)]
+        return text.format(*numbers, c=export.comment)
 
     return write
 

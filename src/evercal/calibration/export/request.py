@@ -3,12 +3,11 @@
 import os
 import re
 from dataclasses import dataclass, replace
-from typing import TypeAlias, TypedDict, Unpack
+from typing import TYPE_CHECKING, TypeAlias, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.calibration import Calibration
 from evercal.calibration.export.driver_frame import (
     published_at,
     read_link_from_optical,
@@ -18,6 +17,9 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
+
+if TYPE_CHECKING:
+    from evercal.calibration.calibration import Calibration
 
 PoseSource: TypeAlias = RobotPoses | str | os.PathLike[str] | None
 
@@ -55,7 +57,7 @@ class ExportOptions(TypedDict, total=False):
 class Export:
     """A calibration with everything that a format writer may need."""
 
-    calibration: Calibration
+    calibration: "Calibration"
     """Calibration with the exported frames."""
     name: str
     """Name of the calibration in easy_handeye."""
@@ -77,6 +79,11 @@ class Export:
         return self.calibration.child_frame
 
     @property
+    def in_hand(self) -> bool:
+        """Whether the gripper carries the camera."""
+        return self.calibration.mount == "eye_in_hand"
+
+    @property
     def pose(self) -> SE3:
         """parent_from_child, metres."""
         return self.calibration.parent_from_child
@@ -93,15 +100,20 @@ class Export:
         """Meaning of the numbers; the frame names in it are safe in any file."""
         return f"{self.calibration.meaning}. Written by evercal."
 
+    def numbers(self, convention: str = "xyzw") -> list[float]:
+        """The pose as numbers of a convention."""
+        return pose_numbers(self.pose, convention).tolist()
+
+
+def pose_numbers(poses: SE3, convention: str = "xyzw") -> NDArray[np.float64]:
+    """Return (...) poses as numbers (..., k) of a convention, without negative zeros."""
+    return numbers_from_poses(poses, pose_convention(convention)) + 0.0
+
 
 def prepare_export(
-    calibration: Calibration, name: str = "evercal", **options: Unpack[ExportOptions]
+    calibration: "Calibration", name: str = "evercal", **options: Unpack[ExportOptions]
 ) -> Export:
-    """Rename the frames, move the pose to the driver's root frame, and read the files.
-
-    Raises:
-        InputError: A frame name is invalid, the options contradict each other, or a file is broken.
-    """
+    """Rename the frames, move the pose to the driver's root frame, and read the files."""
     parent = options.get("parent") or calibration.parent_frame
     child = options.get("child") or calibration.child_frame
     link, other = options.get("via"), options.get("robot_frame")
@@ -117,14 +129,13 @@ def prepare_export(
     calibration = replace(calibration, parent_frame=parent, child_frame=child)
     if link is not None:
         calibration = published_at(calibration, link, link_from_optical)
-    robot = _poses(options.get("robot_poses"), "robot", options.get("convention"))
-    target = _poses(options.get("target_poses"), "target", None)
+    robot, target = options.get("robot_poses"), options.get("target_poses")
+    if robot is not None and not isinstance(robot, RobotPoses):
+        what, convention = "file of robot poses", options.get("convention")
+        robot = read_robot_poses(robot, convention, what=what, option="--convention")
+    if target is not None and not isinstance(target, RobotPoses):
+        target = read_robot_poses(target, what="file of target poses", option=None)
     return Export(calibration, name, other, robot, target)
-
-
-def pose_numbers(poses: SE3, convention: str = "xyzw") -> NDArray[np.float64]:
-    """Return (...) poses as numbers (..., k) of a convention, without negative zeros."""
-    return numbers_from_poses(poses, pose_convention(convention)) + 0.0
 
 
 def _link_from_optical(optical: str, options: ExportOptions) -> SE3:
@@ -140,10 +151,3 @@ def _link_from_optical(optical: str, options: ExportOptions) -> SE3:
     if link is not None and file is not None:
         return read_link_from_optical(file, link, optical)
     return standard_link_from_optical(offset or (0.0, 0.0, 0.0))
-
-
-def _poses(source: PoseSource, role: str, convention: str | None) -> RobotPoses | None:
-    if source is None or isinstance(source, RobotPoses):
-        return source
-    option = "--convention" if role == "robot" else None
-    return read_robot_poses(source, convention, what=f"file of {role} poses", option=option)

@@ -12,10 +12,13 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import yaml
 
-from evercal.calibration.export.request import Export, pose_numbers
+from evercal.calibration.export.request import Export
+
+_NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_MOVE_GROUP = {"move_group_namespace": "/", "move_group": "manipulator"}
 
 
-def publisher_command(export: Export) -> str:
+def command(export: Export) -> str:
     """Write a shell command for ROS 2."""
     words = ["ros2", "run", "tf2_ros", "static_transform_publisher"]
     return shlex.join([*words, *(word for pair in _flags(export).items() for word in pair)]) + "\n"
@@ -58,7 +61,7 @@ def ros1_launch(export: Export) -> str:
 """
 
 
-def transform_stamped(export: Export) -> str:
+def stamped(export: Export) -> str:
     """Write a geometry_msgs/TransformStamped of ROS 2 as YAML."""
     message = {
         "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": export.parent},
@@ -73,45 +76,38 @@ def urdf(export: Export) -> str:
 
     The angles rotate about fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll), in radians.
     """
-    numbers = _numbers(export, "rpy")
-    xyz, rpy = " ".join(numbers[:3]), " ".join(numbers[3:])
-    name = _node_name(export, r"\w.-")
+    numbers, name = _numbers(export, "rpy"), _node_name(export, r"\w.-")
     return f"""<joint name={quoteattr(name)} type="fixed">
   <!-- {_xml_comment(export)} -->
   <parent link={quoteattr(export.parent)}/>
   <child link={quoteattr(export.child)}/>
-  <origin xyz="{xyz}" rpy="{rpy}"/>
+  <origin xyz="{" ".join(numbers[:3])}" rpy="{" ".join(numbers[3:])}"/>
 </joint>
 """
 
 
 def easy_handeye2(export: Export) -> str:
     """Write the message HandeyeCalibration of easy_handeye2."""
-    in_hand = export.calibration.mount == "eye_in_hand"
     parameters = {
         "name": export.name,
-        "calibration_type": "eye_in_hand" if in_hand else "eye_on_base",
+        "calibration_type": "eye_in_hand" if export.in_hand else "eye_on_base",
         **_handeye_frames(export),
         "freehand_robot_movement": True,
-        "move_group_namespace": "/",
-        "move_group": "manipulator",
+        **_MOVE_GROUP,
     }
-    return yaml.safe_dump(
-        {"parameters": parameters, "transform": _transform(export)}, sort_keys=False
-    )
+    message = {"parameters": parameters, "transform": _transform(export)}
+    return yaml.safe_dump(message, sort_keys=False)
 
 
 def easy_handeye(export: Export) -> str:
     """Write the YAML of easy_handeye for ROS 1."""
     parameters = {
         "namespace": f"/{export.name}/",
-        "move_group_namespace": "/",
-        "move_group": "manipulator",
-        "eye_on_hand": export.calibration.mount == "eye_in_hand",
+        **_MOVE_GROUP,
+        "eye_on_hand": export.in_hand,
         **_handeye_frames(export),
     }
-    names = ("x", "y", "z", "qx", "qy", "qz", "qw")
-    transformation = dict(zip(names, pose_numbers(export.pose).tolist(), strict=True))
+    transformation = dict(zip(_NAMES, export.numbers(), strict=True))
     calibration = {"parameters": parameters, "transformation": transformation}
     return yaml.safe_dump(calibration, sort_keys=False)
 
@@ -128,34 +124,33 @@ def camera_info(export: Export) -> str:
         "distortion_model": "plumb_bob" if len(distortion) == 5 else "rational_polynomial",
         "distortion_coefficients": _matrix(np.array([distortion])),
         "rectification_matrix": _matrix(np.eye(3)),
-        "projection_matrix": _matrix(np.hstack([camera.matrix(), np.zeros((3, 1))])),
+        "projection_matrix": _matrix(np.c_[camera.matrix(), np.zeros(3)]),
     }
     return yaml.safe_dump(info, sort_keys=False, default_flow_style=None)
 
 
 def _numbers(export: Export, convention: str = "xyzw") -> list[str]:
-    return [repr(number) for number in pose_numbers(export.pose, convention).tolist()]
+    return [repr(number) for number in export.numbers(convention)]
 
 
 def _transform(export: Export) -> dict[str, dict[str, float]]:
     """Return the fields of geometry_msgs/Transform."""
-    x, y, z, *rotation = pose_numbers(export.pose).tolist()
-    rotation = dict(zip("xyzw", rotation, strict=True))
-    return {"translation": {"x": x, "y": y, "z": z}, "rotation": rotation}
+    x, y, z, *rotation = export.numbers()
+    quaternion = dict(zip("xyzw", rotation, strict=True))
+    return {"translation": {"x": x, "y": y, "z": z}, "rotation": quaternion}
 
 
 def _flags(export: Export) -> dict[str, str]:
-    names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
-    flags = dict(zip(names, _numbers(export), strict=True))
+    flags = {f"--{name}": number for name, number in zip(_NAMES, _numbers(export), strict=True)}
     return {**flags, "--frame-id": export.parent, "--child-frame-id": export.child}
 
 
 def _handeye_frames(export: Export) -> dict[str, str]:
     """Return the four frames of a hand-eye setup; the calibration itself names two of them."""
-    in_hand, other = export.calibration.mount == "eye_in_hand", export.robot_frame
+    other = export.robot_frame
     return {
-        "robot_base_frame": other or "base" if in_hand else export.parent,
-        "robot_effector_frame": export.parent if in_hand else other or "gripper",
+        "robot_base_frame": other or "base" if export.in_hand else export.parent,
+        "robot_effector_frame": export.parent if export.in_hand else other or "gripper",
         "tracking_base_frame": export.child,
         "tracking_marker_frame": "no_marker",  # the tools require a name
     }

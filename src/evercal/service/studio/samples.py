@@ -5,8 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from evercal.calibration.next_views import NextViews, next_views
-from evercal.calibration.view_information import HandEyeViews
+from evercal.calibration.next_views import NextViews, looked_at, next_views
 from evercal.geometry import SE3
 from evercal.live.coverage import Coverage, Sample, coverage
 from evercal.recordings.frame import Frame
@@ -38,16 +37,17 @@ def next_view(
     good = [pose for pose, row in zip(poses, rows, strict=True) if not row.problems]
     if not good:
         return None
-    state = HandEyeViews.recorded(SE3.stack(good), gripper_from_camera)
     if reachable is None:
-        reachable = _around(SE3.stack(poses), state)
-    views = next_views(state, reachable, 1, SE3.stack([*poses, *refused]))
+        reachable = _around(SE3.stack(poses), SE3.stack(good), gripper_from_camera)
+    excluded = SE3.stack([*poses, *refused])
+    views = next_views(SE3.stack(good), reachable, 1, gripper_from_camera, excluded)
     return views if len(views.poses) else None
 
 
-def _around(recorded: SE3, state: HandEyeViews) -> SE3:
+def _around(recorded: SE3, good: SE3, gripper_from_camera: SE3 | None) -> SE3:
     """Poses (n,) near recorded ones that look at the same point."""
-    mount, point_m = state.gripper_from_camera, state.base_from_scene.translation_m
+    mount = SE3.identity() if gripper_from_camera is None else gripper_from_camera
+    point_m = looked_at(good @ mount)
     rng, cameras = np.random.default_rng(len(recorded)), recorded @ mount
     start = cameras[rng.integers(len(cameras), size=_CANDIDATES)]
     turns, closer = np.zeros((2, _CANDIDATES, 6))

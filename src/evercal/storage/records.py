@@ -1,0 +1,49 @@
+"""JSON files that evercal wrote: they state their format and version."""
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from evercal.errors import InputError
+
+Content = TypeVar("Content")
+
+
+def of_format(
+    data: object, format: str, version: int, read: Callable[[Mapping[str, Any]], Content]
+) -> Content:
+    """Convert JSON values that state their format and version.
+
+    Raises:
+        ValueError: The format or version is another one, or an entry is missing or broken.
+    """
+    if not isinstance(data, dict) or data.get("format") != format:
+        raise ValueError(f"'format' is not {format!r}")
+    if data.get("version") != version:
+        raise ValueError(f"version {data.get('version')!r}; this evercal reads {version}")
+    try:
+        return read(data)
+    except KeyError as error:
+        raise ValueError(f"{error} is missing") from None
+    except (TypeError, AttributeError, IndexError) as error:
+        raise ValueError(f"an entry has the wrong kind of value ({error})") from None
+
+
+def read_record(
+    path: str | os.PathLike[str], what: str, convert: Callable[[object], Content]
+) -> Content:
+    """Read a JSON file and convert its values; `what` names it in messages.
+
+    Raises:
+        InputError: The file is missing, or `convert` raises ValueError.
+    """
+    try:
+        return convert(json.loads(Path(path).read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        raise InputError(f"{path}: {what} is missing; check the path") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        raise InputError(f"{path}: {error}; give the JSON that evercal wrote") from None
