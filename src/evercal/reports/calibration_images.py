@@ -220,3 +220,29 @@ def _is_other_map(calibration: Calibration, localizer: "LearnedLocalizer") -> bo
         not isinstance(localizer, Localizer)
         or localizer.contents.scene(str(scene)).digest != digest
     )
+
+
+def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:
+    """Return the board in each image of a calibration by name; empty without corners.
+
+    Args:
+        calibration: By `evercal solve`.
+        folder: Folder of its file.
+    """
+    poses = calibration.checks.get("camera_from_board")
+    given = Path(str(calibration.source.get("camera_poses", "")))
+    file = next((f for f in (folder / given, given, folder / given.name) if f.is_file()), None)
+    if not isinstance(poses, dict) or file is None:
+        return {}
+    try:
+        board = read_board_poses(file)
+    except InputError:  # poses by other programs have no corners
+        return {}
+    views = {(file.parent / image.name).resolve(): image.view for image in board.images}
+    scale, seen = float(calibration.checks.get("scale", 1.0)), {}
+    for name, pose in poses.items():
+        view = views.get((folder / name).resolve()) or views.get((file.parent / name).resolve())
+        if view is not None:
+            camera_from_board = SE3(pose["quaternion_wxyz"], pose["translation_m"])
+            seen[name] = BoardSeen(view, camera_from_board, scale)
+    return seen
