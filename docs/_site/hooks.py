@@ -43,12 +43,17 @@ _FENCE = re.compile(r"^(```\w+) +([\w./-]+)$", re.M)
 
 
 def site_uri(path: str) -> str | None:
-    """Name in the site of a file of the repository; None if there is no such file."""
+    """Name in the site of a file of the repository; None if there is no such file.
+
+    Markdown outside docs/ is copied as text: laboratory notes are no pages of the site.
+    """
     if path in ROOT_PAGES:
         return ROOT_PAGES[path]
     if not (ROOT / path).is_file():
         return None
-    return path.removeprefix("docs/") if path.startswith("docs/") else f"{COPIES}/{path}"
+    if path.startswith("docs/"):
+        return path.removeprefix("docs/")
+    return f"{COPIES}/{path}.txt" if path.endswith(".md") else f"{COPIES}/{path}"
 
 
 def links(markdown: str, source: str) -> dict[str, str]:

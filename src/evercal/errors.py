@@ -11,3 +11,14 @@ class InputError(Exception):
 
     def __init__(self, message: str = ""):
         super().__init__(" ".join(str(message).splitlines()))
+
+
+def missing_extra(need: str, extra: str) -> InputError:
+    """Return the error for an optional package that is not installed.
+
+    Args:
+        need: What needs which package, such as "a client needs urllib3".
+        extra: The extra of evercal that holds it.
+    """
+    command = f"python -m pip install -c constraints.txt '.[{extra}]'"
+    return InputError(f"{need}; in the checkout of evercal, run: {command}")

@@ -94,4 +94,4 @@ def test_a_missing_package_is_named(
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     ran = run("serve", hall_store)
     assert ran.code == 2
-    assert "run: pip install 'evercal[serve]'" in ran.err[0]
+    assert "constraints.txt '.[serve]'" in ran.err[0]

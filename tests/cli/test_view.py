@@ -68,4 +68,5 @@ def test_a_missing_package_is_named(
     monkeypatch.setitem(sys.modules, "viser", None)
     ran = run("view", hall_store)
     assert (ran.code, len(ran.err)) == (2, 1)
-    assert ran.err[0] == "error: the page needs viser; run: pip install 'evercal[view]'"
+    assert ran.err[0].startswith("error: the page needs viser; in the checkout of evercal, run: ")
+    assert ran.err[0].endswith("-c constraints.txt '.[view]'")

@@ -31,5 +31,5 @@ def test_missing_extra_names_the_install_command(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InputError, match=rf"pip install 'evercal\[{extra}\]'"):
+    with pytest.raises(InputError, match=rf"constraints.txt '\.\[{extra}\]'"):
         read(tmp_path)

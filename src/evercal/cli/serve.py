@@ -9,7 +9,7 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json
 from evercal.cli.options import Device
-from evercal.errors import InputError
+from evercal.errors import missing_extra
 
 TOKEN = "EVERCAL_TOKEN"
 
@@ -43,9 +43,7 @@ class Serve:
         try:
             from evercal.service.server import ServeOptions, serve
         except ImportError as error:
-            raise InputError(
-                f"the service needs {error.name}; run: pip install 'evercal[serve]'"
-            ) from None
+            raise missing_extra(f"the service needs {error.name}", "serve") from None
 
         token = self.token or os.environ.get(TOKEN) or None
         serve(

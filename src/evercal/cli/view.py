@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 from evercal.cli.console import print_json
 from evercal.cli.options import Device
 from evercal.cli.stores import open_map
-from evercal.errors import InputError
+from evercal.errors import InputError, missing_extra
 from evercal.service.hosts import is_local
 
 
@@ -76,7 +76,7 @@ def prepare_page(host: str, danger: str) -> None:
     try:
         import viser  # noqa: F401
     except ImportError as error:
-        raise InputError(f"the page needs {error.name}; run: pip install 'evercal[view]'") from None
+        raise missing_extra(f"the page needs {error.name}", "view") from None
     if not is_local(host):
         who = "the page has no password; whoever reaches this machine"
         print(f"warning: --host {host}: {who} {danger}", file=sys.stderr)

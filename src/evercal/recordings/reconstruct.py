@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError
+from evercal.errors import InputError, missing_extra
 from evercal.recordings.images import write_image
 from evercal.recordings.streams import StreamFrame, stream
 
@@ -82,7 +82,7 @@ def reconstruct(
     try:
         import pycolmap
     except ImportError:
-        raise InputError("reconstruction takes the extra: pip install 'evercal[colmap]'") from None
+        raise missing_extra("reconstruction needs pycolmap", "colmap") from None
     options, root = options or ReconstructOptions(), Path(out)
     names = _chosen(str(source), root, options, on_step)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.calibration.boards.board_poses import read_board_poses
 from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.errors import InputError

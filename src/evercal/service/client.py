@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from evercal.calibration.calibration import Calibration, ImageUse, Mount
-from evercal.errors import InputError
+from evercal.errors import InputError, missing_extra
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.recordings.image_files import image_files
@@ -41,7 +41,7 @@ class Client:
         try:
             import urllib3
         except ImportError:
-            raise InputError("a client needs urllib3; run: pip install 'evercal[serve]'") from None
+            raise missing_extra("a client needs urllib3", "serve") from None
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         self._url = url.rstrip("/")
         retries = urllib3.Retry(

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from evercal.errors import InputError
+from evercal.errors import InputError, missing_extra
 from evercal.geometry import SE3, Camera
 from evercal.recordings.formats.nerfstudio import frame_note
 from evercal.recordings.frame import Frame, Recording
@@ -98,9 +98,8 @@ def _model(folder: Path) -> Any:
     try:
         import pycolmap  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise InputError(
-            f"{folder}: reading a COLMAP model needs pycolmap; run: pip install 'evercal[colmap]'"
-        ) from None
+        need = f"{folder}: reading a COLMAP model needs pycolmap"
+        raise missing_extra(need, "colmap") from None
     _require_ends(folder)
     try:
         model = pycolmap.Reconstruction(str(folder))

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError
+from evercal.errors import InputError, missing_extra
 from evercal.recordings.formats.generic import path_inside
 from evercal.recordings.formats.lerobot_poses import feature_poses, pose_feature
 from evercal.recordings.formats.video_file import VideoFrame, Videos
@@ -182,9 +182,8 @@ def _parquet(path: Path) -> Any:
     try:
         import pyarrow.parquet as parquet  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise InputError(
-            f"{path}: LeRobot datasets need pyarrow and PyAV; run: pip install 'evercal[lerobot]'"
-        ) from None
+        need = f"{path}: LeRobot datasets need pyarrow and PyAV"
+        raise missing_extra(need, "lerobot") from None
     return parquet
 
 

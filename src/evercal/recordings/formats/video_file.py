@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError
+from evercal.errors import InputError, missing_extra
 from evercal.recordings.images import StoredImage
 
 _MOST_OPEN = 4
@@ -60,9 +60,8 @@ class Videos:
         try:
             import av  # pyright: ignore[reportMissingImports]
         except ImportError:
-            raise InputError(
-                "reading videos needs PyAV; run: pip install 'evercal[lerobot]'"
-            ) from None
+            need = "reading videos of datasets needs PyAV"
+            raise missing_extra(need, "lerobot") from None
         self._av: Any = av
         self._half = 0.5 / fps
         self._open: OrderedDict[Path, _Open] = OrderedDict()

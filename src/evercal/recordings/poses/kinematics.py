@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError
+from evercal.errors import InputError, missing_extra
 from evercal.geometry import SE3
 
 _MOVING = ("revolute", "continuous", "prismatic")
@@ -24,9 +24,7 @@ class RobotModel:
         try:
             import yourdfpy  # pyright: ignore[reportMissingImports]
         except ImportError:
-            raise InputError(
-                f"{path}: reading a URDF needs yourdfpy; run: pip install 'evercal[urdf]'"
-            ) from None
+            raise missing_extra(f"{path}: reading a URDF needs yourdfpy", "urdf") from None
         if not self.path.is_file():
             raise InputError(f"{path}: no such URDF file")
         if self.path.suffix == ".xacro":

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evercal.errors import InputError
+from evercal.errors import InputError, missing_extra
 
 _FILES = (".bag", ".mcap", ".db3")
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -48,9 +48,7 @@ class BagFile:
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
         except ImportError:
-            raise InputError(
-                f"{path}: reading bags needs rosbags; run: pip install 'evercal[bags]'"
-            ) from None
+            raise missing_extra(f"{path}: reading bags needs rosbags", "bags") from None
         # Bags of ROS 2 before Iron lack type definitions; the types read here never changed.
         types = get_typestore(Stores.ROS2_HUMBLE)
         parts = _parts(path)
