@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from evercal.calibration.pose_pairs.fit import HandEyeFit, agreement, robust_fit
+from evercal.calibration.pose_pairs.fit import KINDS, HandEyeFit, agreement, robust_fit
 from evercal.calibration.pose_pairs.measured import BoardCorners
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
 
@@ -66,7 +66,7 @@ def _alike(fit: HandEyeFit) -> float:
     Errors of an arm depend on its pose. Together as large as the noise, they may move the size by
     as much as all poses together, where independent noise averages out.
     """
-    noise = sum(np.trace(fit.contributions[kind][:3, :3]) for kind in fit.levels.kinds)
+    noise = sum(np.trace(fit.contributions[kind][:3, :3]) for kind in KINDS if kind in fit.contributions)
     return float(noise / np.trace(fit.covariance[:3, :3]) * fit.inliers.sum())
 
 

@@ -52,7 +52,7 @@ def held_out_error(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
         use = np.zeros(len(equation), dtype=bool)
         use[rows] = ~held_out
         at = refine(equation, fit.at, fit.weights, use)
-        residual = equation[rows[held_out]].residuals(at).reshape(-1, 2, 3)
+        residual = equation[rows[held_out]].system(at).residual.reshape(-1, 2, 3)
         lengths.append(np.linalg.norm(residual, axis=2))
     error = np.concatenate(lengths) * (1000.0, 180 / np.pi)
     rms, median = np.sqrt((error**2).mean(0)), np.median(error, 0)
