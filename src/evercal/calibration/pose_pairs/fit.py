@@ -6,7 +6,6 @@ R. Thompson, Recovery of inter-block information, 1971; the iteration is that of
 MM algorithms for variance components models, 2019.
 """
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -29,6 +28,8 @@ MIN_POSES = 5
 """Minimum number of different poses; an outlier among fewer cannot be detected."""
 KINDS = ("translation", "rotation about gripper", "depth", "rotation about board")
 """Kinds of noise of an arm and of a camera, besides known noise of corners."""
+_MANY = 12
+"""Number of poses that separate four kinds of noise."""
 _FLOOR = np.diag([1e-14] * 6)
 """Minimum variance of a pose, metres^2 and radians^2, so that exact poses have finite weight."""
 _PLAIN_SHARE = 0.25
@@ -161,9 +162,9 @@ def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
 
 
 def _kinds(equation: PoseEquation) -> tuple[str, ...]:
-    few = len(equation) < 12 or "intrinsics" in equation.extras.groups
-    return {"": KINDS[:2] if few else KINDS, "four": KINDS, "arm": KINDS[:2], "board": (KINDS[0], KINDS[3]),
-            "three": KINDS[:2] if few else (KINDS[0], KINDS[1], KINDS[3])}[os.environ.get("KINDS", "")]
+    """Return the kinds of noise that the poses can separate."""
+    known = "intrinsics" in equation.extras.groups
+    return KINDS[:2] if known or len(equation) < _MANY else KINDS
 
 
 def refine(equation: PoseEquation, at: Unknowns, weights: Array, use: Mask) -> Unknowns:
@@ -338,7 +339,9 @@ def _result(equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels
     response = Response.of(used, weights[use], noise[use])
     moves = [response.gain[:, :6] @ used.directions[kind] for kind in _kinds(equation)]
     slopes = np.stack([(move @ move.transpose(0, 2, 1)).sum(0) for move in moves])
-    contributions = dict(zip(_kinds(equation), slopes * levels.variance[:, None, None], strict=True))
+    contributions = dict(
+        zip(_kinds(equation), slopes * levels.variance[:, None, None], strict=True)
+    )
     # Without a pose its residual no longer pulls; the leverage is the share it explains itself.
     leverage = used.jacobian @ response.gain
     pull = np.linalg.solve(np.eye(6) * (1 + 1e-9) - leverage, used.residual[..., None])

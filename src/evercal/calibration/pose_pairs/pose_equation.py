@@ -180,7 +180,9 @@ class PoseEquation:
         lever = lever + self.robot_rotation @ at.translations[0]
         difference = fixed_from_camera @ turned @ at.rotations[1].T
         rotation = Rotation.from_matrix(difference, assume_valid=True).as_rotvec()
-        residual = np.concatenate([lever + self.robot_translation - at.translations[1], rotation], 1)
+        residual = np.concatenate(
+            [lever + self.robot_translation - at.translations[1], rotation], 1
+        )
         slope = _log_slope(rotation)
         jacobian = np.zeros((n, 6, self.unknowns))
         jacobian[:, :3, 0:3] = self.robot_rotation
