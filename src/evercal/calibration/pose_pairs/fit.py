@@ -6,7 +6,6 @@ R. Thompson, Recovery of inter-block information, 1971; the iteration is that of
 MM algorithms for variance components models, 2019.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,13 +26,9 @@ _ROUNDS = 12
 MIN_POSES = 5
 """Minimum number of different poses; an outlier among fewer cannot be detected."""
 KINDS = ("translation", "rotation about gripper", "depth", "rotation about board")
-"""Kinds of noise of an arm and of a camera, besides known noise of corners."""
-_MANY = 12
-"""Number of poses that separate four kinds of noise."""
+"""Kinds of noise: two of an arm, and two of a camera unless corners tell its noise."""
 _FLOOR = np.diag([1e-14] * 6)
 """Minimum variance of a pose, metres^2 and radians^2, so that exact poses have finite weight."""
-_PLAIN_SHARE = 0.25
-"""Share of isotropic noise in the weights of a fit."""
 _LEVEL_ROUNDS = 100
 _ABSENT = 1e-3
 """Share of the noise below which a kind is absent."""
@@ -46,29 +41,9 @@ class NoiseLevels(NamedTuple):
     """Variance of each kind of noise, with its uncertainty."""
 
     variance: Array
-    """(k,) metres^2 or radians^2, in the order of the kinds; zero for kinds that are absent."""
+    """(k,) metres^2 or radians^2, in the order of the kinds; nearly zero for absent kinds."""
     uncertainty: Array
     """(k, k) covariance of `variance`; zero for kinds that are absent."""
-
-
-class Response(NamedTuple):
-    """Linear response of the p unknowns of a weighted fit to n residuals."""
-
-    gain: Array
-    """(n, p, 6) derivative of the unknowns by each residual, up to the sign."""
-    covariance: Array
-    """(p, p) covariance of the unknowns under the actual noise."""
-    by_prior: Array
-    """(p, p) derivative of the unknowns by the gradient of the prior."""
-
-    @classmethod
-    def of(cls, system: System, working: Array, noise: Array) -> "Response":
-        """Compute it from assumed and actual covariances (n, 6, 6) of the residuals."""
-        weighted = np.linalg.inv(working) @ system.jacobian
-        inverse = normal_inverse(_normal(system, weighted))
-        gain = inverse @ weighted.transpose(0, 2, 1)
-        covariance = inverse @ system.prior @ inverse
-        return cls(gain, covariance + (gain @ noise @ gain.transpose(0, 2, 1)).sum(0), inverse)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +65,7 @@ class HandEyeFit:
     """(6, 6) covariance of `parent_from_camera` due to each kind of noise, to the noise that is
     known (`known`) and to each group of extras."""
     weights: Array
-    """(n, 6, 6) covariance that weights the residuals."""
+    """(n, 6, 6) covariance of the noise."""
     moved: Array
     """(n, 6) change of `parent_from_camera` if a pose is left out; zero for rejected poses."""
     information: Array
@@ -146,11 +121,10 @@ def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
     for _ in range(_ROUNDS):
         at = refine(equation, at, weights, inliers)
         used, system = equation[inliers].system(at), equation.system(at)
-        levels = estimate_levels(used, _kinds(equation), levels)
-        noise = noise_of(system, _kinds(equation), levels.variance)
-        weights = working_noise(noise, inliers)
-        response = Response.of(used, weights[inliers], noise[inliers])
-        distance2 = _distances(system, noise, response, inliers)
+        levels = estimate_levels(used, levels)
+        weights = noise_of(system, levels.variance)
+        covariance = normal_inverse(_normal(used, _weighted(used, weights[inliers])))
+        distance2 = _distances(system, weights, covariance, inliers)
         freedom = max(6 * int(inliers.sum()) - equation.unknowns, 2)
         selected = distance2 < 6 * f.ppf(1 - _REJECTION / len(inliers), 6, freedom)
         if selected.sum() < max(MIN_POSES, len(selected) // 2) or (selected == inliers).all():
@@ -159,12 +133,6 @@ def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
     assert levels is not None
     at = refine(equation, at, weights, inliers)
     return _result(equation, at, inliers, levels)
-
-
-def _kinds(equation: PoseEquation) -> tuple[str, ...]:
-    """Return the kinds of noise that the poses can separate."""
-    known = "intrinsics" in equation.extras.groups
-    return KINDS[:2] if known or len(equation) < _MANY else KINDS
 
 
 def refine(equation: PoseEquation, at: Unknowns, weights: Array, use: Mask) -> Unknowns:
@@ -196,21 +164,17 @@ def least_sigma(equation: PoseEquation, fit: HandEyeFit) -> Array:
     return np.sqrt(np.diag(normal_inverse(_normal(system, information[:, None] * system.jacobian))))
 
 
-def estimate_levels(
-    system: System, kinds: tuple[str, ...], start: NoiseLevels | None = None
-) -> NoiseLevels:
+def estimate_levels(system: System, start: NoiseLevels | None = None) -> NoiseLevels:
     """Estimate the variance of each kind of noise by restricted maximum likelihood.
 
     Args:
         system: Linear system at the estimate.
-        kinds: Kinds of noise of the poses.
         start: Levels of a similar fit.
     """
-    parts = [system.directions[kind] for kind in kinds]
-    spreads = np.stack([part @ part.transpose(0, 2, 1) for part in parts])
+    spreads = _spreads(system)
     sizes = np.einsum("knii->k", spreads)
     if start is None:
-        variance = _first_levels(system.residual, kinds)
+        variance = _first_levels(system)
     else:
         variance = np.maximum(start.variance, 1e-6 * (sizes @ start.variance) / sizes)
     weight, weighted, inverse = _weighting(system, spreads, variance)
@@ -226,15 +190,14 @@ def estimate_levels(
         if (sizes * np.abs(variance - before)).max() <= 2e-3 * (sizes * variance).max():
             break
     present = sizes * variance > _ABSENT * (sizes @ variance)
-    variance = np.where(present, variance, 0.0)
     return NoiseLevels(variance, _level_uncertainty(spreads, weight, weighted, inverse, present))
 
 
-def _first_levels(residual: Array, kinds: tuple[str, ...]) -> Array:
+def _first_levels(system: System) -> Array:
     """Return variances that explain equal shares of the residuals."""
-    metres2, radians2 = (np.mean(part**2) for part in np.split(residual, 2, 1))
-    rotations = [kind.startswith("rotation") for kind in kinds]
-    return np.where(rotations, radians2, metres2) / max(len(kinds) / 2, 1) + 1e-18
+    metres2, radians2 = (np.mean(part**2) for part in np.split(system.residual, 2, 1))
+    rotations = [kind.startswith("rotation") for kind in system.directions]
+    return np.where(rotations, radians2, metres2) * 2 / len(rotations) + 1e-18
 
 
 def _weighting(system: System, spreads: Array, variance: Array) -> tuple[Array, Array, Array]:
@@ -264,25 +227,14 @@ def _level_uncertainty(
     return uncertainty
 
 
-def noise_of(system: System, kinds: tuple[str, ...], variance: Array) -> Array:
+def noise_of(system: System, variance: Array) -> Array:
     """Return the (n, 6, 6) covariance of the residuals, known and estimated noise together."""
-    noise = system.known + _FLOOR
-    for kind, level in zip(kinds, variance, strict=True):
-        noise = noise + level * system.directions[kind] @ system.directions[kind].transpose(0, 2, 1)
-    return noise
+    return system.known + _FLOOR + np.tensordot(variance, _spreads(system), 1)
 
 
-def working_noise(noise: Array, use: Mask) -> Array:
-    """Return the covariance (n, 6, 6) for the weights of a fit: the estimate, made more even.
-
-    Estimated levels may assign almost no noise to some combination of translation and rotation, and
-    the fit would then depend on it. A share of isotropic noise, equal for all poses, costs little
-    accuracy if the levels are right and makes the fit robust if they are wrong.
-    """
-    mean = noise[use].mean(0)
-    metres2, radians2 = np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3
-    plain = np.diag(np.repeat([metres2, radians2], 3))
-    return (1 - _PLAIN_SHARE) * noise + _PLAIN_SHARE * plain
+def _spreads(system: System) -> Array:
+    """Return the (k, n, 6, 6) covariance due to a unit of variance of each kind of noise."""
+    return np.stack([part @ part.transpose(0, 2, 1) for part in system.directions.values()])
 
 
 def ellipsoid_factor(covariance: Array, slopes: Array, uncertainty: Array) -> float:
@@ -315,6 +267,10 @@ def normal_inverse(normal: Array) -> Array:
     return np.outer(unit, unit) * ((axes / np.maximum(values, 1e-14)) @ axes.T)
 
 
+def _weighted(system: System, noise: Array) -> Array:
+    return np.linalg.inv(noise) @ system.jacobian
+
+
 def _normal(system: System, weighted: Array) -> Array:
     p = weighted.shape[2]
     return weighted.reshape(-1, p).T @ system.jacobian.reshape(-1, p) + system.prior
@@ -334,52 +290,44 @@ def _step(system: System, information: Array) -> tuple[Array, float]:
 
 def _result(equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels) -> HandEyeFit:
     system, used = equation.system(at), equation[use].system(at)
-    noise = noise_of(system, _kinds(equation), levels.variance)
-    weights = working_noise(noise, use)
-    response = Response.of(used, weights[use], noise[use])
-    moves = [response.gain[:, :6] @ used.directions[kind] for kind in _kinds(equation)]
+    noise = noise_of(system, levels.variance)
+    weighted = _weighted(used, noise[use])
+    covariance = normal_inverse(_normal(used, weighted))
+    # (n, p, 6) response of the unknowns to each residual.
+    gain = covariance @ weighted.transpose(0, 2, 1)
+    moves = [gain[:, :6] @ part for part in used.directions.values()]
     slopes = np.stack([(move @ move.transpose(0, 2, 1)).sum(0) for move in moves])
-    contributions = dict(
-        zip(_kinds(equation), slopes * levels.variance[:, None, None], strict=True)
-    )
+    contributions = dict(zip(used.directions, slopes * levels.variance[:, None, None], strict=True))
+    contributions["known"] = (gain[:, :6] @ used.known @ gain[:, :6].transpose(0, 2, 1)).sum(0)
+    for group in dict.fromkeys(equation.extras.groups):
+        own = 12 + equation.extras.indices(group)
+        by_prior = covariance[:6, own]
+        contributions[group] = by_prior @ used.prior[np.ix_(own, own)] @ by_prior.T
     # Without a pose its residual no longer pulls; the leverage is the share it explains itself.
-    leverage = used.jacobian @ response.gain
+    leverage = used.jacobian @ gain
     pull = np.linalg.solve(np.eye(6) * (1 + 1e-9) - leverage, used.residual[..., None])
     moved, information = np.zeros((len(use), 6)), np.zeros(len(use))
-    moved[use] = (response.gain[:, :6] @ pull)[..., 0]
+    moved[use] = (gain[:, :6] @ pull)[..., 0]
     information[use] = np.trace(leverage, axis1=1, axis2=2) / equation.unknowns
     return HandEyeFit(
         at=at,
-        covariance=response.covariance,
-        factor=ellipsoid_factor(response.covariance[:6, :6], slopes, levels.uncertainty),
+        covariance=covariance,
+        factor=ellipsoid_factor(covariance[:6, :6], slopes, levels.uncertainty),
         inliers=use,
         residual=system.residual,
-        distance2=_distances(system, noise, response, use),
-        contributions=contributions | _given(equation, used, response),
-        weights=weights,
+        distance2=_distances(system, noise, covariance, use),
+        contributions=contributions,
+        weights=noise,
         moved=moved,
         information=information,
     )
 
 
-def _given(equation: PoseEquation, used: System, response: Response) -> Mapping[str, Array]:
-    """Return the (6, 6) covariances due to known noise and to the priors of groups of extras."""
-    gain = response.gain[:, :6]
-    parts = {"known": (gain @ used.known @ gain.transpose(0, 2, 1)).sum(0)}
-    for group in dict.fromkeys(equation.extras.groups):
-        own = 12 + equation.extras.indices(group)
-        by_group = response.by_prior[:6, own]
-        parts[group] = by_group @ used.prior[np.ix_(own, own)] @ by_group.T
-    return parts
-
-
-def _distances(system: System, noise: Array, response: Response, use: Mask) -> Array:
+def _distances(system: System, noise: Array, covariance: Array, use: Mask) -> Array:
     """Return the (n,) squared Mahalanobis distance of each residual."""
-    jacobian = system.jacobian
-    spread = noise + jacobian @ response.covariance @ jacobian.transpose(0, 2, 1)
     # Used poses have moved the estimate towards themselves. A pose that alone constrains an unknown
     # has no spread along some axis.
-    correlation = jacobian[use] @ response.gain @ noise[use]
-    spread[use] -= correlation + correlation.transpose(0, 2, 1)
-    spread = spread + 1e-3 * noise
+    sign = np.where(use, -1.0, 1.0)[:, None, None]
+    explained = system.jacobian @ covariance @ system.jacobian.transpose(0, 2, 1)
+    spread = (1 + 1e-3) * noise + sign * explained
     return (system.residual * np.linalg.solve(spread, system.residual[..., None])[..., 0]).sum(1)

@@ -9,7 +9,6 @@ axes of OpenGL. Geometry gives them away: a camera sees its board near its optic
 gripper carries is near the gripper.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -91,7 +90,7 @@ def require_agreement(
     suspect = fit.metres > _SUSPECT_M or fit.radians > _SUSPECT_RAD or fit.inliers.mean() < _FEW
     readings = [_Reading(*other, mount) for other in _other_conventions(pairs, suspect)]
     if suspect:
-        readings = [*_other_frames(pairs, mount), *readings]
+        readings = [*_readings(pairs, mount, same_equation=False), *readings]
     fits = [(quick_fit(r.pairs, r.mount, scale_known)[0], r) for r in readings]
     better = [(other, r) for other, r in fits if _clearly_better(other, fit)]
     if better:
@@ -127,7 +126,7 @@ def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> No
         return
     others = [
         (_plausibility(r, quick_fit(r.pairs, r.mount, scale_known)[0]), r)
-        for r in _same_equation(given.pairs, given.mount)
+        for r in _readings(given.pairs, given.mount, same_equation=True)
     ]
     plausibility, best = max(others, key=lambda other: other[0])
     board = best.pairs.camera_from_board.translation_m
@@ -164,94 +163,90 @@ def _plausibility(reading: _Reading, fit: Agreement) -> float:
     return float(_IMAGES * seen.mean() - 0.5 * (ratio**2).sum())
 
 
-def _same_equation(pairs: PosePairs, mount: Mount) -> Iterator[_Reading]:
-    """Yield readings that agree as well as the given one."""
-    robot, camera = pairs.base_from_gripper, pairs.camera_from_board
-    yield _Reading(
-        "the files look exchanged: the camera poses look like gripper poses; exchange"
-        " --robot-poses and --camera-poses",
-        replace(pairs, base_from_gripper=camera, camera_from_board=robot),
-        mount,
-    )
-    yield _Reading(
-        "robot and camera poses look inverted (gripper_from_base and board_from_camera):"
-        " invert both (--invert both)",
-        replace(pairs, base_from_gripper=robot.inverse(), camera_from_board=camera.inverse()),
-        mount,
-    )
-    yield _Reading(
-        "the board is behind the camera, as if the camera poses had OpenGL's axes (y up, z"
-        " back): append :opengl to --camera-convention, or convert the poses to OpenCV's axes"
-        " (y down, z forward)",
-        replace(pairs, camera_from_board=_FLIP @ camera),
-        mount,
-    )
-
-
-def _other_frames(pairs: PosePairs, mount: Mount) -> Iterator[_Reading]:
-    """Yield readings that connect other frames or other rows."""
+def _readings(pairs: PosePairs, mount: Mount, same_equation: bool) -> list[_Reading]:
+    """Return readings that agree as well as the given one, or those of other frames and rows."""
     robot, camera = pairs.base_from_gripper, pairs.camera_from_board
     other: Mount = "eye_to_hand" if mount == "eye_in_hand" else "eye_in_hand"
-    yield _Reading(
-        "the robot poses look inverted (gripper_from_base): invert them (--invert robot), or, if"
-        f" they are base_from_gripper, use --mount {other}",
-        replace(pairs, base_from_gripper=robot.inverse()),
-        mount,
-    )
-    yield _Reading(
-        "the camera poses look inverted (board_from_camera): invert them (--invert camera), or, if"
-        f" they are camera_from_board, use --mount {other}",
-        replace(pairs, camera_from_board=camera.inverse()),
-        mount,
-    )
-    yield _Reading(
-        f"the mount looks wrong: use --mount {other}, or, if it is {mount}, invert the robot poses"
-        " (--invert robot)",
-        pairs,
-        other,
-    )
-    for part, name, poses in (
-        ("base_from_gripper", "robot", robot),
-        ("camera_from_board", "camera", camera),
-    ):
-        conjugate = poses.rotation_wxyz * [1.0, -1.0, -1.0, -1.0]
-        yield _Reading(
-            f"the rotations of the {name} poses look transposed (their translations do not): swap"
-            f" rows and columns of the matrices, or the sign of the quaternions' x y z",
-            replace(pairs, **{part: SE3(conjugate, poses.translation_m)}),
-            mount,
+
+    def reading(text: str, robot: SE3 = robot, camera: SE3 = camera, to: Mount = mount) -> _Reading:
+        return _Reading(text, replace(pairs, base_from_gripper=robot, camera_from_board=camera), to)
+
+    if same_equation:
+        exchanged = (
+            "the files look exchanged: the camera poses look like gripper poses; exchange"
+            " --robot-poses and --camera-poses"
         )
-    rows = np.arange(len(pairs))
-    for late, of_robot, of_camera in (
-        ("robot", rows[1:], rows[:-1]),
-        ("camera", rows[:-1], rows[1:]),
-    ):
-        if len(of_robot) >= MIN_POSES:
-            yield _Reading(
+        inverted = (
+            "robot and camera poses look inverted (gripper_from_base and board_from_camera):"
+            " invert both (--invert both)"
+        )
+        opengl = (
+            "the board is behind the camera, as if the camera poses had OpenGL's axes (y up, z"
+            " back): append :opengl to --camera-convention, or convert the poses to OpenCV's axes"
+            " (y down, z forward)"
+        )
+        return [
+            reading(exchanged, camera, robot),
+            reading(inverted, robot.inverse(), camera.inverse()),
+            reading(opengl, camera=_FLIP @ camera),
+        ]
+    inverted = (
+        "the {0} poses look inverted ({1}): invert them (--invert {0}), or, if they are {2}, use"
+        f" --mount {other}"
+    )
+    wrong_mount = (
+        f"the mount looks wrong: use --mount {other}, or, if it is {mount}, invert the robot poses"
+        " (--invert robot)"
+    )
+    transposed = (
+        "the rotations of the {} poses look transposed (their translations do not): swap rows and"
+        " columns of the matrices, or the sign of the quaternions' x y z"
+    )
+    readings = [
+        reading(
+            inverted.format("robot", "gripper_from_base", "base_from_gripper"), robot.inverse()
+        ),
+        reading(
+            inverted.format("camera", "board_from_camera", "camera_from_board"),
+            camera=camera.inverse(),
+        ),
+        reading(wrong_mount, to=other),
+        reading(transposed.format("robot"), _transposed(robot)),
+        reading(transposed.format("camera"), camera=_transposed(camera)),
+    ]
+    if len(pairs) > MIN_POSES:
+        before, after = np.arange(len(pairs) - 1), np.arange(1, len(pairs))
+        for late, of_robot, of_camera in (("robot", after, before), ("camera", before, after)):
+            text = (
                 f"rows and images are shifted by one: the {late} poses have an extra pose at the"
-                f" beginning; pair each row with its own image",
-                replace(pairs[of_robot], camera_from_board=camera[of_camera]),
-                mount,
+                f" beginning; pair each row with its own image"
             )
+            shifted = replace(pairs[of_robot], camera_from_board=camera[of_camera])
+            readings.append(_Reading(text, shifted, mount))
+    return readings
 
 
-def _other_conventions(pairs: PosePairs, every: bool) -> Iterator[tuple[str, PosePairs]]:
-    """Yield the pairs with the numbers of one file in another convention, the best first.
+def _transposed(poses: SE3) -> SE3:
+    return SE3(poses.rotation_wxyz * [1.0, -1.0, -1.0, -1.0], poses.translation_m)
+
+
+def _other_conventions(pairs: PosePairs, every: bool) -> list[tuple[str, PosePairs]]:
+    """Return the pairs with the numbers of one file in another convention, the best first.
 
     Unless `every` is set, the angles of robot and camera must agree far better. An exchanged order
     of quaternions keeps all angles.
     """
     robot, camera = pairs.base_from_gripper, pairs.camera_from_board
-    limit = _mismatch_rad(robot, camera) / _SCREENED
-    readings: list[tuple[float, int, str, PosePairs]] = []
-    for name, part, poses, other in (
-        ("robot", "base_from_gripper", robot, camera),
-        ("camera", "camera_from_board", camera, robot),
+    limit = np.inf if every else _mismatch_rad(robot, camera) / _SCREENED
+    readings: list[tuple[float, str, PosePairs]] = []
+    for name, part, poses, other, numbers in (
+        ("robot", "base_from_gripper", robot, camera, pairs.robot_numbers),
+        ("camera", "camera_from_board", camera, robot, pairs.camera_numbers),
     ):
-        for given in _numbers(poses, getattr(pairs, f"{name}_numbers")):
+        for given in _numbers(poses, numbers):
             for meant, corrected in _reread(given):
                 mismatch = _mismatch_rad(corrected, other)
-                if mismatch > limit and not every:
+                if mismatch > limit:
                     continue
                 message = (
                     f"the {name} poses look written as {' or '.join(meant)} and read as"
@@ -259,20 +254,17 @@ def _other_conventions(pairs: PosePairs, every: bool) -> Iterator[tuple[str, Pos
                     f" ({CONVENTIONS[pose_convention(meant[0]).base].meaning})"
                 )
                 changed = replace(pairs, **{part: corrected})
-                order = round(np.rad2deg(mismatch), 1), len(readings)
-                readings.append((*order, message, changed))
-    readings.sort(key=lambda entry: entry[:2])
-    yield from ((message, changed) for _, _, message, changed in readings[:_FITTED])
+                readings.append((round(np.rad2deg(mismatch), 1), message, changed))
+    readings.sort(key=lambda entry: entry[0])
+    return [(message, changed) for _, message, changed in readings[:_FITTED]]
 
 
-def _numbers(poses: SE3, given: PoseNumbers | None) -> Iterator[PoseNumbers]:
-    """Yield the numbers of a file, or of bare poses in the likely conventions."""
+def _numbers(poses: SE3, given: PoseNumbers | None) -> list[PoseNumbers]:
+    """Return the numbers of a file, or of bare poses in the likely conventions."""
     if given is not None:
-        yield given
-        return
-    for name in ("wxyz", "xyzw", "rpy", "ur", "staubli:m", "kuka:m"):
-        used = pose_convention(name)
-        yield PoseNumbers(numbers_from_poses(poses, used), used)
+        return [given]
+    likely = [pose_convention(n) for n in ("wxyz", "xyzw", "rpy", "ur", "staubli:m", "kuka:m")]
+    return [PoseNumbers(numbers_from_poses(poses, used), used) for used in likely]
 
 
 def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:

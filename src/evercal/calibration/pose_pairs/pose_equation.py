@@ -211,20 +211,22 @@ class PoseEquation:
     def _noise_directions(self, at: Unknowns) -> dict[str, Array]:
         """Return (n, 6, c) residuals due to unit errors of each kind, one metre or one radian.
 
-        A rotation about a distant point also moves the board.
+        A rotation about a distant point also moves the board. The last two kinds are the noise of a
+        camera, which corners tell.
         """
         n = len(self)
         board, parent = at.translations[1], self.robot_translation
         gripper = parent if self.base_is_fixed else np.zeros((n, 3))
+        directions = {
+            "translation": np.broadcast_to(np.eye(6, 3), (n, 6, 3)),
+            "rotation about gripper": _rotated(board - gripper),
+        }
+        if "intrinsics" in self.extras.groups:
+            return directions
         ray = board - parent - self.robot_rotation @ at.translations[0]
         depth = np.zeros((n, 6, 1))
         depth[:, :3, 0] = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
-        return {
-            "translation": np.broadcast_to(np.eye(6, 3), (n, 6, 3)),
-            "depth": depth,
-            "rotation about board": _rotated(np.zeros((n, 3))),
-            "rotation about gripper": _rotated(board - gripper),
-        }
+        return directions | {"depth": depth, "rotation about board": _rotated(np.zeros((n, 3)))}
 
 
 def _log_slope(rotvec: Array) -> Array:

@@ -170,7 +170,7 @@ class PairSolution:
         fit, terms = self.fit, []
         for name, cause in (_CAUSES | _EXTRA_CAUSES).items():
             part = fit.contributions.get(name)
-            if part is not None and np.trace(part) > 1e-12 * np.trace(fit.covariance[:6, :6]):
+            if part is not None and np.trace(part) > 1e-6 * np.trace(fit.covariance[:6, :6]):
                 terms.append(ErrorTerm.of(cause, part))
         rest = fit.factor * fit.covariance[:6, :6] - sum(fit.contributions.values())
         return (*terms, ErrorTerm.of("few poses, and errors alike in similar poses", rest))
