@@ -53,7 +53,7 @@ class Detect(Verb):
     """File of the intrinsics; if omitted, they are estimated from the board."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("board.json")
     """File of poses and corners to write."""
-    make_board: Annotated[Path | None, arg(metavar="FILE.pdf|svg", help_behavior_hint="")] = None
+    make_board: Annotated[Path | None, arg(metavar="FILE.pdf|png", help_behavior_hint="")] = None
     """Write the board at true size, to print; detect nothing."""
     paper: Annotated[str, arg(metavar="NAME")] = "a4"
     """Paper of --make-board: a4, letter, a3, tabloid, a2, a1 or a0."""

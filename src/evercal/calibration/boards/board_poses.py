@@ -80,17 +80,17 @@ class BoardPoses:
     @classmethod
     def from_dict(cls, data: object) -> Self:
         """Create board poses from the values of `to_dict`, or raise ValueError."""
-        return of_format(data, FORMAT, VERSION, cls._from_mapping)
 
-    @classmethod
-    def _from_mapping(cls, data: Mapping[str, Any]) -> Self:
-        return cls(
-            board=Board.from_dict(data["board"]),
-            camera=Camera.from_dict(data["camera"]),
-            images=tuple(_image_from_dict(image) for image in data["images"]),
-            corner_sigma_px=float(data["corner_sigma_px"]),
-            camera_from=str(data.get("camera_from", "file")),
-        )
+        def read(values: Mapping[str, Any]) -> Self:
+            return cls(
+                board=Board.from_dict(values["board"]),
+                camera=Camera.from_dict(values["camera"]),
+                images=tuple(_image_from_dict(image) for image in values["images"]),
+                corner_sigma_px=float(values["corner_sigma_px"]),
+                camera_from=str(values.get("camera_from", "file")),
+            )
+
+        return of_format(data, FORMAT, VERSION, read)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the file atomically."""
@@ -120,40 +120,44 @@ def board_poses(
         views: Corners by image name, or the reason for a missing board.
         camera_from: Source of the intrinsics, `file` or `board`.
     """
-    fits = {name: _fitted(view, camera) for name, view in views.items()}
-    poses = [fit for fit in fits.values() if isinstance(fit, BoardPose)]
-    sigma = pixel_sigma(poses) if poses else 0.0
-    images = []
-    for name, fit in fits.items():
-        view = views[name]
-        if isinstance(fit, str) or isinstance(view, str):
-            images.append(BoardImage(name, reason=str(fit)))
+    fits: dict[str, tuple[BoardView, BoardPose]] = {}
+    reasons: dict[str, str] = {}
+    for name, view in views.items():
+        if isinstance(view, str):
+            reasons[name] = view
             continue
+        try:
+            fits[name] = view, board_pose(view, camera)
+        except ValueError:
+            reasons[name] = "the detected corners fit no pose of the board"
+    sigma = pixel_sigma([fit for _, fit in fits.values()]) if fits else 0.0
+    images = []
+    for name in views:
+        if name in reasons:
+            images.append(BoardImage(name, reason=reasons[name]))
+            continue
+        view, fit = fits[name]
         covariance = sigma**2 * fit.unit_covariance
         images.append(BoardImage(name, view, fit.camera_from_board, covariance, fit.rms_px))
     return BoardPoses(board, camera, tuple(images), sigma, camera_from)
 
 
-def _fitted(view: BoardView | str, camera: Camera) -> BoardPose | str:
-    try:
-        return view if isinstance(view, str) else board_pose(view, camera)
-    except ValueError:
-        return "the detected corners fit no pose of the board"
+def pose_dict(pose: SE3) -> dict[str, object]:
+    """Return a pose as JSON values."""
+    return {
+        "translation_m": pose.translation_m.tolist(),
+        "quaternion_wxyz": pose.rotation_wxyz.tolist(),
+    }
 
 
 def _image_to_dict(image: BoardImage) -> dict[str, Any]:
-    pose, view, covariance = image.camera_from_board, image.view, image.covariance
+    view, pose = image.view, image.camera_from_board
     return {
         "name": image.name,
         "reason": image.reason,
         "rms_px": image.rms_px,
-        "camera_from_board": None
-        if pose is None
-        else {
-            "translation_m": pose.translation_m.tolist(),
-            "quaternion_wxyz": pose.rotation_wxyz.tolist(),
-        },
-        "covariance": None if covariance is None else covariance.tolist(),
+        "camera_from_board": None if pose is None else pose_dict(pose),
+        "covariance": None if image.covariance is None else image.covariance.tolist(),
         "points_m": None if view is None else view.points_m.tolist(),
         "pixels": None if view is None else view.pixels.tolist(),
     }

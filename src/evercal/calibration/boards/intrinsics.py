@@ -1,4 +1,9 @@
-"""Estimate intrinsics from views of a board."""
+"""Estimate intrinsics from views of a board.
+
+The corners of an image determine the pose of the board up to the intrinsics, which all images
+share. Eliminating the poses from the normal equations leaves the information on the intrinsics (the
+Schur complement of bundle adjustment). A prior is added to it: stated intrinsics, or usual ones.
+"""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -6,19 +11,67 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from evercal.calibration.boards.corners import BoardView, board_pose, pixel_sigma
-from evercal.calibration.boards.lens import LensPrior, lens_estimate, moved_camera
+from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma
 from evercal.errors import InputError
 from evercal.geometry import Camera
 
+Array = NDArray[np.floating]
+
+LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 MIN_VIEWS = 5
 """Minimum number of views of a flat board."""
+_USUAL_CENTRE, _USUAL_ASPECT = 0.1, 0.02
+"""Standard deviations of the principal point from the middle of the image, in widths, and of the
+ratio of both focal lengths from one."""
+_ROUGH_FOCAL = 0.5
+"""Relative standard deviation of a rough focal length."""
+_USUAL_DISTORTION = (0.3, 0.5, 2e-3, 2e-3, 0.5, 0.1, 0.1, 0.1)
+_STATED = 0.005
+"""Standard deviation of a stated focal length and principal point, relative to the focal length."""
+_STATED_DISTORTION = (0.02, 0.05, 5e-4, 5e-4, 0.1, 0.02, 0.02, 0.02)
 _FOCAL_SIGMA = 0.1
 """Maximum relative standard deviation of the focal length."""
 _FALSE = 10.0
 """Residual of a false detection, in medians of all views."""
 _ROUNDS = 25
+
+
+class LensPrior(NamedTuple):
+    """A Gaussian over the (q,) intrinsics in the order of `LENS`."""
+
+    mean: Array
+    information: Array
+    """(q, q) inverse covariance."""
+
+    @classmethod
+    def stated(cls, camera: Camera) -> "LensPrior":
+        """Prior of intrinsics from the maker or from another calibration."""
+        mean = lens_vector(camera)
+        sigma = np.r_[np.full(4, _STATED * camera.fx), _STATED_DISTORTION][: len(mean)]
+        return cls(mean, np.diag(sigma**-2.0))
+
+    @classmethod
+    def usual(cls, camera: Camera) -> "LensPrior":
+        """Prior of unknown intrinsics; `camera` gives image size and a rough focal length."""
+        mean = np.zeros(len(lens_vector(camera)))
+        mean[:2] = camera.fx
+        mean[2:4] = (camera.width - 1) / 2, (camera.height - 1) / 2
+        sigma = np.r_[np.full(4, _USUAL_CENTRE * camera.width), _USUAL_DISTORTION][: len(mean)]
+        information = np.diag(sigma**-2.0)
+        aspect = np.array([[1.0, -1.0], [-1.0, 1.0]]) / (_USUAL_ASPECT * camera.fx) ** 2
+        information[:2, :2] = aspect + np.eye(2) / (_ROUGH_FOCAL * camera.fx) ** 2
+        return cls(mean, information)
+
+
+class LensEstimate(NamedTuple):
+    """The best intrinsics relative to those that the board poses were fitted with."""
+
+    change: Array
+    """(q,)."""
+    information: Array
+    """(q, q) of the corners and the prior."""
 
 
 class Intrinsics(NamedTuple):
@@ -27,6 +80,36 @@ class Intrinsics(NamedTuple):
     camera: Camera
     focal_sigma_px: float
     """Standard deviation of the focal length, the larger of x and y."""
+
+
+def lens_estimate(
+    poses: Sequence[BoardPose], sigma_px: float, camera: Camera, prior: LensPrior
+) -> LensEstimate:
+    """Estimate the change of the intrinsics `camera` from board poses fitted with them."""
+    variance = sigma_px**2
+    information = np.sum([pose.lens_normal for pose in poses], 0) / variance + prior.information
+    right = np.sum([pose.lens_gradient for pose in poses], 0) / variance
+    right = right + prior.information @ (prior.mean - lens_vector(camera))
+    unit = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information * np.outer(unit, unit)
+    return LensEstimate(unit * np.linalg.lstsq(scaled, unit * right, rcond=1e-13)[0], information)
+
+
+def lens_vector(camera: Camera) -> Array:
+    """Return the (q,) intrinsics in the order of `LENS`, q = 9 or 12."""
+    distortion = np.zeros(max(5, len(camera.distortion)))
+    distortion[: len(camera.distortion)] = camera.distortion
+    return np.r_[camera.fx, camera.fy, camera.cx, camera.cy, distortion]
+
+
+def moved_camera(camera: Camera, change: Array) -> Camera:
+    """Return the camera after a (q,) change of its intrinsics.
+
+    Raises:
+        ValueError: A focal length is no longer positive.
+    """
+    fx, fy, cx, cy, *distortion = (float(value) for value in lens_vector(camera) + change)
+    return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion))
 
 
 def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Intrinsics:
@@ -42,9 +125,6 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
             f"the board was detected in {len(views)} images, intrinsics take at least {MIN_VIEWS};"
             f" take 15 with the board tilted by 20 to 45 deg, or give --camera"
         )
-    open_focal = "the images leave the focal length open{}; tilt the board by 20 to 45 deg in" + (
-        " several directions, or give --camera"
-    )
     views = _consistent(views, _rough(views, width, height))
     if len(views) < MIN_VIEWS:
         raise InputError(
@@ -53,25 +133,25 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
         )
     camera = _rough(views, width, height)
     prior = LensPrior.usual(camera)
+    open_focal = "the images leave the focal length open{}; tilt the board by 20 to 45 deg in" + (
+        " several directions, or give --camera"
+    )
+    information = prior.information
     try:
-        poses, estimate = [board_pose(view, camera) for view in views], None
+        poses = [board_pose(view, camera) for view in views]
+        for _ in range(_ROUNDS):
+            change, information = lens_estimate(poses, pixel_sigma(poses), camera, prior)
+            change = change * min(1.0, 0.2 * camera.fx / np.abs(change[:2]).max())
+            camera = moved_camera(camera, change)
+            starts = [pose.camera_from_board for pose in poses]
+            poses = [board_pose(v, camera, s) for v, s in zip(views, starts, strict=True)]
+            if change @ information @ change < 1e-4:
+                break
     except ValueError:
         raise InputError(open_focal.format("")) from None
-    for _ in range(_ROUNDS):
-        sigma = pixel_sigma(poses)
-        estimate = lens_estimate(poses, sigma, camera, prior)
-        change = estimate.change * min(1.0, 0.2 * camera.fx / np.abs(estimate.change[:2]).max())
-        try:
-            moved = moved_camera(camera, change)
-            starts = [pose.camera_from_board for pose in poses]
-            poses = [board_pose(v, moved, s) for v, s in zip(views, starts, strict=True)]
-        except ValueError:
-            raise InputError(open_focal.format("")) from None
-        camera = moved
-        if change @ estimate.information @ change < 1e-4:
-            break
-    assert estimate is not None
-    focal = float(np.sqrt(np.diag(estimate.covariance)[:2].max()))
+    unit = 1 / np.sqrt(np.diag(information))
+    scaled = np.linalg.pinv(information * np.outer(unit, unit), 1e-13, hermitian=True)
+    focal = float(np.sqrt((np.diag(scaled) * unit**2)[:2].max()))
     if not focal < _FOCAL_SIGMA * camera.fx:
         raise InputError(open_focal.format(f" ({camera.fx:.0f} +- {focal:.0f} px)"))
     return Intrinsics(camera, focal)
@@ -104,6 +184,4 @@ def _rough(views: Sequence[BoardView], width: int, height: int) -> Camera:
     except cv2.error:
         return middle
     focal = float(matrix[0, 0])
-    if not 0.1 * width < focal < 20 * width:
-        return middle
-    return replace(middle, fx=focal, fy=focal)
+    return replace(middle, fx=focal, fy=focal) if 0.1 * width < focal < 20 * width else middle

@@ -10,7 +10,7 @@ from evercal.calibration.boards.detection import Board, dictionary_of
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from PIL.Image import Image
 
 PAPERS_MM = {
     "a4": (210.0, 297.0),
@@ -23,86 +23,83 @@ PAPERS_MM = {
     "a0": (841.0, 1189.0),
 }
 """Width and height of upright paper, smaller sheets first."""
-FILE_KINDS = (".pdf", ".svg")
+FILE_KINDS = (".pdf", ".png")
 _MARGIN_MM, _FOOTER_MM, _RULER_MM = 8.0, 13.0, 100
+_DPI = 300.0
+"""Approximate resolution; the exact one makes a square a whole number of pixels."""
 
 
-def black_rectangles(board: Board) -> NDArray[np.float64]:
-    """Return the dark parts of a board, (k, 4) x0 y0 x1 y1 in metres: x right, y down in the print.
+def board_image(board: Board, unit_px: int) -> NDArray[np.uint8]:
+    """Draw a board without a margin.
 
-    The origin is that of the board frame. Rectangles do not overlap.
+    Args:
+        board: Board.
+        unit_px: Pixels along a square, or along a cell of a tag.
+
+    Returns:
+        (h, w) image, dark parts 0 and bright parts 255.
     """
-    if board.kind == "apriltag":
-        half = board.size_m / 2
-        return _marker(board, board.tag or 0, np.array([-half, -half]), board.size_m)
-    if board.kind == "chessboard":
-        # The square between the first four inner corners is bright.
-        columns, rows, first, start = board.columns + 1, board.rows + 1, 1, -board.size_m
-    else:
-        columns, rows, first, start = board.columns, board.rows, 0, 0.0
-    j, i = np.mgrid[:rows, :columns]
-    dark = (i + j) % 2 == first
-    squares = start + board.size_m * np.stack([i, j, i + 1, j + 1], -1)
-    if board.kind == "chessboard":
-        return squares[dark]
-    inset = (board.size_m - board.marker_m) / 2
-    markers = [
-        _marker(board, number, square[:2] + inset, board.marker_m)
-        for number, square in enumerate(squares[~dark])
-    ]
-    return np.concatenate([squares[dark], *markers])
-
-
-def _marker(board: Board, number: int, start: NDArray, side_m: float) -> NDArray[np.float64]:
-    """Return the dark runs of a marker's rows, (k, 4), from its upper left corner `start`."""
     import cv2
 
+    if board.kind == "chessboard":
+        i, j = np.indices((board.rows + 1, board.columns + 1))
+        # The square between the first four inner corners is bright.
+        bright = np.where((i + j) % 2 == 0, 255, 0).astype(np.uint8)
+        return bright.repeat(unit_px, 0).repeat(unit_px, 1)
     dictionary = dictionary_of(board)
-    count = dictionary.markerSize + 2
-    if not 0 <= number < len(dictionary.bytesList):
+    size = (board.columns, board.rows)
+    last = size[0] * size[1] // 2 - 1 if board.kind == "charuco" else board.tag or 0
+    if not 0 <= last < len(dictionary.bytesList):
         raise InputError(
-            f"{board.dictionary} has no marker {number}; its numbers are 0 to"
+            f"{board.dictionary} has no marker {last}; its numbers are 0 to"
             f" {len(dictionary.bytesList) - 1}"
         )
-    dark = cv2.aruco.generateImageMarker(dictionary, number, count) < 128
-    steps = np.diff(np.pad(dark, ((0, 0), (1, 1))).astype(int), axis=1)
-    rows, begins = np.nonzero(steps == 1)
-    ends = np.nonzero(steps == -1)[1]
-    cells = np.stack([begins, rows, ends, rows + 1], 1)
-    return np.tile(start, 2) + side_m / count * cells
+    if board.kind == "charuco":
+        page = cv2.aruco.CharucoBoard(size, board.size_m, board.marker_m, dictionary)
+        drawn = page.generateImage((size[0] * unit_px, size[1] * unit_px))
+    else:
+        drawn = cv2.aruco.generateImageMarker(dictionary, last, _cells(board) * unit_px)
+    return np.asarray(drawn, dtype=np.uint8)
 
 
-def drawing(board: Board, paper: str = "a4") -> "Figure":
+def _cells(board: Board) -> int:
+    """Return the number of cells along a tag with its border, or 1 for a board of squares."""
+    return dictionary_of(board).markerSize + 2 if board.kind == "apriltag" else 1
+
+
+def drawing(board: Board, paper: str = "a4") -> "tuple[Image, float]":
     """Draw a board at true size on a sheet, upright or landscape, with a ruler.
+
+    Returns:
+        Black and white image, and its resolution in pixels per inch.
 
     Raises:
         InputError: The paper is not known, or the board does not fit.
     """
-    from matplotlib.figure import Figure
-    from matplotlib.patches import PathPatch
-    from matplotlib.path import Path as Outline
+    from PIL import Image, ImageDraw, ImageFont
 
-    dark = 1000 * black_rectangles(board)
-    low, high = dark[:, :2].min(0), dark[:, 2:].max(0)
-    width, height = _sheet(board, paper, high - low)
-    figure = Figure(figsize=(width / 25.4, height / 25.4), facecolor="white")
-    axes = figure.add_axes((0, 0, 1, 1))
-    axes.set(xlim=(0, width), ylim=(height, 0))
-    axes.axis("off")
-    spare = np.array([width, height - _FOOTER_MM]) - (high - low)
-    dark += np.tile(spare / 2 - low, 2)
-    ruler_y = height - _MARGIN_MM
-    ticks = [
-        [_MARGIN_MM + t, ruler_y - 2, _MARGIN_MM + t + 0.2, ruler_y] for t in range(0, 101, 10)
-    ]
-    bar = [_MARGIN_MM, ruler_y, _MARGIN_MM + _RULER_MM + 0.2, ruler_y + 0.3]
-    boxes = np.concatenate([dark, ticks, [bar]])
-    # One path, so that no viewer draws seams between parts that touch.
-    vertices = boxes[:, [0, 1, 2, 1, 2, 3, 0, 3, 0, 1]].reshape(-1, 2)
-    codes = [Outline.MOVETO, *[Outline.LINETO] * 3, Outline.CLOSEPOLY] * len(boxes)
-    axes.add_patch(PathPatch(Outline(vertices, codes), fc="black", lw=0, snap=False))
-    axes.text(_MARGIN_MM, ruler_y + 1, f"{_RULER_MM} mm: {label(board)}", va="top", fontsize=7)
-    return figure
+    unit_mm = 1000 * board.size_m / _cells(board)
+    unit_px = max(1, round(unit_mm * _DPI / 25.4))
+    per_mm = unit_px / unit_mm
+    picture = board_image(board, unit_px)
+    width, height = _sheet(board, paper, np.array(picture.shape[::-1]) / per_mm)
+    page = Image.new("1", (round(width * per_mm), round(height * per_mm)), 1)
+    left = (page.width - picture.shape[1]) // 2
+    top = (page.height - round(_FOOTER_MM * per_mm) - picture.shape[0]) // 2
+    page.paste(Image.fromarray(picture), (left, top))
+    draw, bottom = ImageDraw.Draw(page), height - _MARGIN_MM
+
+    def bar(x_mm: float, y_mm: float, width_mm: float, height_mm: float) -> None:
+        corners = np.array([x_mm, y_mm, x_mm + width_mm, y_mm + height_mm]) * per_mm
+        draw.rectangle(corners.round().tolist(), fill=0)
+
+    bar(_MARGIN_MM, bottom, _RULER_MM, 0.3)
+    for tick in range(0, _RULER_MM + 1, 10):
+        bar(_MARGIN_MM + tick, bottom - 2, 0.2, 2)
+    text_at = (_MARGIN_MM * per_mm, (bottom + 1) * per_mm)
+    font = ImageFont.load_default(size=2.5 * per_mm)
+    draw.text(text_at, f"{_RULER_MM} mm: {label(board)}", font=font, fill=0)
+    return page, 25.4 * per_mm
 
 
 def label(board: Board) -> str:
@@ -144,12 +141,16 @@ def _sheet(board: Board, paper: str, size_mm: NDArray) -> tuple[float, float]:
 
 
 def write_board(path: Path, board: Board, paper: str = "a4") -> None:
-    """Write a board at true size to a PDF or SVG file.
+    """Write a board at true size to a PDF or PNG file; the resolution is stored in the file.
 
     Raises:
         InputError: The file has another ending, or the board does not fit the paper.
     """
-    if path.suffix.lower() not in FILE_KINDS:
+    kind = path.suffix.lower()
+    if kind not in FILE_KINDS:
         raise InputError(f"{path}: give a file name that ends with {' or '.join(FILE_KINDS)}")
-    metadata = {"CreationDate" if path.suffix.lower() == ".pdf" else "Date": None}
-    drawing(board, paper).savefig(path, format=path.suffix[1:].lower(), metadata=metadata)
+    page, dpi = drawing(board, paper)
+    if kind == ".pdf":
+        page.save(path, resolution=dpi)
+    else:
+        page.save(path, dpi=(dpi, dpi))

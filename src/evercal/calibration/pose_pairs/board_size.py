@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from evercal.calibration.pose_pairs.fit import HandEyeFit, agreement, robust_fit
+from evercal.calibration.pose_pairs.fit import KINDS, HandEyeFit, agreement, robust_fit
 from evercal.calibration.pose_pairs.measured import BoardCorners
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
 
@@ -31,31 +31,28 @@ def with_tested_size(
     sigma *= float(np.sqrt(1 + _alike(freed)))
     if abs(off) < max(_SIZE_SIGMAS * sigma, SIZE_SIGMA):
         return equation, fit, []
-    better = _misfit(fit) / _misfit(freed)
-    larger = "larger" if off > 0 else "smaller"
-    if abs(off) > _LARGE_SIZE and better < _MUCH_BETTER:
+    what, larger = "board" if of_board else "map", "larger" if off > 0 else "smaller"
+    if abs(off) > _LARGE_SIZE and _misfit(fit) < _MUCH_BETTER * _misfit(freed):
         warning = (
-            f"a {'board' if of_board else 'map'} {100 * abs(off):.0f} % {larger} than stated would"
-            f" fit the robot's motions better, but not well: check its size, the robot poses and"
-            f" the intrinsics"
+            f"a {100 * abs(off):.0f} % {larger} {what} improves the fit but does not explain the"
+            f" residuals: check its size, the robot poses and the intrinsics"
         )
         return equation, fit, [warning]
+    evidence = f"by the robot's motions ({abs(off) / sigma:.0f} standard deviations)"
     if not of_board:
         warning = (
             f"the lengths of the map are {100 * abs(off):.2f} +- {100 * sigma:.2f} % too"
-            f" {'short' if off > 0 else 'long'}, by the robot's motions"
-            f" ({abs(off) / sigma:.0f} standard deviations): the estimated scale is used"
+            f" {'short' if off > 0 else 'long'}, {evidence}: the estimated scale is used"
         )
         return free, freed, [warning]
-    stated = None if corners is None else corners.size_m
     size = f"a square or tag of 24 mm would measure {24 * (1 + off):.2f} mm"
-    if stated is not None:
-        size = f"its side measures {1000 * stated * (1 + off):.2f} mm, not {1000 * stated:.2f} mm"
+    if corners is not None and corners.size_m is not None:
+        stated = 1000 * corners.size_m
+        size = f"its side measures {stated * (1 + off):.2f} mm, not {stated:.2f} mm"
     warning = (
-        f"the board is {100 * abs(off):.2f} +- {100 * sigma:.2f} % {larger} than stated, by the"
-        f" robot's motions"
-        f" ({abs(off) / sigma:.0f} standard deviations): {size}; check its size and the focal"
-        f" length. The calibration uses the estimated size"
+        f"the board is {100 * abs(off):.2f} +- {100 * sigma:.2f} % {larger} than stated,"
+        f" {evidence}: {size}; check its size and the focal length. The calibration uses the"
+        f" estimated size"
     )
     return free, freed, [warning]
 
@@ -66,7 +63,9 @@ def _alike(fit: HandEyeFit) -> float:
     Errors of an arm depend on its pose. Together as large as the noise, they may move the size by
     as much as all poses together, where independent noise averages out.
     """
-    noise = sum(np.trace(fit.contributions[kind][:3, :3]) for kind in fit.levels.kinds)
+    noise = sum(
+        np.trace(fit.contributions[kind][:3, :3]) for kind in KINDS if kind in fit.contributions
+    )
     return float(noise / np.trace(fit.covariance[:3, :3]) * fit.inliers.sum())
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.pose_pairs.fit import HandEyeFit, refine
-from evercal.calibration.pose_pairs.pose_equation import PoseEquation
+from evercal.calibration.pose_pairs.pose_equation import PoseEquation, Unknowns
 from evercal.geometry import pose_distance_mm_deg
 
 Array = NDArray[np.floating]
@@ -49,10 +49,8 @@ def held_out_error(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
     lengths = []
     for fold in range(FOLDS):
         held_out = np.arange(len(rows)) % FOLDS == fold
-        use = np.zeros(len(equation), dtype=bool)
-        use[rows] = ~held_out
-        at = refine(equation, fit.at, fit.weights, use)
-        residual = equation[rows[held_out]].residuals(at).reshape(-1, 2, 3)
+        at = _refined(equation, fit, rows[~held_out])
+        residual = equation[rows[held_out]].system(at).residual.reshape(-1, 2, 3)
         lengths.append(np.linalg.norm(residual, axis=2))
     error = np.concatenate(lengths) * (1000.0, 180 / np.pi)
     rms, median = np.sqrt((error**2).mean(0)), np.median(error, 0)
@@ -69,13 +67,15 @@ def repeatability(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
     rows = np.flatnonzero(fit.inliers)
     if len(rows) < _MIN_HALVED:
         return {}
-    halves = []
-    for half in range(2):
-        use = np.zeros(len(equation), dtype=bool)
-        use[rows[half::2]] = True
-        halves.append(refine(equation, fit.at, fit.weights, use).parent_from_camera)
+    halves = (_refined(equation, fit, rows[half::2]).parent_from_camera for half in range(2))
     millimetres, degrees = pose_distance_mm_deg(*halves)
     return {"repeatability_mm": millimetres, "repeatability_deg": degrees}
+
+
+def _refined(equation: PoseEquation, fit: HandEyeFit, rows: NDArray[np.int64]) -> Unknowns:
+    use = np.zeros(len(equation), dtype=bool)
+    use[rows] = True
+    return refine(equation, fit.at, fit.weights, use)
 
 
 def left_open(fit: HandEyeFit, parent: str) -> list[str]:

@@ -1,23 +1,22 @@
-"""Robust joint estimate of all unknowns of the hand-eye equation, and its covariance."""
+"""Robust joint estimate of all unknowns of the hand-eye equation, and its covariance.
+
+The levels of the kinds of noise are estimated from the residuals by restricted maximum likelihood,
+because residuals are smaller than the noise: the fit follows part of it. See H. Patterson and
+R. Thompson, Recovery of inter-block information, 1971; the iteration is that of H. Zhou and others,
+MM algorithms for variance components models, 2019.
+"""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
-from evercal.calibration.pose_pairs.noise import (
-    Gain,
-    NoiseLevels,
-    ellipsoid_factor,
-    estimate_levels,
-    normal_inverse,
-    working_noise,
-)
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation, System, Unknowns
 
 _TAILS = 3.0
-"""Degrees of freedom of the Student t distribution in the first refinement."""
+"""Degrees of freedom of the Student t distribution in `agreement`."""
 _GROSS = 40.0
 """Squared distance of gross outliers, which the first noise estimate ignores."""
 _REJECTION = 0.001
@@ -26,13 +25,25 @@ _ROUNDS = 12
 """Maximum number of rounds of refinement, noise estimation and rejection."""
 MIN_POSES = 5
 """Minimum number of different poses; an outlier among fewer cannot be detected."""
-_MANY = 12
-"""Number of poses that separate four kinds of noise."""
-ARM_KINDS = ("translation", "rotation about gripper")
-"""Kinds of noise besides that of the corners, and the kinds that few poses can separate."""
-POSE_KINDS = (*ARM_KINDS, "depth", "rotation about board")
+KINDS = ("translation", "rotation about gripper", "depth", "rotation about board")
+"""Kinds of noise: two of an arm, and two of a camera unless corners tell its noise."""
+_FLOOR = np.diag([1e-14] * 6)
+"""Minimum variance of a pose, metres^2 and radians^2, so that exact poses have finite weight."""
+_LEVEL_ROUNDS = 100
+_ABSENT = 1e-3
+"""Share of the noise below which a kind is absent."""
+_COVERAGE = 0.95
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
+
+
+class NoiseLevels(NamedTuple):
+    """Variance of each kind of noise, with its uncertainty."""
+
+    variance: Array
+    """(k,) metres^2 or radians^2, in the order of the kinds; nearly zero for absent kinds."""
+    uncertainty: Array
+    """(k, k) covariance of `variance`; zero for kinds that are absent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +61,11 @@ class HandEyeFit:
     """(n, 6) residuals of all poses in the fixed frame, metres and radians."""
     distance2: Array
     """(n,) squared Mahalanobis distance of each residual."""
-    levels: NoiseLevels
     contributions: dict[str, Array]
     """(6, 6) covariance of `parent_from_camera` due to each kind of noise, to the noise that is
     known (`known`) and to each group of extras."""
     weights: Array
-    """(n, 6, 6) covariance that weights the residuals."""
-
+    """(n, 6, 6) covariance of the noise."""
     moved: Array
     """(n, 6) change of `parent_from_camera` if a pose is left out; zero for rejected poses."""
     information: Array
@@ -89,13 +98,11 @@ def agreement(equation: PoseEquation, start: Unknowns) -> Agreement:
     sigma, distance2 = np.zeros(2), np.zeros(n)
     for _ in range(30):
         system = equation.system(at)
-        lengths = np.linalg.norm(system.residual[:n].reshape(n, 2, 3), axis=2)
+        lengths = np.linalg.norm(system.residual.reshape(n, 2, 3), axis=2)
         sigma = np.maximum(np.median(lengths, 0) * to_sigma, 1e-8)
         distance2 = ((lengths / sigma) ** 2).sum(1)
-        information = np.broadcast_to(np.eye(6), (len(system.residual), 6, 6)).copy()
         weight = (_TAILS + 6) / (_TAILS + distance2)
-        information[:n] = weight[:, None, None] * np.diag(np.repeat(sigma**-2.0, 3))
-        step, length2 = _step(system, information)
+        step, length2 = _step(system, weight[:, None, None] * np.diag(np.repeat(sigma**-2.0, 3)))
         at = at.moved(step)
         if length2 < 1e-2:
             break
@@ -106,31 +113,22 @@ def agreement(equation: PoseEquation, start: Unknowns) -> Agreement:
 
 def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
     """Refine the result of `agreement` for at least four sorted poses, and reject outliers."""
-    at, inliers = start.at, start.inliers
-    few = len(equation) < _MANY or "intrinsics" in equation.extras.groups
-    kinds = ARM_KINDS if few else POSE_KINDS
+    at, inliers, levels = start.at, start.inliers, None
     if inliers.sum() < MIN_POSES:  # outliers cannot be detected; all poses widen the covariance
         inliers = np.ones(len(equation), dtype=bool)
     plain = np.diag(np.repeat([start.metres**2, start.radians**2], 3))
     weights = np.broadcast_to(plain, (len(equation), 6, 6))
-    levels: NoiseLevels | None = None
-    visited: list[bytes] = []
     for _ in range(_ROUNDS):
         at = refine(equation, at, weights, inliers)
-        used = equation[inliers].system(at)
-        before, levels = levels, estimate_levels(used, kinds, levels)
-        system = equation.system(at)
-        noise = levels.covariances(system)
-        weights = working_noise(noise[: len(equation)], inliers)
-        distance2 = _distances(system, noise, weights, inliers)
-        selected = _within_noise(distance2, inliers, equation.unknowns)
-        if selected.sum() < max(MIN_POSES, len(selected) // 2):
+        used, system = equation[inliers].system(at), equation.system(at)
+        levels = estimate_levels(used, levels)
+        weights = noise_of(system, levels.variance)
+        covariance = normal_inverse(_normal(used, _weighted(used, weights[inliers])))
+        distance2 = _distances(system, weights, covariance, inliers)
+        freedom = max(6 * int(inliers.sum()) - equation.unknowns, 2)
+        selected = distance2 < 6 * f.ppf(1 - _REJECTION / len(inliers), 6, freedom)
+        if selected.sum() < max(MIN_POSES, len(selected) // 2) or (selected == inliers).all():
             break
-        same, converged = bool((selected == inliers).all()), _converged(before, levels)
-        # A pose at the threshold may alternate for ever; stop at the second visit.
-        if (same and converged) or (not same and selected.tobytes() in visited):
-            break
-        visited.append(inliers.tobytes())
         inliers = selected
     assert levels is not None
     at = refine(equation, at, weights, inliers)
@@ -148,8 +146,7 @@ def refine(equation: PoseEquation, at: Unknowns, weights: Array, use: Mask) -> U
     """
     selected, information = equation[use], np.linalg.inv(weights[use])
     for _ in range(30):
-        system = selected.system(at)
-        step, length2 = _step(system, _with_identity(information, system))
+        step, length2 = _step(selected.system(at), information)
         at = at.moved(step)
         if length2 < 1e-4:
             break
@@ -163,88 +160,174 @@ def least_sigma(equation: PoseEquation, fit: HandEyeFit) -> Array:
     unknown that they do not constrain.
     """
     system = equation[fit.inliers].system(fit.at)
-    whitened = system.jacobian.copy()
-    whitened[: system.poses] /= np.repeat([1e-4, np.deg2rad(0.01)], 3)[:, None]
-    flat = whitened.reshape(-1, equation.unknowns)
-    return np.sqrt(np.diag(normal_inverse(flat.T @ flat)))
+    information = np.repeat([1e-4, np.deg2rad(0.01)], 3) ** -2.0
+    return np.sqrt(np.diag(normal_inverse(_normal(system, information[:, None] * system.jacobian))))
 
 
-def _with_identity(blocks: Array, system: System) -> Array:
-    """Append the unit covariance of the priors."""
-    priors = np.broadcast_to(np.eye(6), (len(system.residual) - len(blocks), 6, 6))
-    return np.concatenate([blocks, priors])
+def estimate_levels(system: System, start: NoiseLevels | None = None) -> NoiseLevels:
+    """Estimate the variance of each kind of noise by restricted maximum likelihood.
+
+    Args:
+        system: Linear system at the estimate.
+        start: Levels of a similar fit.
+    """
+    spreads = _spreads(system)
+    sizes = np.einsum("knii->k", spreads)
+    if start is None:
+        variance = _first_levels(system)
+    else:
+        variance = np.maximum(start.variance, 1e-6 * (sizes @ start.variance) / sizes)
+    weight, weighted, inverse = _weighting(system, spreads, variance)
+    for _ in range(_LEVEL_ROUNDS):
+        gradient = np.einsum("nip,ni->p", weighted, system.residual) + system.prior @ system.change
+        error = system.residual - system.jacobian @ (inverse @ gradient)
+        error = (weight @ error[..., None])[..., 0]
+        projector = weight - weighted @ inverse @ weighted.transpose(0, 2, 1)
+        forms = np.einsum("ni,knij,nj->k", error, spreads, error)
+        expected = np.einsum("nij,knji->k", projector, spreads)
+        before, variance = variance, variance * np.sqrt(forms / expected)
+        weight, weighted, inverse = _weighting(system, spreads, variance)
+        if (sizes * np.abs(variance - before)).max() <= 2e-3 * (sizes * variance).max():
+            break
+    present = sizes * variance > _ABSENT * (sizes @ variance)
+    return NoiseLevels(variance, _level_uncertainty(spreads, weight, weighted, inverse, present))
+
+
+def _first_levels(system: System) -> Array:
+    """Return variances that explain equal shares of the residuals."""
+    metres2, radians2 = (np.mean(part**2) for part in np.split(system.residual, 2, 1))
+    rotations = [kind.startswith("rotation") for kind in system.directions]
+    return np.where(rotations, radians2, metres2) * 2 / len(rotations) + 1e-18
+
+
+def _weighting(system: System, spreads: Array, variance: Array) -> tuple[Array, Array, Array]:
+    """Return weights (n, 6, 6), weighted derivatives, and the inverse of the normal equations."""
+    weight = np.linalg.inv(system.known + _FLOOR + np.tensordot(variance, spreads, 1))
+    weighted = weight @ system.jacobian
+    return weight, weighted, normal_inverse(_normal(system, weighted))
+
+
+def _level_uncertainty(
+    spreads: Array, weight: Array, weighted: Array, inverse: Array, present: Mask
+) -> Array:
+    """Return the inverse of the Fisher information of the restricted likelihood."""
+    k = len(spreads)
+    turned = spreads @ weight
+    own = np.einsum("anij,bnji->ab", turned, turned)
+    sides = spreads @ weighted
+    shared = np.einsum("anip,nij,bnjq,pq->ab", sides, weight, sides, inverse, optimize=True)
+    grams = np.einsum("nip,anij,njq->apq", weighted, spreads, weighted, optimize=True) @ inverse
+    gram = own - 2 * shared + np.einsum("apq,bqp->ab", grams, grams)
+    uncertainty = np.zeros((k, k))
+    if present.any():
+        rows = np.ix_(present, present)
+        unit = 1 / np.sqrt(np.maximum(np.diag(gram)[present], 1e-300))
+        scaled = gram[rows] * np.outer(unit, unit) + 1e-9 * np.eye(int(present.sum()))
+        uncertainty[rows] = 2.0 * np.linalg.inv(scaled) * np.outer(unit, unit)
+    return uncertainty
+
+
+def noise_of(system: System, variance: Array) -> Array:
+    """Return the (n, 6, 6) covariance of the residuals, known and estimated noise together."""
+    return system.known + _FLOOR + np.tensordot(variance, _spreads(system), 1)
+
+
+def _spreads(system: System) -> Array:
+    """Return the (k, n, 6, 6) covariance due to a unit of variance of each kind of noise."""
+    return np.stack([part @ part.transpose(0, 2, 1) for part in system.directions.values()])
+
+
+def ellipsoid_factor(covariance: Array, slopes: Array, uncertainty: Array) -> float:
+    """Return the factor that corrects a covariance for estimated noise levels.
+
+    Squared distances by an estimated covariance follow an F distribution rather than chi-square. A
+    variance with nu degrees of freedom has a relative variance of 2 / nu (F. Satterthwaite, An
+    approximate distribution of estimates of variance components, 1946); the axis with the fewest
+    degrees of freedom decides. With this factor, the chi-square quantile of 95 % has a coverage of
+    95 %.
+
+    Args:
+        covariance: (d, d).
+        slopes: (k, d, d) derivatives of the covariance by the variances of the noise.
+        uncertainty: (k, k) covariance of the variances.
+    """
+    d = len(covariance)
+    values, axes = np.linalg.eigh(covariance)
+    whiten = axes / np.sqrt(np.maximum(values, 1e-300))
+    gradient = np.einsum("dm,kde,em->mk", whiten, slopes, whiten)
+    relative = np.einsum("mk,kl,ml->m", gradient, uncertainty, gradient).max()
+    freedom = float(np.clip(2 / max(relative, 1e-300), 2.5, 1e6))
+    return max(1.0, float(d * f.ppf(_COVERAGE, d, freedom) / chi2.ppf(_COVERAGE, d)))
+
+
+def normal_inverse(normal: Array) -> Array:
+    """Invert (p, p) normal equations; an unconstrained unknown gets a huge variance."""
+    unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-200))
+    values, axes = np.linalg.eigh(normal * np.outer(unit, unit))
+    return np.outer(unit, unit) * ((axes / np.maximum(values, 1e-14)) @ axes.T)
+
+
+def _weighted(system: System, noise: Array) -> Array:
+    return np.linalg.inv(noise) @ system.jacobian
+
+
+def _normal(system: System, weighted: Array) -> Array:
+    p = weighted.shape[2]
+    return weighted.reshape(-1, p).T @ system.jacobian.reshape(-1, p) + system.prior
 
 
 def _step(system: System, information: Array) -> tuple[Array, float]:
     """Return a Gauss-Newton step and its squared Mahalanobis length."""
-    p = system.jacobian.shape[2]
-    weighted = (information @ system.jacobian).reshape(-1, p)
-    normal = weighted.T @ system.jacobian.reshape(-1, p)
+    weighted = information @ system.jacobian
+    normal = _normal(system, weighted)
     # Scale the unknowns so that the normal equations are well conditioned.
     unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    right = unit * (weighted.T @ system.residual.ravel())
-    step = -unit * np.linalg.lstsq(normal * np.outer(unit, unit), right, rcond=1e-13)[0]
+    gradient = np.einsum("nip,ni->p", weighted, system.residual) + system.prior @ system.change
+    scaled = normal * np.outer(unit, unit)
+    step = -unit * np.linalg.lstsq(scaled, unit * gradient, rcond=1e-13)[0]
     return step, float(step @ normal @ step)
-
-
-def _converged(before: NoiseLevels | None, now: NoiseLevels) -> bool:
-    return before is not None and bool(
-        np.abs(now.variance - before.variance).max() <= 0.05 * now.variance.max()
-    )
 
 
 def _result(equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels) -> HandEyeFit:
     system, used = equation.system(at), equation[use].system(at)
-    noise, used_noise = levels.covariances(system), levels.covariances(used)
-    weights = working_noise(noise[: len(equation)], use)
-    working = _with_identity(weights[use], used)
-    gain = Gain.of(used.jacobian, working, used_noise)
-    slopes = gain.slopes([used.directions[kind] for kind in levels.kinds])[:, :6, :6]
-    factor = ellipsoid_factor(gain.covariance[:6, :6], slopes, levels.uncertainty)
-    parts = dict(zip(levels.kinds, slopes * levels.variance[:, None, None], strict=True))
-    own = gain.gain[:, :6] @ used.known @ gain.gain[:, :6].transpose(0, 2, 1)
-    for name, block in zip(("known",) * used.poses + used.priors, own, strict=True):
-        parts[name] = parts.get(name, 0.0) + block
+    noise = noise_of(system, levels.variance)
+    weighted = _weighted(used, noise[use])
+    covariance = normal_inverse(_normal(used, weighted))
+    # (n, p, 6) response of the unknowns to each residual.
+    gain = covariance @ weighted.transpose(0, 2, 1)
+    moves = [gain[:, :6] @ part for part in used.directions.values()]
+    slopes = np.stack([(move @ move.transpose(0, 2, 1)).sum(0) for move in moves])
+    contributions = dict(zip(used.directions, slopes * levels.variance[:, None, None], strict=True))
+    contributions["known"] = (gain[:, :6] @ used.known @ gain[:, :6].transpose(0, 2, 1)).sum(0)
+    for group in dict.fromkeys(equation.extras.groups):
+        own = 12 + equation.extras.indices(group)
+        by_prior = covariance[:6, own]
+        contributions[group] = by_prior @ used.prior[np.ix_(own, own)] @ by_prior.T
     # Without a pose its residual no longer pulls; the leverage is the share it explains itself.
-    leverage = used.jacobian @ gain.gain
+    leverage = used.jacobian @ gain
     pull = np.linalg.solve(np.eye(6) * (1 + 1e-9) - leverage, used.residual[..., None])
     moved, information = np.zeros((len(use), 6)), np.zeros(len(use))
-    moved[use] = (gain.gain[:, :6] @ pull)[: used.poses, :, 0]
-    information[use] = np.trace(leverage, axis1=1, axis2=2)[: used.poses] / equation.unknowns
-    distance2 = _distances(system, noise, weights, use)
-    residual = system.residual[: len(equation)]
+    moved[use] = (gain[:, :6] @ pull)[..., 0]
+    information[use] = np.trace(leverage, axis1=1, axis2=2) / equation.unknowns
     return HandEyeFit(
         at=at,
-        covariance=gain.covariance,
-        factor=factor,
+        covariance=covariance,
+        factor=ellipsoid_factor(covariance[:6, :6], slopes, levels.uncertainty),
         inliers=use,
-        residual=residual,
-        distance2=distance2,
-        levels=levels,
-        contributions=parts,
-        weights=weights,
+        residual=system.residual,
+        distance2=_distances(system, noise, covariance, use),
+        contributions=contributions,
+        weights=noise,
         moved=moved,
         information=information,
     )
 
 
-def _distances(system: System, noise: Array, weights: Array, use: Mask) -> Array:
+def _distances(system: System, noise: Array, covariance: Array, use: Mask) -> Array:
     """Return the (n,) squared Mahalanobis distance of each residual."""
-    n = system.poses
-    rows = np.concatenate([use, np.ones(len(noise) - n, dtype=bool)])
-    gain = Gain.of(system.jacobian[rows], _with_identity(weights, system)[rows], noise[rows])
-    jacobian, noise = system.jacobian[:n], noise[:n]
-    spread = noise + jacobian @ gain.covariance @ jacobian.transpose(0, 2, 1)
     # Used poses have moved the estimate towards themselves. A pose that alone constrains an unknown
     # has no spread along some axis.
-    correlation = jacobian[use] @ gain.gain[: use.sum()] @ noise[use]
-    spread[use] -= correlation + correlation.transpose(0, 2, 1)
-    spread = spread + 1e-3 * noise
-    residual = system.residual[:n]
-    return (residual * np.linalg.solve(spread, residual[..., None])[..., 0]).sum(1)
-
-
-def _within_noise(distance2: Array, use: Mask, unknowns: int) -> Mask:
-    """Return (n,) whether the distance of each pose is explained by the estimated noise."""
-    freedom = max(6 * int(use.sum()) - unknowns, 2)
-    return distance2 < 6 * f.ppf(1 - _REJECTION / len(use), 6, freedom)
+    sign = np.where(use, -1.0, 1.0)[:, None, None]
+    explained = system.jacobian @ covariance @ system.jacobian.transpose(0, 2, 1)
+    spread = (1 + 1e-3) * noise + sign * explained
+    return (system.residual * np.linalg.solve(spread, system.residual[..., None])[..., 0]).sum(1)

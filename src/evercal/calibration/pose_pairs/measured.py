@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma
-from evercal.calibration.boards.lens import LENS, LensPrior, lens_estimate
+from evercal.calibration.boards.intrinsics import LENS, LensPrior, lens_estimate
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.pose_equation import Extras
 from evercal.geometry import SE3, Camera

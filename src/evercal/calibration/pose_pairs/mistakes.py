@@ -9,7 +9,6 @@ axes of OpenGL. Geometry gives them away: a camera sees its board near its optic
 gripper carries is near the gripper.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -32,41 +31,26 @@ from evercal.recordings.poses.conventions import (
 
 Array = NDArray[np.floating]
 
-SUSPECT_M, SUSPECT_RAD = 0.01, np.deg2rad(1.0)
-"""Residuals above which other readings are tested."""
-_FEW = 0.8
-"""Share of inliers below which other readings are tested."""
-HOPELESS_M, HOPELESS_RAD = 0.05, np.deg2rad(3.0)
+_SUSPECT_M, _SUSPECT_RAD, _FEW = 0.01, np.deg2rad(1.0), 0.8
+"""Residuals above which other readings are tested, and share of inliers below which they are."""
+_HOPELESS_M, _HOPELESS_RAD = 0.05, np.deg2rad(3.0)
 """Residuals above which the pairs are refused."""
-_EXACT = 1e-5
-"""Residual, metres or radians, that is not improved."""
-_BETTER = 3.0
-"""Factor by which another reading must reduce the residuals of translation or rotation."""
-_MORE = 0.2
-"""Share of poses, rejected before, that another reading must explain instead."""
-_SCREENED = 1.5
-"""Factor by which another reading must reduce the differences of angles to be fitted."""
-_SPOILT = 1.2
-"""Largest factor by which it may enlarge the others."""
+_BETTER, _SPOILT, _MORE = 3.0, 1.2, 0.2
+"""Another reading must reduce the residuals of translation or rotation by the first factor, or
+explain this share of poses more, and must not enlarge either by more than the second factor."""
+_SCREENED, _FITTED = 1.5, 30
+"""Conventions are fitted if they reduce the differences of angles by a factor; so many at most."""
 _NEAR_M, _FAR_M, _SPREAD = 0.1, 0.7, 0.8
 """Usual distances of a camera or board from the gripper that carries it, and from the base;
 standard deviation of their logarithms."""
-_FIELD_RAD, _ANYWHERE = np.deg2rad(22.0), 0.03
-"""Usual angle between board and optical axis; share of images with any angle."""
-_IMAGES = 4.0
-"""Number of independent images: all look in similar directions."""
+_FIELD_RAD, _ANYWHERE, _IMAGES = np.deg2rad(22.0), 0.03, 4.0
+"""Usual angle between board and optical axis; share of images with any angle; number of independent
+images, because all look in similar directions."""
 _CLEARLY = 4.0
 """Logarithm of the likelihood ratio at which another reading is more plausible."""
-_MOST = 0.9
-"""Share of images that show the board ahead of the camera, if a reading is right."""
-_COHERENT = 0.8
-"""Length of the mean of directions above which they are similar in all images."""
-_OBLIQUE = np.cos(np.deg2rad(45.0))
-"""Cosine of the mean angle from the optical axis at which similar directions are suspect."""
-_LONG_M = 0.4
-"""Distance of a camera or board from its gripper above which a reading is suspect."""
-_FITTED = 30
-"""Number of rotation readings to fit, sorted by their agreement of angles."""
+_MOST, _COHERENT, _OBLIQUE, _LONG_M = 0.9, 0.8, np.cos(np.deg2rad(45.0)), 0.4
+"""A geometry is suspect if this share of the boards is behind the camera, if boards in similar
+directions (length of their mean) are far from the optical axis, or if a gripper reaches so far."""
 _LENGTHS = {1.0: "m", 0.001: "mm"}
 _FLIP = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
 _CAUSES = (
@@ -103,75 +87,53 @@ def require_agreement(
         InputError: Another reading of the poses fits far better or is far more plausible, or the
             residuals are too large.
     """
-    suspect = fit.metres > SUSPECT_M or fit.radians > SUSPECT_RAD or fit.inliers.mean() < _FEW
+    suspect = fit.metres > _SUSPECT_M or fit.radians > _SUSPECT_RAD or fit.inliers.mean() < _FEW
     readings = [_Reading(*other, mount) for other in _other_conventions(pairs, suspect)]
     if suspect:
-        readings = [*_readings(pairs, mount), *readings]
-    best, found = fit, []
-    for reading in readings:
-        other, _ = quick_fit(reading.pairs, reading.mount, scale_known)
-        if _clearly_better(other, fit):
-            found.append((other, reading))
-            best = min(best, other, key=_cost)
-    # Inverted robot poses, inverted camera poses and the other mount obey the same equation.
-    found = [(other, reading) for other, reading in found if _cost(other) < 3 * _cost(best)]
-    if found:
-        fit_of, likely = max(found, key=lambda pair: _plausibility(pair[1], pair[0]))
+        readings = [*_readings(pairs, mount, same_equation=False), *readings]
+    fits = [(quick_fit(r.pairs, r.mount, scale_known)[0], r) for r in readings]
+    better = [(other, r) for other, r in fits if _clearly_better(other, fit)]
+    if better:
+        # Inverted robot poses, inverted camera poses and the other mount obey the same equation.
+        least = min(_cost(other) for other, _ in better)
+        equal = [(other, r) for other, r in better if _cost(other) < 3 * least]
+        corrected, likely = max(equal, key=lambda pair: _plausibility(pair[1], pair[0]))
         raise InputError(
-            f"{likely.message}; corrected, the poses agree to {_size(fit_of)}, as given to"
+            f"{likely.message}; corrected, the poses agree to {_size(corrected)}, as given to"
             f" {_size(fit)}"
         )
     if not suspect:
         if of_board:
-            _require_plausible(pairs, mount, fit)
+            _require_plausible(_Reading("", pairs, mount), fit, scale_known)
         return
     if scale_known:
         _require_unit(pairs, mount, fit)
     enough = fit.inliers.mean() >= 0.5
-    if not (fit.metres < HOPELESS_M and fit.radians < HOPELESS_RAD and enough):
+    if not (fit.metres < _HOPELESS_M and fit.radians < _HOPELESS_RAD and enough):
         raise InputError(f"{_mismatch(pairs)}; they agree only to {_size(fit)}; {_CAUSES}")
 
 
-def _require_plausible(pairs: PosePairs, mount: Mount, fit: Agreement) -> None:
-    """Refuse pairs that agree, but whose geometry fits another reading far better.
-
-    Each other reading has the solution X and Z of the given one, exchanged or inverted.
-    """
-    x, z = fit.at.parent_from_camera, fit.at.fixed_from_board
-    camera = pairs.camera_from_board
-    given = _likelihood(mount, x, z, camera)
-    first, second = (z, x) if mount == "eye_in_hand" else (x, z)
-    others = (
-        (
-            "the files look exchanged: the camera poses look like gripper poses; exchange"
-            " --robot-poses and --camera-poses",
-            _likelihood(mount, first.inverse(), second.inverse(), pairs.base_from_gripper),
-            pairs.base_from_gripper,
-        ),
-        (
-            "robot and camera poses look inverted (gripper_from_base and board_from_camera):"
-            " invert both (--invert both)",
-            _likelihood(mount, z, x, camera.inverse()),
-            camera.inverse(),
-        ),
-        (
-            "the board is behind the camera, as if the camera poses had OpenGL's axes (y up, z"
-            " back): append :opengl to --camera-convention, or convert the poses to OpenCV's axes"
-            " (y down, z forward)",
-            _likelihood(mount, x @ _FLIP, z, _FLIP @ camera),
-            _FLIP @ camera,
-        ),
-    )
-    message, best, seen = max(others, key=lambda other: other[1])
+def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> None:
+    """Refuse pairs that agree, but whose geometry fits another reading far better."""
+    camera = given.pairs.camera_from_board
     rays = camera.translation_m / np.linalg.norm(camera.translation_m, axis=1)[:, None].clip(1e-9)
     behind = (rays[:, 2] < 0).mean() > _MOST
-    mean = rays.mean(0)
-    coherent = float(np.linalg.norm(mean))
+    mean, coherent = rays.mean(0), float(np.linalg.norm(rays.mean(0)))
     beside = coherent > _COHERENT and mean[2] < _OBLIQUE * coherent
-    carried = x if mount == "eye_in_hand" else z
-    odd = behind or beside or np.linalg.norm(carried.translation_m) > _LONG_M
-    if odd and best > given + _CLEARLY and _ahead(seen) > _MOST:
-        raise InputError(message)
+    x, z = fit.at.parent_from_camera, fit.at.fixed_from_board
+    carried = x if given.mount == "eye_in_hand" else z
+    if not (behind or beside or np.linalg.norm(carried.translation_m) > _LONG_M):
+        return
+    others = [
+        (_plausibility(r, quick_fit(r.pairs, r.mount, scale_known)[0]), r)
+        for r in _readings(given.pairs, given.mount, same_equation=True)
+    ]
+    plausibility, best = max(others, key=lambda other: other[0])
+    board = best.pairs.camera_from_board.translation_m
+    # Within 60 degrees of the optical axis, where a camera may see the board.
+    ahead = (board[:, 2] > 0.5 * np.linalg.norm(board, axis=1)).mean()
+    if plausibility > _plausibility(given, fit) + _CLEARLY and ahead > _MOST:
+        raise InputError(best.message)
     if behind:
         raise InputError(
             "the board is behind the camera: camera poses are camera_from_board, with OpenCV's axes"
@@ -179,98 +141,112 @@ def _require_plausible(pairs: PosePairs, mount: Mount, fit: Agreement) -> None:
         )
 
 
-def _ahead(camera_from_board: SE3) -> float:
-    """Return the share of boards that a camera may see, within 60 degrees of its optical axis."""
-    board = camera_from_board.translation_m
-    return float((board[:, 2] > 0.5 * np.linalg.norm(board, axis=1)).mean())
-
-
 def _clearly_better(other: Agreement, fit: Agreement) -> bool:
     """Whether a reading improves translation or rotation by far, or explains many more poses."""
-    metres = max(other.metres, _EXACT) / max(fit.metres, _EXACT)
-    radians = max(other.radians, _EXACT) / max(fit.radians, _EXACT)
-    more = float(other.inliers.mean() - fit.inliers.mean())
-    better = min(metres, radians) * _BETTER < 1 or more > _MORE
-    return better and max(metres, radians) < _SPOILT
+    # Residuals below 0.01 mm and 0.01 mrad are not improved.
+    metres, radians = max(other.metres, 1e-5), max(other.radians, 1e-5)
+    ratios = metres / max(fit.metres, 1e-5), radians / max(fit.radians, 1e-5)
+    more = other.inliers.mean() - fit.inliers.mean() > _MORE
+    return bool(min(ratios) * _BETTER < 1 or more) and max(ratios) < _SPOILT
 
 
 def _plausibility(reading: _Reading, fit: Agreement) -> float:
-    camera = reading.pairs.camera_from_board
-    return _likelihood(reading.mount, fit.at.parent_from_camera, fit.at.fixed_from_board, camera)
-
-
-def _likelihood(mount: Mount, x: SE3, z: SE3, camera_from_board: SE3) -> float:
     """Return how usual a geometry is, the logarithm of a probability density."""
-    usual = (_NEAR_M, _FAR_M) if mount == "eye_in_hand" else (_FAR_M, _NEAR_M)
+    x, z = fit.at.parent_from_camera, fit.at.fixed_from_board
+    usual = (_NEAR_M, _FAR_M) if reading.mount == "eye_in_hand" else (_FAR_M, _NEAR_M)
     lengths = np.array([np.linalg.norm(x.translation_m), np.linalg.norm(z.translation_m)])
     ratio = np.log(np.maximum(lengths, 0.03) / usual) / _SPREAD
-    board = camera_from_board.translation_m
+    board = reading.pairs.camera_from_board.translation_m
     angle = np.arccos(np.clip(board[:, 2] / np.linalg.norm(board, axis=1).clip(1e-9), -1, 1))
     bell = np.exp(-0.5 * (angle / _FIELD_RAD) ** 2) / (_FIELD_RAD * np.sqrt(np.pi / 2))
     seen = np.log((1 - _ANYWHERE) * bell + _ANYWHERE / np.pi)
     return float(_IMAGES * seen.mean() - 0.5 * (ratio**2).sum())
 
 
-def _readings(pairs: PosePairs, mount: Mount) -> Iterator[_Reading]:
-    """Yield other readings of the pairs."""
+def _readings(pairs: PosePairs, mount: Mount, same_equation: bool) -> list[_Reading]:
+    """Return readings that agree as well as the given one, or those of other frames and rows."""
     robot, camera = pairs.base_from_gripper, pairs.camera_from_board
     other: Mount = "eye_to_hand" if mount == "eye_in_hand" else "eye_in_hand"
-    yield _Reading(
-        "the robot poses look inverted (gripper_from_base): invert them (--invert robot), or, if"
-        f" they are base_from_gripper, use --mount {other}",
-        replace(pairs, base_from_gripper=robot.inverse()),
-        mount,
-    )
-    yield _Reading(
-        "the camera poses look inverted (board_from_camera): invert them (--invert camera), or, if"
-        f" they are camera_from_board, use --mount {other}",
-        replace(pairs, camera_from_board=camera.inverse()),
-        mount,
-    )
-    yield _Reading(
-        f"the mount looks wrong: use --mount {other}, or, if it is {mount}, invert the robot poses"
-        " (--invert robot)",
-        pairs,
-        other,
-    )
-    for name, part, poses in (
-        ("robot", "base_from_gripper", robot),
-        ("camera", "camera_from_board", camera),
-    ):
-        conjugate = poses.rotation_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
-        yield _Reading(
-            f"the rotations of the {name} poses look transposed (their translations do not): swap"
-            f" rows and columns of the matrices, or the sign of the quaternions' x y z",
-            replace(pairs, **{part: SE3(conjugate, poses.translation_m)}),
-            mount,
+
+    def reading(text: str, robot: SE3 = robot, camera: SE3 = camera, to: Mount = mount) -> _Reading:
+        return _Reading(text, replace(pairs, base_from_gripper=robot, camera_from_board=camera), to)
+
+    if same_equation:
+        exchanged = (
+            "the files look exchanged: the camera poses look like gripper poses; exchange"
+            " --robot-poses and --camera-poses"
         )
-    for shift, late in ((1, "robot"), (-1, "camera")):
-        rows = np.arange(len(pairs))[max(shift, 0) : len(pairs) + min(shift, 0)]
-        shifted = replace(pairs[rows], camera_from_board=camera[rows - shift])
-        if len(shifted) >= MIN_POSES:
-            yield _Reading(
+        inverted = (
+            "robot and camera poses look inverted (gripper_from_base and board_from_camera):"
+            " invert both (--invert both)"
+        )
+        opengl = (
+            "the board is behind the camera, as if the camera poses had OpenGL's axes (y up, z"
+            " back): append :opengl to --camera-convention, or convert the poses to OpenCV's axes"
+            " (y down, z forward)"
+        )
+        return [
+            reading(exchanged, camera, robot),
+            reading(inverted, robot.inverse(), camera.inverse()),
+            reading(opengl, camera=_FLIP @ camera),
+        ]
+    inverted = (
+        "the {0} poses look inverted ({1}): invert them (--invert {0}), or, if they are {2}, use"
+        f" --mount {other}"
+    )
+    wrong_mount = (
+        f"the mount looks wrong: use --mount {other}, or, if it is {mount}, invert the robot poses"
+        " (--invert robot)"
+    )
+    transposed = (
+        "the rotations of the {} poses look transposed (their translations do not): swap rows and"
+        " columns of the matrices, or the sign of the quaternions' x y z"
+    )
+    readings = [
+        reading(
+            inverted.format("robot", "gripper_from_base", "base_from_gripper"), robot.inverse()
+        ),
+        reading(
+            inverted.format("camera", "board_from_camera", "camera_from_board"),
+            camera=camera.inverse(),
+        ),
+        reading(wrong_mount, to=other),
+        reading(transposed.format("robot"), _transposed(robot)),
+        reading(transposed.format("camera"), camera=_transposed(camera)),
+    ]
+    if len(pairs) > MIN_POSES:
+        before, after = np.arange(len(pairs) - 1), np.arange(1, len(pairs))
+        for late, of_robot, of_camera in (("robot", after, before), ("camera", before, after)):
+            text = (
                 f"rows and images are shifted by one: the {late} poses have an extra pose at the"
-                f" beginning; pair each row with its own image",
-                shifted,
-                mount,
+                f" beginning; pair each row with its own image"
             )
+            shifted = replace(pairs[of_robot], camera_from_board=camera[of_camera])
+            readings.append(_Reading(text, shifted, mount))
+    return readings
 
 
-def _other_conventions(pairs: PosePairs, every: bool) -> Iterator[tuple[str, PosePairs]]:
-    """Yield the pairs with the numbers of one file in another convention, the best first.
+def _transposed(poses: SE3) -> SE3:
+    return SE3(poses.rotation_wxyz * [1.0, -1.0, -1.0, -1.0], poses.translation_m)
+
+
+def _other_conventions(pairs: PosePairs, every: bool) -> list[tuple[str, PosePairs]]:
+    """Return the pairs with the numbers of one file in another convention, the best first.
 
     Unless `every` is set, the angles of robot and camera must agree far better. An exchanged order
     of quaternions keeps all angles.
     """
     robot, camera = pairs.base_from_gripper, pairs.camera_from_board
-    limit = mismatch_rad(robot, camera) / _SCREENED
-    found: list[tuple[float, int, str, PosePairs]] = []
-    for name, part in {"robot": "base_from_gripper", "camera": "camera_from_board"}.items():
-        poses, other = (robot, camera) if name == "robot" else (camera, robot)
-        for given in _numbers(poses, getattr(pairs, f"{name}_numbers")):
+    limit = np.inf if every else _mismatch_rad(robot, camera) / _SCREENED
+    readings: list[tuple[float, str, PosePairs]] = []
+    for name, part, poses, other, numbers in (
+        ("robot", "base_from_gripper", robot, camera, pairs.robot_numbers),
+        ("camera", "camera_from_board", camera, robot, pairs.camera_numbers),
+    ):
+        for given in _numbers(poses, numbers):
             for meant, corrected in _reread(given):
-                mismatch = mismatch_rad(corrected, other)
-                if mismatch > limit and not every:
+                mismatch = _mismatch_rad(corrected, other)
+                if mismatch > limit:
                     continue
                 message = (
                     f"the {name} poses look written as {' or '.join(meant)} and read as"
@@ -278,19 +254,17 @@ def _other_conventions(pairs: PosePairs, every: bool) -> Iterator[tuple[str, Pos
                     f" ({CONVENTIONS[pose_convention(meant[0]).base].meaning})"
                 )
                 changed = replace(pairs, **{part: corrected})
-                found.append((round(np.rad2deg(mismatch), 1), len(found), message, changed))
-    found.sort(key=lambda entry: entry[:2])
-    yield from ((message, changed) for _, _, message, changed in found[:_FITTED])
+                readings.append((round(np.rad2deg(mismatch), 1), message, changed))
+    readings.sort(key=lambda entry: entry[0])
+    return [(message, changed) for _, message, changed in readings[:_FITTED]]
 
 
-def _numbers(poses: SE3, given: PoseNumbers | None) -> Iterator[PoseNumbers]:
-    """Yield the numbers of a file, or of bare poses in the likely conventions."""
+def _numbers(poses: SE3, given: PoseNumbers | None) -> list[PoseNumbers]:
+    """Return the numbers of a file, or of bare poses in the likely conventions."""
     if given is not None:
-        yield given
-        return
-    for name in ("wxyz", "xyzw", "rpy", "ur", "staubli:m", "kuka:m"):
-        used = pose_convention(name)
-        yield PoseNumbers(numbers_from_poses(poses, used), used)
+        return [given]
+    likely = [pose_convention(n) for n in ("wxyz", "xyzw", "rpy", "ur", "staubli:m", "kuka:m")]
+    return [PoseNumbers(numbers_from_poses(poses, used), used) for used in likely]
 
 
 def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:
@@ -298,15 +272,14 @@ def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:
 
     Of several names of one convention the shortest are given.
     """
-    found: dict[bytes, tuple[list[str], SE3]] = {}
+    readings: dict[bytes, tuple[list[str], SE3]] = {}
     used = given.convention
     kept = [word for word in ("inverse", "opengl") if used.has(word)]
     for name, other in CONVENTIONS.items():
         if given.numbers.shape[1] not in other.counts or name == "tum":
             continue
-        length = (
-            "" if other.metres_per_unit == used.metres_per_unit else _LENGTHS[used.metres_per_unit]
-        )
+        same_unit = other.metres_per_unit == used.metres_per_unit
+        length = "" if same_unit else _LENGTHS[used.metres_per_unit]
         for angle in ("", "deg" if not other.degrees else "rad") if other.has_angles else ("",):
             meant = ":".join(filter(None, (name, length, angle, *kept)))
             try:
@@ -315,17 +288,11 @@ def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:
             except ValueError:  # no rotations in that convention
                 continue
             key = np.abs(corrected.rotation_wxyz).round(6).tobytes()
-            found.setdefault(key, ([], corrected))[0].append(meant)
-    for names, _ in found.values():
+            readings.setdefault(key, ([], corrected))[0].append(meant)
+    for names, _ in readings.values():
         fewest = min(name.count(":") for name in names)
         names[:] = [name for name in names if name.count(":") == fewest]
-    return list(found.values())
-
-
-def mismatch_rad(robot: SE3, camera: SE3) -> float:
-    """Return the lower quartile of the differences between angles of robot and camera."""
-    first, second = (_angles(poses) for poses in (robot, camera))
-    return float(np.quantile(np.abs(first - second), 0.25))
+    return list(readings.values())
 
 
 def _angles(poses: SE3) -> Array:
@@ -335,23 +302,23 @@ def _angles(poses: SE3) -> Array:
     return 2 * np.arccos(np.minimum(np.abs((q[i] * q[j]).sum(1)), 1.0))
 
 
+def _mismatch_rad(robot: SE3, camera: SE3) -> float:
+    """Return the lower quartile of the differences between angles of robot and camera."""
+    return float(np.quantile(np.abs(_angles(robot) - _angles(camera)), 0.25))
+
+
 def _require_unit(pairs: PosePairs, mount: Mount, fit: Agreement) -> None:
     """Refuse camera lengths in another unit than the robot's."""
     free, scale = quick_fit(pairs, mount, False)
     if free.metres * _BETTER > fit.metres or free.radians > 1.5 * fit.radians + 1e-4:
         return
-    units = {0.001: "millimetres", 0.01: "centimetres", 0.0254: "inches"}
-    for unit, name in units.items():
-        if abs(np.log(scale / unit)) < 0.1:
-            raise InputError(
-                f"the camera poses look like {name}, the robot's like metres; convert them, or"
-                f" state the unit with --camera-convention"
-            )
-        if abs(np.log(scale * unit)) < 0.1:
-            raise InputError(
-                f"the robot poses look like {name}, the camera's like metres; convert them, or"
-                f" state the unit with --robot-convention"
-            )
+    for unit, name in {0.001: "millimetres", 0.01: "centimetres", 0.0254: "inches"}.items():
+        for factor, side, other in ((unit, "camera", "robot"), (1 / unit, "robot", "camera")):
+            if abs(np.log(scale / factor)) < 0.1:
+                raise InputError(
+                    f"the {side} poses look like {name}, the {other}'s like metres; convert them,"
+                    f" or state the unit with --{side}-convention"
+                )
     raise InputError(
         f"the camera's lengths fit the robot's only if multiplied by {scale:.4g}; check the board's"
         f" square or tag size and both units, or estimate the scale with --scale unknown"
@@ -366,10 +333,9 @@ def _mismatch(pairs: PosePairs) -> str:
     i, j = np.triu_indices(len(pairs), 1)
     typical = int(np.argsort(differences)[len(differences) // 2])
     return (
-        f"robot and camera agree in no rotation: from {pairs.names[i[typical]]} to"
-        f" {pairs.names[j[typical]]} the robot turned by {np.rad2deg(robot[typical]):.1f}"
-        f" deg, the camera by {np.rad2deg(camera[typical]):.1f} deg; most pairs differ"
-        f" by as much"
+        f"rotations of robot and camera are inconsistent: from {pairs.names[i[typical]]} to"
+        f" {pairs.names[j[typical]]} the robot rotated by {np.rad2deg(robot[typical]):.1f} deg, the"
+        f" camera by {np.rad2deg(camera[typical]):.1f} deg (typical)"
     )
 
 

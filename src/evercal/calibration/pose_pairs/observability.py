@@ -101,13 +101,12 @@ def _require_metres(poses: SE3, names: Sequence[str], role: str) -> None:
 
 def _require_motion(pairs: PosePairs, scale_known: bool) -> None:
     """Refuse stale poses: one side stands still while the other moves."""
-    robot_m, robot_rad = _largest_motion(pairs.base_from_gripper)
-    camera_m, camera_rad = _largest_motion(pairs.camera_from_board)
+    unit = 1.0
     if not scale_known:
         size = np.linalg.norm(pairs.camera_from_board.translation_m, axis=1)
-        camera_m /= max(float(np.median(size)), 1e-12)
-    robot_still = robot_m < _STILL_M and robot_rad < _STILL_RAD
-    camera_still = camera_m < _STILL_M and camera_rad < _STILL_RAD
+        unit = max(float(np.median(size)), 1e-12)
+    robot_still = _is_still(pairs.base_from_gripper, 1.0)
+    camera_still = _is_still(pairs.camera_from_board, unit)
     if robot_still and not camera_still:
         raise InputError(
             "the robot's pose is the same in every row while the board moves in the images; the"
@@ -120,7 +119,6 @@ def _require_motion(pairs: PosePairs, scale_known: bool) -> None:
         )
 
 
-def _largest_motion(poses: SE3) -> tuple[float, float]:
-    """Return metres and radians."""
+def _is_still(poses: SE3, unit_m: float) -> bool:
     metres, radians = pose_distance(poses[0], poses)
-    return float(metres.max()), float(radians.max())
+    return bool(metres.max() / unit_m < _STILL_M and radians.max() < _STILL_RAD)

@@ -31,6 +31,10 @@ class PoseNumbers:
     camera_from: bool = False
     """Whether the camera's frame is the first of the pose."""
 
+    def __getitem__(self, rows: NDArray[np.int64]) -> Self:
+        """Return a subset of the rows."""
+        return replace(self, numbers=self.numbers[rows])
+
 
 @dataclass(frozen=True, eq=False)
 class PosePairs:
@@ -79,20 +83,18 @@ class PosePairs:
             camera_from_board=self.camera_from_board[rows],
             camera_covariance=None if covariance is None else covariance[rows],
             velocity=None if self.velocity is None else self.velocity[rows],
-            robot_numbers=_taken(self.robot_numbers, rows),
-            camera_numbers=_taken(self.camera_numbers, rows),
+            robot_numbers=self.robot_numbers and self.robot_numbers[rows],
+            camera_numbers=self.camera_numbers and self.camera_numbers[rows],
         )
 
-    def order(self) -> NDArray[np.int64]:
-        """Return (n,) indices that sort the pairs by value, whatever their order."""
+    def distinct(self, scale_known: bool = True) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return indices of different pairs, sorted by value whatever their order.
+
+        The second array holds for each of the n pairs the first equal pair.
+        """
         keys = [*self.base_from_gripper.translation_m.T, *self.camera_from_board.translation_m.T]
         keys += [*_canonical(self.base_from_gripper).T, *_canonical(self.camera_from_board).T]
-        return np.lexsort(keys[::-1])
-
-    def distinct(self, scale_known: bool = True) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return sorted indices of different pairs, and (n,) the first equal pair of every pair."""
-        order = self.order()
-        first = np.empty(len(self), dtype=np.int64)
+        order, first = np.lexsort(keys[::-1]), np.empty(len(self), dtype=np.int64)
         first[order] = order[self[order].repeats(scale_known)]
         return order[first[order] == order], first
 
@@ -145,10 +147,6 @@ class PosePairs:
             base_is_fixed=on_arm,
             velocity=velocity,
         )
-
-
-def _taken(given: PoseNumbers | None, rows: NDArray[np.int64]) -> PoseNumbers | None:
-    return None if given is None else replace(given, numbers=given.numbers[rows])
 
 
 def listed(names: Sequence[str], limit: int = 5) -> str:

@@ -7,8 +7,7 @@ rotates its gripper about the origin of the gripper or of the base. These are th
 `parent` and `fixed`, so one model serves both mounts.
 
 Further unknowns, the extras, change every camera pose: intrinsics, the size of a square, a depth
-error that all images share. Each has a prior. A prior is one more measurement: in the arrays of a
-`System` priors are further rows after those of the poses.
+error that all images share. Each has a Gaussian prior.
 
 Residuals are (translation, rotation vector) in the frame `fixed`, metres and radians.
 """
@@ -39,12 +38,18 @@ class Unknowns:
     @property
     def parent_from_camera(self) -> SE3:
         """The calibration."""
-        return se3(self.rotations[0], self.translations[0])
+        return self._pose(0)
 
     @property
     def fixed_from_board(self) -> SE3:
         """Board pose in the fixed frame."""
-        return se3(self.rotations[1], self.translations[1])
+        return self._pose(1)
+
+    def _pose(self, which: int) -> SE3:
+        quaternion = Rotation.from_matrix(self.rotations[which]).as_quat(
+            canonical=True, scalar_first=True
+        )
+        return SE3(quaternion, np.asarray(self.translations[which], dtype=np.float64))
 
     def moved(self, step: Array) -> "Unknowns":
         """Return the unknowns after a (12 + q,) step: (translation, rotation) of X, of Z, extras.
@@ -64,7 +69,7 @@ class Extras:
     names: tuple[str, ...]
     """(q,)."""
     groups: tuple[str, ...]
-    """(q,) `intrinsics`, `depth`, `size` or `clock`."""
+    """(q,) `intrinsics`, `shared depth`, `size` or `clock`."""
     slopes: Array
     """(n, 6, q) derivatives of `camera_from_board`: translation in the camera frame, rotation about
     the board's axes; zero for a time offset, which moves the robot instead."""
@@ -80,10 +85,8 @@ class Extras:
 
     def with_one(self, name: str, slopes: Array, sigma: float) -> Self:
         """Add an unknown with slopes (n, 6), mean 0 and a standard deviation, which may be inf."""
-        q = len(self.names)
-        information = np.zeros((q + 1, q + 1))
-        information[:q, :q] = self.information
-        information[q, q] = sigma**-2.0
+        information = np.pad(self.information, (0, 1))
+        information[-1, -1] = sigma**-2.0
         return replace(
             self,
             names=(*self.names, name),
@@ -103,39 +106,23 @@ class Extras:
         information[k], information[:, k] = 0.0, 0.0
         return replace(self, information=information)
 
-    def __getitem__(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Self:
-        """Return the extras of a subset of the poses."""
-        return replace(self, slopes=self.slopes[rows])
-
-    def whitened(self) -> list[tuple[str, Array]]:
-        """Return the rows (k, q) of unit variance that make up the prior of each group."""
-        rows = []
-        for group in dict.fromkeys(self.groups):
-            own = self.indices(group)
-            values, axes = np.linalg.eigh(self.information[np.ix_(own, own)])
-            kept = values > 1e-14 * max(values.max(), 1e-300)
-            whiten = np.zeros((int(kept.sum()), len(self.names)))
-            whiten[:, own] = np.sqrt(values[kept])[:, None] * axes[:, kept].T
-            rows.append((group, whiten))
-        return rows
-
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """The linear system at an estimate: n poses, then rows of priors, in blocks of six."""
+    """The linear system of n poses at an estimate."""
 
     residual: Array
-    """(n + b, 6)."""
+    """(n, 6)."""
     jacobian: Array
-    """(n + b, 6, 12 + q)."""
+    """(n, 6, 12 + q)."""
     known: Array
-    """(n + b, 6, 6) known covariance."""
+    """(n, 6, 6) known covariance."""
     directions: dict[str, Array]
-    """(n + b, 6, c) residuals due to unit errors of each kind of noise, by kind."""
-    poses: int
-    """n."""
-    priors: tuple[str, ...]
-    """(b,) group of the extras that each block of priors belongs to."""
+    """(n, 6, c) residuals due to unit errors of each kind of noise, by kind."""
+    prior: Array
+    """(12 + q, 12 + q) information of the prior on the unknowns."""
+    change: Array
+    """(12 + q,) difference of the estimate from the mean of the prior."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +156,7 @@ class PoseEquation:
             camera_rotation=self.camera_rotation[index],
             camera_translation=self.camera_translation[index],
             camera_covariance=self.camera_covariance[index],
-            extras=self.extras[index],
+            extras=replace(self.extras, slopes=self.extras.slopes[index]),
             velocity=None if self.velocity is None else self.velocity[index],
         )
 
@@ -182,43 +169,21 @@ class PoseEquation:
         """Number of unknowns."""
         return 12 + len(self.extras.names)
 
-    @property
-    def _is_timed(self) -> bool:
-        """Whether the last extra is a time offset."""
-        return "clock" in self.extras.groups
-
-    def residuals(self, at: Unknowns) -> Array:
-        """Return (n, 6) differences between the board pose by each image and the estimate."""
-        return self._evaluated(at)[0]
-
-    def _evaluated(self, at: Unknowns) -> tuple[Array, Array, Array, Array]:
-        """Return residuals, `fixed_from_camera`, and translation and rotation of the board."""
-        change = self.extras.slopes @ at.extras
+    def system(self, at: Unknowns) -> System:
+        """Linearize at an estimate."""
+        n, change = len(self), self.extras.slopes @ at.extras
         board = self.camera_translation + change[:, :3]
-        turned = self.camera_rotation
-        if change[:, 3:].any():
-            turned = turned @ Rotation.from_rotvec(change[:, 3:]).as_matrix()
+        turned = self.camera_rotation @ Rotation.from_rotvec(change[:, 3:]).as_matrix()
         fixed_from_camera = self.robot_rotation @ at.rotations[0]
+        # From the origin of the parent to the board.
         lever = (fixed_from_camera @ board[..., None])[..., 0]
         lever = lever + self.robot_rotation @ at.translations[0]
         difference = fixed_from_camera @ turned @ at.rotations[1].T
         rotation = Rotation.from_matrix(difference, assume_valid=True).as_rotvec()
-        moved = lever + self.robot_translation - at.translations[1]
-        residual = np.concatenate([moved, rotation], 1)
-        if self._is_timed and at.extras[-1]:
-            residual = residual + at.extras[-1] * self._by_time(lever, rotation)
-        return residual, fixed_from_camera, board, turned
-
-    def _by_time(self, lever: Array, rotation: Array) -> Array:
-        assert self.velocity is not None
-        angular = self.velocity[:, 3:]
-        moved = self.velocity[:, :3] + np.cross(angular, lever)
-        return np.concatenate([moved, (_log_slope(rotation) @ angular[..., None])[..., 0]], 1)
-
-    def system(self, at: Unknowns) -> System:
-        """Linearize at an estimate."""
-        residual, fixed_from_camera, board, turned = self._evaluated(at)
-        n, slope = len(self), _log_slope(residual[:, 3:])
+        residual = np.concatenate(
+            [lever + self.robot_translation - at.translations[1], rotation], 1
+        )
+        slope = _log_slope(rotation)
         jacobian = np.zeros((n, 6, self.unknowns))
         jacobian[:, :3, 0:3] = self.robot_rotation
         jacobian[:, :3, 3:6] = -fixed_from_camera @ cross_matrix(board)
@@ -229,62 +194,39 @@ class PoseEquation:
         by_camera[:, :3, :3], by_camera[:, 3:, 3:] = fixed_from_camera, fixed_from_camera @ turned
         jacobian[:, :, 12:] = by_camera @ self.extras.slopes
         jacobian[:, 3:, 12:] = slope @ jacobian[:, 3:, 12:]
-        if self._is_timed:
-            lever = (fixed_from_camera @ board[..., None])[..., 0]
-            lever = lever + self.robot_rotation @ at.translations[0]
-            jacobian[:, :, -1] = self._by_time(lever, residual[:, 3:])
-        known = by_camera @ self.camera_covariance @ by_camera.transpose(0, 2, 1)
-        error, slopes, priors = self._priors(at)
-        blank = np.zeros((len(priors), 6, 3))
-        directions = {
-            kind: np.concatenate([columns, blank[:, :, : columns.shape[2]]])
-            for kind, columns in self._noise_directions(at).items()
-        }
+        if self.velocity is not None and "clock" in self.extras.names:
+            angular = self.velocity[:, 3:]
+            jacobian[:, :3, -1] = self.velocity[:, :3] + np.cross(angular, lever)
+            jacobian[:, 3:, -1] = (slope @ angular[..., None])[..., 0]
+            residual = residual + at.extras[-1] * jacobian[:, :, -1]
         return System(
-            np.concatenate([residual, error]),
-            np.concatenate([jacobian, slopes]),
-            np.concatenate([known, np.broadcast_to(np.eye(6), (len(priors), 6, 6))]),
-            directions,
-            n,
-            priors,
+            residual=residual,
+            jacobian=jacobian,
+            known=by_camera @ self.camera_covariance @ by_camera.transpose(0, 2, 1),
+            directions=self._noise_directions(at),
+            prior=np.pad(self.extras.information, (12, 0)),
+            change=np.r_[np.zeros(12), at.extras - self.extras.mean],
         )
-
-    def _priors(self, at: Unknowns) -> tuple[Array, Array, tuple[str, ...]]:
-        """Return residuals (b, 6), derivatives (b, 6, 12 + q) and groups of the priors."""
-        change = at.extras - self.extras.mean
-        errors, slopes, groups = [np.zeros((0, 6))], [np.zeros((0, 6, self.unknowns))], []
-        for group, rows in self.extras.whitened():
-            blocks = -(-len(rows) // 6)
-            padded = np.zeros((6 * blocks, self.unknowns))
-            padded[: len(rows), 12:] = rows
-            errors.append((padded[:, 12:] @ change).reshape(-1, 6))
-            slopes.append(padded.reshape(-1, 6, self.unknowns))
-            groups += [group] * blocks
-        return np.concatenate(errors), np.concatenate(slopes), tuple(groups)
 
     def _noise_directions(self, at: Unknowns) -> dict[str, Array]:
         """Return (n, 6, c) residuals due to unit errors of each kind, one metre or one radian.
 
-        A rotation about a distant point also moves the board.
+        A rotation about a distant point also moves the board. The last two kinds are the noise of a
+        camera, which corners tell.
         """
         n = len(self)
         board, parent = at.translations[1], self.robot_translation
         gripper = parent if self.base_is_fixed else np.zeros((n, 3))
+        directions = {
+            "translation": np.broadcast_to(np.eye(6, 3), (n, 6, 3)),
+            "rotation about gripper": _rotated(board - gripper),
+        }
+        if "intrinsics" in self.extras.groups:
+            return directions
         ray = board - parent - self.robot_rotation @ at.translations[0]
         depth = np.zeros((n, 6, 1))
         depth[:, :3, 0] = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
-        return {
-            "translation": np.broadcast_to(np.eye(6, 3), (n, 6, 3)),
-            "depth": depth,
-            "rotation about board": _rotated(np.zeros((n, 3))),
-            "rotation about gripper": _rotated(board - gripper),
-        }
-
-
-def se3(rotation: Array, translation: Array) -> SE3:
-    """Create poses from rotation matrices (..., 3, 3) and translations (..., 3)."""
-    quaternion = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
-    return SE3(quaternion, np.asarray(translation, dtype=np.float64))
+        return directions | {"depth": depth, "rotation about board": _rotated(np.zeros((n, 3)))}
 
 
 def _log_slope(rotvec: Array) -> Array:
@@ -294,8 +236,8 @@ def _log_slope(rotvec: Array) -> Array:
     Jacobian of SO(3), accurate to 1e-4 up to one radian.
     """
     matrix = cross_matrix(rotvec)
-    square = matrix @ matrix
     angle2 = (rotvec**2).sum(1)[:, None, None]
+    square = matrix @ matrix
     return np.eye(3) - 0.5 * matrix + (1 / 12 + angle2 / 720 + angle2**2 / 30240) * square
 
 

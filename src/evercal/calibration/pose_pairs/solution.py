@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.boards.lens import moved_camera
+from evercal.calibration.boards.board_poses import pose_dict
+from evercal.calibration.boards.intrinsics import moved_camera
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, Mount
 from evercal.calibration.pose_pairs.checks import held_out_error, left_open, repeatability
 from evercal.calibration.pose_pairs.fit import HandEyeFit
@@ -115,7 +116,7 @@ class PairSolution:
             **held_out_error(self.equation, fit),
             **repeatability(self.equation, fit),
             "target_m": float(np.median(distance)),
-            f"{fixed}_from_board": _pose_dict(self.fixed_from_board),
+            f"{fixed}_from_board": pose_dict(self.fixed_from_board),
             "leave_one_out_mm": self._by_name(1000 * np.linalg.norm(fit.moved[:, :3], axis=1)),
             "information_percent": self._by_name(100 * fit.information),
             "camera_from_board": self._board_poses(),
@@ -142,7 +143,7 @@ class PairSolution:
     def _board_poses(self) -> dict[str, object]:
         """Return the board pose of every pair by name, as JSON values."""
         poses = zip(self.rows, self.camera_from_board, strict=True)
-        return {self.pairs.names[i]: _pose_dict(pose) for i, pose in poses}
+        return {self.pairs.names[i]: pose_dict(pose) for i, pose in poses}
 
     def _images(self) -> tuple[ImageUse, ...]:
         """Return the use of every pair in the given order."""
@@ -169,14 +170,7 @@ class PairSolution:
         fit, terms = self.fit, []
         for name, cause in (_CAUSES | _EXTRA_CAUSES).items():
             part = fit.contributions.get(name)
-            if part is not None and np.trace(part) > 1e-12 * np.trace(fit.covariance[:6, :6]):
+            if part is not None and np.trace(part) > 1e-6 * np.trace(fit.covariance[:6, :6]):
                 terms.append(ErrorTerm.of(cause, part))
         rest = fit.factor * fit.covariance[:6, :6] - sum(fit.contributions.values())
         return (*terms, ErrorTerm.of("few poses, and errors alike in similar poses", rest))
-
-
-def _pose_dict(pose: SE3) -> dict[str, object]:
-    return {
-        "translation_m": pose.translation_m.tolist(),
-        "quaternion_wxyz": pose.rotation_wxyz.tolist(),
-    }

@@ -6,11 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.boards.corners import BoardView, board_pose
-from evercal.calibration.boards.lens import lens_vector, moved_camera
+from evercal.calibration.boards.intrinsics import lens_vector, moved_camera
 from evercal.calibration.calibration import Calibration, Mount
 from evercal.calibration.pose_pairs.board_size import SIZE_SIGMA, widened, with_tested_size
 from evercal.calibration.pose_pairs.fit import (
-    Agreement,
     HandEyeFit,
     agreement,
     least_sigma,
@@ -97,7 +96,10 @@ def solve_pairs(
         pairs = lens.applied_to(pairs)
         start, scale = quick_fit(pairs[rows], mount, scale_known)
         robot = pairs[rows].base_from_gripper
-        predicted = _predicted(robot if mount == "eye_in_hand" else robot.inverse(), start, scale)
+        fixed_from_parent = robot if mount == "eye_in_hand" else robot.inverse()
+        at = start.at
+        predicted = (fixed_from_parent @ at.parent_from_camera).inverse() @ at.fixed_from_board
+        predicted = SE3(predicted.rotation_wxyz, predicted.translation_m / scale)
         corners, poses = _other_board_poses(corners, lens, rows, ~start.inliers, predicted)
         lens = measured(corners, corners.camera, poses)
     problem = _Problem(mount, scale, scale_known, corners, of_board)
@@ -129,7 +131,9 @@ class _Problem:
         self, pairs: PosePairs, rows: NDArray[np.int64], start: Unknowns, lens: Measured | None
     ) -> tuple[PoseEquation, HandEyeFit, Measured | None]:
         """Fit all unknowns; with corners, until the intrinsics no longer change."""
-        at = _in_the_middle(start, middle_of(self.corners))
+        at, shifts = start, start.translations.copy()
+        shifts[1] += at.rotations[1] @ middle_of(self.corners)
+        at = replace(at, translations=shifts)
         for turn in range(_MOST_LENSES):
             equation = self.equation(pairs, lens)[rows]
             at = replace(at, extras=np.zeros(len(equation.extras.names)))
@@ -199,20 +203,6 @@ def _lens_warnings(
     ]
 
 
-def _in_the_middle(at: Unknowns, middle: Array) -> Unknowns:
-    """Return the unknowns with the board's origin moved to a point (3,) of the board."""
-    moved = at.translations.copy()
-    moved[1] += at.rotations[1] @ middle
-    return replace(at, translations=moved)
-
-
-def _predicted(fixed_from_parent: SE3, start: Agreement, scale: float) -> SE3:
-    """Return camera_from_board by the other poses, in the camera's unit of length."""
-    at = start.at
-    poses = (fixed_from_parent @ at.parent_from_camera).inverse() @ at.fixed_from_board
-    return SE3(poses.rotation_wxyz, poses.translation_m / scale)
-
-
 def _other_board_poses(
     corners: BoardCorners,
     lens: Measured,
@@ -227,12 +217,10 @@ def _other_board_poses(
     """
     views, poses = list(corners.views), [pose.camera_from_board for pose in lens.poses]
     for row in np.flatnonzero(outliers):
-        i = int(rows[row])
+        i, nearest = int(rows[row]), np.inf
         view, old = corners.views[i], lens.poses[i]
         orders = corners.orders(len(view.pixels))
-        candidates = [view, *(BoardView(view.points_m, view.pixels[order]) for order in orders)]
-        nearest = np.inf
-        for candidate in candidates:
+        for candidate in (view, *(BoardView(view.points_m, view.pixels[k]) for k in orders)):
             pose = board_pose(candidate, lens.camera, predicted[row])
             # All orders of a symmetric board fit; the other poses decide between them.
             _, turn = pose_distance(pose.camera_from_board, predicted[row])

@@ -18,7 +18,7 @@ from evercal.calibration.pose_pairs.pose_equation import PoseEquation, Unknowns
 
 Array = NDArray[np.floating]
 
-SAMPLES = 150
+_SAMPLES = 150
 """Number of samples; even with 50 % outliers about 20 samples contain inliers only."""
 _SCORED = 60
 """Maximum number of poses that score a sample."""
@@ -33,24 +33,6 @@ class Start(NamedTuple):
     """Metres per unit of the camera's translations."""
 
 
-class _Hypotheses(NamedTuple):
-    """h candidates for `parent_from_camera`."""
-
-    rotations: Array
-    """(h, 3, 3)"""
-    translations: Array
-    """(h, 3)"""
-    scales: Array
-    """(h,) metres per unit of the camera's translations."""
-
-
-class _Boards(NamedTuple):
-    """Board poses in the fixed frame: by each hypothesis, or one mean pose for each."""
-
-    rotations: Array
-    translations: Array
-
-
 def consensus_start(equation: PoseEquation, scale_known: bool = True) -> Start:
     """Return the hypothesis that agrees best with the better half of three or more poses.
 
@@ -60,35 +42,42 @@ def consensus_start(equation: PoseEquation, scale_known: bool = True) -> Start:
     scored = equation[np.unique(np.linspace(0, n - 1, _SCORED).round().astype(int))]
     i, j = np.triu_indices(len(scored), 1)
     triples = _triples(n)
-    sampled = solve_motions(equation, triples[:, [0, 0, 1]], triples[:, [1, 2, 2]], scale_known)
-    whole = solve_motions(scored, i[None], j[None], scale_known)
-    hypotheses = _Hypotheses(*(np.concatenate(pair) for pair in zip(sampled, whole, strict=True)))
-    cost, mean = _spread(_boards(scored, hypotheses))
-    cost[~(hypotheses.scales > 0)] = np.inf
+    sampled = _solve_motions(equation, triples[:, [0, 0, 1]], triples[:, [1, 2, 2]], scale_known)
+    whole = _solve_motions(scored, i[None], j[None], scale_known)
+    rotations, shifts, scales = (np.concatenate(both) for both in zip(sampled, whole, strict=True))
+    # (h, n) board poses in the fixed frame by each hypothesis.
+    fixed_from_camera = scored.robot_rotation @ rotations[:, None]
+    turned = fixed_from_camera @ scored.camera_rotation
+    placed = (fixed_from_camera @ scored.camera_translation[..., None])[..., 0]
+    placed = placed * scales[:, None, None] + scored.robot_translation
+    placed += (scored.robot_rotation @ shifts[:, None, :, None])[..., 0]
+    cost, mean_rotations, mean_shifts = _spread(turned, placed)
+    cost[~(scales > 0)] = np.inf
     best = int(np.argmin(cost))
     at = Unknowns(
-        np.stack([hypotheses.rotations[best], mean.rotations[best]]),
-        np.stack([hypotheses.translations[best], mean.translations[best]]),
+        np.stack([rotations[best], mean_rotations[best]]),
+        np.stack([shifts[best], mean_shifts[best]]),
         np.zeros(len(equation.extras.names)),
     )
-    return Start(at, float(hypotheses.scales[best]))
+    return Start(at, float(scales[best]))
 
 
 def _triples(n: int) -> NDArray[np.int64]:
     """Return (h, 3) indices of distinct poses."""
-    if n * (n - 1) * (n - 2) // 6 <= SAMPLES:
+    if n * (n - 1) * (n - 2) // 6 <= _SAMPLES:
         return np.array(list(combinations(range(n), 3)))
     rng = np.random.default_rng(0)
-    return np.argsort(rng.random((SAMPLES, n)), 1)[:, :3]
+    return np.argsort(rng.random((_SAMPLES, n)), 1)[:, :3]
 
 
-def solve_motions(
-    equation: PoseEquation,
-    first: NDArray[np.int64],
-    second: NDArray[np.int64],
-    scale_known: bool = True,
-) -> _Hypotheses:
-    """Solve A X = X B for h sets of m motions between the poses `first` and `second`, (h, m)."""
+def _solve_motions(
+    equation: PoseEquation, first: NDArray[np.int64], second: NDArray[np.int64], scale_known: bool
+) -> tuple[Array, Array, Array]:
+    """Solve A X = X B for h sets of m motions between the poses `first` and `second`, (h, m).
+
+    Returns:
+        Rotations (h, 3, 3), translations (h, 3) and scales (h,) of `parent_from_camera`.
+    """
     robot, camera = equation.robot_rotation, equation.camera_rotation
     inverse = robot[first].transpose(0, 1, 3, 2)
     rotation_a = inverse @ robot[second]
@@ -112,7 +101,7 @@ def solve_motions(
     projected = system.transpose(0, 2, 1) @ right_side
     solution = np.linalg.solve(normal + ridge * np.eye(unknowns), projected)[..., 0]
     scales = np.ones(h) if scale_known else solution[:, 3] / unit[:, 0, 0]
-    return _Hypotheses(rotations, solution[:, :3], scales)
+    return rotations, solution[:, :3], scales
 
 
 def _sine_axes(rotations: Array) -> Array:
@@ -121,48 +110,23 @@ def _sine_axes(rotations: Array) -> Array:
     return np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
 
 
-def _boards(equation: PoseEquation, hypotheses: _Hypotheses) -> _Boards:
-    """Return the board pose by each hypothesis and pose: (h, n, 3, 3) and (h, n, 3)."""
-    fixed_from_camera = equation.robot_rotation @ hypotheses.rotations[:, None]
-    scales = hypotheses.scales[:, None, None]
-    board = (fixed_from_camera @ equation.camera_translation[..., None])[..., 0] * scales
-    camera = (equation.robot_rotation @ hypotheses.translations[:, None, :, None])[..., 0]
-    return _Boards(
-        fixed_from_camera @ equation.camera_rotation, board + camera + equation.robot_translation
-    )
-
-
-def _spread(boards: _Boards) -> tuple[Array, _Boards]:
-    """Return the (h,) logarithmic spread of the better half of the boards, and their mean."""
-    rotations, translations = boards
+def _spread(rotations: Array, translations: Array) -> tuple[Array, Array, Array]:
+    """Return the (h,) logarithmic spread of the better half of n boards, and their mean."""
     h, n = translations.shape[:2]
-    half = min(n, (n + 4) // 2)
-    rows = np.arange(h)[:, None]
-    mean = _Boards(_nearest(np.median(rotations, 1)), np.median(translations, 1))
-    nearest = _by_distance(boards, mean)[:, :half]
-    for _ in range(2):
-        mean = _Boards(
-            _nearest(rotations[rows, nearest].mean(1)), translations[rows, nearest].mean(1)
-        )
-        nearest = _by_distance(boards, mean)[:, :half]
-    metres2, radians2 = _squared_distances(boards, mean)
-    metres2, radians2 = (np.take_along_axis(d, nearest, 1).mean(1) for d in (metres2, radians2))
-    return np.log(metres2 + _FLOOR**2) + np.log(radians2 + _FLOOR**2), mean
-
-
-def _by_distance(boards: _Boards, mean: _Boards) -> NDArray[np.int64]:
-    """Return (h, n) indices of the boards, sorted by distance from the mean."""
-    metres2, radians2 = _squared_distances(boards, mean)
-    radians2 = radians2 / 2
-    # Each distance is divided by its median so that the two can be added.
-    ratio = metres2 / (np.median(metres2, 1, keepdims=True) + _FLOOR**2)
-    return np.argsort(ratio + radians2 / (np.median(radians2, 1, keepdims=True) + _FLOOR**2), 1)
-
-
-def _squared_distances(boards: _Boards, mean: _Boards) -> tuple[Array, Array]:
-    """Return (h, n) squared metres and squared Frobenius norms of the rotation differences."""
-    metres2 = ((boards.translations - mean.translations[:, None]) ** 2).sum(-1)
-    return metres2, ((boards.rotations - mean.rotations[:, None]) ** 2).sum((-1, -2))
+    half, rows = min(n, (n + 4) // 2), np.arange(h)[:, None]
+    mean_rotation = _nearest(np.median(rotations, 1))
+    mean_translation = np.median(translations, 1)
+    for _ in range(3):
+        metres2 = ((translations - mean_translation[:, None]) ** 2).sum(-1) + _FLOOR**2
+        radians2 = ((rotations - mean_rotation[:, None]) ** 2).sum((-1, -2)) / 2 + _FLOOR**2
+        # Each distance is divided by its median so that the two can be added.
+        ratio = metres2 / np.median(metres2, 1, keepdims=True)
+        ratio += radians2 / np.median(radians2, 1, keepdims=True)
+        nearest = np.argsort(ratio, 1)[:, :half]
+        mean_rotation = _nearest(rotations[rows, nearest].mean(1))
+        mean_translation = translations[rows, nearest].mean(1)
+    spread = [np.take_along_axis(d, nearest, 1).mean(1) for d in (metres2, radians2)]
+    return np.log(spread[0]) + np.log(spread[1]), mean_rotation, mean_translation
 
 
 def _nearest(matrices: Array) -> Array:

@@ -41,8 +41,7 @@ class CameraTrack:
 
     def __getitem__(self, index: NDArray[np.bool_]) -> "CameraTrack":
         """Return a subset of the images."""
-        rows = np.flatnonzero(index)
-        corners = self.corners
+        rows, corners = np.flatnonzero(index), self.corners
         if corners is not None:
             corners = replace(corners, views=tuple(corners.views[row] for row in rows))
         names = tuple(self.names[row] for row in rows)
@@ -74,24 +73,22 @@ def solve_with_offset(
             the offset.
     """
     offset = _coarse_offset(robot, camera, largest_s)
-    solution, correction, used = None, 0.0, offset
-    for _ in range(6):
-        used = offset
-        pairs, overlapping = _pairs_at(robot, camera, used)
+    turns = 0
+    while True:
+        pairs, overlapping = _pairs_at(robot, camera, offset)
         solution = solve_pairs(pairs, mount, scale_known, overlapping.corners)
-        correction = float(solution.fit.at.extras[-1])
-        if abs(correction) < 1e-4:
-            break
+        correction, sigma = float(solution.fit.at.extras[-1]), float(solution.fit.sigma[-1])
         offset += float(np.clip(correction, -largest_s, largest_s))
-    assert solution is not None
-    sigma = float(solution.fit.sigma[-1])
+        turns += 1
+        if abs(correction) < 1e-4 or turns == 6:
+            break
     if not sigma < _MAX_SIGMA_S or abs(correction) > 0.02:
         raise InputError(
             f"the time offset is not determined (standard deviation {1000 * sigma:.0f} ms): too few"
             f" images show the robot in motion; move it while recording, or pair images and poses"
             f" of a still robot and omit --time-offset"
         )
-    return solution.calibration(used + correction)
+    return solution.calibration(offset)
 
 
 def interpolated_pairs(robot: PoseTrack, camera: CameraTrack) -> tuple[PosePairs, CameraTrack]:
@@ -120,8 +117,7 @@ def _pairs_at(
         times - _HALF_S, robot.stamps_s[0], None
     )
     linear = after.translation_m - before.translation_m
-    inverse = SE3(before.rotation_wxyz, np.zeros_like(before.translation_m)).inverse()
-    angular = (SE3(after.rotation_wxyz, np.zeros_like(after.translation_m)) @ inverse).log()[:, 3:]
+    angular = (after @ before.inverse()).log()[:, 3:]
     velocity = np.concatenate([linear, angular], 1) / np.maximum(duration, 1e-9)[:, None]
     names, boards = overlapping.names, overlapping.camera_from_board
     return PosePairs(names, poses, boards, velocity=velocity), overlapping
