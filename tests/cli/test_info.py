@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 MAP_KEYS = {"name", "train_frames", "memory_bytes", "keyframes", "camera", "landmarks"}
-MAP_KEYS |= {"min_support", "adjusted"}
+MAP_KEYS |= {"min_support", "adjusted", "hand_eye"}
 
 
 def test_info_of_a_map(run: Any, store: Path) -> None:
