@@ -149,7 +149,7 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     ),
     "shuffled rows": (
         lambda p: replace(p, camera_from_board=p.camera_from_board[np.arange(25) * 7 % 25]),
-        "agree in no rotation: from row .* check that each row belongs to its image",
+        "rotations .* inconsistent: from row .* check that each row belongs to its image",
     ),
     "stale robot": (
         robot_by(lambda p: p[np.zeros(25, dtype=int)]),
