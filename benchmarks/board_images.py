@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.boards.detection import Board
-from evercal.calibration.boards.printing import black_rectangles
+from evercal.calibration.boards.printing import board_image
 from evercal.geometry import SE3, Camera
 
 CAMERA = Camera(960, 600, 760.0, 760.0, 479.5, 299.5)
@@ -20,7 +20,7 @@ TAG = Board("apriltag", 0.08, dictionary="APRILTAG_36h11", tag=3)
 _FINER = 4
 """Samples of a pixel along each axis."""
 _TEXELS = 60
-"""Texture pixels along a square; along a cell of a tag, ten times fewer suffice."""
+"""Texture pixels along a square, or along two cells of a tag."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,7 @@ def corner_points(board: Board) -> np.ndarray:
 
 def _pose(board: Board, photo: Photo, rng: np.random.Generator) -> SE3:
     """Return camera_from_board with the given tilt about a random axis."""
-    dark = black_rectangles(board)
-    low, high = dark[:, :2].min(0), dark[:, 2:].max(0)
+    low, high = _extent(board)
     camera, size = photo.camera, high - low + 0.5 * board.size_m
     fills = max(size[0] * camera.fx / camera.width, size[1] * camera.fy / camera.height)
     turn, roll = rng.uniform(0, 2 * np.pi), np.deg2rad(photo.roll_deg * rng.uniform(-1, 1))
@@ -113,19 +112,16 @@ def _photograph(board: Board, photo: Photo, pose: SE3, rng: np.random.Generator)
 
 def _texture(board: Board) -> tuple[np.ndarray, float, np.ndarray]:
     """Return a print (h, w) float32, its pixels per metre, and the place of its corner, metres."""
-    dark = black_rectangles(board)
-    size = board.size_m / (4 if board.kind == "apriltag" else 1)
-    margin, per_m = 0.8 * size, _TEXELS / size
-    start = dark[:, :2].min(0) - margin
-    width, height = np.ceil((dark[:, 2:].max(0) + margin - start) * per_m).astype(int)
-    covered = np.zeros((height, width), np.float32)
-    for x0, y0, x1, y1 in (dark - np.tile(start, 2)) * per_m:
-        along = np.clip(
-            np.minimum(x1, np.arange(width) + 1) - np.maximum(x0, np.arange(width)), 0, 1
-        )
-        down = np.clip(
-            np.minimum(y1, np.arange(height) + 1) - np.maximum(y0, np.arange(height)), 0, 1
-        )
-        i, j = np.nonzero(down)[0], np.nonzero(along)[0]
-        covered[i[0] : i[-1] + 1, j[0] : j[-1] + 1] += np.outer(down[i], along[j])
-    return (225 - 200 * covered).astype(np.float32), per_m, start
+    image = board_image(board, _TEXELS // 2 if board.kind == "apriltag" else _TEXELS)
+    low, high = _extent(board)
+    per_m, margin = image.shape[1] / (high - low)[0], round(0.8 * _TEXELS)
+    bright = np.pad(image, margin, constant_values=255) / 255
+    return (25 + 200 * bright).astype(np.float32), per_m, low - margin / per_m
+
+
+def _extent(board: Board) -> tuple[np.ndarray, np.ndarray]:
+    """Return the upper left and the lower right corner of a print, x right and y down, metres."""
+    if board.kind == "apriltag":
+        return np.full(2, -board.size_m / 2), np.full(2, board.size_m / 2)
+    size = board.size_m * np.array([board.columns, board.rows], dtype=float)
+    return (np.full(2, -board.size_m) if board.kind == "chessboard" else np.zeros(2)), size

@@ -5,6 +5,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.detection import Board
+from evercal.calibration.boards.printing import board_image
 from evercal.geometry import SE3, Camera
 
 CAMERA = Camera(640, 480, 600, 602, 318, 242)
@@ -23,35 +24,18 @@ def grid(columns: int, rows: int) -> np.ndarray:
 
 def printed(board: Board) -> tuple[np.ndarray, np.ndarray]:
     """Return the print of a board and the (3, 3) map from metres to pixels of the print."""
-    side = board.size_m * _PER_METRE
+    side = round(board.size_m * _PER_METRE)
+    image = board_image(board, side // 10 if board.kind == "apriltag" else side)
+    margin = side // 3 if board.kind == "apriltag" else side
+    # The black and the white of a real print.
+    image = np.pad(image, margin, constant_values=255) // 255 * 210 + 20
+    start, up = margin - 0.5, 1
     if board.kind == "chessboard":
-        # One square more than inner corners, and a white margin of one square.
-        columns, rows = board.columns + 3, board.rows + 3
-        y, x = np.mgrid[: int(rows * side), : int(columns * side)]
-        i, j = (np.floor((v + 0.5) / side).astype(int) - 1 for v in (x, y))
-        inside = (i >= 0) & (i < columns - 2) & (j >= 0) & (j < rows - 2)
-        # The square between the first inner corners is bright.
-        image = np.where(inside & ((i + j) % 2 == 1), 20, 230).astype(np.uint8)
-        start = 2 * side - 0.5
-        return image, np.array([[_PER_METRE, 0, start], [0, _PER_METRE, start], [0, 0, 1.0]])
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.dictionary}"))
-    if board.kind == "charuco":
-        page = cv2.aruco.CharucoBoard(
-            (board.columns, board.rows), board.size_m, board.marker_m, dictionary
-        )
-        margin = int(side)
-        size = (int(board.columns * side) + 2 * margin, int(board.rows * side) + 2 * margin)
-        start = margin - 0.5
-        image = page.generateImage(size, marginSize=margin)
-        return image, np.array([[_PER_METRE, 0, start], [0, _PER_METRE, start], [0, 0, 1.0]])
-    count = int(side)
-    margin = count // 3
-    image = np.full((count + 2 * margin, count + 2 * margin), 255, np.uint8)
-    image[margin:-margin, margin:-margin] = cv2.aruco.generateImageMarker(
-        dictionary, board.tag or 0, count
-    )
-    centre = margin + count / 2 - 0.5
-    return image, np.array([[_PER_METRE, 0, centre], [0, -_PER_METRE, centre], [0, 0, 1.0]])
+        start += side  # the first inner corner
+    elif board.kind == "apriltag":
+        start, up = start + side / 2, -1
+    to_print = np.array([[_PER_METRE, 0, start], [0, up * _PER_METRE, start], [0, 0, 1.0]])
+    return image.astype(np.uint8), to_print
 
 
 def photographed(board: Board, camera_from_board: SE3, seed: int = 0) -> np.ndarray:

@@ -60,8 +60,7 @@ def degenerate_motions() -> dict[str, tuple[SE3, str]]:
     }
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("noise", [0.0, 1.0])
+@pytest.mark.parametrize(("mount", "noise"), [("eye_in_hand", 0.0), ("eye_to_hand", 1.0)])
 @pytest.mark.parametrize("name", degenerate_motions())
 @pytest.mark.parametrize("scale_known", [True, False])
 def test_degenerate_motions_are_refused(
@@ -149,7 +148,7 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     ),
     "shuffled rows": (
         lambda p: replace(p, camera_from_board=p.camera_from_board[np.arange(25) * 7 % 25]),
-        "agree in no rotation: from row .* check that each row belongs to its image",
+        "rotations .* inconsistent: from row .* check that each row belongs to its image",
     ),
     "stale robot": (
         robot_by(lambda p: p[np.zeros(25, dtype=int)]),
@@ -164,8 +163,7 @@ AMBIGUOUS = ("quaternion order", "XYZ for xyz", "ZYX for XYZ", "robot transposed
 """Mistakes for which another reading may fit equally well."""
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("path", ["random", "table"])
+@pytest.mark.parametrize(("mount", "path"), [("eye_in_hand", "table"), ("eye_to_hand", "random")])
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistakes_are_diagnosed(mount: Mount, path: str, name: str) -> None:
     mistake, expected = MISTAKES[name]
@@ -202,8 +200,7 @@ def rng_of(seed: int) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("mount", "seed"), [("eye_in_hand", 0), ("eye_to_hand", 1)])
 def test_files_that_agree_in_the_wrong_roles_are_named(mount: Mount, seed: int) -> None:
     pairs = physical(mount, seed)
     robot, camera = pairs.base_from_gripper, pairs.camera_from_board

@@ -48,26 +48,25 @@ def test_exact_poses_give_the_exact_calibration(
         assert calibration.checks["scale"] == pytest.approx(scale, rel=1e-6)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("outliers", [0, 3])
-def test_errors_lie_inside_the_covariance(mount: Mount, outliers: int) -> None:
+@pytest.mark.parametrize("setting", [Setting(), Setting("eye_to_hand", outliers=3)])
+def test_errors_lie_inside_the_covariance(setting: Setting) -> None:
     # The benchmark runs a thousand trials; these few detect a broken covariance.
-    result = trials(Setting(mount, outliers=outliers), 40, 100)
+    result = trials(setting, 20, 100)
     assert result["median mm"] < 1.4
     assert result["median deg"] < 0.1
     assert result["largest mm"] < 6
     assert result["inside 95 %"] > 80
-    assert result["outliers exactly"] >= 97
+    assert result["outliers exactly"] >= 95
 
 
 def test_the_covariance_is_not_too_large() -> None:
     distances = []
-    for seed in range(40):
+    for seed in range(24):
         truth = recording(Setting(noisy="both"), 200 + seed)
         result = solve(truth.pairs, "eye_in_hand")
         distances.append(result.uncertain_pose.squared_mahalanobis(truth.parent_from_camera))
     # Chi-square with six degrees of freedom has mean 6 and median 5.35.
-    assert 4.2 < np.mean(distances) < 7.8
+    assert 4.2 < np.mean(distances) < 8.5
     assert 0.25 < np.mean(np.array(distances) < 5.35) < 0.75
     assert share_inside(distances) > 80
 
@@ -92,7 +91,7 @@ def test_outliers_are_named_in_any_order() -> None:
 
 
 def test_a_third_of_outliers_is_tolerated() -> None:
-    for seed in range(5):
+    for seed in range(3):
         truth = recording(Setting(outliers=9), seed)
         calibration = solve(truth.pairs, "eye_in_hand")
         difference = error(calibration.parent_from_child, truth.parent_from_camera)
@@ -103,7 +102,7 @@ def test_a_third_of_outliers_is_tolerated() -> None:
 
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_unknown_scale_is_estimated(mount: Mount) -> None:
-    result = trials(Setting(mount, scale=0.37, outliers=3), 10)
+    result = trials(Setting(mount, scale=0.37, outliers=3), 5)
     assert result["scale off %"] < 0.5
     assert result["median mm"] < 2.0
 
@@ -171,11 +170,12 @@ def photographed(mount: Mount, seed: int, robot_deg: float = 0.0) -> Photographe
     return Photographed(pairs, parent_from_camera, camera)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize(("noise_px", "robot_deg"), [(0.3, 0.0), (0.1, 0.1)])
+@pytest.mark.parametrize(
+    ("mount", "noise_px", "robot_deg"), [("eye_in_hand", 0.3, 0.0), ("eye_to_hand", 0.1, 0.1)]
+)
 def test_corners_improve_the_calibration(mount: Mount, noise_px: float, robot_deg: float) -> None:
     distances, with_corners, without = [], [], []
-    for seed in range(12):
+    for seed in range(6):
         truth = photographed(mount, seed, robot_deg)
         views = truth.views(grid(9, 6), noise_px, seed)
         # Inaccurate board poses are refitted to the corners.
@@ -195,31 +195,18 @@ def test_corners_improve_the_calibration(mount: Mount, noise_px: float, robot_de
     assert np.median(with_corners) < 0.5 * np.median(without)
 
 
-def test_reversed_corners_of_a_symmetric_board_are_corrected() -> None:
-    truth, points = photographed("eye_in_hand", 1), grid(8, 6)
-    half_turn = SE3(np.array([0.0, 0.0, 0.0, 1.0]), points.max(0))
-    views, poses = list(truth.views(points, 0.0, 0)), list(truth.pairs.camera_from_board)
-    for i in range(1, len(views), 4):
-        views[i] = BoardView(points, views[i].pixels[::-1])
-        poses[i] = poses[i] @ half_turn
-    pairs = replace(truth.pairs, camera_from_board=SE3.stack(poses))
-    corners = BoardCorners(truth.camera, tuple(views), half_turn=True)
-    calibration = solve(pairs, "eye_in_hand", corners=corners)
-    assert all(image.used for image in calibration.images)
-    assert np.abs(error(calibration.parent_from_child, truth.parent_from_camera)).max() < 1e-4
-
-
-@pytest.mark.parametrize("side", [7, 8])
-def test_turned_corners_of_a_square_board_are_corrected(side: int) -> None:
-    truth, points = photographed("eye_in_hand", 1), grid(side, side)
+@pytest.mark.parametrize("size", [(8, 6), (7, 7), (8, 8)])
+def test_turned_corners_of_a_symmetric_board_are_corrected(size: tuple[int, int]) -> None:
+    truth, points, square = photographed("eye_in_hand", 1), grid(*size), size[0] == size[1]
     views = list(truth.views(points, 0.0, 0))
     poses = [board_pose(view, truth.camera).camera_from_board for view in views]
+    indices = np.arange(len(points)).reshape(size[::-1])
     for i in range(1, len(views), 3):
-        order = np.rot90(np.arange(side * side).reshape(side, side), 1 + i % 3).ravel()
+        order = np.rot90(indices, 1 + i % 3 if square else 2).ravel()
         views[i] = BoardView(points, views[i].pixels[order])
         poses[i] = board_pose(views[i], truth.camera).camera_from_board
     pairs = replace(truth.pairs, camera_from_board=SE3.stack(poses))
-    corners = BoardCorners(truth.camera, tuple(views), quarter_turn=True)
+    corners = BoardCorners(truth.camera, tuple(views), half_turn=not square, quarter_turn=square)
     calibration = solve(pairs, "eye_in_hand", corners=corners)
     assert all(image.used for image in calibration.images)
     assert np.abs(error(calibration.parent_from_child, truth.parent_from_camera)).max() < 1e-4

@@ -1,6 +1,7 @@
 """Read pose pairs from a file of robot poses and a file of camera poses."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Literal
@@ -16,7 +17,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.conventions import PoseConvention
 from evercal.recordings.poses.pose_track import PoseTrack
-from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
+from evercal.recordings.poses.robot_poses import read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, times_in_names, without_ending
 
 Inverted = Literal["robot", "camera", "both"]
@@ -38,25 +39,42 @@ class PairFiles:
 
 
 @dataclass(frozen=True, eq=False)
-class _CameraPoses:
-    """All images of a camera file."""
+class _Poses:
+    """The n poses of a file."""
 
     names: tuple[str, ...] | None
     stamps_s: NDArray[np.float64] | None
-    """(n,) times from the file or from the names."""
-    poses: list[SE3 | None]
-    """(n,) poses, or None if the image shows no board."""
-    board: BoardPoses | None
-    """The file of `evercal detect`."""
-    numbers: NDArray[np.float64] | None = None
+    """(n,) times from the file or from the names of images."""
+    poses: SE3
+    """(n,) poses; any for an image that shows no board."""
+    measured: NDArray[np.bool_]
+    """(n,) whether the image shows a board; true for a table."""
+    numbers: PoseNumbers | None = None
     """(n, k) numbers of a table."""
-    convention: PoseConvention | None = None
-    camera_from: bool = True
-    """Whether the camera's frame is the first of a pose of the table."""
+    board: BoardPoses | None = None
+    """The file of `evercal detect`."""
 
-    def rows(self) -> tuple[str, ...]:
-        """Return the image names, or the row numbers of a file without names."""
+    def row_names(self) -> tuple[str, ...]:
+        """Return the names, or the row numbers of a file without names."""
         return self.names or tuple(f"row {i + 1}" for i in range(len(self.poses)))
+
+    def numbers_of(self, rows: Sequence[int]) -> PoseNumbers | None:
+        """Return the numbers of some rows."""
+        return self.numbers and self.numbers[np.array(rows, dtype=np.int64)]
+
+    def corners_of(self, rows: Sequence[int]) -> BoardCorners | None:
+        """Return the corners of images that show the board."""
+        if self.board is None:
+            return None
+        images, printed = self.board.images, self.board.board
+        return BoardCorners(
+            self.board.camera,
+            tuple(view for row in rows if (view := images[row].view) is not None),
+            half_turn=printed.half_turn,
+            quarter_turn=printed.quarter_turn,
+            stated=self.board.camera_from == "file",
+            size_m=printed.size_m,
+        )
 
 
 def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
@@ -69,12 +87,11 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
     Raises:
         InputError: A file is broken, or the poses cannot be paired.
     """
-    robot, camera = _read_robot(files), _read_camera(files)
+    robot, camera = _read(files, "robot"), _read(files, "camera")
     if robot.names is not None and camera.names is not None:
         rows = _rows_by_name(files, robot.names, camera.names)
     elif robot.stamps_s is not None and camera.stamps_s is not None:
-        track = PoseTrack(robot.stamps_s, robot.poses)
-        pairs, overlapping = interpolated_pairs(track, _camera_track(camera))
+        pairs, overlapping = interpolated_pairs(*_streams(robot, camera))
         return pairs, overlapping.corners
     elif len(robot.poses) == len(camera.poses):
         rows = [*range(len(robot.poses))]
@@ -83,23 +100,24 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
             f"{files.robot}: {len(robot.poses)} poses for {len(camera.poses)} images of"
             f" {files.camera}; give one row per image, or name the images in a column 'image'"
         )
-    paired = [i for i, row in enumerate(rows) if row is not None and camera.poses[i] is not None]
+    paired = [(i, row) for i, row in enumerate(rows) if row is not None and camera.measured[i]]
     if not paired:
         raise InputError(f"{files.camera}: no image has both a board and a robot pose")
-    names = camera.names or robot.names or camera.rows()
+    images, robots = zip(*paired, strict=True)
+    names = camera.names or robot.row_names()
     pairs = PosePairs(
-        tuple(names[i] for i in paired),
-        robot.poses[np.array([rows[i] for i in paired], dtype=np.int64)],
-        SE3.stack([pose for i in paired if (pose := camera.poses[i]) is not None]),
-        robot_numbers=_numbers(robot.numbers, robot.convention, [rows[i] or 0 for i in paired]),
-        camera_numbers=_numbers(camera.numbers, camera.convention, paired, camera.camera_from),
+        tuple(names[i] for i in images),
+        robot.poses[np.array(robots)],
+        camera.poses[np.array(images)],
+        robot_numbers=robot.numbers_of(robots),
+        camera_numbers=camera.numbers_of(images),
     )
-    return pairs, _corners(camera.board, paired)
+    return pairs, camera.corners_of(images)
 
 
 def read_streams(files: PairFiles) -> tuple[PoseTrack, CameraTrack]:
     """Read robot and camera poses with times of separate clocks, or raise InputError."""
-    robot, camera = _read_robot(files), _read_camera(files)
+    robot, camera = _read(files, "robot"), _read(files, "camera")
     if robot.stamps_s is None:
         raise InputError(f"{files.robot}: has no times; --time-offset takes a column stamp_s")
     if camera.stamps_s is None:
@@ -107,76 +125,62 @@ def read_streams(files: PairFiles) -> tuple[PoseTrack, CameraTrack]:
             f"{files.camera}: has no times; --time-offset takes a column stamp_s, or images named"
             f" after their time in seconds"
         )
-    return PoseTrack(robot.stamps_s, robot.poses), _camera_track(camera)
+    return _streams(robot, camera)
 
 
-def _read_robot(files: PairFiles) -> RobotPoses:
-    robot = _read_poses(files.robot, "robot", files.robot_convention)
-    if files.invert in ("robot", "both"):
-        convention = _inverted(robot.convention)
-        robot = replace(robot, poses=robot.poses.inverse(), convention=convention)
-    return robot
+def _streams(robot: _Poses, camera: _Poses) -> tuple[PoseTrack, CameraTrack]:
+    assert robot.stamps_s is not None
+    assert camera.stamps_s is not None
+    rows, names = np.flatnonzero(camera.measured), camera.row_names()
+    track = CameraTrack(
+        tuple(names[row] for row in rows),
+        camera.stamps_s[rows],
+        camera.poses[rows],
+        camera.corners_of(rows.tolist()),
+    )
+    return PoseTrack(robot.stamps_s, robot.poses), track
 
 
-def _inverted(convention: PoseConvention | None) -> PoseConvention | None:
+def _read(files: PairFiles, role: Literal["robot", "camera"]) -> _Poses:
+    """Read the poses of one file; messages name its role and its own option."""
+    path = files.robot if role == "robot" else files.camera
+    inverted = files.invert in (role, "both")
+    if not path.exists():
+        raise InputError(f"{path}: file of {role} poses is missing; check --{role}-poses")
+    if role == "camera" and _is_board_file(path):
+        board = read_board_poses(path)
+        images = sorted(board.images, key=lambda image: natural_key(PurePath(image.name).name))
+        board = replace(board, images=tuple(images))
+        if not images:
+            raise InputError(f"{path}: holds no images; repeat evercal detect")
+        names = tuple(image.name for image in images)
+        measured = np.array([image.camera_from_board is not None for image in images])
+        poses = SE3.stack([image.camera_from_board or SE3.identity() for image in images])
+        poses = poses.inverse() if inverted else poses
+        return _Poses(names, times_in_names(names), poses, measured, board=board)
+    table = read_robot_poses(
+        path,
+        files.robot_convention if role == "robot" else files.camera_convention,
+        what=f"file of {role} poses",
+        option=f"--{role}-convention",
+        # Inverted, the file of the camera states board_from_camera.
+        camera_from=role == "camera" and not inverted,
+    )
+    stamps, numbers = table.stamps_s, None
+    if role == "camera" and stamps is None and table.names is not None:
+        stamps = times_in_names(table.names)
+    if table.numbers is not None and table.convention is not None:
+        used = _inverted(table.convention) if inverted else table.convention
+        numbers = PoseNumbers(table.numbers, used, camera_from=role == "camera")
+    poses = table.poses.inverse() if inverted else table.poses
+    return _Poses(table.names, stamps, poses, np.ones(len(poses), dtype=bool), numbers)
+
+
+def _inverted(convention: PoseConvention) -> PoseConvention:
     """Return the convention of the same numbers that states the inverse."""
-    if convention is None:
-        return None
     words = convention.name.split(":")
     words = [w for w in words if w != "inverse"] if "inverse" in words else [*words, "inverse"]
     return replace(convention, name=":".join(words))
-
-
-def _numbers(
-    numbers: NDArray[np.float64] | None,
-    convention: PoseConvention | None,
-    rows: list[int],
-    camera_from: bool = False,
-) -> PoseNumbers | None:
-    if numbers is None or convention is None:
-        return None
-    return PoseNumbers(numbers[rows], convention, camera_from)
-
-
-def _read_camera(files: PairFiles) -> _CameraPoses:
-    if _is_board_file(files.camera):
-        board = read_board_poses(files.camera)
-        images = sorted(board.images, key=lambda image: natural_key(PurePath(image.name).name))
-        names = tuple(image.name for image in images)
-        poses = [image.camera_from_board for image in images]
-        board = replace(board, images=tuple(images))
-        camera = _CameraPoses(names, times_in_names(names), poses, board)
-    else:
-        # Inverted, the file states board_from_camera.
-        camera_from = files.invert not in ("camera", "both")
-        table = _read_poses(files.camera, "camera", files.camera_convention, camera_from)
-        stamps = table.stamps_s
-        if stamps is None and table.names is not None:
-            stamps = times_in_names(table.names)
-        poses: list[SE3 | None] = [*table.poses]
-        numbers = table.numbers
-        camera = _CameraPoses(
-            table.names, stamps, poses, None, numbers, table.convention, camera_from
-        )
-    if files.invert not in ("camera", "both"):
-        return camera
-    inverse = [p if p is None else p.inverse() for p in camera.poses]
-    return replace(camera, poses=inverse, convention=_inverted(camera.convention), camera_from=True)
-
-
-def _read_poses(
-    path: Path, role: str, convention: str | None, camera_from: bool = False
-) -> RobotPoses:
-    """Read a table of poses; messages name its role and its own option."""
-    if not path.exists():
-        raise InputError(f"{path}: file of {role} poses is missing; check --{role}-poses")
-    return read_robot_poses(
-        path,
-        convention,
-        what=f"file of {role} poses",
-        option=f"--{role}-convention",
-        camera_from=camera_from,
-    )
 
 
 def _is_board_file(path: Path) -> bool:
@@ -206,25 +210,3 @@ def _rows_by_name(
             f" image is {camera[0]!r}"
         )
     return rows
-
-
-def _camera_track(camera: _CameraPoses) -> CameraTrack:
-    assert camera.stamps_s is not None
-    detected = [i for i, pose in enumerate(camera.poses) if pose is not None]
-    names = camera.rows()
-    return CameraTrack(
-        tuple(names[i] for i in detected),
-        camera.stamps_s[detected],
-        SE3.stack([pose for pose in camera.poses if pose is not None]),
-        _corners(camera.board, detected),
-    )
-
-
-def _corners(board: BoardPoses | None, rows: list[int]) -> BoardCorners | None:
-    if board is None:
-        return None
-    views = tuple(view for i in rows if (view := board.images[i].view) is not None)
-    stated = board.camera_from == "file"
-    printed = board.board
-    turns = printed.half_turn, printed.quarter_turn
-    return BoardCorners(board.camera, views, *turns, stated, printed.size_m)

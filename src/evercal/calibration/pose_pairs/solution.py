@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.board_poses import pose_dict
-from evercal.calibration.boards.intrinsics import moved_camera
+from evercal.calibration.boards.intrinsics import LENS, moved_camera
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, Mount
 from evercal.calibration.pose_pairs.checks import held_out_error, left_open, repeatability
 from evercal.calibration.pose_pairs.fit import HandEyeFit
@@ -131,9 +131,7 @@ class PairSolution:
         checks |= {"scale": self.board_scale, "scale_sigma": sigma["size"]}
         if self.lens is not None:
             checks["corner_sigma_px"] = self.lens.sigma_px
-            lens = [name for name, g in zip(extras.names, extras.groups, strict=True)
-                    if g == "intrinsics"]  # fmt: skip
-            checks["camera_sigma"] = {name: sigma[name] for name in lens}
+            checks["camera_sigma"] = {name: sigma[name] for name in LENS if name in sigma}
         return checks
 
     def _by_name(self, values: Array) -> dict[str, float]:
