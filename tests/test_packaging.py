@@ -11,7 +11,6 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "evercal"
 DATA = (
     "py.typed",
-    "continual/benchmark/row_files/*.json",
     "features/weights/*.safetensors",
     "recordings/sample_cell/**/*.*",
     "recordings/sample_rooms/**/*.*",

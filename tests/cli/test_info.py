@@ -1,4 +1,4 @@
-"""`evercal info` and `evercal verify`."""
+"""`evercal info`."""
 
 import json
 import shutil
@@ -26,7 +26,7 @@ def test_info_of_a_map(run: Any, store: Path) -> None:
     assert any(line.startswith(f"box-room-41 {counts}") for line in lines)
     residual = f"box-room-41 {scene['adjusted']['residual_px']:.2f} px "
     assert any(line.startswith(residual) for line in lines)
-    assert lines[-1] == f"next: evercal verify {store}"
+    assert lines[-1] == f"next: evercal info {store} --check"
 
 
 def test_info_of_a_map_without_reports(run: Any, hall_store: Path) -> None:
@@ -48,18 +48,18 @@ def test_info_of_a_network(run: Any, network_store: Path) -> None:
 
 def test_damaged_files_are_named(run: Any, store: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(store, tmp_path / "s"))
-    assert run("verify", copy).code == 0
-    assert json.loads(run("verify", copy, "--json").out)["ok"] is True
+    assert run("info", "--check", copy).code == 0
+    assert json.loads(run("info", "--check", copy, "--json").out)["ok"] is True
     keyframes = next(copy.rglob("keyframes.safetensors"))
     data = bytearray(keyframes.read_bytes())
     data[-1] ^= 1
     keyframes.write_bytes(data)
     next(copy.rglob("scene.json")).unlink()
-    ran = run("verify", copy)
+    ran = run("info", "--check", copy)
     assert ran.code == 1
     assert "keyframes.safetensors: checksum" in ran.out
     assert "scene.json: missing" in ran.out
-    record = json.loads(run("verify", copy, "--json").out)
+    record = json.loads(run("info", "--check", copy, "--json").out)
     assert record["ok"] is False
     assert len(record["problems"]) == 2
     for words in (["info", copy], ["learn", copy, tmp_path], ["evaluate", copy, tmp_path]):
@@ -67,9 +67,9 @@ def test_damaged_files_are_named(run: Any, store: Path, tmp_path: Path) -> None:
         assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
 
 
-@pytest.mark.parametrize("verb", ["info", "verify"])
-def test_other_folders_are_refused(run: Any, tmp_path: Path, verb: str) -> None:
+@pytest.mark.parametrize("verb", [["info"], ["info", "--check"]])
+def test_other_folders_are_refused(run: Any, tmp_path: Path, verb: list[str]) -> None:
     for path in (tmp_path, tmp_path / "nowhere"):
-        ran = run(verb, path)
+        ran = run(*verb, path)
         assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-        assert json.loads(run(verb, path, "--json").out).keys() == {"error"}
+        assert json.loads(run(*verb, path, "--json").out).keys() == {"error"}

@@ -24,7 +24,6 @@ VERBS = {
         "refresh",
         "evaluate",
         "info",
-        "verify",
         "map",
         "serve",
     ],

@@ -7,7 +7,12 @@ bundle adjustment estimated.
 import os
 from pathlib import Path
 
-from evercal.calibration.calibration import Calibration, read_calibration
+from evercal.calibration.calibration import (
+    Calibration,
+    ErrorTerm,
+    ImageUse,
+    read_calibration,
+)
 from evercal.errors import InputError
 from evercal.storage.stages import is_store
 
@@ -55,5 +60,7 @@ def learned_calibration(root: Path, scene: str | None = None) -> Calibration:
             " it has no gripper_from_camera; run 'evercal calibrate' and give its file"
         )
     camera, report = stored[name]
-    frames = int(report["train_frames"])
-    return HandEyeReport(**report["hand_eye"]).calibration(camera, name, frames)
+    hand_eye = dict(report["hand_eye"])
+    for field, kind in (("error_terms", ErrorTerm), ("images", ImageUse)):
+        hand_eye[field] = tuple(kind(**row) for row in hand_eye.get(field, ()))
+    return HandEyeReport(**hand_eye).calibration(camera, name, int(report["train_frames"]))

@@ -166,7 +166,8 @@ def _parse(words: list[str], as_json: bool) -> Any:
             )
     except SystemExit as stop:
         shown.seek(0)
-        sys.stdout.write(_wrapped(shown.read()))
+        page = shown.read()
+        sys.stdout.write(_wrapped(page) if page else "")
         sys.stderr.write(caught.getvalue())
         code = 0 if stop.code in (0, None) else 2
         if code and as_json:

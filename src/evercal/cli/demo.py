@@ -75,7 +75,8 @@ class Demo(Verb):
             f"copied {', '.join(ROOMS)} and the robot cell {folder / 'cell'} to {folder}; the cell"
             " has recordings of a camera on the gripper (wrist) and of a fixed camera (tripod)"
         )
-        print_next("evercal", "learn", "cell.evercal", folder / "cell" / "wrist")
+        wrist = folder / "cell" / "wrist"
+        print_next("evercal", "learn", "cell.evercal", wrist, "--calibration", "wrist.json")
         return 0
 
 

@@ -25,7 +25,7 @@ def grid(columns: int, rows: int) -> np.ndarray:
 def printed(board: Board) -> tuple[np.ndarray, np.ndarray]:
     """Return the print of a board and the (3, 3) map from metres to pixels of the print."""
     side = round(board.size_m * _PER_METRE)
-    image = board_image(board, side // 10 if board.kind == "apriltag" else side)
+    image = board_image(board, side // 8 if board.kind == "apriltag" else side)
     margin = side // 3 if board.kind == "apriltag" else side
     # The black and the white of a real print.
     image = np.pad(image, margin, constant_values=255) // 255 * 210 + 20

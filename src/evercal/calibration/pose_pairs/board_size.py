@@ -72,8 +72,9 @@ def _alike(fit: HandEyeFit) -> float:
 def widened(equation: PoseEquation, fit: HandEyeFit) -> HandEyeFit:
     """Add what errors of an arm that are alike in similar poses do through an unknown size."""
     k = 12 + equation.extras.names.index("size")
-    column = fit.covariance[:, k]
-    added = _alike(fit) * np.outer(column, column) / max(fit.covariance[k, k], 1e-300)
+    # Divided before the product, which overflows where the size is open.
+    column = fit.covariance[:, k] / np.sqrt(max(fit.covariance[k, k], 1e-300))
+    added = _alike(fit) * np.outer(column, column)
     return replace(fit, covariance=fit.covariance + added)
 
 
