@@ -117,7 +117,7 @@ def test_covariance_and_influence_match_their_definitions() -> None:
     without = np.arange(14) != 3
     left_out = refine(equation, fit.at, fit.weights, without)
     moved = left_out.translations[0] - fit.at.translations[0]
-    assert fit.moved[3, :3] == pytest.approx(moved, abs=0.02 * np.linalg.norm(moved))
+    assert fit.moved[3, :3] == pytest.approx(moved, abs=0.02 * float(np.linalg.norm(moved)))
 
 
 def test_one_outlier_is_rejected_by_its_distance() -> None:

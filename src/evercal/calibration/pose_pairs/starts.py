@@ -116,6 +116,7 @@ def _spread(rotations: Array, translations: Array) -> tuple[Array, Array, Array]
     half, rows = min(n, (n + 4) // 2), np.arange(h)[:, None]
     mean_rotation = _nearest(np.median(rotations, 1))
     mean_translation = np.median(translations, 1)
+    spread = np.zeros((2, h))
     for _ in range(3):
         metres2 = ((translations - mean_translation[:, None]) ** 2).sum(-1) + _FLOOR**2
         radians2 = ((rotations - mean_rotation[:, None]) ** 2).sum((-1, -2)) / 2 + _FLOOR**2
@@ -125,7 +126,7 @@ def _spread(rotations: Array, translations: Array) -> tuple[Array, Array, Array]
         nearest = np.argsort(ratio, 1)[:, :half]
         mean_rotation = _nearest(rotations[rows, nearest].mean(1))
         mean_translation = translations[rows, nearest].mean(1)
-    spread = [np.take_along_axis(d, nearest, 1).mean(1) for d in (metres2, radians2)]
+        spread = np.stack([d[rows, nearest].mean(1) for d in (metres2, radians2)])
     return np.log(spread[0]) + np.log(spread[1]), mean_rotation, mean_translation
 
 
