@@ -33,4 +33,4 @@ def load_tensors(path: Path) -> "dict[str, Tensor]":
     try:
         return load(path.read_bytes())
     except (OSError, SafetensorError) as error:
-        raise InputError(f"{path}: not readable ({error}); run 'evercal verify'") from None
+        raise InputError(f"{path}: not readable ({error}); run 'evercal info --check'") from None
