@@ -78,11 +78,16 @@ def drawing(board: Board, paper: str = "a4") -> "tuple[Image, float]":
     """
     from PIL import Image, ImageDraw, ImageFont
 
+    counts = {
+        "chessboard": (board.columns + 1, board.rows + 1),
+        "charuco": (board.columns, board.rows),
+        "apriltag": (1, 1),
+    }
+    width, height = _sheet(board, paper, 1000 * board.size_m * np.array(counts[board.kind]))
     unit_mm = 1000 * board.size_m / _cells(board)
     unit_px = max(1, round(unit_mm * _DPI / 25.4))
     per_mm = unit_px / unit_mm
     picture = board_image(board, unit_px)
-    width, height = _sheet(board, paper, np.array(picture.shape[::-1]) / per_mm)
     page = Image.new("1", (round(width * per_mm), round(height * per_mm)), 1)
     left = (page.width - picture.shape[1]) // 2
     top = (page.height - round(_FOOTER_MM * per_mm) - picture.shape[0]) // 2
