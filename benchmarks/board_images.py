@@ -19,8 +19,8 @@ CHARUCO = Board("charuco", 0.04, 8, 6, 0.03, "5X5_100")
 TAG = Board("apriltag", 0.08, dictionary="APRILTAG_36h11", tag=3)
 _FINER = 4
 """Samples of a pixel along each axis."""
-_TEXELS = 60
-"""Texture pixels along a square, or along two cells of a tag."""
+_TEXELS = 56
+"""Texture pixels along a square, or along two cells of a tag; cells of CHARUCO are whole pixels."""
 
 
 @dataclass(frozen=True)

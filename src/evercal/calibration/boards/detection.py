@@ -183,17 +183,17 @@ def _sharpened(grey: NDArray, view: BoardView, board: Board) -> BoardView:
     """
     import cv2
 
-    homography, _ = cv2.findHomography(view.points_m[:, :2], view.pixels)
-    if homography is None:
+    points, pixels = view.points_m[:, :2] / board.size_m, view.pixels
+    if cv2.findHomography(points, pixels)[0] is None:
         return view
-    along, down = board.size_m * _steps(homography, view.points_m[:, :2])
-    area = np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
-    area = area * (board.size_m - board.marker_m) / (2 * board.size_m)
+    share = (board.size_m - board.marker_m) / (2 * board.size_m)
+    along, down, area = _steps(points, pixels)
     longer = np.maximum(np.abs(along).sum(1), np.abs(down).sum(1))
-    pixels = _in_windows(grey, view.pixels, area / np.maximum(longer, 1e-9))
+    pixels = _in_windows(grey, pixels, share * area / np.maximum(longer, 1e-9))
+    along, down, area = _steps(points, pixels)
     lines = []
     for step in (along, down):
-        free = area / np.maximum(np.linalg.norm(step, axis=1), 1e-9) - _EDGE_BLUR_PX
+        free = share * area / np.maximum(np.linalg.norm(step, axis=1), 1e-9) - _EDGE_BLUR_PX
         reach = np.where(free >= _LEAST_REACH_PX, np.minimum(free, _MOST_REACH_PX), np.nan)
         arms = [
             _edges(grey, pixels + sign * 0.08 * step, pixels + sign * 0.5 * step, reach)
@@ -222,12 +222,16 @@ def _in_windows(grey: NDArray, pixels: Array, free_px: Array) -> Array:
     return refined.astype(np.float64)
 
 
-def _steps(homography: NDArray, points: Array) -> Array:
-    """Return the (2, n, 2) derivatives of pixels by x and y of points (n, 2) on the board."""
+def _steps(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
+    """Return the steps in pixels (n, 2) along x and y of corners (n, 2), and their area (n,)."""
+    import cv2
+
+    homography = cv2.findHomography(points, pixels)[0]
     mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
     depth = mapped[:, 2:]
-    pixels = mapped[:, :2] / depth
-    return np.stack([(h[:2] - pixels * h[2]) / depth for h in (homography[:, 0], homography[:, 1])])
+    projected = mapped[:, :2] / depth
+    along, down = ((h[:2] - projected * h[2]) / depth for h in homography.T[:2])
+    return along, down, np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
 
 
 def _first_square_is_bright(grey: NDArray, grid: Array) -> bool:
