@@ -262,7 +262,7 @@ def ellipsoid_factor(covariance: Array, slopes: Array, uncertainty: Array) -> fl
 
 def normal_inverse(normal: Array) -> Array:
     """Invert (p, p) normal equations; an unconstrained unknown gets a huge variance."""
-    unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-20))
+    unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-200))
     values, axes = np.linalg.eigh(normal * np.outer(unit, unit))
     return np.outer(unit, unit) * ((axes / np.maximum(values, 1e-14)) @ axes.T)
 
