@@ -30,8 +30,6 @@ KINDS = ("translation", "rotation about gripper", "depth", "rotation about board
 _FLOOR = np.diag([1e-14] * 6)
 """Minimum variance of a pose, metres^2 and radians^2, so that exact poses have finite weight."""
 _LEVEL_ROUNDS = 100
-_ABSENT = 1e-3
-"""Share of the noise below which a kind is absent."""
 _COVERAGE = 0.95
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -43,7 +41,7 @@ class NoiseLevels(NamedTuple):
     variance: Array
     """(k,) metres^2 or radians^2, in the order of the kinds; nearly zero for absent kinds."""
     uncertainty: Array
-    """(k, k) covariance of `variance`; zero for kinds that are absent."""
+    """(k, k) covariance of `variance`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,8 +187,7 @@ def estimate_levels(system: System, start: NoiseLevels | None = None) -> NoiseLe
         weight, weighted, inverse = _weighting(system, spreads, variance)
         if (sizes * np.abs(variance - before)).max() <= 2e-3 * (sizes * variance).max():
             break
-    present = sizes * variance > _ABSENT * (sizes @ variance)
-    return NoiseLevels(variance, _level_uncertainty(spreads, weight, weighted, inverse, present))
+    return NoiseLevels(variance, _level_uncertainty(spreads, weight, weighted, inverse))
 
 
 def _first_levels(system: System) -> Array:
@@ -207,24 +204,17 @@ def _weighting(system: System, spreads: Array, variance: Array) -> tuple[Array, 
     return weight, weighted, normal_inverse(_normal(system, weighted))
 
 
-def _level_uncertainty(
-    spreads: Array, weight: Array, weighted: Array, inverse: Array, present: Mask
-) -> Array:
+def _level_uncertainty(spreads: Array, weight: Array, weighted: Array, inverse: Array) -> Array:
     """Return the inverse of the Fisher information of the restricted likelihood."""
-    k = len(spreads)
     turned = spreads @ weight
     own = np.einsum("anij,bnji->ab", turned, turned)
     sides = spreads @ weighted
     shared = np.einsum("anip,nij,bnjq,pq->ab", sides, weight, sides, inverse, optimize=True)
     grams = np.einsum("nip,anij,njq->apq", weighted, spreads, weighted, optimize=True) @ inverse
     gram = own - 2 * shared + np.einsum("apq,bqp->ab", grams, grams)
-    uncertainty = np.zeros((k, k))
-    if present.any():
-        rows = np.ix_(present, present)
-        unit = 1 / np.sqrt(np.maximum(np.diag(gram)[present], 1e-300))
-        scaled = gram[rows] * np.outer(unit, unit) + 1e-9 * np.eye(int(present.sum()))
-        uncertainty[rows] = 2.0 * np.linalg.inv(scaled) * np.outer(unit, unit)
-    return uncertainty
+    unit = 1 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    scaled = gram * np.outer(unit, unit) + 1e-9 * np.eye(len(gram))
+    return 2.0 * np.linalg.inv(scaled) * np.outer(unit, unit)
 
 
 def noise_of(system: System, variance: Array) -> Array:
