@@ -13,8 +13,8 @@ from benchmarks.rows import save
 from evercal.evaluation.metrics import share_inside
 from evercal.features.encoder import Encoder, load_encoder
 from evercal.geometry import pose_distance
+from evercal.learning.fit_acceptance import fit_acceptance
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.fit_acceptance import fit_acceptance
 from evercal.localization.localizer import Localizer
 from evercal.localization.refreshing import refresh_scene
 from evercal.mapping.build import MapOptions, build_map

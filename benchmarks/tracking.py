@@ -10,8 +10,8 @@ from tqdm import tqdm
 from benchmarks.rows import save
 from evercal.features.encoder import load_encoder
 from evercal.geometry import SE3, Camera, pose_distance
+from evercal.learning.fit_acceptance import fit_acceptance
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.fit_acceptance import fit_acceptance
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import TrackedFrame, Tracker, TrackOptions
 from evercal.mapping.build import MapOptions, build_map

@@ -168,7 +168,7 @@ def hall_room() -> BoxRoom:
 def hall_built(hall: Recording, shared: Shared) -> BuiltMap:
     """The map of `hall` with 7 keyframes; its acceptance is fitted to three test frames."""
     from evercal.features.encoder import load_encoder
-    from evercal.localization.fit_acceptance import fit_acceptance
+    from evercal.learning.fit_acceptance import fit_acceptance
     from evercal.mapping.build import MapOptions, build_map
     from evercal.mapping.memory_budget import MemoryBudget
     from evercal.mapping.scene_map import MapContents

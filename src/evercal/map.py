@@ -1,4 +1,4 @@
-"""`Map`: scenes that a robot has learned, and everything that is asked of them.
+"""`Map`: learned scenes, with methods to localize, track and calibrate.
 
 Learning a scene reads through four files: `Map.learn` here, `learning.scene`,
 `mapping.build.build_map`, and `mapping.store.MapStore.commit`. Methods import what they need, so
@@ -161,7 +161,7 @@ class Map:
         on_scene: Callable[[LearnReport], object] = lambda _: None,
         on_progress: OnProgress = lambda *_: None,
     ) -> tuple[LearnReport, ...]:
-        """Learn recordings in several processes at once; the map is as if learned in turn.
+        """Learn recordings in parallel; the result is identical to learning them one by one.
 
         Scenes are added in the order of the recordings. A recording that cannot be used does not
         stop the others.

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3, UncertainPose
+from evercal.learning.fit_acceptance import fit_acceptance, scatter
 from evercal.localization.acceptance import (
     COVARIANCE_SCALE,
     MAX_SUPPORT,
@@ -17,7 +18,6 @@ from evercal.localization.acceptance import (
     support,
     widened,
 )
-from evercal.localization.fit_acceptance import fit_acceptance, scatter
 from evercal.localization.query import Hypothesis
 from evercal.mapping.scene_map import LeftOut, MapContents
 from evercal.recordings.frame import Frame, Recording

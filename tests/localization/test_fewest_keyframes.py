@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evercal.geometry import pose_distance
-from evercal.localization.fewest_keyframes import fewest_keyframes
+from evercal.learning.fewest_keyframes import fewest_keyframes
 from evercal.localization.localizer import Localizer
 from evercal.mapping.build import BuiltMap
 from evercal.mapping.scene_map import MapContents
@@ -39,8 +39,8 @@ def test_all_keyframes_are_kept_if_fewer_are_worse(
     empty: MapContents,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for name, value in {"SHARES": (0.05, 0.2), "MOST_M": 1e-9, "PROBES": 8}.items():
-        monkeypatch.setattr(f"evercal.localization.fewest_keyframes.{name}", value)
+    for name, value in {"SHARES": (0.05, 0.2), "MOST_M": 1e-9, "PROBE_FRAMES": 8}.items():
+        monkeypatch.setattr(f"evercal.learning.fewest_keyframes.{name}", value)
     selected = fewest_keyframes(empty, hall_built, hall.train)
     np.testing.assert_array_equal(selected, np.arange(7))
 

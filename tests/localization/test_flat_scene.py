@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3, Camera
-from evercal.localization.alignment import _self_calibrated as self_calibrated
-from evercal.localization.fit_acceptance import LEAST_SHARED_PX
-from evercal.localization.intrinsics import NOT_STATED, STATED, IntrinsicsPrior, Prior
+from evercal.learning.fit_acceptance import LEAST_SHARED_PX
+from evercal.localization.intrinsics import (
+    NOT_STATED,
+    STATED,
+    IntrinsicsPrior,
+    Prior,
+    self_calibrated,
+)
 from evercal.localization.pose_refinement import Observed
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from evercal.geometry import Camera
+from evercal.learning.fit_acceptance import LEAST_SHARED_PX, shared_px
 from evercal.localization import intrinsics
-from evercal.localization.fit_acceptance import LEAST_SHARED_PX, shared_px
 from evercal.localization.intrinsics import Prior
 from evercal.localization.localizer import Localizer
 from evercal.localization.pose_refinement import MeasuredIntrinsics

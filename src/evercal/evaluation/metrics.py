@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evercal.geometry import SE3
+from evercal.geometry.near import COARSE
 
 Status = Literal["ok", "ambiguous", "unknown_scene", "failed"]
 
-COARSE = (0.05, math.radians(5.0))
-"""5 cm and 5 deg, the threshold of the indoor benchmarks, in metres and radians."""
 MIDDLE = (0.02, math.radians(2.0))
 """2 cm and 2 deg, in metres and radians."""
 FINE = (0.01, math.radians(1.0))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from evercal.geometry import SE3
-from evercal.localization.fit_acceptance import fit_acceptance
+from evercal.learning.fit_acceptance import fit_acceptance
 from evercal.mapping.build import Adjusted, MapOptions, OnProgress, build_map
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -90,7 +90,7 @@ def learn_scene(
     built = build_map(recording.name, split.train, contents.encoder, options, on_progress)
     built = replace(built, scene=replace(built.scene, metric=recording.metric))
     if budget.auto:
-        from evercal.localization.fewest_keyframes import fewest_keyframes
+        from evercal.learning.fewest_keyframes import fewest_keyframes
 
         built = built.take(fewest_keyframes(contents, built, split.train, on_progress))
     scene = fit_acceptance(
@@ -122,7 +122,7 @@ def learn_scene(
 def _sized(options: MapOptions, budget: MemoryBudget, short_side: int) -> MapOptions:
     """Options with the memory of a scene and the working size of a map."""
     if budget.auto:
-        from evercal.localization.fewest_keyframes import MOST_SHARE
+        from evercal.learning.fewest_keyframes import MOST_SHARE
 
         budget = MemoryBudget(share=MOST_SHARE)
     return replace(options, memory=budget, size=replace(options.size, cells=short_side))

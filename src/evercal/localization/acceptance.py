@@ -1,7 +1,8 @@
 """Acceptance: which poses are answers, and how wide their covariance is.
 
-This file holds the formula of the support, its constants and the decision; `fit_acceptance` fits
-the threshold of a scene. `LocalizeOptions` says at which support further attempts are made.
+This file holds the formula of the support, its constants and the decision;
+`learning.fit_acceptance` fits the threshold of a scene. `LocalizeOptions` says at which support
+further attempts are made.
 
 The support of a pose is
 

@@ -7,13 +7,12 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.geometry import SE3, Camera, UncertainPose
-from evercal.localization.intrinsics import SAME_MODEL, UNKNOWN, Prior
+from evercal.geometry import SE3, Camera
+from evercal.localization.intrinsics import Prior, self_calibrated
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import (
     INTRINSICS,
-    MeasuredIntrinsics,
     Observed,
     RefinedPose,
     changed_camera,
@@ -24,19 +23,14 @@ from evercal.mapping.patches import Patches, align_patches, from_level, to_level
 
 Array = NDArray[np.floating]
 
-_STEPS = 10
-"""Gauss-Newton steps of pose and intrinsics, at most."""
 _MOST_AGAIN = 8
 """Searches after a change of the intrinsics, at most."""
 _NOTICEABLE_PX = 0.2
-"""Landmarks are searched again if the intrinsics moved their projections by more than this."""
+"""Shift of projections by the intrinsics above which landmarks are searched again, pixels."""
 _HOPELESS = 0.08
-"""They are not searched again if a smaller share of them are inliers."""
+"""Inlier ratio below which landmarks are not searched again."""
 _FAR_PX = 1.0
-"""They are searched in all rounds, coarse to fine, if it was more than this."""
-_REACHED = 0.05 * 7.815
-"""Probability of another camera from which the covariance has a deviation as large as the distance
-to its pose. That pose is inside the 95 % ellipsoid (chi-squared) where its probability is 5 %."""
+"""Shift above which the coarse round is repeated, pixels."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +159,7 @@ def align_pose(
         if passed is None:
             return None
         pose, found = passed
-        refined = _self_calibrated(found.observed, camera, pose, change, prior)
+        refined = self_calibrated(found.observed, camera, pose, change, prior)
         moved = _moved_px(camera, change, refined.change)
         if moved < _NOTICEABLE_PX:
             break
@@ -190,71 +184,6 @@ def align_pose(
         min(found.expected, options.rounds[-1].landmarks),
         search.target.templates(found.observed.landmark[inliers]),
     )
-
-
-def _self_calibrated(
-    observed: Observed,
-    camera: Camera,
-    pose: SE3,
-    change: Array,
-    prior: Prior,
-) -> RefinedPose:
-    """Pose and intrinsics; the prior gives way where the image contradicts it."""
-    free = refine_pose(observed, camera, pose, _STEPS, prior.free(camera), change)
-    # Errors that neighbouring landmarks share do not average out.
-    by_shared = float((observed.whitening**2).sum()) / (2 * free.variance)
-    shared = 1 + prior.shared_px**2 * by_shared
-    prior = replace(prior, scale=shared * prior.scale)
-    if prior.sigma.other_camera:
-        refined = _own_or_other(observed, camera, pose, free, prior)
-    else:
-        refined = _contradictable(observed, camera, free, prior)
-    squares = free.change @ np.linalg.solve(free.change_covariance, free.change)
-    wider = refined.pose.covariance + (shared - 1) * refined.by_intrinsics
-    return replace(
-        refined,
-        pose=UncertainPose(refined.pose.pose, wider),
-        by_intrinsics=shared * refined.by_intrinsics,
-        change_covariance=shared * refined.change_covariance,
-        measured=MeasuredIntrinsics(float(squares), by_shared),
-    )
-
-
-def _contradictable(
-    observed: Observed, camera: Camera, free: RefinedPose, prior: Prior
-) -> RefinedPose:
-    """Pose and intrinsics under a prior that gives way."""
-    variances = prior.tested(camera, free.change, free.change_covariance)
-    return refine_pose(observed, camera, free.pose.pose, _STEPS, variances, free.change)
-
-
-def _own_or_other(
-    observed: Observed, camera: Camera, pose: SE3, free: RefinedPose, prior: Prior
-) -> RefinedPose:
-    """Pose for the recording's camera; for any camera if another one is more probable.
-
-    A less probable camera widens the covariance, see `_REACHED`.
-    """
-    doubt = prior.other_camera(camera, free.change, free.change_covariance)
-    if doubt > 0.5:
-        return _contradictable(observed, camera, free, replace(prior, sigma=UNKNOWN))
-    own = refine_pose(observed, camera, pose, _STEPS, prior.tight(camera))
-    other = _contradictable(observed, camera, free, replace(prior, sigma=SAME_MODEL))
-    # Covariances are scaled by the caller, distances are not.
-    apart = _apart(own.pose.pose, other.pose.pose) / prior.scale
-    more = min(1.0, doubt / _REACHED) * (other.by_intrinsics - own.by_intrinsics + apart)
-    return replace(
-        own,
-        pose=UncertainPose(own.pose.pose, own.pose.covariance + more),
-        by_intrinsics=own.by_intrinsics + more,
-    )
-
-
-def _apart(kept: SE3, other: SE3) -> Array:
-    """(6, 6) covariance whose deviation reaches from one pose to another."""
-    turn = (kept.inverse() @ other).log()[3:]
-    off = np.r_[other.translation_m - kept.translation_m, turn]
-    return np.outer(off, off)
 
 
 def _moved_px(camera: Camera, before: Array, after: Array) -> float:

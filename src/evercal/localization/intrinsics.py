@@ -1,4 +1,4 @@
-"""What is known of a camera's intrinsics before an image is located, and how far that is believed.
+"""Priors on the intrinsics of a query image.
 
 A stated focal length is a prior and not a fact. The landmarks of an image measure the intrinsics
 together with the pose, to a thousandth. Where they contradict the prior, the prior gives way.
@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from scipy.special import expit, logit
 
 from evercal.errors import InputError
-from evercal.geometry import Camera
+from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.localization.pose_refinement import (
+    MeasuredIntrinsics,
+    Observed,
+    RefinedPose,
+    refine_pose,
+)
 from evercal.mapping.scene_map import SHARED_PX
 
 if TYPE_CHECKING:
@@ -25,6 +31,12 @@ CONTRADICTED = 15.1
 """Squared deviation of all five, above which no prior holds: the 99 % quantile (chi-squared)."""
 DOUBT = 3.0
 """Squared deviations from the prior, in standard deviations, from which it gives way."""
+
+_REFINE_STEPS = 10
+"""Gauss-Newton steps of pose and intrinsics, at most."""
+_REACHED = 0.05 * 7.815
+"""Posterior probability of a different camera at which the covariance is inflated to include that
+camera's pose: the 95 % ellipsoid (chi-squared) reaches it where the probability is 5 %."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +123,71 @@ def _log_density(change: Array, covariance: Array) -> float:
     """Logarithm of a Gaussian density about zero, without its constant."""
     squares = change @ np.linalg.solve(covariance, change)
     return float(-(squares + np.linalg.slogdet(covariance)[1]) / 2)
+
+
+def self_calibrated(
+    observed: Observed,
+    camera: Camera,
+    pose: SE3,
+    change: Array,
+    prior: Prior,
+) -> RefinedPose:
+    """Pose and intrinsics; the prior gives way where the image contradicts it."""
+    free = refine_pose(observed, camera, pose, _REFINE_STEPS, prior.free(camera), change)
+    # Errors that neighbouring landmarks share do not average out.
+    by_shared = float((observed.whitening**2).sum()) / (2 * free.variance)
+    shared = 1 + prior.shared_px**2 * by_shared
+    prior = replace(prior, scale=shared * prior.scale)
+    if prior.sigma.other_camera:
+        refined = _own_or_other(observed, camera, pose, free, prior)
+    else:
+        refined = _contradictable(observed, camera, free, prior)
+    squares = free.change @ np.linalg.solve(free.change_covariance, free.change)
+    wider = refined.pose.covariance + (shared - 1) * refined.by_intrinsics
+    return replace(
+        refined,
+        pose=UncertainPose(refined.pose.pose, wider),
+        by_intrinsics=shared * refined.by_intrinsics,
+        change_covariance=shared * refined.change_covariance,
+        measured=MeasuredIntrinsics(float(squares), by_shared),
+    )
+
+
+def _contradictable(
+    observed: Observed, camera: Camera, free: RefinedPose, prior: Prior
+) -> RefinedPose:
+    """Pose and intrinsics under a prior that gives way."""
+    variances = prior.tested(camera, free.change, free.change_covariance)
+    return refine_pose(observed, camera, free.pose.pose, _REFINE_STEPS, variances, free.change)
+
+
+def _own_or_other(
+    observed: Observed, camera: Camera, pose: SE3, free: RefinedPose, prior: Prior
+) -> RefinedPose:
+    """Pose for the recording's camera; for any camera if another one is more probable.
+
+    A less probable camera widens the covariance, see `_REACHED`.
+    """
+    doubt = prior.other_camera(camera, free.change, free.change_covariance)
+    if doubt > 0.5:
+        return _contradictable(observed, camera, free, replace(prior, sigma=UNKNOWN))
+    own = refine_pose(observed, camera, pose, _REFINE_STEPS, prior.tight(camera))
+    other = _contradictable(observed, camera, free, replace(prior, sigma=SAME_MODEL))
+    # Covariances are scaled by the caller, distances are not.
+    apart = _apart(own.pose.pose, other.pose.pose) / prior.scale
+    more = min(1.0, doubt / _REACHED) * (other.by_intrinsics - own.by_intrinsics + apart)
+    return replace(
+        own,
+        pose=UncertainPose(own.pose.pose, own.pose.covariance + more),
+        by_intrinsics=own.by_intrinsics + more,
+    )
+
+
+def _apart(kept: SE3, other: SE3) -> Array:
+    """(6, 6) covariance whose deviation reaches from one pose to another."""
+    turn = (kept.inverse() @ other).log()[3:]
+    off = np.r_[other.translation_m - kept.translation_m, turn]
+    return np.outer(off, off)
 
 
 def cameras_in_scenes(

@@ -482,5 +482,5 @@ class Localizer:
 
 
 def _rival_reason(mm: float, deg: float, unit_known: bool) -> str:
-    away = f"{mm:.0f} mm and {deg:.1f} deg away" if unit_known else f"{deg:.1f} deg away"
-    return f"another pose, {away}, explains it as well"
+    away = f"{mm:.0f} mm, {deg:.1f} deg away" if unit_known else f"{deg:.1f} deg away"
+    return f"ambiguous: a second pose {away} fits equally well"

@@ -47,7 +47,7 @@ class LocalizeOptions:
     aligned_inliers: int = 12
     """Poses with fewer PnP inliers are not aligned."""
     promising_inliers: int = 16
-    """Images whose quick attempts end with fewer PnP inliers show no known place."""
+    """Images with fewer PnP inliers after the quick attempts are rejected."""
     immediate: float = 3.0
     """A pose of the first attempt is final if its support is this many times the threshold.
     Otherwise the second attempt runs and the pose with more support is taken."""

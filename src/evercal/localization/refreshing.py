@@ -65,7 +65,7 @@ class RefreshReport:
 
 
 @dataclass(frozen=True, eq=False)
-class _Located:
+class _NewImage:
     """A new image in the map."""
 
     frame: Frame
@@ -156,7 +156,7 @@ def _usable(
     images: Sequence[tuple[str, NDArray[np.uint8]]],
     estimates: Sequence[PoseEstimate],
     scene: SceneMap,
-) -> tuple[list[_Located], dict[str, str]]:
+) -> tuple[list[_NewImage], dict[str, str]]:
     """Return the precisely located images of a scene, and why others are left out."""
     located, left_out = [], {}
     for (name, image), estimate in zip(images, estimates, strict=True):
@@ -171,7 +171,7 @@ def _usable(
             pose = scene.frame.from_base(answer.pose)
             camera = estimate.camera or scene.adjusted_camera
             camera = camera.resized(image.shape[1], image.shape[0])
-            located.append(_Located(Frame(name, image, camera, pose), answer))
+            located.append(_NewImage(Frame(name, image, camera, pose), answer))
     return located, left_out
 
 
@@ -183,7 +183,7 @@ def _precise(estimate: PoseEstimate, scene: SceneMap) -> bool:
 
 
 def _verified(
-    after: Localizer, check: Sequence[_Located], camera: Camera | None, scene: str
+    after: Localizer, check: Sequence[_NewImage], camera: Camera | None, scene: str
 ) -> tuple[SE3, NDArray[np.float64], int]:
     """Locate images outside the refreshed map; return shift, its standard deviation, and count."""
     moves = []

@@ -27,7 +27,7 @@ from evercal.recordings.images import as_rgb
 TrackState = Literal["tracking", "relocalized", "lost"]
 _SEARCHING = "localization takes longer than the time for a frame"
 _MARGIN = 1.3
-"""An alignment may take so many times as long as the last one."""
+"""Time allowance for an alignment, relative to the previous one."""
 _ANSWER_S = 0.002
 """Time to answer after waiting."""
 
@@ -51,7 +51,7 @@ class TrackOptions:
     reach_deg: float = 8.0
     """The same for the rotation."""
     settled: float = 2.0
-    """The prediction counts if the last support was so many times the threshold."""
+    """Minimum support of the last pose, relative to the threshold, for using it as a prior."""
     at_most_ms: float | None = None
     """Time for a frame. Where alignment fails, the frame is located in the background, and frames
     are answered as `lost` meanwhile, see `PoseEstimate.omitted`. One alignment always runs."""

@@ -26,10 +26,11 @@ SMOOTHING = 0.7
 """Share of a cell's neighbours in its similarity."""
 PARALLAX_RAD = np.deg2rad([4.0, 20.0, 35.0])
 """Parallax of a good view: at least the first, at most the second, useless from the third on."""
-MIN_SHARED = 0.1
+MIN_USEFULNESS = 0.1
 """Smallest mean usefulness of a source view."""
-PROBES = 64
-MIN_SIMILARITY = 0.4
+PROBED_CELLS = 64
+"""Cells of a view that are projected into other views."""
+MIN_PEAK_SIMILARITY = 0.4
 OUTLIER_PX = 4.0
 """Residuals beyond this have little weight in the refinement."""
 
@@ -67,7 +68,7 @@ def select_source_views(
 
     Rough depths (h * w,) are those of the cells of the view; poses (n,) are base_from_camera.
     """
-    some = np.linspace(0, len(depth_m) - 1, PROBES).astype(int)
+    some = np.linspace(0, len(depth_m) - 1, PROBED_CELLS).astype(int)
     points = view.base_from_camera.apply(view.rays()[some] * depth_m[some, None])
     own = points - view.base_from_camera.translation_m
     own /= np.linalg.norm(own, axis=-1, keepdims=True)
@@ -86,7 +87,7 @@ def select_source_views(
     useful = np.clip(parallax / few, 0, 1) * np.clip((many - parallax) / (many - enough), 0, 1)
     usefulness = np.where(visible, useful, 0).mean(-1)
     best = np.argsort(-usefulness, kind="stable")[:count]
-    return [int(i) for i in best if usefulness[i] > MIN_SHARED]
+    return [int(i) for i in best if usefulness[i] > MIN_USEFULNESS]
 
 
 def inverse_depths(
@@ -175,7 +176,7 @@ class _SourceView:
         column, row = cell.clamp(min=1).minimum(last.float()).long().unbind(1)
         position, similarity = peak(self.similarity, row, column)
         residual = stride * position + (stride - 1) / 2 - here
-        weight = inside * (similarity - MIN_SIMILARITY).clamp(min=0) ** 2
+        weight = inside * (similarity - MIN_PEAK_SIMILARITY).clamp(min=0) ** 2
         weight = weight / (1 + (residual.norm(dim=1) / OUTLIER_PX) ** 2)
         return weight * (slope * residual).sum(1), weight * (slope * slope).sum(1)
 

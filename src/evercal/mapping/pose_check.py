@@ -38,13 +38,13 @@ MAX_DISTANCE_PX = 6.0
 at the encoder's working size."""
 MAX_SIFT_PX = 3.0
 """The same for SIFT matches, which are more exact."""
-MIN_SIMILARITY = 0.6
+MIN_MATCH_SIMILARITY = 0.6
 """Smallest cosine of matched features."""
 MIN_MATCHES = 30
 """Pairs with fewer mutual matches are ignored."""
 RATIO, NEIGHBOURS = 0.9, 2.5
-"""A match is used if no cell beyond so many cells from it is nearly as similar: the distance of
-features is below this ratio (Lowe, IJCV 2004). Repeated texture would contradict right poses."""
+"""Ratio test (Lowe, IJCV 2004); cells within this radius of a match are not compared. Repeated
+texture would contradict right poses."""
 STRIDE = 3
 """Step between the cells of the first frame that are matched."""
 
@@ -171,7 +171,7 @@ def _matched(recording: PreparedFrames, i: int, j: int) -> MatchedPair:
     best = similar.max(1)
     back = similar.argmax(0)
     rows = torch.arange(len(a))
-    mutual = (back[best.indices] == rows) & (best.values > MIN_SIMILARITY)
+    mutual = (back[best.indices] == rows) & (best.values > MIN_MATCH_SIMILARITY)
     stride = recording.encoder.stride
     camera, other = recording.cell_camera(i), recording.cell_camera(j)
     rows = rows[mutual]

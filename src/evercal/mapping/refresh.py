@@ -27,6 +27,7 @@ from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import PoseSpace, select_farthest
 from evercal.mapping.tracks import (
     REACH_PX,
+    WIDE_STEPS,
     KeyframeTracks,
     bundle_tracks,
     observe,
@@ -53,9 +54,9 @@ class RefreshOptions:
     least_surviving: float = 0.6
     """A keyframe with a smaller share of surviving landmarks leaves."""
     richer: float = 1.25
-    """A keyframe leaves for the nearest new image with so many times its surviving landmarks."""
+    """A keyframe is replaced if the nearest new image has this many times more landmarks."""
     novel: float = 1.5
-    """An image is new ground if the nearest keyframe is this many usual steps away."""
+    """Distance, in median keyframe spacings, beyond which an image counts as unexplored."""
     most_novel: float = 0.25
     """Share of the keyframes that leave for new ground in one refresh, at most."""
     bundle: BundleOptions = field(default_factory=lambda: BundleOptions(intrinsics=False))
@@ -180,14 +181,10 @@ def _survival(
         if not len(similar):
             continue
         expected[similar] += 1
-        observed = observe(prepared, keyframe, j, every[similar], _STEPS, REACH_PX)
+        observed = observe(prepared, keyframe, j, every[similar], WIDE_STEPS, REACH_PX)
         found[observed.landmark] += 1
     checked = (expected >= options.looks) | (found > 0)
     return _Survival(checked, ~checked | (found > 0))
-
-
-_STEPS = ((2, 4), (1, 4), (0, 4))
-"""Pyramid levels and iterations of alignment."""
 
 
 def _selected(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from evercal.mapping.bundle_equations import BundleTracks
 from evercal.mapping.landmarks import Landmarks, detect, project_surface, slopes
 from evercal.mapping.patches import Patches, align_down, cut_patches, to_level, whitening
-from evercal.mapping.plane_sweep import FAR_M, NEAR_M
+from evercal.mapping.plane_sweep import FAR_M, NEAR_M, PROBED_CELLS
 from evercal.mapping.prepared_frames import PYRAMID_LEVELS, PreparedFrames
 
 Array = NDArray[np.floating]
@@ -25,14 +25,12 @@ _DEPTH_ROUNDS: tuple[tuple[Steps, int], ...] = (
     (((0, 4),), 2),
 )
 """Rounds of depth refinement: alignment, and the number of Gauss-Newton steps after it."""
-_WIDE_STEPS: Steps = ((2, 4), (1, 4), (0, 4))
-_PROBES = 64
-"""Cells of a keyframe that are projected into other frames to measure the shared view."""
+WIDE_STEPS: Steps = ((2, 4), (1, 4), (0, 4))
 _FAR_OFF_PX = 1e3
 """Residual of a landmark that the distortion of a camera has no pixel for."""
 _OUTLIER_SQUARES = 16.0
 """Squared whitened residual above which an observation does not count."""
-SOURCE_VIEWS = 12
+SWEPT_FRAMES = 12
 """Frames that the depths of a keyframe are swept over, at most."""
 MIN_CORRELATION = 0.8
 """Smallest normalised cross-correlation of an observation."""
@@ -46,7 +44,7 @@ LANDMARKS_PER_KEYFRAME = 200
 """Landmarks of a keyframe in bundle adjustment, at most."""
 BUNDLE_LANDMARKS = 6000
 """Landmarks of all keyframes in bundle adjustment, at most."""
-MIN_SHARED = 0.15
+MIN_SHARED_VIEW = 0.15
 """Share of a keyframe's view that a frame tied to it must show."""
 FLOOR_PX = 0.1
 """Alignment error of a perfect patch where the noise is 1, pixels: 0.08 px where it is 0.8."""
@@ -92,9 +90,9 @@ class Observations(NamedTuple):
 def open_keyframe(recording: PreparedFrames, frame: int) -> KeyframeTracks:
     """Landmarks of a keyframe, with depths from a plane sweep over other frames."""
     view = recording.posed_cells(frame)
-    swept, _ = recording.swept(frame, SOURCE_VIEWS)
+    swept, _ = recording.swept(frame, SWEPT_FRAMES)
     inverse = swept.double().numpy()
-    near = recording.source_views(1 / inverse, view, SOURCE_VIEWS)
+    near = recording.source_views(1 / inverse, view, SWEPT_FRAMES)
     cell_px = recording.cell_px(frame)
     pixels, cells = detect(recording.grey[frame], view.grid, cell_px)
     has_ray = np.isfinite(recording.cameras[frame].unproject(pixels)).all(1)
@@ -174,7 +172,7 @@ def bundle_tracks(recording: PreparedFrames, keyframes: list[KeyframeTracks]) ->
         number = np.full(len(keyframe.landmarks), -1)
         number[which] = start + np.arange(len(which))
         for j in frames:
-            observed = observe(recording, keyframe, j, which, _WIDE_STEPS, WIDE_REACH_PX)
+            observed = observe(recording, keyframe, j, which, WIDE_STEPS, WIDE_REACH_PX)
             parts.append(observed._replace(landmark=number[observed.landmark]))
         host.append(np.full(len(which), keyframe.frame))
         pixels.append(keyframe.landmarks.pixels[which])
@@ -210,7 +208,7 @@ def _tied_frames(recording: PreparedFrames, keyframes: list[KeyframeTracks]) -> 
     best = np.argsort(-shared, axis=0, kind="stable")[:FRAMES_PER_KEYFRAME]
     tied = np.zeros(shared.shape, bool)
     np.put_along_axis(tied, best, True, axis=0)
-    tied &= shared > MIN_SHARED
+    tied &= shared > MIN_SHARED_VIEW
     return [
         sorted({*np.flatnonzero(row).tolist(), *keyframe.sources} - {keyframe.frame})
         for row, keyframe in zip(tied, keyframes, strict=True)
@@ -220,7 +218,7 @@ def _tied_frames(recording: PreparedFrames, keyframes: list[KeyframeTracks]) -> 
 def _shared_view(recording: PreparedFrames, keyframe: KeyframeTracks) -> np.ndarray:
     """(n,) share of a keyframe's view that each frame shows from a similar direction."""
     cells, poses = recording.posed_cells(keyframe.frame), recording.poses
-    some = np.linspace(0, len(keyframe.cell_inverse_depth) - 1, _PROBES).astype(int)
+    some = np.linspace(0, len(keyframe.cell_inverse_depth) - 1, PROBED_CELLS).astype(int)
     local = cells.rays()[some] / keyframe.cell_inverse_depth[some, None]
     points = cells.base_from_camera.apply(local)
     direction = points[None] - poses.translation_m[:, None]

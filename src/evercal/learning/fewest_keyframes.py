@@ -18,7 +18,7 @@ MOST_SHARE = 0.3
 """Share of the frames that are keyframes at first."""
 SHARES = (0.05, 0.07, 0.1, 0.14, 0.2, MOST_SHARE)
 """Shares of the frames that are tried, smallest first."""
-PROBES = 60
+PROBE_FRAMES = 60
 """Other frames that are located, spread over the recording."""
 LEAST_LOCATED = 0.98
 """Share of the probes located by all keyframes that a subset must locate as well."""
@@ -40,7 +40,7 @@ def fewest_keyframes(
     others = [frame for frame in frames if frame.name not in set(built.keyframe_names)]
     poses = built.scene.keyframes.base_from_camera
     everything = np.arange(len(poses))
-    spread = np.linspace(0, len(others) - 1, min(PROBES, len(others))).round().astype(int)
+    spread = np.linspace(0, len(others) - 1, min(PROBE_FRAMES, len(others))).round().astype(int)
     located = _located(contents, built, everything, [others[i] for i in spread])
     probes = [others[i] for i, pose in zip(spread, located, strict=True) if pose is not None]
     reference = [pose for pose in located if pose is not None]

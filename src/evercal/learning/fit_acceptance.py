@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evercal.geometry.near import NEAR_M, NEAR_RAD
+from evercal.geometry.near import COARSE
 from evercal.localization.acceptance import COVARIANCE_SCALE, MAX_SUPPORT, MIN_SUPPORT
 from evercal.localization.localizer import Localizer
 from evercal.localization.pose_refinement import MeasuredIntrinsics
@@ -18,8 +18,8 @@ AGREE_SQUARES = 7.29
 LEAST_SHARED_PX = 0.01
 """Frames near the recorded path agree better than others, so no map counts as more exact."""
 LEAST_ANSWERS, WRONG_PLACE_M = 8, 0.5
-"""The scatter is fitted to so many answers, at least. Answers farther from their stated pose are
-wrong, or the pose is, and say nothing about its scatter."""
+"""Least number of answers that the scatter is fitted to. Answers farther than this from the stated
+pose are outliers and are ignored."""
 
 
 def fit_acceptance(
@@ -92,7 +92,7 @@ class _Answer(NamedTuple):
     def near(self, metric: bool) -> bool:
         """Whether the frame is well located; by its rotation where the unit is unknown."""
         metres, radians = np.linalg.norm(self.off.reshape(2, 3), axis=1)
-        return bool((metres < NEAR_M or not metric) and radians < NEAR_RAD)
+        return bool((metres < COARSE[0] or not metric) and radians < COARSE[1])
 
 
 def _located(contents: MapContents, frames: Sequence[Frame], scene: str) -> list[_Answer]:
