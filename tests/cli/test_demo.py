@@ -94,7 +94,9 @@ def test_copied_samples_are_recordings_and_nothing_else(
     assert [path.name for path in tmp_path.iterdir()] == ["samples"]
     names = sorted(path.name for path in (tmp_path / "samples").iterdir())
     assert names == ["bedroom", "cell", "kitchen", "living"]
-    assert ran.out.splitlines()[-1] == "next: evercal learn cell.evercal samples/cell/wrist"
+    assert ran.out.splitlines()[-1] == (
+        "next: evercal learn cell.evercal samples/cell/wrist --calibration wrist.json"
+    )
     for folder in ("kitchen", "cell/wrist"):
         assert run("inspect", f"samples/{folder}").code == 0
     again = run("demo", "--copy-samples", "samples", "--json")
