@@ -30,6 +30,9 @@ os.environ["EVERCAL_PRECISION"] = "float32"
 os.environ |= {"OPENBLAS_CORETYPE": "", "MKL_CBWR": ""}
 
 from .chromium import CHROMIUM, chromium
+from .slow import pytest_addoption, pytest_collection_modifyitems, pytest_sessionfinish
+
+__all__ = ("pytest_addoption", "pytest_collection_modifyitems", "pytest_sessionfinish")
 
 if TYPE_CHECKING:
     import torch

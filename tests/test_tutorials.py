@@ -20,6 +20,7 @@ from docs._site.notebooks import NOTEBOOKS, Step, notebook_of, parts
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "tutorials"
+slow = pytest.mark.slow("docs/tutorials", "docs/_site")
 PORT = "8000"
 """Port on the pages; tests use a free one."""
 TIMEOUT_S = 1800
@@ -126,6 +127,7 @@ def test_notebooks_hold_all_that_their_pages_hold() -> None:
                 assert part.text.strip() in cell["source"]
 
 
+@slow
 def test_a_wrist_camera_from_nothing(tmp_path: Path) -> None:
     printed = run_notebook("wrist-camera", tmp_path)
     shift = re.search(r"moved by ([\d.]+) mm", printed)
@@ -135,6 +137,7 @@ def test_a_wrist_camera_from_nothing(tmp_path: Path) -> None:
     assert (tmp_path / "report.html").is_file()
 
 
+@slow
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
 def test_a_fleet(tmp_path: Path) -> None:
     pytest.importorskip("fastapi")
@@ -144,6 +147,7 @@ def test_a_fleet(tmp_path: Path) -> None:
     assert "kitchen [" in printed  # the answer of the client
 
 
+@slow
 def test_from_a_phone_video_to_a_calibrated_camera(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     printed = run_notebook("phone-video", tmp_path)
@@ -153,7 +157,7 @@ def test_from_a_phone_video_to_a_calibrated_camera(tmp_path: Path) -> None:
     assert float(error[1]) < 20
 
 
-@pytest.mark.slow
+@slow
 def test_a_method_of_your_own(tmp_path: Path) -> None:
     printed = run("own-method", tmp_path)
     assert "mine" in printed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from evercal.features.encoder import load_encoder
 from evercal.features.weights_file import network_bytes
 from evercal.learning.many import LearnTask, learn_scenes
 from evercal.map import Map
+from evercal.mapping.build import MapOptions
 from evercal.mapping.scene_map import MapContents
 from evercal.recordings import Recording
 from evercal.recordings.images import StoredImage
@@ -48,29 +50,23 @@ def deadly(recording: Recording, marks: Path, times: int) -> Recording:
     return replace(recording, train=(replace(first, image=image), *recording.train[1:]))
 
 
-def test_the_map_is_that_of_learning_in_turn(rooms: tuple[Recording, ...], tmp_path: Path) -> None:
-    turn, many = Map.open(tmp_path / "turn"), Map.open(tmp_path / "many")
-    for recording in rooms[:2]:
-        turn.learn(recording)
-    seen, steps = [], []
-    reports = many.learn_many(
-        rooms[:2],
-        workers=2,
-        on_scene=lambda report: seen.append(report.scene),
-        on_progress=lambda *step: steps.append(step),
-    )
-    assert [report.scene for report in reports] == seen == ["alpha", "beta"]
-    assert steps == [("learning", i, 2) for i in range(3)]
-    assert reports[0].memory_bytes < reports[1].memory_bytes
-    for stage in ("0001-alpha", "0002-beta"):
-        for name in ("keyframes.safetensors", "scene.json"):
-            one, other = (tmp_path / root / "stages" / stage / name for root in ("turn", "many"))
-            assert one.read_bytes() == other.read_bytes()
+QUICK = MapOptions(adjust=False)
 
 
-def test_scenes_of_another_encoder_share_their_centroids(
-    rooms: tuple[Recording, ...], tmp_path: Path
-) -> None:
+@pytest.fixture(scope="module")
+def small(rooms: tuple[Recording, ...]) -> tuple[Recording, ...]:
+    """`rooms` with as few frames as a map needs."""
+    return tuple(replace(room, train=room.train[:16], test=()) for room in rooms)
+
+
+@pytest.fixture(scope="module")
+def few(small: tuple[Recording, ...]) -> Recording:
+    """A recording of too few frames: it is refused at once."""
+    return replace(small[0], name="few", train=small[0].train[:3])
+
+
+def test_the_map_is_that_of_learning_in_turn(small: tuple[Recording, ...], tmp_path: Path) -> None:
+    # The first recording of another encoder determines the centroids of all scenes.
     encoder = load_encoder()
     with torch.no_grad():
         next(encoder.parameters()).mul_(1.001)  # pyright: ignore[reportAttributeAccessIssue]
@@ -78,25 +74,38 @@ def test_scenes_of_another_encoder_share_their_centroids(
     turn, many = (
         Map.open(tmp_path / name, encoder=tmp_path / "own.safetensors") for name in ("turn", "many")
     )
-    for recording in rooms[:2]:
-        turn.learn(recording)
-    many.learn_many(rooms[:2], workers=1)
-    for stage in ("0001-alpha", "0002-beta"):
-        one, other = (
-            tmp_path / root / "stages" / stage / "keyframes.safetensors"
-            for root in ("turn", "many")
-        )
-        assert one.read_bytes() == other.read_bytes()
+    for recording in small:
+        turn.learn(recording, options=QUICK)
+    seen, steps = [], []
+    reports = many.learn_many(
+        small,
+        workers=2,
+        options=QUICK,
+        on_scene=lambda report: seen.append(report.scene),
+        on_progress=lambda *step: steps.append(step),
+    )
+    assert [report.scene for report in reports] == seen == ["alpha", "beta", "gamma"]
+    assert steps == [("learning", i, 3) for i in range(4)]
+    assert reports[0].memory_bytes < reports[1].memory_bytes < reports[2].memory_bytes
+    for stage in ("0001-alpha", "0002-beta", "0003-gamma"):
+        for name in ("keyframes.safetensors", "scene.json"):
+            one, other = (tmp_path / root / "stages" / stage / name for root in ("turn", "many"))
+            assert one.read_bytes() == other.read_bytes()
 
 
-def test_an_unusable_recording_does_not_stop_the_others(
-    rooms: tuple[Recording, ...], tmp_path: Path
+def test_unusable_recordings_and_killed_workers_do_not_stop_the_others(
+    small: tuple[Recording, ...], few: Recording, tmp_path: Path
 ) -> None:
-    few = replace(rooms[0], name="few", train=rooms[0].train[:3])
+    once = deadly(small[0], tmp_path / "once", 1)
+    always = deadly(small[2], tmp_path / "always", 99)
     opened = Map.open(tmp_path / "map")
-    with pytest.raises(InputError, match=r"1 of 3 recordings were not learned: few \(.*3 "):
-        opened.learn_many((rooms[0], few, rooms[1]), workers=2)
+    with pytest.raises(InputError, match=r"2 of 4 recordings were not learned") as error:
+        opened.learn_many((once, few, always, small[1]), workers=2, options=QUICK)
+    assert re.search(r"few \(.*3 training", str(error.value))
+    assert re.search(r"gamma \(.*killed 3 times", str(error.value))
     assert opened.scenes == Map.open(tmp_path / "map").scenes == ("alpha", "beta")
+    assert len(list((tmp_path / "once").iterdir())) == 1
+    assert len(list((tmp_path / "always").iterdir())) in (2, 3)  # the first kill ended both
 
 
 def test_names_are_checked_before_anything_is_learned(
@@ -109,38 +118,19 @@ def test_names_are_checked_before_anything_is_learned(
     assert not (tmp_path / "map/manifest.json").exists()
 
 
-def test_a_killed_worker_is_replaced(rooms: tuple[Recording, ...], tmp_path: Path) -> None:
-    once = deadly(rooms[0], tmp_path / "marks", 1)
-    opened = Map.open(tmp_path / "map")
-    reports = opened.learn_many((once, rooms[1]), workers=2)
-    assert [report.scene for report in reports] == ["alpha", "beta"]
-    assert len(list((tmp_path / "marks").iterdir())) == 1
-
-
 def test_a_worker_killed_while_the_caller_writes_a_scene_is_replaced(
-    rooms: tuple[Recording, ...],
+    small: tuple[Recording, ...], few: Recording
 ) -> None:
-    many = [replace(rooms[0], name=f"{i}") for i in range(3)]
-    outcomes = learn_scenes(LearnTask(MapContents(load_encoder(), 240)), many, 2)
+    task = LearnTask(MapContents(load_encoder(), 240), options=QUICK)
+    outcomes = learn_scenes(task, (few, small[0], few), 2)
     first = next(iter(outcomes))
     for child in children_of(os.getpid()):
         if is_worker(child):
             os.kill(child, signal.SIGKILL)
     time.sleep(2.0)  # until the pool has noticed
     rest = list(outcomes)
-    assert sorted(outcome.number for outcome in (first, *rest)) == [0, 1, 2]
-    assert all(outcome.scene is not None for outcome in (first, *rest))
-
-
-def test_a_recording_that_always_kills_is_given_up(
-    rooms: tuple[Recording, ...], tmp_path: Path
-) -> None:
-    always = deadly(rooms[0], tmp_path / "marks", 99)
-    opened = Map.open(tmp_path / "map")
-    with pytest.raises(InputError, match=r"alpha .*killed 3 times"):
-        opened.learn_many((always, rooms[1]), workers=2)
-    assert opened.scenes == ("beta",)
-    assert len(list((tmp_path / "marks").iterdir())) == 3
+    learned = {outcome.number: outcome.scene is not None for outcome in (first, *rest)}
+    assert learned == {0: False, 1: True, 2: False}
 
 
 PARENT = """
@@ -193,9 +183,9 @@ def wait_for(condition):
     return value
 
 
-def test_stopping_early_ends_the_workers(rooms: tuple[Recording, ...]) -> None:
-    many = [replace(rooms[0], name=f"{i}") for i in range(4)]
-    outcomes = learn_scenes(LearnTask(MapContents(load_encoder(), 240)), many, 1)
-    assert next(iter(outcomes)).scene is not None
+def test_stopping_early_ends_the_workers(small: tuple[Recording, ...], few: Recording) -> None:
+    task = LearnTask(MapContents(load_encoder(), 240), options=QUICK)
+    outcomes = learn_scenes(task, (few, *small), 2)
+    assert next(iter(outcomes)).error
     outcomes.close()  # pyright: ignore[reportAttributeAccessIssue]
     wait_for(lambda: not [c for c in children_of(os.getpid()) if is_worker(c)])

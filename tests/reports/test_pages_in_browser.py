@@ -15,7 +15,7 @@ from evercal.reports.page import Picture, Table
 from .test_calibration_page import full, read, solved
 from .test_page import PNG, page
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow("src/evercal/reports/templates")
 
 CONTRAST = """() => {
   const levels = c => c.match(/[\\d.]+/g).map(Number);

@@ -65,7 +65,7 @@ def test_malformed_requests(narrow: Any, image: Path) -> None:
     assert row["status"] == "ok"
 
 
-@pytest.mark.slow
+@pytest.mark.slow("src/evercal/service")
 def test_a_thousand_malformed_requests(narrow: Any) -> None:
     print(statuses(narrow, range(100, 1100)))  # noqa: T201
 

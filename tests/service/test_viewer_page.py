@@ -149,7 +149,7 @@ def test_names_of_files_are_no_markup() -> None:
     assert "<script>" not in page
 
 
-@pytest.mark.slow
+@pytest.mark.slow("src/evercal/service/viewer")
 def test_a_browser_shows_the_map_and_a_tracked_camera(
     localizer: Localizer, hall: Recording, browser: Any, tmp_path: Path
 ) -> None:

@@ -138,7 +138,7 @@ def test_reserved_seeds_are_refused() -> None:
         VirtualCell(9000)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("src/evercal/simulation")
 def test_the_whole_chain_finds_the_truth(tmp_path: Path) -> None:
     """Wrist recording to mount and fixed camera: within 1 mm and 0.05 deg."""
     from evercal import Map

@@ -213,7 +213,7 @@ def test_training_lowers_the_loss(data: PretrainData, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("small")
-@pytest.mark.slow
+@pytest.mark.slow("training")
 def test_training_starts_from_an_earlier_run(
     data: PretrainData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

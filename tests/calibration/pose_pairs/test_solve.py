@@ -259,7 +259,7 @@ def test_franka_beside_the_camera() -> None:
     assert tags.translation_m.std(0).max() < 0.003
 
 
-@pytest.mark.slow
+@pytest.mark.slow("src/evercal/calibration/pose_pairs", "src/evercal/calibration/boards")
 def test_kuka() -> None:
     calibration, boards = solve_real(
         "kuka_eye_in_hand", "eye_in_hand", Board("chessboard", 0.015, 24, 17), None

@@ -44,7 +44,7 @@ def comparable(folder: Path) -> pd.DataFrame:
     return read(folder).drop(columns="seconds").sort_values(KEY, ignore_index=True)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("src/evercal/continual/benchmark")
 def test_cluster_gives_the_results_of_a_loop(
     scenes: list[Recording], options: BenchOptions, tmp_path: Path
 ) -> None:
@@ -61,7 +61,7 @@ def test_cluster_gives_the_results_of_a_loop(
     assert list(run_on_ray(scenes, options, spread, "local")) == []
 
 
-@pytest.mark.slow
+@pytest.mark.slow("src/evercal/continual/benchmark")
 def test_run_of_a_dead_worker_is_retried(
     scenes: list[Recording],
     options: BenchOptions,
