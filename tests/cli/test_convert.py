@@ -67,7 +67,7 @@ def test_next_command_repeats_the_reading_options(run: Any, wave: Path) -> None:
     assert "gripper moved in 0.20 x 0.00 x 0.00 m" in ran.out
     assert "note: images and poses were paired in order" in ran.out
     last = ran.out.splitlines()[-1]
-    assert last == f"next: evercal learn STORE {wave} --camera {camera} --every 2"
+    assert last == f"next: evercal learn MAP {wave} --camera {camera} --every 2"
 
 
 def test_options_are_those_of_load_recording(run: Any) -> None:

@@ -96,7 +96,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _discard_stdout() -> None:
-    """Keep Python from writing to a broken stdout again when it exits."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -127,7 +126,8 @@ def _help() -> str:
         lines += ["", f"{group}:"]
         for name in names:
             summary = " ".join((verb_class(name).__doc__ or "").split("\n\n")[0].split())
-            lines.append(f"  {name:11s} {summary.split('; ')[0].rstrip('.')}")
+            line = f"  {name:11s} {summary.split('; ')[0].rstrip('.')}"
+            lines += textwrap.wrap(line, 80, subsequent_indent=" " * 14)
     lines += [
         "",
         "'evercal VERB --help' lists the options of a verb. Every verb has --json.",
@@ -178,7 +178,6 @@ def _parse(words: list[str], as_json: bool) -> Any:
 
 
 def _wrapped(text: str) -> str:
-    """Wrap the lines of a help page that tyro leaves longer than the terminal is wide."""
     columns = shutil.get_terminal_size().columns
     lines = []
     for line in text.splitlines():
@@ -187,6 +186,5 @@ def _wrapped(text: str) -> str:
 
 
 def _box_text(box: str) -> str:
-    """The first paragraph of tyro's framed message as one line."""
     text = " ".join(line.strip("│ ") for line in box.splitlines()[1:])
     return " ".join(text.partition("──")[0].split()) or "unusable arguments"

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next
-from evercal.cli.image_words import read_images
-from evercal.cli.options import Device, File, Name, Store, Verb
+from evercal.cli.arguments import read_images
+from evercal.cli.options import Device, File, Name, SomeImages, Store, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,12 +28,9 @@ class Align(Verb):
     """
 
     store: Store
-    """Folder of the map."""
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
     """Name of the scene."""
-    images: Annotated[
-        Positional[tuple[Path, ...]], arg(metavar="[IMAGE...]", help_behavior_hint="")
-    ] = ()
+    images: SomeImages = ()
     """Images of a camera on the gripper, or a folder of them."""
     robot_poses: File = None
     """base_from_gripper of every image."""
@@ -53,7 +49,6 @@ class Align(Verb):
     device: Device = "auto"
 
     def run(self) -> int:
-        """Align the scene and print the uncertainty."""
         by_points = self.points is not None or self.picks is not None
         if by_points == (self.robot_poses is not None):
             raise InputError("give either images with --robot-poses, or --points with --picks")
@@ -73,8 +68,7 @@ class Align(Verb):
             localizer = Localizer(opened.contents.to(where))
             alignment = self._by_points(localizer) if by_points else self._by_gripper(localizer)
             opened.update(alignment.applied_to(localizer.contents.scene(self.scene)))
-        self._print(alignment)
-        return 0
+        return self._print(alignment)
 
     def _by_gripper(self, localizer: "Localizer") -> "MapAlignment":
         from evercal.calibration.align import align_by_gripper
@@ -95,7 +89,6 @@ class Align(Verb):
         return align_by_gripper(localizer, self.scene, images, poses, metric, boards)
 
     def _metric(self, localizer: "Localizer") -> bool:
-        """Whether the scale is known."""
         return localizer.contents.scene(self.scene).metric and not self.unknown_scale
 
     def _by_points(self, localizer: "Localizer") -> "MapAlignment":
@@ -115,32 +108,27 @@ class Align(Verb):
         metric = self._metric(localizer)
         return aligned_by_points(localizer, self.scene, points, picks, metric)
 
-    def _print(self, alignment: "MapAlignment") -> None:
+    def _print(self, alignment: "MapAlignment") -> int:
         similarity, (mm, deg) = alignment.similarity, alignment.sigma
-        if self.json:
-            gripper = alignment.gripper_from_camera
-            print_json(
-                {
-                    "scene": self.scene,
-                    "base_from_map": similarity.base_from_map.matrix().tolist(),
-                    "scale": similarity.scale,
-                    "sigma_mm": mm,
-                    "sigma_deg": deg,
-                    "used": alignment.used,
-                    "given": alignment.given,
-                    "gripper_from_camera": None if gripper is None else gripper.matrix().tolist(),
-                    "warnings": alignment.warnings,
-                }
-            )
-            return
-        print(
+        gripper = alignment.gripper_from_camera
+        record = {
+            "scene": self.scene,
+            "base_from_map": similarity.base_from_map.matrix().tolist(),
+            "scale": similarity.scale,
+            "sigma_mm": mm,
+            "sigma_deg": deg,
+            "used": alignment.used,
+            "given": alignment.given,
+            "gripper_from_camera": None if gripper is None else gripper.matrix().tolist(),
+            "warnings": alignment.warnings,
+        }
+        lines = [
             f"aligned {self.scene}: standard deviation {mm:.2f} mm and {deg:.3f} deg per axis in"
             f" the middle of the scene; scale {similarity.scale:.5f}; {alignment.used} of"
-            f" {alignment.given} are inliers, residual {alignment.residual}"
-        )
-        for warning in alignment.warnings:
-            print(f"warning: {warning}")
-        print_next("evercal", "calibrate", self.store, "IMAGE...")
+            f" {alignment.given} are inliers, residual {alignment.residual}",
+            *(f"warning: {warning}" for warning in alignment.warnings),
+        ]
+        return self.answer(record, lines, ("calibrate", self.store, "IMAGE..."))
 
 
 def _rows(

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next
-from evercal.cli.options import Device
+from evercal.cli.options import Count, Device, Folder, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ LEAST_BATCH = 64
 
 
 @dataclass(frozen=True)
-class Bench:
+class Bench(Verb):
     """Compare strategies on a sequence of scenes; the same command resumes.
 
     Given a folder of results, print its tables again.
@@ -51,9 +50,9 @@ class Bench:
     given order by one place for each seed, and reverses it in every second round."""
     scenes: Annotated[str, arg(metavar="A,B", help_behavior_hint="")] = ""
     """Comma-separated scenes of the suite. Defaults to all."""
-    data: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    data: Folder = None
     """Folder of the suite's recordings, with one folder per scene."""
-    poses: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    poses: Folder = None
     """Structure-from-motion poses for i7s and i12s (Brachmann et al., ICCV 2021). Defaults to the
     original poses."""
     parts: int = 4
@@ -65,9 +64,9 @@ class Bench:
     and loss (paper) or by ours (paper_head)."""
     offsets: Literal["per_centre", "shared"] = "per_centre"
     """One offset and scale per centre (the paper), or one for all centres (GLACE)."""
-    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    steps: Count = None
     """Optimiser steps of a stage. Defaults to that of the preset."""
-    batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    batch: Count = None
     """Rows of the new scene in a step; replayed rows keep the preset's proportion. Defaults to that
     of the preset."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
@@ -81,11 +80,8 @@ class Bench:
     """Ray cluster to run on, or `local` for this machine. Without it, runs are sequential."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-bench")
     """Folder of results. The same command resumes there."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
-        """Run what is missing and print the tables."""
         if Path(self.suite).is_dir():
             return self._show(Path(self.suite))
         seeds = _numbers(self.seeds)
@@ -115,19 +111,13 @@ class Bench:
         return self._show(self.out, strategies[0].name)
 
     def _show(self, folder: Path, reference: str = "") -> int:
-        """Write tables and figure of a folder of results, and print the tables."""
         from evercal.continual.benchmark import report, results
         from evercal.continual.benchmark.comparison import LEGEND, summary
 
         text = report.write_report(folder, reference or _words(self.strategies)[0])
-        if self.json:
-            print_json({"strategies": summary(results.read(folder))})
-            return 0
-        print(
-            f"{text}\n\n{LEGEND}\nwrote {folder / report.TABLES}, {report.LATEX}, {report.FIGURE}"
-        )
-        print_next("evercal", "bench", folder)
-        return 0
+        wrote = f"wrote {folder / report.TABLES}, {report.LATEX}, {report.FIGURE}"
+        record = {"strategies": summary(results.read(folder))}
+        return self.answer(record, [text, "", LEGEND, wrote], ("bench", folder))
 
     def _strategies(self) -> "tuple[Strategy, ...]":
         from evercal.continual.benchmark.paper_tables import TABLE4
@@ -193,7 +183,6 @@ class Bench:
 
 
 def _progress(step: "Step") -> str:
-    """Describe a stage: accuracy of each scene, under every name that the strategy is judged by."""
     start = f"[{step.done}/{step.total}] "
     if step.results.empty:
         return f"{start}{step.strategy} seed {step.seed}: no results before the last stage"

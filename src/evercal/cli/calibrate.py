@@ -7,11 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar, require_writable
-from evercal.cli.image_words import camera_for, read_images
-from evercal.cli.options import Device, File, Name, Store, Verb
-from evercal.cli.point_words import Point, point_dict, point_of, point_text
-from evercal.cli.stores import open_map
+from evercal.cli.arguments import (
+    Point,
+    camera_for,
+    open_map,
+    point_dict,
+    point_of,
+    point_text,
+    read_images,
+)
+from evercal.cli.console import progress_bar, require_writable
+from evercal.cli.options import At, Device, File, Intrinsics, Name, Store, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,7 +39,6 @@ class Calibrate(Verb):
     """
 
     store: Store
-    """Folder of the map."""
     images: Annotated[Positional[tuple[str, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
     """Image files or folders of them, all of one camera; or NAME=FOLDER for each camera of a
     rig."""
@@ -47,17 +52,13 @@ class Calibrate(Verb):
     ] = None
     """eye_to_hand for a fixed camera, eye_in_hand for one on the gripper. Default: decided from
     the camera's motion."""
-    camera: File = None
-    """Intrinsics of these images. Default: those of the camera that recorded the scene."""
+    camera: Intrinsics = None
     out: Annotated[Path, arg(metavar="FILE")] = Path("calibration.json")
     """Output file."""
-    at: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None
-    """A point in the camera frame (x right, y down, z forward; metres), such as an object that the
-    camera sees: print its standard deviation in the base or gripper frame."""
+    at: At = None
     device: Device = "auto"
 
     def run(self) -> int:
-        """Calibrate, write the file and print the verdict."""
         require_writable(self.out, "--out")
         point = point_of(self.at)
         named = {word.split("=", 1)[0]: Path(word.split("=", 1)[1]) for word in self._named()}
@@ -70,12 +71,11 @@ class Calibrate(Verb):
         localizer = open_map(self.store, self.device)
         calibration = self._calibrated(localizer, given)
         calibration.write(self.out)
-        if self.json:
-            print_json({**calibration.to_dict(), **_at_dict(calibration, point)})
-        else:
-            for line in calibration_lines(calibration, point):
-                print(line)
-            print_next("evercal", "export", self.out, "--format", "easy_handeye2")
+        self.answer(
+            {**calibration.to_dict(), **_at_dict(calibration, point)},
+            calibration_lines(calibration, point),
+            ("export", self.out, "--format", "easy_handeye2"),
+        )
         from evercal.calibration.verdict import tier
 
         return 0 if tier(calibration) else 1
@@ -117,19 +117,13 @@ class Calibrate(Verb):
             cameras[name] = self._calibrated(localizer, self._given(image_files([folder])))
         rig = rig_of(cameras)
         rig.write(self.out)
-        if self.json:
-            record = rig.to_dict()
-            for name, calibration in rig.cameras.items():
-                record["cameras"][name] |= _at_dict(calibration, point)
-            print_json(record)
-        else:
-            for line in _rig_lines(rig, point):
-                print(line)
-        return 0
+        record = rig.to_dict()
+        for name, calibration in rig.cameras.items():
+            record["cameras"][name] |= _at_dict(calibration, point)
+        return self.answer(record, _rig_lines(rig, point))
 
 
 def _at_dict(calibration: "Calibration", point: Point | None) -> dict[str, object]:
-    """The entry of --at in the JSON output; empty without the option."""
     return {} if point is None else {"at": point_dict(point, calibration.uncertain_pose)}
 
 
@@ -162,7 +156,6 @@ def calibration_lines(calibration: "Calibration", point: Point | None = None) ->
 
 
 def _budget_lines(terms: "Sequence[ErrorTerm]") -> list[str]:
-    """The terms of the uncertainty that count, each with its share."""
     from evercal.calibration.calibration import position_shares
 
     return [

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
-from evercal.cli.console import print_json, print_next, progress_bar
-from evercal.cli.image_words import camera_for, read_images
-from evercal.cli.options import Device, File, Store, Verb
-from evercal.cli.stores import open_map
+from evercal.cli.arguments import camera_for, open_map, read_images
+from evercal.cli.console import progress_bar
+from evercal.cli.options import Device, File, Images, Store, Verb
 from evercal.reports.answers import check_record
 
 if TYPE_CHECKING:
@@ -24,8 +23,7 @@ class Check(Verb):
     """
 
     store: Store
-    """Folder of the map."""
-    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
+    images: Images
     """New images of one camera, or a folder of them; five or more reveal smaller shifts."""
     reference: Annotated[Path, arg(metavar="FILE")]
     """The camera's calibration from 'evercal calibrate'."""
@@ -34,7 +32,6 @@ class Check(Verb):
     device: Device = "auto"
 
     def run(self) -> int:
-        """Compare and print the shift."""
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.drift import check
         from evercal.recordings.image_files import image_files
@@ -46,15 +43,9 @@ class Check(Verb):
         localizer = open_map(self.store, self.device)
         with progress_bar("localizing", len(images), "image") as bar:
             shift = check(localizer, images, reference, camera, on_image=bar.update)
-        if self.json:
-            print_json(check_record(shift))
-        else:
-            print(shift_line(shift))
-            for use in shift.images:
-                if not use.used:
-                    print(f"  rejected  {use.name}: {use.reason}")
-            if shift.moved:
-                print_next("evercal", "calibrate", self.store, *self.images[:1])
+        rejected = [f"  rejected  {use.name}: {use.reason}" for use in shift.images if not use.used]
+        then = ("calibrate", self.store, *self.images[:1]) if shift.moved else ()
+        self.answer(check_record(shift), [shift_line(shift), *rejected], then)
         return 1 if shift.moved else 0
 
 

@@ -97,13 +97,14 @@ _UNITS = {
 }
 
 
-def print_table(rows: Sequence[Mapping[str, object]]) -> None:
-    """Print rows under the names of their columns; nothing without a row."""
+def table(rows: Sequence[Mapping[str, object]]) -> list[str]:
+    """Lines of a table with the names of its columns; none without a row."""
     from tabulate import tabulate
 
-    if rows:
-        align = ("left", *("right" for _ in list(rows[0])[1:]))
-        print(tabulate(list(rows), headers="keys", colalign=align, disable_numparse=True))
+    if not rows:
+        return []
+    align = ("left", *("right" for _ in list(rows[0])[1:]))
+    return [tabulate(list(rows), headers="keys", colalign=align, disable_numparse=True)]
 
 
 def size(count: float) -> str:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.console import progress_bar
 from evercal.cli.options import Name, Verb
 from evercal.cli.reading import Reading
 from evercal.errors import InputError
@@ -31,7 +31,6 @@ class Convert(Verb):
     """Link image files instead of copying them; changes then affect both."""
 
     def run(self) -> int:
-        """Read, write and print a summary."""
         from evercal.recordings.formats import generic
 
         if self.out.exists() and not self.out.is_dir():
@@ -52,16 +51,11 @@ class Convert(Verb):
             "with_base_from_gripper": sum(f.base_from_gripper is not None for f in frames),
             "notes": list(scene.notes),
         }
-        if self.json:
-            print_json(record)
-            return 0
-        print(
+        lines = [
             f"{self.out}: {scene.name}, {len(scene.train)} training and {len(scene.test)} test"
             f" frames; {record['with_base_from_camera']} with the camera's pose,"
             f" {record['with_base_from_gripper']} with the gripper's; {scene.untracked} images"
-            f" without a pose left out"
-        )
-        for note in scene.notes:
-            print(f"note: {note}")
-        print_next("evercal", "inspect", self.out)
-        return 0
+            f" without a pose left out",
+            *(f"note: {note}" for note in scene.notes),
+        ]
+        return self.answer(record, lines, ("inspect", self.out))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from evercal.cli.console import Bars, print_json, print_next, progress_bar, require_folder, size
+from evercal.cli.console import Bars, progress_bar, require_folder, size
 from evercal.cli.options import Device, Folder, Verb
 from evercal.errors import InputError
 
@@ -49,35 +49,27 @@ class Demo(Verb):
     device: Device = "auto"
 
     def run(self) -> int:
-        """Run the demo; takes about a minute on two cores."""
         if self.copy_samples is not None:
             return self._copy_samples(self.copy_samples)
         from evercal.recordings.samples import sample_rooms
 
         result = run_demo(self.out, sample_rooms(), self.device, quiet=self.json)
-        if self.json:
-            print_json(result.to_dict())
-            return 0
-        for number, explanation in result.headlines().items():
-            print(f"{number:>12}  {explanation}")
-        print(f"wrote {self.out / REPORT} in {result.seconds:.0f} s")
-        print_next("evercal", "localize", self.out / STORE, self.out / QUERY)
-        return 0
+        lines = [f"{number:>12}  {words}" for number, words in result.headlines().items()]
+        lines.append(f"wrote {self.out / REPORT} in {result.seconds:.0f} s")
+        then = ("localize", self.out / STORE, self.out / QUERY)
+        return self.answer(result.to_dict(), lines, then)
 
     def _copy_samples(self, folder: Path) -> int:
         from evercal.recordings.samples import ROOMS, copy_samples
 
         copy_samples(folder)
-        if self.json:
-            print_json({"samples": str(folder)})
-            return 0
-        print(
+        line = (
             f"copied {', '.join(ROOMS)} and the robot cell {folder / 'cell'} to {folder}; the cell"
             " has recordings of a camera on the gripper (wrist) and of a fixed camera (tripod)"
         )
-        wrist = folder / "cell" / "wrist"
-        print_next("evercal", "learn", "cell.evercal", wrist, "--calibration", "wrist.json")
-        return 0
+        learn = ("learn", "cell.evercal", folder / "cell" / "wrist")
+        record = {"samples": str(folder)}
+        return self.answer(record, [line], (*learn, "--calibration", "wrist.json"))
 
 
 def run_demo(
@@ -163,7 +155,6 @@ def _learn(store: Path, scene: "Recording", device: str, result: "DemoResult") -
 
 
 def _localize_unknown(localizer: "Localizer", scene: "Recording", result: "DemoResult") -> None:
-    """Localize images of a room that is not in the store yet."""
     frames = _spread(scene.test, UNKNOWN_IMAGES)
     with progress_bar(f"images of unknown room {scene.name}", len(frames), "image") as bar:
         for frame in frames:
@@ -228,7 +219,6 @@ def _pose(recording: "Recording") -> "SE3":
 
 
 def _pictures(localizer: "Localizer", scene: "Recording") -> "list[Picture]":
-    """Test images with detected landmarks."""
     from evercal.reports.overlay import draw_landmarks
     from evercal.reports.page import Picture
 
@@ -243,7 +233,6 @@ def _pictures(localizer: "Localizer", scene: "Recording") -> "list[Picture]":
 
 
 def _spread(frames: "Sequence[Frame]", count: int) -> "list[Frame]":
-    """At most `count` frames, evenly spread."""
     import numpy as np
 
     indices = (np.arange(count) + 0.5) * len(frames) / count

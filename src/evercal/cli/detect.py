@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
-from evercal.cli.console import print_json, print_next, progress_bar, require_writable
-from evercal.cli.options import File, Verb
+from evercal.cli.console import progress_bar, require_writable
+from evercal.cli.options import File, SomeImages, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,9 +32,7 @@ class Detect(Verb):
 
     board: Literal["chessboard", "charuco", "apriltag"]
     """Printed board."""
-    images: Annotated[
-        Positional[tuple[Path, ...]], arg(metavar="[IMAGE...]", help_behavior_hint="")
-    ] = ()
+    images: SomeImages = ()
     """Image files of one camera, or a folder of them."""
     size: Annotated[str | None, arg(metavar="CxR", help_behavior_hint="")] = None
     """Inner corners of a chessboard (9x6), or squares of a ChArUco board."""
@@ -59,7 +57,6 @@ class Detect(Verb):
     """Paper of --make-board: a4, letter, a3, tabloid, a2, a1 or a0."""
 
     def run(self) -> int:
-        """Detect the board in every image and write the poses, or print a board."""
         if self.make_board is not None:
             return self._make(self.make_board)
         if not self.images:
@@ -91,11 +88,8 @@ class Detect(Verb):
             camera, source = calibrate_camera(detected, width, height).camera, "board"
         poses = board_poses(board, camera, views, source)
         poses.write(self.out)
-        if self.json:
-            print_json(poses.to_dict())
-        else:
-            self._print(poses)
-        return 0
+        words = ("--robot-poses", "FILE", "--camera-poses", self.out, "--mount", "eye_in_hand")
+        return self.answer(poses.to_dict(), _lines(poses), ("solve", *words))
 
     def _make(self, path: Path) -> int:
         from evercal.calibration.boards.printing import label, write_board
@@ -105,11 +99,9 @@ class Detect(Verb):
         require_writable(path, "--make-board")
         board = self._board()
         write_board(path, board, self.paper)
-        if self.json:
-            print_json({"file": str(path), "paper": self.paper, "board": board.to_dict()})
-        else:
-            print(f"wrote {path} on {self.paper}: {label(board)} Measure the 100 mm ruler.")
-        return 0
+        line = f"wrote {path} on {self.paper}: {label(board)} Measure the 100 mm ruler."
+        record = {"file": str(path), "paper": self.paper, "board": board.to_dict()}
+        return self.answer(record, [line])
 
     def _board(self) -> "Board":
         from evercal.calibration.boards.detection import Board
@@ -151,18 +143,19 @@ class Detect(Verb):
                 bar.update()
         return views
 
-    def _print(self, poses: "BoardPoses") -> None:
-        for image in poses.images:
-            if image.camera_from_board is None:
-                print(f"{image.name}: {image.reason}")
-                continue
-            x, y, z = 1000 * image.camera_from_board.translation_m
-            print(f"{image.name}: board at {x:+.1f} {y:+.1f} {z:+.1f} mm, {image.rms_px:.2f} px")
-        camera = poses.camera
-        print(
-            f"{len(poses.detected)} of {len(poses.images)} images show the board; corner noise"
-            f" {poses.corner_sigma_px:.2f} px; camera (from the {poses.camera_from}) fx"
-            f" {camera.fx:.2f}, fy {camera.fy:.2f}, cx {camera.cx:.2f}, cy {camera.cy:.2f}"
-        )
-        words = ("--robot-poses", "FILE", "--camera-poses", self.out, "--mount", "eye_in_hand")
-        print_next("evercal", "solve", *words)
+
+def _lines(poses: "BoardPoses") -> list[str]:
+    lines = []
+    for image in poses.images:
+        if image.camera_from_board is None:
+            lines.append(f"{image.name}: {image.reason}")
+            continue
+        x, y, z = 1000 * image.camera_from_board.translation_m
+        lines.append(f"{image.name}: board at {x:+.1f} {y:+.1f} {z:+.1f} mm, {image.rms_px:.2f} px")
+    camera = poses.camera
+    lines.append(
+        f"{len(poses.detected)} of {len(poses.images)} images show the board; corner noise"
+        f" {poses.corner_sigma_px:.2f} px; camera (from the {poses.camera_from}) fx"
+        f" {camera.fx:.2f}, fy {camera.fy:.2f}, cx {camera.cx:.2f}, cy {camera.cy:.2f}"
+    )
+    return lines

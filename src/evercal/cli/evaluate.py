@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.arguments import open_localizer
+from evercal.cli.console import progress_bar
 from evercal.cli.options import Device, Store, Verb
-from evercal.cli.stores import open_localizer
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ class Evaluate(Verb):
     """
 
     store: Store
-    """Folder of the store."""
     scenes: Annotated[
         Positional[tuple[str, ...]], arg(metavar="[NAME=]SCENE...", help_behavior_hint="")
     ]
@@ -31,7 +30,6 @@ class Evaluate(Verb):
     device: Device = "auto"
 
     def run(self) -> int:
-        """Evaluate and print a table."""
         if not self.scenes:
             raise InputError("no scene given; name one or more scene folders after the store")
         scenes = load_named(self.scenes)
@@ -47,13 +45,11 @@ class Evaluate(Verb):
 
             results = evaluate(localizer, scenes, on_frame=show)
         summary = scores(results)
-        if self.json:
-            print_json(summary.to_dict())
-            return 0
-        print(score_table(summary))
-        print(f"{summary.ms_per_image:.0f} ms per image, one at a time, decoding included")
-        print_next("evercal", "learn", self.store, "SCENE")
-        return 0
+        lines = [
+            score_table(summary),
+            f"{summary.ms_per_image:.0f} ms per image, one at a time, decoding included",
+        ]
+        return self.answer(summary.to_dict(), lines, ("learn", self.store, "SCENE"))
 
 
 def load_named(words: tuple[str, ...]) -> "dict[str, Recording]":

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next
 from evercal.cli.options import File, Frame, Name, Verb
 from evercal.errors import InputError
 
@@ -57,7 +56,6 @@ class Export(Verb):
     """Pose convention of --robot-poses if its header does not state it: ur, kuka, fanuc, ..."""
 
     def run(self) -> int:
-        """Read all inputs before writing the output."""
         from evercal.calibration.export.formats import FORMATS, export_files
         from evercal.calibration.export.request import ExportOptions
         from evercal.calibration.learned import calibration_at
@@ -81,27 +79,22 @@ class Export(Verb):
                 f" root frame with --via, because a tf frame has only one parent",
                 file=sys.stderr,
             )
-        if self.json:
-            print_json(self._record(exported))
-        elif self.out is None:
+        if self.out is None and not self.json:
             sys.stdout.write(exported.text)
-        else:
-            print(f"wrote {', '.join(map(str, exported.files))}")
-            print(f"  {exported.calibration.meaning}")
-            if verdict:
-                print(f"  {verdict}")
-            print_next("evercal", "check", "STORE", "IMAGE", "--reference", self.calibration)
+            return
+        lines = [f"wrote {', '.join(map(str, exported.files))}"]
+        lines += [f"  {words}" for words in (exported.calibration.meaning, verdict) if words]
+        then = ("check", "MAP", "IMAGE", "--reference", self.calibration)
+        self.answer(self._record(exported), lines, then)
 
     def _list(self) -> int:
         from evercal.calibration.export.formats import FORMATS
 
-        if self.json:
-            print_json({"formats": {name: row.description for name, row in FORMATS.items()}})
-            return 0
-        for name, row in FORMATS.items():
-            print(f"{name:27} {row.description}")
-        print_next("evercal", "export", self.calibration or "CALIBRATION.json", "--format", "NAME")
-        return 0
+        return self.answer(
+            {"formats": {name: row.description for name, row in FORMATS.items()}},
+            [f"{name:27} {row.description}" for name, row in FORMATS.items()],
+            ("export", self.calibration or "CALIBRATION.json", "--format", "NAME"),
+        )
 
     def _record(self, exported: "Exported") -> dict[str, object]:
         calibration = exported.calibration

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from evercal.cli.console import print_json, print_next, print_table, size
+from evercal.cli.console import size, table
 from evercal.cli.options import Store, Verb
 
 MEMORY_FILES = ("keyframes.safetensors", "state.safetensors")
@@ -18,15 +18,13 @@ class Info(Verb):
     """
 
     store: Store
-    """Folder of the map."""
     check: bool = False
     """Compare every file with its checksum; exit code 1 if one is damaged."""
 
     def run(self) -> int:
-        """Open the store and describe it."""
         if self.check:
             return self._check()
-        from evercal.cli.stores import MAP, strategy_of
+        from evercal.cli.arguments import MAP, strategy_of
 
         strategy = strategy_of(self.store)
         if strategy in (MAP, None):
@@ -46,36 +44,28 @@ class Info(Verb):
             "total_bytes": total,
             "scenes": scenes,
         }
-        if self.json:
-            print_json(content)
-            return 0
         plural = "s" if len(scenes) != 1 else ""
-        print(
-            f"{self.store}: {len(scenes)} scene{plural}, strategy {strategy}, images at"
-            f" {short_side} px"
-        )
         network = f"networks {size(heads)}, " if heads else ""
-        print(f"{size(total)} in all: keyframes {size(memory)}, {network}the rest is the encoder")
-        print_table([_content(scene) for scene in scenes])
-        print_table([_adjusted(scene) for scene in scenes if scene.get("adjusted")])
-        print_next("evercal", "info", self.store, "--check")
-        return 0
+        lines = [
+            f"{self.store}: {len(scenes)} scene{plural}, strategy {strategy}, images at"
+            f" {short_side} px",
+            f"{size(total)} in all: keyframes {size(memory)}, {network}the rest is the encoder",
+            *table([_content(scene) for scene in scenes]),
+            *table([_adjusted(scene) for scene in scenes if scene.get("adjusted")]),
+        ]
+        return self.answer(content, lines, ("info", self.store, "--check"))
 
     def _check(self) -> int:
         from evercal.storage import verify
 
         problems = verify(self.store)
-        if self.json:
-            print_json({"store": str(self.store), "ok": not problems, "problems": problems})
-            return 1 if problems else 0
-        for problem in problems:
-            print(problem)
+        lines = [*problems, f"{self.store}: all files match their checksums"]
         if problems:
             files = "1 file is" if len(problems) == 1 else f"{len(problems)} files are"
-            print(f"{files} damaged; restore from a copy of the map")
-            return 1
-        print(f"{self.store}: all files match their checksums")
-        return 0
+            lines[-1] = f"{files} damaged; restore from a copy of the map"
+        record = {"store": str(self.store), "ok": not problems, "problems": problems}
+        self.answer(record, lines)
+        return 1 if problems else 0
 
 
 def _map(given: Info) -> tuple[Sequence[dict[str, Any]], int, int, dict[str, int]]:

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next
 from evercal.cli.options import File, Verb
 from evercal.cli.reading import Reading
 from evercal.errors import InputError
@@ -16,6 +15,7 @@ if TYPE_CHECKING:
     from evercal.geometry import SE3
     from evercal.live.coverage import Coverage
     from evercal.recordings import Recording
+    from evercal.recordings.inspection import Inspection
 
 
 @dataclass(frozen=True)
@@ -40,41 +40,14 @@ class Inspect(Verb):
     Without it, axes are those of the gripper."""
 
     def run(self) -> int:
-        """Read the recording and some of its images."""
         from evercal.recordings.inspection import inspect_recording
 
         recording = self.reading.recording(self.scene)
         found = inspect_recording(recording)
         covered, views = self._advice(recording)
-        if self.json:
-            print_json(asdict(found) | _advice_record(covered, views))
-            return 0
-        extent = " x ".join(f"{side:.2f}" for side in found.extent_m)
-        whose = {"camera": "", "gripper": " with the gripper's pose"}.get(found.poses, "")
-        print(f"{found.name}: {found.train} training and {found.test} test frames{whose}")
-        print(f"  without a pose  {found.untracked}")
-        for lens in found.cameras:
-            print(f"  camera          {lens}")
-        mover = "gripper" if found.poses == "gripper" else "camera"
-        print(f"  {mover} moved in {extent} m (training frames)")
-        if found.step_median_m is not None and found.step_largest_m is not None:
-            print(
-                f"  frame to frame  {100 * found.step_median_m:.1f} cm"
-                f" and {found.step_median_deg:.1f} deg (median),"
-                f" {found.step_largest_m:.2f} m at most"
-            )
-        if found.near_training is not None:
-            print(
-                f"  near training   {found.near_training:.1f} % of the test frames lie within 5 cm"
-                f" and 5 deg of a training frame"
-            )
-        for note in found.notes:
-            print(f"note: {note}")
-        for warning in found.warnings:
-            print(f"warning: {warning}")
-        _print_advice(covered, views)
-        print_next("evercal", "learn", "STORE", self.scene, *self.reading.words())
-        return 0
+        lines = [*_found_lines(found), *_advice_lines(covered, views)]
+        then = ("learn", "MAP", self.scene, *self.reading.words())
+        return self.answer(asdict(found) | _advice_record(covered, views), lines, then)
 
     def _advice(self, recording: "Recording") -> "tuple[Coverage | None, NextViews | None]":
         """Coverage and next poses, if asked for."""
@@ -108,6 +81,30 @@ class Inspect(Verb):
         return next_views(poses, reachable.poses, self.count, rough)
 
 
+def _found_lines(found: "Inspection") -> list[str]:
+    extent = " x ".join(f"{side:.2f}" for side in found.extent_m)
+    whose = {"camera": "", "gripper": " with the gripper's pose"}.get(found.poses, "")
+    mover = "gripper" if found.poses == "gripper" else "camera"
+    lines = [
+        f"{found.name}: {found.train} training and {found.test} test frames{whose}",
+        f"  without a pose  {found.untracked}",
+        *(f"  camera          {lens}" for lens in found.cameras),
+        f"  {mover} moved in {extent} m (training frames)",
+    ]
+    if found.step_median_m is not None and found.step_largest_m is not None:
+        lines.append(
+            f"  frame to frame  {100 * found.step_median_m:.1f} cm"
+            f" and {found.step_median_deg:.1f} deg (median), {found.step_largest_m:.2f} m at most"
+        )
+    if found.near_training is not None:
+        lines.append(
+            f"  near training   {found.near_training:.1f} % of the test frames lie within 5 cm"
+            f" and 5 deg of a training frame"
+        )
+    lines += [f"note: {note}" for note in found.notes]
+    return [*lines, *(f"warning: {warning}" for warning in found.warnings)]
+
+
 def _advice_record(covered: "Coverage | None", views: "NextViews | None") -> dict[str, object]:
     """The parts that were asked for, as JSON values."""
     record: dict[str, object] = {}
@@ -127,21 +124,29 @@ def _advice_record(covered: "Coverage | None", views: "NextViews | None") -> dic
     return record
 
 
-def _print_advice(covered: "Coverage | None", views: "NextViews | None") -> None:
+def _advice_lines(covered: "Coverage | None", views: "NextViews | None") -> list[str]:
+    lines = list[str]()
     if covered is not None:
-        print(f"  {covered.verdict}")
-        for axis in covered.rotations:
-            print(f"  rotation        {axis.spread:.0f} deg {axis.name} (standard deviation)")
-        for axis in covered.positions:
-            print(f"  position        {axis.spread:.0f} mm {axis.name} (standard deviation)")
-        for sample in covered.samples:
-            for problem in sample.problems:
-                print(f"  {sample.name}: {problem}")
+        lines.append(f"  {covered.verdict}")
+        for what, unit, axes in (
+            ("rotation", "deg", covered.rotations),
+            ("position", "mm", covered.positions),
+        ):
+            lines += [
+                f"  {what}        {axis.spread:.0f} {unit} {axis.name} (standard deviation)"
+                for axis in axes
+            ]
+        lines += [f"  {sample.name}: {p}" for sample in covered.samples for p in sample.problems]
     if views is not None:
-        print(f"  expected sigma  {views.sigma_mm[0]:.2f} mm, {views.sigma_deg[0]:.3f} deg now")
+        sigmas = [
+            f"{mm:.2f} mm, {deg:.3f} deg"
+            for mm, deg in zip(views.sigma_mm, views.sigma_deg, strict=True)
+        ]
+        lines.append(f"  expected sigma  {sigmas[0]} now")
         for i, pose in enumerate(views.poses):
             x, y, z = pose.translation_m
-            print(
+            lines.append(
                 f"  next {i + 1}          row {views.index[i] + 1}: {x:+.3f} {y:+.3f} {z:+.3f} m,"
-                f" then {views.sigma_mm[i + 1]:.2f} mm, {views.sigma_deg[i + 1]:.3f} deg"
+                f" then {sigmas[i + 1]}"
             )
+    return lines

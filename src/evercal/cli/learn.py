@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import Bars, print_json, print_next, require_writable, size
+from evercal.cli.arguments import MAP, strategy_of
+from evercal.cli.console import Bars, require_writable, size
 from evercal.cli.networks import NetworkOptions, learn_into_networks
 from evercal.cli.options import Device, File, Name, Store, Verb
 from evercal.cli.reading import Reading
-from evercal.cli.stores import MAP, strategy_of
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,7 +60,6 @@ class Learn(Verb):
     device: Device = "auto"
 
     def run(self) -> int:
-        """Learn and print a summary."""
         if not self.recordings:
             raise InputError("no RECORDING given; name the folder of one or more")
         single = len(self.recordings) == 1
@@ -107,11 +106,8 @@ class Learn(Verb):
                 on_scene=lambda report: bars.write("\n".join(summary(report))),
                 on_progress=bars.step,
             )
-        if self.json:
-            print_json({"scenes": [dataclasses.asdict(report) for report in reports]})
-        else:
-            print_next("evercal", "localize", self.store, "IMAGE")
-        return 0
+        record = {"scenes": [dataclasses.asdict(report) for report in reports]}
+        return self.answer(record, then=("localize", self.store, "IMAGE"))
 
     def _run_one(self, path: Path, strategy: str) -> int:
         from evercal.recordings.frame import lacks_camera_poses
@@ -129,12 +125,11 @@ class Learn(Verb):
         except KeyboardInterrupt:
             print("stopped; the same command starts again", file=sys.stderr)
             return 130
-        if self.json:
-            print_json(dataclasses.asdict(report))
-            return 0
-        print("\n".join(summary(report)))
-        self._print_next(recording, report, path)
-        return 0
+        lines = summary(report)
+        if self.calibration is not None:
+            lines.append(f"wrote {self.calibration}")
+        then = self._next(recording, report, path)
+        return self.answer(dataclasses.asdict(report), lines, then)
 
     def _learned(self, recording: "Recording", strategy: str) -> "LearnReport":
         from evercal.calibration.calibration import read_transform
@@ -156,20 +151,17 @@ class Learn(Verb):
             cell.calibration(report.scene).write(self.calibration)
         return report
 
-    def _print_next(self, recording: "Recording", report: "LearnReport", path: Path) -> None:
-        if self.calibration is not None:
-            print(f"wrote {self.calibration}")
-            print_next("evercal", "export", self.calibration, "--format", "easy_handeye2")
-        elif report.hand_eye is not None:
-            print_next("evercal", "export", self.store, "--format", "easy_handeye2")
-        elif not recording.metric:
-            align = ("evercal", "align", self.store, report.scene)
-            print_next(*align, "IMAGE...", "--robot-poses", "FILE")
-        elif recording.test:
+    def _next(
+        self, recording: "Recording", report: "LearnReport", path: Path
+    ) -> tuple[object, ...]:
+        if report.hand_eye is not None:
+            return "export", self.calibration or self.store, "--format", "easy_handeye2"
+        if not recording.metric:
+            return "align", self.store, report.scene, "IMAGE...", "--robot-poses", "FILE"
+        if recording.test:
             scene = str(path) if self.name is None else f"{self.name}={path}"
-            print_next("evercal", "evaluate", self.store, scene)
-        else:
-            print_next("evercal", "localize", self.store, "IMAGE")
+            return "evaluate", self.store, scene
+        return "localize", self.store, "IMAGE"
 
     @property
     def _stream(self) -> Any:
@@ -177,7 +169,6 @@ class Learn(Verb):
 
     @staticmethod
     def _refuse(why: str, **options: object) -> None:
-        """Refuse options that were given and do not apply."""
         for name, value in options.items():
             if value is not None:
                 raise InputError(f"--{name.replace('_', '-')} {value}: {why}")

@@ -6,19 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
-from evercal.cli.console import (
-    print_json,
-    print_next,
-    progress_bar,
-    require_folder,
-    require_writable,
+from evercal.cli.arguments import (
+    Point,
+    camera_for,
+    open_localizer,
+    point_dict,
+    point_of,
+    point_text,
 )
-from evercal.cli.image_words import camera_for
-from evercal.cli.options import Device, File, Folder, Store, Verb
-from evercal.cli.point_words import Point, point_dict, point_of, point_text
-from evercal.cli.stores import open_localizer
+from evercal.cli.console import progress_bar, require_folder, require_writable
+from evercal.cli.options import At, Device, Folder, Images, Intrinsics, Store, Verb
 from evercal.reports.answers import Answer, answer_row, budget_of, finite_pose, unit_known
 
 if TYPE_CHECKING:
@@ -39,24 +38,18 @@ class Localize(Verb):
     """
 
     store: Store
-    """Folder of the store."""
-    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
+    images: Images
     """Image files or folders of them."""
-    camera: File = None
-    """Intrinsics: 3x3 matrix as text, JSON, YAML, NPZ, ROS camera_info or OpenCV's storage.
-    Default: those of the camera that recorded the scene."""
+    camera: Intrinsics = None
     overlay: Folder = None
     """Output folder for copies of the images with their landmarks and residuals."""
     video: Annotated[Path | None, arg(metavar="FILE.mp4", help_behavior_hint="")] = None
     """A video of the sequence: each image with its landmarks and residuals, beside the map seen
     from above with the camera's path and its uncertainty."""
-    at: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None
-    """A point in the camera frame (x right, y down, z forward; metres), such as an object that the
-    camera sees: print its standard deviation in the base frame."""
+    at: At = None
     device: Device = "auto"
 
     def run(self) -> int:
-        """Locate every image; nothing is printed before all of them were read."""
         from evercal.recordings.image_files import image_files
 
         point = point_of(self.at)
@@ -73,14 +66,11 @@ class Localize(Verb):
         if self.video is not None:
             self._animate(self.video, localizer, answers)
         located = sum(answer.estimate.status == "ok" for answer in answers)
-        if self.json:
-            print_json({"images": [as_dict(answer, point) for answer in answers]})
-        else:
-            for answer in answers:
-                print(as_text(answer, point))
-            if self.video is not None:
-                print(f"wrote {self.video}")
-            self._next(files, located)
+        lines = [as_text(answer, point) for answer in answers]
+        if self.video is not None:
+            lines.append(f"wrote {self.video}")
+        record = {"images": [as_dict(answer, point) for answer in answers]}
+        self.answer(record, lines, self._next(files, located))
         return 0 if located else 1
 
     def _answers(
@@ -121,17 +111,15 @@ class Localize(Verb):
 
             write_video(path, animate(answers, localizer, read))
 
-    def _next(self, files: list[Path], located: int) -> None:
+    def _next(self, files: list[Path], located: int) -> tuple[object, ...]:
         if not located:
-            print_next("evercal", "learn", self.store, "RECORDING")
-        elif self.overlay is None:
-            print_next("evercal", "localize", self.store, files[0], "--overlay", "DIR")
-        else:
-            print_next("evercal", "evaluate", self.store, "RECORDING")
+            return "learn", self.store, "RECORDING"
+        if self.overlay is None:
+            return "localize", self.store, files[0], "--overlay", "DIR"
+        return "evaluate", self.store, "RECORDING"
 
 
 def _overlay_name(files: list[Path], number: int) -> str:
-    """A file name; images of one name from two folders get different ones."""
     stems = [path.stem for path in files]
     again = f"-{number + 1}" if stems.count(stems[number]) > 1 else ""
     return f"{stems[number]}{again}-overlay.png"
@@ -178,7 +166,6 @@ def as_text(answer: Answer, point: Point | None = None) -> str:
 
 
 def _budget_words(estimate: "PoseEstimate") -> str:
-    """Shares of the causes, the largest first; empty without any."""
     parts = sorted(budget_of(estimate), key=lambda part: -part[1])
     return ", ".join(f"{t.name} {100 * share:.0f} %" for t, share in parts if share >= 0.005)
 

@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from evercal.cli.console import print_json, print_next, size
+from evercal.cli.console import require_writable, size
 from evercal.cli.options import Store, Verb
 
 if TYPE_CHECKING:
     from evercal.map import Map
-
-Folder = Store
 
 
 @dataclass(frozen=True)
@@ -23,11 +21,9 @@ class List(Verb):
     Example: evercal map list cell.evercal
     """
 
-    store: Folder
-    """Folder of the map."""
+    store: Store
 
     def run(self) -> int:
-        """Open the map and print a line for each scene."""
         from evercal.mapping.store import MapStore
 
         scenes = [
@@ -39,17 +35,13 @@ class List(Verb):
             }
             for scene in MapStore.open(self.store).contents.scenes
         ]
-        if self.json:
-            print_json({"store": str(self.store), "scenes": scenes})
-            return 0
-        for scene in scenes:
-            print(
-                f"{scene['name']}: {scene['keyframes']} keyframes,"
-                f" {scene['landmarks']:,} landmarks, {size(scene['memory_bytes'])}"
-            )
-        if not scenes:
-            print(f"{self.store}: no scene")
-        return 0
+        lines = [
+            f"{scene['name']}: {scene['keyframes']} keyframes,"
+            f" {scene['landmarks']:,} landmarks, {size(scene['memory_bytes'])}"
+            for scene in scenes
+        ]
+        record = {"store": str(self.store), "scenes": scenes}
+        return self.answer(record, lines or [f"{self.store}: no scene"])
 
 
 @dataclass(frozen=True)
@@ -59,16 +51,14 @@ class Remove(Verb):
     Example: evercal map remove cell.evercal kitchen
     """
 
-    store: Folder
-    """Folder of the map."""
+    store: Store
     names: Annotated[Positional[tuple[str, ...]], arg(metavar="SCENE...", help_behavior_hint="")]
     """Scenes to remove."""
 
     def run(self) -> int:
-        """Remove the scenes."""
         opened = _opened(self.store)
         opened.remove(*self.names)
-        return _done(opened, f"removed {', '.join(self.names)}", self.json)
+        return _done(self, opened, f"removed {', '.join(self.names)}")
 
 
 @dataclass(frozen=True)
@@ -78,18 +68,16 @@ class Rename(Verb):
     Example: evercal map rename cell.evercal kitchen kitchen-2025
     """
 
-    store: Folder
-    """Folder of the map."""
+    store: Store
     name: Annotated[Positional[str], arg(metavar="SCENE")]
     """Name of the scene."""
     new: Annotated[Positional[str], arg(metavar="NEW")]
     """Its new name."""
 
     def run(self) -> int:
-        """Rename the scene."""
         opened = _opened(self.store)
         opened.rename(self.name, self.new)
-        return _done(opened, f"renamed {self.name} to {self.new}", self.json)
+        return _done(self, opened, f"renamed {self.name} to {self.new}")
 
 
 @dataclass(frozen=True)
@@ -101,7 +89,7 @@ class Merge(Verb):
     Example: evercal map merge all.evercal cell-1.evercal cell-2.evercal
     """
 
-    store: Folder
+    store: Store
     """Folder of the map that grows."""
     others: Annotated[Positional[tuple[Path, ...]], arg(metavar="OTHER...", help_behavior_hint="")]
     """Folders of the other maps; they do not change."""
@@ -110,7 +98,6 @@ class Merge(Verb):
     the scene of the map."""
 
     def run(self) -> int:
-        """Merge the maps."""
         from evercal.map import Map
 
         opened = Map.open(self.store, device="cpu")
@@ -119,7 +106,7 @@ class Merge(Verb):
         words += [f"{name} is now {new}" for name, new in merged.renamed]
         words += [f"skipped {name}" for name in merged.skipped]
         words += [f"replaced {name}" for name in merged.replaced]
-        return _done(opened, "; ".join(words), self.json, dataclasses.asdict(merged))
+        return _done(self, opened, "; ".join(words), dataclasses.asdict(merged))
 
 
 @dataclass(frozen=True)
@@ -129,25 +116,21 @@ class Pack(Verb):
     Example: evercal map pack cell.evercal cell.zip
     """
 
-    store: Folder
-    """Folder of the map."""
+    store: Store
     file: Annotated[Positional[Path], arg(metavar="FILE")]
     """Output file; an existing one is replaced."""
 
     def run(self) -> int:
-        """Pack the map."""
-        from evercal.cli.console import require_writable
         from evercal.mapping.manage import pack_map
 
         require_writable(self.file, "FILE")
         pack_map(self.store, self.file)
         count = self.file.stat().st_size
-        if self.json:
-            print_json({"file": str(self.file), "bytes": count})
-            return 0
-        print(f"wrote {self.file} ({size(count)})")
-        print_next("evercal", "map", "unpack", self.file, "STORE")
-        return 0
+        return self.answer(
+            {"file": str(self.file), "bytes": count},
+            [f"wrote {self.file} ({size(count)})"],
+            ("map", "unpack", self.file, "MAP"),
+        )
 
 
 @dataclass(frozen=True)
@@ -159,15 +142,14 @@ class Unpack(Verb):
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
     """The archive."""
-    store: Folder
+    store: Store
     """New folder for the map."""
 
     def run(self) -> int:
-        """Unpack the map."""
         from evercal.mapping.manage import unpack_map
 
         unpack_map(self.file, self.store)
-        return _done(_opened(self.store), f"unpacked {self.file}", self.json)
+        return _done(self, _opened(self.store), f"unpacked {self.file}")
 
 
 @dataclass(frozen=True)
@@ -189,12 +171,10 @@ class Maps:
     ]
 
     def run(self) -> int:
-        """Run the action."""
         return self.action.run()
 
 
 def _opened(store: Path) -> "Map":
-    """The map at a path that must exist."""
     from evercal.map import Map
     from evercal.storage import read_manifest
 
@@ -202,10 +182,9 @@ def _opened(store: Path) -> "Map":
     return Map.open(store, device="cpu")
 
 
-def _done(opened: "Map", what: str, as_json: bool, more: dict[str, object] | None = None) -> int:
-    if as_json:
-        print_json({"store": str(opened.path), **(more or {}), "scenes": list(opened.scenes)})
-        return 0
-    print(f"{what}; scenes of {opened.path}: {', '.join(opened.scenes) or 'none'}")
-    print_next("evercal", "map", "list", opened.path)
-    return 0
+def _done(verb: Verb, opened: "Map", what: str, more: dict[str, object] | None = None) -> int:
+    return verb.answer(
+        {"store": str(opened.path), **(more or {}), "scenes": list(opened.scenes)},
+        [f"{what}; scenes of {opened.path}: {', '.join(opened.scenes) or 'none'}"],
+        ("map", "list", opened.path),
+    )

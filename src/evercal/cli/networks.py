@@ -59,7 +59,6 @@ def learn_into_networks(
 
 
 def _show(bars: "Bars", event: object) -> None:
-    """Show an event of network training."""
     from evercal.continual.learning.stage import Encoding
     from evercal.continual.networks.trainer import Progress
 

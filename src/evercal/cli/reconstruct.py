@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import Bars, print_json, print_next
+from evercal.cli.console import Bars
 from evercal.cli.options import Verb
 
 _CONNECTED = 0.8
@@ -34,25 +34,22 @@ class Reconstruct(Verb):
     """Frames, at most."""
 
     def run(self) -> int:
-        """Reconstruct and print a summary."""
         from evercal.recordings.reconstruct import ReconstructOptions, reconstruct
 
         options = ReconstructOptions(motion=self.motion, most_frames=self.most)
         with Bars() as bars:
             found = reconstruct(self.source, self.out, options, bars.step)
         whole = found.posed >= _CONNECTED * found.frames
-        if self.json:
-            print_json({"out": str(self.out), **dataclasses.asdict(found)})
-            return 0 if whole else 1
-        print(
+        lines = [
             f"{self.out}: {found.posed} of {found.frames} frames have a pose, {found.points:,}"
             f" points, residual {found.residual_px:.2f} px"
-        )
+        ]
         if not whole:
             parts = ", ".join(map(str, found.parts))
-            print(
+            lines.append(
                 f"the video does not hold together: parts of {parts} frames; move more slowly"
                 " where they end, and return to places seen before"
             )
-        print_next("evercal", "learn", "cell.evercal", self.out)
+        record = {"out": str(self.out), **dataclasses.asdict(found)}
+        self.answer(record, lines, ("learn", "cell.evercal", self.out))
         return 0 if whole else 1

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import Bars, print_json, print_next, size
-from evercal.cli.image_words import camera_for, stated_camera
-from evercal.cli.options import Device, File, Store, Verb
+from evercal.cli.arguments import camera_for, stated_camera
+from evercal.cli.console import Bars, size
+from evercal.cli.options import Device, Intrinsics, Store, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,19 +32,16 @@ class Refresh(Verb):
     """
 
     store: Store
-    """Folder of the map."""
     images: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="[RECORDING|IMAGE...]", help_behavior_hint="")
     ] = ()
     """Images of one camera, a folder of them, or a recording."""
-    camera: File = None
-    """File of the intrinsics. Default: those of the camera that recorded the scene."""
+    camera: Intrinsics = None
     undo: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="")] = None
     """Bring back the state of a scene before its last refresh."""
     device: Device = "auto"
 
     def run(self) -> int:
-        """Refresh, or undo the last refresh."""
         if (self.undo is None) == (not self.images):
             raise InputError("give images of the changed room, or --undo SCENE")
         from evercal.map import Map
@@ -54,11 +51,8 @@ class Refresh(Verb):
         cell = Map.open(self.store, device=self.device)
         if self.undo is not None:
             cell.undo_refresh(self.undo)
-            if self.json:
-                print_json({"scene": self.undo, "undone": True})
-            else:
-                print(f"{self.undo}: the state before its last refresh is back")
-            return 0
+            line = f"{self.undo}: the state before its last refresh is back"
+            return self.answer({"scene": self.undo, "undone": True}, [line])
         recording = _recording(self.images)
         stream = sys.stderr if self.json else sys.stdout
         with Bars(stream) as bars:
@@ -72,16 +66,11 @@ class Refresh(Verb):
                 files = image_files(self.images)
                 camera = camera_for(self.camera, files)
                 report = cell.refresh(files, camera=camera, on_progress=bars.step)
-        if self.json:
-            print_json(dataclasses.asdict(report))
-            return 0
-        print("\n".join(_lines(report)))
-        print_next("evercal", "refresh", self.store, "--undo", report.scene)
-        return 0
+        then = ("refresh", self.store, "--undo", report.scene)
+        return self.answer(dataclasses.asdict(report), _lines(report), then)
 
 
 def _recording(paths: tuple[Path, ...]) -> "Recording | None":
-    """The recording at a single path; None for images."""
     from evercal.recordings import load_recording
 
     if len(paths) != 1 or paths[0].is_file():

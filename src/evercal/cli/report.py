@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar, require_writable
-from evercal.cli.options import Device
-from evercal.cli.point_words import point_dict, point_of, point_text
-from evercal.cli.stores import open_localizer
+from evercal.cli.arguments import open_localizer, point_dict, point_of, point_text
+from evercal.cli.console import progress_bar, require_writable
+from evercal.cli.options import At, Device, Verb
 
 if TYPE_CHECKING:
     from evercal.reports.calibration_images import AnnotatedImages, BoardSeen
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Report:
+class Report(Verb):
     """Write an HTML report of a calibration: verdict, uncertainty, residuals and overlays.
 
     Example: evercal report tripod.json --store cell.evercal
@@ -25,7 +24,7 @@ class Report:
 
     calibration: Annotated[Positional[Path], arg(metavar="CALIBRATION.json")]
     """Calibration file, or a map that was learned from gripper poses (MAP or MAP:SCENE)."""
-    store: Annotated[Path | None, arg(metavar="STORE", help_behavior_hint="")] = None
+    store: Annotated[Path | None, arg(metavar="MAP", help_behavior_hint="")] = None
     """Folder of the store. Its landmarks are drawn with their residuals."""
     images: Annotated[
         tuple[Path, ...],
@@ -34,17 +33,12 @@ class Report:
     """Images of the camera, or a folder of them."""
     against: Annotated[Path | None, arg(metavar="OLD.json", help_behavior_hint="")] = None
     """Older calibration of the same camera, to compare with."""
-    at: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None
-    """A point in the camera frame (x right, y down, z forward; metres), such as an object that the
-    camera sees: its standard deviation in the base or gripper frame is reported."""
+    at: At = None
     out: Annotated[Path, arg(metavar="FILE.html")] = Path("report.html")
     """The report, one file including its pictures."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
-        """Write the report."""
         require_writable(self.out, "--out")
         point = point_of(self.at)
         from evercal.calibration.calibration import read_calibration
@@ -65,31 +59,26 @@ class Report:
         page = calibration_page(file, images, store, older, point, bool(boards))
         write_bytes(self.out, page.html.encode())
         text = calibration.verdict or verdict(calibration)
-        if not self.json:
-            words = [] if point is None else [point_text(point, calibration.uncertain_pose)]
-            print("\n".join([text, *(f"  {line}" for line in (*words, *page.missing))]))
-            print(f"wrote {self.out}")
-            print_next("evercal", "export", self.calibration, "--format", "easy_handeye2")
-            return 0
+        words = [] if point is None else [point_text(point, calibration.uncertain_pose)]
+        lines = [text, *(f"  {line}" for line in (*words, *page.missing)), f"wrote {self.out}"]
         against = None
         if older is not None:
             change = difference(calibration, older.calibration)
             against = {"translation_mm": change.mm, "rotation_deg": change.deg}
         best, (mm, deg) = tier(calibration), expected_error(calibration)
-        print_json(
-            {
-                "report": str(self.out),
-                "verdict": text,
-                "tier": None if best is None else best.name,
-                "expected_error_mm": mm,
-                "expected_error_deg": deg,
-                "pictures": list(images.images),
-                "against": against,
-                "missing": list(page.missing),
-                **({} if point is None else {"at": point_dict(point, calibration.uncertain_pose)}),
-            }
-        )
-        return 0
+        record = {
+            "report": str(self.out),
+            "verdict": text,
+            "tier": None if best is None else best.name,
+            "expected_error_mm": mm,
+            "expected_error_deg": deg,
+            "pictures": list(images.images),
+            "against": against,
+            "missing": list(page.missing),
+            **({} if point is None else {"at": point_dict(point, calibration.uncertain_pose)}),
+        }
+        then = ("export", self.calibration, "--format", "easy_handeye2")
+        return self.answer(record, lines, then)
 
     def _images(
         self,

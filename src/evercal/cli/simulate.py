@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.console import progress_bar
 from evercal.cli.options import Count, Verb
 from evercal.errors import InputError
 
@@ -33,7 +33,6 @@ class Simulate(Verb):
     """Sensor noise as a fraction of full scale. Default: 0.008."""
 
     def run(self) -> int:
-        """Record the cell."""
         from evercal.simulation.cell_recording import TRIPOD_IMAGES, WRIST_IMAGES, record_cell
         from evercal.simulation.virtual_cell import CellOptions
 
@@ -47,13 +46,10 @@ class Simulate(Verb):
         with progress_bar("recording", frames + TRIPOD_IMAGES, "image") as bar:
             for _ in record_cell(self.out, self.seed, frames, options):
                 bar.update()
-        if self.json:
-            seconds = time.perf_counter() - began
-            parts = {name: str(self.out / name) for name in ("wrist", "tripod", "truth.json")}
-            print_json({"scenes": [parts["wrist"]], **parts, "frames": bar.n, "seconds": seconds})
-        else:
-            print_next("evercal", "learn", "STORE", self.out / "wrist")
-        return 0
+        parts = {name: str(self.out / name) for name in ("wrist", "tripod", "truth.json")}
+        record = {"scenes": [parts["wrist"]], **parts, "frames": bar.n}
+        record["seconds"] = time.perf_counter() - began
+        return self.answer(record, then=("learn", "MAP", self.out / "wrist"))
 
 
 def _size(text: str) -> tuple[int, int]:

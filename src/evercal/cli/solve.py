@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import arg
 
 from evercal.cli.calibrate import calibration_lines
-from evercal.cli.console import print_json, print_next, require_writable
+from evercal.cli.console import require_writable
 from evercal.cli.options import Name, Verb
 
 if TYPE_CHECKING:
@@ -50,7 +50,6 @@ class Solve(Verb):
     """Calibration file to write."""
 
     def run(self) -> int:
-        """Solve, write the calibration and print it."""
         require_writable(self.out, "--out")
         from evercal.calibration.verdict import tier
 
@@ -59,12 +58,11 @@ class Solve(Verb):
         source = {"command": "solve", **options, **files}
         calibration = self._with_image_paths(replace(self._solved(), source=source))
         calibration.write(self.out)
-        if self.json:
-            print_json(calibration.to_dict())
-        else:
-            for line in [*calibration_lines(calibration), *_check_lines(calibration)]:
-                print(line)
-            print_next("evercal", "export", self.out, "--format", "easy_handeye2")
+        self.answer(
+            calibration.to_dict(),
+            [*calibration_lines(calibration), *_check_lines(calibration)],
+            ("export", self.out, "--format", "easy_handeye2"),
+        )
         return 0 if tier(calibration) else 1
 
     def _solved(self) -> "Calibration":

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.options import Device
+from evercal.cli.options import Device, File, Host, Name, Port, Source, Verb
 from evercal.cli.view import prepare_page, wait_until_stopped
 from evercal.errors import InputError
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Studio:
+class Studio(Verb):
     """Calibrate a wrist camera and a fixed camera in the browser, step by step.
 
     Everything is written to --out as it is made; the same command continues there. With --virtual,
@@ -26,24 +26,24 @@ class Studio:
 
     map: Annotated[Positional[Path | None], arg(metavar="[MAP]", help_behavior_hint="")] = None
     """Folder of the map that learns the scene. Default: a new one in --out."""
-    camera: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="")] = None
+    camera: Source = None
     """Camera on the gripper: number (0) or device, address (rtsp://...), video or folder."""
-    intrinsics: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    intrinsics: File = None
     """Intrinsics of --camera. Default: those in --out, where it was begun before."""
-    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    poses: File = None
     """Gripper poses: a table or JSON lines that your robot's program appends to."""
-    pose_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    pose_convention: Name = None
     """Convention of --poses if its header does not state it: ur, kuka, fanuc, ..."""
     most_age: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
     """Refuse the last pose of --poses if the file was written more seconds ago. Default: any age,
     for programs that write only when the arm has moved."""
-    reachable: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    reachable: File = None
     """Gripper poses that the robot can reach, for the next best views. Default: near others."""
-    gripper_from_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    gripper_from_camera: File = None
     """A rough gripper_from_camera for the drawing and the next views: 4x4 matrix or calibration."""
-    fixed: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="")] = None
+    fixed: Source = None
     """The fixed camera; sources as for --camera."""
-    fixed_intrinsics: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    fixed_intrinsics: File = None
     """Intrinsics of --fixed. Default: those of the camera on the gripper."""
     virtual: bool = False
     """A virtual arm with a wrist camera and a tripod camera instead of yours."""
@@ -51,16 +51,11 @@ class Studio:
     """Seed of the virtual cell."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("studio")
     """Folder of the recording, images, calibrations, reports and exports."""
-    host: Annotated[str, arg(metavar="H")] = "127.0.0.1"
-    """Address to listen on."""
-    port: Annotated[int, arg(metavar="P")] = 8080
-    """Port to listen on; 0 for any free one."""
+    host: Host = "127.0.0.1"
+    port: Port = 8080
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object when the page is ready."""
 
     def run(self) -> int:
-        """Serve the page until Ctrl-C or SIGTERM."""
         self._refuse()
         prepare_page(self.host, "can use the cameras and move the arm")
         from evercal.service.studio.page import StudioPage

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, require_writable
-from evercal.cli.options import Count, Device, File, Store
-from evercal.cli.stores import open_map
+from evercal.cli.arguments import open_map
+from evercal.cli.console import require_writable
+from evercal.cli.options import Count, Device, Intrinsics, Store, Verb
 from evercal.errors import InputError
 from evercal.reports.answers import unit_known
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Track:
+class Track(Verb):
     """Locate the frames of a camera, a video or a folder one after another.
 
     The last pose is the prior of the next one: a tracked frame takes less than half the time of a
@@ -32,15 +32,13 @@ class Track:
     """
 
     store: Store
-    """Folder of the map."""
     source: Annotated[Positional[str], arg(metavar="SOURCE")]
     """Number (0) or device of a camera, an address (rtsp://...), a video file or a folder."""
     out: Annotated[
         tuple[Path, ...], arg(metavar="FILE...", help_behavior_hint="(default: none)")
     ] = ()
     """Files to write: .jsonl (JSON lines), .tum or .txt (TUM)."""
-    camera: File = None
-    """Intrinsics. Default: those of the camera that recorded the scene."""
+    camera: Intrinsics = None
     at_most: Annotated[float | None, arg(metavar="MS", help_behavior_hint="")] = None
     """Time for a frame, milliseconds. What was left out is in the answer (`omitted`)."""
     smooth: Annotated[float, arg(metavar="SECONDS")] = 0.0
@@ -50,11 +48,8 @@ class Track:
     most: Count = None
     """Stop after so many frames."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object with the summary."""
 
     def run(self) -> int:
-        """Track until the source ends or Ctrl-C."""
         if self.rate <= 0 or self.smooth < 0 or (self.at_most is not None and self.at_most <= 0):
             raise InputError("--rate and --at-most are above 0, --smooth is 0 or more")
         for path in self.out:
@@ -105,19 +100,14 @@ class Track:
         import numpy as np
 
         middle, high = np.quantile(times, [0.5, 0.99]).tolist()
-        if self.json:
-            counts = {state: states[state] for state in ("tracking", "relocalized", "lost")}
-            files = [str(path) for path in self.out]
-            print_json(
-                {"frames": len(times), **counts, "ms_p50": middle, "ms_p99": high, "out": files}
-            )
-            return
-        print(
+        counts = {state: states[state] for state in ("tracking", "relocalized", "lost")}
+        record = {"frames": len(times), **counts, "ms_p50": middle, "ms_p99": high}
+        line = (
             f"{len(times)} frames: {states['tracking']} tracked, {states['relocalized']}"
             f" relocalized, {states['lost']} lost; {middle:.0f} ms (median), {high:.0f} ms (99 %)"
         )
-        if not self.out:
-            print_next("evercal", "track", self.store, self.source, "--out", "track.jsonl")
+        then = () if self.out else ("track", self.store, self.source, "--out", "track.jsonl")
+        self.answer({**record, "out": [str(path) for path in self.out]}, [line], then)
 
 
 def _line(name: str, frame: "TrackedFrame") -> str:

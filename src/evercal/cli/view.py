@@ -12,15 +12,15 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.cli.arguments import open_map
 from evercal.cli.console import print_json
-from evercal.cli.options import Device
-from evercal.cli.stores import open_map
+from evercal.cli.options import Device, File, Host, Port, Source, Store, Verb
 from evercal.errors import InputError, missing_extra
 from evercal.service.hosts import is_local
 
 
 @dataclass(frozen=True)
-class View:
+class View(Verb):
     """Show a map in 3D in the browser, with calibrations, the arm, and a tracked camera.
 
     It is stopped by Ctrl-C or SIGTERM. The page has no password and is served on 127.0.0.1, unless
@@ -29,29 +29,23 @@ class View:
     Example: evercal view cell.evercal tripod.json --live 0
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
-    """Folder of the map."""
+    store: Store
     calibrations: Annotated[
         Positional[tuple[Path, ...]],
         arg(metavar="[CALIBRATION.json...]", help_behavior_hint="(default: none)"),
     ] = ()
     """Calibration files to draw."""
-    live: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="")] = None
+    live: Source = None
     """Camera to track: its number (0) or device, an address (rtsp://...), a video or a folder."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    camera: File = None
     """Intrinsics of the live camera. Default: those of the camera that recorded the scene."""
-    urdf: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    urdf: File = None
     """Robot description of the arm; its base link is at the robot base."""
-    host: Annotated[str, arg(metavar="H")] = "127.0.0.1"
-    """Address to listen on."""
-    port: Annotated[int, arg(metavar="P")] = 8080
-    """Port to listen on; 0 for any free one."""
+    host: Host = "127.0.0.1"
+    port: Port = 8080
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object when the page is ready."""
 
     def run(self) -> int:
-        """Serve the page until Ctrl-C or SIGTERM."""
         if self.camera is not None and self.live is None:
             raise InputError("--camera: is that of --live, which is missing")
         prepare_page(self.host, "sees the map and the images")

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.cli.arguments import open_map, stated_camera
 from evercal.cli.check import shift_line
 from evercal.cli.console import print_json
-from evercal.cli.image_words import stated_camera
-from evercal.cli.options import Device, File, Store
-from evercal.cli.stores import open_map
+from evercal.cli.options import Device, File, Store, Verb
 from evercal.errors import InputError
 from evercal.reports.answers import shift_dict
 
@@ -30,7 +29,7 @@ FALSE_ALARMS = 0.01
 
 
 @dataclass(frozen=True)
-class Watch:
+class Watch(Verb):
     """Watch a folder that a camera writes images to; stop with exit code 1 when it has moved.
 
     The newest images are tested together, so that a single outlier raises no alarm.
@@ -39,7 +38,6 @@ class Watch:
     """
 
     store: Store
-    """Folder of the map."""
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder that images arrive in."""
     reference: Annotated[Path, arg(metavar="FILE")]
@@ -53,11 +51,8 @@ class Watch:
     camera: File = None
     """Intrinsics. Default: those of the reference."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object for every image."""
 
     def run(self) -> int:
-        """Check new images until the camera has moved."""
         if not self.folder.is_dir():
             raise InputError(f"{self.folder}: no such folder; give the one that images arrive in")
         if self.window < 1 or self.interval <= 0:
