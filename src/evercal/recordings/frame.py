@@ -85,6 +85,17 @@ class Recording:
     `base_from_camera` is then in that unit."""
 
 
+def require_images(frames: Iterable[Frame], file: Path) -> None:
+    """Refuse frames whose image files, named in `file`, are missing."""
+    images = [frame.image for frame in frames if isinstance(frame.image, Path)]
+    missing = [image for image in images if not image.is_file()]
+    if missing:
+        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        raise InputError(
+            f"{missing[0]}{more}: named in {file} but missing; restore or take the frame out"
+        )
+
+
 def posed_recording(recording: Recording) -> Recording:
     """Drop training frames without a pose and count them as untracked."""
     train = posed_frames(recording.train)

@@ -3,7 +3,8 @@
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
+from typing import Any
 
 from evercal.errors import InputError
 
@@ -33,7 +34,7 @@ def read_text(path: Path, what: str, remedy: str = "check the path") -> str:
         return path.read_text(encoding="utf-8-sig")
 
 
-def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str, object]:
+def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str, Any]:
     """Read a JSON object; `what` names its contents in messages."""
     try:
         data = json.loads(read_text(path, what, remedy))
@@ -52,3 +53,24 @@ def first_repeated(names: Sequence[str]) -> str | None:
             return name
         known.add(name)
     return None
+
+
+def path_inside(path: object, what: str) -> str:
+    """Check that a path of a file with forward slashes stays inside the file's folder.
+
+    Symbolic links are followed: download caches keep files elsewhere. `what` names the entry.
+
+    Raises:
+        ValueError: The path is empty, absolute or contains "..".
+    """
+    # Windows paths split at both kinds of slashes and have an anchor for drives as well.
+    if not isinstance(path, str) or not path or PureWindowsPath(path).anchor:
+        raise ValueError(f"{what} is a path relative to the folder, got {path!r}")
+    if ".." in PureWindowsPath(path).parts:
+        raise ValueError(f"{what} stays inside the folder, got {path!r}")
+    return path
+
+
+def is_real(value: object) -> bool:
+    """Whether a JSON value is a number."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)

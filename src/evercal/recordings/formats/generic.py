@@ -7,24 +7,28 @@ ignored.
 import contextlib
 import os
 import shutil
-from collections.abc import Callable, Mapping
-from pathlib import Path, PureWindowsPath
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_to_dict
-from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.frame import Frame, Recording, require_images
 from evercal.recordings.images import StoredImage, write_image
-from evercal.recordings.text_files import first_repeated, named_errors, read_json
+from evercal.recordings.text_files import (
+    first_repeated,
+    is_real,
+    named_errors,
+    path_inside,
+    read_json,
+)
 from evercal.storage import write_json
 
 FILE = "scene.json"
 _FORMAT = "evercal-scene"
 _VERSION = 1
-_UNFINISHED = ".unfinished"
-"""Marker file in a folder that is being written; it stays if the writer is interrupted."""
 
 
 def detect(root: Path) -> bool:
@@ -36,42 +40,44 @@ def load(root: str | os.PathLike[str]) -> Recording:
     """Read scene.json and check that its images exist; no image is opened."""
     root = Path(root)
     file = root / FILE
-    data = _read(file)
+    data = read_json(file, "scene file", "convert the recording again")
     with named_errors(file, "scene file"):
+        _check(data)
         cameras = _cameras(data.get("cameras"))
-        entries = data.get("frames")
-        if not isinstance(entries, list) or not entries:
-            raise ValueError("'frames' is a list with at least one frame")
-        frames = [_frame(root, i, entry, cameras) for i, entry in enumerate(entries)]
-        untracked = data.get("untracked", 0)
-        if not isinstance(untracked, int):
-            raise ValueError(f"'untracked' is a count, got {untracked!r}")
-        unit = data.get("unit", "metres")
-        if unit not in ("metres", "unknown"):
-            raise ValueError(f"'unit' is 'metres' or 'unknown', got {unit!r}")
-        notes = data.get("notes", [])
-        if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
-            raise ValueError(f"'notes' is a list of sentences, got {notes!r}")
+        frames = [_frame(root, i, entry, cameras) for i, entry in enumerate(data["frames"])]
         repeated = first_repeated([frame.name for _, frame in frames])
         if repeated is not None:
             raise ValueError(f"frame name {repeated!r} comes twice; names are unique")
-    images = [Path(str(frame.image)) for _, frame in frames]
-    missing = [image for image in images if not image.is_file()]
-    if missing:
-        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise InputError(
-            f"{missing[0]}{more}: named in {file} but missing; restore or take the frame out"
-        )
+    require_images([frame for _, frame in frames], file)
     name = data.get("name")
     train, test = (tuple(f for s, f in frames if s == split) for split in ("train", "test"))
     return Recording(
         name if isinstance(name, str) and name else root.resolve().name,
         train,
         test,
-        untracked,
-        notes=tuple(notes),
-        metric=unit == "metres",
+        data.get("untracked", 0),
+        notes=tuple(data.get("notes", ())),
+        metric=data.get("unit") != "unknown",
     )
+
+
+def _check(data: Mapping[str, Any]) -> None:
+    if data.get("format") != _FORMAT:
+        raise ValueError(f"'format' is not '{_FORMAT}'; this is another program's file")
+    if data.get("version") != _VERSION:
+        raise ValueError(
+            f"version {data.get('version')!r}, this evercal reads {_VERSION}; update evercal or"
+            f" convert the scene"
+        )
+    frames, notes = data.get("frames"), data.get("notes", [])
+    if not isinstance(frames, list) or not frames:
+        raise ValueError("'frames' is a list with at least one frame")
+    if not isinstance(data.get("untracked", 0), int):
+        raise ValueError(f"'untracked' is a count, got {data['untracked']!r}")
+    if data.get("unit", "metres") not in ("metres", "unknown"):
+        raise ValueError(f"'unit' is 'metres' or 'unknown', got {data['unit']!r}")
+    if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+        raise ValueError(f"'notes' is a list of sentences, got {notes!r}")
 
 
 def write(
@@ -123,7 +129,6 @@ class SceneWriter:
                 f"{self._root / FILE}: already there; give a new folder, or remove the whole folder"
             )
         (self._root / "images").mkdir(parents=True, exist_ok=True)
-        self._resumed = (self._root / _UNFINISHED).exists()
 
     def __enter__(self) -> Self:
         """Return the writer; its folder exists already."""
@@ -144,11 +149,8 @@ class SceneWriter:
         data |= {} if self.metric else {"unit": "unknown"}
         data |= {"notes": list(self.notes)} if self.notes else {}
         data |= {"render": self.render} if self.render is not None else {}
-        try:
-            write_json(self._root / FILE, data)
-            (self._root / _UNFINISHED).unlink(missing_ok=True)
-        except OSError as error:
-            raise InputError(f"{self._root / FILE}: cannot be written ({error.strerror})") from None
+        with self._new(FILE) as file:
+            write_json(file, data)
 
     def add(self, frame: Frame, split: Literal["train", "test"]) -> None:
         """Write the frame's image and collect its entry of scene.json."""
@@ -179,47 +181,41 @@ class SceneWriter:
             self._copy(frame.image, relative)
             return relative
         stored = frame.image.file() if isinstance(frame.image, StoredImage) else None
-        if stored is None:
-            relative, image = f"{stem}.png", frame.read_image()
-            self._put(relative, lambda path: write_image(path, image))
-        else:
-            relative = stem + stored[0]
-            self._put(relative, lambda path: path.write_bytes(stored[1]))
+        image = frame.read_image() if stored is None else None
+        relative = stem + (".png" if stored is None else stored[0])
+        with self._new(relative) as path:
+            if image is not None:
+                write_image(path, image)
+            elif stored is not None:
+                path.write_bytes(stored[1])
         return relative
 
     def _copy(self, source: Path, relative: str) -> None:
         """Copy or link a file into the folder, unless it is that file already."""
         target = self._root / relative
-        if target.exists() and target.samefile(source):
-            return
-
-        def write(path: Path) -> None:
-            if self._link:
-                with contextlib.suppress(OSError):  # not every file system has links
-                    # A link through a link would be broken once the folder moves.
-                    return path.hardlink_to(source.resolve())
-            shutil.copyfile(source, path)
-
         try:
+            if target.exists() and target.samefile(source):
+                return
             source.stat()
         except OSError as error:
             raise InputError(f"{source}: cannot be copied ({error.strerror})") from None
-        self._put(relative, write)
+        with self._new(relative):
+            if self._link:
+                with contextlib.suppress(OSError):  # not every file system has links
+                    # A link through a link would be broken once the folder moves.
+                    return target.hardlink_to(source.resolve())
+            shutil.copyfile(source, target)
 
-    def _put(self, relative: str, write: Callable[[Path], object]) -> None:
-        """Write a file under a temporary name and move it, so no hard link is written through."""
-        target, marker = self._root / relative, self._root / _UNFINISHED
-        if target.exists() and not self._resumed:
-            marker.unlink(missing_ok=True)
-            raise InputError(f"{target}: already there; give a new folder")
-        temporary = target.with_name(f".{target.name}")
+    @contextlib.contextmanager
+    def _new(self, relative: str) -> Iterator[Path]:
+        """Path of a new file: writing to an old one could write through its hard links."""
+        path = self._root / relative
+        if path.exists():
+            raise InputError(f"{path}: already there; give a new folder, or remove this one")
         try:
-            marker.touch()
-            temporary.unlink(missing_ok=True)
-            write(temporary)
-            temporary.replace(target)
+            yield path
         except OSError as error:
-            raise InputError(f"{target}: cannot be written ({error.strerror})") from None
+            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
 
 
 def _pose_from_dict(data: object) -> SE3 | None:
@@ -232,18 +228,6 @@ def _pose_from_dict(data: object) -> SE3 | None:
     if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-2:
         raise ValueError(f"'quaternion_wxyz' has length 1, got {quaternion}")
     return SE3(quaternion, translation)
-
-
-def _read(file: Path) -> dict[str, object]:
-    data = read_json(file, "scene file", "convert the recording again")
-    if data.get("format") != _FORMAT:
-        raise InputError(f"{file}: 'format' is not '{_FORMAT}'; this is another program's file")
-    if data.get("version") != _VERSION:
-        raise InputError(
-            f"{file}: version {data.get('version')!r}, this evercal reads {_VERSION}; update"
-            f" evercal or convert the scene"
-        )
-    return data
 
 
 def _cameras(data: object) -> dict[str, Camera]:
@@ -283,27 +267,7 @@ def _frame(
     return split, Frame(str(entry.get("name", image)), root / image, cameras[camera], **optional)
 
 
-def path_inside(path: object, what: str) -> str:
-    """Check that a path of a file with forward slashes stays inside the file's folder.
-
-    Symbolic links are followed: download caches keep files elsewhere. `what` names the entry.
-
-    Raises:
-        ValueError: The path is empty, absolute or contains "..".
-    """
-    # Windows paths split at both kinds of slashes and have an anchor for drives as well.
-    if not isinstance(path, str) or not path or PureWindowsPath(path).anchor:
-        raise ValueError(f"{what} is a path relative to the folder, got {path!r}")
-    if ".." in PureWindowsPath(path).parts:
-        raise ValueError(f"{what} stays inside the folder, got {path!r}")
-    return path
-
-
 def _numbers(value: object, count: int, name: str) -> list[float]:
-    if (
-        not isinstance(value, list)
-        or len(value) != count
-        or any(isinstance(v, bool) or not isinstance(v, (int, float)) for v in value)
-    ):
+    if not isinstance(value, list) or len(value) != count or not all(map(is_real, value)):
         raise ValueError(f"'{name}' is {count} numbers, got {value!r}")
     return [float(v) for v in value]

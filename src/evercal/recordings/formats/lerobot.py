@@ -22,14 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError, missing_extra
-from evercal.recordings.formats.generic import path_inside
 from evercal.recordings.formats.lerobot_poses import feature_poses, pose_feature
 from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, decode_image, image_file
 from evercal.recordings.poses.camera_file import read_camera_of_size
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import read_json
+from evercal.recordings.text_files import path_inside, read_json
 
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
 INFO = Path("meta") / "info.json"

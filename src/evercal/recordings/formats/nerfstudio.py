@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.frame import Frame, Recording, require_images
 from evercal.recordings.images import IMAGE_ENDINGS, image_size
+from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import first_repeated, named_errors, read_json
+from evercal.recordings.text_files import first_repeated, is_real, named_errors, read_json
 
 FILE = "transforms.json"
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
@@ -35,10 +36,7 @@ USES = ("metres",)
 def frame_note(file: str, metric: bool) -> str:
     """What the recording leaves open: its base frame and, unless `metric`, its unit of length."""
     if metric:
-        return (
-            f"the base frame is that of {file}; if it is not the robot's, run 'evercal align' after"
-            " learning"
-        )
+        return f"the base frame is that of {file}; if it is not the robot's, run 'evercal align'"
     return (
         f"the base frame and the unit of length are those of {file}: run 'evercal align' after"
         " learning, or give --metres if the poses are in metres"
@@ -69,10 +67,11 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
             width, height = image_size(_image(root, str(first["file_path"])))
             data |= {"w": width, "h": height}
         frames = [_frame(root, data, i, entry, undo, scale) for i, entry in enumerate(entries)]
-        test = _test_images(root, data, {str(frame.image) for frame in frames})
-    repeated = first_repeated([frame.name for frame in frames])
-    if repeated is not None:
-        raise InputError(f"{file}: {repeated!r} comes twice; keep one entry for each image")
+        test = _test_images(root, data, {frame.image for frame in frames})
+        repeated = first_repeated([frame.name for frame in frames])
+        if repeated is not None:
+            raise ValueError(f"{repeated!r} comes twice; keep one entry for each image")
+    require_images(frames, file)
     frames = _resized(file, frames)
     return Recording(
         root.resolve().name,
@@ -165,36 +164,37 @@ def _resized(file: Path, frames: list[Frame]) -> list[Frame]:
     Downscaled copies of the images get scaled cameras. Rotated and cropped images are refused.
     """
     sizes: dict[tuple[int, int], tuple[int, int]] = {}
+    resized = []
     for frame in frames:
-        image, stated = frame.image, (frame.camera.width, frame.camera.height)
-        if not isinstance(image, Path) or not image.is_file():
-            raise InputError(f"{image}: named in {file} but missing; restore or take the frame out")
-        if stated in sizes:
-            continue
-        size = sizes[stated] = image_size(image)
-        if abs(size[0] / size[1] / (stated[0] / stated[1]) - 1) > 0.01:
-            rotated = "the image was rotated after the intrinsics were written"
-            raise InputError(
-                f"{image}: is {size[0]}x{size[1]}, {file.name} says {stated[0]}x{stated[1]}"
-                f" ({rotated if size == stated[::-1] else 'cropped?'}); give images of that shape"
-            )
-    return [_scaled(frame, sizes) for frame in frames]
+        stated = frame.camera.width, frame.camera.height
+        if stated not in sizes:
+            sizes[stated] = _size_of_shape(frame, stated, file)
+        if sizes[stated] != stated:
+            frame = replace(frame, camera=frame.camera.resized(*sizes[stated]))
+        resized.append(frame)
+    return resized
 
 
-def _scaled(frame: Frame, sizes: Mapping[tuple[int, int], tuple[int, int]]) -> Frame:
-    stated = frame.camera.width, frame.camera.height
-    size = sizes[stated]
-    return frame if size == stated else replace(frame, camera=frame.camera.resized(*size))
+def _size_of_shape(frame: Frame, stated: tuple[int, int], file: Path) -> tuple[int, int]:
+    assert isinstance(frame.image, Path)
+    size = image_size(frame.image)
+    if abs(size[0] / size[1] / (stated[0] / stated[1]) - 1) > 0.01:
+        rotated = "the image was rotated after the intrinsics were written"
+        raise InputError(
+            f"{frame.image}: is {size[0]}x{size[1]}, {file.name} says {stated[0]}x{stated[1]}"
+            f" ({rotated if size == stated[::-1] else 'cropped?'}); give images of that shape"
+        )
+    return size
 
 
-def _test_images(root: Path, data: Mapping[str, object], images: Container[str]) -> set[Path]:
+def _test_images(root: Path, data: Mapping[str, object], images: Container[object]) -> set[Path]:
     test: set[Path] = set()
     for key in ("val_filenames", "test_filenames"):
         names = data.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"{key!r} is a list of file names")
         # A test frame under another name would be learned from.
-        other = [name for name in names if str(_image(root, name)) not in images]
+        other = [name for name in names if _image(root, name) not in images]
         if other:
             raise ValueError(f"{key!r} names {other[0]!r}, which is no frame; correct the name")
         test |= {_image(root, name) for name in names}
@@ -202,18 +202,15 @@ def _test_images(root: Path, data: Mapping[str, object], images: Container[str])
 
 
 def _matrix(value: object, name: str) -> NDArray[np.float64]:
-    try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
+    matrix = number_array(value, repr(name))
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise ValueError(f"{name!r} is 4x4 or 3x4 numbers, got {str(value)[:60]}")
     return matrix
 
 
 def _number(data: Mapping[str, object], name: str, default: float | None = None) -> float:
-    value = data.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    value: Any = data.get(name, default)
+    if not is_real(value) or not math.isfinite(value):
         what = "is missing" if value is None else f"is a number, got {value!r}"
         raise ValueError(f"{name!r} {what}")
     return float(value)
