@@ -33,9 +33,6 @@ def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
         image: (H, W), (H, W, 1), (H, W, 3) RGB or (H, W, 4) RGBA; uint8 or uint16, or nested lists
             of integers from 0 to 255. Grey becomes equal red, green and blue. Alpha is dropped.
             16-bit values are divided by 257 and rounded, so that 65535 becomes 255.
-
-    Raises:
-        InputError: The image is empty or has another shape or type.
     """
     try:
         pixels = np.asarray(image)

@@ -52,11 +52,7 @@ class Inspection:
 
 
 def inspect_recording(recording: Recording) -> Inspection:
-    """Check poses, cameras and some images of a recording.
-
-    Raises:
-        InputError: An image cannot be read, or its size differs from the camera's.
-    """
+    """Check poses, cameras and some images of a recording."""
     both = (*recording.train, *recording.test)
     grippers = any(frame.base_from_gripper for frame in both)
     owner = "camera" if posed_frames(both) else "gripper" if grippers else "none"

@@ -74,10 +74,6 @@ def reconstruct(
         out: New or empty folder.
         options: How frames are chosen and matched.
         on_step: Called with the current step.
-
-    Raises:
-        InputError: The extra `colmap` is not installed, the source cannot be read, too few frames,
-            or no two frames connect.
     """
     try:
         import pycolmap

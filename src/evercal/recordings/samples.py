@@ -48,9 +48,6 @@ def copy_samples(target: Path) -> None:
 
     Args:
         target: A new or empty folder.
-
-    Raises:
-        InputError: `target` is a file, is not empty, or cannot be written.
     """
     if target.exists() and not target.is_dir():
         raise InputError(f"{target}: is a file; name a new folder for the sample recordings")

@@ -94,9 +94,6 @@ def write(
         recording: Frames to write.
         link: Create hard links to image files where the file system allows it.
         on_frame: Called after every frame, for progress bars.
-
-    Raises:
-        InputError: `root` already holds a scene, or an image cannot be read.
     """
     with SceneWriter(root, recording.name, link) as writer:
         writer.untracked, writer.notes = recording.untracked, recording.notes

@@ -25,9 +25,6 @@ def pair_images(
     Rows with names are paired with the images of these names. Rows with times are interpolated at
     the image times `stamps_s`, by name, or the times in the image names. Otherwise rows and images,
     in natural order, are paired in order, and their numbers must be equal.
-
-    Raises:
-        InputError: The images cannot be paired; messages name the pose file.
     """
     if rows.names is not None:
         return _by_name(images, rows.names, rows.poses, file)
@@ -53,11 +50,7 @@ def pair_images(
 
 
 def poses_of_images(file: Path, images: Sequence[Path], convention: str | None = None) -> SE3:
-    """Read (n,) base_from_gripper of n images, for the commands with `--convention`.
-
-    Raises:
-        InputError: The images cannot be paired, or an image has no pose.
-    """
+    """Read (n,) base_from_gripper of n images, for the commands with `--convention`."""
     rows = read_robot_poses(file, convention, option="--convention")
     poses, _ = pair_images(images, rows, None, file)
     missing = [image.name for image, pose in zip(images, poses, strict=True) if pose is None]

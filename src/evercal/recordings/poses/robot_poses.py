@@ -112,9 +112,6 @@ def read_last_robot_pose(path: str | os.PathLike[str], convention: str | None = 
     Args:
         path: `.jsonl` holds one JSON object a line; other endings are read as a table.
         convention: As of `read_robot_poses`.
-
-    Raises:
-        InputError: The file is missing, has no complete row, or its row is no pose.
     """
     path = Path(path)
     with named_errors(path, "file of robot poses"):
