@@ -14,7 +14,7 @@ from evercal.recordings import ReadOptions, Recording, load_recording, read_robo
 from evercal.recordings.formats import lerobot, wrist
 from evercal.recordings.formats.lerobot_poses import pose_feature
 from evercal.recordings.poses.camera_file import read_camera
-from evercal.recordings.poses.joint_states import read_joints
+from evercal.recordings.poses.kinematics import read_joints
 
 PAGE = Path(__file__).parents[2] / "docs" / "formats.md"
 EXAMPLES = dict(re.findall(r"^```\w+ (\S+)\n(.*?)^```$", PAGE.read_text(), re.M | re.S))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evercal.errors import InputError
-from evercal.recordings.poses.joint_states import read_joints
+from evercal.recordings.poses.kinematics import read_joints
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import Rows, read_rows
 

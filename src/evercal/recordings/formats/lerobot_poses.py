@@ -22,8 +22,7 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
     poses_from_numbers,
 )
-from evercal.recordings.poses.joint_states import in_radians
-from evercal.recordings.poses.kinematics import RobotModel
+from evercal.recordings.poses.kinematics import RobotModel, in_radians
 from evercal.recordings.read_options import ReadOptions
 from evercal.recordings.text_files import first_repeated
 
@@ -110,10 +109,8 @@ def _joint_poses(
         raise InputError(f"{root}: {_STATE}: {repeated!r} names several numbers; rename them")
     model = RobotModel(options.urdf)
     values = in_radians(model, names, stated, [options.pose_convention] * len(names))
-    try:
-        return model.poses(names, values, options.base_frame, options.gripper_frame)
-    except InputError as error:
-        raise InputError(f"{root}: {_STATE}: {error} (or give --pose-convention deg)") from None
+    source = f"{root}: {_STATE} (--pose-convention {options.pose_convention or 'rad'})"
+    return model.poses(names, values, options.base_frame, options.gripper_frame, source)
 
 
 def _pose_columns(names: list[str], arm: str | None) -> tuple[PoseConvention, list[int]]:

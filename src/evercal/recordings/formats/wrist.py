@@ -12,8 +12,7 @@ from evercal.geometry import Camera
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, image_size
 from evercal.recordings.poses.camera_file import read_camera_of_size
-from evercal.recordings.poses.joint_states import read_joint_poses
-from evercal.recordings.poses.kinematics import RobotModel
+from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
 from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, read_rows

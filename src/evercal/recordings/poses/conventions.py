@@ -219,7 +219,7 @@ def _check_lengths(lengths: Array, convention: PoseConvention) -> None:
             f"positions are {np.median(usual):.3g} m from the base, but those of poses {poses} are"
             f" {metres[odd][0]:.3g} m; millimetres and metres may be mixed: write all in one unit"
         )
-    problem = f"positions up to {metres.max(initial=0.0):.2g} m from the base look like"
+    problem = f"positions up to {metres.max(initial=0.0):.4g} m from the base look like"
     if far.any():
         raise _other_unit("mm", problem, convention)
     if near.any() and near.all():

@@ -86,7 +86,7 @@ def test_joint_states_with_a_urdf_replace_tf(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no tf in it.*give the robot's --urdf for /joint_states"):
         load_recording(path)
     urdf.write_text(urdf.read_text().replace('"turn"', '"wheel"'))
-    with pytest.raises(InputError, match=r"joint states lack wheel, .* have finger, turn"):
+    with pytest.raises(InputError, match=r"no values for joint wheel, .* given are finger, turn"):
         load_recording(path, options=ReadOptions(urdf=urdf))
 
 

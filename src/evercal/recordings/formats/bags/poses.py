@@ -12,8 +12,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.formats.bags.file import JOINT_STATE, TF, BagFile
 from evercal.recordings.formats.bags.tf_tree import TfTree, Transform, plain_name
-from evercal.recordings.poses.joint_states import interpolate
-from evercal.recordings.poses.kinematics import RobotModel
+from evercal.recordings.poses.kinematics import RobotModel, interpolate
 from evercal.recordings.read_options import ReadOptions
 
 _BASES = ("base_link", "base", "panda_link0", "fr3_link0", "fer_link0", "lbr_link_0", "link_base")
@@ -145,17 +144,12 @@ def _from_joints(
         )
     _check_topic(bag, options.pose_topic, topics, "joint states")
     tracks = _joint_tracks(bag, topics, zero_ns)
-    joints = model.joints_between(base, gripper)
-    missing = [name for name in joints if name not in tracks]
-    if missing:
-        raise InputError(
-            f"{bag.path}: joint states lack {', '.join(missing)}, which {gripper} depends on; they"
-            f" have {', '.join(tracks)}"
-        )
-    values, valid = np.empty((len(stamps), len(joints))), np.ones(len(stamps), dtype=bool)
+    needed = model.joints_between(base, gripper)
+    values, valid = np.zeros((len(stamps), len(tracks))), np.ones(len(stamps), dtype=bool)
     times: Sequence[float] = ()
-    for column, name in enumerate(joints):
-        track = tracks[name]
+    for column, (name, track) in enumerate(tracks.items()):
+        if name not in needed:
+            continue
         if len(track) > 1 and options.pose_topic not in track:
             raise InputError(
                 f"{bag.path}: joint {name} is on several topics, {', '.join(sorted(track))};"
@@ -165,9 +159,9 @@ def _from_joints(
         times, positions = zip(*track[topic], strict=True)
         values[:, column], here = interpolate(np.array(times), np.array(positions), stamps)
         valid &= here
+    poses, notes = model.poses([*tracks], values, base, gripper, bag.path)
     if not valid.any():
         _refuse_times(bag, stamps, times, "the joint states")
-    poses, notes = model.poses(joints, values, base, gripper)
     return ImagePoses(poses, valid, False, notes)
 
 
