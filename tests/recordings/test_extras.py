@@ -19,7 +19,7 @@ from evercal.recordings.poses.kinematics import RobotModel
         ("pycolmap", "colmap", colmap._model),
         ("rosbags.highlevel", "bags", BagFile),
         ("yourdfpy", "urdf", RobotModel),
-        ("pyarrow.parquet", "lerobot", lerobot._parquet),
+        ("pyarrow.parquet", "lerobot", lambda path: lerobot._columns(path, [])),
         ("av", "lerobot", lambda _: Videos(30.0)),
     ],
 )

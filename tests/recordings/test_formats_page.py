@@ -12,7 +12,7 @@ from evercal.cli.align import _rows as read_points
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings import ReadOptions, Recording, load_recording, read_robot_poses, write_image
 from evercal.recordings.formats import lerobot, wrist
-from evercal.recordings.formats.lerobot_poses import pose_feature
+from evercal.recordings.formats.lerobot import _pose_feature
 from evercal.recordings.poses.camera_file import read_camera
 from evercal.recordings.poses.kinematics import read_joints
 
@@ -130,7 +130,7 @@ def test_joint_tables(page: Path) -> None:
 def test_lerobot_description(page: Path) -> None:
     assert lerobot.detect(page / "pusht")
     info = json.loads((page / "pusht" / lerobot.INFO).read_text())
-    assert pose_feature(page / "pusht", info, ReadOptions()) == "observation.ee"
+    assert _pose_feature(page / "pusht", info, ReadOptions()) == "observation.ee"
 
 
 def test_touched_points(page: Path) -> None:

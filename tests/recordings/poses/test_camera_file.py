@@ -263,7 +263,7 @@ def test_files_with_a_matrix_alone_have_no_distortion(tmp_path: Path) -> None:
         ({"K": K, "D": D, "width": 640}, "'image_height' is missing"),
         ({"K": K, "distortion_parameters": D, **SIZE}, "there is distortion_parameters"),
         ({"K": K, "dist": D, "d": D, **SIZE}, "dist and d are the same; keep one"),
-        ({"K": K, "image_size": [480, 640, 3]}, "image size is width and height"),
+        ({"K": K, "image_size": [480, 640, 3]}, r"image size \(width, height\) has 2 numbers"),
         ({**REALSENSE, "coeffs": D, "model": "inverse_brown_conrady"}, "is not supported"),
         ({**REALSENSE, "coeffs": [0] * 5, "model": "kannala_brandt4"}, "is not supported"),
         ({"K": K[:2], **SIZE}, "camera_matrix has 9 numbers, got 6"),

@@ -50,7 +50,7 @@ _EXPECTED = (
 def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> Camera:
     """Read the intrinsics of one camera.
 
-    `size` is (width, height) in pixels of the images; the size in the file, if any, is used instead.
+    `size` is (width, height) of the images in pixels, for files without one.
     """
     path = Path(path)
     with named_errors(path, "camera file"):
@@ -216,7 +216,7 @@ def _size(
         raise ValueError(
             f"{missing[0]!r} is missing, so it has no image size, there is {_listed(data)}"
         )
-    width, height = _numbers(list(stated), "image size", 2)
+    width, height = _numbers(list(stated), "image size (width, height)", 2)
     return width, height
 
 

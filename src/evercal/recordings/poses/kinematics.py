@@ -96,7 +96,8 @@ class RobotModel:
             if revolute and column.size and np.abs(column).max() > _LARGEST_RAD:
                 raise InputError(
                     f"{source}: joint {name} is at {column[np.abs(column).argmax()]:.1f}, too far"
-                    f" for radians; are these degrees (a column {name}_deg)?"
+                    f" for radians; if these are degrees, write the column as {name}_deg or give"
+                    f" --pose-convention deg"
                 )
         matrices = np.empty((len(values), 4, 4))
         for row, matrix in zip(values, matrices, strict=True):
