@@ -72,22 +72,21 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
 
 @dataclass(frozen=True, eq=False)
 class BagImage(StoredImage):
-    """One image message in a bag."""
+    """One image message in a bag, see `Message`."""
 
     bag: BagFile
     topic: str
     logged_ns: int
-    """Time of recording, nanoseconds."""
     repeat: int
-    """Number of earlier messages of the topic with the same time of recording."""
     stamp_ns: int
     frame_id: str
 
     def read(self) -> NDArray[np.uint8]:
         """Decode the message, see `StoredImage.read`."""
+        decode = ros_images.image_of
+        if self.bag.kinds[self.topic] == COMPRESSED:
+            decode = ros_images.compressed_image_of
         message = self.bag.message(self.topic, self.logged_ns, self.repeat)
-        compressed = message.kind == COMPRESSED
-        decode = ros_images.compressed_image_of if compressed else ros_images.image_of
         try:
             return decode(message.content)
         except ValueError as error:
@@ -102,7 +101,6 @@ class BagImage(StoredImage):
 
 
 def _image_topic(bag: BagFile, wanted: str | None) -> str:
-    """The requested topic, or the only one with pictures."""
     topics = bag.topics(IMAGE, COMPRESSED)
     if wanted is not None:
         if wanted not in topics:
@@ -128,7 +126,6 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
 
 
 def _unsupported(bag: BagFile, topic: str) -> str | None:
-    """Reason why the images of a topic cannot be read, if any."""
     first = bag.first(topic)
     if bag.kinds[topic] == IMAGE:
         return ros_images.unsupported(first.encoding)
@@ -136,7 +133,6 @@ def _unsupported(bag: BagFile, topic: str) -> str | None:
 
 
 def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
-    """All images of a topic in order of time, and notes."""
     shots = []
     for message in bag.messages([topic]):
         header = message.content.header

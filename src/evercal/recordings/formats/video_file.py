@@ -32,8 +32,6 @@ class VideoFrame(StoredImage):
 
 
 class _Open:
-    """A video that is being decoded, with its last frame."""
-
     def __init__(self, container: Any) -> None:
         self.container, self.stream = container, container.streams.video[0]
         self.stream.thread_type = "AUTO"

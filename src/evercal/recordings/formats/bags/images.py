@@ -46,11 +46,7 @@ def unsupported(encoding: str) -> str | None:
 
 
 def image_of(message: Any) -> NDArray[np.uint8]:
-    """Decode a sensor_msgs/Image to (H, W, 3) uint8 RGB, 16-bit values converted as by `as_rgb`.
-
-    Raises:
-        ValueError: The encoding is not supported, or there is less data than the size needs.
-    """
+    """Decode a sensor_msgs/Image to (H, W, 3) uint8 RGB, 16-bit values converted as by `as_rgb`."""
     import cv2
 
     reason = unsupported(message.encoding)
@@ -75,11 +71,7 @@ def image_of(message: Any) -> NDArray[np.uint8]:
 
 
 def compressed_image_of(message: Any) -> NDArray[np.uint8]:
-    """Decode a sensor_msgs/CompressedImage with a PNG or JPEG to (H, W, 3) uint8 RGB.
-
-    Raises:
-        ValueError: The image has another format, holds depth, or is broken.
-    """
+    """Decode a sensor_msgs/CompressedImage with a PNG or JPEG to (H, W, 3) uint8 RGB."""
     if "compressedDepth" in message.format:
         raise ValueError(f"format {message.format!r} holds depth, no picture")
     image = decode_image(np.asarray(message.data, dtype=np.uint8))

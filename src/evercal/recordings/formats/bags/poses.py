@@ -78,13 +78,8 @@ def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[TfTree, list[fl
                 stamp = message.seconds(entry.header, zero_ns)
                 times.append(stamp)
             t, q = entry.transform.translation, entry.transform.rotation
-            link = Transform(
-                entry.header.frame_id,
-                entry.child_frame_id,
-                stamp,
-                (q.w, q.x, q.y, q.z),
-                (t.x, t.y, t.z),
-            )
+            frames = entry.header.frame_id, entry.child_frame_id
+            link = Transform(*frames, stamp, (q.w, q.x, q.y, q.z), (t.x, t.y, t.z))
             tree.add(link, message.topic.removesuffix("_static"))
     return tree, times
 
@@ -100,7 +95,6 @@ def _check_topic(bag: BagFile, wanted: str | None, topics: Sequence[str], what: 
 def _frame(
     bag: BagFile, tree: TfTree, wanted: str | None, usual: Sequence[str], option: str
 ) -> str:
-    """The requested frame, or the only one with a usual name."""
     frames = tree.frames()
     if wanted is not None:
         if plain_name(wanted) not in frames:
@@ -134,7 +128,6 @@ def _from_joints(
     model: RobotModel,
     options: ReadOptions,
 ) -> ImagePoses:
-    """Forward kinematics of the joint states, interpolated at the images."""
     base, gripper = model.chosen_links(options.base_frame, options.gripper_frame)
     topics = bag.topics(JOINT_STATE)
     if not topics:

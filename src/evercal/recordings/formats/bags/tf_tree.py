@@ -26,14 +26,13 @@ class Transform(NamedTuple):
 
 @dataclass
 class _Edge:
-    """Transforms of one child frame from one topic."""
+    """Transforms of one child frame from one topic; moving ones take precedence."""
 
     moving: list[Transform] = field(default_factory=list)
     static: list[Transform] = field(default_factory=list)
 
     @property
     def transforms(self) -> list[Transform]:
-        """The last static transform is valid, and moving ones take precedence."""
         return self.moving or self.static[-1:]
 
     @property
@@ -44,9 +43,8 @@ class _Edge:
 class TfTree:
     """Transforms of a recording, added in any order.
 
-    Args:
-        source: The recording, for messages.
-        topic: Topic to use if several topics move one frame. If omitted, this is refused.
+    `source` names it in messages. `topic` is the one to use if several topics move one frame; if
+    omitted, this is refused.
     """
 
     def __init__(self, source: str, topic: str | None = None) -> None:
@@ -80,11 +78,7 @@ class TfTree:
     def a_from_b(
         self, a: str, b: str, stamps_s: NDArray[np.float64]
     ) -> tuple[SE3, NDArray[np.bool_]]:
-        """Interpolate (n,) poses of frame b in frame a, and whether each is valid.
-
-        Validity is that of `PoseTrack.at`. Frames that are not connected, and ambiguous transforms
-        between them, are refused.
-        """
+        """Interpolate (n,) poses of frame b in frame a, and whether each is valid."""
         up, down = self._chain(a), self._chain(b)
         for child in (frame for frame in (*up, *down) if frame in self._edges):
             self._refuse_ambiguous(child)
@@ -106,7 +100,6 @@ class TfTree:
         return sides[0].inverse() @ sides[1], valid
 
     def _edge(self, child: str) -> _Edge:
-        """The transforms to use for a frame: the chosen topic, else a moving one."""
         topics = self._edges[child]
         moving = [topic for topic, edge in topics.items() if edge.moving]
         return topics[self._topic if self._topic in topics else (moving or [*topics])[0]]
