@@ -35,11 +35,10 @@ class Reconstruct(Verb):
 
     def run(self) -> int:
         """Reconstruct and print a summary."""
-        from evercal.recordings.reconstruct import ReconstructOptions, reconstruct
+        from evercal.recordings.reconstruct import reconstruct
 
-        options = ReconstructOptions(motion=self.motion, most_frames=self.most)
         with Bars() as bars:
-            found = reconstruct(self.source, self.out, options, bars.step)
+            found = reconstruct(self.source, self.out, self.motion, self.most, bars.step)
         whole = found.posed >= _CONNECTED * found.frames
         if self.json:
             print_json({"out": str(self.out), **dataclasses.asdict(found)})
