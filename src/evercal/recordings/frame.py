@@ -35,11 +35,7 @@ class Frame:
     """Joint angles of the arm at the time of the image, if stated."""
 
     def read_image(self) -> NDArray[np.uint8]:
-        """Read the pixels, (H, W, 3) uint8 RGB.
-
-        Raises:
-            InputError: The file is missing or broken, or its size differs from the camera's.
-        """
+        """Read the pixels, (H, W, 3) uint8 RGB; a size that is not the camera's is refused."""
         if isinstance(self.image, Path):
             image = read_image(self.image)
         elif isinstance(self.image, StoredImage):

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evercal.errors import InputError
+from evercal.recordings.text_files import named_errors
 from evercal.storage.atomic import write_bytes
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -56,20 +57,13 @@ def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
 
 
 def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
-    """Read a grey, RGB or RGBA image file, turned upright as its EXIF orientation states.
+    """Read a grey, RGB or RGBA image file of 8 or 16 bits, converted as by `as_rgb`.
 
-    Intrinsics are those of the upright image. It is converted as by `as_rgb`.
-
-    Raises:
-        InputError: The file is missing, is a folder, or is not an image of 8 or 16 bits.
+    It is turned upright as its EXIF orientation states; intrinsics are those of the upright image.
     """
     path = Path(path)
-    try:
+    with named_errors(path, "image file"):
         data = np.fromfile(path, dtype=np.uint8)
-    except FileNotFoundError:
-        raise InputError(f"{path}: image file is missing; check the path") from None
-    except OSError as error:
-        raise InputError(f"{path}: image file cannot be read ({error.strerror})") from None
     image = decode_image(data)
     if image is None:
         raise InputError(
@@ -96,12 +90,7 @@ def image_file(data: bytes) -> tuple[str, bytes] | None:
 
 
 def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
-    """Write (H, W, 3) uint8 RGB in the format of the file's ending.
-
-    Raises:
-        InputError: The ending belongs to no image format.
-        ValueError: The image is not (H, W, 3) uint8.
-    """
+    """Write (H, W, 3) uint8 RGB in the format of the file's ending."""
     import cv2
 
     path = Path(path)

@@ -64,7 +64,6 @@ def _images(folder: Path, rate: float) -> Iterator[StreamFrame]:
 
 
 def _captured(source: str) -> Iterator[StreamFrame]:
-    """Frames by OpenCV."""
     import cv2
 
     live = is_live(source)

@@ -59,9 +59,6 @@ def path_inside(path: object, what: str) -> str:
     """Check that a path of a file with forward slashes stays inside the file's folder.
 
     Symbolic links are followed: download caches keep files elsewhere. `what` names the entry.
-
-    Raises:
-        ValueError: The path is empty, absolute or contains "..".
     """
     # Windows paths split at both kinds of slashes and have an anchor for drives as well.
     if not isinstance(path, str) or not path or PureWindowsPath(path).anchor:

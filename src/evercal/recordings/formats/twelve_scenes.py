@@ -12,7 +12,7 @@ from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.formats.frame_files import colour_images, tracked_frames
+from evercal.recordings.formats.seven_scenes import colour_images, tracked_frames
 from evercal.recordings.frame import Recording
 from evercal.recordings.images import image_size
 from evercal.recordings.text_files import read_text

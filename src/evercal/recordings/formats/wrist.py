@@ -69,12 +69,12 @@ def _rows(root: Path, file: Path, options: ReadOptions) -> tuple[RobotPoses, lis
         model = RobotModel(options.urdf or _urdf(root, file))
         links = options.base_frame, options.gripper_frame
         return read_joint_poses(file, model, *links, options.pose_convention)
-    for name in ("urdf", "base_frame", "gripper_frame"):
-        if getattr(options, name) is not None:
-            raise InputError(
-                f"{flag(name)}: {file} holds gripper poses already; leave the option"
-                f" out, or give joint angles in joints.csv instead"
-            )
+    unused = [n for n in ("urdf", "base_frame", "gripper_frame") if getattr(options, n) is not None]
+    if unused:
+        raise InputError(
+            f"{flag(unused[0])}: {file} holds gripper poses already; leave the option out, or give"
+            f" joint angles in joints.csv instead"
+        )
     return read_robot_poses(file, options.pose_convention, option="--pose-convention"), []
 
 
@@ -112,7 +112,6 @@ def _camera(root: Path, file: Path | None, image: Path) -> Camera:
 
 
 def _stamps(root: Path) -> dict[str, float] | None:
-    """Seconds by image name, if there is a stamps file."""
     file = root / "stamps.csv"
     if not file.is_file():
         return None

@@ -106,7 +106,6 @@ def _by_time(times: NDArray[np.float64], track: PoseTrack, file: Path) -> Pairin
 def _image_times(
     images: Sequence[Path], stamps_s: Mapping[str, float] | None
 ) -> NDArray[np.float64] | None:
-    """(n,) seconds from the stamps file, else from image names that are times."""
     if stamps_s is None:
         return times_in_names([image.name for image in images])
     times = [stamps_s.get(i.name, stamps_s.get(i.stem)) for i in images]
