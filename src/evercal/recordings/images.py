@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evercal.errors import InputError
-from evercal.recordings.text_files import named_errors
 from evercal.storage.atomic import write_bytes
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -62,8 +61,12 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     It is turned upright as its EXIF orientation states; intrinsics are those of the upright image.
     """
     path = Path(path)
-    with named_errors(path, "image file"):
+    try:
         data = np.fromfile(path, dtype=np.uint8)
+    except FileNotFoundError:
+        raise InputError(f"{path}: image file is missing; check the path") from None
+    except OSError as error:
+        raise InputError(f"{path}: image file cannot be read ({error.strerror})") from None
     image = decode_image(data)
     if image is None:
         raise InputError(

@@ -10,7 +10,7 @@ from evercal.errors import InputError
 
 
 @contextmanager
-def named_errors(path: Path, what: str, remedy: str = "check the path") -> Iterator[None]:
+def named_errors(path: Path | str, what: str, remedy: str = "check the path") -> Iterator[None]:
     """Turn errors while a file is read into an `InputError` that names it.
 
     `what` names the contents of the file. A ValueError is about the contents and already says what
@@ -26,6 +26,15 @@ def named_errors(path: Path, what: str, remedy: str = "check the path") -> Itera
         raise InputError(f"{path}: {what} is not a text file; {remedy}") from None
     except (ValueError, TypeError, OverflowError, EOFError) as error:
         raise InputError(f"{path}: {error}") from None
+
+
+@contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Begin the message of a ValueError with the entry that it is about."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from None
 
 
 def read_text(path: Path, what: str, remedy: str = "check the path") -> str:

@@ -188,7 +188,7 @@ BREAKS = [
     ((*FIRST, "base_from_camera", "quaternion_wxyz"), [0, 0, 0, 0], "has length 1"),
     ((*FIRST, "base_from_gripper"), {"translation_m": [0, 0, 0]}, "'quaternion_wxyz' is 4"),
     ((*FIRST, "base_from_camera", "translation_m"), [10**400, 0, 0], "too large"),
-    (FIRST, "frame", "frame 0 is an object"),
+    (FIRST, "frame", "frame 0: is an object"),
 ]
 
 

@@ -119,7 +119,7 @@ def test_an_applied_transform_is_undone(
     undo, divide = nerfstudio._applied(data)
     for matrix, new in zip(matrices, moved, strict=True):
         entry = {"file_path": "a.png", "transform_matrix": new.tolist()}
-        frame = nerfstudio._frame(Path(), data, 0, entry, undo, divide)
+        frame = nerfstudio._frame(Path(), data, entry, undo, divide)
         expected = gl_pixel(matrix, LENS, np.array(point))
         np.testing.assert_allclose(pixel_of(frame, np.array(point)), expected, atol=1e-6)
 
@@ -190,14 +190,14 @@ BREAKS: list[tuple[dict[str, Any], str]] = [
     ({"applied_transform": np.diag([1.0, 0, 1, 1]).tolist()}, "cannot be undone"),
     ({"frames": []}, "'frames' is a list with at least one frame"),
     ({"frames": [3]}, "frame 0: an object with 'file_path'"),
-    ({"frames": [{"file_path": "a.png"}]}, "frame 0 .a.png.: 'transform_matrix' is 4x4"),
+    ({"frames": [{"file_path": "a.png"}]}, "frame 0: a.png: 'transform_matrix' is 4x4"),
     (
         {"frames": [{"file_path": "a.png", "transform_matrix": (2 * np.eye(4)).tolist()}]},
-        "frame 0 .a.png.: the last row",
+        "frame 0: a.png: the last row",
     ),
     (
         {"frames": [{"file_path": "a.png", "transform_matrix": np.diag([2, 2, 2, 1.0]).tolist()}]},
-        "frame 0 .a.png.: .*is a rotation",
+        "frame 0: a.png: .*is a rotation",
     ),
     ({"frames": entries(ring(1)) * 2}, "'images/frame_00000.png' comes twice"),
     (

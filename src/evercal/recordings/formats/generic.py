@@ -21,6 +21,7 @@ from evercal.recordings.text_files import (
     first_repeated,
     is_real,
     named_errors,
+    naming,
     path_inside,
     read_json,
 )
@@ -44,7 +45,10 @@ def load(root: str | os.PathLike[str]) -> Recording:
     with named_errors(file, "scene file"):
         _check(data)
         cameras = _cameras(data.get("cameras"))
-        frames = [_frame(root, i, entry, cameras) for i, entry in enumerate(data["frames"])]
+        frames = []
+        for i, entry in enumerate(data["frames"]):
+            with naming(f"frame {i}"):
+                frames.append(_frame(root, entry, cameras))
         repeated = first_repeated([frame.name for _, frame in frames])
         if repeated is not None:
             raise ValueError(f"frame name {repeated!r} comes twice; names are unique")
@@ -215,53 +219,48 @@ class SceneWriter:
             raise InputError(f"{path}: cannot be written ({error.strerror})") from None
 
 
-def _pose_from_dict(data: object) -> SE3 | None:
-    if data is None:
-        return None
-    if not isinstance(data, Mapping):
-        raise ValueError(f"is {{'translation_m', 'quaternion_wxyz'}} or null, got {data!r}")
-    translation = np.array(_numbers(data.get("translation_m"), 3, "translation_m"))
-    quaternion = np.array(_numbers(data.get("quaternion_wxyz"), 4, "quaternion_wxyz"))
-    if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-2:
-        raise ValueError(f"'quaternion_wxyz' has length 1, got {quaternion}")
-    return SE3(quaternion, translation)
-
-
 def _cameras(data: object) -> dict[str, Camera]:
     if not isinstance(data, dict) or not all(isinstance(c, dict) for c in data.values()):
         raise ValueError("'cameras' is an object of objects, got something else")
     cameras = {}
     for number, camera in data.items():
-        try:
+        with naming(f"camera {number!r}"):
             cameras[number] = Camera.from_dict(camera)
-        except ValueError as error:
-            raise ValueError(f"camera {number!r}: {error}") from None
     return cameras
 
 
 def _frame(
-    root: Path, i: int, entry: object, cameras: dict[str, Camera]
+    root: Path, entry: object, cameras: dict[str, Camera]
 ) -> tuple[Literal["train", "test"], Frame]:
     if not isinstance(entry, dict):
-        raise ValueError(f"frame {i} is an object, got {entry!r}")
+        raise ValueError(f"is an object, got {entry!r}")
     camera, split = entry.get("camera"), entry.get("split")
-    image = path_inside(entry.get("image"), f"frame {i}: 'image'")
+    image = path_inside(entry.get("image"), "'image'")
     optional: dict[str, Any] = {}
     if (depth := entry.get("depth")) is not None:
-        optional["depth"] = root / path_inside(depth, f"frame {i}: 'depth'")
+        optional["depth"] = root / path_inside(depth, "'depth'")
     if (joints := entry.get("joints_rad")) is not None:
         count = len(joints) if isinstance(joints, list) else 7
-        optional["joints_rad"] = tuple(_numbers(joints, count, f"frame {i}: joints_rad"))
+        optional["joints_rad"] = tuple(_numbers(joints, count, "joints_rad"))
     if not isinstance(camera, str) or camera not in cameras:
-        raise ValueError(f"frame {i}: 'camera' is one of {sorted(cameras)}, got {camera!r}")
+        raise ValueError(f"'camera' is one of {sorted(cameras)}, got {camera!r}")
     if split not in ("train", "test"):
-        raise ValueError(f"frame {i}: 'split' is 'train' or 'test', got {split!r}")
+        raise ValueError(f"'split' is 'train' or 'test', got {split!r}")
     for key in ("base_from_camera", "base_from_gripper"):
-        try:
-            optional[key] = _pose_from_dict(entry.get(key))
-        except ValueError as error:
-            raise ValueError(f"frame {i}: '{key}': {error}") from None
+        with naming(repr(key)):
+            optional[key] = _pose(entry.get(key))
     return split, Frame(str(entry.get("name", image)), root / image, cameras[camera], **optional)
+
+
+def _pose(data: Any) -> SE3 | None:
+    if data is None:
+        return None
+    data = data if isinstance(data, dict) else {}
+    translation = np.array(_numbers(data.get("translation_m"), 3, "translation_m"))
+    quaternion = np.array(_numbers(data.get("quaternion_wxyz"), 4, "quaternion_wxyz"))
+    if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-2:
+        raise ValueError(f"'quaternion_wxyz' has length 1, got {quaternion}")
+    return SE3(quaternion, translation)
 
 
 def _numbers(value: object, count: int, name: str) -> list[float]:

@@ -23,7 +23,13 @@ from evercal.recordings.frame import Frame, Recording, require_images
 from evercal.recordings.images import IMAGE_ENDINGS, image_size
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import first_repeated, is_real, named_errors, read_json
+from evercal.recordings.text_files import (
+    first_repeated,
+    is_real,
+    named_errors,
+    naming,
+    read_json,
+)
 
 FILE = "transforms.json"
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
@@ -66,7 +72,10 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
         if isinstance(first, dict) and "file_path" in first and not {"w", "h"} & {*data, *first}:
             width, height = image_size(_image(root, str(first["file_path"])))
             data |= {"w": width, "h": height}
-        frames = [_frame(root, data, i, entry, undo, scale) for i, entry in enumerate(entries)]
+        frames = []
+        for i, entry in enumerate(entries):
+            with naming(f"frame {i}"):
+                frames.append(_frame(root, data, entry, undo, scale))
         test = _test_images(root, data, {frame.image for frame in frames})
         repeated = first_repeated([frame.name for frame in frames])
         if repeated is not None:
@@ -93,24 +102,18 @@ def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
     size = abs(np.linalg.det(matrix[:, :3])) ** (1 / 3)
     if not size > 0:
         raise ValueError("'applied_transform' cannot be undone: its determinant is 0")
-    try:
+    with naming("'applied_transform'"):
         return SE3.from_matrix(matrix / size, _TOLERANCE).inverse(), scale * size
-    except ValueError as error:
-        raise ValueError(f"'applied_transform': {error}") from None
 
 
-def _frame(
-    root: Path, data: Mapping[str, object], i: int, entry: object, undo: SE3, scale: float
-) -> Frame:
+def _frame(root: Path, data: Mapping[str, object], entry: object, undo: SE3, scale: float) -> Frame:
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
-        raise ValueError(f"frame {i}: an object with 'file_path' and 'transform_matrix'")
+        raise ValueError("an object with 'file_path' and 'transform_matrix'")
     name = entry["file_path"]
-    try:
+    with naming(name):
         matrix = _matrix(entry.get("transform_matrix"), "transform_matrix")
         stated = SE3.from_matrix(matrix, _TOLERANCE)
         camera = _camera({**data, **entry})
-    except ValueError as error:
-        raise ValueError(f"frame {i} ({name}): {error}") from None
     world_from_gl = undo @ SE3(stated.rotation_wxyz, stated.translation_m / scale)
     return Frame(name, _image(root, name), camera, world_from_gl @ _GL_FROM_CV)
 
