@@ -16,6 +16,8 @@ from evercal.recordings.formats.lerobot import _pose_feature
 from evercal.recordings.poses.camera_file import read_camera
 from evercal.recordings.poses.kinematics import read_joints
 
+from .checks import assert_pose
+
 PAGE = Path(__file__).parents[2] / "docs" / "formats.md"
 EXAMPLES = dict(re.findall(r"^```\w+ (\S+)\n(.*?)^```$", PAGE.read_text(), re.M | re.S))
 CAMERA = Camera(640, 480, 525.2, 526.5, 319.5, 239.3, (0.1, -0.02, 0.001, 0.0, 0.03))
@@ -98,8 +100,7 @@ def test_recordings(page: Path, name: str) -> None:
 
 def assert_poses(read: Recording) -> None:
     for frame, expected in zip(read.train, POSES, strict=True):
-        assert frame.base_from_gripper is not None
-        assert max(pose_distance(frame.base_from_gripper, expected)) < 1e-4
+        assert_pose(frame.base_from_gripper, expected, 1e-4)
 
 
 @pytest.mark.parametrize("name", sorted(CAMERAS))

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from evercal.errors import InputError
 from evercal.recordings.images import write_image
 from evercal.recordings.streams import stream
+
+from .checks import refused
 
 
 def image(value: int) -> np.ndarray:
@@ -46,14 +47,11 @@ def test_a_video_with_its_own_times(tmp_path: Path) -> None:
     ],
 )
 def test_sources_that_do_not_exist(source: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        list(stream(source))
+    refused(message, list, stream(source))
 
 
 def test_files_that_are_no_video(tmp_path: Path) -> None:
     (tmp_path / "notes.mp4").write_text("no video")
-    with pytest.raises(InputError, match="cannot be opened as a video"):
-        list(stream(str(tmp_path / "notes.mp4")))
+    refused("cannot be opened as a video", list, stream(str(tmp_path / "notes.mp4")))
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="image"):
-        list(stream(str(tmp_path / "empty")))
+    refused("image", list, stream(str(tmp_path / "empty")))

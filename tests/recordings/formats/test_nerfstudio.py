@@ -15,6 +15,8 @@ from evercal.recordings import Frame, load_recording, write_image
 from evercal.recordings.formats import nerfstudio
 from evercal.recordings.inspection import inspect_recording
 
+from ..checks import refused
+
 LENS = {"fl_x": 40.0, "fl_y": 42.0, "cx": 13.0, "cy": 17.5, "w": 24, "h": 36,
         "k1": 0.05, "k2": -0.02, "p1": 0.003, "p2": -0.002}  # fmt: skip
 
@@ -215,12 +217,10 @@ def test_broken_files_are_refused(change: dict[str, Any], message: str, tmp_path
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
     with pytest.raises(InputError, match=message) as caught:
         load_recording(tmp_path)
-    assert "\n" not in str(caught.value)
     assert "transforms.json" in str(caught.value)
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", "\x00"])
 def test_other_json_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text(text)
-    with pytest.raises(InputError, match=r"transforms\.json"):
-        load_recording(tmp_path)
+    refused(r"transforms\.json", load_recording, tmp_path)

@@ -15,6 +15,7 @@ from evercal.recordings.formats.ros_bag import BagImage
 
 pytest.importorskip("rosbags", reason="the extra 'bags' is not installed")
 
+from ..checks import refused
 from .bags_of_messages import (
     BASE_FROM_SHOULDER,
     KINDS,
@@ -69,8 +70,7 @@ def test_every_second_image_is_taken(tmp_path: Path) -> None:
     path = recorded_bag("ros1").write(tmp_path)
     recording = load_recording(path, options=ReadOptions(every=2))
     assert [frame.name for frame in recording.train] == ["000000", "000002", "000004"]
-    with pytest.raises(InputError, match="--every 0: give a number >= 1"):
-        load_recording(path, options=ReadOptions(every=0))
+    refused("--every 0: give a number >= 1", load_recording, path, options=ReadOptions(every=0))
 
 
 def test_compressed_images_are_read_by_threads_and_copied(tmp_path: Path) -> None:
@@ -257,6 +257,4 @@ def test_damaged_bags_are_refused(tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(b"\x89MCAP0\r\n")
     for file in (path, cut):
-        with pytest.raises(InputError, match="rosbags cannot read it") as caught:
-            load_recording(file)
-        assert "\n" not in str(caught.value)
+        refused("rosbags cannot read it", load_recording, file)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from evercal.continual.benchmark.suites import load_suite
-from evercal.errors import InputError
-from evercal.geometry import SE3, pose_distance
+from evercal.geometry import SE3
 from evercal.recordings import load_recording, write_image
+
+from ..checks import assert_pose, refused
 
 INFO = """m_versionNumber = 4
 m_sensorName = StructureSensor
@@ -52,8 +53,7 @@ def test_first_sequence_is_for_testing(apartment: Path) -> None:
     assert [frame.name for frame in recording.train] == ["frame-000002", "frame-000004"]
     assert recording.untracked == 1
     pose = recording.train[1].base_from_camera
-    assert pose is not None
-    assert max(pose_distance(pose, SE3.exp([1.0, 4, 0.0, 0.4, 0.2, 0.3]))) < 1e-5
+    assert_pose(pose, SE3.exp([1.0, 4, 0.0, 0.4, 0.2, 0.3]), 1e-5)
     assert abs(float(recording.train[1].read_image().mean()) - 160) < 2
 
 
@@ -69,8 +69,7 @@ def test_suite_loads_scenes_and_names_missing_ones(apartment: Path) -> None:
     write(data / "apt1" / "living")
     scenes = load_suite("i12s", data, ["apt1/living", "apt1/kitchen"])
     assert [recording.name for recording in scenes] == ["apt1-kitchen", "apt1-living"]
-    with pytest.raises(InputError, match="apt2/bed is missing; get it from https://graphics"):
-        load_suite("i12s", data)
+    refused("apt2/bed is missing; get it from https://graphics", load_suite, "i12s", data)
 
 
 @pytest.mark.parametrize(
@@ -91,5 +90,4 @@ def test_broken_files_are_refused(
 ) -> None:
     for path in apartment.glob(file):
         path.unlink() if text is None else path.write_text(text)
-    with pytest.raises(InputError, match=message):
-        load_recording(apartment)
+    refused(message, load_recording, apartment)

@@ -14,6 +14,8 @@ from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.recordings.poses.camera_file import read_camera
 
+from ..checks import refused
+
 CAMERA = Camera(640, 480, 525.25, 526.5, 319.5, 239.25, (0.1, -0.02, 0.001, 1e-5, 0.03))
 
 CALIBRATION = """\
@@ -100,8 +102,7 @@ def test_opencv_storage_is_read(tmp_path: Path) -> None:
     old = yaml.read_text().replace("%YAML 1.2", "%YAML:1.0")
     assert read_camera(written(tmp_path, old)) == CAMERA
     assert read_camera(stored(tmp_path, size=False), (640, 480)) == CAMERA
-    with pytest.raises(InputError, match="'image_width' is missing"):
-        read_camera(stored(tmp_path, size=False))
+    refused("'image_width' is missing", read_camera, stored(tmp_path, size=False))
     for more, expected in (
         ({"fisheye_model": 1}, "fisheye_model is set"),
         ({"K": np.eye(3)}, "camera_matrix and K are the same; keep one"),
@@ -116,15 +117,12 @@ def test_opencv_storage_is_read(tmp_path: Path) -> None:
         ("<opencv_storage><a>", "not valid XML"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage/>', "declares XML entities"),
     ):
-        with pytest.raises(InputError, match=expected) as caught:
-            read_camera(written(tmp_path, text), (640, 480))
-        assert "\n" not in str(caught.value)
+        refused(expected, read_camera, written(tmp_path, text), (640, 480))
 
 
 def test_missing_distortion_is_refused(tmp_path: Path) -> None:
     text = CALIBRATION.replace("distortion_coefficients", "lens")
-    with pytest.raises(InputError, match="'distortion_coefficients' is missing"):
-        read_camera(written(tmp_path, text))
+    refused("'distortion_coefficients' is missing", read_camera, written(tmp_path, text))
     assert read_camera(written(tmp_path, text + "d: [0, 0, 0, 0]\n")).distortion == ()
 
 
@@ -187,7 +185,6 @@ def test_broken_files_are_refused_in_one_line(tmp_path: Path, text: str, expecte
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
     assert expected in message
-    assert "\n" not in message
 
 
 def test_a_single_number_called_size_is_no_image_size(tmp_path: Path) -> None:
@@ -195,27 +192,21 @@ def test_a_single_number_called_size_is_no_image_size(tmp_path: Path) -> None:
     np.savez(tmp_path / "camera.npz", K=matrix, dist=np.zeros(5), size=0.025)
     camera = read_camera(tmp_path / "camera.npz", (640, 480))
     assert (camera.fx, camera.width, camera.height) == (500, 640, 480)
-    with pytest.raises(InputError, match="no image size"):
-        read_camera(tmp_path / "camera.npz")
+    refused("no image size", read_camera, tmp_path / "camera.npz")
 
 
 def test_missing_camera_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="missing"):
-        read_camera(tmp_path / "none.yaml")
-    with pytest.raises(InputError, match="cannot be read"):
-        read_camera(tmp_path)
+    refused("missing", read_camera, tmp_path / "none.yaml")
+    refused("cannot be read", read_camera, tmp_path)
     (tmp_path / "image.png").write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(InputError, match="not a text file"):
-        read_camera(tmp_path / "image.png")
-    with pytest.raises(InputError, match="has no image size"):
-        read_camera(written(tmp_path, "1 0 0 0 1 0 0 0 1"))
+    refused("not a text file", read_camera, tmp_path / "image.png")
+    refused("has no image size", read_camera, written(tmp_path, "1 0 0 0 1 0 0 0 1"))
 
 
 def test_yaml_cannot_run_code(tmp_path: Path) -> None:
     bait = tmp_path / "bait"
     text = f"width: !!python/object/apply:os.mkdir ['{bait}']\n"
-    with pytest.raises(InputError, match="not valid YAML"):
-        read_camera(written(tmp_path, text))
+    refused("not valid YAML", read_camera, written(tmp_path, text))
     assert not bait.exists()
 
 
@@ -272,8 +263,7 @@ def test_files_with_a_matrix_alone_have_no_distortion(tmp_path: Path) -> None:
 def test_unclear_fields_are_refused(
     tmp_path: Path, fields: dict[str, object], message: str
 ) -> None:
-    with pytest.raises(InputError, match=message):
-        read_camera(written(tmp_path, json.dumps(fields)))
+    refused(message, read_camera, written(tmp_path, json.dumps(fields)))
 
 
 def test_realsense_without_distortion_is_read(tmp_path: Path) -> None:

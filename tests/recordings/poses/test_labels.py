@@ -11,6 +11,8 @@ from evercal.recordings.poses.kinematics import read_joints
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import Rows, read_rows
 
+from ..checks import refused
+
 NAMES = ("image", "Image_Name", "img", "file", "filename", "file_path", "path", "name", "frame")
 STAMPS = (("t", 1.0), ("time [s]", 1.0), ("timestamp", 1.0), ("stamp_ms", 1e3), ("Time_NS", 1e9))
 POSE = {"translation_m": [0.5, 0.0, 0.2], "quaternion_wxyz": [1, 0, 0, 0]}
@@ -77,11 +79,9 @@ def test_plainest_of_several_labels_is_used(tmp_path: Path) -> None:
 def test_labels_missing_from_some_rows_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "p.json"
     file.write_text(json.dumps([{**POSE, "image": "a.png"}, POSE]))
-    with pytest.raises(InputError, match=r"p\.json: some poses have 'image', others lack it"):
-        read_robot_poses(file)
+    refused(r"p\.json: some poses have 'image', others lack it", read_robot_poses, file)
     file.write_text(json.dumps({"poses": [POSE] * 2, "images": ["a.png"]}))
-    with pytest.raises(InputError, match=r"p\.json: 'images' holds 1 entries for 2 poses"):
-        read_robot_poses(file)
+    refused(r"p\.json: 'images' holds 1 entries for 2 poses", read_robot_poses, file)
 
 
 def test_column_in_seconds_is_checked(tmp_path: Path) -> None:

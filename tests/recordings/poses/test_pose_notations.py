@@ -18,6 +18,8 @@ from evercal.recordings.poses.conventions import (
 )
 from evercal.recordings.poses.robot_poses import read_robot_poses
 
+from ..checks import refused
+
 Array = NDArray[np.float64]
 NAMES = tuple(f"{i}.png" for i in range(5))
 
@@ -133,8 +135,7 @@ def test_ambiguous_forms_are_asked_for(
     tmp_path: Path, text: str, given: str | None, message: str
 ) -> None:
     (tmp_path / "p.txt").write_text(text)
-    with pytest.raises(InputError, match=message):
-        read_robot_poses(tmp_path / "p.txt", given, option="--c")
+    refused(message, read_robot_poses, tmp_path / "p.txt", given, option="--c")
 
 
 def test_conventions_of_matrices_take_12_numbers(tmp_path: Path) -> None:
@@ -164,16 +165,13 @@ def test_arrays_by_name_are_read(tmp_path: Path) -> None:
         assert read.stamps_s is not None
         np.testing.assert_array_equal(read.stamps_s, stamps)
     np.savez(file, robot=MATRICES, board=MATRICES, **camera)
-    with pytest.raises(InputError, match=r"robot and board of its keys .* call the right one"):
-        read_robot_poses(file)
+    refused(r"robot and board of its keys .* call the right one", read_robot_poses, file)
     np.savez(file, robot=MATRICES, board=MATRICES, base_from_gripper=MATRICES)
     assert_arm(read_robot_poses(file).poses)
     np.savez(file, **camera)
-    with pytest.raises(InputError, match=r"none of its keys \(K, D\)"):
-        read_robot_poses(file)
+    refused(r"none of its keys \(K, D\)", read_robot_poses, file)
     file.write_bytes(b"PK\x03\x04 broken")
-    with pytest.raises(InputError, match=r"p\.npz: "):
-        read_robot_poses(file)
+    refused(r"p\.npz: ", read_robot_poses, file)
 
 
 def test_json_of_3x4_matrices_and_named_numbers_is_read(tmp_path: Path) -> None:

@@ -16,6 +16,8 @@ from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.conventions import CONVENTIONS, numbers_from_poses, pose_convention
 from evercal.recordings.poses.robot_poses import read_robot_poses
 
+from ..checks import refused
+
 COUNT = 6
 
 
@@ -130,8 +132,7 @@ def test_tum_files_are_read(tmp_path: Path) -> None:
         assert read.stamps_s[2] == 1.7e9 + 2
     inverse = read_robot_poses(tmp_path / "c.txt", "tum:inverse")
     assert same(inverse.poses, arm().inverse())
-    with pytest.raises(InputError, match=r"8 columns without a header .* xyzw, tum, "):
-        read_robot_poses(tmp_path / "c.txt")
+    refused(r"8 columns without a header .* xyzw, tum, ", read_robot_poses, tmp_path / "c.txt")
 
 
 def test_decimal_commas_are_read(tmp_path: Path) -> None:
@@ -168,8 +169,7 @@ def test_json_matrices_and_numbers_are_read(tmp_path: Path) -> None:
     assert same(read_robot_poses(file).poses, arm())
     file.write_text(json.dumps(numbers_from_poses(arm(), CONVENTIONS["kuka"]).tolist()))
     assert same(read_robot_poses(file, "kuka").poses, arm())
-    with pytest.raises(InputError, match="6 columns without a header do not define a pose"):
-        read_robot_poses(file)
+    refused("6 columns without a header do not define a pose", read_robot_poses, file)
 
 
 def test_npy_files_are_read(tmp_path: Path) -> None:
@@ -180,16 +180,14 @@ def test_npy_files_are_read(tmp_path: Path) -> None:
     assert same(read_robot_poses(file).poses, arm()[:1])
     np.save(file, arm().matrix().swapaxes(1, 2))
     assert same(read_robot_poses(file, "franka").poses, arm())
-    with pytest.raises(InputError, match="written column after column; give the convention franka"):
-        read_robot_poses(file)
+    refused("written column after column; give the convention franka", read_robot_poses, file)
     for name in ("wxyz", "xyzw", "ur", "kuka", "franka"):
         np.save(file, numbers_from_poses(arm(), CONVENTIONS[name]))
         assert same(read_robot_poses(file, name).poses, arm())
         if name == "franka":
             assert same(read_robot_poses(file).poses, arm())
             continue
-        with pytest.raises(InputError, match="do not define a pose"):
-            read_robot_poses(file)
+        refused("do not define a pose", read_robot_poses, file)
 
 
 Q = "0.5,0.1,0.2,1,0,0,0"
@@ -247,7 +245,6 @@ def test_ambiguous_and_broken_tables_are_refused(
     with pytest.raises(InputError, match=message) as caught:
         read_robot_poses(tmp_path / "p.csv", given)
     assert str(caught.value).startswith(str(tmp_path / "p.csv"))
-    assert "\n" not in str(caught.value)
 
 
 def test_messages_name_the_option_of_the_command(tmp_path: Path) -> None:
@@ -285,28 +282,21 @@ def test_broken_json_is_refused(
     tmp_path: Path, data: object, given: str | None, message: str
 ) -> None:
     (tmp_path / "p.json").write_text(json.dumps(data))
-    with pytest.raises(InputError, match=message):
-        read_robot_poses(tmp_path / "p.json", given)
+    refused(message, read_robot_poses, tmp_path / "p.json", given)
 
 
 def test_missing_and_broken_files_are_refused(tmp_path: Path) -> None:
     for name in ("no.csv", "no.json", "no.npy"):
-        with pytest.raises(InputError, match="file of robot poses is missing; check the path"):
-            read_robot_poses(tmp_path / name)
+        refused("file of robot poses is missing; check the path", read_robot_poses, tmp_path / name)
         with pytest.raises(InputError, match=f"{name}: camera file is missing"):
             read_robot_poses(tmp_path / name, what="camera file")
     (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(InputError, match="not a text file"):
-        read_robot_poses(tmp_path / "b.csv")
+    refused("not a text file", read_robot_poses, tmp_path / "b.csv")
     (tmp_path / "b.json").write_text("{")
-    with pytest.raises(InputError, match=r"b\.json: "):
-        read_robot_poses(tmp_path / "b.json")
+    refused(r"b\.json: ", read_robot_poses, tmp_path / "b.json")
     (tmp_path / "b.npy").write_text("hello")
-    with pytest.raises(InputError, match=r"b\.npy: "):
-        read_robot_poses(tmp_path / "b.npy")
+    refused(r"b\.npy: ", read_robot_poses, tmp_path / "b.npy")
     np.save(tmp_path / "o.npy", np.array([{}, {}], dtype=object), allow_pickle=True)
-    with pytest.raises(InputError, match=r"o\.npy: "):
-        read_robot_poses(tmp_path / "o.npy")
+    refused(r"o\.npy: ", read_robot_poses, tmp_path / "o.npy")
     np.save(tmp_path / "v.npy", np.zeros((2, 3, 4, 5)))
-    with pytest.raises(InputError, match=r"got \(2, 3, 4, 5\)"):
-        read_robot_poses(tmp_path / "v.npy")
+    refused(r"got \(2, 3, 4, 5\)", read_robot_poses, tmp_path / "v.npy")

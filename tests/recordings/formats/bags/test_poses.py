@@ -11,6 +11,7 @@ from evercal.recordings import ReadOptions, load_recording
 
 pytest.importorskip("rosbags", reason="the extra 'bags' is not installed")
 
+from ...checks import assert_pose, refused
 from ..bags_of_messages import (
     BASE_FROM_SHOULDER,
     SHOTS,
@@ -83,8 +84,7 @@ def test_joint_states_with_a_urdf_replace_tf(tmp_path: Path) -> None:
         assert frame.base_from_gripper is not None
         expected = SE3.exp([1, 0, 0, 0, 0, 0]) @ SE3.exp([0, 0, 0, 0, 0, at])
         assert max(pose_distance(frame.base_from_gripper, expected)) < 1e-7
-    with pytest.raises(InputError, match=r"no tf in it.*give the robot's --urdf for /joint_states"):
-        load_recording(path)
+    refused(r"no tf in it.*give the robot's --urdf for /joint_states", load_recording, path)
     urdf.write_text(urdf.read_text().replace('"turn"', '"wheel"'))
     with pytest.raises(InputError, match=r"no values for joint wheel, .* given are finger, turn"):
         load_recording(path, options=ReadOptions(urdf=urdf))
@@ -108,8 +108,7 @@ def test_joint_on_several_topics_needs_a_pose_topic(tmp_path: Path) -> None:
     path = tmp_path / "wave"
     recording = load_recording(path, options=ReadOptions(urdf=urdf, pose_topic="/joint_states"))
     pose = recording.train[0].base_from_gripper
-    assert pose is not None
-    assert max(pose_distance(pose, SE3.exp([1, 0, 0, 0, 0, 0]) @ SE3.exp([0] * 5 + [1.0]))) < 1e-7
+    assert_pose(pose, SE3.exp([1, 0, 0, 0, 0, 0]) @ SE3.exp([0] * 5 + [1.0]), 1e-7)
     with pytest.raises(InputError, match="no joint states on --pose-topic /tf; it is on /hand/"):
         load_recording(path, options=ReadOptions(urdf=urdf, pose_topic="/tf"))
 
@@ -131,8 +130,7 @@ def test_frame_on_several_topics_needs_a_pose_topic(tmp_path: Path) -> None:
     for topic, late in (("/tf", 0.0), ("/left/tf", 0.3)):
         recording = load_recording(tmp_path / "moving/wave", options=ReadOptions(pose_topic=topic))
         pose = recording.train[0].base_from_gripper
-        assert pose is not None
-        assert max(pose_distance(pose, BASE_FROM_SHOULDER @ shoulder_from_tool(late))) < 1e-7
+        assert_pose(pose, BASE_FROM_SHOULDER @ shoulder_from_tool(late), 1e-7)
     expected_message = "no tf on --pose-topic /right/tf; it is on /left/tf, /tf"
     assert expected_message in refusal_of(tmp_path / "moving/wave", pose_topic="/right/tf")
 
@@ -147,8 +145,7 @@ def test_ambiguous_frames_are_refused(tmp_path: Path) -> None:
         ),
         (ReadOptions(gripper_frame="hand"), "--gripper-frame hand: no such frame"),
     ):
-        with pytest.raises(InputError, match=message):
-            load_recording(path, options=options)
+        refused(message, load_recording, path, options=options)
     (tmp_path / "ur").mkdir()
     bag.tf(0.0, "base_link", "base", SE3.identity(), static=True)
     assert "--base-frame (it may be base_link or base); tf has" in refusal(bag, tmp_path / "ur")
