@@ -247,12 +247,6 @@ def test_ambiguous_and_broken_tables_are_refused(
     assert str(caught.value).startswith(str(tmp_path / "p.csv"))
 
 
-def test_messages_name_the_option_of_the_command(tmp_path: Path) -> None:
-    (tmp_path / "p.csv").write_text("x,y,z,rx,ry,rz\n0.5,0,0,0.1,0.2,0.3")
-    with pytest.raises(InputError, match=r"columns rx, ry, rz .*; give --pose-convention ur "):
-        read_robot_poses(tmp_path / "p.csv", option="--pose-convention")
-
-
 def test_given_convention_overrides_the_header(tmp_path: Path) -> None:
     (tmp_path / "p.csv").write_text("x_m,y_m,z_m,qw,qx,qy,qz\n500,100,200,1,0,0,0")
     read = read_robot_poses(tmp_path / "p.csv", "wxyz:mm")
