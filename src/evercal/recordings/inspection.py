@@ -170,7 +170,6 @@ def _motion_warnings(poses: SE3, extent: float, step: float, of_camera: bool) ->
 def _copy_warnings(
     train: Sequence[Frame], test: Sequence[Frame], poses: SE3, tested: SE3
 ) -> Iterator[str]:
-    """Warn of test frames with the file or the pose of a training frame."""
     from scipy.spatial import KDTree
 
     files = {f.image for f in train if isinstance(f.image, Path)}

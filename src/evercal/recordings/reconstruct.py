@@ -104,7 +104,6 @@ def reconstruct(
 
 
 def _chosen(source: str, images: Path, motion: float, most: int) -> list[str]:
-    """Write the frames to reconstruct, and return their names."""
     folder = Path(source).is_dir()
     names = []
     for frame in stream(source) if folder else _moving(stream(source), motion):
@@ -184,7 +183,6 @@ def _match(pycolmap: Any, root: Path, names: list[str]) -> None:
 
 
 def _mapped(pycolmap: Any, root: Path, count: int, on_step: OnStep) -> list[Any]:
-    """Return the models, largest first; the largest is written as number 0."""
     working, done = root / "mapping", itertools.count(1)
     working.mkdir()
     on_step("mapping", 0, count)

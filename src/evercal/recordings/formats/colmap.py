@@ -74,10 +74,7 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
 
 
 def _models(root: Path) -> list[Path]:
-    """Model folders in the first of the usual places that has one.
-
-    Models in other places have other images: distorted/sparse is from before undistortion.
-    """
+    """Model folders in the first of the usual places; distorted/sparse is before undistortion."""
     for name in _MODEL_FOLDERS:
         parent = root / name
         inner = sorted(parent.iterdir()) if parent.is_dir() else []

@@ -176,7 +176,6 @@ class SceneWriter:
         self._entries[frame.name] = entry
 
     def _write_image(self, frame: Frame, stem: str) -> str:
-        """Write an image file as it is stored, else a PNG; return its path in the folder."""
         if isinstance(frame.image, Path):
             relative = stem + frame.image.suffix.lower()
             self._copy(frame.image, relative)

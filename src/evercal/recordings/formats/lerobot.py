@@ -128,7 +128,6 @@ class _Row(NamedTuple):
 
 
 def _rows(root: Path, column: str) -> tuple[list[_Row], NDArray[np.float64]]:
-    """The n rows of all episodes, and (n, k) numbers of the pose feature."""
     files = sorted((root / "data").glob("*/*.parquet"))
     if not files:
         raise InputError(
@@ -290,7 +289,6 @@ def _feature_poses(
     values: NDArray[np.float64],
     options: ReadOptions,
 ) -> tuple[SE3, list[str]]:
-    """Convert the numbers (n, k) of a feature to (n,) base_from_gripper, with notes."""
     names = _names(info, column)
     if options.urdf is not None:
         return _joint_poses(root, names, values, options)
@@ -354,7 +352,6 @@ def _convention_of(names: list[str]) -> str | None:
 
 
 def _arms(names: list[str]) -> list[str]:
-    """Prefixes of the names of whole poses, such as left_ee and right_ee."""
     prefixes = dict.fromkeys(name.rpartition(".")[0] for name in names)
     return [arm for arm in prefixes if _convention_of(_of_arm(names, arm))]
 
@@ -365,7 +362,6 @@ def _of_arm(names: list[str], arm: str) -> list[str]:
 
 
 def _names(info: Mapping[str, Any], column: str) -> list[str]:
-    """Names of the numbers of a feature, without `.pos`."""
     names = info["features"].get(column, {}).get("names") or []
     if isinstance(names, dict):  # {"motors": [...]}, or several arms with the same names
         groups = {key: group for key, group in names.items() if isinstance(group, list)}

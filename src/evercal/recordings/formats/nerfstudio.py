@@ -55,10 +55,7 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
-    """Read the poses and the size of one image of every camera; no other image is opened.
-
-    If the file states no image size, that of the first image is taken.
-    """
+    """Read the poses and the size of one image of every camera; no other image is opened."""
     root, metric = Path(root), options is not None and options.metres
     file = root if root.is_file() else root / FILE
     root = file.parent
@@ -69,6 +66,7 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
         if not isinstance(entries, list) or not entries:
             raise ValueError("'frames' is a list with at least one frame")
         first = entries[0]
+        # Without a stated image size, that of the first image is taken.
         if isinstance(first, dict) and "file_path" in first and not {"w", "h"} & {*data, *first}:
             width, height = image_size(_image(root, str(first["file_path"])))
             data |= {"w": width, "h": height}
@@ -92,7 +90,6 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
 
 
 def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
-    """Inverse of the rigid part of `applied_transform`, and the scale to divide by first."""
     scale = _number(data, "applied_scale", 1.0)
     if not scale > 0:
         raise ValueError(f"'applied_scale' is > 0, got {scale}")
@@ -119,7 +116,6 @@ def _frame(root: Path, data: Mapping[str, object], entry: object, undo: SE3, sca
 
 
 def _image(root: Path, name: str) -> Path:
-    """Image file of a frame; old files omit its ending."""
     image = root / name
     if image.suffix:
         return image
@@ -150,7 +146,6 @@ def _camera(data: Mapping[str, object]) -> Camera:
 
 
 def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
-    """Focal length in pixels, stated or from the angle of view; None if neither is stated."""
     if data.get(f"fl_{axis}") is not None:
         return _number(data, f"fl_{axis}")
     if data.get(f"camera_angle_{axis}") is None:

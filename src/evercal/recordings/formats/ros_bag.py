@@ -167,10 +167,9 @@ def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
 
 
 def _bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
-    """Read the first camera_info beside an image topic, with its topic.
+    """The first camera_info beside an image topic, such as `/cam/image_raw/compressed`.
 
-    The topic of `/camera/image_raw/compressed` is `/camera/camera_info`. Rectified images
-    take P without distortion, others K and D.
+    Rectified images take P without distortion, others K and D.
     """
     topics = bag.topics(CAMERA_INFO)
     image = image_topic.removesuffix("/compressed")

@@ -2,8 +2,7 @@
 
 As is usual, the first sequence is for testing and the others are for training. The intrinsics of
 info.txt are scaled to the image size. Pixel (0, 0) is taken as a pixel centre: the data set states
-no convention, and its cy of 483.5 is then the middle of 968 rows. Poses with inf or nan mark
-untracked frames, which are left out and counted.
+no convention, and its cy of 483.5 is then the middle of 968 rows.
 """
 
 import os

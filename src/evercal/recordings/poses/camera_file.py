@@ -154,7 +154,6 @@ def _plain(key: object) -> str:
 
 
 def _fields(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Values by key of `_ALIASES`, others by their plain key."""
     keys: dict[str, str] = {}
     for key in data:
         plain = _plain(key)
@@ -225,7 +224,6 @@ def _listed(keys: Iterable[object]) -> str:
 
 
 def _numbers(value: Any, name: str, count: int | None = None) -> list[float]:
-    """Numbers from a list, nested or not, or from OpenCV's {rows, cols, data}."""
     value = value.get("data") if isinstance(value, dict) else value
     try:
         if not isinstance(value, list) or any(isinstance(v, bool) for v in value):

@@ -187,10 +187,7 @@ def matrix_convention(numbers: Array) -> PoseConvention:
 
 
 def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
-    """Refuse numbers (n, k) of one recording that look like another unit than the convention's.
-
-    Units in its name are final.
-    """
+    """Refuse numbers (n, k) that look like another unit than the convention only implies."""
     numbers = np.asarray(numbers, dtype=np.float64)
     if not convention.has("m", "mm"):
         at = numbers
@@ -257,7 +254,6 @@ def _matrices(numbers: Array, layout: str) -> Array:
 
 
 def _rigid(matrices: Array) -> NDArray[np.bool_]:
-    """(...) whether matrices (..., 3 or 4, 4) are rigid transforms."""
     block, last = matrices[..., :3, :3], matrices[..., 3:, :]
     drift = np.abs(np.swapaxes(block, -1, -2) @ block - np.eye(3)).max((-1, -2), initial=0.0)
     homogeneous = np.abs(last - (0.0, 0.0, 0.0, 1.0)).max((-1, -2), initial=0.0) < 1e-6

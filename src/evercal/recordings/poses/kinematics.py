@@ -124,10 +124,7 @@ class RobotModel:
         return joint is not None and joint.type in ("revolute", "continuous")
 
     def _beyond_limits(self, names: Sequence[str], values: NDArray[np.float64]) -> list[str]:
-        """One sentence for each joint that exceeds its limits by more than 0.1.
-
-        Joints without limits are reported beyond two full rotations, which degrees exceed, too.
-        """
+        """One sentence for each joint that exceeds its limits by 0.1, or two rotations."""
         notes = []
         for name, column in zip(names, values.T, strict=True):
             joint = self._urdf.joint_map[name]
@@ -170,8 +167,7 @@ def read_joint_poses(
 ) -> tuple[RobotPoses, list[str]]:
     """Read joint angles and compute gripper poses, with notes.
 
-    `unit` is "rad" or "deg" of angles whose column states no unit; radians if omitted. Links are
-    chosen by `RobotModel.chosen_links`.
+    `unit` is "rad" or "deg" of angles whose column states no unit; radians if omitted.
     """
     rows = read_joints(path)
     base, gripper = model.chosen_links(base, gripper)
@@ -208,10 +204,9 @@ def in_radians(
 def interpolate(
     times_s: NDArray[np.float64], positions: NDArray[np.float64], stamps_s: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Interpolate (n,) positions of a joint at (m,) seconds; jumps by full rotations are removed.
+    """Interpolate (n,) positions of a joint at (m,) seconds, and whether each is valid.
 
-    The second array tells whether each is valid: between the ends, and not in a long gap over which
-    the joint moved.
+    Jumps by full rotations are removed. Validity is that of `PoseTrack.at`.
     """
     times, first = np.unique(times_s, return_index=True)
     values = np.unwrap(positions[first])

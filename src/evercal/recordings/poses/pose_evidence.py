@@ -36,10 +36,7 @@ _GL = Rotation.from_euler("x", 180, degrees=True)
 def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> list[str]:
     """Describe contradictions between stated rotations and the images, in sentences.
 
-    Args:
-        frames: (n,) frames in recorded order.
-        poses: (n,) base_from_camera or base_from_gripper.
-        of_camera: Whether the poses are base_from_camera.
+    (n,) frames are in recorded order, (n,) poses base_from_camera or else base_from_gripper.
     """
     first, second, measured = measured_pairs(frames, poses)
     if len(measured) < LEAST_PAIRS:

@@ -219,7 +219,6 @@ def _without_brackets(
 
 
 def _is_header(words: Sequence[str]) -> bool:
-    """Whether a line names columns; some names may be numbers."""
     numbers = [is_number(word) for word in words]
     return not all(numbers) and (not any(numbers) or bool(_groups(words)))
 

@@ -34,12 +34,9 @@ class Message:
 
 
 class BagFile:
-    """A bag that stays open until nothing refers to it.
+    """A bag that stays open until nothing refers to it: a file, or a folder of a bag or its parts.
 
     Threads may share it, and messages may be read while others are iterated.
-
-    Args:
-        path: A `.bag`, `.mcap` or `.db3` file, or a folder of a ROS 2 bag or of parts of a bag.
     """
 
     def __init__(self, path: Path) -> None:
@@ -109,7 +106,6 @@ class BagFile:
     def _messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Message]:
-        """Messages from `start_ns` to before `stop_ns`; the caller holds the lock."""
         links = [link for link in self._reader.connections if link.topic in topics]
         if not links:
             return
@@ -136,7 +132,6 @@ def is_bag(path: Path) -> bool:
 
 
 def _parts(path: Path) -> list[Path]:
-    """A bag file, a ROS 2 folder as a whole, or the bag files of a folder."""
     if path.is_file():
         return [path] if path.suffix in _FILES else []
     metadata = path / "metadata.yaml"

@@ -60,7 +60,6 @@ def poses_at_images(
 
 
 def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[TfTree, list[float]]:
-    """All transforms, and times of the moving ones in seconds after `zero_ns`."""
     topics = bag.topics(*TF)
     if not topics:
         joints = bag.topics(JOINT_STATE)
