@@ -74,23 +74,18 @@ def load_recording(
         what = "no known scene format" if root.is_dir() else "a file, not a folder, and no bag"
         known = ", ".join(f"{entry.contents} ({key})" for key, entry in FORMATS.items())
         raise InputError(f"{root}: {what}; expected {known}")
-    _refuse_unused(format, options)
+    if options.every < 1:
+        raise InputError(f"--every {options.every}: give a number >= 1")
     read, uses = FORMATS[format].reader.load, FORMATS[format].uses
+    for given in options.given():
+        if given not in ("every", *uses):
+            users = [key for key, entry in FORMATS.items() if given in entry.uses]
+            raise InputError(
+                f"{flag(given)}: not used by recordings of format {format}, only by"
+                f" {', '.join(users)}; leave it out"
+            )
     recording = read(root, options) if uses else read(root)
     if options.every > 1:
         train, test = (part[:: options.every] for part in (recording.train, recording.test))
         recording = dataclasses.replace(recording, train=train, test=test)
     return recording if name is None else dataclasses.replace(recording, name=name)
-
-
-def _refuse_unused(format: str, options: ReadOptions) -> None:
-    if options.every < 1:
-        raise InputError(f"--every {options.every}: give a number >= 1")
-    uses = FORMATS[format].uses
-    for name in options.given():
-        if name not in ("every", *uses):
-            users = [key for key, entry in FORMATS.items() if name in entry.uses]
-            raise InputError(
-                f"{flag(name)}: not used by recordings of format {format}, only by"
-                f" {', '.join(users)}; leave it out"
-            )

@@ -131,7 +131,10 @@ def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFram
     last: NDArray[np.uint8] | None = None
     best: tuple[float, StreamFrame, NDArray[np.uint8]] | None = None
     for frame in frames:
-        small = _small(frame.image)
+        grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+        scale = _SMALL_PX / grey.shape[1]
+        resized = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small = np.asarray(resized, np.uint8)
         moved = np.inf if last is None else _motion(last, small)
         if best is not None and moved > 1.5 * motion:
             yield best[1]
@@ -143,15 +146,6 @@ def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFram
                 best = (sharp, frame, small)
     if best is not None:
         yield best[1]
-
-
-def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    import cv2
-
-    scale = _SMALL_PX / image.shape[1]
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return np.asarray(small, np.uint8)
 
 
 def _motion(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:

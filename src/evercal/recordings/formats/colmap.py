@@ -80,17 +80,15 @@ def _models(root: Path) -> list[Path]:
         inner = sorted(parent.iterdir()) if parent.is_dir() else []
         if name == ".":  # may be a folder of models, which COLMAP numbers
             inner = [folder for folder in inner if folder.name.isdigit()]
-        models = [folder for folder in (parent, *inner) if _is_model(folder)]
+        kinds = [(folder, kind) for folder in (parent, *inner) for kind in ("bin", "txt")]
+        models = [
+            folder
+            for folder, kind in kinds
+            if all((folder / f"{file}.{kind}").is_file() for file in ("cameras", "images"))
+        ]
         if models:
-            return models
+            return list(dict.fromkeys(models))
     return []
-
-
-def _is_model(folder: Path) -> bool:
-    return any(
-        (folder / f"cameras.{kind}").is_file() and (folder / f"images.{kind}").is_file()
-        for kind in ("bin", "txt")
-    )
 
 
 def _model(folder: Path) -> Any:

@@ -135,7 +135,13 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
             f"{bag.path}: no images in it; record a topic of sensor_msgs/Image or CompressedImage."
             f" It holds {bag.contents()}"
         )
-    reasons = {topic: _unsupported(bag, topic) for topic in topics}
+    reasons: dict[str, str | None] = {}
+    for topic in topics:
+        first = bag.first(topic)
+        if bag.kinds[topic] == IMAGE:
+            reasons[topic] = unsupported(first.encoding)
+        else:
+            reasons[topic] = "holds depth" if "compressedDepth" in first.format else None
     pictures = [topic for topic, reason in reasons.items() if reason is None]
     if len(pictures) != 1:
         refused = "; ".join(f"{t}: {reason}" for t, reason in reasons.items() if reason)
@@ -144,13 +150,6 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
             f"{bag.path}: {what}; name one with --image-topic: {', '.join(pictures or topics)}"
         )
     return pictures[0]
-
-
-def _unsupported(bag: BagFile, topic: str) -> str | None:
-    first = bag.first(topic)
-    if bag.kinds[topic] == IMAGE:
-        return unsupported(first.encoding)
-    return "holds depth" if "compressedDepth" in first.format else None
 
 
 def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:

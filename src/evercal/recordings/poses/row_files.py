@@ -114,7 +114,16 @@ def row_labels(
         plain = [word.removesuffix("s") if word.endswith("s") else "" for word in plain]
     stamp = next((plain.index(word) for word in _STAMPS if word in plain), None)
     name = next((plain.index(word) for word in _NAMES if word in plain), None)
-    name = _image_column(words, columns) if name is None else name
+    if name is None:
+        files = [
+            i
+            for i, column in enumerate(columns)
+            if column and all(str(cell).lower().endswith(IMAGE_ENDINGS) for cell in column)
+        ]
+        if len(files) > 1:
+            found = " and ".join(words[i] for i in files)
+            raise ValueError(f"{found} name image files; call the right one 'image'")
+        name = files[0] if files else None
     for i in (i for i in (name, stamp) if i is not None):
         if len(columns[i]) != count:
             raise ValueError(f"{words[i]!r} holds {len(columns[i])} entries for {count} poses")
@@ -127,18 +136,6 @@ def row_labels(
         times = number_array(columns[stamp], f"{words[stamp]!r}")
         stamps = in_unit(times, name_and_unit(words[stamp])[1])
     return names, stamps, others
-
-
-def _image_column(words: Sequence[str], columns: Sequence[Sequence[object]]) -> int | None:
-    files = [i for i, column in enumerate(columns) if column and all(map(_is_image, column))]
-    if len(files) > 1:
-        found = " and ".join(words[i] for i in files)
-        raise ValueError(f"{found} name image files; call the right one 'image'")
-    return files[0] if files else None
-
-
-def _is_image(cell: object) -> bool:
-    return str(cell).lower().endswith(IMAGE_ENDINGS)
 
 
 def number_array(values: object, what: str) -> Array:
