@@ -1,7 +1,7 @@
 """Text and JSON files that a user names, and their errors."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -54,14 +54,13 @@ def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str
     return data
 
 
-def first_repeated(names: Sequence[str]) -> str | None:
-    """The first name that came before."""
+def refuse_repeated(names: Iterable[str], remedy: str) -> None:
+    """Raise ValueError for the first name that came before."""
     known: set[str] = set()
     for name in names:
         if name in known:
-            return name
+            raise ValueError(f"{name!r} comes twice; {remedy}")
         known.add(name)
-    return None
 
 
 def path_inside(path: object, what: str) -> str:

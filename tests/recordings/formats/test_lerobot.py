@@ -250,7 +250,7 @@ def test_repeated_joint_names_are_refused(tmp_path: Path) -> None:
     (root / "arm.urdf").write_text(URDF)
     read = options(root, urdf=root / "arm.urdf")
     change_names(root, ["shoulder.pos", "shoulder"], "observation.state")
-    refused(r"state: 'shoulder' names several numbers", load_recording, root, options=read)
+    refused(r"state: 'shoulder' comes twice", load_recording, root, options=read)
     change_names(root, {"left": ["shoulder"], "right": ["reach"]}, "observation.state")
     refused(r"no values for joint shoulder.*left\.shoulder", load_recording, root, options=read)
 

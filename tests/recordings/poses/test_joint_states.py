@@ -153,7 +153,10 @@ def test_json_and_csv_agree(tmp_path: Path, model: RobotModel) -> None:
     [
         ("shoulder,elbow\n0,0\n", "no values for joint reach, which tip depends on"),
         ("shoulder,elbow,reach\n90,20,0\n", "joint shoulder is at 90.0.*shoulder_deg"),
-        ("shoulder,elbow,reach,elbow_deg\n0,1,0,90\n", "several columns are of joint elbow"),
+        (
+            "shoulder,elbow,reach,elbow_deg\n0,1,0,90\n",
+            "'elbow' comes twice; keep one column of each joint",
+        ),
         ("shoulder,elbow,reach\n0,x,0\n", "column 'elbow': 'x' is not a finite number"),
         ("shoulder,elbow,reach\n", "then rows of joint angles"),
     ],

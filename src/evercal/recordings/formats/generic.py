@@ -18,12 +18,12 @@ from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.recordings.frame import Frame, Recording, require_images
 from evercal.recordings.images import StoredImage, write_image
 from evercal.recordings.text_files import (
-    first_repeated,
     is_real,
     named_errors,
     naming,
     path_inside,
     read_json,
+    refuse_repeated,
 )
 from evercal.storage import write_json
 
@@ -49,9 +49,7 @@ def load(root: str | os.PathLike[str]) -> Recording:
         for i, entry in enumerate(data["frames"]):
             with naming(f"frame {i}"):
                 frames.append(_frame(root, entry, cameras))
-        repeated = first_repeated([frame.name for _, frame in frames])
-        if repeated is not None:
-            raise ValueError(f"frame name {repeated!r} comes twice; names are unique")
+        refuse_repeated((frame.name for _, frame in frames), "names of frames are unique")
     require_images([frame for _, frame in frames], file)
     name = data.get("name")
     train, test = (tuple(f for s, f in frames if s == split) for split in ("train", "test"))

@@ -40,7 +40,7 @@ from evercal.recordings.poses.conventions import (
 )
 from evercal.recordings.poses.kinematics import RobotModel, in_radians
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import first_repeated, path_inside, read_json
+from evercal.recordings.text_files import named_errors, path_inside, read_json, refuse_repeated
 
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
 INFO = Path("meta") / "info.json"
@@ -325,9 +325,8 @@ def _joint_poses(
     source = f"{root}: {_STATE}"
     if len(names) != count:
         raise InputError(f"{source} has {count} numbers and {len(names)} names")
-    repeated = first_repeated(names)
-    if repeated is not None:
-        raise InputError(f"{source}: {repeated!r} names several numbers; rename them")
+    with named_errors(source, "names"):
+        refuse_repeated(names, "rename the numbers")
     model = RobotModel(options.urdf)
     values = in_radians(model, names, stated, [unit] * count)
     return model.poses(names, values, options.base_frame, options.gripper_frame, source)

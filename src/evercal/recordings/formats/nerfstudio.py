@@ -24,11 +24,11 @@ from evercal.recordings.images import IMAGE_ENDINGS, image_size
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
 from evercal.recordings.text_files import (
-    first_repeated,
     is_real,
     named_errors,
     naming,
     read_json,
+    refuse_repeated,
 )
 
 FILE = "transforms.json"
@@ -75,9 +75,7 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
             with naming(f"frame {i}"):
                 frames.append(_frame(root, data, entry, undo, scale))
         test = _test_images(root, data, {frame.image for frame in frames})
-        repeated = first_repeated([frame.name for frame in frames])
-        if repeated is not None:
-            raise ValueError(f"{repeated!r} comes twice; keep one entry for each image")
+        refuse_repeated((frame.name for frame in frames), "keep one entry for each image")
     require_images(frames, file)
     frames = _resized(file, frames)
     return Recording(

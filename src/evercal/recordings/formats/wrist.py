@@ -17,7 +17,7 @@ from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, read_rows
 from evercal.recordings.read_options import ReadOptions, flag
-from evercal.recordings.text_files import first_repeated
+from evercal.recordings.text_files import named_errors, refuse_repeated
 
 USES = ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention")
 _POSES = tuple(
@@ -119,7 +119,6 @@ def _stamps(root: Path) -> dict[str, float] | None:
     if rows.names is None or rows.stamps_s is None:
         raise InputError(f"{file}: needs the columns image and stamp_s")
     names = [PurePath(name).name for name in rows.names]
-    repeated = first_repeated(names)
-    if repeated is not None:
-        raise InputError(f"{file}: {repeated!r} comes twice; give every image one time")
+    with named_errors(file, "stamps"):
+        refuse_repeated(names, "give every image one time")
     return dict(zip(names, rows.stamps_s.tolist(), strict=True))

@@ -17,7 +17,7 @@ from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import times_around
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import Rows, read_rows, row_labels
-from evercal.recordings.text_files import first_repeated, read_json
+from evercal.recordings.text_files import named_errors, read_json, refuse_repeated
 
 _MOVING = ("revolute", "continuous", "prismatic")
 # Two full rotations: no joint of an arm exceeds them, and 12.6 in degrees is a small angle.
@@ -179,9 +179,8 @@ def read_joint_poses(
         stated = ending in _UNITS and not model.has_joint(column) and model.has_joint(plain)
         names.append(plain if stated else column)
         units.append(ending if stated else unit)
-    repeated = first_repeated([name for name in names if model.has_joint(name)])
-    if repeated is not None:
-        raise InputError(f"{path}: several columns are of joint {repeated}; keep one of them")
+    with named_errors(path, "joint angles"):
+        refuse_repeated(filter(model.has_joint, names), "keep one column of each joint")
     values = in_radians(model, names, rows.values, units)
     poses, notes = model.poses(names, values, base, gripper, path)
     return RobotPoses(rows.names, rows.stamps_s, poses), notes

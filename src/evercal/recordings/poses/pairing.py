@@ -12,6 +12,7 @@ from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, times_in_names
+from evercal.recordings.text_files import named_errors, refuse_repeated
 
 Pairing = tuple[list[SE3 | None], list[str]]
 """The pose of each image, if it has one, and notes."""
@@ -62,12 +63,10 @@ def poses_of_images(file: Path, images: Sequence[Path], convention: str | None =
 
 
 def _by_name(images: Sequence[Path], names: Sequence[str], poses: SE3, file: Path) -> Pairing:
-    by_name: dict[str, SE3] = {}
-    for name, pose in zip(names, poses, strict=True):
-        key = PurePath(name).name
-        if key in by_name:
-            raise InputError(f"{file}: {name!r} comes twice; give every image one row")
-        by_name[key] = pose
+    keys = [PurePath(name).name for name in names]
+    with named_errors(file, "poses"):
+        refuse_repeated(keys, "give every image one row")
+    by_name = dict(zip(keys, poses, strict=True))
     # A table may omit the ending.
     paired = [by_name.pop(i.name, None) or by_name.pop(i.stem, None) for i in images]
     if not any(pose is not None for pose in paired):

@@ -36,7 +36,7 @@ from evercal.recordings.poses.row_files import (
     number_array,
     row_labels,
 )
-from evercal.recordings.text_files import first_repeated, named_errors, read_text
+from evercal.recordings.text_files import named_errors, read_text, refuse_repeated
 
 _KEYS = ("poses", "base_from_gripper", "camera_from_board", "T", "transforms", "matrices")
 """Keys of poses in JSON and NPZ."""
@@ -100,9 +100,7 @@ def read_robot_poses(
             poses = _poses(table, camera_from)
         except ConventionError as error:
             raise InputError(f"{path}: {error.naming(option)}") from None
-        repeated = first_repeated(table.names or ())
-        if repeated is not None:
-            raise ValueError(f"the name {repeated!r} comes twice; names are unique")
+        refuse_repeated(table.names or (), "names are unique")
         stated = (None, None) if table.fixed else (table.numbers, table.convention)
         return RobotPoses(table.names, table.stamps_s, poses, *stated)
 
