@@ -25,8 +25,7 @@ from evercal.recordings.formats.bags.file import (
     is_bag,
     stamp_ns,
 )
-from evercal.recordings.formats.bags.poses import poses_at_images
-from evercal.recordings.formats.bags.tf_tree import plain_name
+from evercal.recordings.formats.bags.poses import plain_name, poses_at_images
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, as_rgb, decode_image, image_file
 from evercal.recordings.poses.camera_file import camera_from_fields, check_size, read_camera_of_size
