@@ -245,12 +245,8 @@ class _Embedded(StoredImage):
         if cell["bytes"]:
             return bytes(cell["bytes"])
         where = f"{self.path}: row {self.row}: image {cell['path']!r}"
-        try:
+        with named_errors(where, "file"):
             return (self.root / path_inside(cell["path"], "the path")).read_bytes()
-        except ValueError as error:
-            raise InputError(f"{where}: {error}") from None
-        except OSError as error:
-            raise InputError(f"{where} cannot be read ({error.strerror})") from None
 
 
 def _pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> str:

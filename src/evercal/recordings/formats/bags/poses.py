@@ -22,28 +22,25 @@ _GRIPPERS = (
 )  # fmt: skip
 
 
-class Transform(NamedTuple):
+class _Transform(NamedTuple):
     """One TransformStamped, parent_from_child."""
 
     parent: str
     child: str
-    stamp_s: float | None
-    """Seconds, or None for a static transform."""
-    quaternion: tuple[float, ...]
-    """Unit quaternion wxyz."""
+    stamp_s: float | None  # None if static
+    quaternion: tuple[float, ...]  # wxyz
     translation: tuple[float, ...]
-    """Metres."""
 
 
 @dataclass
 class _Edge:
     """Transforms of one child frame from one topic; moving ones take precedence."""
 
-    moving: list[Transform] = field(default_factory=list)
-    static: list[Transform] = field(default_factory=list)
+    moving: list[_Transform] = field(default_factory=list)
+    static: list[_Transform] = field(default_factory=list)
 
     @property
-    def transforms(self) -> list[Transform]:
+    def transforms(self) -> list[_Transform]:
         return self.moving or self.static[-1:]
 
     @property
@@ -51,19 +48,14 @@ class _Edge:
         return {transform.parent for transform in (*self.moving, *self.static)}
 
 
-class TfTree:
-    """Transforms of a recording, added in any order.
-
-    `source` names it in messages. `topic` is the one to use if several topics move one frame; if
-    omitted, this is refused.
-    """
+class _TfTree:
+    """Transforms, added in any order; `topic` is used if several topics move one frame."""
 
     def __init__(self, source: str, topic: str | None = None) -> None:
         self._source, self._topic = source, topic
-        self._edges: dict[str, dict[str, _Edge]] = {}
-        """By child and topic."""
+        self._edges: dict[str, dict[str, _Edge]] = {}  # by child and topic
 
-    def add(self, transform: Transform, topic: str) -> None:
+    def add(self, transform: _Transform, topic: str) -> None:
         """Add a transform of a topic; /tf_static belongs to /tf."""
         length = float(np.linalg.norm(transform.quaternion))
         parent, child = plain_name(transform.parent), plain_name(transform.child)
@@ -83,7 +75,6 @@ class TfTree:
         return tuple(sorted({*parents, *self._edges}, key=lambda f: (len(self._chain(f)), f)))
 
     def connected(self, a: str, b: str) -> bool:
-        """Whether a chain of transforms joins two frames."""
         return self._chain(a)[-1] == self._chain(b)[-1]
 
     def a_from_b(
@@ -198,7 +189,7 @@ def poses_at_images(
     return ImagePoses(poses, valid, of_camera, notes)
 
 
-def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[TfTree, list[float]]:
+def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[_TfTree, list[float]]:
     topics = bag.topics(*TF)
     if not topics:
         joints = bag.topics(JOINT_STATE)
@@ -208,7 +199,7 @@ def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[TfTree, list[fl
             f" /tf_static{instead}. It holds {bag.contents()}"
         )
     _check_topic(bag, wanted, [t for t in topics if not t.endswith("tf_static")], "tf")
-    tree, times = TfTree(str(bag.path), wanted), []
+    tree, times = _TfTree(str(bag.path), wanted), []
     for message in bag.messages(topics):
         for entry in message.content.transforms:
             stamp = None
@@ -217,7 +208,7 @@ def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[TfTree, list[fl
                 times.append(stamp)
             t, q = entry.transform.translation, entry.transform.rotation
             frames = entry.header.frame_id, entry.child_frame_id
-            link = Transform(*frames, stamp, (q.w, q.x, q.y, q.z), (t.x, t.y, t.z))
+            link = _Transform(*frames, stamp, (q.w, q.x, q.y, q.z), (t.x, t.y, t.z))
             tree.add(link, message.topic.removesuffix("_static"))
     return tree, times
 
@@ -231,7 +222,7 @@ def _check_topic(bag: BagFile, wanted: str | None, topics: Sequence[str], what: 
 
 
 def _frame(
-    bag: BagFile, tree: TfTree, wanted: str | None, usual: Sequence[str], option: str
+    bag: BagFile, tree: _TfTree, wanted: str | None, usual: Sequence[str], option: str
 ) -> str:
     frames = tree.frames()
     if wanted is not None:
