@@ -47,7 +47,8 @@ def matched_once() -> Iterator[None]:
 
 def test_measured_rotations_agree_with_true_poses(bedroom: tuple[Frame, ...]) -> None:
     poses = stated(bedroom)
-    first, second, measured = pose_evidence.measured_pairs(bedroom, poses)
+    pairs, measured = pose_evidence.measured_pairs(bedroom, poses)
+    first, second = pairs.T
     assert len(measured) >= 8
     rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
     off = Rotation.from_rotvec(measured).inv() * rotation[first].inv() * rotation[second]

@@ -38,7 +38,7 @@ def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> l
 
     (n,) frames are in recorded order, (n,) poses base_from_camera or else base_from_gripper.
     """
-    first, second, measured = measured_pairs(frames, poses)
+    pairs, measured = measured_pairs(frames, poses)
     if len(measured) < LEAST_PAIRS:
         return []
     owner = "camera" if of_camera else "gripper"
@@ -47,7 +47,7 @@ def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> l
             "the gripper rotates and the images hardly do; does the camera stand still, or are the"
             " angles in another unit than stated?"
         ]
-    stated, readings = _readings(poses, first, second, of_camera)
+    stated, readings = _readings(poses, pairs, of_camera)
     # Between gripper and camera is a fixed rotation that is not known.
     error_of, better = (_error_deg, BETTER) if of_camera else (_fitted_error_deg, GRIPPER_BETTER)
     error = error_of(measured, stated)
@@ -73,9 +73,10 @@ def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> l
 
 
 def _readings(
-    poses: SE3, first: list[int], second: list[int], of_camera: bool
+    poses: SE3, pairs: NDArray[np.intp], of_camera: bool
 ) -> tuple[Array, dict[str, Array]]:
     """(n, 3) rotation vectors first_from_second of pairs as stated, and in other readings."""
+    first, second = pairs.T
     rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
     swapped = Rotation.from_quat(poses.rotation_wxyz)
     stated = (rotation[first].inv() * rotation[second]).as_rotvec()
@@ -88,16 +89,12 @@ def _readings(
     return stated, readings | {"with quaternions in another order": another_order}
 
 
-def measured_pairs(frames: Sequence[Frame], poses: SE3) -> tuple[list[int], list[int], Array]:
-    """Indices of the frames of n matched pairs, and their (n, 3) `measured_rotation`."""
-    first, second, measured = [], [], []
-    for i, j in _pairs(poses):
-        vector = measured_rotation(frames[i], frames[j])
-        if vector is not None:
-            first.append(i)
-            second.append(j)
-            measured.append(vector)
-    return first, second, np.array(measured)
+def measured_pairs(frames: Sequence[Frame], poses: SE3) -> tuple[NDArray[np.intp], Array]:
+    """(n, 2) frames of the pairs that match, and (n, 3) `measured_rotation` of each."""
+    measured = [((i, j), measured_rotation(frames[i], frames[j])) for i, j in _pairs(poses)]
+    pairs = [pair for pair, vector in measured if vector is not None]
+    vectors = [vector for _, vector in measured if vector is not None]
+    return np.array(pairs, np.intp).reshape(-1, 2), np.array(vectors)
 
 
 def measured_rotation(first: Frame, second: Frame) -> Array | None:
