@@ -5,7 +5,6 @@ image size, and the principal point is the middle of the image. Poses with inf o
 frames, which are left out and counted. All sequences come from one camera.
 """
 
-import itertools
 import os
 import re
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import image_size
 from evercal.recordings.poses.row_files import is_number
-from evercal.recordings.text_files import named_errors, read_text
+from evercal.recordings.text_files import named_errors, read_text, refuse_repeated
 
 _SPLITS = ("TrainSplit.txt", "TestSplit.txt")
 _FOCAL_AT_640 = 525.0
@@ -85,9 +84,8 @@ def colour_images(folder: Path) -> list[Path]:
     names = sorted(name for name in names if re.search(r"\.color\.(png|jpe?g)$", name))
     if not names:
         raise InputError(f"{folder}: no images; expected frame-XXXXXX.color.png or .jpg")
-    for first, second in itertools.pairwise(map(_frame_name, names)):
-        if first == second:
-            raise InputError(f"{folder}: {first}.color is there as .png and as .jpg; keep one")
+    with named_errors(folder, "images"):
+        refuse_repeated(map(_frame_name, names), "keep its .png or its .jpg")
     return [folder / name for name in names]
 
 
