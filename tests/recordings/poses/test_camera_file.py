@@ -218,7 +218,7 @@ def test_files_with_a_matrix_alone_have_no_distortion(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        ("1 2 3", "3 numbers, a 3x3 matrix has 9"),
+        ("1 2 3", "camera_matrix has 9 numbers, got 3"),
         ("1: 2\nfx: 5\n", "camera 'fy' is missing"),
         ("1 2 3 4 5 6 7 8 9", "fx 0 cx"),
         ("nan 0 0 0 1 0 0 0 1", "finite"),

@@ -175,9 +175,8 @@ def test_wrong_joint_tables_are_refused(
      '{"joint_names": ["shoulder"], "positions": [[1]], "images": ["a", "b"]}'],
 )  # fmt: skip
 def test_wrong_json_is_refused(tmp_path: Path, model: RobotModel, data: str) -> None:
-    file = tmp_path / "joints.json"
-    file.write_text(data)
-    refused(r"joints\.json", read_joint_poses, file, model)
+    (tmp_path / "joints.json").write_text(data)
+    refused(r"joints\.json", read_joint_poses, tmp_path / "joints.json", model)
 
 
 @pytest.mark.parametrize(

@@ -111,8 +111,6 @@ def _fields_of(path: Path) -> Mapping[str, Any]:
         return _xml_of_opencv(text)
     words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
     if all(map(is_number, words)):
-        if len(words) != 9:
-            raise ValueError(f"{len(words)} numbers, a 3x3 matrix has 9; {_EXPECTED}")
         return {"camera_matrix": [float(word) for word in words]}
     try:
         if text.lstrip().startswith("{"):
@@ -233,5 +231,5 @@ def _numbers(value: Any, name: str, count: int | None = None) -> list[float]:
     except (TypeError, ValueError):
         raise ValueError(f"'{name}' is a list of numbers, got {value!r}") from None
     if count is not None and len(numbers) != count:
-        raise ValueError(f"{name} has {count} numbers, got {len(numbers)}")
+        raise ValueError(f"{name} has {count} numbers, got {len(numbers)}; {_EXPECTED}")
     return numbers
