@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from evercal.errors import InputError
 from evercal.recordings.formats import colmap, lerobot
 from evercal.recordings.formats.bags.file import BagFile
 from evercal.recordings.formats.video_file import Videos
 from evercal.recordings.poses.kinematics import RobotModel
+
+from .checks import refused
 
 
 @pytest.mark.parametrize(
@@ -19,7 +20,7 @@ from evercal.recordings.poses.kinematics import RobotModel
         ("pycolmap", "colmap", colmap._model),
         ("rosbags.highlevel", "bags", BagFile),
         ("yourdfpy", "urdf", RobotModel),
-        ("pyarrow.parquet", "lerobot", lerobot._parquet),
+        ("pyarrow.parquet", "lerobot", lambda path: lerobot._columns(path, [])),
         ("av", "lerobot", lambda _: Videos(30.0)),
     ],
 )
@@ -31,5 +32,4 @@ def test_missing_extra_names_the_install_command(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InputError, match=rf"constraints.txt '\.\[{extra}\]'"):
-        read(tmp_path)
+    refused(rf"constraints.txt '\.\[{extra}\]'", read, tmp_path)

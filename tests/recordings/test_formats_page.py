@@ -12,9 +12,11 @@ from evercal.cli.align import _rows as read_points
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings import ReadOptions, Recording, load_recording, read_robot_poses, write_image
 from evercal.recordings.formats import lerobot, wrist
-from evercal.recordings.formats.lerobot_poses import pose_feature
+from evercal.recordings.formats.lerobot import _pose_feature
 from evercal.recordings.poses.camera_file import read_camera
-from evercal.recordings.poses.joint_states import read_joints
+from evercal.recordings.poses.kinematics import read_joints
+
+from .checks import assert_pose
 
 PAGE = Path(__file__).parents[2] / "docs" / "formats.md"
 EXAMPLES = dict(re.findall(r"^```\w+ (\S+)\n(.*?)^```$", PAGE.read_text(), re.M | re.S))
@@ -98,8 +100,7 @@ def test_recordings(page: Path, name: str) -> None:
 
 def assert_poses(read: Recording) -> None:
     for frame, expected in zip(read.train, POSES, strict=True):
-        assert frame.base_from_gripper is not None
-        assert max(pose_distance(frame.base_from_gripper, expected)) < 1e-4
+        assert_pose(frame.base_from_gripper, expected, 1e-4)
 
 
 @pytest.mark.parametrize("name", sorted(CAMERAS))
@@ -130,7 +131,7 @@ def test_joint_tables(page: Path) -> None:
 def test_lerobot_description(page: Path) -> None:
     assert lerobot.detect(page / "pusht")
     info = json.loads((page / "pusht" / lerobot.INFO).read_text())
-    assert pose_feature(page / "pusht", info, ReadOptions()) == "observation.ee"
+    assert _pose_feature(page / "pusht", info, ReadOptions()) == "observation.ee"
 
 
 def test_touched_points(page: Path) -> None:

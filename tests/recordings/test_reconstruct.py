@@ -15,6 +15,8 @@ from evercal.recordings.reconstruct import _moving, reconstruct
 from evercal.recordings.samples import sample_rooms
 from evercal.recordings.streams import StreamFrame
 
+from .checks import refused
+
 pytest.importorskip("pycolmap")
 
 
@@ -75,8 +77,7 @@ def test_poses_agree_with_the_truth_up_to_a_similarity(folder: Path, tmp_path: P
     assert np.median(apart(own.translation_m, true.translation_m)) < 0.02
     focal = sample_rooms()[0].scene.train[0].camera.fx
     assert recording.train[0].camera.fx == pytest.approx(focal, rel=0.05)
-    with pytest.raises(InputError, match="is not empty; give a new folder"):
-        reconstruct(folder, tmp_path / "out")
+    refused("is not empty; give a new folder", reconstruct, folder, tmp_path / "out")
 
 
 def test_sources_that_cannot_be_reconstructed(tmp_path: Path) -> None:
@@ -89,5 +90,4 @@ def test_sources_that_cannot_be_reconstructed(tmp_path: Path) -> None:
         reconstruct(tmp_path / "few", tmp_path / "out")
     for i in range(12):
         write_image(tmp_path / f"noise/{i}.png", rng.integers(0, 255, (120, 160, 3)).astype("u1"))
-    with pytest.raises(InputError, match="do not connect to a model"):
-        reconstruct(tmp_path / "noise", tmp_path / "other")
+    refused("do not connect to a model", reconstruct, tmp_path / "noise", tmp_path / "other")

@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
 from evercal.recordings import load_recording
 from evercal.recordings.samples import CELL, FOLDER, SampleRoom, copy_samples, sample_rooms
+
+from .checks import refused
 
 
 @pytest.fixture(scope="module")
@@ -77,15 +78,9 @@ def test_cell_is_complete_and_small() -> None:
 def test_copies_are_complete_and_never_overwrite(tmp_path: Path) -> None:
     target = tmp_path / "new" / "samples"
     copy_samples(target)
-    assert sorted(path.name for path in target.iterdir()) == [
-        "bedroom",
-        "cell",
-        "kitchen",
-        "living",
-    ]
+    names = sorted(path.name for path in target.iterdir())
+    assert names == ["bedroom", "cell", "kitchen", "living"]
     assert len(load_recording(target / "kitchen").train) == 91
     assert len(load_recording(target / "cell/wrist").train) == 60
-    with pytest.raises(InputError, match="not empty"):
-        copy_samples(target)
-    with pytest.raises(InputError, match="is a file"):
-        copy_samples(target / "cell/bumped.jpg")
+    refused("not empty", copy_samples, target)
+    refused("is a file", copy_samples, target / "cell/bumped.jpg")

@@ -38,22 +38,14 @@ def test_a_video_with_its_own_times(tmp_path: Path) -> None:
     assert frames[4].image[20, 10] == pytest.approx([200, 30, 10], abs=12)  # RGB
 
 
-@pytest.mark.parametrize(
-    ("source", "message"),
-    [
+def test_sources_that_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "notes.mp4").write_text("no video")
+    (tmp_path / "empty").mkdir()
+    for source, message in (
         ("missing", "no such folder or video; give one, a camera's number"),
         ("97", "97: cannot be opened as a video"),
-    ],
-)
-def test_sources_that_do_not_exist(source: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        list(stream(source))
-
-
-def test_files_that_are_no_video(tmp_path: Path) -> None:
-    (tmp_path / "notes.mp4").write_text("no video")
-    with pytest.raises(InputError, match="cannot be opened as a video"):
-        list(stream(str(tmp_path / "notes.mp4")))
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="image"):
-        list(stream(str(tmp_path / "empty")))
+        (tmp_path / "notes.mp4", "cannot be opened as a video"),
+        (tmp_path / "empty", "no images in this folder"),
+    ):
+        with pytest.raises(InputError, match=message):
+            list(stream(str(source)))

@@ -34,11 +34,10 @@ class Reconstruct(Verb):
     """Frames, at most."""
 
     def run(self) -> int:
-        from evercal.recordings.reconstruct import ReconstructOptions, reconstruct
+        from evercal.recordings.reconstruct import reconstruct
 
-        options = ReconstructOptions(motion=self.motion, most_frames=self.most)
         with Bars() as bars:
-            found = reconstruct(self.source, self.out, options, bars.step)
+            found = reconstruct(self.source, self.out, self.motion, self.most, bars.step)
         whole = found.posed >= _CONNECTED * found.frames
         lines = [
             f"{self.out}: {found.posed} of {found.frames} frames have a pose, {found.points:,}"

@@ -20,17 +20,13 @@ from evercal.recordings.images import write_image as write_image
 if TYPE_CHECKING:
     from evercal.recordings.formats import generic as generic
     from evercal.recordings.load import FORMATS as FORMATS
-    from evercal.recordings.load import Format as Format
     from evercal.recordings.load import load_recording as load_recording
-    from evercal.recordings.poses.robot_poses import RobotPoses as RobotPoses
     from evercal.recordings.poses.robot_poses import read_robot_poses as read_robot_poses
     from evercal.recordings.read_options import ReadOptions as ReadOptions
 
 _LOADED_ON_USE = {
     "FORMATS": "load",
-    "Format": "load",
     "ReadOptions": "read_options",
-    "RobotPoses": "poses.robot_poses",
     "load_recording": "load",
     "read_robot_poses": "poses.robot_poses",
     "generic": "formats.generic",

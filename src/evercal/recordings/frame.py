@@ -35,11 +35,7 @@ class Frame:
     """Joint angles of the arm at the time of the image, if stated."""
 
     def read_image(self) -> NDArray[np.uint8]:
-        """Read the pixels, (H, W, 3) uint8 RGB.
-
-        Raises:
-            InputError: The file is missing or broken, or its size differs from the camera's.
-        """
+        """Read the pixels, (H, W, 3) uint8 RGB; a size that is not the camera's is refused."""
         if isinstance(self.image, Path):
             image = read_image(self.image)
         elif isinstance(self.image, StoredImage):
@@ -83,6 +79,17 @@ class Recording:
     metric: bool = True
     """Whether lengths are metres; False where their unit is unknown, as in structure from motion.
     `base_from_camera` is then in that unit."""
+
+
+def require_images(frames: Iterable[Frame], file: Path) -> None:
+    """Refuse frames whose image files, named in `file`, are missing."""
+    images = [frame.image for frame in frames if isinstance(frame.image, Path)]
+    missing = [image for image in images if not image.is_file()]
+    if missing:
+        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        raise InputError(
+            f"{missing[0]}{more}: named in {file} but missing; restore or take the frame out"
+        )
 
 
 def posed_recording(recording: Recording) -> Recording:

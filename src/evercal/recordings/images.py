@@ -33,9 +33,6 @@ def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
         image: (H, W), (H, W, 1), (H, W, 3) RGB or (H, W, 4) RGBA; uint8 or uint16, or nested lists
             of integers from 0 to 255. Grey becomes equal red, green and blue. Alpha is dropped.
             16-bit values are divided by 257 and rounded, so that 65535 becomes 255.
-
-    Raises:
-        InputError: The image is empty or has another shape or type.
     """
     try:
         pixels = np.asarray(image)
@@ -59,12 +56,9 @@ def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
 
 
 def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
-    """Read a grey, RGB or RGBA image file, turned upright as its EXIF orientation states.
+    """Read a grey, RGB or RGBA image file of 8 or 16 bits, converted as by `as_rgb`.
 
-    Intrinsics are those of the upright image. It is converted as by `as_rgb`.
-
-    Raises:
-        InputError: The file is missing, is a folder, or is not an image of 8 or 16 bits.
+    It is turned upright as its EXIF orientation states; intrinsics are those of the upright image.
     """
     path = Path(path)
     try:
@@ -99,12 +93,7 @@ def image_file(data: bytes) -> tuple[str, bytes] | None:
 
 
 def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
-    """Write (H, W, 3) uint8 RGB in the format of the file's ending.
-
-    Raises:
-        InputError: The ending belongs to no image format.
-        ValueError: The image is not (H, W, 3) uint8.
-    """
+    """Write (H, W, 3) uint8 RGB in the format of the file's ending."""
     import cv2
 
     path = Path(path)

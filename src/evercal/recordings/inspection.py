@@ -1,7 +1,7 @@
 """Summary and plausibility checks of a recording."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -52,11 +52,7 @@ class Inspection:
 
 
 def inspect_recording(recording: Recording) -> Inspection:
-    """Check poses, cameras and some images of a recording.
-
-    Raises:
-        InputError: An image cannot be read, or its size differs from the camera's.
-    """
+    """Check poses, cameras and some images of a recording."""
     both = (*recording.train, *recording.test)
     grippers = any(frame.base_from_gripper for frame in both)
     owner = "camera" if posed_frames(both) else "gripper" if grippers else "none"
@@ -66,20 +62,20 @@ def inspect_recording(recording: Recording) -> Inspection:
     for size in {(camera.width, camera.height) for camera in cameras}:
         next(f for f in both if (f.camera.width, f.camera.height) == size).read_image()
     poses, tested = (SE3.stack([*map(pose_of, part)]) for part in (train, test))
-    metres = radians = None
-    if len(train) > 1:
-        metres, radians = pose_distance(poses[:-1], poses[1:])
     extent = np.ptp(poses.translation_m, axis=0) if len(train) else np.zeros(3)
     untracked = recording.untracked + len(both) - len(train) - len(test)
-    warnings = _warn_frames(len(train), len(test), untracked, owner)
-    warnings += [warning for camera in cameras for warning in _warn_camera(camera)]
-    if metres is not None:
-        warnings += _warn_motion(
-            poses, float(extent.max()), float(np.median(metres)), owner == "camera"
-        )
-        warnings += rotation_warnings(train, poses, owner == "camera")
+    warnings = [*_frame_warnings(len(train), len(test), untracked, owner)]
+    warnings += [warning for camera in cameras for warning in _camera_warnings(camera)]
+    step_m = step_deg = largest_m = near = None
+    if len(train) > 1:
+        metres, radians = pose_distance(poses[:-1], poses[1:])
+        step_m, step_deg = float(np.median(metres)), float(np.rad2deg(np.median(radians)))
+        largest_m, of_camera = float(metres.max()), owner == "camera"
+        warnings += _motion_warnings(poses, float(extent.max()), step_m, of_camera)
+        warnings += rotation_warnings(train, poses, of_camera)
     if train and test:
-        warnings += _warn_copies(train, test, poses, tested)
+        warnings += _copy_warnings(train, test, poses, tested)
+        near = 100 * float(near_training(poses, tested).mean())
     x, y, z = extent.tolist()
     return Inspection(
         name=recording.name,
@@ -89,17 +85,16 @@ def inspect_recording(recording: Recording) -> Inspection:
         untracked=untracked,
         cameras=_camera_lines(cameras),
         extent_m=(x, y, z),
-        step_median_m=None if metres is None else float(np.median(metres)),
-        step_median_deg=None if radians is None else float(np.rad2deg(np.median(radians))),
-        step_largest_m=None if metres is None else float(metres.max()),
-        near_training=100 * float(near_training(poses, tested).mean()) if train and test else None,
+        step_median_m=step_m,
+        step_median_deg=step_deg,
+        step_largest_m=largest_m,
+        near_training=near,
         notes=recording.notes,
         warnings=tuple(warnings),
     )
 
 
 def _camera_lines(cameras: Counter[Camera]) -> tuple[str, ...]:
-    """One line per camera, or one line per image size if there are many cameras."""
     if len(cameras) <= MOST_CAMERAS_LISTED:
         return tuple(_camera_line(camera, count) for camera, count in cameras.items())
     lines = []
@@ -122,79 +117,59 @@ def _camera_line(camera: Camera, count: int) -> str:
     )
 
 
-def _applying(checks: Iterable[tuple[bool, str]]) -> list[str]:
-    return [warning for applies, warning in checks if applies]
-
-
-def _warn_frames(train: int, test: int, untracked: int, owner: str) -> list[str]:
+def _frame_warnings(train: int, test: int, untracked: int, owner: str) -> Iterator[str]:
+    if train < MIN_TRAIN_FRAMES:
+        yield f"{train} training frames with a pose; learning takes {MIN_TRAIN_FRAMES} or more"
+    if not test and owner != "gripper":
+        yield "no test frame with a pose; 'evercal evaluate' has nothing to measure on"
     total = train + test + untracked
-    too_few = f"{train} training frames with a pose; learning takes {MIN_TRAIN_FRAMES} or more"
-    untested = "no test frame with a pose; 'evercal evaluate' has nothing to measure on"
-    lost = f"{untracked} of {total} frames have no pose; check the tracking"
-    return _applying(
-        [
-            (train < MIN_TRAIN_FRAMES, too_few),
-            (not test and owner != "gripper", untested),
-            (untracked > total / 2, lost),
-        ]
-    )
+    if untracked > total / 2:
+        yield f"{untracked} of {total} frames have no pose; check the tracking"
 
 
-def _warn_camera(camera: Camera) -> list[str]:
+def _camera_warnings(camera: Camera) -> Iterator[str]:
     name = f"camera {camera.width}x{camera.height}"
     middle = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height
     view = np.rad2deg(2 * np.arctan(camera.width / (2 * camera.fx)))
     size = "are the intrinsics those of this image size?"
-    far = f"principal point ({camera.cx:.0f}, {camera.cy:.0f}) is far from the middle; {size}"
-    uneven = f"fx {camera.fx:.0f} and fy {camera.fy:.0f} differ; square pixels?"
-    return _applying(
-        [
-            (max(abs(share - 0.5) for share in middle) > 0.2, f"{name}: {far}"),
-            (not 20 < view < 150, f"{name}: sees {view:.0f} deg across; {size}"),
-            (not 0.8 < camera.fx / camera.fy < 1.25, f"{name}: {uneven}"),
-        ]
-    )
+    if max(abs(share - 0.5) for share in middle) > 0.2:
+        point = f"({camera.cx:.0f}, {camera.cy:.0f})"
+        yield f"{name}: principal point {point} is far from the middle; {size}"
+    if not 20 < view < 150:
+        yield f"{name}: sees {view:.0f} deg across; {size}"
+    if not 0.8 < camera.fx / camera.fy < 1.25:
+        yield f"{name}: fx {camera.fx:.0f} and fy {camera.fy:.0f} differ; square pixels?"
 
 
-def _warn_motion(poses: SE3, extent: float, step: float, of_camera: bool) -> list[str]:
+def _motion_warnings(poses: SE3, extent: float, step: float, of_camera: bool) -> Iterator[str]:
     rotation_deg = np.rad2deg(pose_distance(poses[0], poses)[1].max())
     reach = float(np.median(np.linalg.norm(poses.translation_m, axis=1)))
-    far = extent > LARGEST_EXTENT_M
-    return _applying(
-        [
-            (
-                reach > LARGEST_REACH_M and not of_camera,
-                f"the gripper is {reach:.1f} m from the robot's base, farther than arms reach; are"
-                f" the poses in millimetres?",
-            ),
-            (
-                extent < SAME_M,
-                f"all training frames stand at one point, rotating by {rotation_deg:.0f} deg; a map"
-                f" takes views from several. Are the translations there, and in metres?",
-            ),
-            (
-                SAME_M <= extent < SMALLEST_EXTENT_M,
-                f"the training camera moves by {100 * extent:.1f} cm only; points may get no"
-                f" depth. Are the translations in metres?",
-            ),
-            (
-                rotation_deg < SAME_DEG,
-                "all training frames look the same way; are the rotations missing?",
-            ),
-            (far, f"the camera moves over {extent:.0f} m; are the poses in millimetres?"),
-            (
-                step > LARGEST_STEP_M and of_camera and not far,
-                f"consecutive frames are {step:.2f} m apart; are they in recorded order and in"
-                f" metres?",
-            ),
-        ]
-    )
+    if reach > LARGEST_REACH_M and not of_camera:
+        yield (
+            f"the gripper is {reach:.1f} m from the robot's base, farther than arms reach; are the"
+            f" poses in millimetres?"
+        )
+    if extent < SAME_M:
+        yield (
+            f"all training frames stand at one point, rotating by {rotation_deg:.0f} deg; a map"
+            f" takes views from several. Are the translations there, and in metres?"
+        )
+    elif extent < SMALLEST_EXTENT_M:
+        yield (
+            f"the training camera moves by {100 * extent:.1f} cm only; points may get no depth. Are"
+            f" the translations in metres?"
+        )
+    if rotation_deg < SAME_DEG:
+        yield "all training frames look the same way; are the rotations missing?"
+    if extent > LARGEST_EXTENT_M:
+        yield f"the camera moves over {extent:.0f} m; are the poses in millimetres?"
+    elif step > LARGEST_STEP_M and of_camera:
+        yield f"consecutive frames are {step:.2f} m apart; are they in order and in metres?"
 
 
-def _warn_copies(
+def _copy_warnings(
     train: Sequence[Frame], test: Sequence[Frame], poses: SE3, tested: SE3
-) -> list[str]:
-    """Warn of test frames with the file or the pose of a training frame."""
+) -> Iterator[str]:
     from scipy.spatial import KDTree
 
     files = {f.image for f in train if isinstance(f.image, Path)}
@@ -206,9 +181,8 @@ def _warn_copies(
             radians = pose_distance(tested[i], poses[close[i]])[1]
             copied = bool(np.rad2deg(radians.min()) < SAME_DEG)
         copies += copied
-    if copies < max(1, len(test) / 10):
-        return []
-    return [
-        f"{copies} of {len(test)} test frames have the pose or the file of a training frame;"
-        f" accuracy on them means nothing"
-    ]
+    if copies >= max(1, len(test) / 10):
+        yield (
+            f"{copies} of {len(test)} test frames have the pose or the file of a training frame;"
+            f" accuracy on them means nothing"
+        )

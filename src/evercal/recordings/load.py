@@ -31,10 +31,6 @@ class Format:
         """Fields of `ReadOptions` that it uses, apart from `every`."""
         return getattr(self.reader, "USES", ())
 
-    def load(self, root: Path, options: ReadOptions) -> Recording:
-        """Read a recording."""
-        return self.reader.load(root, options) if self.uses else self.reader.load(root)
-
 
 FORMATS = {
     "generic": Format("generic", "scene.json"),
@@ -64,8 +60,8 @@ def load_recording(
         options: Information that the recording lacks.
 
     Raises:
-        InputError: The recording is missing, broken or of an unknown format, or its format does
-            not use an option that was given.
+        InputError: The recording is missing or broken, or its format is unknown or does not use an
+            option that was given.
     """
     root, options = Path(path), options or ReadOptions()
     if format is not None and format not in FORMATS:
@@ -78,21 +74,18 @@ def load_recording(
         what = "no known scene format" if root.is_dir() else "a file, not a folder, and no bag"
         known = ", ".join(f"{entry.contents} ({key})" for key, entry in FORMATS.items())
         raise InputError(f"{root}: {what}; expected {known}")
-    _refuse_unused(format, options)
-    recording = FORMATS[format].load(root, options)
+    if options.every < 1:
+        raise InputError(f"--every {options.every}: give a number >= 1")
+    read, uses = FORMATS[format].reader.load, FORMATS[format].uses
+    for given in options.given():
+        if given not in ("every", *uses):
+            users = [key for key, entry in FORMATS.items() if given in entry.uses]
+            raise InputError(
+                f"{flag(given)}: not used by recordings of format {format}, only by"
+                f" {', '.join(users)}; leave it out"
+            )
+    recording = read(root, options) if uses else read(root)
     if options.every > 1:
         train, test = (part[:: options.every] for part in (recording.train, recording.test))
         recording = dataclasses.replace(recording, train=train, test=test)
     return recording if name is None else dataclasses.replace(recording, name=name)
-
-
-def _refuse_unused(format: str, options: ReadOptions) -> None:
-    if options.every < 1:
-        raise InputError(f"--every {options.every}: give a number >= 1")
-    for name in options.given():
-        if name != "every" and name not in FORMATS[format].uses:
-            users = [key for key, entry in FORMATS.items() if name in entry.uses]
-            raise InputError(
-                f"{flag(name)}: not used by recordings of format {format}, only by"
-                f" {', '.join(users)}; leave it out"
-            )

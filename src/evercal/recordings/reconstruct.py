@@ -25,24 +25,12 @@ from evercal.recordings.streams import StreamFrame, stream
 OnStep = Callable[[str, int, int], object]
 """Called with the name of the step, how much of it is done, and its total."""
 
-_SMALL_PX = 320
-"""Width of the copy in which motion and sharpness are measured."""
+_SMALL_PX = 320  # width of the copy in which motion and sharpness are measured
 _LEAST_FRAMES = 12
-
-
-@dataclass(frozen=True)
-class ReconstructOptions:
-    """How frames are chosen and matched."""
-
-    motion: float = 0.04
-    """Median motion of corners from one chosen frame of a video to the next, parts of its width."""
-    most_frames: int = 300
-    """Maximum number of frames; of more, every n-th is used."""
-    exhaustive: int = 60
-    """Up to this many frames are matched exhaustively. Longer sequences are matched sequentially,
-    plus exhaustively on a subset of this size for loop closure."""
-    camera_model: str = "OPENCV"
-    """COLMAP's camera model, shared by all frames."""
+_EXHAUSTIVE = 60
+"""Up to this many frames are matched exhaustively. Longer sequences are matched sequentially, plus
+exhaustively on a subset of this size for loop closure."""
+_CAMERA_MODEL = "OPENCV"  # shared by all frames
 
 
 @dataclass(frozen=True)
@@ -64,7 +52,8 @@ class Reconstruction:
 def reconstruct(
     source: str | os.PathLike[str],
     out: str | os.PathLike[str],
-    options: ReconstructOptions | None = None,
+    motion: float = 0.04,
+    most_frames: int = 300,
     on_step: OnStep = lambda *_: None,
 ) -> Reconstruction:
     """Reconstruct camera poses from a video or a folder of images of one camera.
@@ -72,21 +61,32 @@ def reconstruct(
     Args:
         source: Video file or folder.
         out: New or empty folder.
-        options: How frames are chosen and matched.
+        motion: Median motion of corners from one chosen frame of a video to the next, parts of its
+            width.
+        most_frames: Maximum number of frames; of more, every n-th is used.
         on_step: Called with the current step.
-
-    Raises:
-        InputError: The extra `colmap` is not installed, the source cannot be read, too few frames,
-            or no two frames connect.
     """
     try:
         import pycolmap
     except ImportError:
         raise missing_extra("reconstruction needs pycolmap", "colmap") from None
-    options, root = options or ReconstructOptions(), Path(out)
-    names = _chosen(str(source), root, options, on_step)
+    root = Path(out)
+    if root.exists() and any(root.iterdir()):
+        raise InputError(f"{root}: is not empty; give a new folder")
+    names = _chosen(str(source), root / "images", motion, most_frames)
+    on_step("choosing frames", len(names), len(names))
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-    _detect_and_match(pycolmap, root, names, options, on_step)
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = _CAMERA_MODEL
+    on_step("detecting features", 0, 1)
+    pycolmap.extract_features(
+        root / "database.db",
+        root / "images",
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
+    )
+    on_step("matching", 0, 1)
+    _match(pycolmap, root, names)
     models = _mapped(pycolmap, root, len(names), on_step)
     if not models:
         raise InputError(
@@ -103,23 +103,19 @@ def reconstruct(
     )
 
 
-def _chosen(source: str, root: Path, options: ReconstructOptions, on_step: OnStep) -> list[str]:
-    """Write the frames to reconstruct, and return their names."""
-    if root.exists() and any(root.iterdir()):
-        raise InputError(f"{root}: is not empty; give a new folder")
-    images = Path(source).is_dir()
+def _chosen(source: str, images: Path, motion: float, most: int) -> list[str]:
+    folder = Path(source).is_dir()
     names = []
-    for frame in stream(source) if images else _moving(stream(source), options.motion):
-        name = Path(frame.name).stem + ".jpg" if images else f"{int(frame.name):06d}.jpg"
+    for frame in stream(source) if folder else _moving(stream(source), motion):
+        name = Path(frame.name).stem + ".jpg" if folder else f"{int(frame.name):06d}.jpg"
         if name in names:
             raise InputError(f"{source}: has two images called {Path(name).stem}; rename one")
-        (root / "images").mkdir(parents=True, exist_ok=True)
-        write_image(root / "images" / name, frame.image)
+        images.mkdir(parents=True, exist_ok=True)
+        write_image(images / name, frame.image)
         names.append(name)
-    on_step("choosing frames", len(names), max(len(names), 1))
-    keep = names[:: max(1, -(-len(names) // options.most_frames))]
+    keep = names[:: max(1, -(-len(names) // most))]
     for name in set(names) - set(keep):
-        (root / "images" / name).unlink()
+        (images / name).unlink()
     if len(keep) < _LEAST_FRAMES:
         raise InputError(
             f"{source}: {len(keep)} frames to reconstruct, at least {_LEAST_FRAMES} are required;"
@@ -130,30 +126,26 @@ def _chosen(source: str, root: Path, options: ReconstructOptions, on_step: OnSte
 
 def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFrame]:
     """Yield the sharpest frame of each step of a moving camera."""
+    import cv2
+
     last: NDArray[np.uint8] | None = None
     best: tuple[float, StreamFrame, NDArray[np.uint8]] | None = None
     for frame in frames:
-        small = _small(frame.image)
+        grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+        scale = _SMALL_PX / grey.shape[1]
+        resized = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small = np.asarray(resized, np.uint8)
         moved = np.inf if last is None else _motion(last, small)
         if best is not None and moved > 1.5 * motion:
             yield best[1]
             last, best = best[2], None
             moved = _motion(last, small)
         if moved > motion:
-            sharp = _sharpness(small)
+            sharp = float(cv2.Laplacian(small, cv2.CV_64F).var())
             if best is None or sharp > best[0]:
                 best = (sharp, frame, small)
     if best is not None:
         yield best[1]
-
-
-def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    import cv2
-
-    scale = _SMALL_PX / image.shape[1]
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return np.asarray(small, np.uint8)
 
 
 def _motion(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:
@@ -170,39 +162,21 @@ def _motion(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:
     return float(np.median(np.linalg.norm((moved - corners)[found], axis=-1))) / _SMALL_PX
 
 
-def _sharpness(grey: NDArray[np.uint8]) -> float:
-    import cv2
-
-    return float(cv2.Laplacian(grey, cv2.CV_64F).var())
-
-
-def _detect_and_match(
-    pycolmap: Any, root: Path, names: list[str], options: ReconstructOptions, on_step: OnStep
-) -> None:
-    """Match all pairs of few frames, else neighbours and, for loops, pairs of spread frames."""
+def _match(pycolmap: Any, root: Path, names: list[str]) -> None:
     database = root / "database.db"
-    on_step("detecting features", 0, 1)
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = options.camera_model
-    mode = pycolmap.CameraMode.SINGLE
-    pycolmap.extract_features(database, root / "images", camera_mode=mode, reader_options=reader)
-    on_step("detecting features", 1, 1)
-    on_step("matching", 0, 1)
-    if len(names) <= options.exhaustive:
+    if len(names) <= _EXHAUSTIVE:
         pycolmap.match_exhaustive(database)
-    else:
-        pycolmap.match_sequential(database)
-        spread = np.linspace(0, len(names) - 1, options.exhaustive).round().astype(int)
-        pairs = itertools.combinations([names[i] for i in spread], 2)
-        (root / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs))
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = root / "pairs.txt"
-        pycolmap.match_image_pairs(database, pairing_options=pairing)
-    on_step("matching", 1, 1)
+        return
+    pycolmap.match_sequential(database)
+    spread = np.linspace(0, len(names) - 1, _EXHAUSTIVE).round().astype(int)
+    pairs = itertools.combinations([names[i] for i in spread], 2)
+    (root / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs))
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = root / "pairs.txt"
+    pycolmap.match_image_pairs(database, pairing_options=pairing)
 
 
 def _mapped(pycolmap: Any, root: Path, count: int, on_step: OnStep) -> list[Any]:
-    """Return the models, largest first; the largest is written as number 0."""
     working, done = root / "mapping", itertools.count(1)
     working.mkdir()
     on_step("mapping", 0, count)

@@ -44,14 +44,7 @@ def sample_rooms() -> tuple[SampleRoom, ...]:
 
 
 def copy_samples(target: Path) -> None:
-    """Copy the sample recordings to a folder: `bedroom`, `kitchen`, `living` and `cell`.
-
-    Args:
-        target: A new or empty folder.
-
-    Raises:
-        InputError: `target` is a file, is not empty, or cannot be written.
-    """
+    """Copy `bedroom`, `kitchen`, `living` and `cell` to a new or empty folder."""
     if target.exists() and not target.is_dir():
         raise InputError(f"{target}: is a file; name a new folder for the sample recordings")
     sources = {name: FOLDER / name for name in ROOMS} | {"cell": CELL}

@@ -42,9 +42,6 @@ def stream(source: str, rate: float = 15.0) -> Iterator[StreamFrame]:
     Args:
         source: Number or device of a camera, address of a network stream, video file, or folder.
         rate: Frames per second of a folder whose file names hold no times.
-
-    Raises:
-        InputError: The source does not exist or cannot be opened, or a file cannot be read.
     """
     if not is_live(source):
         path = Path(source)
@@ -67,7 +64,6 @@ def _images(folder: Path, rate: float) -> Iterator[StreamFrame]:
 
 
 def _captured(source: str) -> Iterator[StreamFrame]:
-    """Frames by OpenCV."""
     import cv2
 
     live = is_live(source)

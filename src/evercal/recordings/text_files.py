@@ -1,15 +1,16 @@
 """Text and JSON files that a user names, and their errors."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
+from typing import Any
 
 from evercal.errors import InputError
 
 
 @contextmanager
-def named_errors(path: Path, what: str, remedy: str = "check the path") -> Iterator[None]:
+def named_errors(path: Path | str, what: str, remedy: str = "check the path") -> Iterator[None]:
     """Turn errors while a file is read into an `InputError` that names it.
 
     `what` names the contents of the file. A ValueError is about the contents and already says what
@@ -27,13 +28,22 @@ def named_errors(path: Path, what: str, remedy: str = "check the path") -> Itera
         raise InputError(f"{path}: {error}") from None
 
 
+@contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Begin the message of a ValueError with the entry that it is about."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from None
+
+
 def read_text(path: Path, what: str, remedy: str = "check the path") -> str:
     """Read a UTF-8 text file; `what` names its contents in messages."""
     with named_errors(path, what, remedy):
         return path.read_text(encoding="utf-8-sig")
 
 
-def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str, object]:
+def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str, Any]:
     """Read a JSON object; `what` names its contents in messages."""
     try:
         data = json.loads(read_text(path, what, remedy))
@@ -44,11 +54,28 @@ def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str
     return data
 
 
-def first_repeated(names: Sequence[str]) -> str | None:
-    """The first name that came before."""
+def refuse_repeated(names: Iterable[str], remedy: str) -> None:
+    """Raise ValueError for the first name that came before."""
     known: set[str] = set()
     for name in names:
         if name in known:
-            return name
+            raise ValueError(f"{name!r} comes twice; {remedy}")
         known.add(name)
-    return None
+
+
+def path_inside(path: object, what: str) -> str:
+    """Check that a path of a file with forward slashes stays inside the file's folder.
+
+    Symbolic links are followed: download caches keep files elsewhere. `what` names the entry.
+    """
+    # Windows paths split at both kinds of slashes and have an anchor for drives as well.
+    if not isinstance(path, str) or not path or PureWindowsPath(path).anchor:
+        raise ValueError(f"{what} is a path relative to the folder, got {path!r}")
+    if ".." in PureWindowsPath(path).parts:
+        raise ValueError(f"{what} stays inside the folder, got {path!r}")
+    return path
+
+
+def is_real(value: object) -> bool:
+    """Whether a JSON value is a number."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)

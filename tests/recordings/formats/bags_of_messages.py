@@ -1,6 +1,6 @@
 """Small bags with a turning arm in them, written by rosbags in every container that ROS has."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -65,9 +65,10 @@ class Bag:
         stamp = self.make("builtin_interfaces/msg/Time", sec=ns // 10**9, nanosec=ns % 10**9)
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
-    def add(self, topic: str, kind: str, seconds: float, message: Any) -> None:
-        """Recorded 5 ms after `seconds`."""
-        self.messages.append((topic, kind, START_NS + round(seconds * 1e9) + 5_000_000, message))
+    def add(self, topic: str, kind: str, seconds: float, **fields: Any) -> None:
+        """A message that is recorded 5 ms after `seconds`."""
+        logged = START_NS + round(seconds * 1e9) + 5_000_000
+        self.messages.append((topic, kind, logged, self.make(kind, **fields)))
 
     def tf(self, seconds: float, parent: str, child: str, pose: SE3, static: bool = False,
            robot: str = "") -> None:  # fmt: skip
@@ -86,8 +87,7 @@ class Bag:
             transform=transform,
         )
         topic = robot + ("/tf_static" if static else "/tf")
-        kind = "tf2_msgs/msg/TFMessage"
-        self.add(topic, kind, seconds, self.make(kind, transforms=[entry]))
+        self.add(topic, "tf2_msgs/msg/TFMessage", seconds, transforms=[entry])
 
     def image(self, seconds: float, topic: str, pixels: np.ndarray, encoding: str = "rgb8",
               stamped: bool = True, pad: int = 3) -> None:  # fmt: skip
@@ -95,9 +95,10 @@ class Bag:
         height, width = pixels.shape[:2]
         rows = pixels.reshape(height, -1).view(np.uint8)
         rows = np.pad(rows, ((0, 0), (0, pad)), constant_values=99)
-        kind = "sensor_msgs/msg/Image"
-        message = self.make(
-            kind,
+        self.add(
+            topic,
+            "sensor_msgs/msg/Image",
+            seconds,
             header=self.header(seconds if stamped else None, "camera_optical"),
             height=height,
             width=width,
@@ -106,20 +107,17 @@ class Bag:
             step=rows.shape[1],
             data=rows.reshape(-1),
         )
-        self.add(topic, kind, seconds, message)
 
     def compressed(self, seconds: float, topic: str, data: bytes, what: str) -> None:
         """An image file."""
+        head, content = self.header(seconds, "camera_optical"), np.frombuffer(data, np.uint8)
         kind = "sensor_msgs/msg/CompressedImage"
-        head = self.header(seconds, "camera_optical")
-        content = np.frombuffer(data, np.uint8)
-        self.add(topic, kind, seconds, self.make(kind, header=head, format=what, data=content))
+        self.add(topic, kind, seconds, header=head, format=what, data=content)
 
     def info(self, topic: str, focal: float = 30.0, distortion: Iterable[float] = (0.1, 0, 0, 0, 0),
              model: str = "plumb_bob", rectified_focal: float = 28.0,
              size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:  # fmt: skip
         """A camera_info."""
-        kind = "sensor_msgs/msg/CameraInfo"
         k = [focal, 0, 15.0, 0, focal, 11.0, 0, 0, 1] if focal else [0.0] * 9
         p = [rectified_focal, 0, 16.0, 0, 0, rectified_focal, 12.0, 0, 0, 0, 1, 0]
         values = {"k": k, "d": list(distortion), "r": np.eye(3).reshape(-1), "p": p}
@@ -127,8 +125,10 @@ class Bag:
             values = {name.upper(): value for name, value in values.items()}
         roi = self.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0,
                         width=0, do_rectify=False)  # fmt: skip
-        message = self.make(
-            kind,
+        self.add(
+            topic,
+            "sensor_msgs/msg/CameraInfo",
+            0.0,
             header=self.header(0.0, "camera_optical"),
             width=size[0],
             height=size[1],
@@ -138,38 +138,34 @@ class Bag:
             roi=roi,
             **{name: np.array(value, np.float64) for name, value in values.items()},
         )
-        self.add(topic, kind, 0.0, message)
 
     def joints(self, seconds: float, values: dict[str, float],
                topic: str = "/joint_states") -> None:  # fmt: skip
         """A joint state."""
-        kind = "sensor_msgs/msg/JointState"
         numbers, none = np.array(list(values.values())), np.empty(0)
-        message = self.make(kind, header=self.header(seconds, ""), name=list(values),
-                            position=numbers, velocity=none, effort=none)  # fmt: skip
-        self.add(topic, kind, seconds, message)
+        self.add(topic, "sensor_msgs/msg/JointState", seconds, header=self.header(seconds, ""),
+                 name=list(values), position=numbers, velocity=none, effort=none)  # fmt: skip
 
     def write(self, root: Path) -> Path:
         """Writes all messages by time; gives the path of the bag."""
+        root.mkdir(exist_ok=True)
         ordered = sorted(self.messages, key=lambda entry: entry[2])
         if self.kind == "ros1":
             path = root / "wave.bag"
-            with Writer1(path) as writer:
-                links = self._links(lambda t, k: writer.add_connection(t, k, typestore=self.store))
-                for topic, kind, ns, message in ordered:
-                    data = self.store.serialize_ros1(message, kind)
-                    writer.write(links[topic, kind], ns, data)
-            return path
-        path = root / "wave"
-        plugin = StoragePlugin.MCAP if self.kind == "mcap" else StoragePlugin.SQLITE3
-        with Writer2(path, version=9, storage_plugin=plugin) as writer:
-            links = self._links(lambda t, k: writer.add_connection(t, k, typestore=self.store))
+            writing: Any = Writer1(path)
+        else:
+            path = root / "wave"
+            plugin = StoragePlugin.MCAP if self.kind == "mcap" else StoragePlugin.SQLITE3
+            writing = Writer2(path, version=9, storage_plugin=plugin)
+        encode = self.store.serialize_ros1 if self.kind == "ros1" else self.store.serialize_cdr
+        links: dict[tuple[str, str], Any] = {}
+        with writing as writer:
             for topic, kind, ns, message in ordered:
-                writer.write(links[topic, kind], ns, self.store.serialize_cdr(message, kind))
+                if (topic, kind) not in links:
+                    link = writer.add_connection(topic, kind, typestore=self.store)
+                    links[topic, kind] = link
+                writer.write(links[topic, kind], ns, encode(message, kind))
         return path
-
-    def _links(self, add: Callable[[str, str], Any]) -> dict[tuple[str, str], Any]:
-        return {pair: add(*pair) for pair in dict.fromkeys((t, k) for t, k, *_ in self.messages)}
 
 
 def arm(bag: Bag, first: float = 0.0, last: float = 2.0, rate: float = 25.0) -> Bag:
@@ -180,6 +176,17 @@ def arm(bag: Bag, first: float = 0.0, last: float = 2.0, rate: float = 25.0) -> 
     for i in range(round((last - first) * rate) + 1):
         at = first + i / rate
         bag.tf(at, "shoulder", "tool0", shoulder_from_tool(at))
+    return bag
+
+
+def single(
+    pixels: np.ndarray | None = None, encoding: str = "rgb8", topic: str = "/cam/image_raw",
+    kind: str = "mcap", at: float = 0.5, stamped: bool = True, **info: Any,
+) -> Bag:  # fmt: skip
+    """An arm, a camera and one image."""
+    bag = arm(Bag(kind))
+    bag.image(at, topic, picture(0) if pixels is None else pixels, encoding, stamped)
+    bag.info("/cam/camera_info", **info)
     return bag
 
 

@@ -119,7 +119,7 @@ def test_an_applied_transform_is_undone(
     undo, divide = nerfstudio._applied(data)
     for matrix, new in zip(matrices, moved, strict=True):
         entry = {"file_path": "a.png", "transform_matrix": new.tolist()}
-        frame = nerfstudio._frame(Path(), data, 0, entry, undo, divide)
+        frame = nerfstudio._frame(Path(), data, entry, undo, divide)
         expected = gl_pixel(matrix, LENS, np.array(point))
         np.testing.assert_allclose(pixel_of(frame, np.array(point)), expected, atol=1e-6)
 
@@ -144,12 +144,11 @@ def test_downscaled_images_get_scaled_cameras(tmp_path: Path) -> None:
     np.testing.assert_allclose(pixel_of(frame, point), gl_pixel(matrices[1], LENS, point) / 2)
 
 
-def test_names_without_ending_and_horizontal_angle_of_view(tmp_path: Path) -> None:
+def test_names_without_ending_are_read(tmp_path: Path) -> None:
     write(tmp_path, entries(ring(2)), camera_angle_x=0.5, w=24, h=36)
     file = tmp_path / "transforms.json"
     file.write_text(file.read_text().replace(".png", ""))
     frame = load_recording(tmp_path).train[0]
-    assert frame.camera.fx == frame.camera.fy == pytest.approx(12 / np.tan(0.25))
     assert (frame.camera.cx, frame.camera.cy) == (11.5, 17.5)
     assert frame.read_image().shape == (36, 24, 3)
 
@@ -157,6 +156,7 @@ def test_names_without_ending_and_horizontal_angle_of_view(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("lens", "focal"),
     [
+        ({"camera_angle_x": 0.5}, (12 / np.tan(0.25), 12 / np.tan(0.25))),
         ({"camera_angle_y": 0.5}, (18 / np.tan(0.25), 18 / np.tan(0.25))),
         ({"camera_angle_x": 0.4, "camera_angle_y": 0.5}, (12 / np.tan(0.2), 18 / np.tan(0.25))),
         ({"fl_x": 40.0, "camera_angle_y": 0.5}, (40.0, 18 / np.tan(0.25))),
@@ -169,6 +169,10 @@ def test_angles_of_view_without_image_size(
     camera = load_recording(tmp_path).train[1].camera
     assert (camera.width, camera.height) == (24, 36)
     assert (camera.fx, camera.fy) == pytest.approx(focal)
+
+
+def one(matrix: np.ndarray) -> list[dict[str, Any]]:
+    return [{"file_path": "a.png", "transform_matrix": matrix.tolist()}]
 
 
 BREAKS: list[tuple[dict[str, Any], str]] = [
@@ -190,20 +194,11 @@ BREAKS: list[tuple[dict[str, Any], str]] = [
     ({"applied_transform": np.diag([1.0, 0, 1, 1]).tolist()}, "cannot be undone"),
     ({"frames": []}, "'frames' is a list with at least one frame"),
     ({"frames": [3]}, "frame 0: an object with 'file_path'"),
-    ({"frames": [{"file_path": "a.png"}]}, "frame 0 .a.png.: 'transform_matrix' is 4x4"),
-    (
-        {"frames": [{"file_path": "a.png", "transform_matrix": (2 * np.eye(4)).tolist()}]},
-        "frame 0 .a.png.: the last row",
-    ),
-    (
-        {"frames": [{"file_path": "a.png", "transform_matrix": np.diag([2, 2, 2, 1.0]).tolist()}]},
-        "frame 0 .a.png.: .*is a rotation",
-    ),
+    ({"frames": [{"file_path": "a.png"}]}, "frame 0: a.png: 'transform_matrix' is 4x4"),
+    ({"frames": one(2 * np.eye(4))}, "frame 0: a.png: the last row"),
+    ({"frames": one(np.diag([2, 2, 2, 1.0]))}, "frame 0: a.png: .*is a rotation"),
     ({"frames": entries(ring(1)) * 2}, "'images/frame_00000.png' comes twice"),
-    (
-        {"frames": [{"file_path": "no.png", "transform_matrix": np.eye(4).tolist()}]},
-        "no.png: named",
-    ),
+    ({"frames": one(np.eye(4))}, "a.png: named"),
     ({"test_filenames": "all"}, "'test_filenames' is a list of file names"),
 ]
 
@@ -215,12 +210,4 @@ def test_broken_files_are_refused(change: dict[str, Any], message: str, tmp_path
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
     with pytest.raises(InputError, match=message) as caught:
         load_recording(tmp_path)
-    assert "\n" not in str(caught.value)
     assert "transforms.json" in str(caught.value)
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{", "\x00"])
-def test_other_json_is_refused(text: str, tmp_path: Path) -> None:
-    (tmp_path / "transforms.json").write_text(text)
-    with pytest.raises(InputError, match=r"transforms\.json"):
-        load_recording(tmp_path)

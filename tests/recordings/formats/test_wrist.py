@@ -16,6 +16,8 @@ from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import natural_key, times_in_names
 
+from ..checks import assert_pose, refused
+
 CAMERA = Camera(32, 24, 30.0, 31.0, 15.0, 11.0, (0.1, 0.0, 0.0, 0.0))
 
 
@@ -44,8 +46,7 @@ def assert_paired(recording: Recording, names: Sequence[str], poses: SE3) -> Non
     assert [frame.name for frame in recording.train] == list(names)
     for frame, pose in zip(recording.train, poses, strict=True):
         assert frame.base_from_camera is None
-        assert frame.base_from_gripper is not None
-        assert max(pose_distance(frame.base_from_gripper, pose)) < 1e-9
+        assert_pose(frame.base_from_gripper, pose)
         assert frame.camera == CAMERA
 
 
@@ -98,8 +99,7 @@ def test_images_that_cannot_be_paired_are_refused(
 ) -> None:
     count = len(images) if stamps is None else len(stamps)
     rows = RobotPoses(names, stamps, some_poses(count))
-    with pytest.raises(InputError, match=message):
-        pair_images([Path(image) for image in images], rows, None, Path("p.csv"))
+    refused(message, pair_images, [Path(image) for image in images], rows, None, Path("p.csv"))
 
 
 def test_frame_numbers_and_folders_are_paired_in_order() -> None:
@@ -137,8 +137,7 @@ def test_poses_are_interpolated_at_times_in_a_stamps_file(tmp_path: Path) -> Non
     np.testing.assert_allclose(first.base_from_gripper.translation_m, [0.5, 0, 0])
     np.testing.assert_allclose(second.base_from_gripper.translation_m, [1.5, 0, 0])
     (tmp_path / "stamps.csv").write_text("image,stamp_s\nx.png,0.05\n")
-    with pytest.raises(InputError, match=r"y\.png: stamps\.csv has no row"):
-        load_recording(tmp_path)
+    refused(r"y\.png: stamps\.csv has no row", load_recording, tmp_path)
 
 
 def test_times_in_names() -> None:
@@ -164,8 +163,7 @@ def test_natural_order_of_mixed_names(tmp_path: Path) -> None:
 def test_camera_file_is_chosen_and_must_fit_the_images(tmp_path: Path) -> None:
     make_folder(tmp_path, ["1.png", "2.png"], some_poses(2))
     (tmp_path / "camera.json").rename(tmp_path / "other.json")
-    with pytest.raises(InputError, match=r"no camera file in it; name the file .* --camera"):
-        load_recording(tmp_path)
+    refused(r"no camera file in it; name the file .* --camera", load_recording, tmp_path)
     recording = load_recording(tmp_path, options=ReadOptions(camera=tmp_path / "other.json"))
     assert recording.train[0].camera == CAMERA
     (tmp_path / "camera.txt").write_text("30 0 15\n0 31 11\n0 0 1\n")
@@ -173,23 +171,19 @@ def test_camera_file_is_chosen_and_must_fit_the_images(tmp_path: Path) -> None:
     (tmp_path / "camera.txt").unlink()
     wide = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
     (tmp_path / "camera.json").write_text(json.dumps(wide.to_dict()))
-    with pytest.raises(InputError, match=r"is for images of 64x48, 1\.png is 32x24"):
-        load_recording(tmp_path)
+    refused(r"is for images of 64x48, 1\.png is 32x24", load_recording, tmp_path)
 
 
 def test_missing_and_ambiguous_files_are_refused(tmp_path: Path) -> None:
     make_folder(tmp_path, [], some_poses(2))
-    with pytest.raises(InputError, match="no images"):
-        load_recording(tmp_path)
+    refused("no images", load_recording, tmp_path)
     (tmp_path / "joints.csv").write_text("a\n1\n")
-    with pytest.raises(InputError, match=r"holds base_from_gripper\.csv and joints\.csv"):
-        load_recording(tmp_path)
+    refused(r"holds base_from_gripper\.csv and joints\.csv", load_recording, tmp_path)
     (tmp_path / "joints.csv").unlink()
     with pytest.raises(InputError, match=r"--gripper-frame: .* holds gripper poses already"):
         load_recording(tmp_path, options=ReadOptions(gripper_frame="tool0"))
     (tmp_path / "base_from_gripper.csv").unlink()
-    with pytest.raises(InputError, match="no gripper poses; expected base_from_gripper"):
-        wrist.load(tmp_path)
+    refused("no gripper poses; expected base_from_gripper", wrist.load, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -209,7 +203,6 @@ def test_broken_stamps_are_refused(tmp_path: Path, text: str, message: str) -> N
     (tmp_path / "stamps.csv").write_text(text)
     with pytest.raises(InputError, match=message) as caught:
         load_recording(tmp_path)
-    assert "\n" not in str(caught.value)
     assert "stamps.csv" in str(caught.value)
 
 
@@ -222,7 +215,6 @@ def test_other_kinds_of_pose_files_are_read(tmp_path: Path) -> None:
     rows = np.hstack([1000 * poses.translation_m, poses.log()[:, 3:]])
     numbers = "\n".join(" ".join(f"{v:.12g}" for v in row) for row in rows)
     (tmp_path / "base_from_gripper.txt").write_text(numbers)
-    with pytest.raises(InputError, match=r"base_from_gripper\.txt"):
-        load_recording(tmp_path)  # the convention is missing
+    refused(r"base_from_gripper\.txt", load_recording, tmp_path)  # the convention is missing
     recording = load_recording(tmp_path, options=ReadOptions(pose_convention="ur:mm"))
     assert_paired(recording, names, poses)

@@ -188,6 +188,7 @@ def test_poses_in_mixed_units_are_named(name: str, factor: float) -> None:
     [
         ("wxyz", lambda n: n[:, :6], "has 7 numbers .* got 6"),
         ("wxyz", lambda n: n * np.where(np.arange(7) > 2, 2, 1), "pose 1 .* not of length 1"),
+        ("wxyz", lambda n: np.r_[n[:2], n[2:] * 1.2], r"pose 3 \(and 3 more\): .*length 1"),
         ("ur", lambda n: np.where(np.arange(6) == 4, np.nan, n), "inf or nan"),
         ("matrix", lambda n: n.reshape(-1, 4, 4).swapaxes(1, 2).reshape(-1, 16), "franka"),
         ("franka", lambda n: n.reshape(-1, 4, 4).swapaxes(1, 2).reshape(-1, 16), "matrix"),
@@ -201,10 +202,3 @@ def test_invalid_numbers_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         poses_from_numbers(change(rows(name)), CONVENTIONS[name])
-
-
-def test_first_broken_pose_is_named() -> None:
-    numbers = rows("wxyz")
-    numbers[[2, 3], 3:] *= 1.2
-    with pytest.raises(ValueError, match=r"pose 3 \(and 1 more\)"):
-        poses_from_numbers(numbers, CONVENTIONS["wxyz"])

@@ -46,12 +46,14 @@ def matched_once() -> Iterator[None]:
 
 
 def test_measured_rotations_agree_with_true_poses(bedroom: tuple[Frame, ...]) -> None:
-    turns = pose_evidence.pair_rotations(bedroom, stated(bedroom))
-    assert turns is not None
-    assert len(turns.measured) >= 8
-    off = Rotation.from_rotvec(turns.measured).inv() * Rotation.from_rotvec(turns.stated)
+    poses = stated(bedroom)
+    pairs, measured = pose_evidence.measured_pairs(bedroom, poses)
+    first, second = pairs.T
+    assert len(measured) >= 8
+    rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
+    off = Rotation.from_rotvec(measured).inv() * rotation[first].inv() * rotation[second]
     assert np.rad2deg(np.median(off.magnitude())) < 1.0
-    assert np.rad2deg(np.median(np.linalg.norm(turns.measured, axis=1))) > pose_evidence.LEAST_DEG
+    assert np.rad2deg(np.median(np.linalg.norm(measured, axis=1))) > pose_evidence.LEAST_DEG
 
 
 def reordered(poses: SE3) -> SE3:

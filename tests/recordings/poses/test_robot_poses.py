@@ -16,6 +16,8 @@ from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.conventions import CONVENTIONS, numbers_from_poses, pose_convention
 from evercal.recordings.poses.robot_poses import read_robot_poses
 
+from ..checks import refused
+
 COUNT = 6
 
 
@@ -130,8 +132,7 @@ def test_tum_files_are_read(tmp_path: Path) -> None:
         assert read.stamps_s[2] == 1.7e9 + 2
     inverse = read_robot_poses(tmp_path / "c.txt", "tum:inverse")
     assert same(inverse.poses, arm().inverse())
-    with pytest.raises(InputError, match=r"8 columns without a header .* xyzw, tum, "):
-        read_robot_poses(tmp_path / "c.txt")
+    refused(r"8 columns without a header .* xyzw, tum, ", read_robot_poses, tmp_path / "c.txt")
 
 
 def test_decimal_commas_are_read(tmp_path: Path) -> None:
@@ -142,54 +143,41 @@ def test_decimal_commas_are_read(tmp_path: Path) -> None:
     assert read.names == ("a,b.png",)
 
 
-def test_json_objects_are_read(tmp_path: Path) -> None:
-    keys = ("translation_m", "quaternion_wxyz")
+def test_json_is_read(tmp_path: Path) -> None:
+    file, poses, matrices = tmp_path / "p.json", arm(), arm().matrix()
     objects = [
-        dict(zip(keys, (p.translation_m.tolist(), p.rotation_wxyz.tolist()), strict=True))
-        for p in arm()
+        {"translation_m": p.translation_m.tolist(), "quaternion_wxyz": p.rotation_wxyz.tolist()}
+        for p in poses
     ]
-    file = tmp_path / "p.json"
-    for data in (objects, {"poses": objects}):
+    kuka = numbers_from_poses(poses, CONVENTIONS["kuka"]).tolist()
+    for data, convention, expected in (
+        (objects, None, poses),
+        ({"poses": objects}, None, poses),
+        (objects, "wxyz:inverse", poses.inverse()),
+        (objects[0], None, poses[:1]),
+        ([{"matrix": m.tolist()} for m in matrices], None, poses),
+        ([{"matrix": m.T.ravel().tolist()} for m in matrices], "franka", poses),
+        (matrices.tolist(), None, poses),
+        (kuka, "kuka", poses),
+    ):
         file.write_text(json.dumps(data))
-        assert same(read_robot_poses(file).poses, arm())
-    assert same(read_robot_poses(file, "wxyz:inverse").poses, arm().inverse())
-    file.write_text(json.dumps(objects[0]))
-    assert same(read_robot_poses(file).poses, arm()[:1])
-
-
-def test_json_matrices_and_numbers_are_read(tmp_path: Path) -> None:
-    file = tmp_path / "p.json"
-    matrices = arm().matrix()
-    file.write_text(json.dumps([{"matrix": m.tolist()} for m in matrices]))
-    assert same(read_robot_poses(file).poses, arm())
-    file.write_text(json.dumps([{"matrix": m.T.ravel().tolist()} for m in matrices]))
-    assert same(read_robot_poses(file, "franka").poses, arm())
-    file.write_text(json.dumps(matrices.tolist()))
-    assert same(read_robot_poses(file).poses, arm())
-    file.write_text(json.dumps(numbers_from_poses(arm(), CONVENTIONS["kuka"]).tolist()))
-    assert same(read_robot_poses(file, "kuka").poses, arm())
-    with pytest.raises(InputError, match="6 columns without a header do not define a pose"):
-        read_robot_poses(file)
+        assert same(read_robot_poses(file, convention).poses, expected)
+    refused("6 columns without a header do not define a pose", read_robot_poses, file)
 
 
 def test_npy_files_are_read(tmp_path: Path) -> None:
-    file = tmp_path / "p.npy"
-    np.save(file, arm().matrix())
-    assert same(read_robot_poses(file).poses, arm())
-    np.save(file, arm().matrix()[0])
+    file, matrices = tmp_path / "p.npy", arm().matrix()
+    np.save(file, matrices[0])
     assert same(read_robot_poses(file).poses, arm()[:1])
-    np.save(file, arm().matrix().swapaxes(1, 2))
+    np.save(file, matrices.swapaxes(1, 2))
     assert same(read_robot_poses(file, "franka").poses, arm())
-    with pytest.raises(InputError, match="written column after column; give the convention franka"):
-        read_robot_poses(file)
+    refused("written column after column; give the convention franka", read_robot_poses, file)
     for name in ("wxyz", "xyzw", "ur", "kuka", "franka"):
         np.save(file, numbers_from_poses(arm(), CONVENTIONS[name]))
         assert same(read_robot_poses(file, name).poses, arm())
-        if name == "franka":
-            assert same(read_robot_poses(file).poses, arm())
-            continue
-        with pytest.raises(InputError, match="do not define a pose"):
-            read_robot_poses(file)
+        if name != "franka":
+            refused("do not define a pose", read_robot_poses, file)
+    assert same(read_robot_poses(file).poses, arm())
 
 
 Q = "0.5,0.1,0.2,1,0,0,0"
@@ -198,11 +186,7 @@ REFUSED = [
     ("x,y,z,roll,pitch,yaw\n0.5,0,0,0.1,0.2,0.3", None, "give the convention rpy:rad or rpy:deg"),
     ("x,y,z,a,b,c\n500,0,0,10,20,30", None, "columns a, b, c .* give the convention kuka"),
     ("x,y,z,q1,q2,q3,q4\n" + Q, None, "give the convention abb, wxyz or xyzw"),
-    (
-        "x,y,z,qw,qx,qy,qz,rotvec_x,rotvec_y,rotvec_z\n" + Q + ",0,0,0",
-        None,
-        "names quaternion and",
-    ),
+    ("x,y,z,qw,qx,qy,qz,rvec_x,rvec_y,rvec_z\n" + Q + ",0,0,0", None, "names quaternion and"),
     ("a1,a2,a3,a4,a5,a6,a7\n" + Q, None, "a1, .* name no known pose"),
     ("x,y,z,u,v\n0,0,0,0,0", "kuka", "columns x, y, z, u, v are none of kuka"),
     ("x,y,z,qw,qx,qy,qz\n" + Q, "kuka", "are none of kuka"),
@@ -211,11 +195,7 @@ REFUSED = [
     (Q + ",3,4", "wxyz", "rows have 9 numbers; wxyz takes 7"),
     (Q + "\n1,2", "wxyz", "row 2, column 3: '' is not a finite number"),
     ("x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,1,0,0", None, "row 1, column 'qz': '' is not"),
-    (
-        "x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,1,0,0,none",
-        None,
-        "row 1, column 'qz': 'none' is not a finite number",
-    ),
+    ("x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,1,0,0,none", None, "row 1, column 'qz': 'none' is not a fin"),
     ("x,y,z,qw,qx,qy,qz\n500,100,200,1,0,0,0", None, "look like millimetres.* wxyz:mm"),
     ("x_m,y_m,z_m,qw,qx,qy,qz\n500,100,200,1,0,0,0", None, "look like millimetres.* wxyz:mm"),
     ("x,y,z,rotvec_x,rotvec_y,rotvec_z\n0.5,0,0,100,20,3", None, "look like degrees.* ur:deg"),
@@ -227,11 +207,7 @@ REFUSED = [
     ("x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,1,1,0,0", None, "not of length 1"),
     ("x,y,z,qw,qx,qy,qz,px,py,pz\n" + Q + ",1,2,3", None, "x and px may both be the position's"),
     ("x,y,z,qw,qx,qy,qz,qw,qx,qy,qz\n" + Q + ",1,0,0,0", None, "qw and qw may both be"),
-    (
-        "0.5,0.1,0.2,0,0,1,9\n0.4,0.1,0.2,0,0,1,9",
-        "ur",
-        "rows have 7 numbers; ur takes 6 .* stamp that increases",
-    ),
+    ("5,1,2,0,0,1,9\n4,1,2,0,0,1,9", "ur", "rows have 7 numbers; ur takes 6 .* that increases"),
     ("# nothing\n", None, "no line of numbers"),
     (",,,\n", None, "no line of numbers"),
     ("x,y,z,qw,qx,qy,qz\n", None, "no line of numbers"),
@@ -247,13 +223,6 @@ def test_ambiguous_and_broken_tables_are_refused(
     with pytest.raises(InputError, match=message) as caught:
         read_robot_poses(tmp_path / "p.csv", given)
     assert str(caught.value).startswith(str(tmp_path / "p.csv"))
-    assert "\n" not in str(caught.value)
-
-
-def test_messages_name_the_option_of_the_command(tmp_path: Path) -> None:
-    (tmp_path / "p.csv").write_text("x,y,z,rx,ry,rz\n0.5,0,0,0.1,0.2,0.3")
-    with pytest.raises(InputError, match=r"columns rx, ry, rz .*; give --pose-convention ur "):
-        read_robot_poses(tmp_path / "p.csv", option="--pose-convention")
 
 
 def test_given_convention_overrides_the_header(tmp_path: Path) -> None:
@@ -267,11 +236,7 @@ def test_given_convention_overrides_the_header(tmp_path: Path) -> None:
     [
         ([{"translation_m": [1, 2, 3]}], None, "x_m, y_m, z_m name no known pose"),
         ([{"translation_m": [1, 2], "quaternion_wxyz": [1, 0, 0, 0]}], None, "no known pose"),
-        (
-            [{"translation_m": [1, 2, "x"], "quaternion_wxyz": [1, 0, 0, 0]}],
-            None,
-            "'x' is not a finite number",
-        ),
+        ([{"translation_m": [1, 2, "x"], "quaternion_wxyz": [1, 0, 0, 0]}], None, "'x' is not"),
         ([{"translation_m": [1, 2, 3], "quaternion_wxyz": [1, 0, 0, 0]}], "ur", "are none of ur"),
         ([{"matrix": np.eye(4).tolist()}], "kuka", r"got \(1, 4, 4\) for kuka"),
         ([{"matrix": np.eye(3).tolist()}], None, r"or \(n, k\) numbers, got \(1, 3, 3\)"),
@@ -285,28 +250,24 @@ def test_broken_json_is_refused(
     tmp_path: Path, data: object, given: str | None, message: str
 ) -> None:
     (tmp_path / "p.json").write_text(json.dumps(data))
-    with pytest.raises(InputError, match=message):
-        read_robot_poses(tmp_path / "p.json", given)
+    refused(message, read_robot_poses, tmp_path / "p.json", given)
 
 
 def test_missing_and_broken_files_are_refused(tmp_path: Path) -> None:
     for name in ("no.csv", "no.json", "no.npy"):
-        with pytest.raises(InputError, match="file of robot poses is missing; check the path"):
-            read_robot_poses(tmp_path / name)
-        with pytest.raises(InputError, match=f"{name}: camera file is missing"):
-            read_robot_poses(tmp_path / name, what="camera file")
-    (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(InputError, match="not a text file"):
-        read_robot_poses(tmp_path / "b.csv")
-    (tmp_path / "b.json").write_text("{")
-    with pytest.raises(InputError, match=r"b\.json: "):
-        read_robot_poses(tmp_path / "b.json")
-    (tmp_path / "b.npy").write_text("hello")
-    with pytest.raises(InputError, match=r"b\.npy: "):
-        read_robot_poses(tmp_path / "b.npy")
+        refused("file of robot poses is missing; check", read_robot_poses, tmp_path / name)
+    refused(
+        "no.csv: camera file is missing", read_robot_poses, tmp_path / "no.csv", what="camera file"
+    )
     np.save(tmp_path / "o.npy", np.array([{}, {}], dtype=object), allow_pickle=True)
-    with pytest.raises(InputError, match=r"o\.npy: "):
-        read_robot_poses(tmp_path / "o.npy")
     np.save(tmp_path / "v.npy", np.zeros((2, 3, 4, 5)))
-    with pytest.raises(InputError, match=r"got \(2, 3, 4, 5\)"):
-        read_robot_poses(tmp_path / "v.npy")
+    for name, content, message in (
+        ("b.csv", b"\xff\xfe\x00\x80", "not a text file"),
+        ("b.json", b"{", r"b\.json: "),
+        ("b.npy", b"hello", r"b\.npy: "),
+        ("o.npy", None, r"o\.npy: "),
+        ("v.npy", None, r"got \(2, 3, 4, 5\)"),
+    ):
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+        refused(message, read_robot_poses, tmp_path / name)

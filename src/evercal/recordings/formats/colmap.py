@@ -63,10 +63,10 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
     if not posed:
         raise InputError(f"{folder}: no image has a pose; reconstruct with more overlap")
     images = _image_folder(root, folder, [image.name for image in posed])
-    frames = []
-    for image in posed:
-        pose = _base_from_camera(folder, image)
-        frames.append(Frame(image.name, images / image.name, cameras[image.camera_id], pose))
+    frames = [
+        Frame(i.name, images / i.name, cameras[i.camera_id], _base_from_camera(folder, i))
+        for i in posed
+    ]
     files = [p for p in images.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS]
     total = max(len(model.images), len(files) if images != root else 0)
     name, lost = root.resolve().name, total - len(frames)
@@ -74,19 +74,16 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
 
 
 def _models(root: Path) -> list[Path]:
-    """Model folders in the first of the usual places that has one.
-
-    Models in other places have other images: distorted/sparse is from before undistortion.
-    """
+    """Model folders in the first of the usual places; distorted/sparse is before undistortion."""
     for name in _MODEL_FOLDERS:
         parent = root / name
         inner = sorted(parent.iterdir()) if parent.is_dir() else []
         if name == ".":  # may be a folder of models, which COLMAP numbers
             inner = [folder for folder in inner if folder.name.isdigit()]
+        kinds = [(folder, kind) for folder in (parent, *inner) for kind in ("bin", "txt")]
         models = [
             folder
-            for folder in (parent, *inner)
-            for kind in ("bin", "txt")
+            for folder, kind in kinds
             if all((folder / f"{file}.{kind}").is_file() for file in ("cameras", "images"))
         ]
         if models:

@@ -7,24 +7,29 @@ ignored.
 import contextlib
 import os
 import shutil
-from collections.abc import Callable, Mapping
-from pathlib import Path, PureWindowsPath
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_to_dict
-from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.frame import Frame, Recording, require_images
 from evercal.recordings.images import StoredImage, write_image
-from evercal.recordings.text_files import first_repeated, named_errors, read_json
+from evercal.recordings.text_files import (
+    is_real,
+    named_errors,
+    naming,
+    path_inside,
+    read_json,
+    refuse_repeated,
+)
 from evercal.storage import write_json
 
 FILE = "scene.json"
 _FORMAT = "evercal-scene"
 _VERSION = 1
-_UNFINISHED = ".unfinished"
-"""Marker file in a folder that is being written; it stays if the writer is interrupted."""
 
 
 def detect(root: Path) -> bool:
@@ -36,42 +41,45 @@ def load(root: str | os.PathLike[str]) -> Recording:
     """Read scene.json and check that its images exist; no image is opened."""
     root = Path(root)
     file = root / FILE
-    data = _read(file)
+    data = read_json(file, "scene file", "convert the recording again")
     with named_errors(file, "scene file"):
+        _check(data)
         cameras = _cameras(data.get("cameras"))
-        entries = data.get("frames")
-        if not isinstance(entries, list) or not entries:
-            raise ValueError("'frames' is a list with at least one frame")
-        frames = [_frame(root, i, entry, cameras) for i, entry in enumerate(entries)]
-        untracked = data.get("untracked", 0)
-        if not isinstance(untracked, int):
-            raise ValueError(f"'untracked' is a count, got {untracked!r}")
-        unit = data.get("unit", "metres")
-        if unit not in ("metres", "unknown"):
-            raise ValueError(f"'unit' is 'metres' or 'unknown', got {unit!r}")
-        notes = data.get("notes", [])
-        if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
-            raise ValueError(f"'notes' is a list of sentences, got {notes!r}")
-        repeated = first_repeated([frame.name for _, frame in frames])
-        if repeated is not None:
-            raise ValueError(f"frame name {repeated!r} comes twice; names are unique")
-    images = [Path(str(frame.image)) for _, frame in frames]
-    missing = [image for image in images if not image.is_file()]
-    if missing:
-        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise InputError(
-            f"{missing[0]}{more}: named in {file} but missing; restore or take the frame out"
-        )
+        frames = []
+        for i, entry in enumerate(data["frames"]):
+            with naming(f"frame {i}"):
+                frames.append(_frame(root, entry, cameras))
+        refuse_repeated((frame.name for _, frame in frames), "names of frames are unique")
+    require_images([frame for _, frame in frames], file)
     name = data.get("name")
     train, test = (tuple(f for s, f in frames if s == split) for split in ("train", "test"))
     return Recording(
         name if isinstance(name, str) and name else root.resolve().name,
         train,
         test,
-        untracked,
-        notes=tuple(notes),
-        metric=unit == "metres",
+        data.get("untracked", 0),
+        notes=tuple(data.get("notes", ())),
+        metric=data.get("unit") != "unknown",
     )
+
+
+def _check(data: Mapping[str, Any]) -> None:
+    if data.get("format") != _FORMAT:
+        raise ValueError(f"'format' is not '{_FORMAT}'; this is another program's file")
+    if data.get("version") != _VERSION:
+        raise ValueError(
+            f"version {data.get('version')!r}, this evercal reads {_VERSION}; update evercal or"
+            f" convert the scene"
+        )
+    frames, notes = data.get("frames"), data.get("notes", [])
+    if not isinstance(frames, list) or not frames:
+        raise ValueError("'frames' is a list with at least one frame")
+    if not isinstance(data.get("untracked", 0), int):
+        raise ValueError(f"'untracked' is a count, got {data['untracked']!r}")
+    if data.get("unit", "metres") not in ("metres", "unknown"):
+        raise ValueError(f"'unit' is 'metres' or 'unknown', got {data['unit']!r}")
+    if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+        raise ValueError(f"'notes' is a list of sentences, got {notes!r}")
 
 
 def write(
@@ -88,9 +96,6 @@ def write(
         recording: Frames to write.
         link: Create hard links to image files where the file system allows it.
         on_frame: Called after every frame, for progress bars.
-
-    Raises:
-        InputError: `root` already holds a scene, or an image cannot be read.
     """
     with SceneWriter(root, recording.name, link) as writer:
         writer.untracked, writer.notes = recording.untracked, recording.notes
@@ -123,7 +128,6 @@ class SceneWriter:
                 f"{self._root / FILE}: already there; give a new folder, or remove the whole folder"
             )
         (self._root / "images").mkdir(parents=True, exist_ok=True)
-        self._resumed = (self._root / _UNFINISHED).exists()
 
     def __enter__(self) -> Self:
         """Return the writer; its folder exists already."""
@@ -144,11 +148,8 @@ class SceneWriter:
         data |= {} if self.metric else {"unit": "unknown"}
         data |= {"notes": list(self.notes)} if self.notes else {}
         data |= {"render": self.render} if self.render is not None else {}
-        try:
-            write_json(self._root / FILE, data)
-            (self._root / _UNFINISHED).unlink(missing_ok=True)
-        except OSError as error:
-            raise InputError(f"{self._root / FILE}: cannot be written ({error.strerror})") from None
+        with self._new(FILE) as file:
+            write_json(file, data)
 
     def add(self, frame: Frame, split: Literal["train", "test"]) -> None:
         """Write the frame's image and collect its entry of scene.json."""
@@ -173,77 +174,46 @@ class SceneWriter:
         self._entries[frame.name] = entry
 
     def _write_image(self, frame: Frame, stem: str) -> str:
-        """Write an image file as it is stored, else a PNG; return its path in the folder."""
         if isinstance(frame.image, Path):
             relative = stem + frame.image.suffix.lower()
             self._copy(frame.image, relative)
             return relative
         stored = frame.image.file() if isinstance(frame.image, StoredImage) else None
-        if stored is None:
-            relative, image = f"{stem}.png", frame.read_image()
-            self._put(relative, lambda path: write_image(path, image))
-        else:
-            relative = stem + stored[0]
-            self._put(relative, lambda path: path.write_bytes(stored[1]))
+        image = frame.read_image() if stored is None else None
+        relative = stem + (".png" if stored is None else stored[0])
+        with self._new(relative) as path:
+            if image is not None:
+                write_image(path, image)
+            elif stored is not None:
+                path.write_bytes(stored[1])
         return relative
 
     def _copy(self, source: Path, relative: str) -> None:
         """Copy or link a file into the folder, unless it is that file already."""
         target = self._root / relative
-        if target.exists() and target.samefile(source):
-            return
-
-        def write(path: Path) -> None:
-            if self._link:
-                with contextlib.suppress(OSError):  # not every file system has links
-                    # A link through a link would be broken once the folder moves.
-                    return path.hardlink_to(source.resolve())
-            shutil.copyfile(source, path)
-
         try:
+            if target.exists() and target.samefile(source):
+                return
             source.stat()
         except OSError as error:
             raise InputError(f"{source}: cannot be copied ({error.strerror})") from None
-        self._put(relative, write)
+        with self._new(relative):
+            if self._link:
+                with contextlib.suppress(OSError):  # not every file system has links
+                    # A link through a link would be broken once the folder moves.
+                    return target.hardlink_to(source.resolve())
+            shutil.copyfile(source, target)
 
-    def _put(self, relative: str, write: Callable[[Path], object]) -> None:
-        """Write a file under a temporary name and move it, so no hard link is written through."""
-        target, marker = self._root / relative, self._root / _UNFINISHED
-        if target.exists() and not self._resumed:
-            marker.unlink(missing_ok=True)
-            raise InputError(f"{target}: already there; give a new folder")
-        temporary = target.with_name(f".{target.name}")
+    @contextlib.contextmanager
+    def _new(self, relative: str) -> Iterator[Path]:
+        """Path of a new file: writing to an old one could write through its hard links."""
+        path = self._root / relative
+        if path.exists():
+            raise InputError(f"{path}: already there; give a new folder, or remove this one")
         try:
-            marker.touch()
-            temporary.unlink(missing_ok=True)
-            write(temporary)
-            temporary.replace(target)
+            yield path
         except OSError as error:
-            raise InputError(f"{target}: cannot be written ({error.strerror})") from None
-
-
-def _pose_from_dict(data: object) -> SE3 | None:
-    if data is None:
-        return None
-    if not isinstance(data, Mapping):
-        raise ValueError(f"is {{'translation_m', 'quaternion_wxyz'}} or null, got {data!r}")
-    translation = np.array(_numbers(data.get("translation_m"), 3, "translation_m"))
-    quaternion = np.array(_numbers(data.get("quaternion_wxyz"), 4, "quaternion_wxyz"))
-    if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-2:
-        raise ValueError(f"'quaternion_wxyz' has length 1, got {quaternion}")
-    return SE3(quaternion, translation)
-
-
-def _read(file: Path) -> dict[str, object]:
-    data = read_json(file, "scene file", "convert the recording again")
-    if data.get("format") != _FORMAT:
-        raise InputError(f"{file}: 'format' is not '{_FORMAT}'; this is another program's file")
-    if data.get("version") != _VERSION:
-        raise InputError(
-            f"{file}: version {data.get('version')!r}, this evercal reads {_VERSION}; update"
-            f" evercal or convert the scene"
-        )
-    return data
+            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
 
 
 def _cameras(data: object) -> dict[str, Camera]:
@@ -251,59 +221,46 @@ def _cameras(data: object) -> dict[str, Camera]:
         raise ValueError("'cameras' is an object of objects, got something else")
     cameras = {}
     for number, camera in data.items():
-        try:
+        with naming(f"camera {number!r}"):
             cameras[number] = Camera.from_dict(camera)
-        except ValueError as error:
-            raise ValueError(f"camera {number!r}: {error}") from None
     return cameras
 
 
 def _frame(
-    root: Path, i: int, entry: object, cameras: dict[str, Camera]
+    root: Path, entry: object, cameras: dict[str, Camera]
 ) -> tuple[Literal["train", "test"], Frame]:
     if not isinstance(entry, dict):
-        raise ValueError(f"frame {i} is an object, got {entry!r}")
+        raise ValueError(f"is an object, got {entry!r}")
     camera, split = entry.get("camera"), entry.get("split")
-    image = path_inside(entry.get("image"), f"frame {i}: 'image'")
+    image = path_inside(entry.get("image"), "'image'")
     optional: dict[str, Any] = {}
     if (depth := entry.get("depth")) is not None:
-        optional["depth"] = root / path_inside(depth, f"frame {i}: 'depth'")
+        optional["depth"] = root / path_inside(depth, "'depth'")
     if (joints := entry.get("joints_rad")) is not None:
         count = len(joints) if isinstance(joints, list) else 7
-        optional["joints_rad"] = tuple(_numbers(joints, count, f"frame {i}: joints_rad"))
+        optional["joints_rad"] = tuple(_numbers(joints, count, "joints_rad"))
     if not isinstance(camera, str) or camera not in cameras:
-        raise ValueError(f"frame {i}: 'camera' is one of {sorted(cameras)}, got {camera!r}")
+        raise ValueError(f"'camera' is one of {sorted(cameras)}, got {camera!r}")
     if split not in ("train", "test"):
-        raise ValueError(f"frame {i}: 'split' is 'train' or 'test', got {split!r}")
+        raise ValueError(f"'split' is 'train' or 'test', got {split!r}")
     for key in ("base_from_camera", "base_from_gripper"):
-        try:
-            optional[key] = _pose_from_dict(entry.get(key))
-        except ValueError as error:
-            raise ValueError(f"frame {i}: '{key}': {error}") from None
+        with naming(repr(key)):
+            optional[key] = _pose(entry.get(key))
     return split, Frame(str(entry.get("name", image)), root / image, cameras[camera], **optional)
 
 
-def path_inside(path: object, what: str) -> str:
-    """Check that a path of a file with forward slashes stays inside the file's folder.
-
-    Symbolic links are followed: download caches keep files elsewhere. `what` names the entry.
-
-    Raises:
-        ValueError: The path is empty, absolute or contains "..".
-    """
-    # Windows paths split at both kinds of slashes and have an anchor for drives as well.
-    if not isinstance(path, str) or not path or PureWindowsPath(path).anchor:
-        raise ValueError(f"{what} is a path relative to the folder, got {path!r}")
-    if ".." in PureWindowsPath(path).parts:
-        raise ValueError(f"{what} stays inside the folder, got {path!r}")
-    return path
+def _pose(data: Any) -> SE3 | None:
+    if data is None:
+        return None
+    data = data if isinstance(data, dict) else {}
+    translation = np.array(_numbers(data.get("translation_m"), 3, "translation_m"))
+    quaternion = np.array(_numbers(data.get("quaternion_wxyz"), 4, "quaternion_wxyz"))
+    if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-2:
+        raise ValueError(f"'quaternion_wxyz' has length 1, got {quaternion}")
+    return SE3(quaternion, translation)
 
 
 def _numbers(value: object, count: int, name: str) -> list[float]:
-    if (
-        not isinstance(value, list)
-        or len(value) != count
-        or any(isinstance(v, bool) or not isinstance(v, (int, float)) for v in value)
-    ):
+    if not isinstance(value, list) or len(value) != count or not all(map(is_real, value)):
         raise ValueError(f"'{name}' is {count} numbers, got {value!r}")
     return [float(v) for v in value]

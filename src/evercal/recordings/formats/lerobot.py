@@ -6,14 +6,18 @@
     ROOT/data/chunk-000/file-000.parquet                      version 3: several episodes per file
     ROOT/meta/episodes/chunk-000/file-000.parquet, ROOT/videos/KEY/chunk-000/file-000.mp4
 
-Poses are read from the features, see `lerobot_poses`. The format has no intrinsics, so a camera
-file is required. Frames of all episodes are training frames with base_from_gripper. Paths in the
-dataset must stay inside its folder.
+The format has no intrinsics, so a camera file is required. Frames of all episodes are training
+frames with base_from_gripper. Paths in the dataset must stay inside its folder.
+
+A pose is a feature whose names end in x, y, z and qx, qy, qz, qw, or wx, wy, wz for a rotation
+vector; the first numbers of a feature in a convention that the user gives; or, with a URDF, the
+joints of observation.state. `--gripper-frame` selects the feature if several hold poses, or the
+arm, such as left_ee, if one feature holds left_ee.x and right_ee.x.
 """
 
 import functools
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,17 +26,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError, missing_extra
-from evercal.recordings.formats.generic import path_inside
-from evercal.recordings.formats.lerobot_poses import feature_poses, pose_feature
+from evercal.geometry import SE3
 from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, decode_image, image_file
 from evercal.recordings.poses.camera_file import read_camera_of_size
+from evercal.recordings.poses.conventions import (
+    ConventionError,
+    PoseConvention,
+    check_units,
+    pose_convention,
+    poses_from_numbers,
+)
+from evercal.recordings.poses.kinematics import RobotModel, in_radians
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import read_json
+from evercal.recordings.text_files import named_errors, path_inside, read_json, refuse_repeated
 
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
 INFO = Path("meta") / "info.json"
+_STATE = "observation.state"
+# Names of the numbers of a pose, by convention.
+_PARTS = {"xyzw": ("x", "y", "z", "qx", "qy", "qz", "qw"), "ur": ("x", "y", "z", "wx", "wy", "wz")}
 
 
 def detect(root: Path) -> bool:
@@ -63,9 +77,9 @@ def _load(root: Path, options: ReadOptions) -> Recording:
     shape = [int(n) for n in info["features"][key]["shape"]]
     height, width = shape[1:3] if shape[0] == 3 else shape[:2]  # some state channels first
     camera = read_camera_of_size(options.camera, (width, height), key)
-    column = pose_feature(root, info, options)
+    column = _pose_feature(root, info, options)
     rows, values = _rows(root, column)
-    poses, notes = feature_poses(root, info, column, values, options)
+    poses, notes = _feature_poses(root, info, column, values, options)
     frames = tuple(
         Frame(f"episode_{row.episode:06d}/{row.number:06d}", image, camera, None, pose)
         for row, image, pose in zip(rows, _images(root, info, key, rows), poses, strict=True)
@@ -114,7 +128,6 @@ class _Row(NamedTuple):
 
 
 def _rows(root: Path, column: str) -> tuple[list[_Row], NDArray[np.float64]]:
-    """The n rows of all episodes, and (n, k) numbers of the pose feature."""
     files = sorted((root / "data").glob("*/*.parquet"))
     if not files:
         raise InputError(
@@ -157,52 +170,49 @@ def _video_starts(
     root: Path, info: Mapping[str, Any], key: str, episodes: set[int]
 ) -> dict[int, tuple[Path, float]]:
     """By episode: its video, and the time in the video at which it starts."""
-    starts = {}
+
+    def video(**numbers: int) -> Path:
+        path = str(info["video_path"]).format(video_key=key, **numbers)
+        return root / path_inside(path, "'video_path'")
+
     if str(info["codebase_version"]).startswith("v2"):
-        for episode in episodes:
-            chunk = episode // int(info.get("chunks_size", 1000))
-            numbers = {"episode_chunk": chunk, "episode_index": episode}
-            starts[episode] = _video_path(root, info, key, numbers), 0.0
-        return starts
+        size = int(info.get("chunks_size", 1000))
+        return {i: (video(episode_chunk=i // size, episode_index=i), 0.0) for i in episodes}
     parts = ("chunk_index", "file_index", "from_timestamp")
     names = ["episode_index", *(f"videos/{key}/{part}" for part in parts)]
-    for file in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
-        for episode, chunk, number, start in zip(*_columns(file, names), strict=True):
-            numbers = {"chunk_index": chunk, "file_index": number}
-            starts[int(episode)] = _video_path(root, info, key, numbers), float(start)
-    return starts
+    return {
+        int(episode): (video(chunk_index=chunk, file_index=number), float(start))
+        for file in sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+        for episode, chunk, number, start in zip(*_columns(file, names), strict=True)
+    }
 
 
-def _video_path(root: Path, info: Mapping[str, Any], key: str, numbers: dict[str, int]) -> Path:
-    path = str(info["video_path"]).format(video_key=key, **numbers)
-    return root / path_inside(path, "'video_path'")
-
-
-def _parquet(path: Path) -> Any:
+@contextmanager
+def _parquet(path: Path) -> Iterator[Any]:
+    """pyarrow.parquet, with its errors."""
     try:
         import pyarrow.parquet as parquet  # pyright: ignore[reportMissingImports]
     except ImportError:
         need = f"{path}: LeRobot datasets need pyarrow and PyAV"
         raise missing_extra(need, "lerobot") from None
-    return parquet
+    try:
+        yield parquet
+    except Exception as error:  # pyarrow raises many types for damaged files
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: cannot be read: {reason}") from None
 
 
 def _columns(file: Path, names: list[str]) -> list[list[Any]]:
-    parquet = _parquet(file)
-    try:
+    with _parquet(file) as parquet:
         table = parquet.read_table(file, columns=names)
         return [table[name].to_pylist() for name in names]
-    except Exception as error:  # pyarrow raises many types for damaged files
-        raise _unreadable(file, error) from None
-
-
-def _unreadable(file: Path, error: Exception) -> InputError:
-    return InputError(f"{file}: cannot be read: {' '.join(str(error).split())[:200]}")
 
 
 @functools.lru_cache(maxsize=1)
 def _row_group(path: Path, group: int, key: str) -> list[Any]:
-    with _parquet(path).ParquetFile(path) as file:
+    import pyarrow.parquet as parquet  # pyright: ignore[reportMissingImports]
+
+    with parquet.ParquetFile(path) as file:
         return file.read_row_group(group, columns=[key])[key].to_pylist()
 
 
@@ -227,21 +237,132 @@ class _Embedded(StoredImage):
         return image_file(self._content())
 
     def _content(self) -> bytes:
-        parquet = _parquet(self.path)
-        try:
-            with parquet.ParquetFile(self.path) as file:
-                groups = range(file.num_row_groups)
-                ends = np.cumsum([file.metadata.row_group(group).num_rows for group in groups])
+        with _parquet(self.path) as parquet, parquet.ParquetFile(self.path) as file:
+            groups = range(file.num_row_groups)
+            ends = np.cumsum([file.metadata.row_group(group).num_rows for group in groups])
             group = int(np.searchsorted(ends, self.row, side="right"))
             cell = _row_group(self.path, group, self.key)[self.row - int(ends[group])]
-        except Exception as error:
-            raise _unreadable(self.path, error) from None
         if cell["bytes"]:
             return bytes(cell["bytes"])
         where = f"{self.path}: row {self.row}: image {cell['path']!r}"
-        try:
+        with named_errors(where, "file"):
             return (self.root / path_inside(cell["path"], "the path")).read_bytes()
-        except ValueError as error:
-            raise InputError(f"{where}: {error}") from None
-        except OSError as error:
-            raise InputError(f"{where} cannot be read ({error.strerror})") from None
+
+
+def _pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> str:
+    features = info["features"]
+    if options.urdf is not None:
+        return _STATE
+    if options.pose_convention is not None:
+        column = options.gripper_frame or _STATE
+        if column not in features:
+            names = ", ".join(features)
+            raise InputError(f"{root}: no feature {column!r}; --gripper-frame is one of {names}")
+        return column
+    observed = {key: _names(info, key) for key in features if key.startswith("observation")}
+    keys = [key for key, names in observed.items() if _convention_of(names)]
+    if options.gripper_frame is not None:
+        keys = [key for key in keys if options.gripper_frame in (key, *_arms(observed[key]))]
+    if _STATE in keys or len(keys) == 1:
+        return _STATE if _STATE in keys else keys[0]
+    if keys:
+        raise InputError(
+            f"{root}: gripper poses are in {' and '.join(keys)}; name one with --gripper-frame"
+        )
+    named = {key: names for key, names in observed.items() if names and "image" not in key}
+    listed = "; ".join(f"{key}: {', '.join(names)}" for key, names in named.items())
+    raise InputError(
+        f"{root}: no feature holds a pose (x, y, z and qx, qy, qz, qw or wx, wy, wz), there are"
+        f" {listed or 'no named numbers'}; for joint angles give --urdf, for a pose in another form"
+        f" --pose-convention and --gripper-frame FEATURE"
+    )
+
+
+def _feature_poses(
+    root: Path,
+    info: Mapping[str, Any],
+    column: str,
+    values: NDArray[np.float64],
+    options: ReadOptions,
+) -> tuple[SE3, list[str]]:
+    names = _names(info, column)
+    if options.urdf is not None:
+        return _joint_poses(root, names, values, options)
+    if options.base_frame is not None:
+        raise InputError(f"{root}: --base-frame goes with --urdf only; leave it out")
+    count, notes = values.shape[1], []
+    try:
+        if options.pose_convention is not None:
+            convention = pose_convention(options.pose_convention)
+            taken = convention.counts[-1]
+            numbers = values[:, :taken]
+            if taken < count:
+                used = f" ({', '.join(names[:taken])})" if names else ""
+                notes = [f"the first {taken} of its {count} numbers were taken{used}"]
+        elif len(names) != count:
+            raise ValueError(f"has {count} numbers and {len(names)} names")
+        else:
+            convention, columns = _pose_columns(names, options.gripper_frame)
+            numbers = values[:, columns]
+        poses = poses_from_numbers(numbers, convention)
+        check_units(numbers, convention)
+    except ConventionError as error:
+        raise InputError(f"{root}: {column}: {error.naming('--pose-convention')}") from None
+    except ValueError as error:
+        raise InputError(f"{root}: {column}: {error}") from None
+    return poses, [f"gripper poses are {column}: {convention.meaning}", *notes]
+
+
+def _joint_poses(
+    root: Path, names: list[str], stated: NDArray[np.float64], options: ReadOptions
+) -> tuple[SE3, list[str]]:
+    assert options.urdf is not None
+    unit, count = options.pose_convention, stated.shape[1]
+    source = f"{root}: {_STATE}"
+    if len(names) != count:
+        raise InputError(f"{source} has {count} numbers and {len(names)} names")
+    with named_errors(source, "names"):
+        refuse_repeated(names, "rename the numbers")
+    model = RobotModel(options.urdf)
+    values = in_radians(model, names, stated, [unit] * count)
+    return model.poses(names, values, options.base_frame, options.gripper_frame, source)
+
+
+def _pose_columns(names: list[str], arm: str | None) -> tuple[PoseConvention, list[int]]:
+    arms = _arms(names)
+    chosen = _of_arm(names, arm) if arm in arms else names
+    convention = _convention_of(chosen)
+    assert convention is not None
+    last = [name.rpartition(".")[2] for name in chosen]
+    if any(last.count(part) > 1 for part in _PARTS[convention]):
+        which = " or ".join(filter(None, arms))
+        remedy = f"--gripper-frame {which}" if which else "names that tell them apart in info.json"
+        raise ValueError(f"holds several poses ({', '.join(names)}); give {remedy}")
+    return pose_convention(convention), [last.index(part) for part in _PARTS[convention]]
+
+
+def _convention_of(names: list[str]) -> str | None:
+    last = [name.rpartition(".")[2] for name in names]
+    return next((c for c, parts in _PARTS.items() if all(p in last for p in parts)), None)
+
+
+def _arms(names: list[str]) -> list[str]:
+    prefixes = dict.fromkeys(name.rpartition(".")[0] for name in names)
+    return [arm for arm in prefixes if _convention_of(_of_arm(names, arm))]
+
+
+def _of_arm(names: list[str], arm: str) -> list[str]:
+    """The names of one arm, others as empty strings."""
+    return [name if name.rpartition(".")[0] == arm else "" for name in names]
+
+
+def _names(info: Mapping[str, Any], column: str) -> list[str]:
+    names = info["features"].get(column, {}).get("names") or []
+    if isinstance(names, dict):  # {"motors": [...]}, or several arms with the same names
+        groups = {key: group for key, group in names.items() if isinstance(group, list)}
+        names = [
+            f"{key}.{name}" if len(groups) > 1 else name
+            for key, group in groups.items()
+            for name in group
+        ]
+    return [str(name).removesuffix(".pos") for name in names]

@@ -19,10 +19,17 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.frame import Frame, Recording, require_images
 from evercal.recordings.images import IMAGE_ENDINGS, image_size
+from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import first_repeated, named_errors, read_json
+from evercal.recordings.text_files import (
+    is_real,
+    named_errors,
+    naming,
+    read_json,
+    refuse_repeated,
+)
 
 FILE = "transforms.json"
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
@@ -35,10 +42,7 @@ USES = ("metres",)
 def frame_note(file: str, metric: bool) -> str:
     """What the recording leaves open: its base frame and, unless `metric`, its unit of length."""
     if metric:
-        return (
-            f"the base frame is that of {file}; if it is not the robot's, run 'evercal align' after"
-            " learning"
-        )
+        return f"the base frame is that of {file}; if it is not the robot's, run 'evercal align'"
     return (
         f"the base frame and the unit of length are those of {file}: run 'evercal align' after"
         " learning, or give --metres if the poses are in metres"
@@ -51,10 +55,7 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
-    """Read the poses and the size of one image of every camera; no other image is opened.
-
-    If the file states no image size, that of the first image is taken.
-    """
+    """Read the poses and the size of one image of every camera; no other image is opened."""
     root, metric = Path(root), options is not None and options.metres
     file = root if root.is_file() else root / FILE
     root = file.parent
@@ -65,14 +66,17 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
         if not isinstance(entries, list) or not entries:
             raise ValueError("'frames' is a list with at least one frame")
         first = entries[0]
+        # Without a stated image size, that of the first image is taken.
         if isinstance(first, dict) and "file_path" in first and not {"w", "h"} & {*data, *first}:
             width, height = image_size(_image(root, str(first["file_path"])))
             data |= {"w": width, "h": height}
-        frames = [_frame(root, data, i, entry, undo, scale) for i, entry in enumerate(entries)]
-        test = _test_images(root, data, {str(frame.image) for frame in frames})
-    repeated = first_repeated([frame.name for frame in frames])
-    if repeated is not None:
-        raise InputError(f"{file}: {repeated!r} comes twice; keep one entry for each image")
+        frames = []
+        for i, entry in enumerate(entries):
+            with naming(f"frame {i}"):
+                frames.append(_frame(root, data, entry, undo, scale))
+        test = _test_images(root, data, {frame.image for frame in frames})
+        refuse_repeated((frame.name for frame in frames), "keep one entry for each image")
+    require_images(frames, file)
     frames = _resized(file, frames)
     return Recording(
         root.resolve().name,
@@ -84,7 +88,6 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
 
 
 def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
-    """Inverse of the rigid part of `applied_transform`, and the scale to divide by first."""
     scale = _number(data, "applied_scale", 1.0)
     if not scale > 0:
         raise ValueError(f"'applied_scale' is > 0, got {scale}")
@@ -94,30 +97,23 @@ def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
     size = abs(np.linalg.det(matrix[:, :3])) ** (1 / 3)
     if not size > 0:
         raise ValueError("'applied_transform' cannot be undone: its determinant is 0")
-    try:
+    with naming("'applied_transform'"):
         return SE3.from_matrix(matrix / size, _TOLERANCE).inverse(), scale * size
-    except ValueError as error:
-        raise ValueError(f"'applied_transform': {error}") from None
 
 
-def _frame(
-    root: Path, data: Mapping[str, object], i: int, entry: object, undo: SE3, scale: float
-) -> Frame:
+def _frame(root: Path, data: Mapping[str, object], entry: object, undo: SE3, scale: float) -> Frame:
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
-        raise ValueError(f"frame {i}: an object with 'file_path' and 'transform_matrix'")
+        raise ValueError("an object with 'file_path' and 'transform_matrix'")
     name = entry["file_path"]
-    try:
+    with naming(name):
         matrix = _matrix(entry.get("transform_matrix"), "transform_matrix")
         stated = SE3.from_matrix(matrix, _TOLERANCE)
         camera = _camera({**data, **entry})
-    except ValueError as error:
-        raise ValueError(f"frame {i} ({name}): {error}") from None
     world_from_gl = undo @ SE3(stated.rotation_wxyz, stated.translation_m / scale)
     return Frame(name, _image(root, name), camera, world_from_gl @ _GL_FROM_CV)
 
 
 def _image(root: Path, name: str) -> Path:
-    """Image file of a frame; old files omit its ending."""
     image = root / name
     if image.suffix:
         return image
@@ -148,7 +144,6 @@ def _camera(data: Mapping[str, object]) -> Camera:
 
 
 def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
-    """Focal length in pixels, stated or from the angle of view; None if neither is stated."""
     if data.get(f"fl_{axis}") is not None:
         return _number(data, f"fl_{axis}")
     if data.get(f"camera_angle_{axis}") is None:
@@ -165,36 +160,37 @@ def _resized(file: Path, frames: list[Frame]) -> list[Frame]:
     Downscaled copies of the images get scaled cameras. Rotated and cropped images are refused.
     """
     sizes: dict[tuple[int, int], tuple[int, int]] = {}
+    resized = []
     for frame in frames:
-        image, stated = frame.image, (frame.camera.width, frame.camera.height)
-        if not isinstance(image, Path) or not image.is_file():
-            raise InputError(f"{image}: named in {file} but missing; restore or take the frame out")
-        if stated in sizes:
-            continue
-        size = sizes[stated] = image_size(image)
-        if abs(size[0] / size[1] / (stated[0] / stated[1]) - 1) > 0.01:
-            rotated = "the image was rotated after the intrinsics were written"
-            raise InputError(
-                f"{image}: is {size[0]}x{size[1]}, {file.name} says {stated[0]}x{stated[1]}"
-                f" ({rotated if size == stated[::-1] else 'cropped?'}); give images of that shape"
-            )
-    return [_scaled(frame, sizes) for frame in frames]
+        stated = frame.camera.width, frame.camera.height
+        if stated not in sizes:
+            sizes[stated] = _size_of_shape(frame, stated, file)
+        if sizes[stated] != stated:
+            frame = replace(frame, camera=frame.camera.resized(*sizes[stated]))
+        resized.append(frame)
+    return resized
 
 
-def _scaled(frame: Frame, sizes: Mapping[tuple[int, int], tuple[int, int]]) -> Frame:
-    stated = frame.camera.width, frame.camera.height
-    size = sizes[stated]
-    return frame if size == stated else replace(frame, camera=frame.camera.resized(*size))
+def _size_of_shape(frame: Frame, stated: tuple[int, int], file: Path) -> tuple[int, int]:
+    assert isinstance(frame.image, Path)
+    size = image_size(frame.image)
+    if abs(size[0] / size[1] / (stated[0] / stated[1]) - 1) > 0.01:
+        rotated = "the image was rotated after the intrinsics were written"
+        raise InputError(
+            f"{frame.image}: is {size[0]}x{size[1]}, {file.name} says {stated[0]}x{stated[1]}"
+            f" ({rotated if size == stated[::-1] else 'cropped?'}); give images of that shape"
+        )
+    return size
 
 
-def _test_images(root: Path, data: Mapping[str, object], images: Container[str]) -> set[Path]:
+def _test_images(root: Path, data: Mapping[str, object], images: Container[object]) -> set[Path]:
     test: set[Path] = set()
     for key in ("val_filenames", "test_filenames"):
         names = data.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"{key!r} is a list of file names")
         # A test frame under another name would be learned from.
-        other = [name for name in names if str(_image(root, name)) not in images]
+        other = [name for name in names if _image(root, name) not in images]
         if other:
             raise ValueError(f"{key!r} names {other[0]!r}, which is no frame; correct the name")
         test |= {_image(root, name) for name in names}
@@ -202,18 +198,15 @@ def _test_images(root: Path, data: Mapping[str, object], images: Container[str])
 
 
 def _matrix(value: object, name: str) -> NDArray[np.float64]:
-    try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
+    matrix = number_array(value, repr(name))
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise ValueError(f"{name!r} is 4x4 or 3x4 numbers, got {str(value)[:60]}")
     return matrix
 
 
 def _number(data: Mapping[str, object], name: str, default: float | None = None) -> float:
-    value = data.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    value: Any = data.get(name, default)
+    if not is_real(value) or not math.isfinite(value):
         what = "is missing" if value is None else f"is a number, got {value!r}"
         raise ValueError(f"{name!r} {what}")
     return float(value)

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.formats.bags import images as ros_images
 from evercal.recordings.formats.bags.file import (
     CAMERA_INFO,
     COMPRESSED,
@@ -26,14 +25,37 @@ from evercal.recordings.formats.bags.file import (
     is_bag,
     stamp_ns,
 )
-from evercal.recordings.formats.bags.poses import poses_at_images
-from evercal.recordings.formats.bags.tf_tree import plain_name
+from evercal.recordings.formats.bags.poses import plain_name, poses_at_images
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import StoredImage, image_file
+from evercal.recordings.images import StoredImage, as_rgb, decode_image, image_file
 from evercal.recordings.poses.camera_file import camera_from_fields, check_size, read_camera_of_size
 from evercal.recordings.poses.pose_track import MAX_GAP_S
 from evercal.recordings.read_options import ReadOptions
+from evercal.recordings.text_files import named_errors
 
+# Encoding: bytes of a channel, channels, and OpenCV's COLOR_... constant if `as_rgb` needs it. ROS
+# names a Bayer pattern by its first two pixels and OpenCV by its second row.
+_ENCODINGS: dict[str, tuple[int, int, str | None]] = {
+    "rgb8": (1, 3, None),
+    "bgr8": (1, 3, "BGR2RGB"),
+    "8UC3": (1, 3, "BGR2RGB"),
+    "rgba8": (1, 4, None),
+    "bgra8": (1, 4, "BGRA2RGB"),
+    "8UC4": (1, 4, "BGRA2RGB"),
+    "mono8": (1, 1, None),
+    "8UC1": (1, 1, None),
+    "rgb16": (2, 3, None),
+    "bgr16": (2, 3, "BGR2RGB"),
+    "mono16": (2, 1, None),
+    "bayer_rggb8": (1, 1, "BayerBG2RGB"),
+    "bayer_bggr8": (1, 1, "BayerRG2RGB"),
+    "bayer_gbrg8": (1, 1, "BayerGR2RGB"),
+    "bayer_grbg8": (1, 1, "BayerGB2RGB"),
+    "yuv422": (1, 2, "YUV2RGB_UYVY"),
+    "uyvy": (1, 2, "YUV2RGB_UYVY"),
+    "yuv422_yuy2": (1, 2, "YUV2RGB_YUY2"),
+    "yuyv": (1, 2, "YUV2RGB_YUY2"),
+}
 USES = ("camera", "image_topic", "pose_topic", "base_frame", "gripper_frame", "urdf")
 
 
@@ -72,26 +94,23 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
 
 @dataclass(frozen=True, eq=False)
 class BagImage(StoredImage):
-    """One image message in a bag."""
+    """One image message in a bag, see `Message`."""
 
     bag: BagFile
     topic: str
     logged_ns: int
-    """Time of recording, nanoseconds."""
     repeat: int
-    """Number of earlier messages of the topic with the same time of recording."""
     stamp_ns: int
     frame_id: str
 
     def read(self) -> NDArray[np.uint8]:
         """Decode the message, see `StoredImage.read`."""
+        decode = image_of
+        if self.bag.kinds[self.topic] == COMPRESSED:
+            decode = compressed_image_of
         message = self.bag.message(self.topic, self.logged_ns, self.repeat)
-        compressed = message.kind == COMPRESSED
-        decode = ros_images.compressed_image_of if compressed else ros_images.image_of
-        try:
+        with named_errors(f"{self.bag.path}: topic {self.topic}", "image"):
             return decode(message.content)
-        except ValueError as error:
-            raise InputError(f"{self.bag.path}: topic {self.topic}: {error}") from None
 
     def file(self) -> tuple[str, bytes] | None:
         """JPEG or PNG of a compressed image; None for other messages."""
@@ -102,7 +121,6 @@ class BagImage(StoredImage):
 
 
 def _image_topic(bag: BagFile, wanted: str | None) -> str:
-    """The requested topic, or the only one with pictures."""
     topics = bag.topics(IMAGE, COMPRESSED)
     if wanted is not None:
         if wanted not in topics:
@@ -116,7 +134,13 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
             f"{bag.path}: no images in it; record a topic of sensor_msgs/Image or CompressedImage."
             f" It holds {bag.contents()}"
         )
-    reasons = {topic: _unsupported(bag, topic) for topic in topics}
+    reasons: dict[str, str | None] = {}
+    for topic in topics:
+        first = bag.first(topic)
+        if bag.kinds[topic] == IMAGE:
+            reasons[topic] = unsupported(first.encoding)
+        else:
+            reasons[topic] = "holds depth" if "compressedDepth" in first.format else None
     pictures = [topic for topic, reason in reasons.items() if reason is None]
     if len(pictures) != 1:
         refused = "; ".join(f"{t}: {reason}" for t, reason in reasons.items() if reason)
@@ -127,16 +151,7 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
     return pictures[0]
 
 
-def _unsupported(bag: BagFile, topic: str) -> str | None:
-    """Reason why the images of a topic cannot be read, if any."""
-    first = bag.first(topic)
-    if bag.kinds[topic] == IMAGE:
-        return ros_images.unsupported(first.encoding)
-    return "holds depth" if "compressedDepth" in first.format else None
-
-
 def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
-    """All images of a topic in order of time, and notes."""
     shots = []
     for message in bag.messages([topic]):
         header = message.content.header
@@ -150,10 +165,9 @@ def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
 
 
 def _bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
-    """Read the first camera_info beside an image topic, with its topic.
+    """The first camera_info beside an image topic, such as `/cam/image_raw/compressed`.
 
-    The topic of `/camera/image_raw/compressed` is `/camera/camera_info`. Rectified images
-    take P without distortion, others K and D.
+    Rectified images take P without distortion, others K and D.
     """
     topics = bag.topics(CAMERA_INFO)
     image = image_topic.removesuffix("/compressed")
@@ -164,10 +178,8 @@ def _bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
             f" {' and '.join(topics) or 'none'}); record it, or give the intrinsics with --camera"
         )
     message = bag.first(beside)
-    try:
+    with named_errors(f"{bag.path}: {beside}", "camera_info"):
         return beside, _camera(message, image.rpartition("/")[2].startswith("image_rect"))
-    except ValueError as error:
-        raise InputError(f"{bag.path}: {beside}: {error}") from None
 
 
 def _camera(message: Any, rectified: bool) -> Camera:
@@ -186,3 +198,47 @@ def _camera(message: Any, rectified: bool) -> Camera:
     offsets = {name: int(getattr(message.roi, name)) for name in ("x_offset", "y_offset")}
     size = {"width": int(message.width), "height": int(message.height)}
     return camera_from_fields({**data, **size, "roi": offsets})
+
+
+def unsupported(encoding: str) -> str | None:
+    """Reason why images of an encoding cannot be read, or None if they can."""
+    if encoding in _ENCODINGS:
+        return None
+    if encoding.startswith(("16UC", "32FC", "64FC", "16SC", "32SC")):
+        return f"encoding {encoding!r} holds depth or numbers, no picture; choose a colour image"
+    return f"encoding {encoding!r} is not supported; use one of {', '.join(_ENCODINGS)}"
+
+
+def image_of(message: Any) -> NDArray[np.uint8]:
+    """Decode a sensor_msgs/Image to (H, W, 3) uint8 RGB, 16-bit values converted as by `as_rgb`."""
+    import cv2
+
+    reason = unsupported(message.encoding)
+    if reason is not None:
+        raise ValueError(reason)
+    size, channels, conversion = _ENCODINGS[message.encoding]
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    line = width * channels * size
+    data = np.asarray(message.data, dtype=np.uint8).reshape(-1)
+    if step < line or data.size < height * step or not line * height:
+        raise ValueError(
+            f"{width}x{height} {message.encoding} with rows of {step} bytes, but {data.size} bytes"
+        )
+    # Rows may be padded, which the package rosbags-image ignores.
+    pixels = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :line])
+    if size == 2:
+        pixels = pixels.view(">u2" if message.is_bigendian else "<u2").astype(np.uint16)
+    pixels = pixels.reshape(height, width, channels)
+    if conversion is not None:
+        pixels = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}"))
+    return as_rgb(pixels)
+
+
+def compressed_image_of(message: Any) -> NDArray[np.uint8]:
+    """Decode a sensor_msgs/CompressedImage with a PNG or JPEG to (H, W, 3) uint8 RGB."""
+    if "compressedDepth" in message.format:
+        raise ValueError(f"format {message.format!r} holds depth, no picture")
+    image = decode_image(np.asarray(message.data, dtype=np.uint8))
+    if image is None:
+        raise ValueError(f"format {message.format!r} is not supported or broken; use jpeg or png")
+    return image

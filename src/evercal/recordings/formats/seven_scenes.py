@@ -7,17 +7,23 @@ frames, which are left out and counted. All sequences come from one camera.
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from evercal.errors import InputError
-from evercal.geometry import Camera
-from evercal.recordings.formats.frame_files import colour_images, read_numbers, tracked_frames
-from evercal.recordings.frame import Recording
+from evercal.geometry import SE3, Camera
+from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import image_size
-from evercal.recordings.text_files import read_text
+from evercal.recordings.poses.row_files import is_number
+from evercal.recordings.text_files import named_errors, read_text, refuse_repeated
 
 _SPLITS = ("TrainSplit.txt", "TestSplit.txt")
 _FOCAL_AT_640 = 525.0
+# Poses printed with few digits, or chained in float32, deviate this much from a rotation.
+_ROTATION_TOLERANCE = 1e-2
 
 
 def detect(root: Path) -> bool:
@@ -67,7 +73,52 @@ def _camera(root: Path, image: Path) -> Camera:
         focal = _FOCAL_AT_640 * max(width, height) / 640.0
         return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     matrix = read_numbers(file, 9, "3x3 intrinsic").reshape(3, 3)
-    try:
+    with named_errors(file, "camera"):
         return Camera.from_matrix(matrix, width, height)
-    except ValueError as error:
-        raise InputError(f"{file}: {error}") from None
+
+
+def colour_images(folder: Path) -> list[Path]:
+    """Colour images of a folder, sorted by name."""
+    # os.listdir and one sort: globbing a thousand files twice dominates the loading time.
+    names = os.listdir(folder) if folder.is_dir() else []
+    names = sorted(name for name in names if re.search(r"\.color\.(png|jpe?g)$", name))
+    if not names:
+        raise InputError(f"{folder}: no images; expected frame-XXXXXX.color.png or .jpg")
+    with named_errors(folder, "images"):
+        refuse_repeated(map(_frame_name, names), "keep its .png or its .jpg")
+    return [folder / name for name in names]
+
+
+def _frame_name(image: str) -> str:
+    return image[: image.rindex(".color.")]
+
+
+def tracked_frames(
+    images: Sequence[Path], camera: Camera, folders: bool = False
+) -> tuple[Frame, ...]:
+    """Build frames from images and the pose files beside them, and drop poses with inf or nan.
+
+    With `folders`, names of frames begin with the name of the folder.
+    """
+    frames = []
+    for image in images:
+        name = _frame_name(image.name)
+        file = image.with_name(f"{name}.pose.txt")
+        matrix = read_numbers(file, 16, "4x4 base_from_camera").reshape(4, 4)
+        if np.isfinite(matrix).all():
+            with named_errors(file, "pose"):
+                pose = SE3.from_matrix(matrix, _ROTATION_TOLERANCE)
+            name = f"{image.parent.name}/{name}" if folders else name
+            frames.append(Frame(name, image, camera, pose))
+    return tuple(frames)
+
+
+def read_numbers(file: Path, count: int, what: str) -> NDArray[np.float64]:
+    """Read the `count` numbers of a matrix from a small text file."""
+    # float() on the words: np.loadtxt takes longer per file than reading the file.
+    words = read_text(file, f"{what} matrix").split()
+    if len(words) != count or not all(map(is_number, words)):
+        raise InputError(
+            f"{file}: expected a {what} matrix of {count} numbers, got {len(words)} words"
+        )
+    return np.array([float(word) for word in words])

@@ -2,8 +2,7 @@
 
 As is usual, the first sequence is for testing and the others are for training. The intrinsics of
 info.txt are scaled to the image size. Pixel (0, 0) is taken as a pixel centre: the data set states
-no convention, and its cy of 483.5 is then the middle of 968 rows. Poses with inf or nan mark
-untracked frames, which are left out and counted.
+no convention, and its cy of 483.5 is then the middle of 968 rows.
 """
 
 import os
@@ -12,7 +11,7 @@ from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.formats.frame_files import colour_images, tracked_frames
+from evercal.recordings.formats.seven_scenes import colour_images, tracked_frames
 from evercal.recordings.frame import Recording
 from evercal.recordings.images import image_size
 from evercal.recordings.text_files import read_text

@@ -32,8 +32,6 @@ class VideoFrame(StoredImage):
 
 
 class _Open:
-    """A video that is being decoded, with its last frame."""
-
     def __init__(self, container: Any) -> None:
         self.container, self.stream = container, container.streams.video[0]
         self.stream.thread_type = "AUTO"
@@ -71,7 +69,12 @@ class Videos:
         """Decode the frame at a time in seconds since the first frame to (H, W, 3) uint8 RGB."""
         with self._lock:
             try:
-                image = self._opened(path).at(seconds, self._half)
+                if path not in self._open:
+                    while len(self._open) >= _MOST_OPEN:
+                        self._open.popitem(last=False)[1].container.close()
+                    self._open[path] = _Open(self._av.open(str(path)))
+                self._open.move_to_end(path)
+                image = self._open[path].at(seconds, self._half)
             except FileNotFoundError:
                 raise InputError(f"{path}: video is missing; download it too") from None
             except (self._av.FFmpegError, IndexError, OSError) as error:
@@ -81,11 +84,3 @@ class Videos:
         if image is None:
             raise InputError(f"{path}: no frame at {seconds:.3f} s; the video is cut off")
         return np.ascontiguousarray(image, dtype=np.uint8)
-
-    def _opened(self, path: Path) -> _Open:
-        if path not in self._open:
-            while len(self._open) >= _MOST_OPEN:
-                self._open.popitem(last=False)[1].container.close()
-            self._open[path] = _Open(self._av.open(str(path)))
-        self._open.move_to_end(path)
-        return self._open[path]

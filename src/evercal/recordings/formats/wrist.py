@@ -12,13 +12,12 @@ from evercal.geometry import Camera
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, image_size
 from evercal.recordings.poses.camera_file import read_camera_of_size
-from evercal.recordings.poses.joint_states import read_joint_poses
-from evercal.recordings.poses.kinematics import RobotModel
+from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
 from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, read_rows
 from evercal.recordings.read_options import ReadOptions, flag
-from evercal.recordings.text_files import first_repeated
+from evercal.recordings.text_files import named_errors, refuse_repeated
 
 USES = ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention")
 _POSES = tuple(
@@ -70,12 +69,12 @@ def _rows(root: Path, file: Path, options: ReadOptions) -> tuple[RobotPoses, lis
         model = RobotModel(options.urdf or _urdf(root, file))
         links = options.base_frame, options.gripper_frame
         return read_joint_poses(file, model, *links, options.pose_convention)
-    for name in ("urdf", "base_frame", "gripper_frame"):
-        if getattr(options, name) is not None:
-            raise InputError(
-                f"{flag(name)}: {file} holds gripper poses already; leave the option"
-                f" out, or give joint angles in joints.csv instead"
-            )
+    unused = [n for n in ("urdf", "base_frame", "gripper_frame") if getattr(options, n) is not None]
+    if unused:
+        raise InputError(
+            f"{flag(unused[0])}: {file} holds gripper poses already; leave the option out, or give"
+            f" joint angles in joints.csv instead"
+        )
     return read_robot_poses(file, options.pose_convention, option="--pose-convention"), []
 
 
@@ -113,7 +112,6 @@ def _camera(root: Path, file: Path | None, image: Path) -> Camera:
 
 
 def _stamps(root: Path) -> dict[str, float] | None:
-    """Seconds by image name, if there is a stamps file."""
     file = root / "stamps.csv"
     if not file.is_file():
         return None
@@ -121,7 +119,6 @@ def _stamps(root: Path) -> dict[str, float] | None:
     if rows.names is None or rows.stamps_s is None:
         raise InputError(f"{file}: needs the columns image and stamp_s")
     names = [PurePath(name).name for name in rows.names]
-    repeated = first_repeated(names)
-    if repeated is not None:
-        raise InputError(f"{file}: {repeated!r} comes twice; give every image one time")
+    with named_errors(file, "stamps"):
+        refuse_repeated(names, "give every image one time")
     return dict(zip(names, rows.stamps_s.tolist(), strict=True))

@@ -8,7 +8,7 @@ In all kinds, pixel (0, 0) is the centre of the top-left pixel, and images are u
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +50,7 @@ _EXPECTED = (
 def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> Camera:
     """Read the intrinsics of one camera.
 
-    `size` is (width, height) in pixels of the images. Files without a size need it; otherwise the
-    size in the file is used.
-
-    Raises:
-        InputError: The file is missing, of an unknown kind, or holds no usable camera.
+    `size` is (width, height) of the images in pixels, for files without one.
     """
     path = Path(path)
     with named_errors(path, "camera file"):
@@ -80,9 +76,8 @@ def check_size(source: str, camera: Camera, size: tuple[int, int], images: str) 
 def camera_from_fields(data: Mapping[str, Any], size: tuple[int, int] | None = None) -> Camera:
     """Build a camera from the fields of a file, or of a ROS message.
 
-    `size` is (width, height) in pixels of the images, if the fields may lack it. ValueError: a
-    field is missing or unusable, the distortion model is not supported, or the image is a region
-    of interest.
+    `size` is (width, height) in pixels of the images, if the fields may lack it. ValueError: the
+    fields are no camera, or the images are distorted otherwise or cut out.
     """
     fields, ros = _fields(data), not {_plain(key) for key in data}.isdisjoint(_ROS)
     roi = data.get("roi")
@@ -105,7 +100,6 @@ def camera_from_fields(data: Mapping[str, Any], size: tuple[int, int] | None = N
 
 
 def _fields_of(path: Path) -> Mapping[str, Any]:
-    """Fields of a file, not yet interpreted."""
     import yaml
 
     with path.open("rb") as file:
@@ -117,8 +111,6 @@ def _fields_of(path: Path) -> Mapping[str, Any]:
         return _xml_of_opencv(text)
     words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
     if all(map(is_number, words)):
-        if len(words) != 9:
-            raise ValueError(f"{len(words)} numbers, a 3x3 matrix has 9; {_EXPECTED}")
         return {"camera_matrix": [float(word) for word in words]}
     try:
         if text.lstrip().startswith("{"):
@@ -137,7 +129,6 @@ def _fields_of(path: Path) -> Mapping[str, Any]:
 
 
 def _xml_of_opencv(text: str) -> dict[str, Any]:
-    """Texts of the elements, and numbers of the matrices, of a cv2.FileStorage."""
     from xml.etree import ElementTree
 
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can expand without bound
@@ -161,7 +152,6 @@ def _plain(key: object) -> str:
 
 
 def _fields(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Values by key of `_ALIASES`, others by their plain key."""
     keys: dict[str, str] = {}
     for key in data:
         plain = _plain(key)
@@ -173,29 +163,20 @@ def _fields(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _matrix(fields: Mapping[str, Any], data: Mapping[str, Any]) -> np.ndarray:
-    """(3, 3) intrinsic matrix."""
     if "camera_matrix" in fields:
-        numbers = _numbers(fields["camera_matrix"], "camera_matrix")
-        if len(numbers) != 9:
-            raise ValueError(f"camera_matrix has 9 numbers, got {len(numbers)}")
-        matrix = np.reshape(numbers, (3, 3))
+        matrix = np.reshape(_numbers(fields["camera_matrix"], "camera_matrix", 9), (3, 3))
         # Open3D writes it column after column.
         return matrix.T if not matrix[:2, 2].any() and matrix[2, :2].any() else matrix
     names = ("fx", "fy", "cx", "cy")
     missing = [name for name in names if name not in fields]
     if missing:
         what = f"camera {missing[0]!r}" if len(missing) < 4 else "'camera_matrix'"
-        found = ", ".join(map(str, data)) or "nothing"
-        raise ValueError(f"{what} is missing, there is {found}; {_EXPECTED}")
-    numbers = [_numbers([fields[name]], name) for name in names]
-    if any(len(each) != 1 for each in numbers):
-        raise ValueError(f"{', '.join(names)} are numbers, got {[fields[name] for name in names]}")
-    (fx,), (fy,), (cx,), (cy,) = numbers
+        raise ValueError(f"{what} is missing, there is {_listed(data) or 'nothing'}; {_EXPECTED}")
+    fx, fy, cx, cy = _numbers([fields[name] for name in names], "fx, fy, cx, cy", 4)
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
 def _distortion(fields: Mapping[str, Any], data: Mapping[str, Any], ros: bool) -> list[float]:
-    """Distortion coefficients, empty if a file has no such field; ROS files must have it."""
     name = "distortion_coefficients"
     stated = [key for key in _COEFFICIENTS if key in fields]
     if name in fields:
@@ -207,8 +188,8 @@ def _distortion(fields: Mapping[str, Any], data: Mapping[str, Any], ros: bool) -
         other = [key for key in data if "dist" in _plain(key) and _plain(key) not in _MODEL_KEYS]
         if ros or other:
             raise ValueError(
-                f"{name!r} is missing, there is {', '.join(map(str, other or data))}; write four"
-                f" zeros if images have no lens distortion"
+                f"{name!r} is missing, there is {_listed(other or data)}; write four zeros if"
+                f" images have no lens distortion"
             )
         numbers = []
     # Longer models add terms that are mostly zero and can then be dropped.
@@ -220,33 +201,35 @@ def _distortion(fields: Mapping[str, Any], data: Mapping[str, Any], ros: bool) -
 def _size(
     fields: Mapping[str, Any], data: Mapping[str, Any], size: tuple[int, int] | None
 ) -> tuple[Any, Any]:
-    """Width and height in pixels, checked when the camera is constructed."""
     missing = [name for name in ("image_width", "image_height") if name not in fields]
-    stated: Any = size if len(missing) == 2 else None
+    stated = fields.get("image_size")
     if not missing:
         stated = [fields["image_width"], fields["image_height"]]
-    elif isinstance(fields.get("image_size"), Mapping):
-        return _size(_fields(fields["image_size"]), fields["image_size"], None)
-    elif isinstance(fields.get("image_size"), list | tuple):  # a number called `size` is not one
-        stated = fields["image_size"]
+    elif isinstance(stated, Mapping):
+        return _size(_fields(stated), stated, None)
+    elif not isinstance(stated, list | tuple):  # a number called `size` is not one
+        stated = size if len(missing) == 2 else None
     if stated is None:
         raise ValueError(
-            f"{missing[0]!r} is missing, so it has no image size, there is"
-            f" {', '.join(map(str, data))}"
+            f"{missing[0]!r} is missing, so it has no image size, there is {_listed(data)}"
         )
-    numbers = _numbers(list(stated), "image size")
-    if len(numbers) != 2:
-        raise ValueError(f"image size is width and height in pixels, got {stated}")
-    return numbers[0], numbers[1]
+    width, height = _numbers(list(stated), "image size (width, height)", 2)
+    return width, height
 
 
-def _numbers(value: Any, name: str) -> list[float]:
-    """Numbers from a list, nested or not, or from OpenCV's {rows, cols, data}."""
+def _listed(keys: Iterable[object]) -> str:
+    return ", ".join(map(str, keys))
+
+
+def _numbers(value: Any, name: str, count: int | None = None) -> list[float]:
     value = value.get("data") if isinstance(value, dict) else value
     try:
         if not isinstance(value, list) or any(isinstance(v, bool) for v in value):
             raise TypeError
         # YAML 1.1 reads 1e-05, as written by ROS, as a word.
-        return np.array(value, dtype=np.float64).ravel().tolist()
+        numbers = np.array(value, dtype=np.float64).ravel().tolist()
     except (TypeError, ValueError):
         raise ValueError(f"'{name}' is a list of numbers, got {value!r}") from None
+    if count is not None and len(numbers) != count:
+        raise ValueError(f"{name} has {count} numbers, got {len(numbers)}; {_EXPECTED}")
+    return numbers

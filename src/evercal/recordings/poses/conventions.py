@@ -1,12 +1,11 @@
 """Named conventions for poses as numbers, as robots and programs write them.
 
-A convention defines order, units and rotation of the numbers. Its name may be followed by
-modifiers: `kuka:m` (KUKA's angles, but metres), `matrix:inverse` (gripper_from_base),
-`matrix:opengl` (camera axes x right, y up, z back). Units in the name are final, units that a
-convention only implies are checked against the numbers.
+A name may be followed by modifiers: `kuka:m` (KUKA's angles, but metres), `matrix:inverse`
+(gripper_from_base), `matrix:opengl` (camera axes x right, y up, z back). Units in the name are
+final; units that a convention only implies are checked against the numbers.
 
-The conventions were checked against Roboception's documentation of pose formats (ABB, FANUC, KUKA,
-Yaskawa), Universal Robots' script manual, RoboDK's converters (Staubli) and libfranka's reference.
+Sources: Roboception's documentation of pose formats (ABB, FANUC, KUKA, Yaskawa), Universal Robots'
+script manual, RoboDK's converters (Staubli) and libfranka's reference.
 """
 
 from dataclasses import dataclass, replace
@@ -36,7 +35,6 @@ class PoseConvention:
     """`wxyz`, `xyzw`, `vector` or Euler axes of scipy after a position, else `rows`, `columns`."""
     meaning: str
     metres_per_unit: float = 1.0
-    """0.001 for millimetres."""
     degrees: bool = False
     """Whether angles are in degrees, else radians."""
 
@@ -106,10 +104,7 @@ UNITS: dict[str, dict[str, Any]] = {
 
 
 def pose_convention(name: str) -> PoseConvention:
-    """Parse the name of a convention with modifiers, such as `kuka:m:inverse`.
-
-    ValueError: the name is not known, or a modifier does not belong to it.
-    """
+    """Parse the name of a convention with modifiers, such as `kuka:m:inverse`."""
     base, *modifiers = name.strip().lower().split(":")
     if base not in CONVENTIONS:
         problem = f"pose convention {name!r} is not known"
@@ -134,10 +129,7 @@ def poses_from_numbers(
 
     Poses are in metres with OpenCV's camera axes, not inverted. The camera's frame is the second of
     the pose, or the first with `camera_from` (camera_from_board); only `:opengl` depends on it.
-
-    Raises:
-        ConventionError: The matrices are transposed.
-        ValueError: Other numbers that are no pose; the message names the first such pose.
+    ValueError: numbers are no pose; the message names the first of them.
     """
     numbers = np.asarray(numbers, dtype=np.float64)
     if not numbers.ndim or numbers.shape[-1] not in convention.counts:
@@ -160,8 +152,7 @@ def poses_from_numbers(
 def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
     """Convert poses (...) to numbers (..., k), k the largest of `convention.counts`.
 
-    Quaternions get w >= 0. If the middle angle of an Euler convention is within 1e-7 rad of gimbal
-    lock, the third angle is 0 and the rotation is exact to 2e-7 rad (scipy).
+    Quaternions get w >= 0. In gimbal lock the third angle is 0.
     """
     poses = poses @ _OPENGL_FROM_OPENCV if convention.has("opengl") else poses
     poses = poses.inverse() if convention.has("inverse") else poses
@@ -183,11 +174,7 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
 
 
 def matrix_convention(numbers: Array) -> PoseConvention:
-    """`matrix` or `franka`, whichever makes rigid transforms of (n, 12 or 16) numbers.
-
-    Raises:
-        ConventionError: Both orders do, or neither.
-    """
+    """`matrix` or `franka`, whichever makes rigid transforms of (n, 12 or 16) numbers."""
     orders = [CONVENTIONS[name] for name in ("matrix", "franka")]
     rigid = [order for order in orders if _rigid(_matrices(numbers, order.layout)).all()]
     if len(rigid) == 1:
@@ -200,21 +187,13 @@ def matrix_convention(numbers: Array) -> PoseConvention:
 
 
 def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
-    """Compare numbers (n, k) of one recording with the units of their convention.
-
-    Units in its name are final.
-
-    Raises:
-        ConventionError: The numbers look like another unit.
-        ValueError: The numbers mix two units of length.
-    """
+    """Refuse numbers (n, k) that look like another unit than the convention only implies."""
     numbers = np.asarray(numbers, dtype=np.float64)
     if not convention.has("m", "mm"):
-        matrix = convention.is_matrix
-        at = _matrices(numbers, convention.layout)[..., 3] if matrix else numbers
-        _check_lengths(
-            np.linalg.norm(at[..., :3], axis=-1) * convention.metres_per_unit, convention
-        )
+        at = numbers
+        if convention.is_matrix:
+            at = _matrices(numbers, convention.layout)[..., 3]
+        _check_lengths(np.linalg.norm(at[..., :3], axis=-1), convention)
     if convention.has_angles and not convention.has("rad", "deg"):
         angles = np.abs(numbers[..., 3:])
         angles = np.linalg.norm(angles, axis=-1) if convention.layout == "vector" else angles
@@ -225,7 +204,8 @@ def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
             raise _other_unit("deg" if degrees else "rad", problem, convention)
 
 
-def _check_lengths(metres: Array, convention: PoseConvention) -> None:
+def _check_lengths(lengths: Array, convention: PoseConvention) -> None:
+    metres = lengths * convention.metres_per_unit
     far = metres > _FAR_M
     near = (metres > 0) & (metres < _NEAR_M) & (convention.metres_per_unit < 1.0)
     odd = far if far.any() else near
@@ -236,18 +216,17 @@ def _check_lengths(metres: Array, convention: PoseConvention) -> None:
             f"positions are {np.median(usual):.3g} m from the base, but those of poses {poses} are"
             f" {metres[odd][0]:.3g} m; millimetres and metres may be mixed: write all in one unit"
         )
+    problem = f"positions up to {metres.max(initial=0.0):.4g} m from the base look like"
     if far.any():
-        problem = f"positions up to {metres.max():.4g} m from the base look like"
         raise _other_unit("mm", problem, convention)
     if near.any() and near.all():
-        problem = f"positions within {1000 * metres.max():.2g} mm of the base look like"
         raise _other_unit("m", problem, convention)
 
 
 def _other_unit(unit: str, problem: str, convention: PoseConvention) -> ConventionError:
-    name = {"m": "metres", "mm": "millimetres", "rad": "radians", "deg": "degrees"}[unit]
     other = {"m": "mm", "mm": "m", "rad": "deg", "deg": "rad"}[unit]
     base = ":".join(word for word in convention.name.split(":") if word not in (unit, other))
+    name = {"m": "metres", "mm": "millimetres", "rad": "radians", "deg": "degrees"}[unit]
     remedy = f"{base}:{unit} (or {base}:{other} if the unit is right as it is)"
     return ConventionError(f"{problem} {name}", remedy)
 
@@ -267,7 +246,7 @@ def _rotations(numbers: Array, convention: PoseConvention) -> Rotation:
 
 
 def _matrices(numbers: Array, layout: str) -> Array:
-    """Numbers (..., 12 or 16) as matrices (..., 3 or 4, 4)."""
+    """(..., 3 or 4, 4) matrices of numbers (..., 12 or 16)."""
     height = numbers.shape[-1] // 4
     if layout == "rows":
         return numbers.reshape(*numbers.shape[:-1], height, 4)
@@ -275,7 +254,6 @@ def _matrices(numbers: Array, layout: str) -> Array:
 
 
 def _rigid(matrices: Array) -> NDArray[np.bool_]:
-    """(...) whether matrices (..., 3 or 4, 4) are rigid transforms."""
     block, last = matrices[..., :3, :3], matrices[..., 3:, :]
     drift = np.abs(np.swapaxes(block, -1, -2) @ block - np.eye(3)).max((-1, -2), initial=0.0)
     homogeneous = np.abs(last - (0.0, 0.0, 0.0, 1.0)).max((-1, -2), initial=0.0) < 1e-6
@@ -284,24 +262,22 @@ def _rigid(matrices: Array) -> NDArray[np.bool_]:
 
 def _from_matrices(numbers: Array, convention: PoseConvention) -> SE3:
     matrices = _matrices(numbers, convention.layout)
-    orders = {"matrix": "row after row", "franka": "column after column"}
     stated, other = ("matrix", "franka") if convention.layout == "rows" else ("franka", "matrix")
     broken = ~_rigid(matrices)
     if broken.any() and _rigid(_matrices(numbers, CONVENTIONS[other].layout)).all():
-        problem = f"no rigid transforms {orders[stated]}, they are written {orders[other]}"
         remedy = ":".join([other, *convention.name.split(":")[1:]])
-        raise ConventionError(f"the matrices are {problem}", remedy)
+        order = "row after row" if other == "matrix" else "column after column"
+        raise ConventionError(f"the matrices are written {order}", remedy)
     _refuse(
         broken,
-        f"the matrix {orders[stated]} is no rigid transform: its last row is not 0 0 0 1, or its"
-        f" left 3x3 block is no rotation but holds a scale or a reflection",
+        f"no rigid transform as {stated}: the last row is not 0 0 0 1, or the left 3x3 block is no"
+        f" rotation but holds a scale or a reflection",
     )
     poses = SE3.from_matrix(matrices, _TOLERANCE)
     return SE3(poses.rotation_wxyz, poses.translation_m * convention.metres_per_unit)
 
 
 def _refuse(broken: ArrayLike, reason: str) -> None:
-    """Raise for the first broken pose."""
     indices = np.flatnonzero(broken)
     if len(indices):
         more = f" (and {len(indices) - 1} more)" if len(indices) > 1 else ""

@@ -1,4 +1,8 @@
-"""Forward kinematics of an arm from its URDF, by yourdfpy (extra `urdf`)."""
+"""Gripper poses from joint angles and a URDF, by yourdfpy (extra `urdf`).
+
+A CSV table has a column for each joint of the URDF; JSON has `joint_names` and `positions`. Values
+are radians, or degrees if a name ends in `_deg`, and metres for prismatic joints.
+"""
 
 import os
 from collections.abc import Sequence
@@ -10,10 +14,17 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError, missing_extra
 from evercal.geometry import SE3
+from evercal.recordings.poses.pose_track import times_around
+from evercal.recordings.poses.robot_poses import RobotPoses
+from evercal.recordings.poses.row_files import Rows, read_rows, row_labels
+from evercal.recordings.text_files import named_errors, read_json, refuse_repeated
 
 _MOVING = ("revolute", "continuous", "prismatic")
 # Two full rotations: no joint of an arm exceeds them, and 12.6 in degrees is a small angle.
 _LARGEST_RAD = 4 * np.pi
+_UNITS = ("deg", "rad", "m")
+_STILL_RAD = 0.001
+_JSON = "an object with 'joint_names', 'positions' and optionally 'images' or 'stamps_s'"
 
 
 class RobotModel:
@@ -64,14 +75,36 @@ class RobotModel:
         values: NDArray[np.float64],
         base: str | None,
         gripper: str | None,
+        source: str | os.PathLike[str] = "joints",
     ) -> tuple[SE3, list[str]]:
-        """Compute (n,) poses of the gripper, with notes about their source and joint limits."""
+        """Compute (n,) poses of the gripper, with notes about their source and joint limits.
+
+        Values (n, k) of the k named joints are radians, or metres for prismatic joints. `source`
+        names their origin in messages.
+        """
         base, gripper = self.chosen_links(base, gripper)
-        poses = self.base_from_gripper(names, values, base, gripper)
-        note = f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
         needed = self.joints_between(base, gripper)
-        columns = values[:, [list(names).index(name) for name in needed]]
-        return poses, [note, *self.beyond_limits(needed, columns)]
+        missing = [name for name in needed if name not in names]
+        if missing:
+            raise InputError(
+                f"{source}: no values for joint {', '.join(missing)}, which {gripper} depends on;"
+                f" given are {', '.join(names) or 'none'}"
+            )
+        values = values[:, [list(names).index(name) for name in needed]]
+        for name, column in zip(needed, values.T, strict=True):
+            revolute = self._urdf.joint_map[name].type == "revolute"
+            if revolute and column.size and np.abs(column).max() > _LARGEST_RAD:
+                raise InputError(
+                    f"{source}: joint {name} is at {column[np.abs(column).argmax()]:.1f}, too far"
+                    f" for radians; if these are degrees, write the column as {name}_deg or give"
+                    f" --pose-convention deg"
+                )
+        matrices = np.empty((len(values), 4, 4))
+        for row, matrix in zip(values, matrices, strict=True):
+            self._urdf.update_cfg(dict(zip(needed, row.tolist(), strict=True)))
+            matrix[...] = self._urdf.get_transform(gripper, base)
+        note = f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
+        return SE3.from_matrix(matrices), [note, *self._beyond_limits(needed, values)]
 
     def joints_between(self, base: str, gripper: str) -> tuple[str, ...]:
         """Moving joints between two links, from the base outwards."""
@@ -85,60 +118,31 @@ class RobotModel:
                 names.append(joint.name if joint.mimic is None else joint.mimic.joint)
         return tuple(dict.fromkeys(names))
 
-    def base_from_gripper(
-        self, names: Sequence[str], values: NDArray[np.float64], base: str, gripper: str
-    ) -> SE3:
-        """Compute (n,) poses of the link `gripper` in the link `base`.
-
-        Values (n, k) of the k named joints are radians, or metres for prismatic joints.
-        """
-        needed = self.joints_between(base, gripper)
-        missing = [name for name in needed if name not in names]
-        if missing:
-            raise InputError(
-                f"no values for joint {', '.join(missing)}, which {gripper} depends on; given are"
-                f" {', '.join(names) or 'none'}"
-            )
-        values = values[:, [list(names).index(name) for name in needed]]
-        for name, column in zip(needed, values.T, strict=True):
-            revolute = self._urdf.joint_map[name].type == "revolute"
-            if revolute and column.size and np.abs(column).max() > _LARGEST_RAD:
-                raise InputError(
-                    f"joint {name} is at {column[np.abs(column).argmax()]:.1f}, too far for"
-                    f" radians; if these are degrees, write the column as {name}_deg"
-                )
-        matrices = np.empty((len(values), 4, 4))
-        for row, matrix in zip(values, matrices, strict=True):
-            self._urdf.update_cfg(dict(zip(needed, row.tolist(), strict=True)))
-            matrix[...] = self._urdf.get_transform(gripper, base)
-        return SE3.from_matrix(matrices)
-
     def rotates(self, name: str) -> bool:
         """Whether a joint exists and its values are angles."""
         joint = self._urdf.joint_map.get(name)
         return joint is not None and joint.type in ("revolute", "continuous")
 
-    def beyond_limits(self, names: Sequence[str], values: NDArray[np.float64]) -> list[str]:
-        """One sentence for each joint that exceeds its limits by more than 0.1.
-
-        Joints without limits are reported beyond two full rotations, which degrees exceed, too.
-        """
+    def _beyond_limits(self, names: Sequence[str], values: NDArray[np.float64]) -> list[str]:
+        """One sentence for each joint that exceeds its limits by 0.1, or two rotations."""
         notes = []
         for name, column in zip(names, values.T, strict=True):
-            joint = self._urdf.joint_map.get(name)
-            limit = None if joint is None else joint.limit
+            joint = self._urdf.joint_map[name]
             covered = f"joint {name} goes from {column.min():.2f} to {column.max():.2f}"
-            if joint is not None and joint.type == "continuous":
+            if joint.type == "continuous":
                 if np.ptp(column) > _LARGEST_RAD:
                     notes.append(
                         f"{covered}, more than two rotations in radians; are these degrees?"
                     )
-            elif limit is None or limit.lower is None or limit.upper is None:
                 continue
-            elif column.min() < limit.lower - 0.1 or column.max() > limit.upper + 0.1:
+            lower = getattr(joint.limit, "lower", None)
+            upper = getattr(joint.limit, "upper", None)
+            if lower is None or upper is None:
+                continue
+            if column.min() < lower - 0.1 or column.max() > upper + 0.1:
                 notes.append(
-                    f"{covered}, the URDF allows {limit.lower:.2f} to {limit.upper:.2f}; are the"
-                    f" joints in the right order and in radians?"
+                    f"{covered}, the URDF allows {lower:.2f} to {upper:.2f}; are the joints in the"
+                    f" right order and in radians?"
                 )
         return notes
 
@@ -152,3 +156,78 @@ class RobotModel:
             joints.append(self._joint_above[link])
             link = joints[-1].parent
         return joints
+
+
+def read_joint_poses(
+    path: Path,
+    model: RobotModel,
+    base: str | None = None,
+    gripper: str | None = None,
+    unit: str | None = None,
+) -> tuple[RobotPoses, list[str]]:
+    """Read joint angles and compute gripper poses, with notes.
+
+    `unit` is "rad" or "deg" of angles whose column states no unit; radians if omitted.
+    """
+    rows = read_joints(path)
+    base, gripper = model.chosen_links(base, gripper)
+    if not model.joints_between(base, gripper):
+        raise InputError(f"{model.path}: no joint moves {gripper} against {base}; name other links")
+    names, units = [], []
+    for column in rows.columns:
+        plain, _, ending = column.rpartition("_")
+        stated = ending in _UNITS and not model.has_joint(column) and model.has_joint(plain)
+        names.append(plain if stated else column)
+        units.append(ending if stated else unit)
+    with named_errors(path, "joint angles"):
+        refuse_repeated(filter(model.has_joint, names), "keep one column of each joint")
+    values = in_radians(model, names, rows.values, units)
+    poses, notes = model.poses(names, values, base, gripper, path)
+    return RobotPoses(rows.names, rows.stamps_s, poses), notes
+
+
+def in_radians(
+    model: RobotModel,
+    names: Sequence[str],
+    values: NDArray[np.float64],
+    units: Sequence[str | None],
+) -> NDArray[np.float64]:
+    """Convert angles in degrees to radians and leave other values (n, k) as they are."""
+    other = next((unit for unit in units if unit not in (None, *_UNITS)), None)
+    if other is not None:
+        raise InputError(f"--pose-convention {other}: joint angles are rad or deg")
+    degrees = [u == "deg" and model.rotates(name) for u, name in zip(units, names, strict=True)]
+    return np.where(degrees, np.deg2rad(values), values)
+
+
+def interpolate(
+    times_s: NDArray[np.float64], positions: NDArray[np.float64], stamps_s: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Interpolate (n,) positions of a joint at (m,) seconds, and whether each is valid.
+
+    Jumps by full rotations are removed. Validity is that of `PoseTrack.at`.
+    """
+    times, first = np.unique(times_s, return_index=True)
+    values = np.unwrap(positions[first])
+    valid = (stamps_s >= times[0]) & (stamps_s <= times[-1])
+    if len(times) > 1:
+        after, close = times_around(times, stamps_s)
+        valid &= close | (np.abs(values[after] - values[after - 1]) < _STILL_RAD)
+    return np.interp(stamps_s, times, values), valid
+
+
+def read_joints(path: Path) -> Rows:
+    """Read a table of joint values."""
+    if path.suffix.lower() == ".csv":
+        return read_rows(path, "joint angles")
+    data: dict[str, Any] = read_json(path, "file of joint angles", f"give {_JSON}")
+    try:
+        columns = tuple(str(name) for name in data["joint_names"])
+        values = np.array(data["positions"], dtype=np.float64)
+        lists = {key: value for key, value in data.items() if isinstance(value, list)}
+        names, times, _ = row_labels([*lists], [*lists.values()], len(values), plural=True)
+        if values.shape != (len(values), len(columns)) or not np.isfinite(values).all():
+            raise ValueError("'positions' are rows of finite numbers, one for each joint")
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: {type(error).__name__} {error}; give {_JSON}") from None
+    return Rows(names, times, columns, values)

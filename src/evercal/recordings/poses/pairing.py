@@ -12,6 +12,7 @@ from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, times_in_names
+from evercal.recordings.text_files import named_errors, refuse_repeated
 
 Pairing = tuple[list[SE3 | None], list[str]]
 """The pose of each image, if it has one, and notes."""
@@ -25,9 +26,6 @@ def pair_images(
     Rows with names are paired with the images of these names. Rows with times are interpolated at
     the image times `stamps_s`, by name, or the times in the image names. Otherwise rows and images,
     in natural order, are paired in order, and their numbers must be equal.
-
-    Raises:
-        InputError: The images cannot be paired; messages name the pose file.
     """
     if rows.names is not None:
         return _by_name(images, rows.names, rows.poses, file)
@@ -53,11 +51,7 @@ def pair_images(
 
 
 def poses_of_images(file: Path, images: Sequence[Path], convention: str | None = None) -> SE3:
-    """Read (n,) base_from_gripper of n images, for the commands with `--convention`.
-
-    Raises:
-        InputError: The images cannot be paired, or an image has no pose.
-    """
+    """Read (n,) base_from_gripper of n images, for the commands with `--convention`."""
     rows = read_robot_poses(file, convention, option="--convention")
     poses, _ = pair_images(images, rows, None, file)
     missing = [image.name for image, pose in zip(images, poses, strict=True) if pose is None]
@@ -69,12 +63,10 @@ def poses_of_images(file: Path, images: Sequence[Path], convention: str | None =
 
 
 def _by_name(images: Sequence[Path], names: Sequence[str], poses: SE3, file: Path) -> Pairing:
-    by_name: dict[str, SE3] = {}
-    for name, pose in zip(names, poses, strict=True):
-        key = PurePath(name).name
-        if key in by_name:
-            raise InputError(f"{file}: {name!r} comes twice; give every image one row")
-        by_name[key] = pose
+    keys = [PurePath(name).name for name in names]
+    with named_errors(file, "poses"):
+        refuse_repeated(keys, "give every image one row")
+    by_name = dict(zip(keys, poses, strict=True))
     # A table may omit the ending.
     paired = [by_name.pop(i.name, None) or by_name.pop(i.stem, None) for i in images]
     if not any(pose is not None for pose in paired):
@@ -113,7 +105,6 @@ def _by_time(times: NDArray[np.float64], track: PoseTrack, file: Path) -> Pairin
 def _image_times(
     images: Sequence[Path], stamps_s: Mapping[str, float] | None
 ) -> NDArray[np.float64] | None:
-    """(n,) seconds from the stamps file, else from image names that are times."""
     if stamps_s is None:
         return times_in_names([image.name for image in images])
     times = [stamps_s.get(i.name, stamps_s.get(i.stem)) for i in images]

@@ -7,7 +7,6 @@ camera. Inverted poses rotate about other axes.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,51 +25,29 @@ LEAST_MATCHES = 40  # feature matches, and inliers of them, below which a pair i
 LONG_SIDE = 640  # longer side of the images that are matched, pixels
 AGREE_DEG = 2.0  # difference up to which rotations agree
 STILL_DEG = 1.0  # median measured rotation below which the images stand still
-BETTER, CLOSE_DEG = 3.0, 0.5
-"""Factor by which another reading of the poses must fit better to be named, and the margin within
-which further readings are named with it."""
+BETTER = 3.0  # factor by which another reading must fit better to be named
+CLOSE_DEG = 0.5  # margin within which further readings are named with the best
+# Stricter for grippers: the free fixed rotation lets wrong readings fit better.
 GRIPPER_AGREE_DEG, GRIPPER_BETTER = 1.0, 2.0
-"""Stricter limits for grippers: the free fixed rotation lets wrong readings fit better."""
 # OpenGL's camera axes (right, up, backward) from OpenCV's (right, down, forward).
 _GL = Rotation.from_euler("x", 180, degrees=True)
-
-
-class PairRotations(NamedTuple):
-    """(n, 3) rotation vectors of the second image of each pair in the frame of the first."""
-
-    measured: Array
-    """From the images, radians."""
-    stated: Array
-    """From the poses, radians."""
-    inverse: Array
-    """From the inverses of the poses, radians."""
-    swapped: Array
-    """From the poses with quaternions in the other order, radians."""
 
 
 def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> list[str]:
     """Describe contradictions between stated rotations and the images, in sentences.
 
-    Args:
-        frames: (n,) frames in recorded order.
-        poses: (n,) base_from_camera or base_from_gripper.
-        of_camera: Whether the poses are base_from_camera.
+    (n,) frames are in recorded order, (n,) poses base_from_camera or else base_from_gripper.
     """
-    rotations = pair_rotations(frames, poses)
-    if rotations is None:
+    pairs, measured = measured_pairs(frames, poses)
+    if len(measured) < LEAST_PAIRS:
         return []
-    measured, stated, inverse, swapped = rotations
     owner = "camera" if of_camera else "gripper"
-    readings = {f"{owner}_from_base, the inverse": inverse}
-    if of_camera:
-        readings["with OpenGL's camera axes (right, up, backward)"] = _GL.apply(stated)
-        readings["the inverse with OpenGL's camera axes"] = _GL.apply(inverse)
-    elif np.rad2deg(np.median(np.linalg.norm(measured, axis=1))) < STILL_DEG:
+    if not of_camera and np.rad2deg(np.median(np.linalg.norm(measured, axis=1))) < STILL_DEG:
         return [
             "the gripper rotates and the images hardly do; does the camera stand still, or are the"
             " angles in another unit than stated?"
         ]
-    readings["with quaternions in another order"] = swapped
+    stated, readings = _readings(poses, pairs, of_camera)
     # Between gripper and camera is a fixed rotation that is not known.
     error_of, better = (_error_deg, BETTER) if of_camera else (_fitted_error_deg, GRIPPER_BETTER)
     error = error_of(measured, stated)
@@ -95,21 +72,29 @@ def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> l
     ]
 
 
-def pair_rotations(frames: Sequence[Frame], poses: SE3) -> PairRotations | None:
-    """Measure the rotation of some image pairs; None if too few pairs can be matched."""
-    pairs = [(i, j, measured_rotation(frames[i], frames[j])) for i, j in _pairs(poses)]
-    pairs = [pair for pair in pairs if pair[2] is not None]
-    if len(pairs) < LEAST_PAIRS:
-        return None
-    first, second = np.array([pair[:2] for pair in pairs]).T
-    stated = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
+def _readings(
+    poses: SE3, pairs: NDArray[np.intp], of_camera: bool
+) -> tuple[Array, dict[str, Array]]:
+    """(n, 3) rotation vectors first_from_second of pairs as stated, and in other readings."""
+    first, second = pairs.T
+    rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
     swapped = Rotation.from_quat(poses.rotation_wxyz)
-    return PairRotations(
-        measured=np.array([pair[2] for pair in pairs]),
-        stated=(stated[first].inv() * stated[second]).as_rotvec(),
-        inverse=(stated[first] * stated[second].inv()).as_rotvec(),
-        swapped=(swapped[first].inv() * swapped[second]).as_rotvec(),
-    )
+    stated = (rotation[first].inv() * rotation[second]).as_rotvec()
+    inverse = (rotation[first] * rotation[second].inv()).as_rotvec()
+    readings = {f"{'camera' if of_camera else 'gripper'}_from_base, the inverse": inverse}
+    if of_camera:
+        readings["with OpenGL's camera axes (right, up, backward)"] = _GL.apply(stated)
+        readings["the inverse with OpenGL's camera axes"] = _GL.apply(inverse)
+    another_order = (swapped[first].inv() * swapped[second]).as_rotvec()
+    return stated, readings | {"with quaternions in another order": another_order}
+
+
+def measured_pairs(frames: Sequence[Frame], poses: SE3) -> tuple[NDArray[np.intp], Array]:
+    """(n, 2) frames of the pairs that match, and (n, 3) `measured_rotation` of each."""
+    measured = [((i, j), measured_rotation(frames[i], frames[j])) for i, j in _pairs(poses)]
+    pairs = [pair for pair, vector in measured if vector is not None]
+    vectors = [vector for _, vector in measured if vector is not None]
+    return np.array(pairs, np.intp).reshape(-1, 2), np.array(vectors)
 
 
 def measured_rotation(first: Frame, second: Frame) -> Array | None:

@@ -100,8 +100,7 @@ _Groups = dict[str, tuple[list[int], str | None]]
 def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     """Read a table; without a given convention, its header or notation defines it.
 
-    Raises:
-        ValueError: The text is no table of numbers, or its convention is not defined.
+    ValueError, also of the functions below: this is no table, or its convention is not defined.
     """
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     plain = [line for line in lines if line[0] != "#"]
@@ -131,12 +130,7 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
 def named_numbers(
     words: Sequence[str], rows: NDArray[np.str_], given: PoseConvention | None
 ) -> PoseTable:
-    """Numbers of rows (n, k) whose columns have names.
-
-    Raises:
-        ValueError: The names are ambiguous or contradict the given convention, or a cell is no
-            number.
-    """
+    """Numbers of rows (n, k) whose columns have names."""
     groups = _groups(words)
     names, stamps, others = row_labels(words, rows.T.tolist(), len(rows))
     convention = given or pose_convention(_defined(groups, words))
@@ -164,11 +158,7 @@ def named_numbers(
 
 
 def plain_numbers(numbers: Array, given: PoseConvention | None, names: Names = None) -> PoseTable:
-    """Matrices (n, 4, 4) or (n, 3, 4), or numbers (n, k) or with stamps (n, 1 + k).
-
-    Raises:
-        ValueError: The numbers do not fit the convention, or a convention is required.
-    """
+    """Matrices (n, 4, 4) or (n, 3, 4), or numbers (n, k) or with stamps (n, 1 + k)."""
     if numbers.ndim != 2:
         given = given or pose_convention("matrix")
         if numbers.shape[1:] not in ((4, 4), (3, 4)) or not given.is_matrix:
@@ -229,16 +219,11 @@ def _without_brackets(
 
 
 def _is_header(words: Sequence[str]) -> bool:
-    """Whether a line names columns; some names may be numbers."""
     numbers = [is_number(word) for word in words]
     return not all(numbers) and (not any(numbers) or bool(_groups(words)))
 
 
 def _groups(words: Sequence[str]) -> _Groups:
-    """Columns of a header that belong together.
-
-    ValueError: the columns of a group differ in unit, or a column is ambiguous.
-    """
     names, units = zip(*map(name_and_unit, words), strict=True)
     groups: _Groups = {}
     for key, group in HEADERS.items():
@@ -262,7 +247,6 @@ def _groups(words: Sequence[str]) -> _Groups:
 
 
 def _defined(groups: _Groups, words: Sequence[str]) -> str:
-    """Name of the only convention that the columns define."""
     rotations = [key for key in groups if key != "position"]
     sure = [k for k in rotations if not HEADERS[k].ask or (k == "roll pitch yaw" and groups[k][1])]
     conventions = [HEADERS[key].conventions[0] for key in sure]

@@ -17,11 +17,7 @@ STILL_M, STILL_DEG = 0.001, 0.1
 
 @dataclass(frozen=True, eq=False)
 class PoseTrack:
-    """A pose over time; of several poses at one time, the last is kept.
-
-    Raises:
-        ValueError: There is no pose, or the numbers of times and poses differ.
-    """
+    """A pose over time; of several poses at one time, the last is kept."""
 
     stamps_s: Array
     """(n,) seconds, in any order."""
@@ -38,25 +34,30 @@ class PoseTrack:
         object.__setattr__(self, "stamps_s", stamps[order])
         object.__setattr__(self, "poses", self.poses[order])
 
-    def at(self, stamps_s: Array, max_gap_s: float = MAX_GAP_S) -> tuple[SE3, NDArray[np.bool_]]:
+    def at(self, stamps_s: Array) -> tuple[SE3, NDArray[np.bool_]]:
         """Interpolate positions linearly and rotations along great circles at (m,) seconds.
 
         Returns:
             (m,) poses and (m,) whether each is valid. Poses are invalid beyond the ends, and in
-            a gap of more than `max_gap_s` seconds over which the frame moved.
+            a gap of more than `MAX_GAP_S` seconds over which the frame moved.
         """
         stamps = np.asarray(stamps_s, dtype=np.float64)
         inside = np.clip(stamps, self.stamps_s[0], self.stamps_s[-1])
         valid = inside == stamps
         if len(self.stamps_s) == 1:
             return self.poses[np.zeros(len(stamps), dtype=int)], valid
-        after = np.searchsorted(self.stamps_s, inside).clip(1, len(self.stamps_s) - 1)
-        before = after - 1
-        metres, radians = pose_distance(self.poses[before], self.poses[after])
+        after, close = times_around(self.stamps_s, inside)
+        metres, radians = pose_distance(self.poses[after - 1], self.poses[after])
         still = (metres < STILL_M) & (np.rad2deg(radians) < STILL_DEG)
-        short = self.stamps_s[after] - self.stamps_s[before] <= max_gap_s
-        exact = (inside == self.stamps_s[before]) | (inside == self.stamps_s[after])
         rotations = Rotation.from_quat(self.poses.rotation_wxyz, scalar_first=True)
         position = [np.interp(inside, self.stamps_s, axis) for axis in self.poses.translation_m.T]
         quaternion = Slerp(self.stamps_s, rotations)(inside).as_quat(scalar_first=True)
-        return SE3(quaternion, np.stack(position, axis=-1)), valid & (short | still | exact)
+        return SE3(quaternion, np.stack(position, axis=-1)), valid & (close | still)
+
+
+def times_around(times_s: Array, stamps_s: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Index of the time after each stamp, and whether no long gap is around it."""
+    after = np.searchsorted(times_s, stamps_s).clip(1, len(times_s) - 1)
+    short = times_s[after] - times_s[after - 1] <= MAX_GAP_S
+    exact = (stamps_s == times_s[after]) | (stamps_s == times_s[after - 1])
+    return after, short | exact

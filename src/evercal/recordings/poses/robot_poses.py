@@ -36,7 +36,7 @@ from evercal.recordings.poses.row_files import (
     number_array,
     row_labels,
 )
-from evercal.recordings.text_files import first_repeated, named_errors, read_text
+from evercal.recordings.text_files import named_errors, read_text, refuse_repeated
 
 _KEYS = ("poses", "base_from_gripper", "camera_from_board", "T", "transforms", "matrices")
 """Keys of poses in JSON and NPZ."""
@@ -92,14 +92,15 @@ def read_robot_poses(
     path = Path(path)
     with named_errors(path, what):
         try:
-            table = _read(path, _given(path, convention), what)
-            poses = poses_from_numbers(table.numbers, table.convention, camera_from)
-            check_units(table.numbers, table.convention)
+            given, ending = _given(path, convention), path.suffix.lower()
+            if ending in (".npy", ".npz"):
+                table = _data_table(arrays_as_lists(path), given)
+            else:
+                table = _table(read_text(path, what), ending, given)
+            poses = _poses(table, camera_from)
         except ConventionError as error:
             raise InputError(f"{path}: {error.naming(option)}") from None
-        repeated = first_repeated(table.names or ())
-        if repeated is not None:
-            raise ValueError(f"the name {repeated!r} comes twice; names are unique")
+        refuse_repeated(table.names or (), "names are unique")
         stated = (None, None) if table.fixed else (table.numbers, table.convention)
         return RobotPoses(table.names, table.stamps_s, poses, *stated)
 
@@ -108,31 +109,26 @@ def read_last_robot_pose(path: str | os.PathLike[str], convention: str | None = 
     """Read the last complete row of a table or of JSON lines that another program appends to.
 
     A row is complete once its line break is written. Long files are read at both ends only.
-
-    Args:
-        path: `.jsonl` holds one JSON object a line; other endings are read as a table.
-        convention: As of `read_robot_poses`.
-
-    Raises:
-        InputError: The file is missing, has no complete row, or its row is no pose.
     """
     path = Path(path)
     with named_errors(path, "file of robot poses"):
-        head, tail = _ends(path)
-        given = _given(path, convention)
-        if path.suffix.lower() == ".jsonl":
-            table = _data_table(json.loads(tail[-1]), given) if tail else None
-        else:
-            first = next((i for i, line in enumerate(head) if line[:1] != "#"), len(head))
-            # The last line is the header, or the only row, if no other follows.
-            last = tail[-1:] if tail[-1:] != head[first : first + 1] else []
-            text = "\n".join([*head[: first + 1], *last])
-            table = read_pose_table(text, given) if first < len(head) else None
-        if table is None:
+        with path.open("rb") as file:
+            lines = _complete_lines(file.read(_END_BYTES))
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _END_BYTES))
+            last = _complete_lines(file.read())[-1:]
+        ending = path.suffix.lower().removesuffix("l")
+        first = next((i for i, line in enumerate(lines) if line[:1] != "#"), len(lines))
+        if first == len(lines):
             raise ValueError("no complete line of a pose in it yet")
-        pose = poses_from_numbers(table.numbers, table.convention)[-1]
-        check_units(table.numbers, table.convention)
-        return pose
+        if ending != ".json":
+            # The first line is the header, or a row and perhaps the only one.
+            last = [*lines[: first + 1], *(last if last != lines[first : first + 1] else [])]
+        return _poses(_table("\n".join(last), ending, _given(path, convention)))[-1]
+
+
+def _complete_lines(part: bytes) -> list[str]:
+    text = part[: part.rfind(b"\n") + 1].decode("utf-8", "replace")
+    return [line for line in text.splitlines() if line.strip()]
 
 
 def _given(path: Path, convention: str | None) -> PoseConvention | None:
@@ -141,32 +137,19 @@ def _given(path: Path, convention: str | None) -> PoseConvention | None:
     return None if convention is None else pose_convention(convention)
 
 
-def _read(path: Path, given: PoseConvention | None, what: str) -> PoseTable:
-    ending = path.suffix.lower()
-    if ending in (".npy", ".npz"):
-        return _data_table(arrays_as_lists(path), given)
-    text = read_text(path, what)
-    return (
-        _data_table(json.loads(text), given) if ending == ".json" else read_pose_table(text, given)
-    )
+def _table(text: str, ending: str, given: PoseConvention | None) -> PoseTable:
+    if ending == ".json":
+        return _data_table(json.loads(text), given)
+    return read_pose_table(text, given)
 
 
-def _ends(path: Path) -> tuple[list[str], list[str]]:
-    """Complete lines at the start and at the end of a file, blank ones left out."""
-    with path.open("rb") as file:
-        head = file.read(_END_BYTES)
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(0, size - _END_BYTES))
-        tail = file.read(_END_BYTES)
-    if size > _END_BYTES:
-        tail = tail[tail.find(b"\n") + 1 :]
-    parts = (part[: part.rfind(b"\n") + 1].decode("utf-8", "replace") for part in (head, tail))
-    first, last = ([line for line in part.splitlines() if line.strip()] for part in parts)
-    return first, last
+def _poses(table: PoseTable, camera_from: bool = False) -> SE3:
+    poses = poses_from_numbers(table.numbers, table.convention, camera_from)
+    check_units(table.numbers, table.convention)
+    return poses
 
 
 def _data_table(data: Any, given: PoseConvention | None) -> PoseTable:
-    """Poses in lists and mappings, as in JSON."""
     if isinstance(data, Mapping) and not {"matrix", "translation_m"} & data.keys():
         key = _pose_key(data)
         lists = {k: v for k, v in data.items() if k != key and isinstance(v, list)}
@@ -192,14 +175,12 @@ def _data_table(data: Any, given: PoseConvention | None) -> PoseTable:
 def _labelled(
     table: PoseTable, columns: Mapping[str, Sequence[object]], plural: bool = False
 ) -> PoseTable:
-    """Add names and times from lists by key to a table without them."""
     names, stamps, _ = row_labels([*columns], [*columns.values()], len(table.numbers), plural)
     stamps = stamps if table.stamps_s is None else table.stamps_s
     return table._replace(names=table.names or names, stamps_s=stamps)
 
 
 def _flat(entry: Mapping[str, Any]) -> dict[str, object]:
-    """Values of an object by the name of a column."""
     cells: dict[str, object] = {}
     for key, value in entry.items():
         if isinstance(value, Mapping):

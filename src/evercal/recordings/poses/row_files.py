@@ -1,9 +1,8 @@
 """Files with one row for each image or time: cells of a table, and labels of its rows.
 
-Labels are columns of a table, or keys of JSON, that hold image names and times. Names are
-case-insensitive, and times may have a unit (`stamp_ns`, `time [ms]`). If there are several
-candidates, the first of the list is used. A column with nothing but names of image files may have
-any name. In JSON lists beside the poses, names are in the plural: `images`, `stamps_s`.
+Labels are columns of a table, or lists of JSON, that hold image names and times; the first of
+`_NAMES` and `_STAMPS` that is there is used. A column with nothing but names of image files may
+have any name. In JSON lists beside the poses, names are in the plural: `images`, `stamps_s`.
 """
 
 import io
@@ -41,9 +40,8 @@ class Rows(NamedTuple):
     stamps_s: Array | None
     """(n,) seconds, if there is such a column."""
     columns: tuple[str, ...]
-    """Names of the other columns."""
     values: Array
-    """(n, columns) numbers."""
+    """(n, columns) numbers of the other columns."""
 
 
 def read_rows(path: Path, contents: str) -> Rows:
@@ -63,7 +61,7 @@ def table_cells(lines: Sequence[str]) -> NDArray[np.str_]:
     """(n, k) cells of lines of text; missing cells at the end of a line are empty.
 
     Semicolons, commas, tabs or blanks of the first line separate them. If it is semicolons, the
-    comma may be a decimal point. ValueError: a line has more cells than the first.
+    comma may be a decimal point.
     """
     import pandas as pd
 
@@ -110,17 +108,22 @@ def name_and_unit(cell: str) -> tuple[str, str | None]:
 def row_labels(
     words: Sequence[str], columns: Sequence[Sequence[object]], count: int, plural: bool = False
 ) -> tuple[Names, Array | None, list[int]]:
-    """Image names, seconds and indices of the other columns of `count` rows.
-
-    Names and seconds are None if there is no such column. ValueError: a column is incomplete, a
-    time is no number, or the columns are ambiguous.
-    """
+    """Image names and seconds of `count` rows, None if missing, and indices of other columns."""
     plain = [name_and_unit(word)[0] for word in words]
     if plural:
         plain = [word.removesuffix("s") if word.endswith("s") else "" for word in plain]
     stamp = next((plain.index(word) for word in _STAMPS if word in plain), None)
     name = next((plain.index(word) for word in _NAMES if word in plain), None)
-    name = _image_column(words, columns) if name is None else name
+    if name is None:
+        files = [
+            i
+            for i, column in enumerate(columns)
+            if column and all(str(cell).lower().endswith(IMAGE_ENDINGS) for cell in column)
+        ]
+        if len(files) > 1:
+            found = " and ".join(words[i] for i in files)
+            raise ValueError(f"{found} name image files; call the right one 'image'")
+        name = files[0] if files else None
     for i in (i for i in (name, stamp) if i is not None):
         if len(columns[i]) != count:
             raise ValueError(f"{words[i]!r} holds {len(columns[i])} entries for {count} poses")
@@ -128,22 +131,11 @@ def row_labels(
             raise ValueError(f"some poses have {words[i]!r}, others lack it; give it to all poses")
     others = [i for i, word in enumerate(plain) if word not in _NAMES + _STAMPS and i != name]
     names = None if name is None else tuple(map(str, columns[name]))
-    if stamp is None:
-        return names, None, others
-    times = number_array(columns[stamp], f"{words[stamp]!r}")
-    return names, in_unit(times, name_and_unit(words[stamp])[1]), others
-
-
-def _image_column(words: Sequence[str], columns: Sequence[Sequence[object]]) -> int | None:
-    files = [
-        i
-        for i, column in enumerate(columns)
-        if column and all(str(cell).lower().endswith(IMAGE_ENDINGS) for cell in column)
-    ]
-    if len(files) > 1:
-        found = " and ".join(words[i] for i in files)
-        raise ValueError(f"{found} name image files; call the right one 'image'")
-    return files[0] if files else None
+    stamps = None
+    if stamp is not None:
+        times = number_array(columns[stamp], f"{words[stamp]!r}")
+        stamps = in_unit(times, name_and_unit(words[stamp])[1])
+    return names, stamps, others
 
 
 def number_array(values: object, what: str) -> Array:
@@ -169,9 +161,7 @@ def arrays_as_lists(path: Path) -> Any:
 def in_unit(stamps: Array, unit: str | None = None) -> Array:
     """Convert stamps (n,) to seconds from `s`, `ms`, `us` or `ns`, by their size if omitted.
 
-    Times since 1970 are about 1.7e9 s, and a thousand, a million or a billion times as large in
-    milli-, micro- or nanoseconds. Smaller numbers are seconds. ValueError: the numbers are too
-    large for seconds.
+    Times since 1970 are about 1.7e9 s. Numbers far larger are in a smaller unit.
     """
     middle = float(np.median(stamps)) if stamps.size else 0.0
     sizes = {"ns": 1e17, "us": 1e14, "ms": 1e11}

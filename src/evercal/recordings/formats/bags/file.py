@@ -34,12 +34,9 @@ class Message:
 
 
 class BagFile:
-    """A bag that stays open until nothing refers to it.
+    """A bag that stays open until nothing refers to it: a file, or a folder of a bag or its parts.
 
     Threads may share it, and messages may be read while others are iterated.
-
-    Args:
-        path: A `.bag`, `.mcap` or `.db3` file, or a folder of a ROS 2 bag or of parts of a bag.
     """
 
     def __init__(self, path: Path) -> None:
@@ -52,29 +49,26 @@ class BagFile:
         # Bags of ROS 2 before Iron lack type definitions; the types read here never changed.
         types = get_typestore(Stores.ROS2_HUMBLE)
         parts = _parts(path)
-        kinds = {part.suffix for part in parts}
-        if len(kinds) > 1:
+        endings = {part.suffix for part in parts}
+        if len(endings) > 1:
             raise InputError(
-                f"{path}: holds bags of several kinds ({', '.join(kinds)}); name one file"
+                f"{path}: holds bags of several kinds ({', '.join(endings)}); name one file"
             )
         try:
             self._reader = AnyReader(parts, default_typestore=types)
             self._reader.open()
-            found = self._reader.connections
-            links = [(str(x.topic), str(x.msgtype), int(x.msgcount)) for x in found]
+            links = [link for link in self._reader.connections if link.msgcount]
+            kinds = {str(link.topic): str(link.msgtype) for link in links}
         except Exception as error:  # damaged bags make rosbags raise many types
             raise InputError(f"{path}: rosbags cannot read it: {_reason(error)}") from None
         weakref.finalize(self, self._reader.close)
         self._lock = threading.Lock()
-        self.kinds: dict[str, str] = {}
-        self.counts: dict[str, int] = {}
-        for topic, kind, count in links:
-            self.kinds[topic] = kind
-            self.counts[topic] = self.counts.get(topic, 0) + count
+        self.kinds = kinds
+        """Types of the topics that hold messages."""
 
     def topics(self, *kinds: str) -> list[str]:
-        """Names of the topics of some types that hold messages, sorted."""
-        return sorted(t for t, kind in self.kinds.items() if kind in kinds and self.counts[t])
+        """Names of the topics of some types, sorted."""
+        return sorted(topic for topic, kind in self.kinds.items() if kind in kinds)
 
     def contents(self) -> str:
         """List of the topics, for messages."""
@@ -112,7 +106,6 @@ class BagFile:
     def _messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Message]:
-        """Messages from `start_ns` to before `stop_ns`; the caller holds the lock."""
         links = [link for link in self._reader.connections if link.topic in topics]
         if not links:
             return
@@ -139,7 +132,6 @@ def is_bag(path: Path) -> bool:
 
 
 def _parts(path: Path) -> list[Path]:
-    """Paths to open: a bag file, a ROS 2 folder as a whole, or the bag files of a folder."""
     if path.is_file():
         return [path] if path.suffix in _FILES else []
     metadata = path / "metadata.yaml"

@@ -2,8 +2,8 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NoReturn
+from dataclasses import dataclass, field
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.formats.bags.file import JOINT_STATE, TF, BagFile
-from evercal.recordings.formats.bags.tf_tree import TfTree, Transform, plain_name
-from evercal.recordings.poses.joint_states import interpolate
-from evercal.recordings.poses.kinematics import RobotModel
+from evercal.recordings.poses.kinematics import RobotModel, interpolate
+from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.read_options import ReadOptions
 
 _BASES = ("base_link", "base", "panda_link0", "fr3_link0", "fer_link0", "lbr_link_0", "link_base")
@@ -21,6 +20,136 @@ _GRIPPERS = (
     "tool0", "flange", "ee_link", "panda_hand", "fr3_hand", "fer_hand", "lbr_link_ee", "link_eef",
     "gripper_link", "tool_link",
 )  # fmt: skip
+
+
+class _Transform(NamedTuple):
+    """One TransformStamped, parent_from_child."""
+
+    parent: str
+    child: str
+    stamp_s: float | None  # None if static
+    quaternion: tuple[float, ...]  # wxyz
+    translation: tuple[float, ...]
+
+
+@dataclass
+class _Edge:
+    """Transforms of one child frame from one topic; moving ones take precedence."""
+
+    moving: list[_Transform] = field(default_factory=list)
+    static: list[_Transform] = field(default_factory=list)
+
+    @property
+    def transforms(self) -> list[_Transform]:
+        return self.moving or self.static[-1:]
+
+    @property
+    def parents(self) -> set[str]:
+        return {transform.parent for transform in (*self.moving, *self.static)}
+
+
+class _TfTree:
+    """Transforms, added in any order; `topic` is used if several topics move one frame."""
+
+    def __init__(self, source: str, topic: str | None = None) -> None:
+        self._source, self._topic = source, topic
+        self._edges: dict[str, dict[str, _Edge]] = {}  # by child and topic
+
+    def add(self, transform: _Transform, topic: str) -> None:
+        """Add a transform of a topic; /tf_static belongs to /tf."""
+        length = float(np.linalg.norm(transform.quaternion))
+        parent, child = plain_name(transform.parent), plain_name(transform.child)
+        if not (abs(length - 1) < 1e-2 and np.isfinite(transform.translation).all()):
+            raise InputError(
+                f"{self._source}: tf {parent} -> {child}: quaternion (w x y z)"
+                f" {transform.quaternion}, translation {transform.translation}: no rigid transform;"
+                f" repair the program that publishes it"
+            )
+        edge = self._edges.setdefault(child, {}).setdefault(topic, _Edge())
+        part = edge.static if transform.stamp_s is None else edge.moving
+        part.append(transform._replace(parent=parent, child=child))
+
+    def frames(self) -> tuple[str, ...]:
+        """All frames, parents before children."""
+        parents = {p for topics in self._edges.values() for e in topics.values() for p in e.parents}
+        return tuple(sorted({*parents, *self._edges}, key=lambda f: (len(self._chain(f)), f)))
+
+    def connected(self, a: str, b: str) -> bool:
+        return self._chain(a)[-1] == self._chain(b)[-1]
+
+    def a_from_b(
+        self, a: str, b: str, stamps_s: NDArray[np.float64]
+    ) -> tuple[SE3, NDArray[np.bool_]]:
+        """Interpolate (n,) poses of frame b in frame a, and whether each is valid."""
+        up, down = self._chain(a), self._chain(b)
+        for child in (frame for frame in (*up, *down) if frame in self._edges):
+            self._refuse_ambiguous(child)
+        if up[-1] != down[-1]:
+            raise InputError(
+                f"{self._source}: tf has no chain between {a!r} and {b!r}: their roots are"
+                f" {up[-1]!r} and {down[-1]!r}; record the transform that joins them"
+            )
+        shared = set(up) & set(down)
+        valid = np.ones(len(stamps_s), dtype=bool)
+        sides = []
+        for chain in (up, down):
+            ancestor_from_frame = SE3.identity((len(stamps_s),))
+            for child in (frame for frame in chain if frame not in shared):
+                parent_from_child, valid_here = self._at(child, stamps_s)
+                ancestor_from_frame = parent_from_child @ ancestor_from_frame
+                valid &= valid_here
+            sides.append(ancestor_from_frame)
+        return sides[0].inverse() @ sides[1], valid
+
+    def _edge(self, child: str) -> _Edge:
+        topics = self._edges[child]
+        moving = [topic for topic, edge in topics.items() if edge.moving]
+        return topics[self._topic if self._topic in topics else (moving or [*topics])[0]]
+
+    def _refuse_ambiguous(self, child: str) -> None:
+        topics, edge = self._edges[child], self._edge(child)
+        others = [] if self._topic in topics else [*topics.values()]
+        moving = sum(bool(other.moving) for other in others)
+        # Equal static transforms agree, and one moving topic takes precedence over static ones.
+        last = [np.r_[e.transforms[-1].translation, e.transforms[-1].quaternion] for e in others]
+        agree = moving == 1 or (
+            not moving and all(np.allclose(last[0], x, atol=1e-6) for x in last)
+        )
+        parent = edge.transforms[0].parent
+        if not agree or any(other.transforms[0].parent != parent for other in others):
+            raise InputError(
+                f"{self._source}: tf {parent} -> {child} is on several topics,"
+                f" {', '.join(sorted(topics))}; choose one with --pose-topic"
+            )
+        if len(edge.parents) > 1:
+            raise InputError(
+                f"{self._source}: tf frame {child!r} has several parents,"
+                f" {', '.join(sorted(edge.parents))}: two programs publish it; record with one of"
+                f" them"
+            )
+
+    def _at(self, child: str, stamps_s: NDArray[np.float64]) -> tuple[SE3, NDArray[np.bool_]]:
+        edge = self._edge(child)
+        _, _, stamps, quaternions, translations = zip(*edge.transforms, strict=True)
+        poses = SE3(np.array(quaternions), np.array(translations))
+        if not edge.moving:
+            return poses[np.zeros(len(stamps_s), int)], np.ones(len(stamps_s), dtype=bool)
+        return PoseTrack(np.array(stamps), poses).at(stamps_s)
+
+    def _chain(self, frame: str) -> list[str]:
+        chain = [frame]
+        while chain[-1] in self._edges:
+            parent = self._edge(chain[-1]).transforms[0].parent
+            if parent in chain:
+                cycle = " -> ".join([*chain, parent])
+                raise InputError(f"{self._source}: tf has a cycle: {cycle}")
+            chain.append(parent)
+        return chain
+
+
+def plain_name(frame: str) -> str:
+    """Name of a frame without the leading slash of old ROS 1 programs."""
+    return frame.lstrip("/")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +189,7 @@ def poses_at_images(
     return ImagePoses(poses, valid, of_camera, notes)
 
 
-def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[TfTree, list[float]]:
-    """All transforms, and times of the moving ones in seconds after `zero_ns`."""
+def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[_TfTree, list[float]]:
     topics = bag.topics(*TF)
     if not topics:
         joints = bag.topics(JOINT_STATE)
@@ -71,7 +199,7 @@ def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[TfTree, list[fl
             f" /tf_static{instead}. It holds {bag.contents()}"
         )
     _check_topic(bag, wanted, [t for t in topics if not t.endswith("tf_static")], "tf")
-    tree, times = TfTree(str(bag.path), wanted), []
+    tree, times = _TfTree(str(bag.path), wanted), []
     for message in bag.messages(topics):
         for entry in message.content.transforms:
             stamp = None
@@ -79,13 +207,8 @@ def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[TfTree, list[fl
                 stamp = message.seconds(entry.header, zero_ns)
                 times.append(stamp)
             t, q = entry.transform.translation, entry.transform.rotation
-            link = Transform(
-                entry.header.frame_id,
-                entry.child_frame_id,
-                stamp,
-                (q.w, q.x, q.y, q.z),
-                (t.x, t.y, t.z),
-            )
+            frames = entry.header.frame_id, entry.child_frame_id
+            link = _Transform(*frames, stamp, (q.w, q.x, q.y, q.z), (t.x, t.y, t.z))
             tree.add(link, message.topic.removesuffix("_static"))
     return tree, times
 
@@ -99,9 +222,8 @@ def _check_topic(bag: BagFile, wanted: str | None, topics: Sequence[str], what: 
 
 
 def _frame(
-    bag: BagFile, tree: TfTree, wanted: str | None, usual: Sequence[str], option: str
+    bag: BagFile, tree: _TfTree, wanted: str | None, usual: Sequence[str], option: str
 ) -> str:
-    """The requested frame, or the only one with a usual name."""
     frames = tree.frames()
     if wanted is not None:
         if plain_name(wanted) not in frames:
@@ -135,7 +257,6 @@ def _from_joints(
     model: RobotModel,
     options: ReadOptions,
 ) -> ImagePoses:
-    """Forward kinematics of the joint states, interpolated at the images."""
     base, gripper = model.chosen_links(options.base_frame, options.gripper_frame)
     topics = bag.topics(JOINT_STATE)
     if not topics:
@@ -145,17 +266,12 @@ def _from_joints(
         )
     _check_topic(bag, options.pose_topic, topics, "joint states")
     tracks = _joint_tracks(bag, topics, zero_ns)
-    joints = model.joints_between(base, gripper)
-    missing = [name for name in joints if name not in tracks]
-    if missing:
-        raise InputError(
-            f"{bag.path}: joint states lack {', '.join(missing)}, which {gripper} depends on; they"
-            f" have {', '.join(tracks)}"
-        )
-    values, valid = np.empty((len(stamps), len(joints))), np.ones(len(stamps), dtype=bool)
+    needed = model.joints_between(base, gripper)
+    values, valid = np.zeros((len(stamps), len(tracks))), np.ones(len(stamps), dtype=bool)
     times: Sequence[float] = ()
-    for column, name in enumerate(joints):
-        track = tracks[name]
+    for column, (name, track) in enumerate(tracks.items()):
+        if name not in needed:
+            continue
         if len(track) > 1 and options.pose_topic not in track:
             raise InputError(
                 f"{bag.path}: joint {name} is on several topics, {', '.join(sorted(track))};"
@@ -165,9 +281,9 @@ def _from_joints(
         times, positions = zip(*track[topic], strict=True)
         values[:, column], here = interpolate(np.array(times), np.array(positions), stamps)
         valid &= here
+    poses, notes = model.poses([*tracks], values, base, gripper, bag.path)
     if not valid.any():
         _refuse_times(bag, stamps, times, "the joint states")
-    poses, notes = model.poses(joints, values, base, gripper)
     return ImagePoses(poses, valid, False, notes)
 
 
