@@ -33,10 +33,6 @@ def evaluate(
 
     Returns:
         Results scene by scene in the order of `scenes`, frames in recorded order.
-
-    Raises:
-        InputError: No scenes, a scene that was not learned or has no posed test frames, or an
-            unreadable image.
     """
     tests = {name: _test_frames(localizer, name, scene) for name, scene in scenes.items()}
     if not tests:
@@ -69,7 +65,6 @@ def _test_frames(localizer: SceneLocalizer, name: str, scene: Recording) -> tupl
 
 
 def _same_base(name: str, scenes: Mapping[str, Recording]) -> set[str]:
-    """Return the names of the scenes with the same base frame."""
     base = scenes[name].base
     return {name} | {n for n, scene in scenes.items() if base is not None and scene.base == base}
 

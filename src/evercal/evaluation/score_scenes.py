@@ -25,9 +25,6 @@ def evaluate(
 
     Returns:
         Scores of each scene and their means.
-
-    Raises:
-        InputError: No scene, a repeated name, or as `evaluation.protocol.evaluate`.
     """
     return scores(frame_results(localizer, _named(scenes)))
 

@@ -19,9 +19,6 @@ def device_of(name: str | torch.device = "auto") -> torch.device:
 
     Returns:
         A numbered device, which equals the `device` of its tensors.
-
-    Raises:
-        InputError: Another name, or a CUDA device that this machine lacks.
     """
     word = str(name)
     if word == "cpu" or (word == "auto" and not torch.cuda.is_available()):

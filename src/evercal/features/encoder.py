@@ -180,11 +180,7 @@ class AceEncoder(nn.Module):
 
 
 def checked_encoder(module: nn.Module) -> Encoder:
-    """Freeze a user's module as an encoder.
-
-    Raises:
-        InputError: It lacks `stride` or `width`, or its output is not (b, width, h, w).
-    """
+    """Freeze a user's module as an encoder."""
     if not isinstance(module, Encoder):
         raise InputError(
             f"encoder {type(module).__name__}: needs integer attributes 'stride' and 'width'"
@@ -203,11 +199,7 @@ def checked_encoder(module: nn.Module) -> Encoder:
 
 
 def own_encoder(module: nn.Module, path: Path) -> Encoder:
-    """Load the weights of a file into a user's module.
-
-    Raises:
-        InputError: The weights belong to another module.
-    """
+    """Load the weights of a file into a user's module."""
     state = {name: value.float() for name, value in load_tensors(path).items()}
     load_strictly(module, state, f"{path}: not the weights of the given encoder")
     return checked_encoder(module)
@@ -219,9 +211,6 @@ def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
     Args:
         path: a safetensors file of `training`, or ACE's published weight file, a torch
             state dict that is read with `weights_only`. Default: the shipped encoder.
-
-    Raises:
-        InputError: No such file, or keys and shapes of neither layout.
     """
     path = ENCODER_FILE if path is None else path
     if not path.is_file():
@@ -238,11 +227,7 @@ def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
 
 
 def ace_encoder_from_state(state: object, name: str) -> AceEncoder:
-    """Build an `AceEncoder` from a state dict in ACE's layout.
-
-    Raises:
-        InputError: A missing, unknown or wrongly shaped tensor.
-    """
+    """Build an `AceEncoder` from a state dict in ACE's layout."""
     if not isinstance(state, dict) or "res2_skip.weight" not in state:
         raise InputError(
             f"encoder {name}: not ACE's layout (no tensor 'res2_skip.weight'); "

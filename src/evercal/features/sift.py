@@ -99,7 +99,6 @@ def epipolar_pair(
 def _distinct_matches(
     a: NDArray[np.float32], b: NDArray[np.float32]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of mutual best matches that pass the ratio test."""
     similar = a @ b.T
     best = similar.argmax(1)
     rows = np.arange(len(a))
@@ -113,5 +112,4 @@ def _distinct_matches(
 
 
 def _ideal(camera: Camera) -> dict[str, object]:
-    """The camera without distortion and principal point, for PoseLib."""
     return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [camera.fx, 0.0, 0.0]}

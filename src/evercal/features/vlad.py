@@ -52,7 +52,6 @@ class Vlad:
         return F.normalize(vector @ projection, dim=0)
 
     def _on(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Centroids and projection on a device, cached."""
         if device not in self._copies:
             self._copies[device] = self.centroids.to(device), self.projection.to(device)
         return self._copies[device]
@@ -65,9 +64,6 @@ def vlad_for(encoder: Encoder, features: Sequence[Tensor] = ()) -> Vlad:
     """The VLAD of an encoder.
 
     Missing centroids are fitted to features (cells, channels) of images.
-
-    Raises:
-        InputError: An encoder without centroids, and no features to fit them to.
     """
     if encoder not in _by_encoder:
         centroids = shipped_centroids(encoder)

@@ -226,7 +226,6 @@ class Camera:
         return cls(**numbers, distortion=tuple(_number(k, "distortion") for k in distortion))
 
     def _distort(self, plane: Array) -> Array:
-        """(..., 2) ideal to distorted points of the plane z = 1."""
         (u, v), _ = self._distorted(plane[..., 0], plane[..., 1])
         return np.stack([u, v], axis=-1)
 
@@ -246,7 +245,6 @@ class Camera:
         return (u, v), (a, cross, d)
 
     def _radial(self, r2: Array) -> tuple[Array, Array]:
-        """Radial scale of points at squared distances from the axis, and its derivative by them."""
         k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
         above = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         steeper = k1 + r2 * (2 * k2 + r2 * 3 * k3)
@@ -257,7 +255,6 @@ class Camera:
         return radial, (steeper - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
 
     def _undistorted(self, distorted: Array) -> Array:
-        """(..., 2) distorted to ideal points of the plane z = 1; NaN outside their range."""
         plane, lost = distorted, np.ones(distorted.shape[:-1], bool)
         for _ in range(50):  # Newton's method: a few steps but close to `widest`
             far = np.sqrt((plane**2).sum(-1, keepdims=True))

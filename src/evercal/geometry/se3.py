@@ -266,7 +266,6 @@ def _quaternion_product(a: Array, b: Array) -> Array:
 
 
 def _medoid(poses: SE3, weights: Array) -> SE3:
-    """The pose with the smallest summed distance to the others, among at most 200 candidates."""
     heavy = np.flatnonzero(weights > 0)
     candidates = heavy[np.unique(np.linspace(0, len(heavy) - 1, 200).round().astype(int))]
     metres, radians = pose_distance(poses[candidates[:, None]], poses[None])

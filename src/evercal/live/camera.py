@@ -35,9 +35,6 @@ class StreamCamera:
         source: number or device of a camera, address, video file or folder.
         rate: frames per second of a folder whose file names hold no times.
         timeout_s: longest time to wait for a live frame, seconds.
-
-    Raises:
-        InputError: The source does not exist or cannot be opened.
     """
 
     def __init__(self, source: str, rate: float = 15.0, timeout_s: float = 5.0):
@@ -46,11 +43,7 @@ class StreamCamera:
         self._newest = NewestFrame(self._frames) if is_live(source) else None
 
     def read(self) -> tuple[float, Image]:
-        """Take the next image.
-
-        Raises:
-            InputError: The source has ended, or no frame arrives in time.
-        """
+        """Take the next image."""
         if self._newest is None:
             frame = next(self._frames, None)
         else:

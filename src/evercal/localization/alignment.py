@@ -187,7 +187,6 @@ def align_pose(
 
 
 def _moved_px(camera: Camera, before: Array, after: Array) -> float:
-    """Motion of the image's edge by a change of the intrinsics, pixels."""
     across = [np.linspace(0, side - 1, 5) for side in (camera.width, camera.height)]
     plane = camera.pinhole.unproject(np.stack(np.meshgrid(*across), -1))
     pixels = [changed_camera(camera, change).project(plane) for change in (before, after)]

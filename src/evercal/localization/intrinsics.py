@@ -120,7 +120,6 @@ class Prior:
 
 
 def _log_density(change: Array, covariance: Array) -> float:
-    """Logarithm of a Gaussian density about zero, without its constant."""
     squares = change @ np.linalg.solve(covariance, change)
     return float(-(squares + np.linalg.slogdet(covariance)[1]) / 2)
 
@@ -156,7 +155,6 @@ def self_calibrated(
 def _contradictable(
     observed: Observed, camera: Camera, free: RefinedPose, prior: Prior
 ) -> RefinedPose:
-    """Pose and intrinsics under a prior that gives way."""
     variances = prior.tested(camera, free.change, free.change_covariance)
     return refine_pose(observed, camera, free.pose.pose, _REFINE_STEPS, variances, free.change)
 
@@ -184,7 +182,6 @@ def _own_or_other(
 
 
 def _apart(kept: SE3, other: SE3) -> Array:
-    """(6, 6) covariance whose deviation reaches from one pose to another."""
     turn = (kept.inverse() @ other).log()[3:]
     off = np.r_[other.translation_m - kept.translation_m, turn]
     return np.outer(off, off)
@@ -196,9 +193,6 @@ def cameras_in_scenes(
     """Intrinsics of an image in each scene; a guess where none are given and no aspect ratio fits.
 
     The recording's intrinsics are replaced by the adjusted ones.
-
-    Raises:
-        InputError: A camera with another aspect ratio than the image's.
     """
     height, width = image.shape[:2]
     if camera is not None and not camera.fits(width, height):
@@ -215,7 +209,6 @@ def cameras_in_scenes(
 
 
 def _own(recorded: Camera, width: int, height: int) -> Camera:
-    """The camera of a recording for an image of another size."""
     if recorded.fits(width, height):
         return recorded.resized(width, height)
     scale = max(width, height) / max(recorded.width, recorded.height)
@@ -224,7 +217,6 @@ def _own(recorded: Camera, width: int, height: int) -> Camera:
 
 
 def _is_own(camera: Camera, scene: "LearnedScene") -> bool:
-    """Whether a stated camera is that of a recording, as stated there or as adjusted."""
     return camera in (scene.camera, scene.adjusted_camera)
 
 

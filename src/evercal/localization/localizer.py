@@ -113,9 +113,6 @@ class Localizer:
 
         The device is `auto` (a CUDA device if there is one), `cpu` or `cuda`. For a map that was
         made with a module of the caller's own, `encoder` is that module.
-
-        Raises:
-            InputError: Not a map, an empty one, or a damaged file; no such device.
         """
         where = device_of(device)
         contents = MapStore.open(Path(store), encoder).contents
@@ -143,9 +140,6 @@ class Localizer:
 
         Returns:
             Pose in the base frame with its covariance, or the reason for rejecting the image.
-
-        Raises:
-            InputError: Not an image, or a camera with another aspect ratio than the image's.
         """
         return self.located(image, camera, at_most_ms)[0]
 
@@ -247,13 +241,11 @@ class Localizer:
         return best
 
     def _turned(self, query: Query, turns: int) -> Query:
-        """The query with features of the image turned clockwise by quarter turns."""
         image = np.ascontiguousarray(np.rot90(query.image, -turns))
         features = encode_image(image, self.contents.encoder, self.contents.short_side)
         return replace(query, features=features, turns=turns)
 
     def _guided(self, query: Query, candidate: Candidate, camera: Camera) -> Hypothesis:
-        """A pose in one scene; with little support it is matched again near itself."""
         best = self._hypothesis(query, candidate, camera)
         dense = replace(candidate, match_stride=1)
         while best.inliers and best.pose and support(best) < self.options.guided_below:

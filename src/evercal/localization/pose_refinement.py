@@ -187,12 +187,10 @@ def changed_camera(camera: Camera, change: Array) -> Camera:
 
 
 def _whitened(white: Array, raw: Array) -> Array:
-    """(2, n) residuals of unit variance."""
     return white[:, 0] * raw[0] + white[:, 1] * raw[1]
 
 
 def _robust_variance(squares: Array) -> float:
-    """Variance of residuals from their squared norms (n,), at least 0.05."""
     # The median of a 2-D Gaussian's squared norm is 1.386 variances.
     return max(_median(squares) / 1.386, 0.05)
 

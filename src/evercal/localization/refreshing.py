@@ -88,10 +88,6 @@ def refresh_scene(
         camera: Their intrinsics. Default: those of the camera that recorded the scene.
         options: Thresholds.
         on_progress: Called with the step, how much of it is done, and its total.
-
-    Raises:
-        InputError: Too few images are located, or the refreshed map would locate fewer of them. The
-            map is unchanged.
     """
     began, options = time.perf_counter(), options or RefreshOptions()
     estimates = []
@@ -147,7 +143,6 @@ def refresh_scene(
 
 
 def _shown(estimates: Sequence[PoseEstimate]) -> str | None:
-    """Return the scene that most images show."""
     names = [e.scene for e in estimates if e.status == "ok" and e.scene is not None]
     return max(sorted(set(names)), key=names.count) if names else None
 

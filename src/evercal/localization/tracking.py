@@ -111,9 +111,6 @@ class Tracker:
         Args:
             image: (H, W, 3) or (H, W) uint8, as for `Localizer.localize`.
             stamp_s: Time of the image, seconds. Default: frames at `fallback_s`.
-
-        Raises:
-            InputError: As `Localizer.localize`.
         """
         number, self._number = self._number, self._number + 1
         stamp = number * self.options.fallback_s if stamp_s is None else stamp_s
@@ -175,7 +172,6 @@ class Tracker:
         return replace(nothing, omitted=omitted), "lost"
 
     def _adopted(self, search: BackgroundSearch, budget: TimeBudget) -> bool:
-        """Take the pose of an earlier frame as prior, if it was found by now."""
         earlier = search.take(budget.left_s - _MARGIN * self._alignment_s)
         if earlier is None or earlier[1][0].status != "ok":
             return False
@@ -248,7 +244,6 @@ class Tracker:
         return 1.0 if similarity is None else similarity.scale
 
     def _predicted(self, stamp: float) -> SE3 | None:
-        """Pose of the next frame at constant velocity."""
         if not self._poses:
             return None
         (last, pose), before = self._poses[-1], self._poses[:-1]
@@ -260,7 +255,6 @@ class Tracker:
         return pose @ SE3.exp(share * (before[0][1].inverse() @ pose).log())
 
     def _next_keyframes(self, pose: SE3) -> NDArray[np.int64]:
-        """Return the keyframes of the scene with the most similar views."""
         keyframes = self.localizer.contents.scenes[self._scene].keyframes
         first = sum(len(s.keyframes) for s in self.localizer.contents.scenes[: self._scene])
         metres, radians = pose_distance(pose, keyframes.base_from_camera)
@@ -269,7 +263,6 @@ class Tracker:
         return first + order[: self.options.keyframes]
 
     def _trusted(self, found: Hypothesis, predicted: SE3, times: float) -> bool:
-        """Whether a pose is accepted and near its prediction."""
         if found.pose is None or not self.localizer.accepts(found, times):
             return False
         metres, radians = pose_distance(found.pose.pose, predicted)
@@ -277,7 +270,6 @@ class Tracker:
         return near and float(radians) < np.deg2rad(self.options.reach_deg)
 
     def _remember(self, found: Hypothesis, stamp: float, settled: bool = False) -> None:
-        """Keep what predicts the next frame, if it is settled."""
         if found.pose is None:
             return
         self._scene = found.scene

@@ -211,7 +211,6 @@ def box_faces(
 
 
 def _wave(t: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
-    """A random smooth periodic function of t, shape (n,), with range [0, 1] over [0, 2 pi]."""
     parts = [(k, rng.uniform(0.4, 1) / k, rng.uniform(0, 2 * np.pi)) for k in (1, 2, 3)]
 
     def total(x: np.ndarray) -> np.ndarray:

@@ -32,9 +32,6 @@ def record_cell(
 
     The wrist poses are spread over the reachable ones. The truth is in a file of its own, which no
     other command reads.
-
-    Raises:
-        InputError: The folder exists, the seed is reserved, or the images are too small.
     """
     if out.exists() and any(out.iterdir()):
         raise InputError(f"{out}: is not empty; give a new folder")

@@ -99,9 +99,6 @@ class VirtualCell:
     Args:
         seed: of room, mount, tripod and noise; below 9000.
         options: noise, image size and time.
-
-    Raises:
-        InputError: The seed is reserved, or the images are too small.
     """
 
     def __init__(self, seed: int = 0, options: CellOptions | None = None):
@@ -157,13 +154,11 @@ def nominal_mount() -> SE3:
 
 
 def _mount(rng: np.random.Generator) -> SE3:
-    """The true gripper_from_camera: the nominal one within 2 cm and some degrees."""
     tangent = np.concatenate([rng.uniform(-0.02, 0.02, 3), rng.uniform(-0.1, 0.1, 3)])
     return nominal_mount() @ SE3.exp(tangent)
 
 
 def _tripod(rng: np.random.Generator) -> SE3:
-    """The true base_from_tripod: beside the arm, looking over the table."""
     side = 1.0 if rng.random() < 0.5 else -1.0
     low, high = (-0.1, 0.4, 0.6), (0.2, 0.6, 0.8)
     position = rng.uniform(low, high) * (1.0, side, 1.0)

@@ -92,11 +92,7 @@ class VirtualRobot:
         return tuple(self._motion.joints_rad(self._clock.now()).tolist())
 
     def move_to(self, base_from_gripper: SE3) -> None:
-        """Move and return when the arm stands still; a second caller waits for the first.
-
-        Raises:
-            InputError: The pose is out of reach.
-        """
+        """Move and return when the arm stands still; a second caller waits for the first."""
         with self._lock:
             now = self._clock.now()
             start = self._motion.joints_rad(now)
