@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.console import print_json, print_next, print_table, progress_bar
 from evercal.cli.options import Device, Store, Verb
 from evercal.cli.stores import open_localizer
 from evercal.errors import InputError
@@ -36,7 +36,7 @@ class Evaluate(Verb):
             raise InputError("no scene given; name one or more scene folders after the store")
         scenes = load_named(self.scenes)
         from evercal.evaluation import evaluate, scores
-        from evercal.evaluation.tables import score_table
+        from evercal.evaluation.tables import score_rows
 
         localizer = open_localizer(self.store, self.device)
         with progress_bar("evaluating", 0, "image") as bar:
@@ -50,7 +50,7 @@ class Evaluate(Verb):
         if self.json:
             print_json(summary.to_dict())
             return 0
-        print(score_table(summary))
+        print_table(score_rows(summary))
         print(f"{summary.ms_per_image:.0f} ms per image, one at a time, decoding included")
         print_next("evercal", "learn", self.store, "SCENE")
         return 0

@@ -83,7 +83,7 @@ class SceneScores:
     median_translation_cm: float
     """Median over all frames; frames without a pose count as infinite."""
     median_rotation_deg: float
-    """Median over all frames; frames without a pose count as infinite."""
+    """The same for the rotation."""
     wrong_scene: float
     """Per cent of frames with a pose in another scene."""
     unknown: float
@@ -140,15 +140,7 @@ class ContinualScores:
 def correct(
     results: Iterable[FrameResult], thresholds: tuple[float, float] = COARSE
 ) -> dict[str, NDArray[np.bool_]]:
-    """Check which frames are correct.
-
-    Args:
-        results: Results of frames.
-        thresholds: Metres and radians. An error equal to its threshold is not correct.
-
-    Returns:
-        Flags (frames,) of each scene, in the order of the results.
-    """
+    """Which frames (frames,) of each scene are correct, by thresholds in metres and radians."""
     metres, radians = thresholds
     return {
         scene: np.array(
@@ -159,14 +151,7 @@ def correct(
 
 
 def scores(results: Sequence[FrameResult]) -> Scores:
-    """Compute scores of scenes.
-
-    Args:
-        results: Results of all frames, at least one.
-
-    Raises:
-        ValueError: There are no results.
-    """
+    """Compute scores of scenes from the results of all frames, at least one."""
     if not results:
         raise ValueError("scores needs at least one result, got none")
     scenes = {scene: _scene_scores(rows) for scene, rows in _by_scene(results).items()}
@@ -179,13 +164,9 @@ def scores(results: Sequence[FrameResult]) -> Scores:
 
 
 def share_inside(squared: ArrayLike) -> float:
-    """Compute the per cent of squared Mahalanobis errors inside the 95 % ellipsoid.
+    """Per cent of squared Mahalanobis errors (n,) inside the 95 % ellipsoid.
 
-    Args:
-        squared: Squared errors, shape (n,). NaN entries are ignored.
-
-    Returns:
-        Per cent, NaN without any number.
+    NaN entries are ignored; the result is NaN without any number.
     """
     values = np.asarray(squared, dtype=np.float64)
     values = values[~np.isnan(values)]
@@ -193,13 +174,9 @@ def share_inside(squared: ArrayLike) -> float:
 
 
 def recall_area(translation_m: ArrayLike, within_m: float = 0.2) -> float:
-    """Compute the area under the curve of recall over position error, in per cent.
+    """Area under the curve of recall over position errors (frames,) up to `within_m`, in per cent.
 
     It separates methods that have few frames below any single threshold.
-
-    Args:
-        translation_m: Errors, infinite without a pose in the right scene, shape (frames,).
-        within_m: End of the curve, metres.
     """
     errors = np.asarray(translation_m, dtype=np.float64)
     return 100 * float(np.clip(1 - errors / within_m, 0, 1).mean())
@@ -214,9 +191,6 @@ def continual_scores(accuracies: ArrayLike) -> ContinualScores:
 
     Returns:
         Scores in the unit of `accuracies`. The three scores of forgetting are NaN for N = 1.
-
-    Raises:
-        ValueError: Not square, or not finite on and below the diagonal.
     """
     matrix = np.asarray(accuracies, dtype=np.float64)
     count = len(matrix) if matrix.ndim == 2 else 0
@@ -274,7 +248,5 @@ def _percent(flags: ArrayLike) -> float:
 
 
 def _plain(record: SceneScores | ContinualScores) -> dict[str, object]:
-    return {
-        key: value if math.isfinite(value) else None
-        for key, value in dataclasses.asdict(record).items()
-    }
+    values = dataclasses.asdict(record).items()
+    return {key: value if math.isfinite(value) else None for key, value in values}
