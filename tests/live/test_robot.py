@@ -29,7 +29,7 @@ def assert_same(a: SE3, b: SE3) -> None:
 
 
 def test_the_last_complete_row_wins_at_every_byte(tmp_path: Path) -> None:
-    path, three, header = tmp_path / "poses.csv", poses(3), f"# written by a program\n#{HEADER}"
+    path, three, header = tmp_path / "poses.csv", poses(2), f"# written by a program\n#{HEADER}"
     rows = [row(i, pose) for i, pose in enumerate(three)]
     whole = header + "".join(rows)
     robot = PoseFileRobot(path)

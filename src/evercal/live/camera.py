@@ -60,7 +60,7 @@ class StreamCamera:
             close()
 
     def __enter__(self) -> Self:
-        """Return the camera itself."""
+        """The camera itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -71,8 +71,7 @@ class StreamCamera:
 class NewestFrame:
     """The newest frame of a stream, read by a thread that empties the buffer of its source.
 
-    Iterating gives the newest frame each time and leaves out those that arrived meanwhile. An
-    error of the source is raised where the frames are used, after the frames before it.
+    An error of the source is raised where the frames are used.
     """
 
     def __init__(self, frames: Iterator[StreamFrame]):
@@ -82,24 +81,14 @@ class NewestFrame:
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
-    def __iter__(self) -> Iterator[StreamFrame]:
-        """Return frames until the stream ends."""
-        last: StreamFrame | None = None
-        try:
-            while (frame := self._other_than(last)) is not None:
-                yield frame
-                last = frame
-        finally:
-            self.close()
-        self._raise_error()
-
     def after(self, stamp_s: float, timeout_s: float) -> StreamFrame | None:
         """Return the first frame at or after a time; None if the stream ends or none arrives."""
         with self._changed:
             self._changed.wait_for(lambda: self._ended or self._reached(stamp_s), timeout_s)
             if self._reached(stamp_s):
                 return self._frame
-        self._raise_error()
+        if self._error is not None:
+            raise self._error
         return None
 
     def close(self) -> None:
@@ -111,11 +100,6 @@ class NewestFrame:
 
     def _reached(self, stamp_s: float) -> bool:
         return self._frame is not None and self._frame.stamp_s >= stamp_s
-
-    def _other_than(self, last: StreamFrame | None) -> StreamFrame | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._ended or self._frame is not last)
-            return None if self._frame is last else self._frame
 
     def _run(self) -> None:
         try:
@@ -133,7 +117,3 @@ class NewestFrame:
             with self._changed:
                 self._ended = True
                 self._changed.notify_all()
-
-    def _raise_error(self) -> None:
-        if self._error is not None:
-            raise self._error
