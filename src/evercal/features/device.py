@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import chain
+from typing import Any
 
 import torch
 from torch import nn
@@ -11,14 +12,10 @@ from evercal.errors import InputError
 
 
 def device_of(name: str | torch.device = "auto") -> torch.device:
-    """Parse the name of a device.
+    """The device of a name, numbered, so that it equals the `device` of its tensors.
 
-    Args:
-        name: `auto` (the current CUDA device if there is one, otherwise the CPU), `cpu`, `cuda`, or
-            a numbered device such as `cuda:1`.
-
-    Returns:
-        A numbered device, which equals the `device` of its tensors.
+    Names are `auto` (the current CUDA device if there is one, otherwise the CPU), `cpu`, `cuda`, or
+    a numbered device such as `cuda:1`.
     """
     word = str(name)
     if word == "cpu" or (word == "auto" and not torch.cuda.is_available()):
@@ -59,14 +56,12 @@ def tf32(device: torch.device) -> Iterator[None]:
     if device.type != "cuda":
         yield
         return
-    products, convolutions = (
-        torch.backends.cuda.matmul.allow_tf32,
-        torch.backends.cudnn.allow_tf32,
-    )
+    kinds: tuple[Any, ...] = torch.backends.cuda.matmul, torch.backends.cudnn
+    before = [kind.allow_tf32 for kind in kinds]
     try:
-        torch.backends.cuda.matmul.allow_tf32 = True
-        torch.backends.cudnn.allow_tf32 = True
+        for kind in kinds:
+            kind.allow_tf32 = True
         yield
     finally:
-        torch.backends.cuda.matmul.allow_tf32 = products
-        torch.backends.cudnn.allow_tf32 = convolutions
+        for kind, allowed in zip(kinds, before, strict=True):
+            kind.allow_tf32 = allowed

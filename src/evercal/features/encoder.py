@@ -72,6 +72,8 @@ class LocalEncoder(nn.Module):
     """
 
     stride = 8
+    names = ("stem", "inner", "blocks", "width")
+    """Settings that a weight file states."""
 
     def __init__(
         self,
@@ -83,29 +85,19 @@ class LocalEncoder(nn.Module):
     ):
         super().__init__()
         self.width = width
-        self.settings: dict[str, Any] = {
-            "stem": list(stem), "inner": inner, "blocks": blocks, "width": width,
-        }  # fmt: skip
-        self.stem = nn.ModuleList(
-            [
-                _ConvBlock(4, stem[0], 3, 1, fused),
-                _ConvBlock(stem[0], stem[0], 3, 1, fused),
-                _ConvBlock(stem[0], stem[1], 2, 2, fused),
-                _ConvBlock(stem[1], stem[1], 3, 1, fused),
-                _ConvBlock(stem[1], inner, 2, 2, fused),
-            ]
-        )
+        values = (list(stem), inner, blocks, width)
+        self.settings: dict[str, Any] = dict(zip(self.names, values, strict=True))
+        half, quarter = stem
+        layers = ((4, half, 3, 1), (half, half, 3, 1), (half, quarter, 2, 2))
+        layers += ((quarter, quarter, 3, 1), (quarter, inner, 2, 2))
+        self.stem = nn.ModuleList(_ConvBlock(*layer, fused) for layer in layers)
         self.blocks = nn.ModuleList(_Residual(inner, fused) for _ in range(blocks))
         self.project = nn.Conv2d(inner, width, 1)
 
     def forward(self, grey: Tensor) -> Tensor:
-        """Encode a batch.
+        """(b, 1, h, w) in [0, 1] -> (b, width, h // 8, w // 8) unit vectors.
 
-        Args:
-            grey: (b, 1, h, w) in [0, 1]; pixels beyond a multiple of 8 are cut off.
-
-        Returns:
-            (b, width, h // 8, w // 8) unit vectors.
+        Pixels beyond a multiple of 8 are cut off.
         """
         height, width = (side // 8 * 8 for side in grey.shape[-2:])
         x = standardise(grey[..., :height, :width])
@@ -206,11 +198,10 @@ def own_encoder(module: nn.Module, path: Path) -> Encoder:
 
 
 def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
-    """Load an encoder for inference.
+    """Load an encoder for inference; by default the shipped one.
 
-    Args:
-        path: a safetensors file of `training`, or ACE's published weight file, a torch
-            state dict that is read with `weights_only`. Default: the shipped encoder.
+    The file is a safetensors file of `training`, or ACE's published weight file, a torch state
+    dict that is read with `weights_only`.
     """
     path = ENCODER_FILE if path is None else path
     if not path.is_file():
@@ -255,13 +246,8 @@ def _load_own(path: Path) -> LocalEncoder | AceEncoder:
                 f"encoder {path}: weights of the module {settings['layout']!r}; pass that module as"
                 " encoder"
             )
-        names = ("stem", "inner", "blocks", "width")
-        encoder = LocalEncoder(**{name: settings[name] for name in names})
+        encoder = LocalEncoder(**{name: settings[name] for name in LocalEncoder.names})
     except (SafetensorError, KeyError, ValueError) as error:
         raise InputError(f"encoder {path}: not an evercal encoder file ({error!r})") from error
     load_strictly(encoder, state, f"encoder {path}: not an evercal encoder file")
-    return cast(LocalEncoder, _channels_last(encoder.eval()))
-
-
-def _channels_last(module: nn.Module) -> nn.Module:
-    return module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    return encoder.eval().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]

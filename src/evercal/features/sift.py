@@ -57,17 +57,7 @@ def sift_features(image: NDArray[np.uint8]) -> SiftFeatures:
 def epipolar_pair(
     a: SiftFeatures, b: SiftFeatures, first: Camera, second: Camera
 ) -> EpipolarPair | None:
-    """Match two images and estimate the camera's motion.
-
-    Args:
-        a: Features of the first image.
-        b: Features of the second image.
-        first: Camera of the first image.
-        second: Camera of the second image.
-
-    Returns:
-        The motion, or None with fewer than `MIN_INLIERS` inliers.
-    """
+    """Match two images and estimate the camera's motion; None for fewer than `MIN_INLIERS`."""
     import poselib
 
     if min(len(a.pixels), len(b.pixels)) < MIN_INLIERS:
