@@ -32,7 +32,7 @@ def features(seed: int, contents: MapContents) -> Tensor:
 
 def test_retrieval_ranks_the_keyframes_of_all_scenes(several: MapContents) -> None:
     bank, descriptors = KeyframeBank(several, 9), several.scenes[1].keyframes.descriptors
-    assert len(bank) == 21
+    assert len(bank.scene) == 21
     assert descriptors is not None
     for seed in range(5):
         query = features(seed, several)
@@ -46,7 +46,7 @@ def test_retrieval_ranks_the_keyframes_of_all_scenes(several: MapContents) -> No
 
 def test_a_keyframe_is_most_similar_to_itself(hall_map: MapContents) -> None:
     bank = KeyframeBank(hall_map, 9)
-    for i in range(len(bank)):
+    for i in range(len(bank.scene)):
         assert bank.retrieve(bank.load(i).cells.features.float())[0] == i
 
 

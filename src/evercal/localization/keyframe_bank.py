@@ -121,9 +121,6 @@ class KeyframeBank:
         """The encoder of the map."""
         return self._contents.encoder
 
-    def __len__(self) -> int:
-        return len(self.scene)
-
     def retrieve(self, features: Tensor) -> NDArray[np.int64]:
         """Rank the keyframes by the similarity of their descriptors.
 
@@ -138,11 +135,10 @@ class KeyframeBank:
         """A keyframe of the bank, by its index."""
         with self._lock:
             if index not in self._loaded:
-                self._loaded[index] = self._read(int(self.scene[index]), int(self._number[index]))
+                keyframes = self._contents.scenes[self.scene[index]].keyframes
+                number = int(self._number[index])
+                self._loaded[index] = LoadedKeyframe(self._contents, keyframes, number)
                 if len(self._loaded) > self._most:
                     self._loaded.popitem(last=False)
             self._loaded.move_to_end(index)
             return self._loaded[index]
-
-    def _read(self, scene: int, number: int) -> LoadedKeyframe:
-        return LoadedKeyframe(self._contents, self._contents.scenes[scene].keyframes, number)

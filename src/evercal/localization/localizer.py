@@ -128,7 +128,7 @@ class Localizer:
     def localize(
         self, image: np.ndarray, camera: Camera | None = None, at_most_ms: float | None = None
     ) -> PoseEstimate:
-        """Estimate the camera pose of one image.
+        """Estimate the camera pose of one image, or the reason for rejecting it.
 
         Args:
             image: RGB or grey, uint8, shape (H, W, 3) or (H, W); other arrays are converted, see
@@ -137,9 +137,6 @@ class Localizer:
                 camera that recorded the scene, as adjusted by the map.
             at_most_ms: Time for the answer, milliseconds. Further attempts are left out when they
                 would take longer, see `PoseEstimate.omitted`; the first one always runs.
-
-        Returns:
-            Pose in the base frame with its covariance, or the reason for rejecting the image.
         """
         return self.located(image, camera, at_most_ms)[0]
 
@@ -159,18 +156,14 @@ class Localizer:
         )
         best = self._best_hypothesis(query, cameras)
         rival: Hypothesis | None = None
-        if self._accepted(best) and query.budget.allows("rival poses", 0.0):
+        if self.accepts(best) and query.budget.allows("rival poses", 0.0):
             best, rival = self._settled(query, best, cameras)
-        answer = self._answer(query, best, rival, 1000 * (time.perf_counter() - began))
+        answer = self.answer(query, best, 1000 * (time.perf_counter() - began), rival)
         return replace(answer, omitted=tuple(query.budget.omitted)), best
 
     def accepts(self, hypothesis: Hypothesis, times: float = 1.0) -> bool:
         """Whether a pose has `times` the support that its scene requires."""
-        return self._accepted(hypothesis, times)
-
-    def answer(self, query: Query, found: Hypothesis, milliseconds: float) -> PoseEstimate:
-        """The answer for a pose in the map's frame."""
-        return self._answer(query, found, None, milliseconds)
+        return accepted(hypothesis, self.contents.scenes[hypothesis.scene], times)
 
     def localize_batch(
         self, images: Sequence[np.ndarray], cameras: Sequence[Camera | None]
@@ -186,7 +179,7 @@ class Localizer:
         first, other_camera = self.options.quick
         began, budget = time.perf_counter(), query.budget
         best, view = self._tried(query, first, cameras), query
-        if self._accepted(best, self.options.immediate):
+        if self.accepts(best, self.options.immediate):
             return best
         once = time.perf_counter() - began
         for turns in (2, 1, 3):
@@ -194,11 +187,11 @@ class Localizer:
                 break
             turned = self._turned(query, turns)
             trial = self._tried(turned, first, cameras)
-            if self._accepted(trial, self.options.immediate):
+            if self.accepts(trial, self.options.immediate):
                 return trial
             if better(trial, best):
                 best, view = trial, turned
-        if not self._accepted(best):
+        if not self.accepts(best):
             if budget.allows("unknown intrinsics", once):
                 unknown = self._tried(view, other_camera, cameras)
                 best = unknown if better(unknown, best) else best
@@ -213,7 +206,7 @@ class Localizer:
             trial = self._tried(view, attempt, cameras, done)
             once = max(once, (time.perf_counter() - began) / _THOROUGH)
             best = trial if support(trial) > support(best) else best
-            if self._accepted(best):
+            if self.accepts(best):
                 break
         return best
 
@@ -236,7 +229,7 @@ class Localizer:
             trial = self._guided(query, candidate, cameras[candidate.scene])
             once = time.perf_counter() - began
             best = trial if best.pose is None or better(trial, best) else best
-            if self._accepted(trial, self.options.immediate):
+            if self.accepts(trial, self.options.immediate):
                 break
         return best
 
@@ -358,7 +351,7 @@ class Localizer:
             rivals = [
                 rival
                 for rival in self._rivals(query, front, cameras[best.scene])
-                if rival.refined and rival.pose and self._accepted(rival)
+                if rival.refined and rival.pose and self.accepts(rival)
             ]
             seen += rivals
             higher = max(rivals, key=support, default=front)
@@ -416,51 +409,12 @@ class Localizer:
             if rival is not None:
                 yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
 
-    def _accepted(self, hypothesis: Hypothesis, times: float = 1.0) -> bool:
-        return accepted(hypothesis, self.contents.scenes[hypothesis.scene], times)
-
-    def _answer(
-        self, query: Query, best: Hypothesis, rival: Hypothesis | None, milliseconds: float
+    def answer(
+        self, query: Query, best: Hypothesis, milliseconds: float, rival: Hypothesis | None = None
     ) -> PoseEstimate:
+        """The answer for a pose in the map's frame, with another one that fits as well."""
         scene = self.contents.scenes[best.scene]
-        if best.pose is None or not self._accepted(best):
-            failed = best.pose is None
-            return replace(
-                self._rejected(best, milliseconds),
-                status="failed" if failed else "unknown_scene",
-                reason="fewer than 6 inliers" if failed else rejection(best, scene),
-            )
-        estimate, terms = in_base(best, scene)
-        if rival is not None and rival.pose is not None:
-            other = scene.frame.to_base(rival.pose).pose
-            mm, deg = pose_distance_mm_deg(estimate.pose, other)
-            return replace(
-                self._rejected(best, milliseconds),
-                status="ambiguous",
-                reason=_rival_reason(mm, deg, scene.unit_known),
-                scene=scene.name,
-                alternatives=(estimate.pose, other),
-            )
-        if scene.unit_known and estimate.sigma_mm > 1000 * USELESS_M:
-            return replace(
-                self._rejected(best, milliseconds),
-                reason=f"its position is uncertain by {estimate.sigma_mm:.0f} mm per axis",
-            )
-        assert best.points_m is not None, "accepted poses have inliers"
-        return replace(
-            self._rejected(best, milliseconds),
-            status="ok",
-            scene=scene.name,
-            base_from_camera=estimate.pose,
-            covariance=estimate.covariance,
-            terms=terms,
-            pixels=best.pixels,
-            points_m=scene.frame.points_to_base(best.points_m),
-            camera=best.refined and best.refined.camera.resized(*query.size),
-        )
-
-    def _rejected(self, best: Hypothesis, milliseconds: float) -> PoseEstimate:
-        return PoseEstimate(
+        rejected = PoseEstimate(
             status="unknown_scene",
             reason="",
             scene=None,
@@ -470,6 +424,36 @@ class Localizer:
             inlier_ratio=best.inlier_ratio,
             milliseconds=milliseconds,
             support=support(best),
+        )
+        if best.pose is None:
+            return replace(rejected, status="failed", reason="fewer than 6 inliers")
+        if not self.accepts(best):
+            return replace(rejected, reason=rejection(best, scene))
+        estimate, terms = in_base(best, scene)
+        if rival is not None and rival.pose is not None:
+            other = scene.frame.to_base(rival.pose).pose
+            mm, deg = pose_distance_mm_deg(estimate.pose, other)
+            return replace(
+                rejected,
+                status="ambiguous",
+                reason=_rival_reason(mm, deg, scene.unit_known),
+                scene=scene.name,
+                alternatives=(estimate.pose, other),
+            )
+        if scene.unit_known and estimate.sigma_mm > 1000 * USELESS_M:
+            reason = f"its position is uncertain by {estimate.sigma_mm:.0f} mm per axis"
+            return replace(rejected, reason=reason)
+        assert best.points_m is not None, "accepted poses have inliers"
+        return replace(
+            rejected,
+            status="ok",
+            scene=scene.name,
+            base_from_camera=estimate.pose,
+            covariance=estimate.covariance,
+            terms=terms,
+            pixels=best.pixels,
+            points_m=scene.frame.points_to_base(best.points_m),
+            camera=best.refined and best.refined.camera.resized(*query.size),
         )
 
 

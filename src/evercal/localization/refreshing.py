@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, UncertainPose, average_poses
+from evercal.geometry import SE3, Camera, average_poses
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.mapping.build import OnProgress
@@ -64,13 +64,8 @@ class RefreshReport:
     """The same for the rotation."""
 
 
-@dataclass(frozen=True, eq=False)
-class _NewImage:
-    """A new image in the map."""
-
-    frame: Frame
-    """Posed in the frame of the keyframes."""
-    answer: UncertainPose
+_NewImage = tuple[Frame, SE3]
+"""A frame posed in the frame of the keyframes, and its base_from_camera."""
 
 
 def refresh_scene(
@@ -80,14 +75,10 @@ def refresh_scene(
     options: RefreshOptions | None = None,
     on_progress: OnProgress = lambda *_: None,
 ) -> tuple[SceneMap, RefreshReport]:
-    """Refresh the scene that most of the images show.
+    """Refresh the scene that most of the images, with their names, show.
 
-    Args:
-        localizer: Localizer of the map.
-        images: Names and images (H, W, 3), uint8 RGB.
-        camera: Their intrinsics. Default: those of the camera that recorded the scene.
-        options: Thresholds.
-        on_progress: Called with the step, how much of it is done, and its total.
+    The intrinsics are by default those of the camera that recorded the scene. Too few located
+    images, or a refreshed map that would locate fewer of them, raise `InputError`.
     """
     began, options = time.perf_counter(), options or RefreshOptions()
     estimates = []
@@ -107,8 +98,8 @@ def refresh_scene(
         )
     check = located[VERIFIED - 1 :: VERIFIED]
     used = [item for i, item in enumerate(located) if i % VERIFIED != VERIFIED - 1]
-    poses = SE3.stack([pose for item in used if (pose := item.frame.base_from_camera) is not None])
-    frames = [used[i].frame for i in spread_poses(poses, options.most_frames)]
+    poses = SE3.stack([pose for frame, _ in used if (pose := frame.base_from_camera) is not None])
+    frames = [used[i][0] for i in spread_poses(poses, options.most_frames)]
     size = WorkingSize(cells=contents.short_side, patches=localizer.options.patches_short_side)
     result = refreshed(scene, frames, contents.encoder, size, options, on_progress)
     scenes = [*contents.scenes]
@@ -166,7 +157,7 @@ def _usable(
             pose = scene.frame.from_base(answer.pose)
             camera = estimate.camera or scene.adjusted_camera
             camera = camera.resized(image.shape[1], image.shape[0])
-            located.append(_NewImage(Frame(name, image, camera, pose), answer))
+            located.append((Frame(name, image, camera, pose), answer.pose))
     return located, left_out
 
 
@@ -182,10 +173,10 @@ def _verified(
 ) -> tuple[SE3, NDArray[np.float64], int]:
     """Locate images outside the refreshed map; return shift, its standard deviation, and count."""
     moves = []
-    for item in check:
-        estimate = after.localize(item.frame.read_image(), camera)
+    for frame, before in check:
+        estimate = after.localize(frame.read_image(), camera)
         if estimate.status == "ok" and estimate.scene == scene and estimate.base_from_camera:
-            moves.append(estimate.base_from_camera @ item.answer.pose.inverse())
+            moves.append(estimate.base_from_camera @ before.inverse())
     lost = len(check) - len(moves)
     if not moves or lost > max(1, WORSE * len(check)):
         raise InputError(

@@ -8,6 +8,7 @@ several periods open.
 
 import time
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -16,7 +17,6 @@ import torch
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.localization.background_search import BackgroundSearch
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import cameras_in_scenes, prior_of
 from evercal.localization.localizer import Localizer
@@ -25,12 +25,12 @@ from evercal.localization.repetition import pattern_steps
 from evercal.recordings.images import as_rgb
 
 TrackState = Literal["tracking", "relocalized", "lost"]
+_Located = tuple[PoseEstimate, Hypothesis]
 _SEARCHING = "localization takes longer than the time for a frame"
 _MARGIN = 1.3
 """Time allowance for an alignment, relative to the previous one."""
 _ANSWER_S = 0.002
 """Time to answer after waiting."""
-
 
 MOST_SPEED_M_S, MOST_ACCELERATION_M_S2 = 1.0, 10.0
 """Motions of a camera that a prediction allows for; faster ones are rare on arms and in hands."""
@@ -83,16 +83,11 @@ class TrackedFrame:
 
 @dataclass(eq=False)
 class Tracker:
-    """Locates the frames of one camera in order.
-
-    Args:
-        localizer: Localizer of the map.
-        camera: Intrinsics. Default: those of the camera that recorded the scene.
-        options: Effort and thresholds.
-    """
+    """Locates the frames of one camera in order."""
 
     localizer: Localizer
     camera: Camera | None = None
+    """Intrinsics. Default: those of the camera that recorded the scene."""
     options: TrackOptions = field(default_factory=TrackOptions)
     _scene: int = -1
     _poses: list[tuple[float, SE3]] = field(default_factory=list)
@@ -102,15 +97,14 @@ class Tracker:
     _number: int = 0
     _alignment_s: float = 0.0
     """Time of the last alignment."""
-    _search: BackgroundSearch | None = None
-    """Locates frames, where the time for a frame is limited."""
+    _pool: ThreadPoolExecutor | None = None
+    _running: tuple[float, Future[_Located]] | None = None
+    """Time of a frame that is located in the background, and its result."""
 
     def track(self, image: np.ndarray, stamp_s: float | None = None) -> TrackedFrame:
-        """Locate the next frame.
+        """Locate the next frame, an image as for `Localizer.localize`, at a time in seconds.
 
-        Args:
-            image: (H, W, 3) or (H, W) uint8, as for `Localizer.localize`.
-            stamp_s: Time of the image, seconds. Default: frames at `fallback_s`.
+        Frames without a time are `fallback_s` apart.
         """
         number, self._number = self._number, self._number + 1
         stamp = number * self.options.fallback_s if stamp_s is None else stamp_s
@@ -151,16 +145,16 @@ class Tracker:
     ) -> tuple[PoseEstimate, TrackState]:
         """The same within a budget; what takes longer goes on in the background."""
         began = time.perf_counter()
-        self._search = search = self._search or BackgroundSearch(self.localizer, self.camera)
-        adopted = search.under_way and self._adopted(search, budget)
+        adopted = self._running is not None and self._adopted(budget)
         estimate = self._near_prediction(image, stamp, budget, adopted)
         if estimate is not None:
             estimate = replace(estimate, omitted=tuple(budget.omitted))
             return estimate, "relocalized" if adopted else "tracking"
         self._poses.clear()
-        if not search.under_way:
-            search.start(image, stamp)
-            if (done := search.take(budget.left_s - _ANSWER_S)) is not None:
+        if self._running is None:
+            self._pool = self._pool or ThreadPoolExecutor(1, "search")
+            self._running = stamp, self._pool.submit(self.localizer.located, image, self.camera)
+            if (done := self._taken(budget.left_s - _ANSWER_S)) is not None:
                 estimate, found = done[1]
                 if estimate.status == "ok":
                     self._remember(found, stamp)
@@ -171,8 +165,17 @@ class Tracker:
         nothing = PoseEstimate("failed", _SEARCHING, None, None, None, 0, 0.0, spent)
         return replace(nothing, omitted=omitted), "lost"
 
-    def _adopted(self, search: BackgroundSearch, budget: TimeBudget) -> bool:
-        earlier = search.take(budget.left_s - _MARGIN * self._alignment_s)
+    def _taken(self, wait_s: float) -> tuple[float, _Located] | None:
+        """Time and result of the frame in the background; None if it is not ready in time."""
+        assert self._running is not None, "a frame was given"
+        stamp, future = self._running
+        if not wait([future], max(wait_s, 0.0)).done:
+            return None
+        self._running = None
+        return stamp, future.result()
+
+    def _adopted(self, budget: TimeBudget) -> bool:
+        earlier = self._taken(budget.left_s - _MARGIN * self._alignment_s)
         if earlier is None or earlier[1][0].status != "ok":
             return False
         stamp, (_, found) = earlier
