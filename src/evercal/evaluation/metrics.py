@@ -20,11 +20,9 @@ from evercal.geometry.near import COARSE
 Status = Literal["ok", "ambiguous", "unknown_scene", "failed"]
 
 MIDDLE = (0.02, math.radians(2.0))
-"""2 cm and 2 deg, in metres and radians."""
 FINE = (0.01, math.radians(1.0))
-"""1 cm and 1 deg, in metres and radians."""
 FINEST = (0.005, math.radians(0.5))
-"""5 mm and 0.5 deg, in metres and radians."""
+"""Thresholds in metres and radians, as `COARSE`."""
 
 CHI2_6 = 12.5916
 """95 % quantile of chi square with six degrees of freedom."""
@@ -32,18 +30,13 @@ CHI2_6 = 12.5916
 
 @dataclass(frozen=True)
 class FrameResult:
-    """Result of one test image."""
+    """Result of one test image: errors are infinite without a pose in the right scene."""
 
     scene: str
-    """Scene of the image."""
     frame: str
-    """Name of the frame in its scene."""
     translation_error_m: float
-    """Metres; infinite without a pose in the right scene."""
     rotation_error_rad: float
-    """Radians; infinite without a pose in the right scene."""
     status: Status
-    """Status of the estimate."""
     found_scene: str | None
     """Scene of the estimate, if any."""
     near_training_frame: bool
@@ -68,30 +61,24 @@ class FrameResult:
 
 @dataclass(frozen=True)
 class SceneScores:
-    """Scores of one scene."""
+    """Scores of one scene: per cent of its test frames, and medians over all of them."""
 
     frames: int
-    """Number of test frames."""
     accuracy_5cm_5deg: float
-    """Per cent."""
     accuracy_2cm_2deg: float
-    """Per cent."""
     accuracy_1cm_1deg: float
-    """Per cent."""
     accuracy_5mm_05deg: float
-    """Per cent, within 5 mm and 0.5 deg."""
     median_translation_cm: float
-    """Median over all frames; frames without a pose count as infinite."""
+    """Frames without a pose count as infinite."""
     median_rotation_deg: float
-    """The same for the rotation."""
     wrong_scene: float
-    """Per cent of frames with a pose in another scene."""
+    """Frames with a pose in another scene."""
     unknown: float
-    """Per cent of frames with status `unknown_scene` or `ambiguous`."""
+    """Frames with status `unknown_scene` or `ambiguous`."""
     near_training_frame: float
-    """Per cent of frames with a training frame within 5 cm and 5 deg."""
+    """Frames with a training frame within 5 cm and 5 deg."""
     inside_95: float = math.nan
-    """Per cent of poses in the right scene whose 95 % ellipsoid contains the true pose; NaN without
+    """Poses in the right scene whose 95 % ellipsoid contains the true pose; NaN without
     covariances."""
 
 
@@ -104,7 +91,6 @@ class Scores:
     mean_accuracy_5cm_5deg: float
     """Per cent, unweighted mean over scenes."""
     mean_accuracy_1cm_1deg: float
-    """Per cent, unweighted mean over scenes."""
     ms_per_image: float
     """Mean milliseconds per image, one at a time, decoding included."""
 

@@ -33,9 +33,7 @@ class RefreshReport:
     """Outcome of a refresh, as JSON values."""
 
     scene: str
-    """Name of the scene."""
     seconds: float
-    """Wall time."""
     images: int
     """Images given."""
     located: int
@@ -49,7 +47,6 @@ class RefreshReport:
     keyframes_left: int
     """Keyframes that were removed."""
     keyframes_added: int
-    """New keyframes."""
     memory_bytes: int
     """Size of the keyframes of this scene."""
     verified: int
@@ -57,11 +54,9 @@ class RefreshReport:
     shift_mm: float
     """Their mean motion by the refresh: the shift of the base frame."""
     shift_deg: float
-    """The same for the rotation."""
     shift_sigma_mm: float
     """Standard deviation of that shift, which is part of every later covariance."""
     shift_sigma_deg: float
-    """The same for the rotation."""
 
 
 _NewImage = tuple[Frame, SE3]
@@ -85,9 +80,10 @@ def refresh_scene(
     for number, (_, image) in enumerate(images):
         estimates.append(localizer.localize(image, camera))
         on_progress("locating", number + 1, len(images))
-    name = _shown(estimates)
+    names = [e.scene for e in estimates if e.status == "ok" and e.scene is not None]
+    shown = max(sorted(set(names)), key=names.count) if names else None
     contents = localizer.contents
-    index = [scene.name for scene in contents.scenes].index(name) if name else -1
+    index = localizer.scenes.index(shown) if shown else -1
     scene = contents.scenes[index]
     located, left_out = _usable(images, estimates, scene)
     if len(located) < LEAST_IMAGES:
@@ -131,11 +127,6 @@ def refresh_scene(
         shift_sigma_deg=float(np.rad2deg(sigma[1])),
     )
     return updated, report
-
-
-def _shown(estimates: Sequence[PoseEstimate]) -> str | None:
-    names = [e.scene for e in estimates if e.status == "ok" and e.scene is not None]
-    return max(sorted(set(names)), key=names.count) if names else None
 
 
 def _usable(
@@ -186,7 +177,6 @@ def _verified(
     poses = SE3.stack(moves)
     shift = average_poses(poses)
     off = (shift.inverse() @ poses).log().reshape(-1, 2, 3)
-    count = max(len(moves) - 1, 1)
-    own = np.sqrt((off**2).mean((0, 2)) / count)
+    own = np.sqrt((off**2).mean((0, 2)) / max(len(moves) - 1, 1))
     size = np.sqrt((shift.log().reshape(2, 3) ** 2).mean(1))
     return shift, np.maximum(own, size), len(moves)

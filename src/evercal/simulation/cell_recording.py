@@ -22,7 +22,6 @@ from evercal.storage import write_bytes, write_json
 WRIST_IMAGES, TRIPOD_IMAGES = 25, 8
 REACHABLE = 200
 JPEG_QUALITY = 95
-_PATH = "wrist"
 
 
 def record_cell(
@@ -41,7 +40,7 @@ def record_cell(
     out.mkdir(parents=True, exist_ok=True)
     reachable = cell.reachable_poses(REACHABLE)
     views = cell.reachable_poses(max(20 * wrist_images, REACHABLE), seed=1)
-    recorder = WristRecorder(out / _PATH, cell.intrinsics)
+    recorder = WristRecorder(out / "wrist", cell.intrinsics)
     for i in spread_poses(views, wrist_images):
         cell.robot.move_to(views[i])
         recorder.add(cell.wrist_camera.read()[1], cell.robot.base_from_gripper())
