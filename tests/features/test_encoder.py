@@ -80,12 +80,6 @@ def test_fused_equals_unfused() -> None:
         torch.testing.assert_close(twin(image), encoder(image), atol=2e-5, rtol=0)
 
 
-def test_fusing_does_not_change_the_mode_of_an_encoder() -> None:
-    encoder = trained().train()
-    encoder.fuse()
-    assert all(layer.training for layer in encoder.modules())
-
-
 @pytest.mark.parametrize("size", [(48, 64), (241, 323), (55, 57), (8, 8), (15, 9)])
 def test_pixels_beyond_whole_cells_are_cut_off(size: tuple[int, int]) -> None:
     height, width = size

@@ -13,13 +13,7 @@ from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.intrinsics import (
-    NOT_STATED,
-    OWN,
-    STATED,
-    cameras_in_scenes,
-    prior_of,
-)
+from evercal.localization.intrinsics import NOT_STATED, OWN, STATED, cameras_in_scenes, prior_of
 from evercal.localization.localizer import Localizer
 from evercal.localization.pnp import PnpOptions
 from evercal.localization.query import Attempt, LocalizeOptions

@@ -9,11 +9,7 @@ import pytest
 
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings import generic, load_recording
-from evercal.simulation.box_room import (
-    BoxRoom,
-    Surface,
-    look_at,
-)
+from evercal.simulation.box_room import BoxRoom, Surface, look_at
 
 from ..box_world import box_room_scene
 

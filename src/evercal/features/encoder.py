@@ -4,6 +4,7 @@ The shipped weights are trained on procedural images alone (`python -m training`
 ACE's published layout can be read, too, and any module with `stride` and `width` can be used.
 """
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
 
@@ -63,12 +64,8 @@ class LocalEncoder(nn.Module):
     (8 j + 3.5, 8 i + 3.5), where (0, 0) is the centre of the first pixel. Strided 3x3 convolutions
     would be centred on (8 j, 8 i), half a cell off.
 
-    Args:
-        stem: channels at 1/2 and 1/4 resolution.
-        inner: channels at 1/8 resolution.
-        blocks: residual blocks (3x3, 1x1, 3x3) at 1/8 resolution.
-        width: output channels.
-        fused: batch norm is folded into the convolutions, for inference; False for training.
+    `stem` are the channels at 1/2 and 1/4 resolution; `inner` channels and `blocks` of 3x3, 1x1 and
+    3x3 are at 1/8. Batch norm is folded into the convolutions, `fused`, except for training.
     """
 
     stride = 8
@@ -110,16 +107,13 @@ class LocalEncoder(nn.Module):
 
     def fuse(self) -> "LocalEncoder":
         """The same function with batch norm folded in, for inference."""
-        training, twin = self.training, LocalEncoder(**self.settings)
-        source = [m for m in self.modules() if isinstance(m, _ConvBlock)]
+        trained, twin = deepcopy(self).eval(), LocalEncoder(**self.settings)
+        source = [m for m in trained.modules() if isinstance(m, _ConvBlock)]
         target = [m for m in twin.modules() if isinstance(m, _ConvBlock)]
         for a, b in zip(source, target, strict=True):
-            conv = cast(nn.Conv2d, a[0])
-            if len(a) == 2:
-                conv = fuse_conv_bn_eval(conv.eval(), cast(nn.BatchNorm2d, a[1]).eval())
+            conv = fuse_conv_bn_eval(cast(nn.Conv2d, a[0]), cast(nn.BatchNorm2d, a[1]))
             b[0].load_state_dict(conv.state_dict())
         twin.project.load_state_dict(self.project.state_dict())
-        self.train(training)
         return twin.eval()
 
 

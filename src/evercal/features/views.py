@@ -35,7 +35,6 @@ class View:
     """One image for the encoder and the rays of its cells."""
 
     grey: np.ndarray
-    """(h, w) uint8."""
     cell_pixels: np.ndarray
     """(cells, 2) float32 pixels of the frame at the cell centres, in an ideal pinhole camera with
     `intrinsics`; row-major over the (h // stride, w // stride) grid."""

@@ -83,17 +83,12 @@ class Alignment:
     refined: RefinedPose
     """map_from_camera and intrinsics."""
     pixels: Array
-    """(n, 2) inliers, pixels of the image."""
+    """(n, 2) inliers, pixels of the image; the other fields are those of `Hypothesis`."""
     points_m: Array
-    """(n, 3) their landmarks in the map's frame."""
     expected: int
-    """Landmarks that should be visible and were searched."""
     matched: int
-    """Landmarks whose patch was found near the expected position."""
     planned: int
-    """Landmarks that the last round would search in an unobstructed image."""
     templates: Array
-    """(n, p) patches of the inliers in their keyframes, at half size."""
 
 
 def align_pose(
@@ -200,11 +195,7 @@ class _Search:
         )
 
     def rounds(
-        self,
-        rounds: Sequence[AlignmentRound],
-        camera: Camera,
-        pose: SE3,
-        found: _Found | None,
+        self, rounds: Sequence[AlignmentRound], camera: Camera, pose: SE3, found: _Found | None
     ) -> tuple[SE3, _Found] | None:
         """Search coarse to fine and refine the pose after every round."""
         for step in rounds:

@@ -33,9 +33,8 @@ class PoseEstimate:
     reason: str
     """Why the status is not `ok`; empty otherwise."""
     scene: str | None
-    """Name of the scene."""
     base_from_camera: SE3 | None
-    """Camera pose in that scene's base frame, metres, OpenCV axes."""
+    """Camera pose in the scene's base frame, metres, OpenCV axes."""
     covariance: np.ndarray | None
     """(6, 6) of (translation in the base frame, metres; rotation about camera axes, radians)."""
     inliers: int

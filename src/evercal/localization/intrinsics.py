@@ -125,11 +125,7 @@ def _log_density(change: Array, covariance: Array) -> float:
 
 
 def self_calibrated(
-    observed: Observed,
-    camera: Camera,
-    pose: SE3,
-    change: Array,
-    prior: Prior,
+    observed: Observed, camera: Camera, pose: SE3, change: Array, prior: Prior
 ) -> RefinedPose:
     """Pose and intrinsics; the prior gives way where the image contradicts it."""
     free = refine_pose(observed, camera, pose, _REFINE_STEPS, prior.free(camera), change)
@@ -171,20 +167,17 @@ def _own_or_other(
         return _contradictable(observed, camera, free, replace(prior, sigma=UNKNOWN))
     own = refine_pose(observed, camera, pose, _REFINE_STEPS, prior.tight(camera))
     other = _contradictable(observed, camera, free, replace(prior, sigma=SAME_MODEL))
-    # Covariances are scaled by the caller, distances are not.
-    apart = _apart(own.pose.pose, other.pose.pose) / prior.scale
+    # A covariance whose deviation reaches from one pose to the other. Covariances are scaled by the
+    # caller, distances are not.
+    turn = (own.pose.pose.inverse() @ other.pose.pose).log()[3:]
+    off = np.r_[other.pose.pose.translation_m - own.pose.pose.translation_m, turn]
+    apart = np.outer(off, off) / prior.scale
     more = min(1.0, doubt / _REACHED) * (other.by_intrinsics - own.by_intrinsics + apart)
     return replace(
         own,
         pose=UncertainPose(own.pose.pose, own.pose.covariance + more),
         by_intrinsics=own.by_intrinsics + more,
     )
-
-
-def _apart(kept: SE3, other: SE3) -> Array:
-    turn = (kept.inverse() @ other).log()[3:]
-    off = np.r_[other.translation_m - kept.translation_m, turn]
-    return np.outer(off, off)
 
 
 def cameras_in_scenes(

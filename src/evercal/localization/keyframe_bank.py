@@ -101,10 +101,7 @@ class LoadedKeyframe:
 
 
 class KeyframeBank:
-    """The keyframes of all scenes of a map.
-
-    `most_loaded` keyframes stay decoded in memory (up to 3 MB each).
-    """
+    """The keyframes of all scenes of a map; `most_loaded` stay decoded (up to 3 MB each)."""
 
     def __init__(self, contents: MapContents, most_loaded: int):
         self._contents, self._most, self._lock = contents, most_loaded, Lock()

@@ -18,12 +18,7 @@ from torch import nn
 from evercal.errors import InputError
 from evercal.features.device import device_of
 from evercal.features.encode import encode_image
-from evercal.geometry import (
-    SE3,
-    Camera,
-    pose_distance_mm_deg,
-    resize_pixels,
-)
+from evercal.geometry import SE3, Camera, pose_distance_mm_deg, resize_pixels
 from evercal.localization.acceptance import (
     USELESS_M,
     accepted,
@@ -109,10 +104,9 @@ class Localizer:
         encoder: nn.Module | None = None,
         device: str = "auto",
     ) -> Self:
-        """A localizer for a map on disk.
+        """A localizer for a map on disk, on a device as for `device_of`.
 
-        The device is `auto` (a CUDA device if there is one), `cpu` or `cuda`. For a map that was
-        made with a module of the caller's own, `encoder` is that module.
+        For a map that was made with a module of the caller's own, `encoder` is that module.
         """
         where = device_of(device)
         contents = MapStore.open(Path(store), encoder).contents
@@ -413,7 +407,7 @@ class Localizer:
         self, query: Query, best: Hypothesis, milliseconds: float, rival: Hypothesis | None = None
     ) -> PoseEstimate:
         """The answer for a pose in the map's frame, with another one that fits as well."""
-        scene = self.contents.scenes[best.scene]
+        scene, (height, width) = self.contents.scenes[best.scene], query.image.shape[:2]
         rejected = PoseEstimate(
             status="unknown_scene",
             reason="",
@@ -441,8 +435,8 @@ class Localizer:
                 alternatives=(estimate.pose, other),
             )
         if scene.unit_known and estimate.sigma_mm > 1000 * USELESS_M:
-            reason = f"its position is uncertain by {estimate.sigma_mm:.0f} mm per axis"
-            return replace(rejected, reason=reason)
+            wide = f"its position is uncertain by {estimate.sigma_mm:.0f} mm per axis"
+            return replace(rejected, reason=wide)
         assert best.points_m is not None, "accepted poses have inliers"
         return replace(
             rejected,
@@ -453,7 +447,7 @@ class Localizer:
             terms=terms,
             pixels=best.pixels,
             points_m=scene.frame.points_to_base(best.points_m),
-            camera=best.refined and best.refined.camera.resized(*query.size),
+            camera=best.refined and best.refined.camera.resized(width, height),
         )
 
 

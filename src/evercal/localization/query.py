@@ -121,12 +121,6 @@ class Query:
     turns: int = 0
     """Quarter turns clockwise of the image before it was encoded."""
     budget: TimeBudget = field(default_factory=TimeBudget)
-    """Time for the answer."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the image, pixels."""
-        return self.image.shape[1], self.image.shape[0]
 
     @cached_property
     def grey(self) -> np.ndarray:
@@ -143,16 +137,13 @@ class Query:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A scene to try."""
+    """A scene to try with the effort of an `Attempt`."""
 
     scene: int
-    """Index of the scene."""
     keyframes: NDArray[np.int64]
     """Its keyframes in the bank, most similar first."""
     match_stride: int = 1
-    """See `Attempt.match_stride`."""
     unknown_camera: bool = False
-    """See `Attempt.unknown_camera`."""
 
     @property
     def key(self) -> tuple[int, int, bool, bytes]:
@@ -185,7 +176,6 @@ class Hypothesis:
     """A pose of the image, assuming that it shows one scene."""
 
     scene: int
-    """Index of the scene."""
     pose: UncertainPose | None = None
     """map_from_camera; None where PnP failed."""
     refined: RefinedPose | None = None
@@ -200,7 +190,6 @@ class Hypothesis:
     """Landmarks whose patch was found near the expected position."""
     planned: int = 0
     """Landmarks that an unobstructed image would have been searched for."""
-
     pnp_inliers: int = 0
     """Matches that agree with the pose before alignment."""
     candidate: Candidate | None = None
@@ -208,7 +197,7 @@ class Hypothesis:
     matches: Matches | None = None
     """All matches; None where alignment failed."""
     templates: np.ndarray | None = None
-    """(n, p) patches of the inliers, see `Alignment.templates`."""
+    """(n, p) patches of the inliers in their keyframes, at half size."""
 
     @property
     def inliers(self) -> int:

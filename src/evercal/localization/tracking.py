@@ -67,14 +67,12 @@ class TrackedFrame:
     """A frame of a stream."""
 
     number: int
-    """Number of the frame, from 0."""
+    """From 0."""
     stamp_s: float
-    """Its time."""
     state: TrackState
     """`tracking`: found near its prediction. `relocalized`: located from nothing. `lost`: no
     pose."""
     estimate: PoseEstimate
-    """The answer."""
     smoothed: SE3 | None = None
     """base_from_camera, smoothed; None where lost or without smoothing."""
     jumped: bool = False
@@ -161,9 +159,8 @@ class Tracker:
                 return estimate, "relocalized" if estimate.status == "ok" else "lost"
         budget.allows("localization", np.inf)
         spent = 1000 * (time.perf_counter() - began)
-        omitted = tuple(budget.omitted)
         nothing = PoseEstimate("failed", _SEARCHING, None, None, None, 0, 0.0, spent)
-        return replace(nothing, omitted=omitted), "lost"
+        return replace(nothing, omitted=tuple(budget.omitted)), "lost"
 
     def _taken(self, wait_s: float) -> tuple[float, _Located] | None:
         """Time and result of the frame in the background; None if it is not ready in time."""
@@ -193,6 +190,7 @@ class Tracker:
         began, predicted = time.perf_counter(), self._predicted(stamp)
         if predicted is None:
             return None
+        settled = self.options.settled if adopted else 1.0
         localizer, contents = self.localizer, self.localizer.contents
         cameras = cameras_in_scenes(self.camera, image, contents.scenes)
         priors = tuple(prior_of(self.camera, image, scene) for scene in contents.scenes)
@@ -200,19 +198,14 @@ class Tracker:
         candidate = Candidate(self._scene, self._next_keyframes(predicted))
         change = np.zeros(5) if self._change is None else self._change
         for coarse in (True,) if adopted else (False, True):
-            start = time.perf_counter()
-            if (
-                coarse
-                and not adopted
-                and not budget.allows("coarse alignment", _MARGIN * self._alignment_s)
-            ):
+            start, expected = time.perf_counter(), _MARGIN * self._alignment_s
+            if coarse and not adopted and not budget.allows("coarse alignment", expected):
                 return None
             found = localizer.aligned(
                 query, candidate, cameras[self._scene], predicted, change, coarse
             )
             self._alignment_s = time.perf_counter() - start
-            times = self.options.settled if adopted else 1.0
-            if found is not None and self._trusted(found, predicted, times):
+            if found is not None and self._trusted(found, predicted, settled):
                 if self._may_have_slipped(found, predicted, stamp):
                     return None
                 answer = localizer.answer(query, found, 1000 * (time.perf_counter() - began))
