@@ -54,7 +54,7 @@ class PoseEstimate:
     alternatives: tuple[SE3, ...] = ()
     """The poses base_from_camera of an ambiguous image, the stronger one first."""
     omitted: tuple[str, ...] = ()
-    """Steps that a time budget left out, see `Localizer.localize`."""
+    """Steps that a time for the frame left out, see `TrackOptions.at_most_ms`."""
     support: float = 0.0
     """Support of the pose, see `localization.acceptance`."""
 

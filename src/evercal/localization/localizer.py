@@ -49,7 +49,6 @@ from evercal.localization.query import (
     LocalizeOptions,
     Matches,
     Query,
-    TimeBudget,
 )
 from evercal.localization.repetition import displaced, pattern_steps
 from evercal.mapping.scene_map import MapContents
@@ -57,8 +56,6 @@ from evercal.mapping.store import MapStore
 from evercal.recordings.images import as_rgb
 
 _ALONG_FOCAL = np.eye(INTRINSICS)[0]
-_THOROUGH = 3.0
-"""Usual duration of a thorough attempt, in quick ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +116,7 @@ class Localizer:
         """Names of the scenes, in order of learning."""
         return tuple(scene.name for scene in self.contents.scenes)
 
-    def localize(
-        self, image: np.ndarray, camera: Camera | None = None, at_most_ms: float | None = None
-    ) -> PoseEstimate:
+    def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         """Estimate the camera pose of one image, or the reason for rejecting it.
 
         Args:
@@ -129,13 +124,11 @@ class Localizer:
                 `recordings.as_rgb`.
             camera: Intrinsics, at any size of the image's aspect ratio. Default: those of the
                 camera that recorded the scene, as adjusted by the map.
-            at_most_ms: Time for the answer, milliseconds. Further attempts are left out when they
-                would take longer, see `PoseEstimate.omitted`; the first one always runs.
         """
-        return self.located(image, camera, at_most_ms)[0]
+        return self.located(image, camera)[0]
 
     def located(
-        self, image: np.ndarray, camera: Camera | None = None, at_most_ms: float | None = None
+        self, image: np.ndarray, camera: Camera | None = None
     ) -> tuple[PoseEstimate, Hypothesis]:
         """`localize`, and the pose in the map's frame, for tracking."""
         began = time.perf_counter()
@@ -146,14 +139,11 @@ class Localizer:
             encode_image(image, contents.encoder, contents.short_side),
             self.options.patches_short_side,
             tuple(prior_of(camera, image, scene) for scene in contents.scenes),
-            budget=TimeBudget(began + (np.inf if at_most_ms is None else at_most_ms / 1000)),
         )
-        best = self._best_hypothesis(query, cameras)
-        rival: Hypothesis | None = None
-        if self.accepts(best) and query.budget.allows("rival poses", 0.0):
+        best, rival = self._best_hypothesis(query, cameras), None
+        if self.accepts(best):
             best, rival = self._settled(query, best, cameras)
-        answer = self.answer(query, best, 1000 * (time.perf_counter() - began), rival)
-        return replace(answer, omitted=tuple(query.budget.omitted)), best
+        return self.answer(query, best, 1000 * (time.perf_counter() - began), rival), best
 
     def accepts(self, hypothesis: Hypothesis, times: float = 1.0) -> bool:
         """Whether a pose has `times` the support that its scene requires."""
@@ -171,14 +161,10 @@ class Localizer:
     def _best_hypothesis(self, query: Query, cameras: Sequence[Camera]) -> Hypothesis:
         """The pose with the most support, from as few attempts as it takes."""
         first, other_camera = self.options.quick
-        began, budget = time.perf_counter(), query.budget
         best, view = self._tried(query, first, cameras), query
         if self.accepts(best, self.options.immediate):
             return best
-        once = time.perf_counter() - began
         for turns in (2, 1, 3):
-            if not budget.allows("turned images", once):
-                break
             turned = self._turned(query, turns)
             trial = self._tried(turned, first, cameras)
             if self.accepts(trial, self.options.immediate):
@@ -186,19 +172,14 @@ class Localizer:
             if better(trial, best):
                 best, view = trial, turned
         if not self.accepts(best):
-            if budget.allows("unknown intrinsics", once):
-                unknown = self._tried(view, other_camera, cameras)
-                best = unknown if better(unknown, best) else best
+            unknown = self._tried(view, other_camera, cameras)
+            best = unknown if better(unknown, best) else best
             if best.pnp_inliers < self.options.promising_inliers:
                 return best
         done: set[tuple[int, int, bool, bytes]] = set()
         # A pose that is barely accepted in the first attempt may be beaten in the second.
         for attempt in self.options.thorough:
-            began = time.perf_counter()
-            if not budget.allows("thorough attempts", _THOROUGH * once):
-                break
             trial = self._tried(view, attempt, cameras, done)
-            once = max(once, (time.perf_counter() - began) / _THOROUGH)
             best = trial if support(trial) > support(best) else best
             if self.accepts(best):
                 break
@@ -212,16 +193,12 @@ class Localizer:
         done: set[tuple[int, int, bool, bytes]] | None = None,
     ) -> Hypothesis:
         """The pose with the most support of one attempt; candidates that are `done` are skipped."""
-        done, best, once = set() if done is None else done, Hypothesis(0), 0.0
+        done, best = set() if done is None else done, Hypothesis(0)
         for candidate in self._matcher.candidates(query, attempt):
             if candidate.key in done:
                 continue  # in a small map a wider attempt often repeats the one before
             done.add(candidate.key)
-            if best.pose is not None and not query.budget.allows("other scenes", once):
-                break
-            began = time.perf_counter()
             trial = self._guided(query, candidate, cameras[candidate.scene])
-            once = time.perf_counter() - began
             best = trial if best.pose is None or better(trial, best) else best
             if self.accepts(trial, self.options.immediate):
                 break

@@ -1,6 +1,5 @@
 """Options of localization, the prepared image, candidate scenes and pose hypotheses."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -84,28 +83,6 @@ class LocalizeOptions:
     """Keyframes that stay decoded in memory."""
 
 
-@dataclass(eq=False)
-class TimeBudget:
-    """Time for one image; steps that would exceed it are left out."""
-
-    until: float = np.inf
-    """`time.perf_counter` at which the answer is due."""
-    omitted: list[str] = field(default_factory=list)
-    """Steps that were left out."""
-
-    @property
-    def left_s(self) -> float:
-        """Time that is left, seconds."""
-        return self.until - time.perf_counter()
-
-    def allows(self, step: str, expected_s: float) -> bool:
-        """Whether a step of an expected duration fits; one that does not is noted."""
-        fits = time.perf_counter() + expected_s <= self.until
-        if not fits and step not in self.omitted:
-            self.omitted.append(step)
-        return fits
-
-
 @dataclass(frozen=True, eq=False)
 class Query:
     """An image to be located."""
@@ -120,7 +97,6 @@ class Query:
     """Of the intrinsics in each scene."""
     turns: int = 0
     """Quarter turns clockwise of the image before it was encoded."""
-    budget: TimeBudget = field(default_factory=TimeBudget)
 
     @cached_property
     def grey(self) -> np.ndarray:

@@ -20,7 +20,7 @@ from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import cameras_in_scenes, prior_of
 from evercal.localization.localizer import Localizer
-from evercal.localization.query import Candidate, Hypothesis, Query, TimeBudget
+from evercal.localization.query import Candidate, Hypothesis, Query
 from evercal.localization.repetition import pattern_steps
 from evercal.recordings.images import as_rgb
 
@@ -111,7 +111,7 @@ class Tracker:
             estimate, state = self._located(image, stamp)
         else:
             until = time.perf_counter() + self.options.at_most_ms / 1000
-            estimate, state = self._located_in_time(image, stamp, TimeBudget(until))
+            estimate, state = self._located_in_time(image, stamp, until)
         smoothed, jumped = self._smooth(estimate, stamp)
         return TrackedFrame(number, stamp, state, estimate, smoothed, jumped)
 
@@ -124,7 +124,7 @@ class Tracker:
             yield self.track(image, stamp)
 
     def _located(self, image: np.ndarray, stamp: float) -> tuple[PoseEstimate, TrackState]:
-        estimate = self._near_prediction(image, stamp, TimeBudget())
+        estimate = self._near_prediction(image, stamp)
         if estimate is not None:
             return estimate, "tracking"
         before, predicted, scene = self._poses[-1:], self._predicted(stamp), self._scene
@@ -139,40 +139,38 @@ class Tracker:
         return estimate, "relocalized"
 
     def _located_in_time(
-        self, image: np.ndarray, stamp: float, budget: TimeBudget
+        self, image: np.ndarray, stamp: float, until: float
     ) -> tuple[PoseEstimate, TrackState]:
-        """The same within a budget; what takes longer goes on in the background."""
+        """The same until a time of the clock; what takes longer goes on in the background."""
         began = time.perf_counter()
-        adopted = self._running is not None and self._adopted(budget)
-        estimate = self._near_prediction(image, stamp, budget, adopted)
+        adopted = self._running is not None and self._adopted(until)
+        estimate = self._near_prediction(image, stamp, until, adopted)
         if estimate is not None:
-            estimate = replace(estimate, omitted=tuple(budget.omitted))
             return estimate, "relocalized" if adopted else "tracking"
         self._poses.clear()
         if self._running is None:
             self._pool = self._pool or ThreadPoolExecutor(1, "search")
             self._running = stamp, self._pool.submit(self.localizer.located, image, self.camera)
-            if (done := self._taken(budget.left_s - _ANSWER_S)) is not None:
+            if (done := self._taken(until - _ANSWER_S)) is not None:
                 estimate, found = done[1]
                 if estimate.status == "ok":
                     self._remember(found, stamp)
                 return estimate, "relocalized" if estimate.status == "ok" else "lost"
-        budget.allows("localization", np.inf)
         spent = 1000 * (time.perf_counter() - began)
         nothing = PoseEstimate("failed", _SEARCHING, None, None, None, 0, 0.0, spent)
-        return replace(nothing, omitted=tuple(budget.omitted)), "lost"
+        return replace(nothing, omitted=("localization",)), "lost"
 
-    def _taken(self, wait_s: float) -> tuple[float, _Located] | None:
+    def _taken(self, until: float) -> tuple[float, _Located] | None:
         """Time and result of the frame in the background; None if it is not ready in time."""
         assert self._running is not None, "a frame was given"
         stamp, future = self._running
-        if not wait([future], max(wait_s, 0.0)).done:
+        if not wait([future], max(until - time.perf_counter(), 0.0)).done:
             return None
         self._running = None
         return stamp, future.result()
 
-    def _adopted(self, budget: TimeBudget) -> bool:
-        earlier = self._taken(budget.left_s - _MARGIN * self._alignment_s)
+    def _adopted(self, until: float) -> bool:
+        earlier = self._taken(until - _MARGIN * self._alignment_s)
         if earlier is None or earlier[1][0].status != "ok":
             return False
         stamp, (_, found) = earlier
@@ -180,7 +178,7 @@ class Tracker:
         return True
 
     def _near_prediction(
-        self, image: np.ndarray, stamp: float, budget: TimeBudget, adopted: bool = False
+        self, image: np.ndarray, stamp: float, until: float = np.inf, adopted: bool = False
     ) -> PoseEstimate | None:
         """Align the landmarks around the predicted pose; None if that does not suffice.
 
@@ -198,8 +196,8 @@ class Tracker:
         candidate = Candidate(self._scene, self._next_keyframes(predicted))
         change = np.zeros(5) if self._change is None else self._change
         for coarse in (True,) if adopted else (False, True):
-            start, expected = time.perf_counter(), _MARGIN * self._alignment_s
-            if coarse and not adopted and not budget.allows("coarse alignment", expected):
+            start = time.perf_counter()
+            if coarse and not adopted and start + _MARGIN * self._alignment_s > until:
                 return None
             found = localizer.aligned(
                 query, candidate, cameras[self._scene], predicted, change, coarse
