@@ -44,12 +44,6 @@ def test_retrieval_ranks_the_keyframes_of_all_scenes(several: MapContents) -> No
         np.testing.assert_allclose(values, sorted(values, reverse=True), atol=1e-6)
 
 
-def test_a_keyframe_is_most_similar_to_itself(hall_map: MapContents) -> None:
-    bank = KeyframeBank(hall_map, 9)
-    for i in range(len(bank.scene)):
-        assert bank.retrieve(bank.load(i).cells.features.float())[0] == i
-
-
 @pytest.mark.parametrize("most", [1, 3, 7])
 def test_least_recently_used_keyframes_are_dropped(most: int, hall_map: MapContents) -> None:
     bank, rng = KeyframeBank(hall_map, most), np.random.default_rng(0)

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import chain
-from typing import Any
 
 import torch
 from torch import nn
@@ -50,18 +49,15 @@ def tf32(device: torch.device) -> Iterator[None]:
     """Let fp32 matrix products on a CUDA device round their factors to 10 bits, which is faster.
 
     For training: weights are stored with 10 bits, too. Products that need all bits, such as points
-    in a camera, are written as sums. The setting is that of the process, so it is restored. On the
-    CPU nothing changes.
+    in a camera, are written as sums. Convolutions are rounded by default. On the CPU nothing
+    changes.
     """
     if device.type != "cuda":
         yield
         return
-    kinds: tuple[Any, ...] = torch.backends.cuda.matmul, torch.backends.cudnn
-    before = [kind.allow_tf32 for kind in kinds]
+    before = torch.get_float32_matmul_precision()
     try:
-        for kind in kinds:
-            kind.allow_tf32 = True
+        torch.set_float32_matmul_precision("high")
         yield
     finally:
-        for kind, allowed in zip(kinds, before, strict=True):
-            kind.allow_tf32 = allowed
+        torch.set_float32_matmul_precision(before)

@@ -143,7 +143,6 @@ def self_calibrated(
         refined,
         pose=UncertainPose(refined.pose.pose, wider),
         by_intrinsics=shared * refined.by_intrinsics,
-        change_covariance=shared * refined.change_covariance,
         measured=MeasuredIntrinsics(float(squares), by_shared),
     )
 

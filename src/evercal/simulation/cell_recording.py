@@ -13,7 +13,7 @@ from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.geometry import pose_to_dict
-from evercal.live.recorder import WristRecorder, pose_rows
+from evercal.live.recorder import JPEG_QUALITY, WristRecorder, pose_rows
 from evercal.mapping.selection import spread_poses
 from evercal.recordings.images import write_jpeg
 from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
@@ -21,7 +21,6 @@ from evercal.storage import write_bytes, write_json
 
 WRIST_IMAGES, TRIPOD_IMAGES = 25, 8
 REACHABLE = 200
-JPEG_QUALITY = 95
 
 
 def record_cell(

@@ -14,7 +14,7 @@ from evercal.geometry import SE3
 from evercal.simulation.box_room import default_camera, look_at
 from evercal.simulation.cell_room import WORK_AREA_M, arm_surfaces, cell_room
 from evercal.simulation.panda_arm import base_from_flange
-from evercal.simulation.virtual_robot import Clock, SimulatedClock, VirtualRobot, WallClock
+from evercal.simulation.virtual_robot import Clock, VirtualRobot
 
 RESERVED = 9000
 """Seeds from here on are reserved for final evaluation."""
@@ -93,7 +93,7 @@ class VirtualCell:
         if min(self.options.width, self.options.height) < 64:
             raise InputError(f"size {self.options.width}x{self.options.height}: at least 64x64")
         rng = np.random.default_rng([seed, 33])
-        self.clock: Clock = WallClock() if self.options.realtime else SimulatedClock()
+        self.clock = Clock(self.options.realtime)
         self.intrinsics = default_camera(self.options.width, self.options.height)
         sigma = self.options.arm_noise_mm / 1000, float(np.deg2rad(self.options.arm_noise_deg))
         self.robot = VirtualRobot(self.clock, *sigma, seed)

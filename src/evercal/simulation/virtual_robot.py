@@ -14,34 +14,22 @@ SPEED_RAD_S = 1.0
 _SETTLE_S = 0.1
 
 
-class WallClock:
-    """Unix time."""
+class Clock:
+    """Unix time, or a simulated one that passes only by `sleep`, at once."""
+
+    def __init__(self, real: bool):
+        self._now_s = None if real else 0.0
 
     def now(self) -> float:
-        """Seconds since 1970."""
-        return time.time()
+        """Seconds since 1970, or since the start."""
+        return time.time() if self._now_s is None else self._now_s
 
     def sleep(self, seconds: float) -> None:
-        """Wait."""
-        time.sleep(seconds)
-
-
-class SimulatedClock:
-    """A time that passes only by `sleep`, at once."""
-
-    def __init__(self) -> None:
-        self._now = 0.0
-
-    def now(self) -> float:
-        """Seconds since the start."""
-        return self._now
-
-    def sleep(self, seconds: float) -> None:
-        """Advance the time."""
-        self._now += seconds
-
-
-Clock = WallClock | SimulatedClock
+        """Wait, or advance the simulated time."""
+        if self._now_s is None:
+            time.sleep(seconds)
+        else:
+            self._now_s += seconds
 
 
 @dataclass(frozen=True, eq=False)
