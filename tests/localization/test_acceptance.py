@@ -113,7 +113,7 @@ def test_shared_errors_of_held_out_poses_widen_the_stated_frame(
         stated = [(frame, frame.base_from_camera) for frame in frames]
         return [replace(f, base_from_camera=shift @ pose) for f, pose in stated if pose is not None]
 
-    held_out = hall.test[::6]
+    held_out = hall.test[::3]
     few = fit_acceptance(hall_map, off(held_out[:7], 0.02))
     assert few.frame.frame_sigma == (0.0, 0.0)
     assert fit_acceptance(hall_map, held_out).frame.frame_sigma == (0.0, 0.0)
