@@ -433,6 +433,6 @@ class Map:
         Raises:
             InputError: A recording that the map has not learned, or without test frames.
         """
-        from evercal.evaluation.score_scenes import evaluate
+        from evercal.evaluation import evaluate, scores
 
-        return evaluate(self.localizer, recordings)
+        return scores(evaluate(self.localizer, recordings))

@@ -80,11 +80,10 @@ def test_scores_of_two_scenes_by_hand() -> None:
     assert (b.wrong_scene, b.unknown, b.near_training_frame) == (0.0, 25.0, 0.0)
     assert total.mean_accuracy_5cm_5deg == 37.5
     assert total.ms_per_image == pytest.approx(11.25)
-
-
-def test_mean_over_scenes_is_unweighted() -> None:
     rows = [result("small")] + [result("large", 50.0)] * 9
-    assert scores(rows).mean_accuracy_5cm_5deg == 50.0
+    assert scores(rows).mean_accuracy_5cm_5deg == 50.0  # the mean over scenes is unweighted
+    with pytest.raises(ValueError, match="at least one"):
+        scores([])
 
 
 def test_json_has_null_for_infinity() -> None:
@@ -94,26 +93,8 @@ def test_json_has_null_for_infinity() -> None:
     data = json.loads(text)
     means = {"mean_accuracy_5cm_5deg", "mean_accuracy_1cm_1deg"}
     assert set(data) == {"scenes", *means, "ms_per_image"}
-    assert list(data["scenes"]["b"]) == [
-        "frames",
-        "accuracy_5cm_5deg",
-        "accuracy_2cm_2deg",
-        "accuracy_1cm_1deg",
-        "accuracy_5mm_05deg",
-        "median_translation_cm",
-        "median_rotation_deg",
-        "wrong_scene",
-        "unknown",
-        "near_training_frame",
-        "inside_95",
-    ]
     assert data["scenes"]["b"]["median_translation_cm"] is None
     assert data["scenes"]["a"]["median_translation_cm"] == pytest.approx(1.0)
-
-
-def test_no_results_are_refused() -> None:
-    with pytest.raises(ValueError, match="at least one"):
-        scores([])
 
 
 def test_continual_scores_by_hand() -> None:
@@ -135,18 +116,12 @@ def test_continual_scores_by_hand() -> None:
     assert total.accuracy_along == pytest.approx(along / 10)
 
 
-def test_entries_above_the_diagonal_are_ignored() -> None:
-    generator = np.random.default_rng(1)
-    matrix = generator.uniform(0, 100, (5, 5))
-    hidden = np.where(np.tri(5, dtype=bool), matrix, np.nan)
-    assert continual_scores(matrix) == continual_scores(hidden)
-
-
 def test_kinds_of_forgetting_differ_only_if_the_end_is_best() -> None:
     generator = np.random.default_rng(2)
     for _ in range(50):
         matrix = generator.uniform(0, 100, (4, 4))
         total = continual_scores(matrix)
+        assert total == continual_scores(np.where(np.tri(4, dtype=bool), matrix, np.nan))
         assert total.total_forgetting >= max(total.forgetting, 0.0)
         assert total.forgetting >= -total.backward_transfer - 1e-9
         matrix[-1] = 0.0

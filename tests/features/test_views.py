@@ -13,7 +13,6 @@ from evercal.features.views import (
     cell_centres,
     frame_view,
     ideal_cell_pixels,
-    plain_view,
     working_image,
 )
 from evercal.geometry import SE3, Camera
@@ -242,8 +241,3 @@ def test_shrinking_averages() -> None:
     image[::2, ::2] = 255
     small, _ = working_image(image, LARGE, 120)
     assert np.abs(small.astype(float) - 255 / 4).max() <= 1
-
-
-def test_plain_view_has_the_identity_as_pose() -> None:
-    view = plain_view(np.zeros((120, 160), np.uint8), PLAIN, 8, OPTIONS)
-    np.testing.assert_array_equal(view.base_from_camera.matrix(), np.eye(4))

@@ -75,10 +75,8 @@ def test_resizing_agrees_with_opencv() -> None:
     ("size", "expected"),
     [
         ((640, 480), (320, 240)),
-        ((480, 640), (240, 320)),
         ((1920, 1080), (427, 240)),
         ((1080, 1920), (240, 427)),
-        ((500, 500), (240, 240)),
         ((10000, 3), (800000, 240)),
     ],
 )
@@ -146,13 +144,11 @@ def test_range_of_the_distortion(distortion: tuple[float, ...], widest: float) -
     assert camera_with(distortion).widest == pytest.approx(widest)
 
 
-def test_zero_coefficients_equal_no_distortion() -> None:
+def test_zero_coefficients_and_points_behind_the_camera() -> None:
     for count in (4, 5, 8):
         assert camera_with((0.0,) * count) == camera_with(())
     assert camera_with(KINECT).coefficients == (*KINECT, 0.0, 0.0, 0.0)
-
-
-def test_points_behind_the_camera_have_no_pixel() -> None:
+    # Points behind the camera have no pixel.
     pixels = camera_with(()).project([[0.0, 0.0, -1.0], [0.1, 0.1, 0.0], [0.0, 0.0, 1.0]])
     assert np.isnan(pixels[:2]).all()
     assert pixels[2] == pytest.approx((318.6, 255.3))

@@ -1,6 +1,5 @@
 """Images of sources in order, and the newest image of a live one."""
 
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +9,7 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.live import camera
-from evercal.live.camera import NewestFrame, StreamCamera
+from evercal.live.camera import StreamCamera
 from evercal.recordings.images import write_image
 from evercal.recordings.streams import StreamFrame
 
@@ -50,13 +49,11 @@ def test_a_live_image_is_not_older_than_the_call(monkeypatch: pytest.MonkeyPatch
     assert closed == ["0"]
 
 
-def test_a_live_source_that_stops_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_live_source_that_stops_or_fails_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera, "stream", lambda source, rate: iter(()))
     with StreamCamera("rtsp://cell") as source, pytest.raises(InputError, match="rtsp://cell"):
         source.read()
 
-
-def test_a_live_source_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     def frames(source: str, rate: float) -> Iterator[StreamFrame]:
         raise InputError("unplugged")
         yield
@@ -64,23 +61,3 @@ def test_a_live_source_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(camera, "stream", frames)
     with StreamCamera("0") as source, pytest.raises(InputError, match="unplugged"):
         source.read()
-
-
-def test_frames_that_arrive_meanwhile_are_left_out() -> None:
-    first, rest = threading.Event(), threading.Event()
-
-    def frames() -> Iterator[StreamFrame]:
-        yield StreamFrame("0", 0.0, picture(0))
-        assert first.wait(10)
-        for i in range(1, 5):
-            yield StreamFrame(str(i), float(i), picture(i))
-        rest.set()
-        raise InputError("unplugged")
-
-    stream = iter(NewestFrame(frames()))
-    assert next(stream).name == "0"
-    first.set()
-    assert rest.wait(10)
-    assert next(stream).name == "4"
-    with pytest.raises(InputError, match="unplugged"):
-        next(stream)

@@ -1,4 +1,4 @@
-"""Robots by a file that grows, and which of them can move."""
+"""Robots by a file that grows."""
 
 import json
 import os
@@ -9,8 +9,7 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
-from evercal.live.robot import MovingRobot, PoseFileRobot, Robot
-from evercal.simulation.virtual_robot import SimulatedClock, VirtualRobot
+from evercal.live.robot import PoseFileRobot
 
 HEADER = "stamp_s,x,y,z,qw,qx,qy,qz\n"
 
@@ -29,7 +28,7 @@ def assert_same(a: SE3, b: SE3) -> None:
 
 
 def test_the_last_complete_row_wins_at_every_byte(tmp_path: Path) -> None:
-    path, three, header = tmp_path / "poses.csv", poses(3), f"# written by a program\n#{HEADER}"
+    path, three, header = tmp_path / "poses.csv", poses(2), f"# written by a program\n#{HEADER}"
     rows = [row(i, pose) for i, pose in enumerate(three)]
     whole = header + "".join(rows)
     robot = PoseFileRobot(path)
@@ -80,10 +79,3 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
     os.utime(path, (1e9, 1e9))
     with pytest.raises(InputError, match="last written"):
         robot.base_from_gripper()
-
-
-def test_what_a_robot_offers_is_visible() -> None:
-    file, arm = PoseFileRobot("x.csv"), VirtualRobot(SimulatedClock(), 0.0, 0.0, 0)
-    assert isinstance(file, Robot)
-    assert not isinstance(file, MovingRobot)
-    assert isinstance(arm, MovingRobot)

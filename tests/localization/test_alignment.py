@@ -10,12 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.localization.alignment import (
-    Alignment,
-    AlignmentOptions,
-    _shift_px,
-    align_pose,
-)
+from evercal.localization.alignment import Alignment, AlignmentOptions, _shift_px, align_pose
 from evercal.localization.intrinsics import Prior
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.localizer import Localizer

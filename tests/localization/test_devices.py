@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import nn
 
-from evercal.features.vlad import Vlad
 from evercal.geometry import pose_distance
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_map import MapContents
@@ -42,17 +40,6 @@ def test_poses_equal_those_of_the_cpu(
             assert estimate.status == "ok"
             assert estimate.base_from_camera is not None
             assert pose_distance(estimate.base_from_camera, expected.base_from_camera)[0] < 0.005
-
-
-def test_vlad_is_computed_on_the_device_of_the_features(device: torch.device) -> None:
-    generator = torch.Generator().manual_seed(0)
-    centroids, features = (
-        nn.functional.normalize(torch.randn(n, 6, generator=generator), dim=1) for n in (5, 200)
-    )
-    vlad = Vlad(centroids, torch.randn(30, 16, generator=generator))
-    result = vlad(features.to(device))
-    assert result.device == device
-    torch.testing.assert_close(result.cpu(), vlad(features), atol=1e-5, rtol=0)
 
 
 @pytest.mark.gpu

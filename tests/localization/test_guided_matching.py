@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from evercal.features.encode import encode_features
-from evercal.features.views import ViewOptions, plain_view
+from evercal.features.encode import encode_image
 from evercal.geometry import SE3, UncertainPose, pose_distance
 from evercal.localization.acceptance import support
 from evercal.localization.intrinsics import OWN
@@ -90,9 +89,8 @@ def frame(hall: Recording) -> Frame:
 
 @pytest.fixture(scope="module")
 def query(hall_map: MapContents, frame: Frame) -> Query:
-    image, encoder = frame.read_image(), hall_map.encoder
-    view = plain_view(image, frame.camera, encoder.stride, ViewOptions(short_side=240))
-    return Query(image, encode_features([view], encoder)[0], 480, [OWN])
+    image = frame.read_image()
+    return Query(image, encode_image(image, hall_map.encoder, 240), 480, [OWN])
 
 
 def truth_of(frame: Frame) -> SE3:

@@ -129,7 +129,7 @@ def test_matches_without_a_common_pose_do_not_diverge() -> None:
     """Ten steps with free intrinsics lead nowhere, and not out of the world."""
     variances = np.array([2e-8, 5e-3, 5e-3, 6e-7, 6e-7])
     white = np.tile(np.eye(2) / 0.1, (28, 1, 1))
-    for seed in range(100):
+    for seed in range(40):
         rng = np.random.default_rng(seed)
         pixels, points_m = rng.uniform(0, [640, 480], (28, 2)), points(28, seed)
         result = refine_pose(Observed(pixels, points_m, white), CAMERA, POSE, 10, variances)

@@ -17,6 +17,7 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.localization.refreshing import RefreshReport, refresh_scene
 from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.mapping.store import MapStore
 from evercal.recordings.frame import Frame
 from evercal.simulation.box_room import BoxRoom, Surface
 
@@ -157,11 +158,13 @@ def test_a_refresh_that_loses_its_only_image_outside_is_refused(
 
 def test_a_refresh_is_refused_or_undone_as_a_whole(
     hall: Recording,
+    hall_map: MapContents,
     images: list[tuple[str, np.ndarray]],
     tmp_path: Path,
     tree: Callable[..., dict[str, str]],
 ) -> None:
-    Map.open(tmp_path / "map", device="cpu").learn(hall, memory="25%")
+    contents = MapContents(hall_map.encoder, hall_map.short_side)
+    MapStore(tmp_path / "map", contents).commit(hall_map.scenes[0], {})
     before, opened = tree(tmp_path / "map"), Map.open(tmp_path / "map", device="cpu")
     other, camera = BoxRoom(55, texture_px=256), hall.train[0].camera
     wrong = [other.render(camera, SE3.exp([0.05 * i, 0, 1.2, 0.3, 0.1, 0.2])) for i in range(2)]

@@ -95,6 +95,7 @@ def test_a_pose_that_is_too_uncertain_is_not_tracked(
     answer = Localizer.answer
 
     def useless(self: Localizer, *given: Any) -> PoseEstimate:
+        monkeypatch.undo()  # the frame is then located from nothing
         return replace(answer(self, *given), status="unknown_scene", base_from_camera=None)
 
     monkeypatch.setattr(Localizer, "answer", useless)
@@ -114,17 +115,6 @@ def test_a_long_gap_and_time_that_runs_backwards_are_no_prediction(
         "tracking",
         "relocalized",
     ]
-
-
-def test_a_time_budget_leaves_steps_out_and_names_them(hall_map: MapContents) -> None:
-    localizer = Localizer(hall_map)
-    noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
-    long = localizer.localize(noise)
-    short = localizer.localize(noise, at_most_ms=1.0)
-    assert long.omitted == ()
-    assert "turned images" in short.omitted
-    assert "unknown intrinsics" in short.omitted
-    assert short.milliseconds < 0.5 * long.milliseconds
 
 
 def test_a_time_for_a_frame_is_kept_while_frames_are_located(

@@ -1,24 +1,16 @@
 """Box rooms: pixels against rays in closed form, paths, and recordings."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.recordings import generic, load_recording
-from evercal.simulation.box_room import (
-    BoxRoom,
-    Surface,
-    look_at,
-)
-
-from ..box_world import box_room_scene
+from evercal.simulation.box_room import BoxRoom, Surface, look_at
 
 CAMERA = Camera(160, 120, 140.0, 135.0, 83.0, 57.0)
-SEEDS = (11, 12, 13)
+SEEDS = (11, 12)
 
 
 @pytest.fixture(scope="module")
@@ -56,23 +48,12 @@ def test_intersections_match_a_slow_reference(boxes: list[BoxRoom]) -> None:
     rng = np.random.default_rng(0)
     for room in boxes:
         origin = room.random_view(rng).translation_m
-        rays = rng.normal(size=(150, 3))
-        points, depth = room.intersect(origin, rays)
+        rays = rng.normal(size=(60, 3))
+        points, depth = room.intersect(np.tile(origin, (60, 1)), rays)
         for ray, point, measured in zip(rays, points, depth, strict=True):
             _, expected = first_hit(room.surfaces, origin, ray)
             assert measured == pytest.approx(expected, abs=1e-9)
             np.testing.assert_allclose(point, origin + expected * ray, atol=1e-9)
-
-
-def test_rays_can_have_different_origins(boxes: list[BoxRoom]) -> None:
-    rng = np.random.default_rng(1)
-    origins = np.stack([boxes[0].random_view(rng).translation_m for _ in range(20)])
-    rays = rng.normal(size=(20, 3))
-    points, depth = boxes[0].intersect(origins, rays)
-    for i in range(20):
-        point, far = boxes[0].intersect(origins[i], rays[i : i + 1])
-        np.testing.assert_allclose(points[i], point[0], atol=1e-12)
-        assert depth[i] == pytest.approx(far[0])
 
 
 def test_rays_that_miss_the_room_have_no_depth(boxes: list[BoxRoom]) -> None:
@@ -101,10 +82,10 @@ def test_pixels_have_the_colour_of_the_surface_on_their_ray(boxes: list[BoxRoom]
     for room in boxes:
         room, colours = single_coloured(room)
         surfaces = set()
-        for _ in range(3):
+        for _ in range(2):
             pose = room.random_view(rng)
             image = room.render(CAMERA, pose)
-            u, v = rng.integers(0, 160, 120), rng.integers(0, 120, 120)
+            u, v = rng.integers(0, 160, 100), rng.integers(0, 120, 100)
             rays = CAMERA.unproject(np.stack([u, v], -1)) @ pose.rotation_matrix().T
             errors = 0
             for k, ray in enumerate(rays):
@@ -148,13 +129,6 @@ def test_small_and_large_images_agree() -> None:
         slopes = np.stack([-g.ravel() for g in np.gradient(expected)], -1)
         shift = np.linalg.lstsq(slopes, (measured - expected).ravel(), rcond=None)[0]
         assert np.abs(shift).max() < 0.08  # pixels
-
-
-def test_walls_face_inwards(boxes: list[BoxRoom]) -> None:
-    for room in boxes:
-        middle = np.array([0, 0, room.size_m[2] / 2])
-        for surface in room.surfaces[:6]:
-            assert (middle - surface.corner_m) @ surface.normal > 0
 
 
 def test_far_surfaces_are_smoothed_against_aliasing() -> None:
@@ -221,13 +195,6 @@ def test_train_and_test_paths_are_close_but_different(boxes: list[BoxRoom]) -> N
         np.testing.assert_array_equal(train.translation_m, room.path(100, 1).translation_m)
 
 
-@pytest.mark.parametrize("frames", [0, 1, 2])
-def test_the_shortest_paths(boxes: list[BoxRoom], frames: int) -> None:
-    path = boxes[0].path(frames, 1)
-    assert path.shape == (frames,)
-    assert np.isfinite(path.translation_m).all()
-
-
 def test_look_at_aims_at_the_target_with_a_clockwise_roll() -> None:
     eye, target = np.array([0.3, -0.2, 1.0]), np.array([2.0, 0.7, 0.4])
     level, rolled = look_at(eye, target), look_at(eye, target, 0.3)
@@ -246,20 +213,3 @@ def test_random_views_are_inside_and_near_upright(boxes: list[BoxRoom]) -> None:
             assert (np.abs(pose.translation_m[:2]) < room.size_m[:2] / 2).all()
             assert 0.5 <= pose.translation_m[2] <= 0.8 * room.size_m[2]
             assert pose.rotation_matrix()[2, 1] < -0.7  # camera's y points down
-
-
-def test_recordings_survive_the_disk(tmp_path: Path) -> None:
-    memory = box_room_scene(21, 3, 2, CAMERA)
-    generic.write(tmp_path / "room", memory)
-    for loaded in (generic.load(tmp_path / "room"), load_recording(tmp_path / "room")):
-        assert loaded.name == memory.name == "box-room-21"
-        for split in ("train", "test"):
-            frames, expected = getattr(loaded, split), getattr(memory, split)
-            assert [frame.name for frame in frames] == [frame.name for frame in expected]
-            for frame, twin in zip(frames, expected, strict=True):
-                np.testing.assert_array_equal(frame.read_image(), twin.image)
-                assert frame.camera == twin.camera
-                metres, radians = pose_distance(frame.base_from_camera, twin.base_from_camera)
-                assert max(metres, radians) < 1e-9
-    assert len(memory.train) == 3
-    assert len(memory.test) == 2

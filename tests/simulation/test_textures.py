@@ -1,25 +1,18 @@
 """Procedural pictures: reproducible pixels and documented statistics."""
 
-import hashlib
-
 import numpy as np
 import pytest
 
 from evercal.simulation.textures import dead_leaves, one_over_f
 
 
-@pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])
-def test_noise_has_mean_0_and_deviation_1(exponent: float) -> None:
-    noise = one_over_f(64, exponent, np.random.default_rng(0))
-    assert noise.shape == (64, 64)
-    assert noise.dtype == np.float32
-    assert abs(noise.mean()) < 1e-5
-    assert noise.std() == pytest.approx(1.0, abs=1e-5)
-
-
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 1.7])
 def test_amplitude_falls_as_one_over_f_to_the_exponent(exponent: float) -> None:
     rng = np.random.default_rng(1)
+    noise = one_over_f(64, exponent, np.random.default_rng(0))
+    assert noise.dtype == np.float32
+    assert abs(noise.mean()) < 1e-5
+    assert noise.std() == pytest.approx(1.0, abs=1e-5)
     power = np.mean([np.abs(np.fft.fft2(one_over_f(128, exponent, rng))) ** 2 for _ in range(8)], 0)
     frequency = np.hypot(np.fft.fftfreq(128)[:, None], np.fft.fftfreq(128)[None])
     band = (frequency > 0.03) & (frequency < 0.5)
@@ -36,21 +29,12 @@ def test_noise_tiles() -> None:
     assert np.abs(noise[:, 0] - noise[:, 64]).mean() > 4 * inside
 
 
-@pytest.mark.parametrize("size", [(40, 60), (60, 40), (96, 96)])
-def test_pictures_repeat_with_the_generator(size: tuple[int, int]) -> None:
-    first, again, other = (dead_leaves(*size, np.random.default_rng(seed)) for seed in (3, 3, 4))
-    assert first.shape == (*size, 3)
+def test_pictures_repeat_with_the_generator_and_not_with_earlier_calls() -> None:
+    first, other, again = (dead_leaves(40, 60, np.random.default_rng(seed)) for seed in (3, 4, 3))
+    assert first.shape == (40, 60, 3)
     assert first.dtype == np.uint8
     np.testing.assert_array_equal(first, again)
     assert (first != other).mean() > 0.5
-
-
-def test_pictures_do_not_depend_on_earlier_calls() -> None:
-    digest = hashlib.sha256(dead_leaves(48, 48, np.random.default_rng(5)).tobytes()).digest()
-    for seed in range(4):
-        dead_leaves(32, 48, np.random.default_rng(seed))
-    again = dead_leaves(48, 48, np.random.default_rng(5))
-    assert hashlib.sha256(again.tobytes()).digest() == digest
 
 
 def test_pictures_have_contrast_and_edges() -> None:

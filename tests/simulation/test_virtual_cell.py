@@ -23,7 +23,7 @@ from evercal.simulation.panda_arm import (
     joints_for,
 )
 from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
-from evercal.simulation.virtual_robot import SimulatedClock, VirtualRobot, WallClock
+from evercal.simulation.virtual_robot import Clock, VirtualRobot
 
 SMALL = CellOptions(width=160, height=120)
 
@@ -54,7 +54,7 @@ def test_links_have_constant_lengths() -> None:
 
 
 def test_motions_take_time_and_other_threads_see_them() -> None:
-    robot = VirtualRobot(WallClock(), 0.0, 0.0, 0)
+    robot = VirtualRobot(Clock(real=True), 0.0, 0.0, 0)
     target = base_from_flange(HOME_RAD + np.array([1.2, 0, 0, 0, 0, 0, 0]))
     start = robot.base_from_gripper()
     began = time.monotonic()
@@ -70,16 +70,16 @@ def test_motions_take_time_and_other_threads_see_them() -> None:
 
 
 def test_the_true_pose_differs_by_the_stated_noise_and_stays_while_the_arm_stands() -> None:
-    clock = SimulatedClock()
+    clock = Clock(real=False)
     robot = VirtualRobot(clock, 1e-3, 2e-3, 5)
     rng, errors = np.random.default_rng(3), []
-    for joints in HOME_RAD + rng.uniform(-0.3, 0.3, (150, 7)):
+    for joints in HOME_RAD + rng.uniform(-0.3, 0.3, (80, 7)):
         robot.move_to(base_from_flange(joints))
         truth = robot.true_state(clock.now())[0]
         errors.append((robot.base_from_gripper().inverse() @ truth).log())
         assert max(pose_distance(truth, robot.true_state(clock.now() + 9)[0])) < 1e-12
     sigma = np.std(errors, axis=0)
-    np.testing.assert_allclose(sigma, np.repeat([1e-3, 2e-3], 3), rtol=0.2)
+    np.testing.assert_allclose(sigma, np.repeat([1e-3, 2e-3], 3), rtol=0.3)
 
 
 def test_images_follow_the_true_mount() -> None:
@@ -106,7 +106,7 @@ def test_the_table_is_below_the_arm() -> None:
 
 
 def test_a_moving_camera_blurs() -> None:
-    cell = VirtualCell(4, CellOptions(exposure_s=0.02))
+    cell = VirtualCell(4, CellOptions(320, 240, exposure_s=0.02))
     cell.robot.move_to(cell.reachable_poses(1)[0])
     still = cell.wrist_camera.read()[1]
     cell.clock.sleep(-cell.clock.now() / 2)  # back to the middle of the motion
@@ -116,9 +116,9 @@ def test_a_moving_camera_blurs() -> None:
 
 def test_a_recording_is_read_back_and_states_its_truth_apart(tmp_path: Path) -> None:
     out = tmp_path / "cell"
-    assert len(list(record_cell(out, 6, 9, SMALL))) == 9 + 8
+    assert len(list(record_cell(out, 6, 4, SMALL))) == 4 + 8
     frames = load_recording(out / "wrist").train
-    assert len(frames) == 9
+    assert len(frames) == 4
     assert len(list((out / "tripod").glob("*.jpg"))) == 8
     assert len(read_robot_poses(out / "reachable.csv").poses) == 200
     truth = json.loads((out / "truth.json").read_text())

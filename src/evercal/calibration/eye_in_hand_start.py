@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError
-from evercal.features.encode import encode_features
+from evercal.features.encode import encode_image
 from evercal.features.encoder import Encoder
 from evercal.features.sift import epipolar_pair, sift_features
-from evercal.features.views import ViewOptions, plain_view, working_image
+from evercal.features.views import working_image
 from evercal.features.vlad import vlad_for
 from evercal.geometry import SE3
 from evercal.mapping.build import OnProgress
@@ -41,6 +41,8 @@ ANGLE_DEG, ROTATION_DEG, DIRECTION_DEG = 3.0, 5.0, 10.0
 """Largest difference of the rotation angles, the rotations and the directions of a pair."""
 LEAST_ROTATION_DEG, LEAST_PAIRS = 4.0, 6
 """Standard deviation of the rotations about a second axis, and pairs that must agree."""
+ENCODED_SIDE = 240
+"""Short side of the images that are encoded, pixels."""
 LEAST_SHARE = 0.1
 """Share of the pairs that must agree. Before a chessboard most pairs match the wrong squares, and
 these do not agree with each other."""
@@ -207,8 +209,7 @@ def _pair_motions(
         grey, camera = working_image(image, frame.camera, short)
         images.append(grey)
         cameras.append(camera)
-        view = plain_view(grey, camera, encoder.stride, ViewOptions())
-        features.append(encode_features([view], encoder, "cpu")[0].flatten(1).T)
+        features.append(encode_image(grey, encoder, ENCODED_SIDE).cpu().flatten(1).T)
     vlad = vlad_for(encoder, features)
     descriptors = torch.stack([vlad(rows) for rows in features])
     similarity = (descriptors @ descriptors.T).fill_diagonal_(-1)

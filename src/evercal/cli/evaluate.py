@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.arguments import open_localizer
-from evercal.cli.console import progress_bar
+from evercal.cli.console import progress_bar, table
 from evercal.cli.options import Device, Store, Verb
 from evercal.errors import InputError
 
@@ -34,7 +34,7 @@ class Evaluate(Verb):
             raise InputError("no scene given; name one or more scene folders after the store")
         scenes = load_named(self.scenes)
         from evercal.evaluation import evaluate, scores
-        from evercal.evaluation.tables import score_table
+        from evercal.evaluation.tables import score_rows
 
         localizer = open_localizer(self.store, self.device)
         with progress_bar("evaluating", 0, "image") as bar:
@@ -46,7 +46,7 @@ class Evaluate(Verb):
             results = evaluate(localizer, scenes, on_frame=show)
         summary = scores(results)
         lines = [
-            score_table(summary),
+            *table(score_rows(summary)),
             f"{summary.ms_per_image:.0f} ms per image, one at a time, decoding included",
         ]
         return self.answer(summary.to_dict(), lines, ("learn", self.store, "SCENE"))

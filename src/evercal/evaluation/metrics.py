@@ -20,11 +20,9 @@ from evercal.geometry.near import COARSE
 Status = Literal["ok", "ambiguous", "unknown_scene", "failed"]
 
 MIDDLE = (0.02, math.radians(2.0))
-"""2 cm and 2 deg, in metres and radians."""
 FINE = (0.01, math.radians(1.0))
-"""1 cm and 1 deg, in metres and radians."""
 FINEST = (0.005, math.radians(0.5))
-"""5 mm and 0.5 deg, in metres and radians."""
+"""Thresholds in metres and radians, as `COARSE`."""
 
 CHI2_6 = 12.5916
 """95 % quantile of chi square with six degrees of freedom."""
@@ -32,18 +30,13 @@ CHI2_6 = 12.5916
 
 @dataclass(frozen=True)
 class FrameResult:
-    """Result of one test image."""
+    """Result of one test image: errors are infinite without a pose in the right scene."""
 
     scene: str
-    """Scene of the image."""
     frame: str
-    """Name of the frame in its scene."""
     translation_error_m: float
-    """Metres; infinite without a pose in the right scene."""
     rotation_error_rad: float
-    """Radians; infinite without a pose in the right scene."""
     status: Status
-    """Status of the estimate."""
     found_scene: str | None
     """Scene of the estimate, if any."""
     near_training_frame: bool
@@ -68,30 +61,24 @@ class FrameResult:
 
 @dataclass(frozen=True)
 class SceneScores:
-    """Scores of one scene."""
+    """Scores of one scene: per cent of its test frames, and medians over all of them."""
 
     frames: int
-    """Number of test frames."""
     accuracy_5cm_5deg: float
-    """Per cent."""
     accuracy_2cm_2deg: float
-    """Per cent."""
     accuracy_1cm_1deg: float
-    """Per cent."""
     accuracy_5mm_05deg: float
-    """Per cent, within 5 mm and 0.5 deg."""
     median_translation_cm: float
-    """Median over all frames; frames without a pose count as infinite."""
+    """Frames without a pose count as infinite."""
     median_rotation_deg: float
-    """Median over all frames; frames without a pose count as infinite."""
     wrong_scene: float
-    """Per cent of frames with a pose in another scene."""
+    """Frames with a pose in another scene."""
     unknown: float
-    """Per cent of frames with status `unknown_scene` or `ambiguous`."""
+    """Frames with status `unknown_scene` or `ambiguous`."""
     near_training_frame: float
-    """Per cent of frames with a training frame within 5 cm and 5 deg."""
+    """Frames with a training frame within 5 cm and 5 deg."""
     inside_95: float = math.nan
-    """Per cent of poses in the right scene whose 95 % ellipsoid contains the true pose; NaN without
+    """Poses in the right scene whose 95 % ellipsoid contains the true pose; NaN without
     covariances."""
 
 
@@ -104,7 +91,6 @@ class Scores:
     mean_accuracy_5cm_5deg: float
     """Per cent, unweighted mean over scenes."""
     mean_accuracy_1cm_1deg: float
-    """Per cent, unweighted mean over scenes."""
     ms_per_image: float
     """Mean milliseconds per image, one at a time, decoding included."""
 
@@ -140,15 +126,7 @@ class ContinualScores:
 def correct(
     results: Iterable[FrameResult], thresholds: tuple[float, float] = COARSE
 ) -> dict[str, NDArray[np.bool_]]:
-    """Check which frames are correct.
-
-    Args:
-        results: Results of frames.
-        thresholds: Metres and radians. An error equal to its threshold is not correct.
-
-    Returns:
-        Flags (frames,) of each scene, in the order of the results.
-    """
+    """Which frames (frames,) of each scene are correct, by thresholds in metres and radians."""
     metres, radians = thresholds
     return {
         scene: np.array(
@@ -159,14 +137,7 @@ def correct(
 
 
 def scores(results: Sequence[FrameResult]) -> Scores:
-    """Compute scores of scenes.
-
-    Args:
-        results: Results of all frames, at least one.
-
-    Raises:
-        ValueError: There are no results.
-    """
+    """Compute scores of scenes from the results of all frames, at least one."""
     if not results:
         raise ValueError("scores needs at least one result, got none")
     scenes = {scene: _scene_scores(rows) for scene, rows in _by_scene(results).items()}
@@ -179,13 +150,9 @@ def scores(results: Sequence[FrameResult]) -> Scores:
 
 
 def share_inside(squared: ArrayLike) -> float:
-    """Compute the per cent of squared Mahalanobis errors inside the 95 % ellipsoid.
+    """Per cent of squared Mahalanobis errors (n,) inside the 95 % ellipsoid.
 
-    Args:
-        squared: Squared errors, shape (n,). NaN entries are ignored.
-
-    Returns:
-        Per cent, NaN without any number.
+    NaN entries are ignored; the result is NaN without any number.
     """
     values = np.asarray(squared, dtype=np.float64)
     values = values[~np.isnan(values)]
@@ -193,13 +160,9 @@ def share_inside(squared: ArrayLike) -> float:
 
 
 def recall_area(translation_m: ArrayLike, within_m: float = 0.2) -> float:
-    """Compute the area under the curve of recall over position error, in per cent.
+    """Area under the curve of recall over position errors (frames,) up to `within_m`, in per cent.
 
     It separates methods that have few frames below any single threshold.
-
-    Args:
-        translation_m: Errors, infinite without a pose in the right scene, shape (frames,).
-        within_m: End of the curve, metres.
     """
     errors = np.asarray(translation_m, dtype=np.float64)
     return 100 * float(np.clip(1 - errors / within_m, 0, 1).mean())
@@ -214,9 +177,6 @@ def continual_scores(accuracies: ArrayLike) -> ContinualScores:
 
     Returns:
         Scores in the unit of `accuracies`. The three scores of forgetting are NaN for N = 1.
-
-    Raises:
-        ValueError: Not square, or not finite on and below the diagonal.
     """
     matrix = np.asarray(accuracies, dtype=np.float64)
     count = len(matrix) if matrix.ndim == 2 else 0
@@ -274,7 +234,5 @@ def _percent(flags: ArrayLike) -> float:
 
 
 def _plain(record: SceneScores | ContinualScores) -> dict[str, object]:
-    return {
-        key: value if math.isfinite(value) else None
-        for key, value in dataclasses.asdict(record).items()
-    }
+    values = dataclasses.asdict(record).items()
+    return {key: value if math.isfinite(value) else None for key, value in values}

@@ -1,5 +1,6 @@
 """The evaluation protocol: test images of all scenes in random order, without their scene names."""
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 
@@ -10,47 +11,67 @@ from evercal.evaluation.metrics import FrameResult
 from evercal.geometry import pose_distance
 from evercal.geometry.near import near_training
 from evercal.localization.learned import SceneLocalizer
-from evercal.recordings import Frame, Recording, posed_frames, stated_poses
+from evercal.recordings import Frame, Recording, load_recording, posed_frames, stated_poses
+
+Recorded = str | os.PathLike[str] | Recording
+"""A recording, or its folder."""
 
 
 def evaluate(
     localizer: SceneLocalizer,
-    scenes: Mapping[str, Recording],
+    scenes: Recorded | Sequence[Recorded] | Mapping[str, Recorded],
     seed: int = 0,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> list[FrameResult]:
-    """Localize every test image of all scenes, one at a time in random order.
+    """Localize every test image of scenes, one at a time in random order.
 
     The localizer gets image and camera only. Errors are measured if the estimated scene is that of
     the frame or has the same base frame (`Recording.base`), and are infinite otherwise. Test frames
     without a pose are skipped.
 
     Args:
-        localizer: Localizer to evaluate.
-        scenes: Recordings by the names under which they were learned; some or all of them.
+        localizer: A localizer that learned these scenes, and possibly others.
+        scenes: Recordings or their folders. Give a mapping if the localizer has other names for
+            them.
         seed: Seed of the random order.
         on_frame: Called after each image with the numbers of images done and in total.
 
     Returns:
         Results scene by scene in the order of `scenes`, frames in recorded order.
-
-    Raises:
-        InputError: No scenes, a scene that was not learned or has no posed test frames, or an
-            unreadable image.
     """
-    tests = {name: _test_frames(localizer, name, scene) for name, scene in scenes.items()}
+    named = _named(scenes)
+    tests = {name: _test_frames(localizer, name, scene) for name, scene in named.items()}
     if not tests:
         raise InputError(f"no scene to evaluate; give one or more of {_listed(localizer.scenes)}")
-    near = [flag for name, frames in tests.items() for flag in _near(scenes[name], frames)]
+    near = [flag for name, frames in tests.items() for flag in _near(named[name], frames)]
     jobs = [(name, frame) for name, frames in tests.items() for frame in frames]
     results: dict[int, FrameResult] = {}
     for done, index in enumerate(np.random.default_rng(seed).permutation(len(jobs)), start=1):
         name, frame = jobs[index]
-        accepted = _same_base(name, scenes)
+        accepted = _same_base(name, named)
         results[int(index)] = _result(localizer, name, frame, near[index], accepted)
         if on_frame is not None:
             on_frame(done, len(jobs))
     return [results[index] for index in range(len(jobs))]
+
+
+def _named(scenes: Recorded | Sequence[Recorded] | Mapping[str, Recorded]) -> dict[str, Recording]:
+    if isinstance(scenes, Mapping):
+        return {name: _loaded(scene) for name, scene in scenes.items()}
+    given = [scenes] if isinstance(scenes, str | os.PathLike | Recording) else scenes
+    named: dict[str, Recording] = {}
+    for scene in map(_loaded, given):
+        if scene.name in named:
+            raise InputError(
+                f"scene {scene.name!r}: given twice; give a mapping of the names under which they"
+                " were learned"
+            )
+        named[scene.name] = scene
+    return named
+
+
+def _loaded(scene: Recorded) -> Recording:
+    return scene if isinstance(scene, Recording) else load_recording(scene)
 
 
 def _test_frames(localizer: SceneLocalizer, name: str, scene: Recording) -> tuple[Frame, ...]:
@@ -69,7 +90,6 @@ def _test_frames(localizer: SceneLocalizer, name: str, scene: Recording) -> tupl
 
 
 def _same_base(name: str, scenes: Mapping[str, Recording]) -> set[str]:
-    """Return the names of the scenes with the same base frame."""
     base = scenes[name].base
     return {name} | {n for n, scene in scenes.items() if base is not None and scene.base == base}
 

@@ -1,14 +1,10 @@
-"""Scores as tables for the terminal and for Markdown."""
+"""Scores as rows of a table."""
 
 import math
-from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 
-from evercal.evaluation.metrics import SceneScores, Scores
-
-Style = Literal["terminal", "markdown"]
+from evercal.evaluation.metrics import Scores
 
 # Title, field of SceneScores, factor and number of decimals.
 _COLUMNS = (
@@ -23,47 +19,26 @@ _COLUMNS = (
     ("in 95 % ellipsoid", "inside_95", 1, 1),
     ("near training %", "near_training_frame", 1, 1),
 )
-SCENE_HEADER = ("scene", "frames", *(title for title, *_ in _COLUMNS))
-"""Titles of `scene_rows`."""
 
 
-def score_table(scores: Scores, style: Style = "terminal") -> str:
-    """Format `scene_rows` as text."""
-    return table(SCENE_HEADER, scene_rows(scores), style)
-
-
-def scene_rows(scores: Scores) -> list[list[str]]:
-    """Cells of one row a scene and, for several scenes, their unweighted mean."""
-    values = np.array([_values(row) for row in scores.scenes.values()])
-    rows = [
-        [name, str(row.frames), *_cells(numbers)]
-        for (name, row), numbers in zip(scores.scenes.items(), values, strict=True)
+def score_rows(scores: Scores) -> list[dict[str, str]]:
+    """Cells by title: a row a scene and, for several scenes, their unweighted mean."""
+    values = [
+        [f * getattr(row, name) for _, name, f, _ in _COLUMNS] for row in scores.scenes.values()
     ]
-    return [*rows, ["mean", "", *_cells(values.mean(axis=0))]] if len(rows) > 1 else rows
-
-
-def table(header: Sequence[str], rows: Sequence[Sequence[str]], style: Style) -> str:
-    """Format cells as text, the first column aligned left and the others right."""
-    from tabulate import tabulate
-
-    if style == "markdown":
-        header = [cell.replace("|", "\\|") for cell in header]
-        rows = [[cell.replace("|", "\\|") for cell in row] for row in rows]
-    return tabulate(
-        rows,
-        headers=header,
-        tablefmt="github" if style == "markdown" else "simple",
-        colalign=("left", *["right"] * (len(header) - 1)),
-        disable_numparse=True,
-    )
-
-
-def _values(row: SceneScores) -> list[float]:
-    return [factor * getattr(row, field) for _, field, factor, _ in _COLUMNS]
-
-
-def _cells(values: Sequence[float]) -> list[str]:
+    heads = [(name, str(row.frames)) for name, row in scores.scenes.items()]
+    if len(values) > 1:
+        values.append(np.mean(values, axis=0).tolist())
+        heads.append(("mean", ""))
     return [
-        "-" if math.isnan(value) else f"{value:.{digits}f}"
-        for value, (*_, digits) in zip(values, _COLUMNS, strict=True)
+        {"scene": scene, "frames": frames}
+        | {
+            title: _cell(value, digits)
+            for value, (title, _, _, digits) in zip(row, _COLUMNS, strict=True)
+        }
+        for (scene, frames), row in zip(heads, values, strict=True)
     ]
+
+
+def _cell(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"

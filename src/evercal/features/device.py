@@ -11,17 +11,10 @@ from evercal.errors import InputError
 
 
 def device_of(name: str | torch.device = "auto") -> torch.device:
-    """Parse the name of a device.
+    """The device of a name, numbered, so that it equals the `device` of its tensors.
 
-    Args:
-        name: `auto` (the current CUDA device if there is one, otherwise the CPU), `cpu`, `cuda`, or
-            a numbered device such as `cuda:1`.
-
-    Returns:
-        A numbered device, which equals the `device` of its tensors.
-
-    Raises:
-        InputError: Another name, or a CUDA device that this machine lacks.
+    Names are `auto` (the current CUDA device if there is one, otherwise the CPU), `cpu`, `cuda`, or
+    a numbered device such as `cuda:1`.
     """
     word = str(name)
     if word == "cpu" or (word == "auto" and not torch.cuda.is_available()):
@@ -56,20 +49,15 @@ def tf32(device: torch.device) -> Iterator[None]:
     """Let fp32 matrix products on a CUDA device round their factors to 10 bits, which is faster.
 
     For training: weights are stored with 10 bits, too. Products that need all bits, such as points
-    in a camera, are written as sums. The setting is that of the process, so it is restored. On the
-    CPU nothing changes.
+    in a camera, are written as sums. Convolutions are rounded by default. On the CPU nothing
+    changes.
     """
     if device.type != "cuda":
         yield
         return
-    products, convolutions = (
-        torch.backends.cuda.matmul.allow_tf32,
-        torch.backends.cudnn.allow_tf32,
-    )
+    before = torch.get_float32_matmul_precision()
     try:
-        torch.backends.cuda.matmul.allow_tf32 = True
-        torch.backends.cudnn.allow_tf32 = True
+        torch.set_float32_matmul_precision("high")
         yield
     finally:
-        torch.backends.cuda.matmul.allow_tf32 = products
-        torch.backends.cudnn.allow_tf32 = convolutions
+        torch.set_float32_matmul_precision(before)

@@ -1,4 +1,4 @@
-"""Features of views from the frozen encoder."""
+"""Features of images from the frozen encoder."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from evercal.features.device import device_of_network
 from evercal.features.encoder import Encoder
 from evercal.features.precision import autocast
-from evercal.features.views import View, ViewOptions, plain_view
+from evercal.features.views import working_image
 from evercal.geometry import Camera
 
 ENCODE_BATCH = 8
@@ -17,23 +17,19 @@ ENCODE_BATCH = 8
 
 
 @torch.inference_mode()
-def encode_features(
-    views: Sequence[View], encoder: Encoder, device: torch.device | str | None = None
-) -> Tensor:
-    """Features (b, channels, h, w) of views of one size, fp32.
+def encode_features(images: Sequence[np.ndarray], encoder: Encoder) -> Tensor:
+    """(b, channels, rows, columns) features of grey images (h, w) of one size, fp32.
 
-    By default they are on the device of the encoder's weights, on which it runs.
+    They are on the device of the encoder's weights, on which it runs.
     """
-    own = device_of_network(encoder)
-    grey = torch.from_numpy(np.stack([view.grey for view in views]))[:, None].to(own)
-    with autocast(own):
-        features = encoder(grey.float() / 255.0).float()
-    return features if device is None else features.to(device)
+    device = device_of_network(encoder)
+    grey = torch.from_numpy(np.stack(images))[:, None].to(device)
+    with autocast(device):
+        return encoder(grey.float() / 255.0).float()
 
 
 def encode_image(image: np.ndarray, encoder: Encoder, short_side: int) -> Tensor:
     """(channels, rows, columns) features of an image, on the encoder's device."""
     height, width = image.shape[:2]
     plain = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
-    view = plain_view(image, plain, encoder.stride, ViewOptions(short_side=short_side))
-    return encode_features([view], encoder)[0]
+    return encode_features([working_image(image, plain, short_side)[0]], encoder)[0]

@@ -4,6 +4,7 @@ The shipped weights are trained on procedural images alone (`python -m training`
 ACE's published layout can be read, too, and any module with `stride` and `width` can be used.
 """
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
 
@@ -63,15 +64,13 @@ class LocalEncoder(nn.Module):
     (8 j + 3.5, 8 i + 3.5), where (0, 0) is the centre of the first pixel. Strided 3x3 convolutions
     would be centred on (8 j, 8 i), half a cell off.
 
-    Args:
-        stem: channels at 1/2 and 1/4 resolution.
-        inner: channels at 1/8 resolution.
-        blocks: residual blocks (3x3, 1x1, 3x3) at 1/8 resolution.
-        width: output channels.
-        fused: batch norm is folded into the convolutions, for inference; False for training.
+    `stem` are the channels at 1/2 and 1/4 resolution; `inner` channels and `blocks` of 3x3, 1x1 and
+    3x3 are at 1/8. Batch norm is folded into the convolutions, `fused`, except for training.
     """
 
     stride = 8
+    names = ("stem", "inner", "blocks", "width")
+    """Settings that a weight file states."""
 
     def __init__(
         self,
@@ -83,29 +82,19 @@ class LocalEncoder(nn.Module):
     ):
         super().__init__()
         self.width = width
-        self.settings: dict[str, Any] = {
-            "stem": list(stem), "inner": inner, "blocks": blocks, "width": width,
-        }  # fmt: skip
-        self.stem = nn.ModuleList(
-            [
-                _ConvBlock(4, stem[0], 3, 1, fused),
-                _ConvBlock(stem[0], stem[0], 3, 1, fused),
-                _ConvBlock(stem[0], stem[1], 2, 2, fused),
-                _ConvBlock(stem[1], stem[1], 3, 1, fused),
-                _ConvBlock(stem[1], inner, 2, 2, fused),
-            ]
-        )
+        values = (list(stem), inner, blocks, width)
+        self.settings: dict[str, Any] = dict(zip(self.names, values, strict=True))
+        half, quarter = stem
+        layers = ((4, half, 3, 1), (half, half, 3, 1), (half, quarter, 2, 2))
+        layers += ((quarter, quarter, 3, 1), (quarter, inner, 2, 2))
+        self.stem = nn.ModuleList(_ConvBlock(*layer, fused) for layer in layers)
         self.blocks = nn.ModuleList(_Residual(inner, fused) for _ in range(blocks))
         self.project = nn.Conv2d(inner, width, 1)
 
     def forward(self, grey: Tensor) -> Tensor:
-        """Encode a batch.
+        """(b, 1, h, w) in [0, 1] -> (b, width, h // 8, w // 8) unit vectors.
 
-        Args:
-            grey: (b, 1, h, w) in [0, 1]; pixels beyond a multiple of 8 are cut off.
-
-        Returns:
-            (b, width, h // 8, w // 8) unit vectors.
+        Pixels beyond a multiple of 8 are cut off.
         """
         height, width = (side // 8 * 8 for side in grey.shape[-2:])
         x = standardise(grey[..., :height, :width])
@@ -118,16 +107,13 @@ class LocalEncoder(nn.Module):
 
     def fuse(self) -> "LocalEncoder":
         """The same function with batch norm folded in, for inference."""
-        training, twin = self.training, LocalEncoder(**self.settings)
-        source = [m for m in self.modules() if isinstance(m, _ConvBlock)]
+        trained, twin = deepcopy(self).eval(), LocalEncoder(**self.settings)
+        source = [m for m in trained.modules() if isinstance(m, _ConvBlock)]
         target = [m for m in twin.modules() if isinstance(m, _ConvBlock)]
         for a, b in zip(source, target, strict=True):
-            conv = cast(nn.Conv2d, a[0])
-            if len(a) == 2:
-                conv = fuse_conv_bn_eval(conv.eval(), cast(nn.BatchNorm2d, a[1]).eval())
+            conv = fuse_conv_bn_eval(cast(nn.Conv2d, a[0]), cast(nn.BatchNorm2d, a[1]))
             b[0].load_state_dict(conv.state_dict())
         twin.project.load_state_dict(self.project.state_dict())
-        self.train(training)
         return twin.eval()
 
 
@@ -180,11 +166,7 @@ class AceEncoder(nn.Module):
 
 
 def checked_encoder(module: nn.Module) -> Encoder:
-    """Freeze a user's module as an encoder.
-
-    Raises:
-        InputError: It lacks `stride` or `width`, or its output is not (b, width, h, w).
-    """
+    """Freeze a user's module as an encoder."""
     if not isinstance(module, Encoder):
         raise InputError(
             f"encoder {type(module).__name__}: needs integer attributes 'stride' and 'width'"
@@ -203,25 +185,17 @@ def checked_encoder(module: nn.Module) -> Encoder:
 
 
 def own_encoder(module: nn.Module, path: Path) -> Encoder:
-    """Load the weights of a file into a user's module.
-
-    Raises:
-        InputError: The weights belong to another module.
-    """
+    """Load the weights of a file into a user's module."""
     state = {name: value.float() for name, value in load_tensors(path).items()}
     load_strictly(module, state, f"{path}: not the weights of the given encoder")
     return checked_encoder(module)
 
 
 def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
-    """Load an encoder for inference.
+    """Load an encoder for inference; by default the shipped one.
 
-    Args:
-        path: a safetensors file of `training`, or ACE's published weight file, a torch
-            state dict that is read with `weights_only`. Default: the shipped encoder.
-
-    Raises:
-        InputError: No such file, or keys and shapes of neither layout.
+    The file is a safetensors file of `training`, or ACE's published weight file, a torch state
+    dict that is read with `weights_only`.
     """
     path = ENCODER_FILE if path is None else path
     if not path.is_file():
@@ -238,11 +212,7 @@ def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
 
 
 def ace_encoder_from_state(state: object, name: str) -> AceEncoder:
-    """Build an `AceEncoder` from a state dict in ACE's layout.
-
-    Raises:
-        InputError: A missing, unknown or wrongly shaped tensor.
-    """
+    """Build an `AceEncoder` from a state dict in ACE's layout."""
     if not isinstance(state, dict) or "res2_skip.weight" not in state:
         raise InputError(
             f"encoder {name}: not ACE's layout (no tensor 'res2_skip.weight'); "
@@ -270,13 +240,8 @@ def _load_own(path: Path) -> LocalEncoder | AceEncoder:
                 f"encoder {path}: weights of the module {settings['layout']!r}; pass that module as"
                 " encoder"
             )
-        names = ("stem", "inner", "blocks", "width")
-        encoder = LocalEncoder(**{name: settings[name] for name in names})
+        encoder = LocalEncoder(**{name: settings[name] for name in LocalEncoder.names})
     except (SafetensorError, KeyError, ValueError) as error:
         raise InputError(f"encoder {path}: not an evercal encoder file ({error!r})") from error
     load_strictly(encoder, state, f"encoder {path}: not an evercal encoder file")
-    return cast(LocalEncoder, _channels_last(encoder.eval()))
-
-
-def _channels_last(module: nn.Module) -> nn.Module:
-    return module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    return encoder.eval().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]

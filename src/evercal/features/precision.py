@@ -18,11 +18,7 @@ AUTO, BFLOAT16, FLOAT32 = "auto", "bfloat16", "float32"
 
 
 def fast_bfloat16(device: torch.device | str = "cpu") -> bool:
-    """Whether products on a device are calculated in bfloat16.
-
-    Raises:
-        InputError: `EVERCAL_PRECISION` has another value than auto, bfloat16 or float32.
-    """
+    """Whether products on a device are calculated in bfloat16."""
     precision = os.environ.get(VARIABLE) or AUTO
     if precision not in (AUTO, BFLOAT16, FLOAT32):
         raise InputError(

@@ -57,17 +57,7 @@ def sift_features(image: NDArray[np.uint8]) -> SiftFeatures:
 def epipolar_pair(
     a: SiftFeatures, b: SiftFeatures, first: Camera, second: Camera
 ) -> EpipolarPair | None:
-    """Match two images and estimate the camera's motion.
-
-    Args:
-        a: Features of the first image.
-        b: Features of the second image.
-        first: Camera of the first image.
-        second: Camera of the second image.
-
-    Returns:
-        The motion, or None with fewer than `MIN_INLIERS` inliers.
-    """
+    """Match two images and estimate the camera's motion; None for fewer than `MIN_INLIERS`."""
     import poselib
 
     if min(len(a.pixels), len(b.pixels)) < MIN_INLIERS:
@@ -99,7 +89,6 @@ def epipolar_pair(
 def _distinct_matches(
     a: NDArray[np.float32], b: NDArray[np.float32]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of mutual best matches that pass the ratio test."""
     similar = a @ b.T
     best = similar.argmax(1)
     rows = np.arange(len(a))
@@ -113,5 +102,4 @@ def _distinct_matches(
 
 
 def _ideal(camera: Camera) -> dict[str, object]:
-    """The camera without distortion and principal point, for PoseLib."""
     return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [camera.fx, 0.0, 0.0]}

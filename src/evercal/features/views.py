@@ -35,7 +35,6 @@ class View:
     """One image for the encoder and the rays of its cells."""
 
     grey: np.ndarray
-    """(h, w) uint8."""
     cell_pixels: np.ndarray
     """(cells, 2) float32 pixels of the frame at the cell centres, in an ideal pinhole camera with
     `intrinsics`; row-major over the (h // stride, w // stride) grid."""
@@ -51,17 +50,6 @@ def cell_centres(height: int, width: int, stride: int) -> np.ndarray:
     """(cells, 2) pixels (u, v) of the cell centres, row-major."""
     v, u = np.mgrid[0 : height // stride, 0 : width // stride]
     return np.stack([u, v], -1).reshape(-1, 2) * float(stride) + (stride - 1) / 2
-
-
-def plain_view(image: np.ndarray, camera: Camera, stride: int, options: ViewOptions) -> View:
-    """An image at working size; the cell pixels are free of distortion.
-
-    The image, (h, w, 3) uint8 RGB or (h, w) grey, may have any size with the camera's aspect ratio.
-    """
-    grey, camera = working_image(image, camera, options.short_side)
-    pixels = ideal_cell_pixels(camera, stride)
-    valid = np.isfinite(pixels).all(axis=1)
-    return View(grey, pixels, np.asarray(valid), _four(camera), SE3.identity())
 
 
 @lru_cache(maxsize=64)
@@ -80,10 +68,11 @@ def ideal_cell_pixels(camera: Camera, stride: int) -> np.ndarray:
 
 
 def frame_view(frame: Frame, stride: int, options: ViewOptions) -> View:
-    """The plain view of a frame, with its pose."""
-    view = plain_view(frame.read_image(), frame.camera, stride, options)
-    pose = frame.base_from_camera or SE3.identity()
-    return View(view.grey, view.cell_pixels, view.valid, view.intrinsics, pose)
+    """The plain view of a frame; its cell pixels are free of distortion."""
+    grey, camera = working_image(frame.read_image(), frame.camera, options.short_side)
+    pixels = ideal_cell_pixels(camera, stride)
+    valid = np.asarray(np.isfinite(pixels).all(axis=1))
+    return View(grey, pixels, valid, _four(camera), frame.base_from_camera or SE3.identity())
 
 
 def augmented_view(
@@ -124,7 +113,10 @@ def augmented_view(
 
 
 def working_image(image: np.ndarray, camera: Camera, short_side: int) -> tuple[np.ndarray, Camera]:
-    """Grey (h, w) uint8 image with the given shorter side, and its camera."""
+    """Grey (h, w) uint8 image with the given shorter side, and its camera.
+
+    The image, (h, w, 3) uint8 RGB or (h, w) grey, may have any size with the camera's aspect ratio.
+    """
     import cv2
 
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

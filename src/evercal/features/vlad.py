@@ -52,7 +52,6 @@ class Vlad:
         return F.normalize(vector @ projection, dim=0)
 
     def _on(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Centroids and projection on a device, cached."""
         if device not in self._copies:
             self._copies[device] = self.centroids.to(device), self.projection.to(device)
         return self._copies[device]
@@ -62,13 +61,7 @@ _by_encoder: WeakKeyDictionary[Encoder, Vlad] = WeakKeyDictionary()
 
 
 def vlad_for(encoder: Encoder, features: Sequence[Tensor] = ()) -> Vlad:
-    """The VLAD of an encoder.
-
-    Missing centroids are fitted to features (cells, channels) of images.
-
-    Raises:
-        InputError: An encoder without centroids, and no features to fit them to.
-    """
+    """The VLAD of an encoder; missing centroids are fitted to features (cells, channels)."""
     if encoder not in _by_encoder:
         centroids = shipped_centroids(encoder)
         if centroids is None and not features:
@@ -89,7 +82,11 @@ def known_centroids(encoder: Encoder) -> Tensor | None:
 
 def keep_centroids(encoder: Encoder, centroids: Tensor) -> None:
     """Use centroids (k, channels), fitted or loaded here or in another process."""
-    _by_encoder[encoder] = _projected(centroids)
+    # A fixed random projection to fewer numbers preserves angles.
+    shape = (centroids.numel(), WIDTH)
+    generator = torch.Generator().manual_seed(1)
+    projection = torch.randn(shape, generator=generator, device="cpu")
+    _by_encoder[encoder] = Vlad(centroids, projection / shape[0] ** 0.5)
 
 
 def shipped_centroids(encoder: Encoder) -> Tensor | None:
@@ -129,14 +126,6 @@ def fit_centroids(features: Sequence[Tensor]) -> Tensor:
         used = sums.norm(dim=1, keepdim=True) > 0
         centroids = torch.where(used, F.normalize(sums, dim=1), centroids)
     return centroids
-
-
-def _projected(centroids: Tensor) -> Vlad:
-    # A fixed random projection to fewer numbers preserves angles.
-    shape = (centroids.numel(), WIDTH)
-    generator = torch.Generator().manual_seed(1)
-    projection = torch.randn(shape, generator=generator, device="cpu")
-    return Vlad(centroids, projection / shape[0] ** 0.5)
 
 
 def _digest(encoder: nn.Module) -> str:

@@ -19,11 +19,7 @@ def network_bytes(module: torch.nn.Module, kind: str) -> bytes:
 
 
 def load_strictly(module: torch.nn.Module, state: Mapping[str, object], name: str) -> None:
-    """Load a state dict with exactly the keys and shapes of a module.
-
-    Raises:
-        InputError: A mismatch; the message starts with `name`.
-    """
+    """Load a state dict with exactly the keys and shapes of a module; `name` begins the error."""
     try:
         module.load_state_dict(dict(state), strict=True)
     except RuntimeError as error:

@@ -34,12 +34,7 @@ def resize_pixels(pixels: ArrayLike, scale: float | Array) -> Array:
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics of one camera at one image size.
-
-    Raises:
-        ValueError: A size or focal length that is not positive, numbers that are not finite, or a
-            number of distortion coefficients other than 0, 4, 5 or 8.
-    """
+    """Intrinsics of one camera at one image size."""
 
     width: int
     """Pixels."""
@@ -79,11 +74,7 @@ class Camera:
     def from_matrix(
         cls, matrix: ArrayLike, width: int, height: int, distortion: tuple[float, ...] = ()
     ) -> Self:
-        """Convert a 3x3 intrinsic matrix.
-
-        Raises:
-            ValueError: Not 3x3, skew, or a last row other than 0 0 1.
-        """
+        """Convert a 3x3 intrinsic matrix without skew."""
         k = np.asarray(matrix, dtype=np.float64)
         if k.shape != (3, 3):
             raise ValueError(f"an intrinsic matrix is 3x3, got {k.shape}")
@@ -163,7 +154,8 @@ class Camera:
         plane = points[..., :2] / depth
         if self.distortion:
             within = (plane**2).sum(-1, keepdims=True) < self.widest**2
-            plane = self._distort(np.where(within, plane, np.nan))
+            plane = np.where(within, plane, np.nan)
+            plane = np.stack(self._distorted(plane[..., 0], plane[..., 1])[0], axis=-1)
         return plane * (self.fx, self.fy) + (self.cx, self.cy)
 
     def unproject(self, pixels: ArrayLike) -> Array:
@@ -181,14 +173,10 @@ class Camera:
         return np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
 
     def slopes(self, plane: ArrayLike) -> tuple[Array, Array]:
-        """Derivatives of pixels by points of the plane z = 1 and by the intrinsics.
+        """Derivatives of pixels by ideal points (..., 2) of the plane z = 1, and by intrinsics.
 
-        Args:
-            plane: (..., 2) ideal points.
-
-        Returns:
-            Derivatives of pixels (..., 2, 2) by the points, and (..., 2, 5) by the logarithm of
-            both focal lengths, the principal point in pixels, k1 and k2.
+        The first are (..., 2, 2). The others are (..., 2, 5): by the logarithm of both focal
+        lengths, the principal point in pixels, k1 and k2.
         """
         plane = np.asarray(plane, dtype=np.float64)
         x, y = plane[..., 0], plane[..., 1]
@@ -213,22 +201,13 @@ class Camera:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, object]) -> Self:
-        """Inverse of `to_dict`; unknown keys are ignored, `distortion` is optional.
-
-        Raises:
-            ValueError: A key is missing or its value is not a number.
-        """
+        """Inverse of `to_dict`; unknown keys are ignored, `distortion` is optional."""
         names = ("width", "height", "fx", "fy", "cx", "cy")
         numbers: dict[str, Any] = {name: _number(data.get(name), name) for name in names}
         distortion = data.get("distortion", ())
         if not isinstance(distortion, (list, tuple)):
             raise ValueError(f"camera 'distortion' is a list of numbers, got {distortion!r}")
         return cls(**numbers, distortion=tuple(_number(k, "distortion") for k in distortion))
-
-    def _distort(self, plane: Array) -> Array:
-        """(..., 2) ideal to distorted points of the plane z = 1."""
-        (u, v), _ = self._distorted(plane[..., 0], plane[..., 1])
-        return np.stack([u, v], axis=-1)
 
     def _distorted(self, x: Array, y: Array) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
         """Distorted points (u, v), and their derivatives du/dx, du/dy = dv/dx and dv/dy."""
@@ -246,7 +225,6 @@ class Camera:
         return (u, v), (a, cross, d)
 
     def _radial(self, r2: Array) -> tuple[Array, Array]:
-        """Radial scale of points at squared distances from the axis, and its derivative by them."""
         k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
         above = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         steeper = k1 + r2 * (2 * k2 + r2 * 3 * k3)
@@ -257,7 +235,6 @@ class Camera:
         return radial, (steeper - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
 
     def _undistorted(self, distorted: Array) -> Array:
-        """(..., 2) distorted to ideal points of the plane z = 1; NaN outside their range."""
         plane, lost = distorted, np.ones(distorted.shape[:-1], bool)
         for _ in range(50):  # Newton's method: a few steps but close to `widest`
             far = np.sqrt((plane**2).sum(-1, keepdims=True))

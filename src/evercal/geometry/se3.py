@@ -21,10 +21,6 @@ class SE3:
     """One rigid transform, or an array of them with any batch shape.
 
     Quaternions are normalised on entry. Two transforms are compared with `pose_distance`, not `==`.
-
-    Raises:
-        ValueError: Shapes that do not belong together, numbers that are not finite, or a
-            quaternion of length zero.
     """
 
     rotation_wxyz: Array
@@ -66,10 +62,6 @@ class SE3:
 
         Shapes are (..., 4, 4) or (..., 3, 4). The nearest rotation is used; `tolerance` is the
         largest entry of `R^T R - I` that counts as rounding.
-
-        Raises:
-            ValueError: Wrong shape, numbers that are not finite, a last row other than 0 0 0 1, or
-                a left 3x3 block that is not a rotation within `tolerance`.
         """
         matrix = np.asarray(matrix, dtype=np.float64)
         if matrix.ndim < 2 or matrix.shape[-2:] not in ((4, 4), (3, 4)):
@@ -224,26 +216,18 @@ def pose_distance_mm_deg(a: SE3, b: SE3) -> tuple[float, float]:
     return 1000 * float(metres), float(np.rad2deg(radians))
 
 
-def average_poses(poses: SE3, weights: ArrayLike | None = None) -> SE3:
-    """Robust mean of poses; up to nearly half of the weight may be outliers.
+def average_poses(poses: SE3) -> SE3:
+    """Robust mean of poses (n,); up to nearly half of them may be outliers.
 
     Iteratively reweighted mean, started at the medoid. Weights are Tukey's biweight of the distance
     to the current mean, cut at four median distances, in metres and in radians.
-
-    Raises:
-        ValueError: No poses, or weights that do not fit.
     """
     if len(poses.shape) != 1 or len(poses) == 0:
         raise ValueError(f"average_poses takes a batch (n,) with n >= 1, got {poses.shape}")
-    given = np.ones(len(poses)) if weights is None else np.asarray(weights, dtype=np.float64)
-    if given.shape != poses.shape or not (given >= 0).all() or not 0 < given.sum() < np.inf:
-        raise ValueError(
-            f"weights are {poses.shape}, finite, not negative, with a positive sum; got {given}"
-        )
-    mean = _medoid(poses, given)
+    mean = _medoid(poses)
     for _ in range(50):
         metres, radians = pose_distance(mean, poses)
-        weight = given * _biweight(metres, given) * _biweight(radians, given)
+        weight = _biweight(metres) * _biweight(radians)
         if weight.sum() <= 0:  # poses near in metres and poses near in radians are disjoint
             return mean
         translation = weight @ poses.translation_m / weight.sum()
@@ -265,22 +249,18 @@ def _quaternion_product(a: Array, b: Array) -> Array:
     return np.stack([w, x, y, z], axis=-1)
 
 
-def _medoid(poses: SE3, weights: Array) -> SE3:
+def _medoid(poses: SE3) -> SE3:
     """The pose with the smallest summed distance to the others, among at most 200 candidates."""
-    heavy = np.flatnonzero(weights > 0)
-    candidates = heavy[np.unique(np.linspace(0, len(heavy) - 1, 200).round().astype(int))]
-    metres, radians = pose_distance(poses[candidates[:, None]], poses[None])
+    candidates = np.unique(np.linspace(0, len(poses) - 1, 200).round().astype(int))
     cost = np.zeros(len(candidates))
-    for distance in (metres, radians):
+    for distance in pose_distance(poses[candidates[:, None]], poses[None]):
         # Scaled by their median, distances in metres and in radians can be added.
-        cost += distance @ weights / max(float(np.median(distance)), 1e-9)
+        cost += distance.sum(1) / max(float(np.median(distance)), 1e-9)
     return poses[candidates[np.argmin(cost)]]
 
 
-def _biweight(distance: Array, weights: Array) -> Array:
-    """Tukey's biweight of (n,) distances, cut at four weighted medians."""
-    order = np.argsort(distance)
-    # side="right" takes the farther of two poses, so that their mean lies halfway.
-    middle = np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2, side="right")
-    cut = 4.0 * max(float(distance[order[min(middle, len(order) - 1)]]), 1e-9)
+def _biweight(distance: Array) -> Array:
+    """Tukey's biweight of (n,) distances, cut at four medians."""
+    # The farther of the two middle poses, so that the mean of two poses lies halfway.
+    cut = 4.0 * max(float(np.sort(distance)[len(distance) // 2]), 1e-9)
     return np.clip(1.0 - (distance / cut) ** 2, 0.0, None) ** 2

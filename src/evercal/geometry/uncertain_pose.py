@@ -28,9 +28,6 @@ class UncertainPose:
     """A rigid transform with a Gaussian error.
 
     First-order propagation: Barfoot and Furgale, IEEE T-RO 2014, for this choice of axes.
-
-    Raises:
-        ValueError: A batch of poses, or a covariance that is not (6, 6).
     """
 
     pose: SE3
@@ -92,11 +89,9 @@ class UncertainPose:
         return float(error @ np.linalg.pinv(self.covariance) @ error)
 
     def point_covariance(self, point_m: ArrayLike) -> Array:
-        """Covariance (3, 3) of a point (3,) in the parent frame, square metres.
+        """Covariance (3, 3), in the parent frame, of a point (3,) that is exact in the child frame.
 
-        The point is exact in the child frame, metres. With the error (dt, dr) of the pose it moves
-        by dt + R (dr x point): metres along the axes of the parent, `dr` in radians about those of
-        the child.
+        With the error (dt, dr) of the pose it moves by dt + R (dr x point).
         """
         slope = np.zeros((3, 6))
         slope[:, :3] = np.eye(3)

@@ -5,7 +5,6 @@ A live camera is any object with `read()`. `StreamCamera` reads every source of 
 
 import threading
 import time
-from collections.abc import Iterator
 from typing import Protocol, Self
 
 import numpy as np
@@ -29,100 +28,62 @@ class StreamCamera:
     """The frames of a camera, a network stream, a video or a folder, one for each `read`.
 
     A live image arrived after the call that asks for it; it was taken earlier by the delay of the
-    source. A video or a folder gives its next frame.
+    source. A thread empties the buffer of a live source. A video or a folder gives its next frame.
 
     Args:
         source: number or device of a camera, address, video file or folder.
         rate: frames per second of a folder whose file names hold no times.
         timeout_s: longest time to wait for a live frame, seconds.
-
-    Raises:
-        InputError: The source does not exist or cannot be opened.
     """
 
     def __init__(self, source: str, rate: float = 15.0, timeout_s: float = 5.0):
         self._source, self._timeout_s = source, timeout_s
         self._frames = stream(source, rate)
-        self._newest = NewestFrame(self._frames) if is_live(source) else None
+        self._frame: StreamFrame | None = None
+        self._error: Exception | None = None
+        self._changed, self._ended = threading.Condition(), False
+        self._thread = threading.Thread(target=self._run, daemon=True) if is_live(source) else None
+        if self._thread is not None:
+            self._thread.start()
 
     def read(self) -> tuple[float, Image]:
-        """Take the next image.
-
-        Raises:
-            InputError: The source has ended, or no frame arrives in time.
-        """
-        if self._newest is None:
-            frame = next(self._frames, None)
-        else:
-            frame = self._newest.after(time.time(), self._timeout_s)
+        """Take the next image; an error of a live source is raised here."""
+        frame = next(self._frames, None) if self._thread is None else self._after(time.time())
         if frame is None:
             raise InputError(f"{self._source}: no more frames; check the camera or give another")
         return frame.stamp_s, frame.image
 
     def close(self) -> None:
-        """Release the source."""
-        if self._newest is not None:
-            self._newest.close()
-        elif (close := getattr(self._frames, "close", None)) is not None:
-            close()
+        """Release the source, a live one after its next frame."""
+        if self._thread is None:
+            self._close_frames()
+            return
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        self._thread.join(1.0)
 
     def __enter__(self) -> Self:
-        """Return the camera itself."""
+        """The camera itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
         """Release the source."""
         self.close()
 
+    def _after(self, stamp_s: float) -> StreamFrame | None:
+        """The first live frame at or after a time; None if the stream ends or none arrives."""
 
-class NewestFrame:
-    """The newest frame of a stream, read by a thread that empties the buffer of its source.
+        def arrived() -> bool:
+            return self._frame is not None and self._frame.stamp_s >= stamp_s
 
-    Iterating gives the newest frame each time and leaves out those that arrived meanwhile. An
-    error of the source is raised where the frames are used, after the frames before it.
-    """
-
-    def __init__(self, frames: Iterator[StreamFrame]):
-        self._frames, self._frame = frames, None
-        self._error: Exception | None = None
-        self._changed, self._ended = threading.Condition(), False
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def __iter__(self) -> Iterator[StreamFrame]:
-        """Return frames until the stream ends."""
-        last: StreamFrame | None = None
-        try:
-            while (frame := self._other_than(last)) is not None:
-                yield frame
-                last = frame
-        finally:
-            self.close()
-        self._raise_error()
-
-    def after(self, stamp_s: float, timeout_s: float) -> StreamFrame | None:
-        """Return the first frame at or after a time; None if the stream ends or none arrives."""
         with self._changed:
-            self._changed.wait_for(lambda: self._ended or self._reached(stamp_s), timeout_s)
-            if self._reached(stamp_s):
+            self._changed.wait_for(lambda: self._ended or arrived(), self._timeout_s)
+            if arrived():
                 return self._frame
-        self._raise_error()
+        if self._error is not None:
+            raise self._error
         return None
-
-    def close(self) -> None:
-        """End the thread after its next frame."""
-        with self._changed:
-            self._ended = True
-            self._changed.notify_all()
-        self._thread.join(1.0)
-
-    def _reached(self, stamp_s: float) -> bool:
-        return self._frame is not None and self._frame.stamp_s >= stamp_s
-
-    def _other_than(self, last: StreamFrame | None) -> StreamFrame | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._ended or self._frame is not last)
-            return None if self._frame is last else self._frame
 
     def _run(self) -> None:
         try:
@@ -135,12 +96,11 @@ class NewestFrame:
         except Exception as error:  # raised where the frames are used
             self._error = error
         finally:
-            if (close := getattr(self._frames, "close", None)) is not None:
-                close()
+            self._close_frames()
             with self._changed:
                 self._ended = True
                 self._changed.notify_all()
 
-    def _raise_error(self) -> None:
-        if self._error is not None:
-            raise self._error
+    def _close_frames(self) -> None:
+        if (close := getattr(self._frames, "close", None)) is not None:
+            close()

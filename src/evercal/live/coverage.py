@@ -1,7 +1,7 @@
 """What a wrist recording covers so far, and which samples are bad.
 
 Hand-eye calibration needs rotations about two axes (Tsai and Lenz, IEEE T-RA 1989); images are
-blurred, over- or underexposed, or show what another one shows. All limits are options.
+blurred, over- or underexposed, or show what another one shows.
 """
 
 from collections.abc import Sequence
@@ -21,24 +21,16 @@ _FLAT = 1.0
 """Squared slope below which an image shows no structure, grey values."""
 
 
-@dataclass(frozen=True)
-class CoverageOptions:
-    """Limits of a good recording."""
-
-    images: int = 25
-    """Images of a complete recording."""
-    rotation_deg: float = 8.0
-    """Standard deviation of the rotation about an axis that counts as covered."""
-    position_mm: float = 25.0
-    """Standard deviation of the position along an axis that counts as covered."""
-    sharpness: float = 0.8
-    """Sharpness, relative to the median, below which an image is blurred."""
-    clipped: float = 0.15
-    """Share of black or white pixels above which an image is badly exposed."""
-    same_mm: float = 8.0
-    """Two samples closer than this, and than `same_deg`, are duplicates."""
-    same_deg: float = 2.0
-    """See `same_mm`."""
+IMAGES = 25
+"""Images of a complete recording."""
+ROTATION_DEG, POSITION_MM = 8.0, 25.0
+"""Standard deviations about or along an axis that counts as covered."""
+SHARPNESS = 0.8
+"""Sharpness, relative to the median, below which an image is blurred."""
+CLIPPED = 0.15
+"""Share of black or white pixels above which an image is badly exposed."""
+SAME_MM, SAME_DEG = 8.0, 2.0
+"""Two samples closer than both are duplicates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +61,6 @@ class SampleReport:
     """Relative to the median of the recording."""
     clipped: float
     """Share of black or white pixels."""
-    nearest_mm: float | None
-    """Distance to the most similar earlier sample; None for the first sample."""
-    nearest_deg: float | None
-    """Rotation from it."""
     problems: tuple[str, ...]
     """Reasons to remove it; empty for a good sample."""
 
@@ -106,20 +94,12 @@ class Coverage:
     """One or two sentences."""
 
 
-def coverage(
-    samples: Sequence[Sample],
-    gripper_from_camera: SE3 | None = None,
-    options: CoverageOptions | None = None,
-) -> Coverage:
-    """Report what the samples cover; samples with problems count as not recorded.
+def coverage(samples: Sequence[Sample], gripper_from_camera: SE3 | None = None) -> Coverage:
+    """Report what samples cover, in recorded order; those with problems count as not recorded.
 
-    Args:
-        samples: in recorded order.
-        gripper_from_camera: a rough one, so that axes are those of the camera.
-        options: limits.
+    With a rough `gripper_from_camera`, axes are those of the camera.
     """
-    options = options or CoverageOptions()
-    rows = _sample_reports(samples, options)
+    rows = _sample_reports(samples)
     good = [s for s, row in zip(samples, rows, strict=True) if not row.problems]
     poses = SE3.stack([sample.base_from_gripper for sample in good])
     mover = "gripper"
@@ -127,11 +107,11 @@ def coverage(
         poses, mover = poses @ gripper_from_camera, "camera"
     turned, principal = _rotations_deg(poses)
     moved = 1000 * poses.translation_m.std(0) if good else np.zeros(3)
-    rotations = _axes(f"about the {mover}'s", turned, options.rotation_deg)
-    positions = _axes("along the base's", moved, options.position_mm)
-    rank = int((principal >= options.rotation_deg).sum())
+    rotations = _axes(f"about the {mover}'s", turned, ROTATION_DEG)
+    positions = _axes("along the base's", moved, POSITION_MM)
+    rank = int((principal >= ROTATION_DEG).sum())
     ready = len(good) >= MIN_GRIPPER_FRAMES and rank >= 2
-    missing = _missing(len(good), rank, rotations, positions, options)
+    missing = _missing(len(good), rank, rotations, positions)
     state = "can be learned" if ready else "cannot be learned yet"
     verdict = f"{len(good)} of {len(rows)} images are good; the recording {state}."
     if missing:
@@ -170,28 +150,23 @@ def clipped_share(image: NDArray[np.uint8]) -> float:
     return float(((image >= 253).all(-1) | (image <= 2).all(-1)).mean())
 
 
-def _sample_reports(
-    samples: Sequence[Sample], options: CoverageOptions
-) -> tuple[SampleReport, ...]:
+def _sample_reports(samples: Sequence[Sample]) -> tuple[SampleReport, ...]:
     middle = float(np.median([sample.sharpness for sample in samples])) if samples else 1.0
     poses = SE3.stack([sample.base_from_gripper for sample in samples])
     rows = []
     for i, sample in enumerate(samples):
-        relative = sample.sharpness / middle if middle > 0 else 0.0
-        problems, near = [], (None, None)
-        if relative < options.sharpness:
+        relative, problems = sample.sharpness / middle if middle > 0 else 0.0, []
+        if relative < SHARPNESS:
             problems.append(f"blurred (sharpness {100 * relative:.0f} % of the median)")
-        if sample.clipped > options.clipped:
+        if sample.clipped > CLIPPED:
             problems.append(f"{100 * sample.clipped:.0f} % of its pixels are black or white")
         if i:
             metres, radians = pose_distance(poses[i], poses[:i])
-            millimetres, degrees = 1000 * metres, np.rad2deg(radians)
-            scaled = np.hypot(millimetres / options.same_mm, degrees / options.same_deg)
-            nearest = int(np.argmin(scaled))
-            near = float(millimetres[nearest]), float(degrees[nearest])
-            if near[0] < options.same_mm and near[1] < options.same_deg:
+            away = np.stack([1000 * metres / SAME_MM, np.rad2deg(radians) / SAME_DEG])
+            nearest = int(np.argmin(np.hypot(*away)))
+            if (away[:, nearest] < 1).all():
                 problems.append(f"same pose as {samples[nearest].name}")
-        rows.append(SampleReport(sample.name, relative, sample.clipped, *near, tuple(problems)))
+        rows.append(SampleReport(sample.name, relative, sample.clipped, tuple(problems)))
     return tuple(rows)
 
 
@@ -212,33 +187,25 @@ def _axes(words: str, spreads: Array, least: float) -> tuple[AxisCoverage, ...]:
 
 
 def _missing(
-    good: int,
-    rank: int,
-    rotations: Sequence[AxisCoverage],
-    positions: Sequence[AxisCoverage],
-    options: CoverageOptions,
+    good: int, rank: int, rotations: Sequence[AxisCoverage], positions: Sequence[AxisCoverage]
 ) -> tuple[str, ...]:
     missing = []
     if good < MIN_GRIPPER_FRAMES:
         missing.append(f"{MIN_GRIPPER_FRAMES - good} more images to start with")
     # Two axes of rotation are necessary, the third one makes the result better.
-    limits = (
-        ("rotations", rotations, options.rotation_deg, "deg"),
-        (
-            "positions",
-            positions,
-            options.position_mm,
-            "mm",
-        ),
-    )
-    for what, axes, limit, unit in limits:
-        missing += [
-            f"{what} {axis.name} ({axis.spread:.0f} {unit}, {limit:.0f} wanted)"
-            for axis in sorted(axes, key=lambda axis: axis.spread)
-            if not axis.covered
-        ]
-    if rank < 2 and not any("rotations" in words for words in missing):
+    rotations_left, positions_left = _uncovered(rotations), _uncovered(positions)
+    if rank < 2 and not rotations_left:
         missing.insert(0, "rotations about a second axis: tilt and turn independently")
-    if MIN_GRIPPER_FRAMES <= good < options.images:
-        missing.append(f"{options.images - good} more images")
+    for axis in rotations_left:
+        wanted = f"{axis.spread:.0f} deg, {ROTATION_DEG:.0f} wanted"
+        missing.append(f"rotations {axis.name} ({wanted})")
+    for axis in positions_left:
+        wanted = f"{axis.spread:.0f} mm, {POSITION_MM:.0f} wanted"
+        missing.append(f"positions {axis.name} ({wanted})")
+    if MIN_GRIPPER_FRAMES <= good < IMAGES:
+        missing.append(f"{IMAGES - good} more images")
     return tuple(missing)
+
+
+def _uncovered(axes: Sequence[AxisCoverage]) -> list[AxisCoverage]:
+    return sorted((axis for axis in axes if not axis.covered), key=lambda axis: axis.spread)

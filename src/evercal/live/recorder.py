@@ -32,9 +32,6 @@ class WristRecorder:
     Args:
         root: folder; created if missing, continued if it holds samples of the same camera.
         camera: intrinsics at the size of the images.
-
-    Raises:
-        InputError: The folder holds samples of another camera, or another file of poses.
     """
 
     def __init__(self, root: Path, camera: Camera):

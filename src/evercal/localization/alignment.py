@@ -1,8 +1,8 @@
 """Alignment: landmarks are searched in an image to a tenth of a pixel, then the pose is refined."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,54 +83,12 @@ class Alignment:
     refined: RefinedPose
     """map_from_camera and intrinsics."""
     pixels: Array
-    """(n, 2) inliers, pixels of the image."""
+    """(n, 2) inliers, pixels of the image; the other fields are those of `Hypothesis`."""
     points_m: Array
-    """(n, 3) their landmarks in the map's frame."""
     expected: int
-    """Landmarks that should be visible and were searched."""
     matched: int
-    """Landmarks whose patch was found near the expected position."""
     planned: int
-    """Landmarks that the last round would search in an unobstructed image."""
     templates: Array
-    """(n, p) patches of the inliers in their keyframes, at half size."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Target:
-    """The landmarks of some keyframes as one set."""
-
-    keyframes: Sequence[AlignedLandmarks]
-    starts: NDArray[np.int64]
-    """(keyframes + 1,) the first landmark of each, and their number."""
-    surface_m: Array
-    """(3, n, 3), see `AlignedLandmarks`."""
-    depth_error_m: Array
-    """(n, 3) displacement of a landmark by one standard deviation of its depth."""
-
-    @classmethod
-    def of(cls, keyframes: Sequence[AlignedLandmarks]) -> Self:
-        """Join the landmarks of keyframes in their order."""
-        surfaces = [keyframe.surface_m for keyframe in keyframes]
-        counts = [surface.shape[1] for surface in surfaces]
-        errors = [k.depth_noise[:, None] * (k.surface_m[0] - k.position_m) for k in keyframes]
-        starts = np.cumsum([0, *counts])
-        return cls(keyframes, starts, np.concatenate(surfaces, 1), np.concatenate(errors))
-
-    def templates(self, which: NDArray[np.int64]) -> Array:
-        """Intensities (n, p) of landmarks at half size, indices in rising order."""
-        return self.patches(1, which).intensity
-
-    def patches(self, level: int, which: NDArray[np.int64]) -> Patches:
-        """Templates of landmarks, indices in rising order."""
-        ends = np.searchsorted(which, self.starts)
-        parts = [
-            keyframe.patches[level].take(which[a:b] - start)
-            for keyframe, start, a, b in zip(
-                self.keyframes, self.starts, ends, ends[1:], strict=False
-            )
-        ]
-        return Patches.joined(parts)
 
 
 def align_pose(
@@ -150,12 +108,12 @@ def align_pose(
     Returns None if too few landmarks match. A start that is known to some pixels needs no `coarse`
     search.
     """
-    search = _Search(pyramid, _Target.of(keyframes), options)
+    search = _Search(pyramid, keyframes, options)
     pose, rounds = start, options.rounds if coarse else options.rounds[1:]
     change = np.zeros(INTRINSICS) if change is None else change
     found, again = None, 0
     while True:
-        passed = search.rounds(rounds, camera, pose, change, prior, found)
+        passed = search.rounds(rounds, changed_camera(camera, change), pose, found)
         if passed is None:
             return None
         pose, found = passed
@@ -171,7 +129,6 @@ def align_pose(
             return None  # the intrinsics do not converge
         pose, change, again = refined.pose.pose, refined.change, again + 1
         rounds = options.rounds if moved > _FAR_PX else options.rounds[-1:]
-    assert found.observed.landmark is not None, "landmarks of this search"
     inliers = refined.residual_px < options.inlier_px
     if inliers.sum() < options.min_matches:
         return None
@@ -180,14 +137,13 @@ def align_pose(
         found.observed.pixels[inliers],
         found.observed.points_m[inliers],
         found.expected,
-        len(found.observed.pixels),
+        len(found.landmark),
         min(found.expected, options.rounds[-1].landmarks),
-        search.target.templates(found.observed.landmark[inliers]),
+        search.patches(1, found.landmark[inliers]).intensity,
     )
 
 
 def _moved_px(camera: Camera, before: Array, after: Array) -> float:
-    """Motion of the image's edge by a change of the intrinsics, pixels."""
     across = [np.linspace(0, side - 1, 5) for side in (camera.width, camera.height)]
     plane = camera.pinhole.unproject(np.stack(np.meshgrid(*across), -1))
     pixels = [changed_camera(camera, change).project(plane) for change in (before, after)]
@@ -208,38 +164,51 @@ class _Found(NamedTuple):
     expected: int
     """Landmarks that were searched."""
     observed: Observed
+    landmark: NDArray[np.int64]
+    """(n,) their numbers."""
 
 
-@dataclass(frozen=True, eq=False)
 class _Search:
-    """Searches the landmarks of some keyframes in an image."""
+    """Searches the landmarks of some keyframes, joined in their order, in an image."""
 
-    pyramid: Sequence[Array]
-    target: _Target
-    options: AlignmentOptions
+    def __init__(
+        self,
+        pyramid: Sequence[Array],
+        keyframes: Sequence[AlignedLandmarks],
+        options: AlignmentOptions,
+    ):
+        self.pyramid, self.keyframes, self.options = pyramid, keyframes, options
+        surfaces = [keyframe.surface_m for keyframe in keyframes]
+        self.starts = np.cumsum([0, *(surface.shape[1] for surface in surfaces)])
+        self.surface_m = np.concatenate(surfaces, 1)
+        # Displacement (n, 3) of a landmark by one standard deviation of its depth.
+        self.depth_error_m = np.concatenate(
+            [k.depth_noise[:, None] * (k.surface_m[0] - k.position_m) for k in keyframes]
+        )
+
+    def patches(self, level: int, which: NDArray[np.int64]) -> Patches:
+        """Templates of landmarks, indices in rising order."""
+        ends = np.searchsorted(which, self.starts)
+        spans = zip(self.keyframes, self.starts, ends, ends[1:], strict=False)
+        return Patches.joined(
+            [keyframe.patches[level].take(which[a:b] - start) for keyframe, start, a, b in spans]
+        )
 
     def rounds(
-        self,
-        rounds: Sequence[AlignmentRound],
-        camera: Camera,
-        pose: SE3,
-        change: Array,
-        prior: Prior,
-        found: _Found | None,
+        self, rounds: Sequence[AlignmentRound], camera: Camera, pose: SE3, found: _Found | None
     ) -> tuple[SE3, _Found] | None:
         """Search coarse to fine and refine the pose after every round."""
-        now = changed_camera(camera, change)
         for step in rounds:
-            found = self.run(step, now, pose, found)
+            found = self.run(step, camera, pose, found)
             if found is None:
                 return None
             if step.level:
                 # Many matches of the first round are wrong; RANSAC selects a consistent set.
-                rough = _consistent(found.observed, now)
+                rough = _consistent(found.observed, camera)
                 if rough is None:
                     return None
                 pose = rough
-            pose = refine_pose(found.observed, now, pose, step.steps).pose.pose
+            pose = refine_pose(found.observed, camera, pose, step.steps).pose.pose
         assert found is not None, "at least one round"
         return pose, found
 
@@ -247,39 +216,31 @@ class _Search:
         self, step: AlignmentRound, camera: Camera, pose: SE3, before: _Found | None
     ) -> _Found | None:
         """Match landmarks near their expected positions; None for too few matches."""
-        share = 1.0 if before is None else len(before.observed.pixels) / before.expected
-        more = max(1.0, self.options.enough_matched / max(share, 1e-3))
-        count = int(min(more, self.options.most_more) * step.landmarks)
-        found = self._matched(replace(step, landmarks=count), camera, pose)
-        enough = found is not None and len(found.observed.pixels) >= self.options.min_matches
-        return found if enough else None
-
-    def _matched(self, step: AlignmentRound, camera: Camera, pose: SE3) -> _Found | None:
-        target, options, inverse = self.target, self.options, pose.inverse()
+        options, inverse = self.options, pose.inverse()
+        share = 1.0 if before is None else len(before.landmark) / before.expected
+        more = max(1.0, options.enough_matched / max(share, 1e-3))
+        most = int(min(more, options.most_more) * step.landmarks)
         rotation, shift = inverse.rotation_matrix(), inverse.translation_m
-        which, pixels, affines = project_surface(target.surface_m, rotation, shift, camera)
-        if len(which) > step.landmarks:
-            spread = np.linspace(0, len(which) - 1, step.landmarks).round().astype(int)
+        which, pixels, affines = project_surface(self.surface_m, rotation, shift, camera)
+        if len(which) > most:
+            spread = np.linspace(0, len(which) - 1, most).round().astype(int)
             which, pixels, affines = which[spread], pixels[spread], affines[spread]
         if not len(which):
             return None
-        patches = target.patches(step.level, which)
-        at, correlation = align_patches(
-            patches,
-            self.pyramid[step.level],
-            to_level(pixels, step.level),
-            affines,
-            step.iterations,
-        )
-        at = from_level(at.astype(np.float64), step.level)
+        patches, level = self.patches(step.level, which), step.level
+        start, image = to_level(pixels, level), self.pyramid[level]
+        at, correlation = align_patches(patches, image, start, affines, step.iterations)
+        at = from_level(at.astype(np.float64), level)
         good = correlation > options.min_correlation
         good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
-        spread = patches.inverse_hessian[good]
-        which, noise = which[good], options.noise * 2**step.level
-        points = target.surface_m[0, which]
-        error = _shift_px(points, target.depth_error_m[which], rotation, shift, camera)
-        white = whitening(affines[good], spread, options.floor_px, noise, error)
-        return _Found(len(good), Observed(at[good], points, white, which))
+        which, noise = which[good], options.noise * 2**level
+        if len(which) < options.min_matches:
+            return None
+        points = self.surface_m[0, which]
+        error = _shift_px(points, self.depth_error_m[which], rotation, shift, camera)
+        hessian = patches.inverse_hessian[good]
+        white = whitening(affines[good], hessian, options.floor_px, noise, error)
+        return _Found(len(good), Observed(at[good], points, white), which)
 
 
 def _shift_px(points: Array, moves: Array, rotation: Array, shift: Array, camera: Camera) -> Array:

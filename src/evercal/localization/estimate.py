@@ -33,9 +33,8 @@ class PoseEstimate:
     reason: str
     """Why the status is not `ok`; empty otherwise."""
     scene: str | None
-    """Name of the scene."""
     base_from_camera: SE3 | None
-    """Camera pose in that scene's base frame, metres, OpenCV axes."""
+    """Camera pose in the scene's base frame, metres, OpenCV axes."""
     covariance: np.ndarray | None
     """(6, 6) of (translation in the base frame, metres; rotation about camera axes, radians)."""
     inliers: int
@@ -55,7 +54,7 @@ class PoseEstimate:
     alternatives: tuple[SE3, ...] = ()
     """The poses base_from_camera of an ambiguous image, the stronger one first."""
     omitted: tuple[str, ...] = ()
-    """Steps that a time budget left out, see `Localizer.localize`."""
+    """Steps that a time for the frame left out, see `TrackOptions.at_most_ms`."""
     support: float = 0.0
     """Support of the pose, see `localization.acceptance`."""
 

@@ -120,17 +120,12 @@ class Prior:
 
 
 def _log_density(change: Array, covariance: Array) -> float:
-    """Logarithm of a Gaussian density about zero, without its constant."""
     squares = change @ np.linalg.solve(covariance, change)
     return float(-(squares + np.linalg.slogdet(covariance)[1]) / 2)
 
 
 def self_calibrated(
-    observed: Observed,
-    camera: Camera,
-    pose: SE3,
-    change: Array,
-    prior: Prior,
+    observed: Observed, camera: Camera, pose: SE3, change: Array, prior: Prior
 ) -> RefinedPose:
     """Pose and intrinsics; the prior gives way where the image contradicts it."""
     free = refine_pose(observed, camera, pose, _REFINE_STEPS, prior.free(camera), change)
@@ -148,7 +143,6 @@ def self_calibrated(
         refined,
         pose=UncertainPose(refined.pose.pose, wider),
         by_intrinsics=shared * refined.by_intrinsics,
-        change_covariance=shared * refined.change_covariance,
         measured=MeasuredIntrinsics(float(squares), by_shared),
     )
 
@@ -156,7 +150,6 @@ def self_calibrated(
 def _contradictable(
     observed: Observed, camera: Camera, free: RefinedPose, prior: Prior
 ) -> RefinedPose:
-    """Pose and intrinsics under a prior that gives way."""
     variances = prior.tested(camera, free.change, free.change_covariance)
     return refine_pose(observed, camera, free.pose.pose, _REFINE_STEPS, variances, free.change)
 
@@ -173,8 +166,11 @@ def _own_or_other(
         return _contradictable(observed, camera, free, replace(prior, sigma=UNKNOWN))
     own = refine_pose(observed, camera, pose, _REFINE_STEPS, prior.tight(camera))
     other = _contradictable(observed, camera, free, replace(prior, sigma=SAME_MODEL))
-    # Covariances are scaled by the caller, distances are not.
-    apart = _apart(own.pose.pose, other.pose.pose) / prior.scale
+    # A covariance whose deviation reaches from one pose to the other. Covariances are scaled by the
+    # caller, distances are not.
+    turn = (own.pose.pose.inverse() @ other.pose.pose).log()[3:]
+    off = np.r_[other.pose.pose.translation_m - own.pose.pose.translation_m, turn]
+    apart = np.outer(off, off) / prior.scale
     more = min(1.0, doubt / _REACHED) * (other.by_intrinsics - own.by_intrinsics + apart)
     return replace(
         own,
@@ -183,22 +179,12 @@ def _own_or_other(
     )
 
 
-def _apart(kept: SE3, other: SE3) -> Array:
-    """(6, 6) covariance whose deviation reaches from one pose to another."""
-    turn = (kept.inverse() @ other).log()[3:]
-    off = np.r_[other.translation_m - kept.translation_m, turn]
-    return np.outer(off, off)
-
-
 def cameras_in_scenes(
     camera: Camera | None, image: np.ndarray, scenes: "Sequence[LearnedScene]"
 ) -> list[Camera]:
     """Intrinsics of an image in each scene; a guess where none are given and no aspect ratio fits.
 
     The recording's intrinsics are replaced by the adjusted ones.
-
-    Raises:
-        InputError: A camera with another aspect ratio than the image's.
     """
     height, width = image.shape[:2]
     if camera is not None and not camera.fits(width, height):
@@ -215,7 +201,6 @@ def cameras_in_scenes(
 
 
 def _own(recorded: Camera, width: int, height: int) -> Camera:
-    """The camera of a recording for an image of another size."""
     if recorded.fits(width, height):
         return recorded.resized(width, height)
     scale = max(width, height) / max(recorded.width, recorded.height)
@@ -224,7 +209,6 @@ def _own(recorded: Camera, width: int, height: int) -> Camera:
 
 
 def _is_own(camera: Camera, scene: "LearnedScene") -> bool:
-    """Whether a stated camera is that of a recording, as stated there or as adjusted."""
     return camera in (scene.camera, scene.adjusted_camera)
 
 

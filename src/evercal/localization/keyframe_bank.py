@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from evercal.features.encode import encode_features
+from evercal.features.encode import encode_image
 from evercal.features.encoder import Encoder
 from evercal.features.precision import fast_bfloat16
-from evercal.features.views import ViewOptions, ideal_cell_pixels, plain_view
+from evercal.features.views import ideal_cell_pixels
 from evercal.features.vlad import vlad_for
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.patches import Patches, cut_patches, image_pyramid, to_level
@@ -74,11 +74,10 @@ class LoadedKeyframe:
     def _encoded(self) -> MatchedCells:
         contents, keyframes, number = self._contents, self._keyframes, self._number
         camera, pose = keyframes.cameras[number], keyframes.base_from_camera[number]
-        stride, view_options = contents.encoder.stride, ViewOptions(short_side=contents.short_side)
-        view = plain_view(keyframes.grey(number), camera, stride, view_options)
-        features = encode_features([view], contents.encoder)[0].flatten(1).T
+        grey, encoder = keyframes.grey(number), contents.encoder
+        features = encode_image(grey, encoder, contents.short_side).flatten(1).T
         small = camera.short_side_resized(contents.short_side)
-        rays = small.pinhole.unproject(ideal_cell_pixels(small, stride))
+        rays = small.pinhole.unproject(ideal_cell_pixels(small, encoder.stride))
         depth = 1 / keyframes.inverse_depth[number].double().numpy()
         kind = torch.bfloat16 if fast_bfloat16(features.device) else torch.float32
         points = rays * depth[:, None]
@@ -102,10 +101,7 @@ class LoadedKeyframe:
 
 
 class KeyframeBank:
-    """The keyframes of all scenes of a map.
-
-    `most_loaded` keyframes stay decoded in memory (up to 3 MB each).
-    """
+    """The keyframes of all scenes of a map; `most_loaded` stay decoded (up to 3 MB each)."""
 
     def __init__(self, contents: MapContents, most_loaded: int):
         self._contents, self._most, self._lock = contents, most_loaded, Lock()
@@ -122,9 +118,6 @@ class KeyframeBank:
         """The encoder of the map."""
         return self._contents.encoder
 
-    def __len__(self) -> int:
-        return len(self.scene)
-
     def retrieve(self, features: Tensor) -> NDArray[np.int64]:
         """Rank the keyframes by the similarity of their descriptors.
 
@@ -139,11 +132,10 @@ class KeyframeBank:
         """A keyframe of the bank, by its index."""
         with self._lock:
             if index not in self._loaded:
-                self._loaded[index] = self._read(int(self.scene[index]), int(self._number[index]))
+                keyframes = self._contents.scenes[self.scene[index]].keyframes
+                number = int(self._number[index])
+                self._loaded[index] = LoadedKeyframe(self._contents, keyframes, number)
                 if len(self._loaded) > self._most:
                     self._loaded.popitem(last=False)
             self._loaded.move_to_end(index)
             return self._loaded[index]
-
-    def _read(self, scene: int, number: int) -> LoadedKeyframe:
-        return LoadedKeyframe(self._contents, self._contents.scenes[scene].keyframes, number)

@@ -18,12 +18,7 @@ from torch import nn
 from evercal.errors import InputError
 from evercal.features.device import device_of
 from evercal.features.encode import encode_image
-from evercal.geometry import (
-    SE3,
-    Camera,
-    pose_distance_mm_deg,
-    resize_pixels,
-)
+from evercal.geometry import SE3, Camera, pose_distance_mm_deg, resize_pixels
 from evercal.localization.acceptance import (
     USELESS_M,
     accepted,
@@ -54,7 +49,6 @@ from evercal.localization.query import (
     LocalizeOptions,
     Matches,
     Query,
-    TimeBudget,
 )
 from evercal.localization.repetition import displaced, pattern_steps
 from evercal.mapping.scene_map import MapContents
@@ -62,8 +56,6 @@ from evercal.mapping.store import MapStore
 from evercal.recordings.images import as_rgb
 
 _ALONG_FOCAL = np.eye(INTRINSICS)[0]
-_THOROUGH = 3.0
-"""Usual duration of a thorough attempt, in quick ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,13 +101,9 @@ class Localizer:
         encoder: nn.Module | None = None,
         device: str = "auto",
     ) -> Self:
-        """A localizer for a map on disk.
+        """A localizer for a map on disk, on a device as for `device_of`.
 
-        The device is `auto` (a CUDA device if there is one), `cpu` or `cuda`. For a map that was
-        made with a module of the caller's own, `encoder` is that module.
-
-        Raises:
-            InputError: Not a map, an empty one, or a damaged file; no such device.
+        For a map that was made with a module of the caller's own, `encoder` is that module.
         """
         where = device_of(device)
         contents = MapStore.open(Path(store), encoder).contents
@@ -128,29 +116,19 @@ class Localizer:
         """Names of the scenes, in order of learning."""
         return tuple(scene.name for scene in self.contents.scenes)
 
-    def localize(
-        self, image: np.ndarray, camera: Camera | None = None, at_most_ms: float | None = None
-    ) -> PoseEstimate:
-        """Estimate the camera pose of one image.
+    def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
+        """Estimate the camera pose of one image, or the reason for rejecting it.
 
         Args:
             image: RGB or grey, uint8, shape (H, W, 3) or (H, W); other arrays are converted, see
                 `recordings.as_rgb`.
             camera: Intrinsics, at any size of the image's aspect ratio. Default: those of the
                 camera that recorded the scene, as adjusted by the map.
-            at_most_ms: Time for the answer, milliseconds. Further attempts are left out when they
-                would take longer, see `PoseEstimate.omitted`; the first one always runs.
-
-        Returns:
-            Pose in the base frame with its covariance, or the reason for rejecting the image.
-
-        Raises:
-            InputError: Not an image, or a camera with another aspect ratio than the image's.
         """
-        return self.located(image, camera, at_most_ms)[0]
+        return self.located(image, camera)[0]
 
     def located(
-        self, image: np.ndarray, camera: Camera | None = None, at_most_ms: float | None = None
+        self, image: np.ndarray, camera: Camera | None = None
     ) -> tuple[PoseEstimate, Hypothesis]:
         """`localize`, and the pose in the map's frame, for tracking."""
         began = time.perf_counter()
@@ -161,22 +139,15 @@ class Localizer:
             encode_image(image, contents.encoder, contents.short_side),
             self.options.patches_short_side,
             tuple(prior_of(camera, image, scene) for scene in contents.scenes),
-            budget=TimeBudget(began + (np.inf if at_most_ms is None else at_most_ms / 1000)),
         )
-        best = self._best_hypothesis(query, cameras)
-        rival: Hypothesis | None = None
-        if self._accepted(best) and query.budget.allows("rival poses", 0.0):
+        best, rival = self._best_hypothesis(query, cameras), None
+        if self.accepts(best):
             best, rival = self._settled(query, best, cameras)
-        answer = self._answer(query, best, rival, 1000 * (time.perf_counter() - began))
-        return replace(answer, omitted=tuple(query.budget.omitted)), best
+        return self.answer(query, best, 1000 * (time.perf_counter() - began), rival), best
 
     def accepts(self, hypothesis: Hypothesis, times: float = 1.0) -> bool:
         """Whether a pose has `times` the support that its scene requires."""
-        return self._accepted(hypothesis, times)
-
-    def answer(self, query: Query, found: Hypothesis, milliseconds: float) -> PoseEstimate:
-        """The answer for a pose in the map's frame."""
-        return self._answer(query, found, None, milliseconds)
+        return accepted(hypothesis, self.contents.scenes[hypothesis.scene], times)
 
     def localize_batch(
         self, images: Sequence[np.ndarray], cameras: Sequence[Camera | None]
@@ -190,36 +161,27 @@ class Localizer:
     def _best_hypothesis(self, query: Query, cameras: Sequence[Camera]) -> Hypothesis:
         """The pose with the most support, from as few attempts as it takes."""
         first, other_camera = self.options.quick
-        began, budget = time.perf_counter(), query.budget
         best, view = self._tried(query, first, cameras), query
-        if self._accepted(best, self.options.immediate):
+        if self.accepts(best, self.options.immediate):
             return best
-        once = time.perf_counter() - began
         for turns in (2, 1, 3):
-            if not budget.allows("turned images", once):
-                break
             turned = self._turned(query, turns)
             trial = self._tried(turned, first, cameras)
-            if self._accepted(trial, self.options.immediate):
+            if self.accepts(trial, self.options.immediate):
                 return trial
             if better(trial, best):
                 best, view = trial, turned
-        if not self._accepted(best):
-            if budget.allows("unknown intrinsics", once):
-                unknown = self._tried(view, other_camera, cameras)
-                best = unknown if better(unknown, best) else best
+        if not self.accepts(best):
+            unknown = self._tried(view, other_camera, cameras)
+            best = unknown if better(unknown, best) else best
             if best.pnp_inliers < self.options.promising_inliers:
                 return best
         done: set[tuple[int, int, bool, bytes]] = set()
         # A pose that is barely accepted in the first attempt may be beaten in the second.
         for attempt in self.options.thorough:
-            began = time.perf_counter()
-            if not budget.allows("thorough attempts", _THOROUGH * once):
-                break
             trial = self._tried(view, attempt, cameras, done)
-            once = max(once, (time.perf_counter() - began) / _THOROUGH)
             best = trial if support(trial) > support(best) else best
-            if self._accepted(best):
+            if self.accepts(best):
                 break
         return best
 
@@ -231,29 +193,23 @@ class Localizer:
         done: set[tuple[int, int, bool, bytes]] | None = None,
     ) -> Hypothesis:
         """The pose with the most support of one attempt; candidates that are `done` are skipped."""
-        done, best, once = set() if done is None else done, Hypothesis(0), 0.0
+        done, best = set() if done is None else done, Hypothesis(0)
         for candidate in self._matcher.candidates(query, attempt):
             if candidate.key in done:
                 continue  # in a small map a wider attempt often repeats the one before
             done.add(candidate.key)
-            if best.pose is not None and not query.budget.allows("other scenes", once):
-                break
-            began = time.perf_counter()
             trial = self._guided(query, candidate, cameras[candidate.scene])
-            once = time.perf_counter() - began
             best = trial if best.pose is None or better(trial, best) else best
-            if self._accepted(trial, self.options.immediate):
+            if self.accepts(trial, self.options.immediate):
                 break
         return best
 
     def _turned(self, query: Query, turns: int) -> Query:
-        """The query with features of the image turned clockwise by quarter turns."""
         image = np.ascontiguousarray(np.rot90(query.image, -turns))
         features = encode_image(image, self.contents.encoder, self.contents.short_side)
         return replace(query, features=features, turns=turns)
 
     def _guided(self, query: Query, candidate: Candidate, camera: Camera) -> Hypothesis:
-        """A pose in one scene; with little support it is matched again near itself."""
         best = self._hypothesis(query, candidate, camera)
         dense = replace(candidate, match_stride=1)
         while best.inliers and best.pose and support(best) < self.options.guided_below:
@@ -366,7 +322,7 @@ class Localizer:
             rivals = [
                 rival
                 for rival in self._rivals(query, front, cameras[best.scene])
-                if rival.refined and rival.pose and self._accepted(rival)
+                if rival.refined and rival.pose and self.accepts(rival)
             ]
             seen += rivals
             higher = max(rivals, key=support, default=front)
@@ -424,51 +380,12 @@ class Localizer:
             if rival is not None:
                 yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
 
-    def _accepted(self, hypothesis: Hypothesis, times: float = 1.0) -> bool:
-        return accepted(hypothesis, self.contents.scenes[hypothesis.scene], times)
-
-    def _answer(
-        self, query: Query, best: Hypothesis, rival: Hypothesis | None, milliseconds: float
+    def answer(
+        self, query: Query, best: Hypothesis, milliseconds: float, rival: Hypothesis | None = None
     ) -> PoseEstimate:
-        scene = self.contents.scenes[best.scene]
-        if best.pose is None or not self._accepted(best):
-            failed = best.pose is None
-            return replace(
-                self._rejected(best, milliseconds),
-                status="failed" if failed else "unknown_scene",
-                reason="fewer than 6 inliers" if failed else rejection(best, scene),
-            )
-        estimate, terms = in_base(best, scene)
-        if rival is not None and rival.pose is not None:
-            other = scene.frame.to_base(rival.pose).pose
-            mm, deg = pose_distance_mm_deg(estimate.pose, other)
-            return replace(
-                self._rejected(best, milliseconds),
-                status="ambiguous",
-                reason=_rival_reason(mm, deg, scene.unit_known),
-                scene=scene.name,
-                alternatives=(estimate.pose, other),
-            )
-        if scene.unit_known and estimate.sigma_mm > 1000 * USELESS_M:
-            return replace(
-                self._rejected(best, milliseconds),
-                reason=f"its position is uncertain by {estimate.sigma_mm:.0f} mm per axis",
-            )
-        assert best.points_m is not None, "accepted poses have inliers"
-        return replace(
-            self._rejected(best, milliseconds),
-            status="ok",
-            scene=scene.name,
-            base_from_camera=estimate.pose,
-            covariance=estimate.covariance,
-            terms=terms,
-            pixels=best.pixels,
-            points_m=scene.frame.points_to_base(best.points_m),
-            camera=best.refined and best.refined.camera.resized(*query.size),
-        )
-
-    def _rejected(self, best: Hypothesis, milliseconds: float) -> PoseEstimate:
-        return PoseEstimate(
+        """The answer for a pose in the map's frame, with another one that fits as well."""
+        scene, (height, width) = self.contents.scenes[best.scene], query.image.shape[:2]
+        rejected = PoseEstimate(
             status="unknown_scene",
             reason="",
             scene=None,
@@ -478,6 +395,36 @@ class Localizer:
             inlier_ratio=best.inlier_ratio,
             milliseconds=milliseconds,
             support=support(best),
+        )
+        if best.pose is None:
+            return replace(rejected, status="failed", reason="fewer than 6 inliers")
+        if not self.accepts(best):
+            return replace(rejected, reason=rejection(best, scene))
+        estimate, terms = in_base(best, scene)
+        if rival is not None and rival.pose is not None:
+            other = scene.frame.to_base(rival.pose).pose
+            mm, deg = pose_distance_mm_deg(estimate.pose, other)
+            return replace(
+                rejected,
+                status="ambiguous",
+                reason=_rival_reason(mm, deg, scene.unit_known),
+                scene=scene.name,
+                alternatives=(estimate.pose, other),
+            )
+        if scene.unit_known and estimate.sigma_mm > 1000 * USELESS_M:
+            wide = f"its position is uncertain by {estimate.sigma_mm:.0f} mm per axis"
+            return replace(rejected, reason=wide)
+        assert best.points_m is not None, "accepted poses have inliers"
+        return replace(
+            rejected,
+            status="ok",
+            scene=scene.name,
+            base_from_camera=estimate.pose,
+            covariance=estimate.covariance,
+            terms=terms,
+            pixels=best.pixels,
+            points_m=scene.frame.points_to_base(best.points_m),
+            camera=best.refined and best.refined.camera.resized(width, height),
         )
 
 

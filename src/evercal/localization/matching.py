@@ -101,7 +101,6 @@ class Matcher:
     def _within(
         self, pixels: np.ndarray, points_m: np.ndarray, camera: Camera, near: SE3
     ) -> NDArray[np.bool_]:
-        """(n, m) which of m points project within the search radius of n pixels."""
         projected = camera.pinhole.project(near.inverse().apply(points_m))
         projected = np.where(np.isnan(projected), np.inf, projected)
         return cdist(pixels, projected, "sqeuclidean") < self._options.guided_px**2

@@ -18,14 +18,13 @@ Result = TypeVar("Result")
 def in_parallel(work: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
     """Results of a function in the order of the items, from as many workers as torch has threads.
 
-    Raises:
-        Exception: whatever `work` raises, when its turn comes; items not begun are left out.
+    What `work` raises is raised when its turn comes; items not begun are left out.
     """
     threads = torch.get_num_threads()
-    if min(threads, len(items)) < 2:
+    workers = min(threads, len(items))
+    if workers < 2:
         yield from map(work, items)
         return
-    workers = min(threads, len(items))
     share = max(1, threads // workers)
     try:
         with ThreadPoolExecutor(workers, "image", torch.set_num_threads, (share,)) as pool:

@@ -1,6 +1,7 @@
 """Pose from 2D-3D matches: PoseLib's LO-RANSAC with a cap, and the covariance of the pose."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,8 +23,7 @@ class PnpOptions:
     """Iterations that always run."""
 
 
-@dataclass(frozen=True, eq=False)
-class PnpResult:
+class PnpResult(NamedTuple):
     """A pose and its inliers."""
 
     pose: UncertainPose
@@ -65,12 +65,9 @@ def solve_pnp(
 def pose_covariance(
     pixels: np.ndarray, points_m: np.ndarray, camera: Camera, points_from_camera: SE3
 ) -> np.ndarray:
-    """First-order covariance from the reprojection Jacobian, sigma^2 (J^T J)^-1.
+    """First-order covariance (6, 6) from the reprojection Jacobian, sigma^2 (J^T J)^-1.
 
     sigma^2 is the mean squared residual per coordinate.
-
-    Returns:
-        (6, 6), see `UncertainPose`.
     """
     rotation = points_from_camera.rotation_matrix()
     position = points_from_camera.translation_m

@@ -1,7 +1,6 @@
 """Robust Gauss-Newton refinement of a camera's pose and intrinsics, with their covariance."""
 
 from dataclasses import dataclass, replace
-from typing import Self
 
 import cv2
 import numpy as np
@@ -34,13 +33,6 @@ class Observed:
     """(n, 3) in the map's frame."""
     whitening: Array
     """(n, 2, 2) that gives errors in the image unit variance."""
-    landmark: NDArray[np.int64] | None = None
-    """(n,) numbers of the landmarks; None where nothing but the pose is wanted."""
-
-    def take(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> Self:
-        """The observations of an index."""
-        number = None if self.landmark is None else self.landmark[index]
-        return type(self)(self.pixels[index], self.points_m[index], self.whitening[index], number)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +73,10 @@ class _Iterate:
     """Pose and intrinsics of an iteration, and the normal equations that led to them."""
 
     rotation: NDArray[np.float64]
-    """(3, 3) of points_from_camera."""
     position: NDArray[np.float64]
-    """(3,)."""
     change: Array
-    """(5,) of the intrinsics."""
     camera: Camera
-    """With the change."""
+    """With the change of the intrinsics."""
     variance: float
     """Robust variance of the whitened errors; infinite before the first iteration."""
     information: Array
@@ -187,12 +176,10 @@ def changed_camera(camera: Camera, change: Array) -> Camera:
 
 
 def _whitened(white: Array, raw: Array) -> Array:
-    """(2, n) residuals of unit variance."""
     return white[:, 0] * raw[0] + white[:, 1] * raw[1]
 
 
 def _robust_variance(squares: Array) -> float:
-    """Variance of residuals from their squared norms (n,), at least 0.05."""
     # The median of a 2-D Gaussian's squared norm is 1.386 variances.
     return max(_median(squares) / 1.386, 0.05)
 

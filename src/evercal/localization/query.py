@@ -1,6 +1,5 @@
 """Options of localization, the prepared image, candidate scenes and pose hypotheses."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -84,28 +83,6 @@ class LocalizeOptions:
     """Keyframes that stay decoded in memory."""
 
 
-@dataclass(eq=False)
-class TimeBudget:
-    """Time for one image; steps that would exceed it are left out."""
-
-    until: float = np.inf
-    """`time.perf_counter` at which the answer is due."""
-    omitted: list[str] = field(default_factory=list)
-    """Steps that were left out."""
-
-    @property
-    def left_s(self) -> float:
-        """Time that is left, seconds."""
-        return self.until - time.perf_counter()
-
-    def allows(self, step: str, expected_s: float) -> bool:
-        """Whether a step of an expected duration fits; one that does not is noted."""
-        fits = time.perf_counter() + expected_s <= self.until
-        if not fits and step not in self.omitted:
-            self.omitted.append(step)
-        return fits
-
-
 @dataclass(frozen=True, eq=False)
 class Query:
     """An image to be located."""
@@ -120,13 +97,6 @@ class Query:
     """Of the intrinsics in each scene."""
     turns: int = 0
     """Quarter turns clockwise of the image before it was encoded."""
-    budget: TimeBudget = field(default_factory=TimeBudget)
-    """Time for the answer."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the image, pixels."""
-        return self.image.shape[1], self.image.shape[0]
 
     @cached_property
     def grey(self) -> np.ndarray:
@@ -143,16 +113,13 @@ class Query:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A scene to try."""
+    """A scene to try with the effort of an `Attempt`."""
 
     scene: int
-    """Index of the scene."""
     keyframes: NDArray[np.int64]
     """Its keyframes in the bank, most similar first."""
     match_stride: int = 1
-    """See `Attempt.match_stride`."""
     unknown_camera: bool = False
-    """See `Attempt.unknown_camera`."""
 
     @property
     def key(self) -> tuple[int, int, bool, bytes]:
@@ -185,7 +152,6 @@ class Hypothesis:
     """A pose of the image, assuming that it shows one scene."""
 
     scene: int
-    """Index of the scene."""
     pose: UncertainPose | None = None
     """map_from_camera; None where PnP failed."""
     refined: RefinedPose | None = None
@@ -200,7 +166,6 @@ class Hypothesis:
     """Landmarks whose patch was found near the expected position."""
     planned: int = 0
     """Landmarks that an unobstructed image would have been searched for."""
-
     pnp_inliers: int = 0
     """Matches that agree with the pose before alignment."""
     candidate: Candidate | None = None
@@ -208,7 +173,7 @@ class Hypothesis:
     matches: Matches | None = None
     """All matches; None where alignment failed."""
     templates: np.ndarray | None = None
-    """(n, p) patches of the inliers, see `Alignment.templates`."""
+    """(n, p) patches of the inliers in their keyframes, at half size."""
 
     @property
     def inliers(self) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, UncertainPose, average_poses
+from evercal.geometry import SE3, Camera, average_poses
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.mapping.build import OnProgress
@@ -33,9 +33,7 @@ class RefreshReport:
     """Outcome of a refresh, as JSON values."""
 
     scene: str
-    """Name of the scene."""
     seconds: float
-    """Wall time."""
     images: int
     """Images given."""
     located: int
@@ -49,7 +47,6 @@ class RefreshReport:
     keyframes_left: int
     """Keyframes that were removed."""
     keyframes_added: int
-    """New keyframes."""
     memory_bytes: int
     """Size of the keyframes of this scene."""
     verified: int
@@ -57,20 +54,13 @@ class RefreshReport:
     shift_mm: float
     """Their mean motion by the refresh: the shift of the base frame."""
     shift_deg: float
-    """The same for the rotation."""
     shift_sigma_mm: float
     """Standard deviation of that shift, which is part of every later covariance."""
     shift_sigma_deg: float
-    """The same for the rotation."""
 
 
-@dataclass(frozen=True, eq=False)
-class _NewImage:
-    """A new image in the map."""
-
-    frame: Frame
-    """Posed in the frame of the keyframes."""
-    answer: UncertainPose
+_NewImage = tuple[Frame, SE3]
+"""A frame posed in the frame of the keyframes, and its base_from_camera."""
 
 
 def refresh_scene(
@@ -80,27 +70,20 @@ def refresh_scene(
     options: RefreshOptions | None = None,
     on_progress: OnProgress = lambda *_: None,
 ) -> tuple[SceneMap, RefreshReport]:
-    """Refresh the scene that most of the images show.
+    """Refresh the scene that most of the images, with their names, show.
 
-    Args:
-        localizer: Localizer of the map.
-        images: Names and images (H, W, 3), uint8 RGB.
-        camera: Their intrinsics. Default: those of the camera that recorded the scene.
-        options: Thresholds.
-        on_progress: Called with the step, how much of it is done, and its total.
-
-    Raises:
-        InputError: Too few images are located, or the refreshed map would locate fewer of them. The
-            map is unchanged.
+    The intrinsics are by default those of the camera that recorded the scene. Too few located
+    images, or a refreshed map that would locate fewer of them, raise `InputError`.
     """
     began, options = time.perf_counter(), options or RefreshOptions()
     estimates = []
     for number, (_, image) in enumerate(images):
         estimates.append(localizer.localize(image, camera))
         on_progress("locating", number + 1, len(images))
-    name = _shown(estimates)
+    names = [e.scene for e in estimates if e.status == "ok" and e.scene is not None]
+    shown = max(sorted(set(names)), key=names.count) if names else None
     contents = localizer.contents
-    index = [scene.name for scene in contents.scenes].index(name) if name else -1
+    index = localizer.scenes.index(shown) if shown else -1
     scene = contents.scenes[index]
     located, left_out = _usable(images, estimates, scene)
     if len(located) < LEAST_IMAGES:
@@ -111,8 +94,8 @@ def refresh_scene(
         )
     check = located[VERIFIED - 1 :: VERIFIED]
     used = [item for i, item in enumerate(located) if i % VERIFIED != VERIFIED - 1]
-    poses = SE3.stack([pose for item in used if (pose := item.frame.base_from_camera) is not None])
-    frames = [used[i].frame for i in spread_poses(poses, options.most_frames)]
+    poses = SE3.stack([pose for frame, _ in used if (pose := frame.base_from_camera) is not None])
+    frames = [used[i][0] for i in spread_poses(poses, options.most_frames)]
     size = WorkingSize(cells=contents.short_side, patches=localizer.options.patches_short_side)
     result = refreshed(scene, frames, contents.encoder, size, options, on_progress)
     scenes = [*contents.scenes]
@@ -146,12 +129,6 @@ def refresh_scene(
     return updated, report
 
 
-def _shown(estimates: Sequence[PoseEstimate]) -> str | None:
-    """Return the scene that most images show."""
-    names = [e.scene for e in estimates if e.status == "ok" and e.scene is not None]
-    return max(sorted(set(names)), key=names.count) if names else None
-
-
 def _usable(
     images: Sequence[tuple[str, NDArray[np.uint8]]],
     estimates: Sequence[PoseEstimate],
@@ -171,7 +148,7 @@ def _usable(
             pose = scene.frame.from_base(answer.pose)
             camera = estimate.camera or scene.adjusted_camera
             camera = camera.resized(image.shape[1], image.shape[0])
-            located.append(_NewImage(Frame(name, image, camera, pose), answer))
+            located.append((Frame(name, image, camera, pose), answer.pose))
     return located, left_out
 
 
@@ -187,10 +164,10 @@ def _verified(
 ) -> tuple[SE3, NDArray[np.float64], int]:
     """Locate images outside the refreshed map; return shift, its standard deviation, and count."""
     moves = []
-    for item in check:
-        estimate = after.localize(item.frame.read_image(), camera)
+    for frame, before in check:
+        estimate = after.localize(frame.read_image(), camera)
         if estimate.status == "ok" and estimate.scene == scene and estimate.base_from_camera:
-            moves.append(estimate.base_from_camera @ item.answer.pose.inverse())
+            moves.append(estimate.base_from_camera @ before.inverse())
     lost = len(check) - len(moves)
     if not moves or lost > max(1, WORSE * len(check)):
         raise InputError(
@@ -200,7 +177,6 @@ def _verified(
     poses = SE3.stack(moves)
     shift = average_poses(poses)
     off = (shift.inverse() @ poses).log().reshape(-1, 2, 3)
-    count = max(len(moves) - 1, 1)
-    own = np.sqrt((off**2).mean((0, 2)) / count)
+    own = np.sqrt((off**2).mean((0, 2)) / max(len(moves) - 1, 1))
     size = np.sqrt((shift.log().reshape(2, 3) ** 2).mean(1))
     return shift, np.maximum(own, size), len(moves)

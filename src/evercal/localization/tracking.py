@@ -8,6 +8,7 @@ several periods open.
 
 import time
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -16,21 +17,20 @@ import torch
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.localization.background_search import BackgroundSearch
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import cameras_in_scenes, prior_of
 from evercal.localization.localizer import Localizer
-from evercal.localization.query import Candidate, Hypothesis, Query, TimeBudget
+from evercal.localization.query import Candidate, Hypothesis, Query
 from evercal.localization.repetition import pattern_steps
 from evercal.recordings.images import as_rgb
 
 TrackState = Literal["tracking", "relocalized", "lost"]
+_Located = tuple[PoseEstimate, Hypothesis]
 _SEARCHING = "localization takes longer than the time for a frame"
 _MARGIN = 1.3
 """Time allowance for an alignment, relative to the previous one."""
 _ANSWER_S = 0.002
 """Time to answer after waiting."""
-
 
 MOST_SPEED_M_S, MOST_ACCELERATION_M_S2 = 1.0, 10.0
 """Motions of a camera that a prediction allows for; faster ones are rare on arms and in hands."""
@@ -67,14 +67,12 @@ class TrackedFrame:
     """A frame of a stream."""
 
     number: int
-    """Number of the frame, from 0."""
+    """From 0."""
     stamp_s: float
-    """Its time."""
     state: TrackState
     """`tracking`: found near its prediction. `relocalized`: located from nothing. `lost`: no
     pose."""
     estimate: PoseEstimate
-    """The answer."""
     smoothed: SE3 | None = None
     """base_from_camera, smoothed; None where lost or without smoothing."""
     jumped: bool = False
@@ -83,16 +81,11 @@ class TrackedFrame:
 
 @dataclass(eq=False)
 class Tracker:
-    """Locates the frames of one camera in order.
-
-    Args:
-        localizer: Localizer of the map.
-        camera: Intrinsics. Default: those of the camera that recorded the scene.
-        options: Effort and thresholds.
-    """
+    """Locates the frames of one camera in order."""
 
     localizer: Localizer
     camera: Camera | None = None
+    """Intrinsics. Default: those of the camera that recorded the scene."""
     options: TrackOptions = field(default_factory=TrackOptions)
     _scene: int = -1
     _poses: list[tuple[float, SE3]] = field(default_factory=list)
@@ -102,18 +95,14 @@ class Tracker:
     _number: int = 0
     _alignment_s: float = 0.0
     """Time of the last alignment."""
-    _search: BackgroundSearch | None = None
-    """Locates frames, where the time for a frame is limited."""
+    _pool: ThreadPoolExecutor | None = None
+    _running: tuple[float, Future[_Located]] | None = None
+    """Time of a frame that is located in the background, and its result."""
 
     def track(self, image: np.ndarray, stamp_s: float | None = None) -> TrackedFrame:
-        """Locate the next frame.
+        """Locate the next frame, an image as for `Localizer.localize`, at a time in seconds.
 
-        Args:
-            image: (H, W, 3) or (H, W) uint8, as for `Localizer.localize`.
-            stamp_s: Time of the image, seconds. Default: frames at `fallback_s`.
-
-        Raises:
-            InputError: As `Localizer.localize`.
+        Frames without a time are `fallback_s` apart.
         """
         number, self._number = self._number, self._number + 1
         stamp = number * self.options.fallback_s if stamp_s is None else stamp_s
@@ -122,7 +111,7 @@ class Tracker:
             estimate, state = self._located(image, stamp)
         else:
             until = time.perf_counter() + self.options.at_most_ms / 1000
-            estimate, state = self._located_in_time(image, stamp, TimeBudget(until))
+            estimate, state = self._located_in_time(image, stamp, until)
         smoothed, jumped = self._smooth(estimate, stamp)
         return TrackedFrame(number, stamp, state, estimate, smoothed, jumped)
 
@@ -135,7 +124,7 @@ class Tracker:
             yield self.track(image, stamp)
 
     def _located(self, image: np.ndarray, stamp: float) -> tuple[PoseEstimate, TrackState]:
-        estimate = self._near_prediction(image, stamp, TimeBudget())
+        estimate = self._near_prediction(image, stamp)
         if estimate is not None:
             return estimate, "tracking"
         before, predicted, scene = self._poses[-1:], self._predicted(stamp), self._scene
@@ -150,33 +139,38 @@ class Tracker:
         return estimate, "relocalized"
 
     def _located_in_time(
-        self, image: np.ndarray, stamp: float, budget: TimeBudget
+        self, image: np.ndarray, stamp: float, until: float
     ) -> tuple[PoseEstimate, TrackState]:
-        """The same within a budget; what takes longer goes on in the background."""
+        """The same until a time of the clock; what takes longer goes on in the background."""
         began = time.perf_counter()
-        self._search = search = self._search or BackgroundSearch(self.localizer, self.camera)
-        adopted = search.under_way and self._adopted(search, budget)
-        estimate = self._near_prediction(image, stamp, budget, adopted)
+        adopted = self._running is not None and self._adopted(until)
+        estimate = self._near_prediction(image, stamp, until, adopted)
         if estimate is not None:
-            estimate = replace(estimate, omitted=tuple(budget.omitted))
             return estimate, "relocalized" if adopted else "tracking"
         self._poses.clear()
-        if not search.under_way:
-            search.start(image, stamp)
-            if (done := search.take(budget.left_s - _ANSWER_S)) is not None:
+        if self._running is None:
+            self._pool = self._pool or ThreadPoolExecutor(1, "search")
+            self._running = stamp, self._pool.submit(self.localizer.located, image, self.camera)
+            if (done := self._taken(until - _ANSWER_S)) is not None:
                 estimate, found = done[1]
                 if estimate.status == "ok":
                     self._remember(found, stamp)
                 return estimate, "relocalized" if estimate.status == "ok" else "lost"
-        budget.allows("localization", np.inf)
         spent = 1000 * (time.perf_counter() - began)
-        omitted = tuple(budget.omitted)
         nothing = PoseEstimate("failed", _SEARCHING, None, None, None, 0, 0.0, spent)
-        return replace(nothing, omitted=omitted), "lost"
+        return replace(nothing, omitted=("localization",)), "lost"
 
-    def _adopted(self, search: BackgroundSearch, budget: TimeBudget) -> bool:
-        """Take the pose of an earlier frame as prior, if it was found by now."""
-        earlier = search.take(budget.left_s - _MARGIN * self._alignment_s)
+    def _taken(self, until: float) -> tuple[float, _Located] | None:
+        """Time and result of the frame in the background; None if it is not ready in time."""
+        assert self._running is not None, "a frame was given"
+        stamp, future = self._running
+        if not wait([future], max(until - time.perf_counter(), 0.0)).done:
+            return None
+        self._running = None
+        return stamp, future.result()
+
+    def _adopted(self, until: float) -> bool:
+        earlier = self._taken(until - _MARGIN * self._alignment_s)
         if earlier is None or earlier[1][0].status != "ok":
             return False
         stamp, (_, found) = earlier
@@ -184,7 +178,7 @@ class Tracker:
         return True
 
     def _near_prediction(
-        self, image: np.ndarray, stamp: float, budget: TimeBudget, adopted: bool = False
+        self, image: np.ndarray, stamp: float, until: float = np.inf, adopted: bool = False
     ) -> PoseEstimate | None:
         """Align the landmarks around the predicted pose; None if that does not suffice.
 
@@ -194,6 +188,7 @@ class Tracker:
         began, predicted = time.perf_counter(), self._predicted(stamp)
         if predicted is None:
             return None
+        settled = self.options.settled if adopted else 1.0
         localizer, contents = self.localizer, self.localizer.contents
         cameras = cameras_in_scenes(self.camera, image, contents.scenes)
         priors = tuple(prior_of(self.camera, image, scene) for scene in contents.scenes)
@@ -202,18 +197,13 @@ class Tracker:
         change = np.zeros(5) if self._change is None else self._change
         for coarse in (True,) if adopted else (False, True):
             start = time.perf_counter()
-            if (
-                coarse
-                and not adopted
-                and not budget.allows("coarse alignment", _MARGIN * self._alignment_s)
-            ):
+            if coarse and not adopted and start + _MARGIN * self._alignment_s > until:
                 return None
             found = localizer.aligned(
                 query, candidate, cameras[self._scene], predicted, change, coarse
             )
             self._alignment_s = time.perf_counter() - start
-            times = self.options.settled if adopted else 1.0
-            if found is not None and self._trusted(found, predicted, times):
+            if found is not None and self._trusted(found, predicted, settled):
                 if self._may_have_slipped(found, predicted, stamp):
                     return None
                 answer = localizer.answer(query, found, 1000 * (time.perf_counter() - began))
@@ -248,7 +238,6 @@ class Tracker:
         return 1.0 if similarity is None else similarity.scale
 
     def _predicted(self, stamp: float) -> SE3 | None:
-        """Pose of the next frame at constant velocity."""
         if not self._poses:
             return None
         (last, pose), before = self._poses[-1], self._poses[:-1]
@@ -260,7 +249,6 @@ class Tracker:
         return pose @ SE3.exp(share * (before[0][1].inverse() @ pose).log())
 
     def _next_keyframes(self, pose: SE3) -> NDArray[np.int64]:
-        """Return the keyframes of the scene with the most similar views."""
         keyframes = self.localizer.contents.scenes[self._scene].keyframes
         first = sum(len(s.keyframes) for s in self.localizer.contents.scenes[: self._scene])
         metres, radians = pose_distance(pose, keyframes.base_from_camera)
@@ -269,7 +257,6 @@ class Tracker:
         return first + order[: self.options.keyframes]
 
     def _trusted(self, found: Hypothesis, predicted: SE3, times: float) -> bool:
-        """Whether a pose is accepted and near its prediction."""
         if found.pose is None or not self.localizer.accepts(found, times):
             return False
         metres, radians = pose_distance(found.pose.pose, predicted)
@@ -277,7 +264,6 @@ class Tracker:
         return near and float(radians) < np.deg2rad(self.options.reach_deg)
 
     def _remember(self, found: Hypothesis, stamp: float, settled: bool = False) -> None:
-        """Keep what predicts the next frame, if it is settled."""
         if found.pose is None:
             return
         self._scene = found.scene

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from evercal.features.encode import encode_features
+from evercal.features.encode import encode_image
 from evercal.features.encoder import Encoder
-from evercal.features.views import View, ViewOptions, plain_view, working_image
+from evercal.features.views import working_image
 from evercal.geometry import SE3, Camera
 from evercal.mapping.patches import image_pyramid
 from evercal.mapping.plane_sweep import (
@@ -85,16 +85,11 @@ class PreparedFrames:
         """Side of a cell of the feature grid, in pixels of the image that patches are cut from."""
         return self.encoder.stride * self.cameras[i].width / self.cell_camera(i).width
 
-    def view(self, i: int) -> View:
-        """A frame as the encoder's input."""
-        options = ViewOptions(short_side=self.size.cells)
-        return plain_view(self.grey[i], self.cameras[i], self.encoder.stride, options)
-
     def features(self, i: int) -> Tensor:
         """(cells, channels) features of a frame on the CPU, cached in half precision."""
         if i not in self._features:
-            features = encode_features([self.view(i)], self.encoder)
-            self._features[i] = features[0].flatten(1).T.half().cpu()
+            features = encode_image(self.grey[i], self.encoder, self.size.cells)
+            self._features[i] = features.flatten(1).T.half().cpu()
         return self._features[i].float()
 
     def posed_cells(self, i: int) -> PosedCells:

@@ -20,14 +20,14 @@ NEAR_M = 0.05
 
 @dataclass(frozen=True)
 class Surface:
-    """One textured rectangle, visible from the side of its normal."""
+    """One textured rectangle in the base frame, visible from the side of its normal."""
 
     corner_m: np.ndarray
-    """Corner of texture pixel (0, 0), shape (3,), base frame."""
+    """(3,) corner of texture pixel (0, 0)."""
     edge_u_m: np.ndarray
-    """Edge along texture columns, shape (3,)."""
+    """(3,) along texture columns."""
     edge_v_m: np.ndarray
-    """Edge along texture rows, shape (3,)."""
+    """(3,) along texture rows."""
     pyramid: tuple[np.ndarray, ...]
     """Texture (h, w, 3) uint8 and its halvings, against aliasing."""
 
@@ -39,11 +39,7 @@ class Surface:
 
 
 class BoxRoom:
-    """A room generated from a seed.
-
-    Seeds 9000 to 9999 are reserved for benchmarks. The number of furniture boxes is random if
-    omitted.
-    """
+    """A room generated from a seed; those from 9000 to 9999 are reserved for benchmarks."""
 
     def __init__(self, seed: int, furniture: int | None = None, texture_px: int = 384):
         rng = np.random.default_rng(seed)
@@ -86,14 +82,7 @@ class BoxRoom:
     def add_box(
         self, low: np.ndarray, size: np.ndarray, rng: np.random.Generator, inward: bool = False
     ) -> None:
-        """Add a textured box without its bottom; `inward` shows its inner sides and its floor.
-
-        Args:
-            low: (3,) its lowest corner, metres.
-            size: (3,) its sides, metres.
-            rng: source of the textures.
-            inward: whether it is seen from inside.
-        """
+        """Add a textured box from its lowest corner (3,) and its sides (3,), see `box_faces`."""
         for corner, u, v in box_faces(low, np.diag(size), inward):
             pyramid = self._texture(rng, calm=inward or rng.random() < 0.3)
             self.surfaces.append(Surface(corner, u, v, pyramid))
@@ -112,16 +101,7 @@ class BoxRoom:
     def render(
         self, camera: Camera, base_from_camera: SE3, moving: Sequence[Surface] = ()
     ) -> np.ndarray:
-        """Render an image of an ideal pinhole camera.
-
-        Args:
-            camera: intrinsics without distortion.
-            base_from_camera: its pose.
-            moving: surfaces that are in the room for this image.
-
-        Raises:
-            ValueError: The camera has distortion.
-        """
+        """Render an image of an ideal pinhole camera; `moving` surfaces are for this image."""
         if camera.distortion:
             raise ValueError("box rooms are rendered through an ideal pinhole, without distortion")
         image = np.zeros((camera.height, camera.width, 3), np.uint8)
@@ -135,19 +115,17 @@ class BoxRoom:
         return image
 
     def intersect(self, origin_m: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Intersect rays with the room in closed form.
+        """First intersections (n, 3) of rays, and their depths (n,) in units of the ray length.
 
-        Origins (3,) or (n, 3) and directions (n, 3) of any length are in the base frame. Returns
-        the first intersections (n, 3), NaN for rays that miss, and depths (n,) in units of the ray
-        length, inf for rays that miss.
+        Origins (3,) or (n, 3) and directions (n, 3) of any length are in the base frame. Rays that
+        miss have NaN and infinite depth.
         """
         origin = np.broadcast_to(origin_m, rays.shape)
         best = np.full(len(rays), np.inf)
         for surface in self.surfaces:
-            normal = surface.normal
-            slope = rays @ normal
+            slope = rays @ surface.normal
             with np.errstate(divide="ignore", invalid="ignore"):
-                depth = ((surface.corner_m - origin) @ normal) / slope
+                depth = ((surface.corner_m - origin) @ surface.normal) / slope
                 local = origin + depth[:, None] * rays - surface.corner_m
                 u = local @ surface.edge_u_m / (surface.edge_u_m @ surface.edge_u_m)
                 v = local @ surface.edge_v_m / (surface.edge_v_m @ surface.edge_v_m)
@@ -167,10 +145,9 @@ class BoxRoom:
         return look_at(position, position + target, rng.uniform(-0.25, 0.25))
 
     def path(self, frames: int, seed: int) -> SE3:
-        """A smooth hand-held sweep once around the room.
+        """A smooth hand-held sweep once around the room, base_from_camera (frames,).
 
-        Returns base_from_camera (frames,). The seed is that of the deviation from the room's common
-        sweep, about 10 to 20 cm and 10 deg.
+        The seed is that of the deviation from the room's common sweep, 10 to 20 cm and 10 deg.
         """
         common = np.random.default_rng([self.seed, 0])
         walker = np.random.default_rng([self.seed, seed])
@@ -196,10 +173,8 @@ def box_faces(
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Corner and two edges, shape (3,), of each visible face of a box: all but its bottom.
 
-    Args:
-        low: (3,) the corner at which the edges start.
-        edges: (3, 3) right-handed orthogonal edges, one a row; the last one points up.
-        inward: whether the box is seen from inside, with its floor.
+    The edges (3, 3), one a row, start at `low`, are right-handed and orthogonal; the last one
+    points up. `inward` is a box that is seen from inside, with its floor.
     """
     ex, ey, ez = edges
     faces = [(low, ex, ez), (low + ey + ex, -ex, ez), (low + ex, ey, ez), (low + ey, -ey, ez)]
@@ -211,7 +186,6 @@ def box_faces(
 
 
 def _wave(t: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
-    """A random smooth periodic function of t, shape (n,), with range [0, 1] over [0, 2 pi]."""
     parts = [(k, rng.uniform(0.4, 1) / k, rng.uniform(0, 2 * np.pi)) for k in (1, 2, 3)]
 
     def total(x: np.ndarray) -> np.ndarray:
@@ -249,10 +223,7 @@ def _draw(
     edges: np.ndarray,
     camera: Camera,
 ) -> None:
-    """Warp a rectangle in camera coordinates into `image` where it is nearest.
-
-    `nearness` is the inverse depth of `image`; both are updated.
-    """
+    """Warp a rectangle in camera coordinates into `image` where it is nearest, by `nearness`."""
     import cv2
 
     normal = np.cross(edges[:, 0], edges[:, 1])

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.geometry import pose_to_dict
-from evercal.live.recorder import WristRecorder, pose_rows
+from evercal.live.recorder import JPEG_QUALITY, WristRecorder, pose_rows
 from evercal.mapping.selection import spread_poses
 from evercal.recordings.images import write_jpeg
 from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
@@ -21,8 +21,6 @@ from evercal.storage import write_bytes, write_json
 
 WRIST_IMAGES, TRIPOD_IMAGES = 25, 8
 REACHABLE = 200
-JPEG_QUALITY = 95
-_PATH = "wrist"
 
 
 def record_cell(
@@ -32,9 +30,6 @@ def record_cell(
 
     The wrist poses are spread over the reachable ones. The truth is in a file of its own, which no
     other command reads.
-
-    Raises:
-        InputError: The folder exists, the seed is reserved, or the images are too small.
     """
     if out.exists() and any(out.iterdir()):
         raise InputError(f"{out}: is not empty; give a new folder")
@@ -44,7 +39,7 @@ def record_cell(
     out.mkdir(parents=True, exist_ok=True)
     reachable = cell.reachable_poses(REACHABLE)
     views = cell.reachable_poses(max(20 * wrist_images, REACHABLE), seed=1)
-    recorder = WristRecorder(out / _PATH, cell.intrinsics)
+    recorder = WristRecorder(out / "wrist", cell.intrinsics)
     for i in spread_poses(views, wrist_images):
         cell.robot.move_to(views[i])
         recorder.add(cell.wrist_camera.read()[1], cell.robot.base_from_gripper())

@@ -67,7 +67,6 @@ def arm_surfaces(joints_rad: np.ndarray) -> list[Surface]:
 
 @lru_cache(maxsize=1)
 def _link_texture() -> tuple[np.ndarray, ...]:
-    """Pale plastic with a darker rim."""
     picture = np.full((16, 16, 3), 205, np.uint8)
     picture[[0, -1]] = picture[:, [0, -1]] = 150
     return (picture,)

@@ -62,9 +62,6 @@ def joints_for(base_from_gripper: SE3, start_rad: Array, seed: int = 0) -> Array
     """Joint angles (7,) that bring the flange to a pose, near `start_rad` if possible.
 
     Damped least squares (Nakamura and Hanafusa 1986) with random restarts.
-
-    Raises:
-        InputError: The pose is out of reach.
     """
     rng = np.random.default_rng(seed)
     starts = [np.asarray(start_rad, float), HOME_RAD]

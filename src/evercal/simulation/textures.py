@@ -5,7 +5,6 @@ IJCV 2001): shapes of power-law size painted over each other, each filled with 1
 checks, a plain tone or text. It has edges, corners, blobs and flat parts at every scale.
 """
 
-from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -14,10 +13,9 @@ _LETTERS = "ABCDEFGHJKLMNPRSTUVWXYZabcdefghkmnpqrstuvwxyz0123456789&%#?!"
 
 
 def one_over_f(size: int, exponent: float, rng: np.random.Generator) -> np.ndarray:
-    """Noise whose amplitude falls with frequency as 1/f^exponent.
+    """Noise (size, size) whose amplitude falls with frequency as 1/f^exponent, float32.
 
-    An exponent of 1 resembles natural images, 0 is white noise. The noise tiles and has mean 0 and
-    standard deviation 1, float32, shape (size, size).
+    An exponent of 1 resembles natural images. The noise tiles, with mean 0 and deviation 1.
     """
     frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :])
     frequency[0, 0] = 1.0
@@ -59,12 +57,7 @@ def _gradient_fill(height: int, width: int, rng: np.random.Generator) -> np.ndar
     return (slope[0] * (u / width - 0.5) + slope[1] * (v / height - 0.5)).astype(np.float32)
 
 
-_FILLS: tuple[Callable[[int, int, np.random.Generator], np.ndarray], ...] = (
-    _noise_fill,
-    _noise_fill,
-    _gradient_fill,
-    _wave_fill,
-)
+_FILLS = (_noise_fill, _noise_fill, _gradient_fill, _wave_fill)
 
 
 def _leaf_mask(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
@@ -97,11 +90,7 @@ def _leaf_mask(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
 def dead_leaves(
     height: int, width: int, rng: np.random.Generator, leaves: int | None = None
 ) -> np.ndarray:
-    """Draw a dead-leaves picture.
-
-    Returns RGB, uint8, shape (height, width, 3). Few leaves give a calm picture; their number is
-    random if omitted.
-    """
+    """A dead-leaves picture (height, width, 3), RGB uint8; few leaves give a calm one."""
     tint = rng.uniform(0.2, 0.8, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(0.2, 0.8))
     picture = np.empty((height, width, 3), np.float32)
     picture[:] = tint + _noise_fill(height, width, rng)[..., None]

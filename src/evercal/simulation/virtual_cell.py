@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3
 from evercal.simulation.box_room import default_camera, look_at
 from evercal.simulation.cell_room import WORK_AREA_M, arm_surfaces, cell_room
 from evercal.simulation.panda_arm import base_from_flange
-from evercal.simulation.virtual_robot import Clock, SimulatedClock, VirtualRobot, WallClock
+from evercal.simulation.virtual_robot import Clock, VirtualRobot
 
 RESERVED = 9000
 """Seeds from here on are reserved for final evaluation."""
@@ -33,13 +33,11 @@ class CellOptions:
     """Noise, image size and time of a virtual cell."""
 
     width: int = 640
-    """Image width, pixels."""
     height: int = 480
-    """Image height, pixels."""
     arm_noise_mm: float = 0.1
     """Standard deviation of the arm's true position about the stated one, per axis."""
     arm_noise_deg: float = 0.02
-    """Standard deviation of its rotation, per axis."""
+    """The same for the rotation."""
     image_noise: float = 0.008
     """Standard deviation of a pixel, as a fraction of full scale."""
     exposure_s: float = 0.01
@@ -59,21 +57,10 @@ class CellTruth:
 
 
 class VirtualCamera:
-    """A camera of the cell: on the gripper, or fixed.
-
-    Args:
-        cell: the cell that it stands in.
-        mounted: gripper_from_camera, or base_from_camera if it is fixed.
-        on_gripper: whether it moves with the gripper.
-    """
+    """A camera of the cell: on the gripper by gripper_from_camera, or fixed in the base."""
 
     def __init__(self, cell: "VirtualCell", mounted: SE3, on_gripper: bool):
         self._cell, self._mounted, self._on_gripper = cell, mounted, on_gripper
-
-    @property
-    def intrinsics(self) -> Camera:
-        """Intrinsics, exact."""
-        return self._cell.intrinsics
 
     def read(self) -> tuple[float, NDArray[np.uint8]]:
         """Take an image: time in seconds, and (H, W, 3) RGB."""
@@ -85,24 +72,19 @@ class VirtualCamera:
         times = np.linspace(*ends, steps + 1) if steps else [stamp]
         images = [self._render(float(time)) for time in times]
         mean = np.asarray(np.mean(images, axis=0), np.float32)
-        return stamp, self._cell.with_noise(mean)
+        noise = self._cell.noise.standard_normal(mean.shape, np.float32)
+        noisy = mean + 255 * options.image_noise * noise
+        return stamp, np.clip(np.round(noisy), 0, 255).astype(np.uint8)
 
     def _render(self, now_s: float) -> NDArray[np.uint8]:
-        base_from_gripper, joints = self._cell.robot.true_state(now_s)
+        cell = self._cell
+        base_from_gripper, joints = cell.robot.true_state(now_s)
         pose = base_from_gripper @ self._mounted if self._on_gripper else self._mounted
-        return self._cell.render(pose, joints)
+        return cell.render(pose, joints)
 
 
 class VirtualCell:
-    """A cell generated from a seed.
-
-    Args:
-        seed: of room, mount, tripod and noise; below 9000.
-        options: noise, image size and time.
-
-    Raises:
-        InputError: The seed is reserved, or the images are too small.
-    """
+    """A cell generated from a seed: that of room, mount, tripod and noise, below 9000."""
 
     def __init__(self, seed: int = 0, options: CellOptions | None = None):
         self.options = options or CellOptions()
@@ -111,21 +93,21 @@ class VirtualCell:
         if min(self.options.width, self.options.height) < 64:
             raise InputError(f"size {self.options.width}x{self.options.height}: at least 64x64")
         rng = np.random.default_rng([seed, 33])
-        self.clock: Clock = WallClock() if self.options.realtime else SimulatedClock()
+        self.clock = Clock(self.options.realtime)
         self.intrinsics = default_camera(self.options.width, self.options.height)
-        noise = self.options.arm_noise_mm / 1000, float(np.deg2rad(self.options.arm_noise_deg))
-        self.robot = VirtualRobot(self.clock, *noise, seed)
+        sigma = self.options.arm_noise_mm / 1000, float(np.deg2rad(self.options.arm_noise_deg))
+        self.robot = VirtualRobot(self.clock, *sigma, seed)
         self.truth = CellTruth(_mount(rng), _tripod(rng))
         self.wrist_camera = VirtualCamera(self, self.truth.gripper_from_camera, True)
         self.tripod_camera = VirtualCamera(self, self.truth.base_from_tripod, False)
-        self._seed, self._noise = seed, np.random.default_rng([seed, 34])
+        self.seed, self.noise = seed, np.random.default_rng([seed, 34])
 
     def reachable_poses(self, count: int, seed: int = 0) -> SE3:
         """Random gripper poses (count,) from which a wrist camera sees the work area.
 
         They rely on the nominal mount (`nominal_mount`), not on the true one.
         """
-        rng = np.random.default_rng([self._seed, 35, seed])
+        rng = np.random.default_rng([self.seed, 35, seed])
         poses: list[SE3] = []
         while len(poses) < count:
             gripper = base_from_flange(_CENTRE_RAD + _SPREAD_RAD * rng.uniform(-1, 1, 7))
@@ -139,15 +121,8 @@ class VirtualCell:
 
     def render(self, base_from_camera: SE3, joints_rad: np.ndarray) -> NDArray[np.uint8]:
         """An ideal image, (H, W, 3), of a camera at a pose while the arm has joint angles (7,)."""
-        room = cell_room(self._seed)
         arm = arm_surfaces(joints_rad) if self.options.show_arm else []
-        return room.render(self.intrinsics, base_from_camera, arm)
-
-    def with_noise(self, image: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """An image with the noise of a sensor, (H, W, 3)."""
-        noise = self._noise.standard_normal(image.shape, np.float32)
-        noisy = image + 255 * self.options.image_noise * noise
-        return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+        return cell_room(self.seed).render(self.intrinsics, base_from_camera, arm)
 
 
 def nominal_mount() -> SE3:
@@ -157,13 +132,11 @@ def nominal_mount() -> SE3:
 
 
 def _mount(rng: np.random.Generator) -> SE3:
-    """The true gripper_from_camera: the nominal one within 2 cm and some degrees."""
     tangent = np.concatenate([rng.uniform(-0.02, 0.02, 3), rng.uniform(-0.1, 0.1, 3)])
     return nominal_mount() @ SE3.exp(tangent)
 
 
 def _tripod(rng: np.random.Generator) -> SE3:
-    """The true base_from_tripod: beside the arm, looking over the table."""
     side = 1.0 if rng.random() < 0.5 else -1.0
     low, high = (-0.1, 0.4, 0.6), (0.2, 0.6, 0.8)
     position = rng.uniform(low, high) * (1.0, side, 1.0)

@@ -14,34 +14,22 @@ SPEED_RAD_S = 1.0
 _SETTLE_S = 0.1
 
 
-class WallClock:
-    """Unix time."""
+class Clock:
+    """Unix time, or a simulated one that passes only by `sleep`, at once."""
+
+    def __init__(self, real: bool):
+        self._now_s = None if real else 0.0
 
     def now(self) -> float:
-        """Seconds since 1970."""
-        return time.time()
+        """Seconds since 1970, or since the start."""
+        return time.time() if self._now_s is None else self._now_s
 
     def sleep(self, seconds: float) -> None:
-        """Wait."""
-        time.sleep(seconds)
-
-
-class SimulatedClock:
-    """A time that passes only by `sleep`, at once."""
-
-    def __init__(self) -> None:
-        self._now = 0.0
-
-    def now(self) -> float:
-        """Seconds since the start."""
-        return self._now
-
-    def sleep(self, seconds: float) -> None:
-        """Advance the time."""
-        self._now += seconds
-
-
-Clock = WallClock | SimulatedClock
+        """Wait, or advance the simulated time."""
+        if self._now_s is None:
+            time.sleep(seconds)
+        else:
+            self._now_s += seconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,24 +45,19 @@ class Motion:
     end_error: SE3
     """The same after it."""
 
-    def share(self, now_s: float) -> float:
-        """How much of the way is done: 0 to 1, smooth at both ends."""
+    def at(self, now_s: float) -> tuple[np.ndarray, SE3]:
+        """Joint angles (7,) and error at a time; the motion is smooth at both ends."""
         t = np.clip((now_s - self.start_s) / max(self.end_s - self.start_s, 1e-9), 0.0, 1.0)
-        return float(t * t * (3 - 2 * t))
-
-    def joints_rad(self, now_s: float) -> np.ndarray:
-        """(7,) joint angles at a time."""
-        return self.start_rad + self.share(now_s) * (self.end_rad - self.start_rad)
+        share, start = float(t * t * (3 - 2 * t)), self.start_error
+        joints = self.start_rad + share * (self.end_rad - self.start_rad)
+        return joints, start @ SE3.exp(share * (start.inverse() @ self.end_error).log())
 
 
 class VirtualRobot:
     """An arm that moves in joint space and stops with a small error that it does not state.
 
-    Args:
-        clock: time of the cell.
-        noise_m: standard deviation of the true position about the stated one, per axis.
-        noise_rad: the same of the rotation.
-        seed: of the errors.
+    `noise_m` and `noise_rad` are standard deviations of the true pose about the stated one, per
+    axis.
     """
 
     def __init__(self, clock: Clock, noise_m: float, noise_rad: float, seed: int):
@@ -85,21 +68,17 @@ class VirtualRobot:
 
     def base_from_gripper(self) -> SE3:
         """The stated pose of the flange."""
-        return base_from_flange(self._motion.joints_rad(self._clock.now()))
+        return base_from_flange(self._motion.at(self._clock.now())[0])
 
     def joints_rad(self) -> tuple[float, ...]:
         """The seven stated joint angles, radians."""
-        return tuple(self._motion.joints_rad(self._clock.now()).tolist())
+        return tuple(self._motion.at(self._clock.now())[0].tolist())
 
     def move_to(self, base_from_gripper: SE3) -> None:
-        """Move and return when the arm stands still; a second caller waits for the first.
-
-        Raises:
-            InputError: The pose is out of reach.
-        """
+        """Move and return when the arm stands still; a second caller waits for the first."""
         with self._lock:
             now = self._clock.now()
-            start = self._motion.joints_rad(now)
+            start, _ = self._motion.at(now)
             end = joints_for(base_from_gripper, start)
             seconds = float(np.abs(end - start).max()) / SPEED_RAD_S
             errors = self._motion.end_error, self._draw()
@@ -108,10 +87,7 @@ class VirtualRobot:
 
     def true_state(self, now_s: float) -> tuple[SE3, np.ndarray]:
         """True base_from_gripper and joint angles (7,) at a time; for cameras and tests only."""
-        motion = self._motion
-        joints, share = motion.joints_rad(now_s), motion.share(now_s)
-        start = motion.start_error
-        error = start @ SE3.exp(share * (start.inverse() @ motion.end_error).log())
+        joints, error = self._motion.at(now_s)
         return base_from_flange(joints) @ error, joints
 
     def _draw(self) -> SE3:

@@ -109,5 +109,5 @@ def encode(
 
     Both are on the encoder's device, which must be that of the descriptor, too.
     """
-    features = encode_features(views, encoder)
+    features = encode_features([view.grey for view in views], encoder)
     return features, descriptor(features)

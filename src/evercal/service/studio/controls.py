@@ -11,7 +11,7 @@ import viser
 from evercal.calibration.export.formats import FORMATS
 from evercal.calibration.next_views import NextViews
 from evercal.errors import InputError
-from evercal.live.coverage import CoverageOptions
+from evercal.live.coverage import POSITION_MM, ROTATION_DEG
 from evercal.service.studio.devices import Which
 from evercal.service.studio.studio import FIXED_IMAGES, STEPS, Studio
 from evercal.service.viewer.html import (
@@ -186,9 +186,9 @@ class Controls:
 
     def _coverage(self) -> str:
         """Spread of the good samples, the next view, and the bad samples."""
-        covered, options, rows = self._studio.coverage(), CoverageOptions(), []
-        axes = [(axis, "°", options.rotation_deg) for axis in covered.rotations]
-        axes += [(axis, " mm", options.position_mm) for axis in covered.positions]
+        covered, rows = self._studio.coverage(), []
+        axes = [(axis, "°", ROTATION_DEG) for axis in covered.rotations]
+        axes += [(axis, " mm", POSITION_MM) for axis in covered.positions]
         for axis, unit, wanted in axes:
             enough = "✓" if axis.covered else f"of {wanted:.0f}{unit}"
             rows.append((axis.name, f"{axis.spread:.0f}{unit} {enough}"))

@@ -11,7 +11,7 @@ from evercal.calibration.export.formats import FORMATS, export_files
 from evercal.calibration.next_views import NextViews
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.live.coverage import Coverage, CoverageOptions
+from evercal.live.coverage import IMAGES, Coverage
 from evercal.live.recorder import JPEG_QUALITY, POSES, WristRecorder
 from evercal.live.robot import MovingRobot
 from evercal.map import Map
@@ -122,15 +122,14 @@ class Studio:
 
     def record(self, on_step: OnStep, stopping: Callable[[], bool] = lambda: False) -> str:
         """Move from one best view to the next and take samples until nothing is missing."""
-        wanted = CoverageOptions().images
         if not self.recorder.frames:
             self.take_sample()
         while not stopping():
             reached, view = self.coverage(), self.next_view()
             good = sum(not row.problems for row in reached.samples)
-            if not reached.missing or view is None or good >= 2 * wanted:
+            if not reached.missing or view is None or good >= 2 * IMAGES:
                 break
-            on_step(f"recording, {good} good images", min(good, wanted), wanted)
+            on_step(f"recording, {good} good images", min(good, IMAGES), IMAGES)
             try:
                 self.move_to(view.poses[0])
             except InputError:  # out of reach, and never proposed again
