@@ -41,11 +41,7 @@ class NetworkLocalizeOptions:
 
 
 def open_networks(path: Path, device: str = "auto") -> "NetworkLocalizer":
-    """A localizer for a store of networks; `device` as for `device_of`.
-
-    Raises:
-        InputError: Not a store, an empty one, or a damaged file; no such device.
-    """
+    """A localizer for a store of networks; `device` as for `device_of`."""
     where = device_of(device)
     scenes = NetworkStore.open(path).contents
     if not scenes.scenes:
@@ -89,13 +85,11 @@ class NetworkLocalizer:
 
     @property
     def _decides_scene(self) -> bool:
-        """Whether the network itself decides the scene (condition `descriptor`)."""
         heads = self.contents.heads
         return len(heads) == 1 and heads[0].options.condition == "descriptor"
 
     @torch.inference_mode()
     def _candidates(self, query: Query, cameras: Sequence[Camera | None]) -> list[int]:
-        """Scenes to try, most similar prototype first."""
         usable = [i for i, camera in enumerate(cameras) if camera is not None]
         if self._decides_scene:
             return usable[:1]
@@ -154,7 +148,6 @@ class NetworkLocalizer:
         return Matches(pixels[valid], points[valid]), len(patches)
 
     def _scene_of(self, rough: PnpResult, scene: int) -> int:
-        """The scene in whose cell of the atlas a pose lies."""
         atlas_from_base = self.contents.scenes[scene].cell.atlas_from_base
         position = atlas_from_base.apply(rough.pose.pose.translation_m)
         inside = self.contents.atlas().scene_at(position)
@@ -207,10 +200,6 @@ def _fitting_cameras(
     """Intrinsics of an image in each scene; None where the aspect ratio does not fit.
 
     Networks do not estimate intrinsics, so that nothing is guessed.
-
-    Raises:
-        InputError: A camera with another aspect ratio than the image's, or no camera given and no
-            scene was recorded at this aspect ratio.
     """
     height, width = image.shape[:2]
     recorded = [scene.adjusted_camera for scene in scenes]

@@ -13,9 +13,6 @@ def load_plugin(path: Path) -> tuple[str, ...]:
 
     Returns:
         The added names.
-
-    Raises:
-        InputError: The file is missing, fails, defines no such dict, or reuses a name.
     """
     spec = importlib.util.spec_from_file_location(f"evercal_plugin_{path.stem}", path)
     if not path.is_file() or spec is None or spec.loader is None:

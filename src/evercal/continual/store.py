@@ -73,9 +73,6 @@ class NetworkStore(StageStore):
             short_side: working size of images, pixels.
             encoder: a weights file; its sibling `descriptor.safetensors` is used, if it fits.
                 Default: the shipped weights.
-
-        Raises:
-            InputError: `root` holds something that is not a store, or a bad encoder.
         """
         if root.exists() and not _is_free(root):
             raise InputError(f"store {root}: exists and is not an evercal store; give another path")
@@ -88,11 +85,7 @@ class NetworkStore(StageStore):
 
     @classmethod
     def open(cls, root: Path) -> Self:
-        """Open a store at its last complete scene.
-
-        Raises:
-            InputError: Not a store, or a file is missing or was changed.
-        """
+        """Open a store at its last complete scene."""
 
         def read(manifest: Manifest) -> Self:
             payload = manifest.payload
@@ -127,11 +120,7 @@ class NetworkStore(StageStore):
             scenes.heads.append(_read_head(folder, scenes.encoder.width))
 
     def commit(self, scenes: LearnedScenes, report: Mapping[str, object]) -> None:
-        """Add the newest scene of `scenes`: whole, or not at all.
-
-        Raises:
-            InputError: Another process writes into the store, or it cannot be written.
-        """
+        """Add the newest scene of `scenes`: whole, or not at all."""
         keyframes = scenes.keyframes[-1]
 
         def write(folder: Path) -> None:
@@ -184,7 +173,6 @@ def describe(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]
 
 
 def _is_free(root: Path) -> bool:
-    """Whether a folder is empty, or holds only what a killed writer of a store left."""
     left = (STAGES, "encoder-", "descriptor-", ".")
     return root.is_dir() and all(path.name.startswith(left) for path in root.iterdir())
 
@@ -212,7 +200,6 @@ def _write_head(folder: Path, head: Head) -> None:
 
 
 def _read_head(folder: Path, features: int) -> Head:
-    """Read the head of a stage; `features` is the width of the store's encoder."""
     from safetensors import safe_open
 
     path = folder / HEAD

@@ -113,11 +113,7 @@ STRATEGIES: dict[str, Strategy] = {strategy.name: strategy for strategy in _ALL}
 
 
 def strategy_named(name: str) -> Strategy:
-    """Return a strategy by name.
-
-    Raises:
-        InputError: The name is unknown.
-    """
+    """Return a strategy by name."""
     if name not in STRATEGIES:
         names = ", ".join(STRATEGIES)
         raise InputError(f"strategy {name!r}: unknown; choose one of {names}")

@@ -86,9 +86,6 @@ def run_bench(
         options: Strategies, seeds and options.
         out: Folder of results, created if missing.
 
-    Raises:
-        InputError: Fewer than two scenes, or the folder has results of other settings.
-
     Yields:
         A `Step` after every stage.
     """
@@ -110,7 +107,6 @@ def run_bench(
 
 @contextmanager
 def _claimed(out: Path, strategy: Strategy, seed: int) -> Iterator[bool]:
-    """Claim a run; yields whether no other process has it."""
     path = out / "runs" / f"{strategy.name}-{seed}.claim"
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -138,7 +134,6 @@ def begin_bench(
 
 
 def _complete(run: tuple[int, Strategy], stored: Table, scenes: int) -> bool:
-    """Check that the last stage has a row per scene, under every name of the strategy."""
     seed, strategy = run
     rows = results.run_of(stored, strategy.name, seed)
     last = rows[rows["stage"] == scenes - 1].groupby("strategy").size()
@@ -146,7 +141,6 @@ def _complete(run: tuple[int, Strategy], stored: Table, scenes: int) -> bool:
 
 
 def _record_strategies(out: Path, strategies: Sequence[Strategy]) -> None:
-    """Add descriptions to strategies.json, and refuse a name with another description."""
     path = out / results.STRATEGIES
     recorded = read_settings(path) if path.exists() else {}
     for strategy in strategies:

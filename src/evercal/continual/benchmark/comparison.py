@@ -26,11 +26,7 @@ NAME:unaligned is the pose from matched keyframes, before landmarks are aligned.
 
 
 def complete_runs(results: Table) -> Table:
-    """Return the rows of runs whose last stage is complete.
-
-    Raises:
-        InputError: There is none.
-    """
+    """Return the rows of runs whose last stage is complete."""
     last = results["stage"].max()
     at_end = results["stage"].eq(last)
     evaluated = at_end.groupby([results["strategy"], results["seed"]]).transform("sum")

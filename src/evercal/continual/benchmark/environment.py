@@ -34,8 +34,6 @@ def environment() -> dict[str, str]:
 
 
 def _commit() -> str:
-    """Return the commit of the checkout that tracks this file, or the version of the package."""
-
     def git(*words: str) -> str:
         command = ["git", "-C", str(Path(__file__).parent), *words]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()

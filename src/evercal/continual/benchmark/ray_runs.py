@@ -65,10 +65,6 @@ def run_on_ray(
         address: Address of a running Ray cluster, or `local` to start one on this machine.
         plugin: Python file of further strategies, loaded by the workers.
 
-    Raises:
-        InputError: The extra is missing, there is no cluster at the address, or, after all other
-            runs, a run failed permanently.
-
     Yields:
         A `Step` for every stage, run by run as they finish.
     """
@@ -111,7 +107,6 @@ def run_on_ray(
 
 
 def _gpus(ray, device: str) -> int:
-    """Return the GPUs a task requests. Ray hides all GPUs from a task that requests none."""
     available = ray.cluster_resources().get("GPU", 0) >= 1
     if device == "cuda" and not available:
         raise InputError("device 'cuda': the cluster has no GPU; use auto or cpu")
@@ -165,13 +160,11 @@ def _one_run(scenes: list[Recording], job: Job) -> tuple[str, bool]:
 
 
 def _line(error: Exception) -> str:
-    """Return type and last line of an error; Ray puts the traceback before it."""
     lines = str(error).strip().splitlines() or [""]
     return f"{type(error).__name__}: {lines[-1].strip()}"
 
 
 def _joined(address: str):
-    """Join the cluster at an address and return the module of Ray."""
     try:
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError:

@@ -168,7 +168,6 @@ def _read(folder: Path, name: str, required: set[str]) -> Table:
 
 
 def _remove_incomplete_line(folder: Path, path: Path) -> None:
-    """Remove a last line that an interrupted call left incomplete."""
     with locked(folder), open(path, "r+b") as file:
         data = file.read()
         file.truncate(data.rfind(b"\n") + 1)

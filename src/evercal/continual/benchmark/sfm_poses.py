@@ -50,7 +50,6 @@ def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
 
 
 def _key(name: str) -> str:
-    """Sequence and number of a frame without its ending; 12-Scenes has no sequence."""
     return name.split(".color.")[0].removeprefix("data/")
 
 

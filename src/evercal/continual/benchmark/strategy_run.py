@@ -187,7 +187,6 @@ class _NetworkRun(_Run):
         return NetworkStore.create(self.store, self.strategy.name, self.options.short_side)
 
     def _prepared(self, scenes: LearnedScenes) -> LearnedScenes:
-        """Move to the device of the run and share encoded views with other runs."""
         scenes.to(self.device)
         cache_features(scenes.encoder, self.features)  # pyright: ignore[reportArgumentType]
         scenes.cache = self.features
@@ -220,8 +219,6 @@ class _NetworkRun(_Run):
         self._new_store().commit(scenes, report)
 
     def _rows(self, scenes: LearnedScenes, train: Sequence[Frame]) -> Callable[[], FeatureBuffer]:
-        """Return a function that encodes the training rows of the first scene, once."""
-
         @cache
         def rows() -> FeatureBuffer:
             buffer = scene_buffer(0, scenes.scenes[0].cell, train, scenes.device)
@@ -243,7 +240,6 @@ class _NetworkRun(_Run):
 
 
 def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOptions:
-    """Add the centres of all scenes to options that need them in advance."""
     if stage.head.centres != "fixed" or stage.fixed_centres_m:
         return stage
     positions = [stated_poses(split_held_out(scene.train).train).translation_m for scene in scenes]

@@ -161,6 +161,5 @@ def regions(scene: Recording, parts: int) -> list[Recording]:
 
 
 def _ahead(frames: Sequence[Frame]) -> np.ndarray:
-    """Return the points one metre in front of the cameras, shape (n, 3)."""
     poses = stated_poses(frames)
     return poses.translation_m + poses.rotation_matrix()[:, :, 2]

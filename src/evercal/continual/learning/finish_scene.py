@@ -58,7 +58,6 @@ def finished_stage(
 
 
 def _keyframes(scenes: LearnedScenes, frames: Sequence[Frame], options: StageOptions) -> Keyframes:
-    """Selected frames as they are stored; replay uses the camera as training corrected it."""
     refined = scenes.scenes[-1].refined_camera
     if refined is not None:
         frames = [replace(frame, camera=refined) for frame in frames]

@@ -76,10 +76,6 @@ def learn_networks(
         recording: its training frames are learned; a few are held out to fit the threshold.
         options: strategy and amount of training.
         on_event: called with every event, for progress bars.
-
-    Raises:
-        InputError: No such device or strategy, too few frames, a name that is taken, another
-            strategy than the store's, or another process is writing into the store.
     """
     began = time.perf_counter()
     named, stage = options.strategy, options.stage_options()

@@ -67,7 +67,6 @@ def whiten(head: Head, buffers: Sequence[FeatureBuffer], seed: int) -> None:
 
 
 def _new_centres(head: Head, options: StageOptions, positions_m: np.ndarray) -> Tensor:
-    """(k, 3) centres that the scene adds, from its camera positions (n, 3) in the atlas."""
     if head.options.centres == "grow":
         count = head.options.centres_per_scene
         return torch.from_numpy(camera_clusters(positions_m, count, options.seed)).float()

@@ -49,11 +49,7 @@ class Atlas:
         self.cells: list[Cell] = []
 
     def place(self, positions_m: np.ndarray) -> Cell:
-        """Assign a cell to a new scene with (n, 3) camera positions in its base frame.
-
-        Raises:
-            InputError: Layout `paper` has no cell left.
-        """
+        """Assign a cell to a new scene with (n, 3) camera positions in its base frame."""
         origin = positions_m.mean(axis=0)
         side = max(MIN_CELL_M, 2.0 * float(np.ptp(positions_m, axis=0).max()))
         if self.layout == "paper":

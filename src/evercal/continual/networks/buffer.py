@@ -47,7 +47,6 @@ _tensors = attrgetter("features", "scene", "descriptor", "index", *_TARGET)
 
 
 def _combined(parts: Sequence[Rows], change: Callable[[list[Tensor]], Tensor]) -> Rows:
-    """Apply a function to each kind of tensor of some batches."""
     columns = zip(*map(_tensors, parts), strict=True)
     features, scene, descriptor, index, *target = (change(list(column)) for column in columns)
     known = [part.known for part in parts if part.known is not None]
@@ -237,7 +236,6 @@ def encode_batches(frames: Sequence[Frame], plan: EncodePlan) -> list[list[int]]
 def _view(
     frames: Sequence[Frame], number: int, plan: EncodePlan, stride: int
 ) -> tuple[View, Tensor]:
-    """Return a view by its number, and a mask (cells,) of its rows to keep."""
     visit, position = divmod(number, len(frames))
     rng = np.random.default_rng([plan.seed, visit, position])
     if visit == 0:

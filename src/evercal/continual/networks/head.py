@@ -77,9 +77,6 @@ class Head(nn.Module):
         features: Channels of the local feature.
         descriptor: Channels of the global descriptor; ignored with condition `code`.
         options: Architecture.
-
-    Raises:
-        InputError: Condition `code` with fixed centres.
     """
 
     centres: Tensor
@@ -241,7 +238,6 @@ class Head(nn.Module):
         return self._trunk(x, None)
 
     def _add_code(self, scene: Tensor | int) -> Callable[[Tensor, int], Tensor]:
-        """Return a function that adds the code of a layer to (n, width) activations in place."""
         if isinstance(scene, int):
             return lambda z, layer: z.add_(self.code[scene, layer].to(z.dtype))
         # A product with one-hot rows, because the gradient of indexing is slow.

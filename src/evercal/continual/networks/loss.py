@@ -80,7 +80,6 @@ def reprojection_error(
 
 
 def _rotated(matrices: Tensor, points: Tensor) -> Tensor:
-    """Multiply (n, 3, 3) matrices and (n, 3) points in full fp32."""
     if points.device.type == "cpu":
         return torch.einsum("nij,nj->ni", matrices, points)
     # A matrix product may round to TF32, an error of millimetres in a room; a sum does not.

@@ -138,7 +138,6 @@ class HeadTrainer:
         return Progress(self.step, options.iterations, costs.detach(), errors)
 
     def _rows(self, rate: float) -> tuple[Rows, int]:
-        """Draw the rows of the step; return them and the number of new rows."""
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
         share = self.options.batch // len(self.buffers)
         parts = [buffer.draw(share, generator) for buffer in self.buffers]
@@ -152,7 +151,6 @@ class HeadTrainer:
         return join(parts), fresh * share
 
     def _fresh_costs(self, points: Tensor, rows: Rows, tau_px: float) -> tuple[Tensor, Tensor]:
-        """Compute loss and error in pixels of the new rows."""
         options, correction = self.options, None
         if options.intrinsics_rate > 0 and tau_px < CORRECTION_FROM_PX:
             share = len(points) // len(self.buffers)
@@ -165,7 +163,6 @@ class HeadTrainer:
         return costs, errors
 
     def _gradients(self, loss: Tensor) -> dict[str, Tensor]:
-        """Compute the gradient of a loss by parameter name, keeping the graph."""
         names, values = zip(*self.head.named_parameters(), strict=True)
         gradients = torch.autograd.grad(loss, values, retain_graph=True, materialize_grads=True)
         return dict(zip(names, gradients, strict=True))
