@@ -13,19 +13,22 @@ each takes runs that no other has.
 """
 
 import json
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from filelock import FileLock, Timeout
 
 from evercal.continual.benchmark import results
 from evercal.continual.benchmark.results import Table
-from evercal.continual.benchmark.strategy_run import NETWORK_LOCALIZE, RunOptions, run_strategy
-from evercal.continual.learning.stage import StageOptions
+from evercal.continual.benchmark.strategy_run import (
+    NETWORK_LOCALIZE,
+    BenchOptions,
+    Order,
+    run_strategy,
+)
 from evercal.continual.networks.descriptor import DESCRIPTOR_FILE
 from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
@@ -35,29 +38,6 @@ from evercal.localization.query import LocalizeOptions
 from evercal.recordings import Recording
 from evercal.storage import sha256_file, write_json
 from evercal.storage.settings import lock_settings, read_settings
-
-Order = Literal["given", "reversed", "shuffled", "balanced"]
-
-
-@dataclass(frozen=True)
-class BenchOptions:
-    """Options of a benchmark."""
-
-    stage: Callable[[int], StageOptions]
-    """Options for learning a scene, given the seed. With `centres: fixed` and no given centres, the
-    centres of all scenes are known from the start, in the paper's combined grid."""
-    strategies: tuple[Strategy, ...]
-    """Strategies to compare, each with a unique name."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds; every strategy runs once with each."""
-    order: Order = "given"
-    """Order of the scenes; `shuffled` and `balanced` depend on the seed."""
-    short_side: int = 240
-    """Working size of images, pixels."""
-    settings: dict[str, object] = field(default_factory=dict)
-    """Further settings that decide the results, for settings.json."""
-    device: str = "auto"
-    """Device of the networks, see `features.device.device_of`."""
 
 
 @dataclass(frozen=True)
@@ -79,27 +59,20 @@ class Step:
 def run_bench(
     scenes: Sequence[Recording], options: BenchOptions, out: Path
 ) -> Generator[Step, None, None]:
-    """Run all runs that are not complete.
+    """Run all runs of two or more scenes that are not complete; yields after every stage.
 
-    Args:
-        scenes: Two or more scenes in the order `given`.
-        options: Strategies, seeds and options.
-        out: Folder of results, created if missing.
-
-    Yields:
-        A `Step` after every stage.
+    `out`, the folder of results, is created if missing.
     """
     total = len(options.seeds) * len(options.strategies) * len(scenes)
     missing = begin_bench(scenes, options, out)
     done = total - len(missing) * len(scenes)
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
-        how = RunOptions(options.stage(seed), options.short_side, out, options.device)
         with _claimed(out, strategy, seed) as free:
             stored = results.read(out)  # another process may have added some
             if not free or _complete((seed, strategy), stored, len(scenes)):
                 continue
-            for stage in run_strategy(strategy, ordered, how):
+            for stage in run_strategy(strategy, ordered, options, seed, out):
                 results.append(out, stage)
                 yield Step(strategy.name, seed, stage.results, done + stage.stage + 1, total)
             done += len(scenes)

@@ -90,7 +90,7 @@ def scene_row(frames: Sequence[FrameResult]) -> dict[str, object]:
 
 
 def frame_row(frame: FrameResult) -> dict[str, object]:
-    """Return the columns of frames.csv that depend on the frame."""
+    """Columns of frames.csv that depend on the frame."""
     outcome = "inside" if frame.squared_mahalanobis < CHI2_6 else "outside"
     if frame.wrong_scene:
         outcome = "wrong scene"
@@ -168,6 +168,7 @@ def _read(folder: Path, name: str, required: set[str]) -> Table:
 
 
 def _remove_incomplete_line(folder: Path, path: Path) -> None:
+    # An interrupted call left it.
     with locked(folder), open(path, "r+b") as file:
         data = file.read()
         file.truncate(data.rfind(b"\n") + 1)
