@@ -10,8 +10,7 @@ import pytest
 
 from evercal.continual.learning.stage import StageOptions
 from evercal.continual.methods.penalties import OldOutput
-from evercal.continual.plugin import load_plugin
-from evercal.continual.strategies import STRATEGIES, strategy_named
+from evercal.continual.strategies import STRATEGIES, load_plugin, strategy_named
 from evercal.errors import InputError
 
 from .stages import EmptyScenes, Rooms, learn, outcome, weights

@@ -91,7 +91,7 @@ class Bench:
         seeds = _numbers(self.seeds)
         from evercal.continual.benchmark.bench import BenchOptions
         from evercal.continual.learning.presets import short_side
-        from evercal.continual.plugin import load_plugin
+        from evercal.continual.strategies import load_plugin
 
         if self.plugin is not None:
             load_plugin(self.plugin)

@@ -20,10 +20,7 @@ from typing import Any, Self
 from torch import Tensor, nn
 
 from evercal.continual.networks.atlas import Cell
-from evercal.continual.networks.descriptor import (
-    descriptor_for,
-    load_descriptor,
-)
+from evercal.continual.networks.descriptor import descriptor_for, load_descriptor
 from evercal.continual.networks.head import Head, HeadOptions
 from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.errors import InputError
@@ -42,14 +39,7 @@ PROTOTYPES, STATE = "prototypes.safetensors", "state.safetensors"
 
 
 class NetworkStore(StageStore):
-    """A store of networks on disk and in memory.
-
-    Args:
-        root: folder of the store.
-        scenes: what was learned.
-        stages: folder names of the scenes, in order.
-        networks: file names of encoder and descriptor.
-    """
+    """A store of networks on disk and in memory; its networks are encoder and descriptor."""
 
     def __init__(
         self,
@@ -67,12 +57,8 @@ class NetworkStore(StageStore):
     ) -> Self:
         """An empty store; nothing is written before the first `commit`.
 
-        Args:
-            root: folder of the store to be.
-            strategy: how scenes are learned into it.
-            short_side: working size of images, pixels.
-            encoder: a weights file; its sibling `descriptor.safetensors` is used, if it fits.
-                Default: the shipped weights.
+        By default it has the shipped weights. The sibling `descriptor.safetensors` of another
+        encoder's file is used, if it fits.
         """
         if root.exists() and not _is_free(root):
             raise InputError(f"store {root}: exists and is not an evercal store; give another path")
@@ -126,7 +112,9 @@ class NetworkStore(StageStore):
         def write(folder: Path) -> None:
             if not self.networks:
                 self.networks = self._write_networks(scenes)
-            _write_record(folder, scenes.scenes[-1])
+            record = scenes.scenes[-1]
+            write_json(folder / RECORD, _plain(record))
+            save_tensors(folder / PROTOTYPES, {"prototypes": record.prototypes})
             _write_head(folder, scenes.heads[-1])
             if keyframes is not None:
                 save_tensors(folder / KEYFRAMES, keyframes.to_tensors())
@@ -156,23 +144,17 @@ def describe(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]
     """Scenes for JSON, working size, size of networks, and files with their sizes."""
     store = NetworkStore.open(path)
     contents = store.contents
-    scenes: list[dict[str, Any]] = [
-        {
-            "name": record.name,
-            "train_frames": record.train_frames,
-            "memory_bytes": keyframes.bytes if keyframes is not None else 0,
-            "keyframes": len(keyframes) if keyframes is not None else 0,
-            "camera": record.camera.to_dict(),
-            "inlier_threshold": record.inlier_threshold,
-            "cell": asdict(record.cell),
-        }
-        for record, keyframes in zip(contents.scenes, contents.keyframes, strict=True)
-    ]
+    scenes = []
+    for record, keyframes in zip(contents.scenes, contents.keyframes, strict=True):
+        memory = (keyframes.bytes, len(keyframes)) if keyframes is not None else (0, 0)
+        sizes = dict(zip(("memory_bytes", "keyframes"), memory, strict=True))
+        scenes.append(_plain(record) | sizes)
     heads = sum(head_bytes(head) for head in contents.heads)
     return scenes, contents.short_side, heads, store.size_bytes()
 
 
 def _is_free(root: Path) -> bool:
+    # Empty, or with what a killed writer left.
     left = (STAGES, "encoder-", "descriptor-", ".")
     return root.is_dir() and all(path.name.startswith(left) for path in root.iterdir())
 
@@ -212,30 +194,20 @@ def _read_head(folder: Path, features: int) -> Head:
     return Head.from_state(features, settings["descriptor"], options, state).eval()
 
 
-def _write_record(folder: Path, record: SceneRecord) -> None:
-    content = {
-        "name": record.name,
-        "camera": record.camera.to_dict(),
-        "cell": asdict(record.cell),
-        "train_frames": record.train_frames,
-        "refined_camera": record.refined_camera.to_dict() if record.refined_camera else None,
-        "inlier_threshold": record.inlier_threshold,
-        "covariance_scale": record.covariance_scale,
-    }
-    write_json(folder / RECORD, content)
-    save_tensors(folder / PROTOTYPES, {"prototypes": record.prototypes})
+def _plain(record: SceneRecord) -> dict[str, Any]:
+    """A record as in its file, without its prototypes."""
+    content = {**vars(record), "cell": asdict(record.cell)}
+    del content["prototypes"]
+    return {k: v.to_dict() if isinstance(v, Camera) else v for k, v in content.items()}
 
 
 def _read_record(folder: Path) -> SceneRecord:
     content = json.loads((folder / RECORD).read_text())
     cell, refined = content["cell"], content["refined_camera"]
-    return SceneRecord(
-        name=content["name"],
-        camera=Camera.from_dict(content["camera"]),
-        cell=Cell(tuple(cell["centre_m"]), cell["side_m"], tuple(cell["origin_m"])),
-        prototypes=load_tensors(folder / PROTOTYPES)["prototypes"],
-        train_frames=content["train_frames"],
-        refined_camera=Camera.from_dict(refined) if refined else None,
-        inlier_threshold=content["inlier_threshold"],
-        covariance_scale=content["covariance_scale"],
-    )
+    read = {
+        "camera": Camera.from_dict(content["camera"]),
+        "cell": Cell(tuple(cell["centre_m"]), cell["side_m"], tuple(cell["origin_m"])),
+        "refined_camera": Camera.from_dict(refined) if refined else None,
+        **load_tensors(folder / PROTOTYPES),
+    }
+    return SceneRecord(**{**content, **read})

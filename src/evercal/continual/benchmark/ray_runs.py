@@ -15,7 +15,7 @@ from pathlib import Path
 
 from evercal.continual.benchmark import results
 from evercal.continual.benchmark.bench import BenchOptions, Step, begin_bench, run_bench
-from evercal.continual.plugin import load_plugin
+from evercal.continual.strategies import load_plugin
 from evercal.errors import InputError
 from evercal.recordings import Recording
 from evercal.storage import write_bytes

@@ -40,8 +40,7 @@ RESULTS, FRAMES = "results.csv", "frames.csv"
 SETTINGS, STRATEGIES = "settings.json", "strategies.json"
 ENVIRONMENTS = "environments.json"
 UNALIGNED = ":unaligned"
-"""Suffix of a strategy's name for additional results of the same run: by the first pose from
-matched keyframes, before landmarks are aligned."""
+"""Suffix of a strategy for results by the first pose, before landmarks are aligned."""
 WITHIN = {
     "within_10cm_10deg": (0.10, math.radians(10.0)),
     "within_5cm_5deg": COARSE,

@@ -18,11 +18,7 @@ from evercal.errors import InputError
 from evercal.features.device import device_of
 from evercal.learning.scene import LearnReport
 from evercal.recordings.frame import Frame, Recording, lacks_camera_poses, posed_recording
-from evercal.recordings.held_out import (
-    named_recording,
-    require_frames,
-    split_held_out,
-)
+from evercal.recordings.held_out import named_recording, require_frames, split_held_out
 from evercal.storage.stages import is_store
 
 
@@ -128,7 +124,6 @@ def _opened(
     options: NetworkLearnOptions,
     frames: Sequence[Frame],
 ) -> NetworkStore:
-    """The store, checked against the options."""
     if stage.memory.auto:
         raise InputError("memory auto: only a map selects its keyframes; give a share or bytes")
     if not is_store(store):

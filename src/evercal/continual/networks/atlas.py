@@ -37,11 +37,9 @@ class Cell:
 class Atlas:
     """Cells in the order of their scenes.
 
-    Args:
-        layout: `open` assigns the first free position of a square spiral that is large enough, so
-            scenes need not be known in advance. `paper` is GLACE's grid: with ceil(sqrt(n))
-            columns, the cell of scene i lies at 5 m (-row, -column, 0).
-        expected: Number of scenes n in the layout `paper`.
+    The layout `open` assigns the first free position of a square spiral that is large enough, so
+    scenes need not be known in advance. `paper` is GLACE's grid for n expected scenes: with
+    ceil(sqrt(n)) columns, the cell of scene i lies at 5 m (-row, -column, 0).
     """
 
     def __init__(self, layout: Literal["open", "paper"] = "open", expected: int = 0):

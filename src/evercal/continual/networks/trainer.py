@@ -33,8 +33,7 @@ class FitOptions:
     peak_rate: float = 4e-3
     """Peak of AdamW's one-cycle learning rate (cosine up and down)."""
     matrix_rate: float = 0.02
-    """Peak learning rate of the hidden matrices, trained by one-sided Shampoo. With 0, AdamW trains
-    them too."""
+    """Peak rate of one-sided Shampoo for the hidden matrices; with 0, AdamW trains them too."""
     warm_share: float = 0.05
     """Share of the steps during which the rate rises."""
     weight_decay: float = 0.01
@@ -42,12 +41,9 @@ class FitOptions:
     diffusion: float = 0.1
     """Standard deviation of the noise on each row's descriptor (GLACE's feature diffusion)."""
     intrinsics_rate: float = 0.3
-    """Learning rate of the camera correction (focal length, principal point, k1, k2), as a share of
-    the head's. With 0, the given intrinsics are used. Cameras with known distortion are never
-    corrected."""
+    """Rate of the correction of a pinhole camera, as a share of the head's; 0 for none."""
     surface_weight: float = 0.0
-    """Weight of the distance to points that are known from depths, beside the reprojection loss.
-    With 0, no depths are estimated."""
+    """Weight of the distance to points from depths; with 0, no depths are estimated."""
     loss: LossOptions = field(default_factory=LossOptions)
     """Reprojection loss on the scenes being learned."""
 
@@ -170,7 +166,6 @@ class HeadTrainer:
     def _take_step(
         self, losses: Sequence[Tensor], constraints: list[dict[str, Tensor]], schedule: float
     ) -> None:
-        """Step the optimisers and let the hooks edit the change."""
         named = dict(self.head.named_parameters())
         before = {}
         if self.hooks.edits_steps:
@@ -191,7 +186,6 @@ class HeadTrainer:
 def _optimisers(
     head: Head, correction: torch.nn.Parameter, options: FitOptions
 ) -> list[torch.optim.Optimizer]:
-    """Create AdamW, and one-sided Shampoo for the hidden matrices if it has a rate."""
     hidden, decay, plain = [], [], []
     for name, parameter in head.named_parameters():
         if name.startswith(("code", "logit")):
