@@ -13,9 +13,7 @@ from evercal.cli.options import Device
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from evercal.continual.benchmark.bench import BenchOptions, Step
+    from evercal.continual.benchmark.bench import Step
     from evercal.continual.learning.stage import StageOptions
     from evercal.continual.strategies import Strategy
     from evercal.recordings import Recording
@@ -77,10 +75,8 @@ class Bench:
     device: Device = "auto"
     plugin: Annotated[Path | None, arg(metavar="FILE.py", help_behavior_hint="")] = None
     """Python file of your own strategies (see examples/my_strategy.py)."""
-    ray: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="")] = None
-    """Ray cluster to run on, or `local` for this machine. Without it, runs are sequential."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-bench")
-    """Folder of results. The same command resumes there."""
+    """Folder of results. The same command resumes there; in a second process it shares the runs."""
     json: bool = False
     """Print one JSON object."""
 
@@ -89,7 +85,7 @@ class Bench:
         if Path(self.suite).is_dir():
             return self._show(Path(self.suite))
         seeds = _numbers(self.seeds)
-        from evercal.continual.benchmark.bench import BenchOptions
+        from evercal.continual.benchmark.bench import BenchOptions, run_bench
         from evercal.continual.learning.presets import short_side
         from evercal.continual.strategies import load_plugin
 
@@ -110,7 +106,7 @@ class Bench:
             },
             device=self.device,
         )
-        for step in self._steps(scenes, options):
+        for step in run_bench(scenes, options, self.out):
             print(_progress(step), file=sys.stderr if self.json else sys.stdout, flush=True)
         return self._show(self.out, strategies[0].name)
 
@@ -136,14 +132,6 @@ class Bench:
         words = _words(self.strategies)
         names = [name for word in words for name in (TABLE4 if word == "table4" else (word,))]
         return tuple(strategy_named(name) for name in dict.fromkeys(names))
-
-    def _steps(self, scenes: "list[Recording]", options: "BenchOptions") -> "Iterator[Step]":
-        from evercal.continual.benchmark.bench import run_bench
-        from evercal.continual.benchmark.ray_runs import run_on_ray
-
-        if self.ray is None:
-            return run_bench(scenes, options, self.out)
-        return run_on_ray(scenes, options, self.out, self.ray, self.plugin)
 
     def _scenes(self) -> "list[Recording]":
         from evercal.continual.benchmark.suites import tuning_split
