@@ -209,8 +209,7 @@ class Head(nn.Module):
     ) -> HeadOutput:
         """Predict the scene coordinates of feature rows (n, features), in fp32 under autocast, too.
 
-        The index of the assumed scene is one for all rows, or (n,). Condition `code` ignores the
-        descriptors (n, descriptor).
+        `scene` is the assumed one of all rows or (n,); condition `code` ignores the descriptors.
         """
         hidden = self.hidden(features, scene, descriptor)
         with torch.autocast(hidden.device.type, enabled=False):
