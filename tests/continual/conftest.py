@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from evercal.continual.store import NetworkStore
     from evercal.recordings.frame import Recording
 
-    from .stages import EmptyScenes, Estimates, MakeStore, Rooms
+    from ..conftest import Shared
+    from .stages import EmptyScenes, MakeStore, Rooms
 
 
 @pytest.fixture(scope="session")
@@ -90,32 +91,8 @@ def make_store() -> MakeStore:
 
 
 @pytest.fixture(scope="session")
-def estimates(rooms: Rooms) -> Estimates:
-    """Poses of one image of each room by the networks, to the last bit."""
-    from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer
-    from evercal.localization.pnp import PnpOptions
-
-    # Networks this small are inaccurate: only a wide inlier radius gives poses to compare.
-    options = NetworkLocalizeOptions(pnp=PnpOptions(threshold_px=20.0))
-
-    def locate(scenes: LearnedScenes) -> list[bytes]:
-        localizer, values = NetworkLocalizer(scenes, options), []
-        for room in rooms:
-            frame = room.train[0]
-            estimate = localizer.localize(frame.read_image(), frame.camera)
-            pose = estimate.base_from_camera
-            numbers = b"" if pose is None else pose.matrix().tobytes()
-            values.append(
-                repr((estimate.status, estimate.scene, estimate.inliers)).encode() + numbers
-            )
-        return values
-
-    return locate
-
-
-@pytest.fixture(scope="session")
 def arc_scenes(
-    arcs: tuple[Recording, Recording], arc_stage: StageOptions
+    arcs: tuple[Recording, Recording], arc_stage: StageOptions, shared: Shared
 ) -> tuple[LearnedScenes, LearnedScenes]:
     """Networks after the first arc, and after both."""
     from evercal.continual.networks.descriptor import load_descriptor
@@ -125,7 +102,10 @@ def arc_scenes(
 
     from .stages import learn, outcome
 
-    strategy = STRATEGIES["evercal_network"]
-    empty = LearnedScenes(load_encoder(), load_descriptor(), strategy.name, 120)
-    one = outcome(learn(empty, strategy, arcs[0], arc_stage))
-    return one, outcome(learn(one, strategy, arcs[1], arc_stage))
+    def train() -> tuple[LearnedScenes, LearnedScenes]:
+        strategy = STRATEGIES["evercal_network"]
+        empty = LearnedScenes(load_encoder(), load_descriptor(), strategy.name, 120)
+        one = outcome(learn(empty, strategy, arcs[0], arc_stage))
+        return one, outcome(learn(one, strategy, arcs[1], arc_stage))
+
+    return shared("arc_scenes", train)

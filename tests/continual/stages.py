@@ -16,7 +16,6 @@ from evercal.recordings.frame import Recording
 
 EmptyScenes = Callable[[str], LearnedScenes]
 MakeStore = Callable[[Path, Sequence[LearnedScenes]], NetworkStore]
-Estimates = Callable[[LearnedScenes], list[bytes]]
 Rooms = tuple[Recording, Recording, Recording]
 Tree = Callable[[Path], dict[str, str]]
 

@@ -5,7 +5,7 @@ from dataclasses import fields
 
 import pytest
 
-from evercal.continual.methods.method import FineTuning, described
+from evercal.continual.methods.method import FineTuning
 from evercal.continual.methods.penalties import Distillation
 from evercal.continual.methods.replay import Replay
 from evercal.continual.selection.selectors import SELECTORS
@@ -46,15 +46,6 @@ def test_strategies_are_distinct() -> None:
         json.dumps(strategy.description(), sort_keys=True) for strategy in STRATEGIES.values()
     ]
     assert len(set(records)) == len(records)
-
-
-def test_description_includes_penalties() -> None:
-    records = described(Replay("sars", Distillation(scale=3.0), 0.5))
-    penalty = records["penalty"]
-    assert isinstance(penalty, dict)
-    assert (records["selector"], records["weight"], records["every_scene"]) == ("sars", 0.5, False)
-    assert (penalty["kind"], penalty["scale"]) == ("Distillation", 3.0)
-    assert penalty["options"]["active_centres"] == 50
 
 
 def test_sars_spdd_has_the_settings_of_the_paper() -> None:

@@ -67,8 +67,8 @@ def drawn(buffers: list[FeatureBuffer]) -> Rows:
 
 def everything(rows: Rows) -> dict[str, Tensor]:
     assert rows.known is not None
-    fields = (rows.features, rows.scene, rows.descriptor, rows.index, rows.known)
-    names = ("features", "scene", "descriptor", "index", "stored")
+    fields = (rows.features, rows.scene, rows.descriptor, rows.known)
+    names = ("features", "scene", "descriptor", "stored")
     target = rows.target
     return dict(zip(names, fields, strict=True)) | {
         "pixels": target.pixels,

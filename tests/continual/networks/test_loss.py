@@ -163,16 +163,3 @@ def test_surface_loss_is_the_logarithm_of_the_distance_in_pixels() -> None:
     torch.testing.assert_close(
         surface_loss(points, known, target, 1.0)[0], 5 * torch.log1p(torch.tensor(10.0) / 5)
     )
-
-
-def test_far_points_are_still_attracted() -> None:
-    """The clamp of the reprojection loss has no gradient there."""
-    matrix = torch.eye(4)[None, :3]
-    target = Target(torch.zeros(1, 2), torch.tensor([[200.0, 200.0, 0.0, 0.0]]), matrix)
-    points = torch.tensor([[3.0, 0.0, 2.0]], requires_grad=True)
-    known = torch.tensor([[0.0, 0.0, 2.0]])
-    (pull,) = torch.autograd.grad(surface_loss(points, known, target, 5.0).sum(), points)
-    clamped = reprojection_loss(points, target, 5.0, LossOptions())[0].sum()
-    (none,) = torch.autograd.grad(clamped, points)
-    assert float(pull[0, 0]) > 1
-    assert float(none.abs().max()) < 1e-6

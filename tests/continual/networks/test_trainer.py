@@ -106,15 +106,6 @@ def test_replay_cost_is_minimised_on_even_shares(learnable: Learnable) -> None:
     assert [tau_px for _, tau_px in captured] == pytest.approx(clamps)
 
 
-def test_scenes_share_a_batch_evenly(learnable: Learnable) -> None:
-    buffers = [learnable(scene)[0] for scene in range(3)]
-    head, captured = head_for(buffers), []
-    head.register_forward_pre_hook(lambda _, inputs: captured.append(inputs[1]))
-    list(HeadTrainer(head, buffers, replace(OPTIONS, iterations=2), 0).run())
-    for scene in captured:
-        assert torch.bincount(scene).tolist() == [32, 32, 32]
-
-
 def test_descriptor_noise_has_the_stated_size(learnable: Learnable) -> None:
     buffer, _ = learnable()
     selected = buffer.tensors["descriptors"].clone()
