@@ -252,13 +252,9 @@ def test_backbone_of_the_paper_gets_all_centres_in_advance(
         paper = on_paper_backbone(replace(few, head=replace(few.head, width=24)))
         return replace(paper, head=replace(paper.head, centres_per_scene=5))
 
-    paper = replace(options, stage=stage, strategies=named("sars_spdd", "joint", "evercal"))
+    paper = replace(options, stage=stage, strategies=named("sars_spdd", "joint"))
     steps = list(run_bench(arcs, paper, tmp_path))
     assert [s.strategy for s in steps] == [s.name for s in paper.strategies for _ in arcs]
     first = NetworkStore.open(tmp_path / "runs" / "first-one-0").contents
     assert len(first.heads[0].centres) == 5
     assert first.scenes[0].cell.side_m == 5.0
-    ends = read(tmp_path).query("stage == 1 and scene == 'two'").set_index("strategy")
-    correct = ends["within_5cm_5deg"]
-    # A few steps are too few for this network; the map does not need any.
-    assert correct["evercal"] > correct["joint"] == 0

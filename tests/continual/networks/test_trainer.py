@@ -150,10 +150,9 @@ def test_small_head_learns_scene_coordinates(learnable: Learnable) -> None:
 def test_wrong_intrinsics_are_corrected_if_allowed(learnable: Learnable) -> None:
     """The true focal length is 4 % longer than stated, and there is barrel distortion."""
     true = replace(CAMERA, fx=CAMERA.fx * 1.04, fy=CAMERA.fy * 1.04, distortion=(-0.1, 0, 0, 0))
-    options = FitOptions(iterations=400, batch=512, peak_rate=5e-3, intrinsics_rate=1.0)
-    options = replace(options, loss=OPTIONS.loss)
+    options = FitOptions(batch=512, peak_rate=5e-3, intrinsics_rate=1.0, loss=OPTIONS.loss)
     rays = torch.from_numpy(true.unproject(cell_centres(120, 160, 8))).float()
-    for correctable, steps in ((True, 400), (False, 30)):
+    for correctable, steps in ((True, 250), (False, 20)):
         buffer, _ = learnable(views=20, lens=true, correctable=correctable)
         head = head_for([buffer], HeadOptions(width=64))
         trainer = HeadTrainer(head, [buffer], replace(options, iterations=steps), 0)
