@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from ..box_world import block_mean, box, shoot
+from .box_features import describe, learnable
+
 if TYPE_CHECKING:
     from evercal.continual.learning.stage import StageOptions
     from evercal.continual.scenes import LearnedScenes
@@ -17,6 +20,8 @@ if TYPE_CHECKING:
 
     from ..conftest import Shared
     from .stages import EmptyScenes, MakeStore, Rooms
+
+__all__ = ["block_mean", "box", "describe", "learnable", "shoot"]
 
 
 @pytest.fixture(scope="session")
@@ -43,10 +48,10 @@ def first_stages(
     """Every strategy that learns scene by scene after the first room."""
     from evercal.continual.strategies import STRATEGIES
 
-    from .stages import learn, outcome
+    from .stages import learn
 
     return {
-        name: outcome(learn(empty_scenes(name), strategy, rooms[0], quick))
+        name: learn(empty_scenes(name), strategy, rooms[0], quick).scenes
         for name, strategy in STRATEGIES.items()
         if strategy.method is not None and not strategy.jointly
     }
@@ -59,13 +64,13 @@ def three_stages(
     """By strategy: what is learned after one, two and three rooms."""
     from evercal.continual.strategies import STRATEGIES
 
-    from .stages import learn, outcome
+    from .stages import learn
 
     stages: dict[str, list[LearnedScenes]] = {}
     for name in ("evercal_network", "isolation"):
         stages[name] = [first_stages[name].copy_for_training()]
         for room in rooms[1:]:
-            stages[name].append(outcome(learn(stages[name][-1], STRATEGIES[name], room, quick)))
+            stages[name].append(learn(stages[name][-1], STRATEGIES[name], room, quick).scenes)
         for after in stages[name]:
             after.scenes = [
                 replace(record, inlier_threshold=0.01 * (i + 1), covariance_scale=1.5)
@@ -100,12 +105,12 @@ def arc_scenes(
     from evercal.continual.strategies import STRATEGIES
     from evercal.features.encoder import load_encoder
 
-    from .stages import learn, outcome
+    from .stages import learn
 
     def train() -> tuple[LearnedScenes, LearnedScenes]:
         strategy = STRATEGIES["evercal_network"]
         empty = LearnedScenes(load_encoder(), load_descriptor(), strategy.name, 120)
-        one = outcome(learn(empty, strategy, arcs[0], arc_stage))
-        return one, outcome(learn(one, strategy, arcs[1], arc_stage))
+        one = learn(empty, strategy, arcs[0], arc_stage).scenes
+        return one, learn(one, strategy, arcs[1], arc_stage).scenes
 
     return shared("arc_scenes", train)

@@ -39,11 +39,6 @@ def second_stage(
     return learn(scenes, STRATEGIES[scenes.strategy], rooms[1], options, on_event)
 
 
-def outcome(stage: Stage) -> LearnedScenes:
-    """What is learned after a stage."""
-    return stage.scenes
-
-
 def weights(head: Head) -> dict[str, Tensor]:
     """A copy of a head's state."""
     return {name: value.clone() for name, value in head.state_dict().items()}

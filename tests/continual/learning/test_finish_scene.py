@@ -25,7 +25,6 @@ from ..stages import (
     MakeStore,
     Rooms,
     learn,
-    outcome,
     second_stage,
     weights,
 )
@@ -61,7 +60,7 @@ def test_arguments_of_a_method(
     scenes, strategy = empty_scenes("recording"), Strategy("recording", method)
     heads = []
     for room in rooms:
-        scenes = outcome(learn(scenes, strategy, room, quick))
+        scenes = learn(scenes, strategy, room, quick).scenes
         heads.append(copy.deepcopy(scenes.heads[0]))
     for number, (start, end) in enumerate(zip(method.starts, method.ends, strict=True)):
         assert (start.replay_rows, start.seed) == (32, 0)
@@ -98,7 +97,7 @@ def test_states_are_stored_and_count_as_memory(
     tmp_path: Path,
 ) -> None:
     first = first_stages[name]
-    second = outcome(second_stage(first, rooms, quick))
+    second = second_stage(first, rooms, quick).scenes
     states = [value for state in second.method_states for value in state.values()]
     assert len(second.method_states) == 2
     assert all(bool(value.isfinite().all()) for value in states)

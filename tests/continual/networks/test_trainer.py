@@ -124,29 +124,6 @@ def test_descriptor_noise_has_the_stated_size(learnable: Learnable) -> None:
     assert float(cosine.mean()) == pytest.approx(expected, abs=0.02)
 
 
-def test_small_head_learns_scene_coordinates(learnable: Learnable) -> None:
-    """Reprojection from several views determines the depth."""
-    buffer, points = learnable(views=20)
-    head = head_for([buffer], HeadOptions(width=64))
-    every = buffer.rows(torch.arange(len(buffer)))
-
-    def evaluate() -> tuple[float, float]:
-        with torch.no_grad():
-            actual = head(every.features.float(), 0, None).points
-            pixels = reprojection_error(actual, every.target)[0].norm(dim=-1)
-        return float(pixels.median()), float((actual - points).norm(dim=-1).median())
-
-    pixels_before, metres_before = evaluate()
-    options = FitOptions(iterations=200, batch=512, peak_rate=5e-3, loss=OPTIONS.loss)
-    progress = list(HeadTrainer(head, [buffer], options, 0).run())
-    pixels, metres = evaluate()
-    assert pixels < 3.0 < 30.0 < pixels_before
-    assert metres < 0.15 < 1.5 < metres_before
-    assert progress[-1].loss < 0.15 * progress[0].loss
-    assert progress[-1].inlier_share > 0.8
-    assert progress[0].inlier_share < 0.1
-
-
 def test_wrong_intrinsics_are_corrected_if_allowed(learnable: Learnable) -> None:
     """The true focal length is 4 % longer than stated, and there is barrel distortion."""
     true = replace(CAMERA, fx=CAMERA.fx * 1.04, fy=CAMERA.fy * 1.04, distortion=(-0.1, 0, 0, 0))

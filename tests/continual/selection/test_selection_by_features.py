@@ -67,13 +67,6 @@ def test_leverage_sums_to_the_rank_and_is_rotation_invariant() -> None:
         np.testing.assert_allclose(leverage_scores(features @ rotation, rank), scores, atol=1e-9)
 
 
-def test_leverage_prefers_the_isolated_frame() -> None:
-    features = np.array([[1.0, 0.0]] * 19 + [[0.0, 1.0]])
-    runs = 400
-    lone = sum(19 in select_leverage(features, 1, rng(seed)) for seed in range(runs)) / runs
-    assert lone == pytest.approx(0.5, abs=5 * 0.5 / np.sqrt(runs))  # 1/20 by chance
-
-
 def test_coverage_selects_frames_with_new_parts() -> None:
     # Forty frames show part 0, one frame also part 1.
     visible = [np.array([0])] * 40 + [np.array([0, 1])]
