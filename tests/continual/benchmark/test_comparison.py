@@ -83,13 +83,6 @@ def test_contrasts_pair_seeds_and_name_missing_runs() -> None:
     assert contrasts.loc["ours - joint"].tolist() == [0, *["-"] * 6]
 
 
-def test_one_common_seed_has_no_bounds() -> None:
-    scores = run_scores(pd.concat([OURS, THEIRS, table("other", 7, [[16], [4, 14]])]))
-    contrasts = contrast_table(scores, [("ours", "theirs"), ("ours", "other")])
-    assert contrasts.loc["ours - theirs"].tolist()[:4] == [1, "+20.0", "-", 1]
-    assert contrasts["runs"].tolist() == [1, 0]
-
-
 def test_seeds_interval_is_students() -> None:
     """By hand: mean 2, deviation 1, t(2) = 4.3027 at 97.5 %."""
     half = 4.3027 / 3**0.5
