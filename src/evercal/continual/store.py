@@ -123,11 +123,7 @@ class NetworkStore(StageStore):
             write_report(folder, report)
 
         shared = len(scenes.heads) == 1
-        payload = {
-            "kind": "networks",
-            "strategy": scenes.strategy,
-            "short_side": scenes.short_side,
-        }
+        payload = {"kind": "networks", "strategy": scenes.strategy, "short_side": scenes.short_side}
         self.add(scenes.scenes[-1].name, write, payload, lambda file: shared and file == HEAD)
         self.contents = scenes
 

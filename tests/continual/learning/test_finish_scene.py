@@ -20,14 +20,7 @@ from evercal.continual.store import NetworkStore
 from evercal.continual.strategies import Strategy
 from evercal.recordings.frame import stated_poses
 
-from ..stages import (
-    EmptyScenes,
-    MakeStore,
-    Rooms,
-    learn,
-    second_stage,
-    weights,
-)
+from ..stages import EmptyScenes, MakeStore, Rooms, learn, second_stage, weights
 
 STATEFUL = ["gec", "ewc"]
 

@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from evercal.continual.localizer import (
-    NetworkLocalizeOptions,
-    NetworkLocalizer,
-    open_networks,
-)
+from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer, open_networks
 from evercal.errors import InputError
 from evercal.geometry import Camera, pose_distance
 from evercal.simulation.box_room import default_camera

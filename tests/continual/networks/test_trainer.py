@@ -183,9 +183,7 @@ def test_proposed_changes_sum_to_the_change_of_the_weights(learnable: Learnable)
     assert hooks.schedules == pytest.approx(shares)
 
 
-def test_constraints_are_not_minimised(
-    learnable: Learnable,
-) -> None:
+def test_constraints_are_not_minimised(learnable: Learnable) -> None:
     """Constraints do not change the step, and each gradient belongs to one scene's rows."""
     buffers = [learnable(scene)[0] for scene in range(3)]
 

@@ -68,11 +68,7 @@ def test_store_opens_as_it_was_written(
     ("strategy", "heads"), [("evercal_network", [3]), ("isolation", [1, 2, 3])]
 )
 def test_of_a_shared_head_only_the_newest_file_remains(
-    strategy: str,
-    heads: list[int],
-    three_stages: Stages,
-    tmp_path: Path,
-    make_store: MakeStore,
+    strategy: str, heads: list[int], three_stages: Stages, tmp_path: Path, make_store: MakeStore
 ) -> None:
     store = make_store(tmp_path, three_stages[strategy])
     files = sorted(tmp_path.rglob("head.safetensors"))

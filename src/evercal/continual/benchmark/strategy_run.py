@@ -74,11 +74,7 @@ class BenchOptions:
 
 
 def run_strategy(
-    strategy: Strategy,
-    scenes: Sequence[Recording],
-    options: BenchOptions,
-    seed: int,
-    out: Path,
+    strategy: Strategy, scenes: Sequence[Recording], options: BenchOptions, seed: int, out: Path
 ) -> Iterator[StageResults]:
     """Learn the scenes in turn and evaluate all scenes learned so far after each.
 

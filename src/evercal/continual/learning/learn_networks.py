@@ -60,10 +60,7 @@ class NetworkLearnOptions:
 
 
 def learn_networks(
-    store: Path,
-    recording: Recording,
-    options: NetworkLearnOptions,
-    on_event: OnEvent = unobserved,
+    store: Path, recording: Recording, options: NetworkLearnOptions, on_event: OnEvent = unobserved
 ) -> LearnReport:
     """Learn a scene into a store; an interrupted call leaves the store at its last scene.
 
