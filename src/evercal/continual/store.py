@@ -28,7 +28,7 @@ from evercal.features.encoder import load_encoder
 from evercal.features.weights_file import network_bytes
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.store import KEYFRAMES, write_encoder
+from evercal.mapping.store import KEYFRAMES, is_free, write_encoder
 from evercal.storage.atomic import write_bytes, write_json
 from evercal.storage.manifest import Manifest
 from evercal.storage.stages import STAGES, StageStore, read_store, write_report
@@ -60,7 +60,7 @@ class NetworkStore(StageStore):
         By default it has the shipped weights. The sibling `descriptor.safetensors` of another
         encoder's file is used, if it fits.
         """
-        if root.exists() and not _is_free(root):
+        if root.exists() and not is_free(root):
             raise InputError(f"store {root}: exists and is not an evercal store; give another path")
         if encoder is None:
             networks = load_encoder(), load_descriptor()
@@ -147,12 +147,6 @@ def describe(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]
         scenes.append(_plain(record) | sizes)
     heads = sum(head_bytes(head) for head in contents.heads)
     return scenes, contents.short_side, heads, store.size_bytes()
-
-
-def _is_free(root: Path) -> bool:
-    # Empty, or with what a killed writer left.
-    left = (STAGES, "encoder-", "descriptor-", ".")
-    return root.is_dir() and all(path.name.startswith(left) for path in root.iterdir())
 
 
 def head_bytes(head: Head) -> int:

@@ -13,8 +13,7 @@ each takes runs that no other has.
 """
 
 import json
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Generator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -66,29 +65,22 @@ def run_bench(
     total = len(options.seeds) * len(options.strategies) * len(scenes)
     missing = begin_bench(scenes, options, out)
     done = total - len(missing) * len(scenes)
+    runs = out / "runs"
+    runs.mkdir(exist_ok=True)
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
-        with _claimed(out, strategy, seed) as free:
+        try:
+            claim = FileLock(runs / f"{strategy.name}-{seed}.claim").acquire(blocking=False)
+        except Timeout:  # another process has this run
+            continue
+        with claim:
             stored = results.read(out)  # another process may have added some
-            if not free or _complete((seed, strategy), stored, len(scenes)):
+            if _complete((seed, strategy), stored, len(scenes)):
                 continue
             for stage in run_strategy(strategy, ordered, options, seed, out):
                 results.append(out, stage)
                 yield Step(strategy.name, seed, stage.results, done + stage.stage + 1, total)
             done += len(scenes)
-
-
-@contextmanager
-def _claimed(out: Path, strategy: Strategy, seed: int) -> Iterator[bool]:
-    path = out / "runs" / f"{strategy.name}-{seed}.claim"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        claim = FileLock(path).acquire(blocking=False)
-    except Timeout:
-        yield False
-        return
-    with claim:
-        yield True
 
 
 def begin_bench(

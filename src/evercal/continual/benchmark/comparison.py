@@ -196,5 +196,5 @@ def summary(results: Table) -> dict[str, list[dict[str, object]]]:
 
 
 def _plain(accuracies: Table) -> list[list[float | None]]:
-    rows = accuracies.round(3).to_numpy(float).tolist()
-    return [[None if math.isnan(value) else value for value in row] for row in rows]
+    known = accuracies.notna()
+    return accuracies.round(3).astype(object).where(known, None).to_numpy().tolist()

@@ -59,7 +59,7 @@ class Atlas:
             centre, side = paper_grid(self.expected)[len(self.cells)], MIN_CELL_M
         else:
             centre = next(c for c in spiral() if self._free(c, side))
-        cell = Cell(_triple(centre), side, _triple(origin))
+        cell = Cell(tuple(centre.tolist()), side, tuple(origin.tolist()))
         self.cells.append(cell)
         return cell
 
@@ -99,12 +99,7 @@ def combined_centres(
     atlas = Atlas("paper", len(positions_m))
     in_atlas = [atlas.place(scene).atlas_from_base.apply(scene) for scene in positions_m]
     means = camera_clusters(np.concatenate(in_atlas), count, seed)
-    return tuple(map(_triple, means))
-
-
-def _triple(point: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = point.tolist()
-    return x, y, z
+    return tuple((x, y, z) for x, y, z in means.tolist())
 
 
 def spiral() -> Iterator[np.ndarray]:
