@@ -9,13 +9,19 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from ..box_world import block_mean, box, shoot
+from .box_features import describe, learnable
+
 if TYPE_CHECKING:
     from evercal.continual.learning.stage import StageOptions
     from evercal.continual.scenes import LearnedScenes
     from evercal.continual.store import NetworkStore
     from evercal.recordings.frame import Recording
 
-    from .stages import EmptyScenes, Estimates, MakeStore, Rooms
+    from ..conftest import Shared
+    from .stages import EmptyScenes, MakeStore, Rooms
+
+__all__ = ["block_mean", "box", "describe", "learnable", "shoot"]
 
 
 @pytest.fixture(scope="session")
@@ -42,10 +48,10 @@ def first_stages(
     """Every strategy that learns scene by scene after the first room."""
     from evercal.continual.strategies import STRATEGIES
 
-    from .stages import learn, outcome
+    from .stages import learn
 
     return {
-        name: outcome(learn(empty_scenes(name), strategy, rooms[0], quick))
+        name: learn(empty_scenes(name), strategy, rooms[0], quick).scenes
         for name, strategy in STRATEGIES.items()
         if strategy.method is not None and not strategy.jointly
     }
@@ -58,13 +64,13 @@ def three_stages(
     """By strategy: what is learned after one, two and three rooms."""
     from evercal.continual.strategies import STRATEGIES
 
-    from .stages import learn, outcome
+    from .stages import learn
 
     stages: dict[str, list[LearnedScenes]] = {}
     for name in ("evercal_network", "isolation"):
         stages[name] = [first_stages[name].copy_for_training()]
         for room in rooms[1:]:
-            stages[name].append(outcome(learn(stages[name][-1], STRATEGIES[name], room, quick)))
+            stages[name].append(learn(stages[name][-1], STRATEGIES[name], room, quick).scenes)
         for after in stages[name]:
             after.scenes = [
                 replace(record, inlier_threshold=0.01 * (i + 1), covariance_scale=1.5)
@@ -90,32 +96,8 @@ def make_store() -> MakeStore:
 
 
 @pytest.fixture(scope="session")
-def estimates(rooms: Rooms) -> Estimates:
-    """Poses of one image of each room by the networks, to the last bit."""
-    from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer
-    from evercal.localization.pnp import PnpOptions
-
-    # Networks this small are inaccurate: only a wide inlier radius gives poses to compare.
-    options = NetworkLocalizeOptions(pnp=PnpOptions(threshold_px=20.0))
-
-    def locate(scenes: LearnedScenes) -> list[bytes]:
-        localizer, values = NetworkLocalizer(scenes, options), []
-        for room in rooms:
-            frame = room.train[0]
-            estimate = localizer.localize(frame.read_image(), frame.camera)
-            pose = estimate.base_from_camera
-            numbers = b"" if pose is None else pose.matrix().tobytes()
-            values.append(
-                repr((estimate.status, estimate.scene, estimate.inliers)).encode() + numbers
-            )
-        return values
-
-    return locate
-
-
-@pytest.fixture(scope="session")
 def arc_scenes(
-    arcs: tuple[Recording, Recording], arc_stage: StageOptions
+    arcs: tuple[Recording, Recording], arc_stage: StageOptions, shared: Shared
 ) -> tuple[LearnedScenes, LearnedScenes]:
     """Networks after the first arc, and after both."""
     from evercal.continual.networks.descriptor import load_descriptor
@@ -123,9 +105,12 @@ def arc_scenes(
     from evercal.continual.strategies import STRATEGIES
     from evercal.features.encoder import load_encoder
 
-    from .stages import learn, outcome
+    from .stages import learn
 
-    strategy = STRATEGIES["evercal_network"]
-    empty = LearnedScenes(load_encoder(), load_descriptor(), strategy.name, 120)
-    one = outcome(learn(empty, strategy, arcs[0], arc_stage))
-    return one, outcome(learn(one, strategy, arcs[1], arc_stage))
+    def train() -> tuple[LearnedScenes, LearnedScenes]:
+        strategy = STRATEGIES["evercal_network"]
+        empty = LearnedScenes(load_encoder(), load_descriptor(), strategy.name, 120)
+        one = learn(empty, strategy, arcs[0], arc_stage).scenes
+        return one, learn(one, strategy, arcs[1], arc_stage).scenes
+
+    return shared("arc_scenes", train)

@@ -16,7 +16,6 @@ from evercal.recordings.frame import Recording
 
 EmptyScenes = Callable[[str], LearnedScenes]
 MakeStore = Callable[[Path, Sequence[LearnedScenes]], NetworkStore]
-Estimates = Callable[[LearnedScenes], list[bytes]]
 Rooms = tuple[Recording, Recording, Recording]
 Tree = Callable[[Path], dict[str, str]]
 
@@ -38,11 +37,6 @@ def second_stage(
 ) -> Stage:
     """Learn the second room with the strategy of the first."""
     return learn(scenes, STRATEGIES[scenes.strategy], rooms[1], options, on_event)
-
-
-def outcome(stage: Stage) -> LearnedScenes:
-    """What is learned after a stage."""
-    return stage.scenes
 
 
 def weights(head: Head) -> dict[str, Tensor]:

@@ -1,15 +1,18 @@
-"""The list of strategies and their descriptions."""
+"""The list of strategies, their descriptions, and strategies from a user's file."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import fields
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from evercal.continual.methods.method import FineTuning, described
 from evercal.continual.methods.penalties import Distillation
 from evercal.continual.methods.replay import Replay
 from evercal.continual.selection.selectors import SELECTORS
-from evercal.continual.strategies import STRATEGIES, Strategy, strategy_named
+from evercal.continual.strategies import STRATEGIES, Strategy, load_plugin, strategy_named
 from evercal.errors import InputError
 
 
@@ -41,22 +44,6 @@ def test_description_contains_all_hyper_parameters(strategy: Strategy) -> None:
     assert method.keys() - {"kind"} == {field.name for field in fields(strategy.method)}
 
 
-def test_strategies_are_distinct() -> None:
-    records = [
-        json.dumps(strategy.description(), sort_keys=True) for strategy in STRATEGIES.values()
-    ]
-    assert len(set(records)) == len(records)
-
-
-def test_description_includes_penalties() -> None:
-    records = described(Replay("sars", Distillation(scale=3.0), 0.5))
-    penalty = records["penalty"]
-    assert isinstance(penalty, dict)
-    assert (records["selector"], records["weight"], records["every_scene"]) == ("sars", 0.5, False)
-    assert (penalty["kind"], penalty["scale"]) == ("Distillation", 3.0)
-    assert penalty["options"]["active_centres"] == 50
-
-
 def test_sars_spdd_has_the_settings_of_the_paper() -> None:
     """SARS with the fixed radius, SPDD with weights 1, tau 2 and 50 active centres."""
     method = STRATEGIES["sars_spdd"].method
@@ -73,3 +60,58 @@ def test_unknown_strategy_is_refused() -> None:
     for name in ("nonsense", "sars+spdd", "er@0.3", ""):
         with pytest.raises(InputError, match=r"unknown; choose one of evercal, .* joint"):
             strategy_named(name)
+
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "my_strategy.py"
+
+
+@pytest.fixture
+def _restored() -> Iterator[None]:
+    before = dict(STRATEGIES)
+    yield
+    STRATEGIES.clear()
+    STRATEGIES.update(before)
+
+
+@pytest.mark.usefixtures("_restored")
+def test_example_can_be_loaded_once() -> None:
+    assert len(EXAMPLE.read_text().splitlines()) <= 40
+    assert load_plugin(EXAMPLE) == ("spread",)
+    method = STRATEGIES["spread"].method
+    assert method is not None
+
+    class Line:
+        positions_m = np.linspace(0, 1, 11)[:, None] * [1.0, 0, 0]
+        quaternions_wxyz = np.tile([1.0, 0, 0, 0], (11, 1))
+
+    selected = method.select(Line(), 3)  # pyright: ignore[reportArgumentType]
+    assert selected is not None
+    assert selected.tolist() == [0, 5, 10]
+    records = described(method)  # with its hyper-parameters
+    penalty = {"kind": "OldOutput", "px_per_m": 25.0}
+    assert (records["kind"], records["penalty"]) == ("Spread", penalty)
+    with pytest.raises(InputError, match="'spread' exists"):
+        load_plugin(EXAMPLE)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x = 1", "defines no STRATEGIES"),
+        ("STRATEGIES = {}", "defines no STRATEGIES"),
+        ("STRATEGIES = {'mine': Strategy('other')}", "defines no STRATEGIES"),
+        ("STRATEGIES = {'finetune': Strategy('finetune', source='mine')}", "'finetune' exists"),
+        ("1 / 0", "ZeroDivisionError: division by zero"),
+        ("def :", "SyntaxError"),
+    ],
+)
+def test_invalid_plugins_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    path, before = tmp_path / "mine.py", dict(STRATEGIES)
+    path.write_text(f"from evercal.continual.strategies import Strategy\n{text}")
+    with pytest.raises(InputError, match=message):
+        load_plugin(path)
+    assert before == STRATEGIES
+    path.with_suffix(".txt").write_text("")
+    for name in ("none.py", "mine.txt"):
+        with pytest.raises(InputError, match=r"ends in \.py"):
+            load_plugin(tmp_path / name)

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.options import Count, Device, Folder, Verb
+from evercal.cli.console import print_json, print_next
+from evercal.cli.options import Device
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from evercal.continual.benchmark.bench import BenchOptions, Step
+    from evercal.continual.benchmark.bench import Step
     from evercal.continual.learning.stage import StageOptions
     from evercal.continual.strategies import Strategy
     from evercal.recordings import Recording
@@ -25,7 +24,7 @@ LEAST_BATCH = 64
 
 
 @dataclass(frozen=True)
-class Bench(Verb):
+class Bench:
     """Compare strategies on a sequence of scenes; the same command resumes.
 
     Given a folder of results, print its tables again.
@@ -50,9 +49,9 @@ class Bench(Verb):
     given order by one place for each seed, and reverses it in every second round."""
     scenes: Annotated[str, arg(metavar="A,B", help_behavior_hint="")] = ""
     """Comma-separated scenes of the suite. Defaults to all."""
-    data: Folder = None
+    data: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder of the suite's recordings, with one folder per scene."""
-    poses: Folder = None
+    poses: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Structure-from-motion poses for i7s and i12s (Brachmann et al., ICCV 2021). Defaults to the
     original poses."""
     parts: int = 4
@@ -64,9 +63,9 @@ class Bench(Verb):
     and loss (paper) or by ours (paper_head)."""
     offsets: Literal["per_centre", "shared"] = "per_centre"
     """One offset and scale per centre (the paper), or one for all centres (GLACE)."""
-    steps: Count = None
+    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Optimiser steps of a stage. Defaults to that of the preset."""
-    batch: Count = None
+    batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Rows of the new scene in a step; replayed rows keep the preset's proportion. Defaults to that
     of the preset."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
@@ -76,18 +75,19 @@ class Bench(Verb):
     device: Device = "auto"
     plugin: Annotated[Path | None, arg(metavar="FILE.py", help_behavior_hint="")] = None
     """Python file of your own strategies (see examples/my_strategy.py)."""
-    ray: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="")] = None
-    """Ray cluster to run on, or `local` for this machine. Without it, runs are sequential."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-bench")
-    """Folder of results. The same command resumes there."""
+    """Folder of results. The same command resumes there; in a second process it shares the runs."""
+    json: bool = False
+    """Print one JSON object."""
 
     def run(self) -> int:
+        """Run what is missing and print the tables."""
         if Path(self.suite).is_dir():
             return self._show(Path(self.suite))
         seeds = _numbers(self.seeds)
-        from evercal.continual.benchmark.bench import BenchOptions
+        from evercal.continual.benchmark.bench import BenchOptions, run_bench
         from evercal.continual.learning.presets import short_side
-        from evercal.continual.plugin import load_plugin
+        from evercal.continual.strategies import load_plugin
 
         if self.plugin is not None:
             load_plugin(self.plugin)
@@ -106,18 +106,24 @@ class Bench(Verb):
             },
             device=self.device,
         )
-        for step in self._steps(scenes, options):
+        for step in run_bench(scenes, options, self.out):
             print(_progress(step), file=sys.stderr if self.json else sys.stdout, flush=True)
         return self._show(self.out, strategies[0].name)
 
     def _show(self, folder: Path, reference: str = "") -> int:
+        """Write tables and figure of a folder of results, and print the tables."""
         from evercal.continual.benchmark import report, results
         from evercal.continual.benchmark.comparison import LEGEND, summary
 
         text = report.write_report(folder, reference or _words(self.strategies)[0])
-        wrote = f"wrote {folder / report.TABLES}, {report.LATEX}, {report.FIGURE}"
-        record = {"strategies": summary(results.read(folder))}
-        return self.answer(record, [text, "", LEGEND, wrote], ("bench", folder))
+        if self.json:
+            print_json({"strategies": summary(results.read(folder))})
+            return 0
+        print(
+            f"{text}\n\n{LEGEND}\nwrote {folder / report.TABLES}, {report.LATEX}, {report.FIGURE}"
+        )
+        print_next("evercal", "bench", folder)
+        return 0
 
     def _strategies(self) -> "tuple[Strategy, ...]":
         from evercal.continual.benchmark.paper_tables import TABLE4
@@ -126,14 +132,6 @@ class Bench(Verb):
         words = _words(self.strategies)
         names = [name for word in words for name in (TABLE4 if word == "table4" else (word,))]
         return tuple(strategy_named(name) for name in dict.fromkeys(names))
-
-    def _steps(self, scenes: "list[Recording]", options: "BenchOptions") -> "Iterator[Step]":
-        from evercal.continual.benchmark.bench import run_bench
-        from evercal.continual.benchmark.ray_runs import run_on_ray
-
-        if self.ray is None:
-            return run_bench(scenes, options, self.out)
-        return run_on_ray(scenes, options, self.out, self.ray, self.plugin)
 
     def _scenes(self) -> "list[Recording]":
         from evercal.continual.benchmark.suites import tuning_split
@@ -183,6 +181,7 @@ class Bench(Verb):
 
 
 def _progress(step: "Step") -> str:
+    """Describe a stage: accuracy of each scene, under every name that the strategy is judged by."""
     start = f"[{step.done}/{step.total}] "
     if step.results.empty:
         return f"{start}{step.strategy} seed {step.seed}: no results before the last stage"

@@ -36,16 +36,11 @@ class NetworkLocalizeOptions:
     patches_short_side: int = 480
     """Short side of the image in a query, pixels."""
     refuses: bool = True
-    """Whether a pose with too few inliers is refused. A comparison with published methods, which
-    answer for every image, scores all poses."""
+    """Whether a pose with too few inliers is refused; published methods answer for every image."""
 
 
 def open_networks(path: Path, device: str = "auto") -> "NetworkLocalizer":
-    """A localizer for a store of networks; `device` as for `device_of`.
-
-    Raises:
-        InputError: Not a store, an empty one, or a damaged file; no such device.
-    """
+    """A localizer for a store of networks; `device` as for `device_of`."""
     where = device_of(device)
     scenes = NetworkStore.open(path).contents
     if not scenes.scenes:
@@ -54,12 +49,7 @@ def open_networks(path: Path, device: str = "auto") -> "NetworkLocalizer":
 
 
 class NetworkLocalizer:
-    """Locates images by scene-coordinate networks.
-
-    Args:
-        scenes: networks and scenes, at least one.
-        options: RANSAC settings and retrieval.
-    """
+    """Locates images by scene-coordinate networks of one or more scenes."""
 
     def __init__(self, scenes: LearnedScenes, options: NetworkLocalizeOptions | None = None):
         self.contents, self.options = scenes, options or NetworkLocalizeOptions()
@@ -73,7 +63,7 @@ class NetworkLocalizer:
         return tuple(record.name for record in self.contents.scenes)
 
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
-        """Estimate the camera pose of one image; see `Localizer.localize`."""
+        """Locate an image; see `Localizer.localize`."""
         began = time.perf_counter()
         image, scenes = as_rgb(image), self.contents
         cameras = _fitting_cameras(camera, image, scenes.scenes)
@@ -89,13 +79,11 @@ class NetworkLocalizer:
 
     @property
     def _decides_scene(self) -> bool:
-        """Whether the network itself decides the scene (condition `descriptor`)."""
         heads = self.contents.heads
         return len(heads) == 1 and heads[0].options.condition == "descriptor"
 
     @torch.inference_mode()
     def _candidates(self, query: Query, cameras: Sequence[Camera | None]) -> list[int]:
-        """Scenes to try, most similar prototype first."""
         usable = [i for i, camera in enumerate(cameras) if camera is not None]
         if self._decides_scene:
             return usable[:1]
@@ -108,7 +96,6 @@ class NetworkLocalizer:
     def _hypothesis(
         self, query: Query, scene: int, cameras: Sequence[Camera | None], moved: bool = False
     ) -> Hypothesis:
-        """A pose in one scene: predict, PnP."""
         camera = cameras[scene]
         assert camera is not None, "only scenes whose camera fits are tried"
         small = camera.short_side_resized(self.contents.short_side)
@@ -137,10 +124,7 @@ class NetworkLocalizer:
 
     @torch.inference_mode()
     def _predicted(self, query: Query, scene: int, camera: Camera) -> tuple[Matches, int]:
-        """Scene coordinates of patches in a scene's base frame, and the number of patches.
-
-        The camera is at the encoder's working size.
-        """
+        """Scene coordinates of patches in a scene's base frame, and the number of patches."""
         scenes = self.contents
         patches, pixels = strided_patches(query, camera, scenes.encoder.stride, 1)
         head, local = scenes.head_for(scene)
@@ -154,7 +138,6 @@ class NetworkLocalizer:
         return Matches(pixels[valid], points[valid]), len(patches)
 
     def _scene_of(self, rough: PnpResult, scene: int) -> int:
-        """The scene in whose cell of the atlas a pose lies."""
         atlas_from_base = self.contents.scenes[scene].cell.atlas_from_base
         position = atlas_from_base.apply(rough.pose.pose.translation_m)
         inside = self.contents.atlas().scene_at(position)
@@ -192,26 +175,16 @@ class NetworkLocalizer:
         if self.contents.atlas().scene_at(position) != best.scene:
             return "failed", "the pose lies outside the cell of its scene"
         if self.options.refuses and best.inlier_ratio < record.inlier_threshold:
-            need = f"{100 * record.inlier_threshold:.0f} %"
-            share = f"{100 * best.inlier_ratio:.0f} %"
-            return (
-                "unknown_scene",
-                f"{share} of the patches are inliers, {record.name} needs {need}",
-            )
+            share, need = 100 * best.inlier_ratio, 100 * record.inlier_threshold
+            reason = f"{share:.0f} % of the patches are inliers, {record.name} needs {need:.0f} %"
+            return "unknown_scene", reason
         return "ok", ""
 
 
 def _fitting_cameras(
     camera: Camera | None, image: np.ndarray, scenes: Sequence[SceneRecord]
 ) -> list[Camera | None]:
-    """Intrinsics of an image in each scene; None where the aspect ratio does not fit.
-
-    Networks do not estimate intrinsics, so that nothing is guessed.
-
-    Raises:
-        InputError: A camera with another aspect ratio than the image's, or no camera given and no
-            scene was recorded at this aspect ratio.
-    """
+    """Intrinsics of an image in each scene, never guessed; None where its shape does not fit."""
     height, width = image.shape[:2]
     recorded = [scene.adjusted_camera for scene in scenes]
     if camera is None and not any(own.fits(width, height) for own in recorded):

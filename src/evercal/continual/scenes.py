@@ -83,10 +83,7 @@ class LearnedScenes:
         return device_of_network(self.encoder)
 
     def to(self, device: torch.device) -> Self:
-        """Move encoder, descriptor and heads to a device, in place.
-
-        Keyframes, prototypes and method states stay on the CPU.
-        """
+        """Move encoder, descriptor and heads to a device, in place; all else stays on the CPU."""
         for network in (self.encoder, self.descriptor, *self.heads):
             if isinstance(network, nn.Module):
                 network.to(device)

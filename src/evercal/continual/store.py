@@ -20,10 +20,7 @@ from typing import Any, Self
 from torch import Tensor, nn
 
 from evercal.continual.networks.atlas import Cell
-from evercal.continual.networks.descriptor import (
-    descriptor_for,
-    load_descriptor,
-)
+from evercal.continual.networks.descriptor import descriptor_for, load_descriptor
 from evercal.continual.networks.head import Head, HeadOptions
 from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.errors import InputError
@@ -31,7 +28,7 @@ from evercal.features.encoder import load_encoder
 from evercal.features.weights_file import network_bytes
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.store import KEYFRAMES, write_encoder
+from evercal.mapping.store import KEYFRAMES, is_free, write_encoder
 from evercal.storage.atomic import write_bytes, write_json
 from evercal.storage.manifest import Manifest
 from evercal.storage.stages import STAGES, StageStore, read_store, write_report
@@ -42,14 +39,7 @@ PROTOTYPES, STATE = "prototypes.safetensors", "state.safetensors"
 
 
 class NetworkStore(StageStore):
-    """A store of networks on disk and in memory.
-
-    Args:
-        root: folder of the store.
-        scenes: what was learned.
-        stages: folder names of the scenes, in order.
-        networks: file names of encoder and descriptor.
-    """
+    """A store of networks on disk and in memory; its networks are encoder and descriptor."""
 
     def __init__(
         self,
@@ -67,17 +57,10 @@ class NetworkStore(StageStore):
     ) -> Self:
         """An empty store; nothing is written before the first `commit`.
 
-        Args:
-            root: folder of the store to be.
-            strategy: how scenes are learned into it.
-            short_side: working size of images, pixels.
-            encoder: a weights file; its sibling `descriptor.safetensors` is used, if it fits.
-                Default: the shipped weights.
-
-        Raises:
-            InputError: `root` holds something that is not a store, or a bad encoder.
+        By default it has the shipped weights. The sibling `descriptor.safetensors` of another
+        encoder's file is used, if it fits.
         """
-        if root.exists() and not _is_free(root):
+        if root.exists() and not is_free(root):
             raise InputError(f"store {root}: exists and is not an evercal store; give another path")
         if encoder is None:
             networks = load_encoder(), load_descriptor()
@@ -88,11 +71,7 @@ class NetworkStore(StageStore):
 
     @classmethod
     def open(cls, root: Path) -> Self:
-        """Open a store at its last complete scene.
-
-        Raises:
-            InputError: Not a store, or a file is missing or was changed.
-        """
+        """Open a store at its last complete scene."""
 
         def read(manifest: Manifest) -> Self:
             payload = manifest.payload
@@ -127,17 +106,15 @@ class NetworkStore(StageStore):
             scenes.heads.append(_read_head(folder, scenes.encoder.width))
 
     def commit(self, scenes: LearnedScenes, report: Mapping[str, object]) -> None:
-        """Add the newest scene of `scenes`: whole, or not at all.
-
-        Raises:
-            InputError: Another process writes into the store, or it cannot be written.
-        """
+        """Add the newest scene of `scenes`: whole, or not at all."""
         keyframes = scenes.keyframes[-1]
 
         def write(folder: Path) -> None:
             if not self.networks:
                 self.networks = self._write_networks(scenes)
-            _write_record(folder, scenes.scenes[-1])
+            record = scenes.scenes[-1]
+            write_json(folder / RECORD, _plain(record))
+            save_tensors(folder / PROTOTYPES, {"prototypes": record.prototypes})
             _write_head(folder, scenes.heads[-1])
             if keyframes is not None:
                 save_tensors(folder / KEYFRAMES, keyframes.to_tensors())
@@ -146,11 +123,7 @@ class NetworkStore(StageStore):
             write_report(folder, report)
 
         shared = len(scenes.heads) == 1
-        payload = {
-            "kind": "networks",
-            "strategy": scenes.strategy,
-            "short_side": scenes.short_side,
-        }
+        payload = {"kind": "networks", "strategy": scenes.strategy, "short_side": scenes.short_side}
         self.add(scenes.scenes[-1].name, write, payload, lambda file: shared and file == HEAD)
         self.contents = scenes
 
@@ -167,26 +140,13 @@ def describe(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]
     """Scenes for JSON, working size, size of networks, and files with their sizes."""
     store = NetworkStore.open(path)
     contents = store.contents
-    scenes: list[dict[str, Any]] = [
-        {
-            "name": record.name,
-            "train_frames": record.train_frames,
-            "memory_bytes": keyframes.bytes if keyframes is not None else 0,
-            "keyframes": len(keyframes) if keyframes is not None else 0,
-            "camera": record.camera.to_dict(),
-            "inlier_threshold": record.inlier_threshold,
-            "cell": asdict(record.cell),
-        }
-        for record, keyframes in zip(contents.scenes, contents.keyframes, strict=True)
-    ]
+    scenes = []
+    for record, keyframes in zip(contents.scenes, contents.keyframes, strict=True):
+        memory = (keyframes.bytes, len(keyframes)) if keyframes is not None else (0, 0)
+        sizes = dict(zip(("memory_bytes", "keyframes"), memory, strict=True))
+        scenes.append(_plain(record) | sizes)
     heads = sum(head_bytes(head) for head in contents.heads)
     return scenes, contents.short_side, heads, store.size_bytes()
-
-
-def _is_free(root: Path) -> bool:
-    """Whether a folder is empty, or holds only what a killed writer of a store left."""
-    left = (STAGES, "encoder-", "descriptor-", ".")
-    return root.is_dir() and all(path.name.startswith(left) for path in root.iterdir())
 
 
 def head_bytes(head: Head) -> int:
@@ -212,7 +172,6 @@ def _write_head(folder: Path, head: Head) -> None:
 
 
 def _read_head(folder: Path, features: int) -> Head:
-    """Read the head of a stage; `features` is the width of the store's encoder."""
     from safetensors import safe_open
 
     path = folder / HEAD
@@ -225,30 +184,20 @@ def _read_head(folder: Path, features: int) -> Head:
     return Head.from_state(features, settings["descriptor"], options, state).eval()
 
 
-def _write_record(folder: Path, record: SceneRecord) -> None:
-    content = {
-        "name": record.name,
-        "camera": record.camera.to_dict(),
-        "cell": asdict(record.cell),
-        "train_frames": record.train_frames,
-        "refined_camera": record.refined_camera.to_dict() if record.refined_camera else None,
-        "inlier_threshold": record.inlier_threshold,
-        "covariance_scale": record.covariance_scale,
-    }
-    write_json(folder / RECORD, content)
-    save_tensors(folder / PROTOTYPES, {"prototypes": record.prototypes})
+def _plain(record: SceneRecord) -> dict[str, Any]:
+    """A record as in its file, without its prototypes."""
+    content = {**vars(record), "cell": asdict(record.cell)}
+    del content["prototypes"]
+    return {k: v.to_dict() if isinstance(v, Camera) else v for k, v in content.items()}
 
 
 def _read_record(folder: Path) -> SceneRecord:
     content = json.loads((folder / RECORD).read_text())
     cell, refined = content["cell"], content["refined_camera"]
-    return SceneRecord(
-        name=content["name"],
-        camera=Camera.from_dict(content["camera"]),
-        cell=Cell(tuple(cell["centre_m"]), cell["side_m"], tuple(cell["origin_m"])),
-        prototypes=load_tensors(folder / PROTOTYPES)["prototypes"],
-        train_frames=content["train_frames"],
-        refined_camera=Camera.from_dict(refined) if refined else None,
-        inlier_threshold=content["inlier_threshold"],
-        covariance_scale=content["covariance_scale"],
-    )
+    read = {
+        "camera": Camera.from_dict(content["camera"]),
+        "cell": Cell(tuple(cell["centre_m"]), cell["side_m"], tuple(cell["origin_m"])),
+        "refined_camera": Camera.from_dict(refined) if refined else None,
+        **load_tensors(folder / PROTOTYPES),
+    }
+    return SceneRecord(**{**content, **read})

@@ -1,6 +1,9 @@
-"""Strategies by name."""
+"""Strategies by name, and those of a user's file."""
 
+import importlib.util
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 from evercal.continual.methods.ewc import ElasticWeightConsolidation
 from evercal.continual.methods.gec import EpisodicConstraint
@@ -113,12 +116,36 @@ STRATEGIES: dict[str, Strategy] = {strategy.name: strategy for strategy in _ALL}
 
 
 def strategy_named(name: str) -> Strategy:
-    """Return a strategy by name.
-
-    Raises:
-        InputError: The name is unknown.
-    """
+    """Return a strategy by name."""
     if name not in STRATEGIES:
         names = ", ".join(STRATEGIES)
         raise InputError(f"strategy {name!r}: unknown; choose one of {names}")
     return STRATEGIES[name]
+
+
+def load_plugin(path: Path) -> tuple[str, ...]:
+    """Run a Python file, add the strategies of its dict `STRATEGIES`, and return their names."""
+    spec = importlib.util.spec_from_file_location(f"evercal_plugin_{path.stem}", path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise InputError(f"plugin {path}: not a Python file; give one that ends in .py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses and pickle look up the module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise InputError(f"plugin {path}: {type(error).__name__}: {error}") from error
+    strategies = getattr(module, "STRATEGIES", None)
+    usable = isinstance(strategies, dict) and all(
+        isinstance(strategy, Strategy) and strategy.name == name
+        for name, strategy in strategies.items()
+    )
+    if not usable or not strategies:
+        raise InputError(
+            f"plugin {path}: defines no STRATEGIES; define a dict from names to Strategy records"
+            " of these names"
+        )
+    for name, strategy in strategies.items():
+        if STRATEGIES.get(name, strategy) is not strategy:
+            raise InputError(f"plugin {path}: strategy {name!r} exists; choose another name")
+    STRATEGIES.update(strategies)
+    return tuple(strategies)

@@ -25,10 +25,7 @@ def fit_threshold(scenes: LearnedScenes, held_out: Sequence[Frame], index: int =
     learned. The threshold lies a sixth of the way from the 95 % quantile of the negatives to the
     5 % quantile of the positives: positives lie on the path of the recording, and views beside it
     have fewer inliers. The scale gives well-located frames the median squared Mahalanobis error of
-    six Gaussian dimensions.
-
-    Returns:
-        The scene's record with its threshold and scale.
+    six Gaussian dimensions. Returned is the scene's record with both.
     """
     # A threshold that was fitted before must not count twice.
     records = list(scenes.scenes)

@@ -257,7 +257,7 @@ def is_free(root: Path) -> bool:
     if not root.is_dir():
         return False
     return all(
-        path.name == "stages" or path.name.startswith(("encoder-", "vlad-", "."))
+        path.name == "stages" or path.name.startswith(("encoder-", "vlad-", "descriptor-", "."))
         for path in root.iterdir()
     )
 

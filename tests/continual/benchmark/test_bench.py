@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pandas as pd
 import pytest
 
+from evercal.continual import threshold
 from evercal.continual.benchmark.bench import BenchOptions, Step, begin_bench, in_order, run_bench
-from evercal.continual.benchmark.environment import environment
 from evercal.continual.benchmark.results import (
     KEY,
     RESULTS,
     SETTINGS,
     STRATEGIES,
     read,
-    read_environments,
     read_frames,
 )
 from evercal.continual.learning.presets import on_paper_backbone
@@ -41,15 +42,24 @@ def named(*names: str) -> tuple[Strategy, ...]:
 
 @pytest.fixture(scope="module")
 def arcs(arcs: Arcs) -> Arcs:
-    """The arcs with eight of their test frames."""
-    one, two = (replace(scene, test=scene.test[::3]) for scene in arcs)
+    """The arcs with 18 of their training frames and three of their test frames."""
+    one, two = (replace(scene, train=scene.train[:18], test=scene.test[:18:7]) for scene in arcs)
     return one, two
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_negatives() -> Iterator[None]:
+    """Negative images that need no rendering."""
+    images = np.random.default_rng(0).integers(0, 256, (2, 120, 160, 3)).astype(np.uint8)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(threshold, "_negative_views", lambda *_: images)
+        yield
 
 
 @pytest.fixture(scope="module")
 def options(arc_stage: StageOptions) -> BenchOptions:
     def stage(seed: int) -> StageOptions:
-        fit = replace(arc_stage.fit, iterations=12, batch=128, replay_batch=64)
+        fit = replace(arc_stage.fit, iterations=6, batch=64, replay_batch=32)
         encode = replace(arc_stage.encode, views_per_frame=1, seed=seed)
         return replace(arc_stage, fit=fit, encode=encode, replay_views_per_frame=1, seed=seed)
 
@@ -87,8 +97,8 @@ def test_all_learned_scenes_are_evaluated_after_every_stage(
     results, frames = read(out), read_frames(out)
     rows = results[["strategy", "stage", "scene"]]
     assert list(rows.itertuples(index=False, name=None)) == expected
-    assert (results["frames"] == 8).all()
-    assert (frames.groupby(["strategy", "scene"]).size() == 8).all()
+    assert (results["frames"] == 3).all()
+    assert (frames.groupby(["strategy", "scene"]).size() == 3).all()
     assert set(frames["strategy"]) == {"er", "finetune", "joint"}
 
 
@@ -98,18 +108,10 @@ def test_strategies_share_the_first_stage(complete: tuple[Path, list[Step]]) -> 
     errors = ["median_mm", "median_deg", "area_20cm"]
     assert first.loc["er", errors].equals(first.loc["finetune", errors])
     assert first.loc["er", "memory_bytes"] > first.loc["finetune", "memory_bytes"] == 0
-    assert first["frames_kept"].to_dict() == {"er": 2, "finetune": 0}
+    assert first["frames_kept"].to_dict() == {"er": 1, "finetune": 0}
     # Stores of complete runs are removed; the first scene stays for other strategies.
     stores = [path.name for path in (out / "runs").iterdir() if path.is_dir()]
     assert stores == ["first-one-0"]
-
-
-def test_complete_runs_are_not_repeated(
-    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[Step]]
-) -> None:
-    before = (complete[0] / RESULTS).read_bytes()
-    assert list(run_bench(arcs, options, complete[0])) == []
-    assert (complete[0] / RESULTS).read_bytes() == before
 
 
 def test_processes_share_the_runs(
@@ -125,24 +127,16 @@ def test_processes_share_the_runs(
     pd.testing.assert_frame_equal(comparable(tmp_path), comparable(complete[0]))
 
 
-def test_every_row_names_commit_and_machine(complete: tuple[Path, list[Step]]) -> None:
-    out, _ = complete
-    records = read_environments(out)
-    assert set(read(out)["environment"]) == set(records)
-    (record,) = records.values()
-    assert record == environment()
-
-
 def test_options_that_decide_a_result_are_recorded(complete: tuple[Path, list[Step]]) -> None:
     settings = json.loads((complete[0] / SETTINGS).read_text())
-    assert settings["fit"]["iterations"] == 12
+    assert settings["fit"]["iterations"] == 6
     assert settings["localize"]["align"] is True
     assert settings["localize"]["pnp"]["threshold_px"] > 0
     assert 0 < settings["acceptance"]["MIN_SUPPORT"] < 1
 
 
-@pytest.mark.parametrize("stages", [1, 2])
-def test_interruption_between_stages_does_not_change_results(
+@pytest.mark.parametrize("stages", [0, 1, 2])
+def test_interruption_does_not_change_results(
     arcs: Arcs,
     options: BenchOptions,
     complete: tuple[Path, list[Step]],
@@ -150,19 +144,12 @@ def test_interruption_between_stages_does_not_change_results(
     stages: int,
 ) -> None:
     one = replace(options, strategies=named("er"))
+    (tmp_path / "runs" / "er-0" / "stages" / ".0001-one").mkdir(parents=True)  # a commit
     steps = run_bench(arcs, one, tmp_path)
     for _ in range(stages):
         next(steps)
     steps.close()
     list(run_bench(arcs, one, tmp_path))
-    pd.testing.assert_frame_equal(comparable(tmp_path), comparable(complete[0], "er"))
-
-
-def test_a_folder_of_an_interrupted_commit_is_removed(
-    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[Step]], tmp_path: Path
-) -> None:
-    (tmp_path / "runs" / "er-0" / "stages" / ".0001-one").mkdir(parents=True)
-    list(run_bench(arcs, replace(options, strategies=named("er")), tmp_path))
     pd.testing.assert_frame_equal(comparable(tmp_path), comparable(complete[0], "er"))
 
 
@@ -193,42 +180,32 @@ def test_missing_rows_of_a_stage_are_added(
     assert len(whole) == 6
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"order": "reversed"}, "order 'given', now it is 'reversed'"),
+def test_other_settings_and_strategies_are_refused(
+    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[Step]]
+) -> None:
+    other = replace(strategy_named("er"), method=Replay("sars", weight=0.3))
+    for change, message in (
+        (replace(options, order="reversed"), "order 'given', now it is 'reversed'"),
         (
-            {"strategies": (replace(strategy_named("er"), method=Replay("sars", weight=0.3)),)},
+            replace(options, strategies=(other,)),
             "strategy 'er' was .*reservoir.*now it is .*sars.*give it another name",
         ),
-        ({"settings": {"suite": "other"}}, "suite None, now it is 'other'"),
-    ],
-)
-def test_other_settings_and_strategies_are_refused(
-    arcs: Arcs,
-    options: BenchOptions,
-    complete: tuple[Path, list[Step]],
-    change: dict[str, object],
-    message: str,
-) -> None:
-    before = (complete[0] / STRATEGIES).read_bytes()
-    with pytest.raises(InputError, match=message):
-        next(run_bench(arcs, replace(options, **change), complete[0]))  # pyright: ignore[reportArgumentType]
-    assert (complete[0] / STRATEGIES).read_bytes() == before
-
-
-def test_strategies_are_described_beside_the_results(
-    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[Step]], tmp_path: Path
-) -> None:
+        (replace(options, settings={"suite": "other"}), "suite None, now it is 'other'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            next(run_bench(arcs, change, complete[0]))
     described = json.loads((complete[0] / STRATEGIES).read_text())
     assert described == {s.name: s.description() for s in options.strategies}
-    # More strategies can be added.
+
+
+def test_strategies_can_be_added(
+    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[Step]], tmp_path: Path
+) -> None:
     row = Strategy("er_3", Replay(weight=0.9))
     more = replace(options, strategies=(*named("er"), row))
-    out = tmp_path / "out"
-    shutil.copytree(complete[0], out, ignore=shutil.ignore_patterns("features"))
-    assert begin_bench(arcs, more, out) == [(0, row)]
-    assert list(json.loads((out / STRATEGIES).read_text())) == ["er", "finetune", "joint", "er_3"]
+    shutil.copytree(complete[0], tmp_path, dirs_exist_ok=True)
+    assert begin_bench(arcs, more, tmp_path) == [(0, row)]
+    assert [*json.loads((tmp_path / STRATEGIES).read_text())] == ["er", "finetune", "joint", "er_3"]
 
 
 def test_single_scene_is_refused(arcs: Arcs, options: BenchOptions, tmp_path: Path) -> None:
@@ -265,13 +242,9 @@ def test_backbone_of_the_paper_gets_all_centres_in_advance(
         paper = on_paper_backbone(replace(few, head=replace(few.head, width=24)))
         return replace(paper, head=replace(paper.head, centres_per_scene=5))
 
-    paper = replace(options, stage=stage, strategies=named("sars_spdd", "joint", "evercal"))
+    paper = replace(options, stage=stage, strategies=named("sars_spdd", "joint"))
     steps = list(run_bench(arcs, paper, tmp_path))
     assert [s.strategy for s in steps] == [s.name for s in paper.strategies for _ in arcs]
     first = NetworkStore.open(tmp_path / "runs" / "first-one-0").contents
     assert len(first.heads[0].centres) == 5
     assert first.scenes[0].cell.side_m == 5.0
-    ends = read(tmp_path).query("stage == 1 and scene == 'two'").set_index("strategy")
-    correct = ends["within_5cm_5deg"]
-    # Twelve steps are too few for this network; the map does not need any.
-    assert correct["evercal"] > correct["joint"] == 0

@@ -5,12 +5,7 @@ import itertools
 import pandas as pd
 
 from evercal.continual.benchmark.comparison import run_scores
-from evercal.continual.benchmark.paper_tables import (
-    ABLATIONS,
-    ablation_table,
-    latex,
-    paper_table,
-)
+from evercal.continual.benchmark.paper_tables import ABLATIONS, ablation_table, latex, paper_table
 from evercal.continual.strategies import strategy_named
 
 from .results_by_hand import JOINT, table

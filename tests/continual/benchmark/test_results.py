@@ -49,12 +49,11 @@ def test_compressed_files_are_read(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(read_frames(tmp_path), TESTS)
 
 
-@pytest.mark.parametrize("cut", [1, 40])
-def test_incomplete_last_line_is_removed_and_written_again(tmp_path: Path, cut: int) -> None:
+def test_incomplete_last_line_is_removed_and_written_again(tmp_path: Path) -> None:
     append(tmp_path, stage(0))
     append(tmp_path, stage(1))
     path = tmp_path / RESULTS
-    path.write_bytes(path.read_bytes()[:-cut])
+    path.write_bytes(path.read_bytes()[:-40])
     assert len(read(tmp_path)) == 2
     append(tmp_path, stage(1))
     assert len(read(tmp_path)) == 3

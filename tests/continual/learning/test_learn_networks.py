@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 import json
-import pickle
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from evercal.continual import threshold
 from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
 from evercal.continual.learning.stage import Encoding, StageOptions
-from evercal.continual.localizer import open_networks
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.store import NetworkStore, head_bytes
 from evercal.errors import InputError
 from evercal.learning.scene import LearnReport
-from evercal.recordings import generic
 
 from ..stages import Rooms, Tree
 
@@ -115,10 +108,6 @@ def test_bad_input_is_refused_and_leaves_the_store_unchanged(
     assert (tmp_path / "thesis.tex").read_text() == "x"
 
 
-def steps_of(events: list[object]) -> list[int]:
-    return [event.step for event in events if isinstance(event, Progress)]
-
-
 def test_second_writer_is_refused(
     rooms: Rooms, options: NetworkLearnOptions, tmp_path: Path
 ) -> None:
@@ -132,42 +121,3 @@ def test_second_writer_is_refused(
 
     learn_networks(store, rooms[0], options, intrude)
     assert len(messages) == 1
-
-
-def test_kill_nine(
-    learned: Learned, rooms: Rooms, options: NetworkLearnOptions, tmp_path: Path, tree: Tree
-) -> None:
-    """A call that is killed in the second scene leaves the first, and can be repeated."""
-    generic.write(tmp_path / "beta", rooms[1])
-    beta, store = generic.load(tmp_path / "beta"), tmp_path / "store"
-    learn_networks(store, rooms[0], options)
-    before = tree(store)
-    (tmp_path / "options").write_bytes(pickle.dumps(options))
-    paths = [str(path) for path in (store, tmp_path / "beta", tmp_path / "options")]
-    command = [sys.executable, "-c", CHILD, *paths]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
-        assert child.stdout is not None
-        assert child.stdout.readline() == "now\n"
-        child.send_signal(signal.SIGKILL)
-        assert child.wait(60) == -signal.SIGKILL
-    assert tree(store) == before
-    assert open_networks(store, "cpu").scenes == ("alpha",)
-    learn_networks(store, beta, options)
-    heads = [NetworkStore.open(root).contents.heads[0] for root in (store, learned.root)]
-    for name, value in heads[0].state_dict().items():
-        torch.testing.assert_close(value, heads[1].state_dict()[name], rtol=0, atol=2e-3)
-
-
-CHILD = """
-import pickle, sys, time
-from pathlib import Path
-from evercal.continual.learning.learn_networks import learn_networks
-from evercal.continual.networks.trainer import Progress
-from evercal.recordings import generic
-def wait(event):
-    if isinstance(event, Progress) and event.step == 6:
-        print("now", flush=True)
-        time.sleep(600)
-store, recording, options = map(Path, sys.argv[1:])
-learn_networks(store, generic.load(recording), pickle.loads(options.read_bytes()), wait)
-"""

@@ -1,5 +1,7 @@
-"""Known points of feature rows, against walls in closed form."""
+"""Depths of frames and known points of feature rows, against walls in closed form."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 import torch
 
 from evercal.continual.learning import surfaces
-from evercal.continual.learning.surfaces import shared_depths, surface_points
+from evercal.continual.learning.surfaces import frame_depths, shared_depths, surface_points
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, encode_frames
 from evercal.continual.networks.descriptor import GlobalDescriptor
 from evercal.features.encoder import LocalEncoder, load_encoder
@@ -23,10 +25,10 @@ ROOM = BoxRoom(3)
 PLAN = EncodePlan(views_per_frame=3, cells=60, view=ViewOptions(short_side=SIDE))
 
 
-def _depths() -> list[np.ndarray]:
-    """True depths of the cells of `FRAMES`."""
+def _depths(frames: Sequence[Frame] = FRAMES) -> list[np.ndarray]:
+    """True depths of the cells of frames along the optical axis."""
     depths = []
-    for frame in FRAMES:
+    for frame in frames:
         small = frame.camera.short_side_resized(SIDE)
         rays = small.pinhole.unproject(ideal_cell_pixels(small, 8))
         pose = frame.base_from_camera
@@ -34,6 +36,22 @@ def _depths() -> list[np.ndarray]:
         _, along = ROOM.intersect(pose.translation_m, rays @ pose.rotation_matrix().T)
         depths.append(along.reshape(small.height // 8, small.width // 8))
     return depths
+
+
+def test_agreed_depths_are_those_of_the_walls() -> None:
+    frames = box_room_scene(3, 12, 1).train
+    depths, truth = np.stack(frame_depths(frames, load_encoder(), SIDE)), np.stack(_depths(frames))
+    known = np.isfinite(depths)
+    assert known.mean() > 0.05  # few views of a bare room have parallax
+    errors = (np.abs(depths - truth) / truth)[known]
+    assert np.median(errors) < 0.03
+    assert (errors < 0.1).mean() > 0.9
+    # Wrong poses agree on little, and a single frame on nothing.
+    poses = [frame.base_from_camera for frame in frames]
+    swapped = [replace(f, base_from_camera=poses[(5 * i + 3) % 12]) for i, f in enumerate(frames)]
+    wrong = np.stack(frame_depths(swapped, load_encoder(), SIDE))
+    assert np.isfinite(wrong).mean() < 0.5 * known.mean()
+    assert np.isnan(frame_depths(frames[:1], load_encoder(), SIDE)).all()
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 
 import pytest
 import torch
@@ -16,15 +15,6 @@ from evercal.recordings.frame import Recording
 Arcs = tuple[Recording, Recording]
 
 
-def on_device(scenes: LearnedScenes, device: torch.device) -> LearnedScenes:
-    """A copy with its networks on a device."""
-    encoder, descriptor, heads = copy.deepcopy((scenes.encoder, scenes.descriptor, scenes.heads))
-    moved = replace(scenes, encoder=encoder, descriptor=descriptor, heads=heads)
-    assert moved.to(device) is moved
-    assert moved.device == device
-    return moved
-
-
 @pytest.mark.gpu
 def test_poses_are_those_of_the_cpu(
     arc_scenes: tuple[LearnedScenes, LearnedScenes], arcs: Arcs, cuda: torch.device
@@ -32,7 +22,9 @@ def test_poses_are_those_of_the_cpu(
     """Features are rounded differently, so poses differ by less than their errors."""
     frames = arcs[0].test[2:20:4]
     cpu = NetworkLocalizer(arc_scenes[1])
-    other = NetworkLocalizer(on_device(arc_scenes[1], cuda))
+    moved = copy.deepcopy(arc_scenes[1]).to(cuda)
+    assert moved.device == cuda
+    other = NetworkLocalizer(moved)
     for frame in frames:
         image = frame.read_image()
         expected, estimate = (one.localize(image, frame.camera) for one in (cpu, other))

@@ -70,14 +70,14 @@ def test_negatives_are_rejected_even_if_positives_have_fewer_inliers(
     assert record.inlier_threshold == pytest.approx(np.quantile(ratios(world, negatives), 0.95))
 
 
-@pytest.mark.parametrize(("factor", "expected"), [(1.0, 1.0), (3.0, 9.0), (0.2, 1.0)])
+@pytest.mark.parametrize(("factor", "expected"), [(3.0, 9.0), (0.2, 1.0)])
 def test_scaled_covariances_match_the_errors(
     factor: float, expected: float, world: World, fit: Fit
 ) -> None:
     rng, held_out = np.random.default_rng(0), []
     unfitted = replace(world.scenes.scenes[0], inlier_threshold=0.0, covariance_scale=1.0)
     localizer = NetworkLocalizer(replace(world.scenes, scenes=[unfitted]))
-    for i in range(120):
+    for i in range(80):
         image = world.view(0, noise_m=0.005)
         pose = localizer.localize(image).uncertain_pose
         assert pose is not None

@@ -103,16 +103,10 @@ class World:
         predicted_for: int | None = None,
         noise_m: float = 0.0,
     ) -> np.ndarray:
-        """An image of a new view.
+        """An image of a new view, by default of the camera's size.
 
-        Args:
-            scene: of the view.
-            camera: of the view.
-            size: width and height of the image; the camera's by default.
-            correct: share of patches with the true point.
-            predicted_for: the scene index with which the head predicts the points; `scene` by
-                default.
-            noise_m: standard deviation of the points.
+        The head predicts the true points for a share of `correct` patches, with noise, if it is
+        asked for the scene, or for `predicted_for`.
         """
         width, height = size or (camera.width, camera.height)
         level, self.levels = self.levels, self.levels + 1

@@ -21,8 +21,7 @@ def rows(count: int, scene: int = 0) -> Rows:
         torch.eye(4)[:3].repeat(count, 1, 1),
     )
     which = torch.full((count,), scene)
-    zero = torch.zeros(count, dtype=torch.long)
-    return Rows(torch.zeros(count, 1), which, torch.zeros(count, 1), target, zero)
+    return Rows(torch.zeros(count, 1), which, torch.zeros(count, 1), target)
 
 
 def off_by(pixels: float) -> list[float]:

@@ -12,7 +12,7 @@ from evercal.continual.networks.head import Head
 from evercal.continual.networks.loss import LossOptions, reprojection_loss
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 
-from .by_hand import flat, stage_start, wave_buffer, wave_head
+from .by_hand import stage_start, wave_buffer, wave_head
 
 OPTIONS = FitOptions(iterations=8, batch=64, peak_rate=1e-2)
 
@@ -93,15 +93,3 @@ def test_fisher_information_is_the_mean_squared_gradient(finished: FinishedScene
     exact = torch.autograd.grad(loss.mean(), list(named.values()), materialize_grads=True)
     for (name, _), slope in zip(named.items(), exact, strict=True):
         torch.testing.assert_close(actual[name], slope.square(), rtol=1e-3, atol=1e-7)
-
-
-def test_ties_constrain_the_weights() -> None:
-    moved = []
-    for strength in (0.0, 1e5):
-        head, old = wave_head(2), wave_head(2)
-        state = tied(old, 1.0)
-        rule = ElasticWeightConsolidation(strength=strength)
-        hooks = rule.begin(stage_start(head, [], states=[state]))
-        list(HeadTrainer(head, [wave_buffer(1)], OPTIONS, 0, hooks).run())
-        moved.append(float((flat(head) - flat(old)).norm()))
-    assert moved[1] < 0.5 * moved[0]

@@ -2,13 +2,10 @@
 
 import copy
 import itertools
-from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from evercal.continual.methods.gec import EpisodicConstraint, nearest_change
 from evercal.continual.methods.method import FinishedScene, MethodState
@@ -46,7 +43,7 @@ def nearest(changes: np.ndarray, g: np.ndarray, most: np.ndarray) -> np.ndarray:
     return context.double().numpy()
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(15))
 def test_nearest_change_equals_search_over_active_sets(seed: int) -> None:
     rng = np.random.default_rng(seed)
     count, size = 1 + seed % 5, 7
@@ -58,7 +55,7 @@ def test_nearest_change_equals_search_over_active_sets(seed: int) -> None:
     np.testing.assert_allclose(actual, slow_nearest(changes, g, most), atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_parallel_constraints_have_a_solution(seed: int) -> None:
     # Along one direction the tightest constraint is active.
     rng = np.random.default_rng(seed)
@@ -77,19 +74,9 @@ def test_constraint_without_a_gradient_is_ignored() -> None:
     np.testing.assert_allclose(nearest(changes, g[:1], np.array([-1.0])), changes)
 
 
-@dataclass
-class AppliedStep:
-    """A proposed step and the applied one."""
-
-    wanted: Tensor
-    taken: Tensor
-    g: Tensor
-    losses: Tensor
-    step: int
-
-
-def steps_of(method: EpisodicConstraint) -> list[AppliedStep]:
-    """Train on a scene that contradicts two remembered ones, and record every step."""
+def test_applied_step_satisfies_every_constraint() -> None:
+    """A new scene contradicts two remembered ones."""
+    method = EpisodicConstraint(alpha=0.5, warm_steps=0)
     head, proposals = wave_head(3), []
     memories = [wave_buffer(i, shift_px=3.0 * i) for i in range(2)]
     states: list[MethodState] = [{"reference": torch.tensor(20.0 - 9 * i)} for i in range(2)]
@@ -102,40 +89,18 @@ def steps_of(method: EpisodicConstraint) -> list[AppliedStep]:
 
     hooks.edit_step = recorded  # type: ignore[method-assign]
     new = wave_buffer(2, shift_px=-12.0)
-    trainer, steps, before = HeadTrainer(head, [new], OPTIONS, 0, hooks), [], flat(head)
-    for _ in trainer.run():
+    before, active = flat(head), 0
+    for _ in HeadTrainer(head, [new], OPTIONS, 0, hooks).run():
         proposed, after = proposals[-1], flat(head)
-        change = flat_of(head, proposed.changes)
+        wanted, taken = flat_of(head, proposed.changes), after - before
         g = torch.stack([flat_of(head, dict(one)) for one in proposed.constraints])
-        steps.append(AppliedStep(change, after - before, g, proposed.losses, proposed.step))
+        h = proposed.losses - 1.05 * torch.tensor([20.0, 11.0])
+        most = -0.5 * 0.03 * one_cycle(OPTIONS, proposed.step) / OPTIONS.peak_rate * h
+        allowed = slow_nearest(*(v.double().numpy() for v in (wanted, g, most)))
+        np.testing.assert_allclose(taken.numpy(), allowed, atol=1e-4 * float(wanted.norm()))
+        active += bool((g @ wanted > most).any())
         before = after
-    return steps
-
-
-def excess(step: AppliedStep, g: Tensor, most: Tensor) -> float:
-    """Compute the largest violation, relative to the lengths of gradient and step."""
-    size = g.double().norm(dim=1) * step.taken.double().norm()
-    return float(((g.double() @ step.taken.double() - most.double()) / size).max())
-
-
-def test_applied_step_satisfies_every_constraint() -> None:
-    steps = steps_of(EpisodicConstraint(alpha=0.5, warm_steps=0))
-    assert len(steps) == OPTIONS.iterations
-    bound = 0
-    for step in steps:
-        g, h = step.g, step.losses - 1.05 * torch.tensor([20.0, 11.0])
-        most = -0.5 * 0.03 * one_cycle(OPTIONS, step.step) / OPTIONS.peak_rate * h
-        assert excess(step, g, most) < 1e-5
-        allowed = slow_nearest(*(v.double().numpy() for v in (step.wanted, g, most)))
-        size = float(step.wanted.norm())
-        np.testing.assert_allclose(step.taken.numpy(), allowed, atol=1e-4 * size)
-        if bool((g @ step.wanted <= most).all()):
-            # No constraint is active, so the step of the optimisers is applied.
-            torch.testing.assert_close(step.taken, step.wanted, rtol=0, atol=1e-6)
-        else:
-            bound += 1
-            assert float((step.taken - step.wanted).norm()) > 1e-4 * size
-    assert bound > 3  # constraints are active in several steps
+    assert 3 < active <= len(proposals) == OPTIONS.iterations
 
 
 def test_constraint_gradients_are_of_the_remembered_losses() -> None:
@@ -164,15 +129,9 @@ def proposed_of(
     losses: list[float], change: list[float], step: int = 100, schedule: float = 1.0
 ) -> ProposedStep:
     """Create a step with one weight per scene, with gradient 1."""
-    count = len(losses)
-    constraints: list[Mapping[str, Tensor]] = [{"w": torch.eye(count)[i]} for i in range(count)]
-    return ProposedStep(
-        {"w": torch.tensor(change)},
-        torch.tensor(losses),
-        constraints,
-        step,
-        schedule,
-    )
+    constraints = [{"w": row} for row in torch.eye(len(losses))]
+    changes = {"w": torch.tensor(change)}
+    return ProposedStep(changes, torch.tensor(losses), constraints, step, schedule)
 
 
 def edited(

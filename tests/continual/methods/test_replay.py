@@ -8,10 +8,7 @@ import torch
 from torch import Tensor
 
 from evercal.continual.methods.penalties import OldOutput, Penalty, Reprojection
-from evercal.continual.methods.replay import (
-    Replay,
-    ReplayHooks,
-)
+from evercal.continual.methods.replay import Replay, ReplayHooks
 from evercal.continual.networks.buffer import Rows, join
 from evercal.continual.networks.head import HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks

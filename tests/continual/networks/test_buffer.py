@@ -181,24 +181,21 @@ def test_draws_are_reproducible_and_cover_the_buffer(filled: Filled) -> None:
     seeded = torch.Generator().manual_seed(3)
     first = buffer.draw(20_000, seeded)
     again = buffer.draw(20_000, torch.Generator().manual_seed(3))
-    assert torch.equal(first.index, again.index)
-    counts = torch.bincount(first.index, minlength=len(buffer)).float()
-    mean = 20_000 / len(buffer)
-    assert float((counts == 0).float().mean()) < 2 * np.exp(-mean) + 0.001
-    assert counts.max() < 4 * mean
-    assert not torch.equal(buffer.draw(50, seeded).index, first.index[:50])
+    assert torch.equal(first.target.pixels, again.target.pixels)
+    _, counts = torch.unique(first.target.pixels, dim=0, return_counts=True)
+    every = torch.unique(buffer.tensors["pixels"], dim=0)
+    assert len(counts) > 0.99 * len(every)
+    assert not torch.equal(buffer.draw(50, seeded).target.pixels, first.target.pixels[:50])
 
 
 def test_part_and_join_are_inverse(filled: Filled) -> None:
     buffer = filled(replace(PLAN, views_per_frame=1))
     rows = buffer.draw(30, torch.Generator().manual_seed(1))
     again = join([rows.part(slice(0, 7)), rows.part(slice(7, 8)), rows.part(slice(8, None))])
-    for name in ("features", "scene", "descriptor", "index"):
+    for name in ("features", "scene", "descriptor"):
         assert torch.equal(getattr(again, name), getattr(rows, name))
     for name in ("pixels", "intrinsics", "camera_from_atlas"):
         assert torch.equal(getattr(again.target, name), getattr(rows.target, name))
-    straight = buffer.rows(rows.index)
-    assert torch.equal(straight.features, rows.features)
 
 
 def test_corrected_rows_follow_an_ideal_pinhole() -> None:

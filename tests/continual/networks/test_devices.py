@@ -6,15 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, Rows, encode_frames, join
-from evercal.continual.networks.descriptor import GlobalDescriptor
+from evercal.continual.networks.buffer import FeatureBuffer, Rows, join
 from evercal.continual.networks.head import Head, HeadOptions, fresh_head
 from evercal.continual.networks.loss import LossOptions, reprojection_loss
-from evercal.features.encoder import LocalEncoder
-from evercal.features.views import ViewOptions
 from evercal.geometry import SE3
-
-from ...box_world import box_room_scene
 
 SHAPES = [
     HeadOptions(width=12, condition="code", offsets="per_centre"),
@@ -22,8 +17,6 @@ SHAPES = [
     HeadOptions(width=12, condition="descriptor", offsets="per_centre", centres="fixed"),
 ]
 CPU = torch.device("cpu")
-FRAMES = box_room_scene(3, 10, 0).train
-PLAN = EncodePlan(views_per_frame=2, cells=20, view=ViewOptions(short_side=48))
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
@@ -67,8 +60,8 @@ def drawn(buffers: list[FeatureBuffer]) -> Rows:
 
 def everything(rows: Rows) -> dict[str, Tensor]:
     assert rows.known is not None
-    fields = (rows.features, rows.scene, rows.descriptor, rows.index, rows.known)
-    names = ("features", "scene", "descriptor", "index", "stored")
+    fields = (rows.features, rows.scene, rows.descriptor, rows.known)
+    names = ("features", "scene", "descriptor", "stored")
     target = rows.target
     return dict(zip(names, fields, strict=True)) | {
         "pixels": target.pixels,
@@ -111,30 +104,3 @@ def test_step_is_equal_on_every_device(options: HeadOptions, cuda: torch.device)
             assert value.device == cuda, name
             size = float(expected[expected.isfinite()].abs().max()) + 1e-6
             torch.testing.assert_close(value.cpu(), expected, atol=1e-3 * size, rtol=1e-3)
-
-
-def networks(device: torch.device) -> tuple[LocalEncoder, GlobalDescriptor]:
-    torch.manual_seed(0)
-    encoder = LocalEncoder(stem=(4, 4), inner=8, blocks=1, width=8).eval()
-    return encoder.to(device), GlobalDescriptor(8, maps=2, hidden=4, width=8).eval().to(device)
-
-
-def encoded(device: torch.device, rows_on: torch.device) -> FeatureBuffer:
-    """Fill a buffer by networks on a device, reading it after every batch."""
-    buffer = FeatureBuffer(0, SE3.identity(), device=rows_on)
-    for done in encode_frames(buffer, FRAMES, PLAN, *networks(device)):
-        assert buffer.views == done
-        assert len(buffer) == len(buffer.tensors["features"])
-    return buffer
-
-
-@pytest.mark.parametrize("rows_on", ["cpu", "device"])
-def test_views_are_encoded_on_the_device_of_the_networks(
-    device: torch.device, rows_on: str
-) -> None:
-    expected = encoded(CPU, CPU).tensors
-    where = CPU if rows_on == "cpu" else device
-    for name, value in encoded(device, where).tensors.items():
-        assert value.device == where, name
-        # Features have half precision, and bfloat16 is used if it is fast.
-        torch.testing.assert_close(value.cpu(), expected[name], atol=0.03, rtol=0.03)

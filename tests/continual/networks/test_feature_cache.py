@@ -3,7 +3,6 @@
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
@@ -70,11 +69,8 @@ def test_truncated_file_is_replaced(tmp_path: Path) -> None:
     assert encoder.captured == 2
 
 
-@pytest.mark.parametrize("call", ["save", "replace"])
 @torch.inference_mode()
-def test_full_disk_only_stops_caching(
-    call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk_only_stops_caching(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     images = torch.rand(4, 1, 16, 16, generator=torch.Generator().manual_seed(1))
     plain, encoder = Counting(), Counting()
     cache_features(encoder, tmp_path)
@@ -86,7 +82,7 @@ def test_full_disk_only_stops_caching(
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(np if call == "save" else os, call, full)
+        patch.setattr(os, "replace", full)
         actual = encoder(images)
     torch.testing.assert_close(actual, plain(images), atol=1e-3, rtol=0)
     assert len(tries) == 3

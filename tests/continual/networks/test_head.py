@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.learning.presets import PRESETS
 from evercal.continual.networks.head import Head, HeadOptions, fresh_head, homogeneous_scale
 from evercal.errors import InputError
 
@@ -152,20 +151,8 @@ def test_new_scenes_do_not_change_the_output_for_old_scenes(
             close = head(features, mixed, None).points
             torch.testing.assert_close(close, together, atol=1e-5, rtol=0)
     assert head.scenes == 5
-    assert not torch.equal(before[0], before[1])
-
-
-@pytest.mark.parametrize("options", SHAPES)
-def test_growing_preserves_the_state(options: HeadOptions) -> None:
-    head = grown(options, 2)
-    before = {key: value.clone() for key, value in head.state_dict().items()}
-    head.grow(random(4, 3), seed=9)
-    after = head.state_dict()
-    assert set(after) == set(before)
-    for key, value in before.items():
-        assert torch.equal(after[key][: len(value)], value), key
-    assert torch.equal(after["centres"][-4:], random(4, 3))
     assert all(parameter.requires_grad for parameter in head.parameters())
+    assert not torch.equal(before[0], before[1])
 
 
 @pytest.mark.parametrize("options", CODED)
@@ -203,45 +190,6 @@ def test_centres_are_added_in_fp32_under_autocast() -> None:
             mixed = head(features, 0, None)
     assert mixed.points.dtype == mixed.logits.dtype == mixed.offsets.dtype == torch.float32
     torch.testing.assert_close(mixed.points, exact, atol=0.2, rtol=0)
-
-
-def in_preset(name: str, scenes: int) -> Head:
-    options = PRESETS[name].head
-    head = fresh_head(128, 128, options, seed=0)
-    for scene in range(scenes):
-        head.grow(5 * random(options.centres_per_scene, 3, seed=scene), seed=scene)
-    return head
-
-
-def total_bytes(head: Head) -> int:
-    """Compute the stored size: half precision, centres in single precision."""
-    return 2 * sum(p.numel() for p in head.parameters()) + 4 * head.centres.numel()
-
-
-@pytest.mark.parametrize("name", ["fast"])
-def test_every_scene_trains_90_percent_of_the_head(
-    monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    """No part of the head belongs to a single scene of seven.
-
-    ReLU is replaced, because the units that it closes depend on the weights.
-    """
-    monkeypatch.setattr(torch.nn.functional, "relu", torch.nn.functional.softplus)
-    head = in_preset(name, 7)
-    total = sum(parameter.numel() for parameter in head.parameters())
-    for scene in range(7):
-        head.zero_grad()
-        features = torch.nn.functional.normalize(random(1500, 128, seed=scene), dim=-1)
-        head(features, torch.full((1500,), scene), None).points.abs().sum().backward()
-        touched = sum(int((p.grad != 0).sum()) for p in head.parameters() if p.grad is not None)
-        assert touched / total >= 0.90
-
-
-@pytest.mark.parametrize("name", ["fast"])
-def test_scene_adds_at_most_5_percent(name: str) -> None:
-    one, two = in_preset(name, 1), in_preset(name, 2)
-    added = total_bytes(two) - total_bytes(one)
-    assert 0 < added <= 0.05 * total_bytes(one)
 
 
 def test_fixed_centres_need_the_descriptor() -> None:

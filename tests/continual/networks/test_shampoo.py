@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from evercal.continual.networks import shampoo
 from evercal.continual.networks.shampoo import (
     DECAY,
     EVERY,
@@ -72,30 +71,14 @@ def test_steps_follow_the_definition() -> None:
     assert (matrix - expected).norm() < 1e-3 * (expected - start).norm()
 
 
-def test_a_repeated_gradient_gives_the_step_of_muon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """If C is M' M, the step is the polar factor of M."""
-    monkeypatch.setattr(shampoo, "FLOOR", 0.0)
-    (gradient,) = _gradients(1)
-    matrix = torch.nn.Parameter(torch.zeros(24, 24))
-    optimiser = OneSidedShampoo([{"params": [matrix]}], 1.0, 0.0)
-    matrix.grad = gradient
-    optimiser.step()
-    u, _, v = torch.linalg.svd(gradient)
-    torch.testing.assert_close(-matrix.detach(), u @ v, atol=2e-3, rtol=0)
-
-
-def test_matrices_are_independent_and_checkpoints_resume() -> None:
+def test_matrices_are_independent() -> None:
     gradients = _gradients(2 * EVERY)
     matrices = [torch.nn.Parameter(torch.eye(24) * k) for k in (1.0, 2.0)]
     alone = torch.nn.Parameter(torch.eye(24))
     both = OneSidedShampoo([{"params": matrices}], 0.05, 0.1)
     one = OneSidedShampoo([{"params": [alone]}], 0.05, 0.1)
-    for number, gradient in enumerate(gradients):
+    for gradient in gradients:
         matrices[0].grad, matrices[1].grad, alone.grad = gradient, -gradient, gradient
-        if number == EVERY + 2:
-            again = OneSidedShampoo([{"params": [alone]}], 0.05, 0.1)
-            again.load_state_dict(one.state_dict())
-            one = again
         both.step()
         one.step()
     torch.testing.assert_close(matrices[0], alone, atol=1e-6, rtol=1e-5)

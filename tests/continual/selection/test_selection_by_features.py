@@ -8,7 +8,6 @@ from evercal.continual.selection.selectors import (
     select_coverage,
     select_gradients,
     select_herding,
-    select_leverage,
     select_reservoir,
 )
 
@@ -67,13 +66,6 @@ def test_leverage_sums_to_the_rank_and_is_rotation_invariant() -> None:
         np.testing.assert_allclose(leverage_scores(features @ rotation, rank), scores, atol=1e-9)
 
 
-def test_leverage_prefers_the_isolated_frame() -> None:
-    features = np.array([[1.0, 0.0]] * 19 + [[0.0, 1.0]])
-    runs = 400
-    lone = sum(19 in select_leverage(features, 1, rng(seed)) for seed in range(runs)) / runs
-    assert lone == pytest.approx(0.5, abs=5 * 0.5 / np.sqrt(runs))  # 1/20 by chance
-
-
 def test_coverage_selects_frames_with_new_parts() -> None:
     # Forty frames show part 0, one frame also part 1.
     visible = [np.array([0])] * 40 + [np.array([0, 1])]
@@ -92,18 +84,3 @@ def test_opposed_gradient_replaces_a_frame() -> None:
     entered = [30 in select_gradients(away, 4, rng(seed)) for seed in range(50)]
     # Its score is 0, so it always replaces the drawn frame.
     assert all(entered)
-
-
-@pytest.mark.parametrize("capacity", [0, 1, 7, 30])
-def test_selection_has_the_requested_size(capacity: int) -> None:
-    features = rng(5).normal(size=(20, 4))
-    visible = [np.flatnonzero(row > 0) for row in features]
-    for selected in (
-        select_reservoir(20, capacity, rng()),
-        select_herding(features, capacity),
-        select_leverage(features, capacity, rng()),
-        select_coverage(visible, capacity, rng()),
-        select_gradients(features, capacity, rng()),
-    ):
-        assert len(selected) == min(capacity, 20)
-        assert (np.diff(selected) > 0).all()

@@ -13,19 +13,21 @@ each takes runs that no other has.
 """
 
 import json
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Generator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from filelock import FileLock, Timeout
 
 from evercal.continual.benchmark import results
 from evercal.continual.benchmark.results import Table
-from evercal.continual.benchmark.strategy_run import NETWORK_LOCALIZE, RunOptions, run_strategy
-from evercal.continual.learning.stage import StageOptions
+from evercal.continual.benchmark.strategy_run import (
+    NETWORK_LOCALIZE,
+    BenchOptions,
+    Order,
+    run_strategy,
+)
 from evercal.continual.networks.descriptor import DESCRIPTOR_FILE
 from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
@@ -35,29 +37,6 @@ from evercal.localization.query import LocalizeOptions
 from evercal.recordings import Recording
 from evercal.storage import sha256_file, write_json
 from evercal.storage.settings import lock_settings, read_settings
-
-Order = Literal["given", "reversed", "shuffled", "balanced"]
-
-
-@dataclass(frozen=True)
-class BenchOptions:
-    """Options of a benchmark."""
-
-    stage: Callable[[int], StageOptions]
-    """Options for learning a scene, given the seed. With `centres: fixed` and no given centres, the
-    centres of all scenes are known from the start, in the paper's combined grid."""
-    strategies: tuple[Strategy, ...]
-    """Strategies to compare, each with a unique name."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds; every strategy runs once with each."""
-    order: Order = "given"
-    """Order of the scenes; `shuffled` and `balanced` depend on the seed."""
-    short_side: int = 240
-    """Working size of images, pixels."""
-    settings: dict[str, object] = field(default_factory=dict)
-    """Further settings that decide the results, for settings.json."""
-    device: str = "auto"
-    """Device of the networks, see `features.device.device_of`."""
 
 
 @dataclass(frozen=True)
@@ -79,47 +58,29 @@ class Step:
 def run_bench(
     scenes: Sequence[Recording], options: BenchOptions, out: Path
 ) -> Generator[Step, None, None]:
-    """Run all runs that are not complete.
+    """Run all runs of two or more scenes that are not complete; yields after every stage.
 
-    Args:
-        scenes: Two or more scenes in the order `given`.
-        options: Strategies, seeds and options.
-        out: Folder of results, created if missing.
-
-    Raises:
-        InputError: Fewer than two scenes, or the folder has results of other settings.
-
-    Yields:
-        A `Step` after every stage.
+    `out`, the folder of results, is created if missing.
     """
     total = len(options.seeds) * len(options.strategies) * len(scenes)
     missing = begin_bench(scenes, options, out)
     done = total - len(missing) * len(scenes)
+    runs = out / "runs"
+    runs.mkdir(exist_ok=True)
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
-        how = RunOptions(options.stage(seed), options.short_side, out, options.device)
-        with _claimed(out, strategy, seed) as free:
+        try:
+            claim = FileLock(runs / f"{strategy.name}-{seed}.claim").acquire(blocking=False)
+        except Timeout:  # another process has this run
+            continue
+        with claim:
             stored = results.read(out)  # another process may have added some
-            if not free or _complete((seed, strategy), stored, len(scenes)):
+            if _complete((seed, strategy), stored, len(scenes)):
                 continue
-            for stage in run_strategy(strategy, ordered, how):
+            for stage in run_strategy(strategy, ordered, options, seed, out):
                 results.append(out, stage)
                 yield Step(strategy.name, seed, stage.results, done + stage.stage + 1, total)
             done += len(scenes)
-
-
-@contextmanager
-def _claimed(out: Path, strategy: Strategy, seed: int) -> Iterator[bool]:
-    """Claim a run; yields whether no other process has it."""
-    path = out / "runs" / f"{strategy.name}-{seed}.claim"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        claim = FileLock(path).acquire(blocking=False)
-    except Timeout:
-        yield False
-        return
-    with claim:
-        yield True
 
 
 def begin_bench(
@@ -138,7 +99,6 @@ def begin_bench(
 
 
 def _complete(run: tuple[int, Strategy], stored: Table, scenes: int) -> bool:
-    """Check that the last stage has a row per scene, under every name of the strategy."""
     seed, strategy = run
     rows = results.run_of(stored, strategy.name, seed)
     last = rows[rows["stage"] == scenes - 1].groupby("strategy").size()
@@ -146,7 +106,6 @@ def _complete(run: tuple[int, Strategy], stored: Table, scenes: int) -> bool:
 
 
 def _record_strategies(out: Path, strategies: Sequence[Strategy]) -> None:
-    """Add descriptions to strategies.json, and refuse a name with another description."""
     path = out / results.STRATEGIES
     recorded = read_settings(path) if path.exists() else {}
     for strategy in strategies:

@@ -26,11 +26,7 @@ NAME:unaligned is the pose from matched keyframes, before landmarks are aligned.
 
 
 def complete_runs(results: Table) -> Table:
-    """Return the rows of runs whose last stage is complete.
-
-    Raises:
-        InputError: There is none.
-    """
+    """Return the rows of runs whose last stage is complete."""
     last = results["stage"].max()
     at_end = results["stage"].eq(last)
     evaluated = at_end.groupby([results["strategy"], results["seed"]]).transform("sum")
@@ -41,14 +37,9 @@ def complete_runs(results: Table) -> Table:
 
 
 def run_scores(results: Table) -> Table:
-    """Score every complete run.
+    """Score every complete run: a row per strategy and seed, with the columns of `LEGEND`.
 
-    Args:
-        results: Rows of results.csv.
-
-    Returns:
-        A row per run, indexed by strategy and seed, with the columns of `LEGEND`. Forgetting and
-        memory of joint training are NaN.
+    Forgetting and memory of joint training are NaN.
     """
     scores = {key: _scores(run) for key, run in _runs(complete_runs(results)).items()}
     table = pd.DataFrame.from_dict(scores, orient="index")
@@ -86,11 +77,9 @@ def _scores(run: Table) -> dict[str, float]:
 
 
 def matrix(run: Table, column: str = COARSE_COLUMN) -> Table:
-    """Return accuracies in per cent: a row per stage, a column per scene in order of learning.
+    """Return accuracies of a run, per cent: a row per stage, a column per scene as learned.
 
-    Args:
-        run: Rows of one run.
-        column: One of `WITHIN`.
+    `column` is one of `WITHIN`.
     """
     scenes = run.loc[run["stage"] == run["stage"].max(), "scene"]
     shares = run.assign(share=100 * run[column] / run["frames"])
@@ -139,14 +128,10 @@ def scene_table(results: Table) -> Table:
 
 
 def contrast_table(scores: Table, pairs: Sequence[tuple[str, str]]) -> Table:
-    """Tabulate differences of two strategies on common seeds, in points.
+    """Tabulate differences of pairs of strategies on common seeds, in points; see `run_scores`.
 
     Final accuracy and area, each with the bounds of `seeds_interval`, which hold for all pairs
     together, and the number of runs in which the first strategy is better.
-
-    Args:
-        scores: See `run_scores`.
-        pairs: Names of strategies.
     """
     scores = scores[[FINAL, AREA]]
     by_name = dict(list(scores.groupby(level="strategy")))
@@ -211,5 +196,5 @@ def summary(results: Table) -> dict[str, list[dict[str, object]]]:
 
 
 def _plain(accuracies: Table) -> list[list[float | None]]:
-    rows = accuracies.round(3).to_numpy(float).tolist()
-    return [[None if math.isnan(value) else value for value in row] for row in rows]
+    known = accuracies.notna()
+    return accuracies.round(3).astype(object).where(known, None).to_numpy().tolist()

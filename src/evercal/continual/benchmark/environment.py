@@ -11,8 +11,7 @@ from pathlib import Path
 def environment() -> dict[str, str]:
     """Describe code, libraries and machine of this process.
 
-    Keys: `commit` (with `-dirty` for changed files; the version of an installed package), `python`,
-    `torch`, `numpy`, `processor`, `instructions`, `precision` (of the networks), `threads`, `gpu`.
+    The commit has `-dirty` for changed files; for an installed package it is the version.
     """
     import numpy as np
     import torch
@@ -34,8 +33,6 @@ def environment() -> dict[str, str]:
 
 
 def _commit() -> str:
-    """Return the commit of the checkout that tracks this file, or the version of the package."""
-
     def git(*words: str) -> str:
         command = ["git", "-C", str(Path(__file__).parent), *words]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()

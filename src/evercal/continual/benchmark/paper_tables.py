@@ -68,15 +68,10 @@ PUBLISHED: Mapping[str, Mapping[str, tuple[float, float]]] = {
 
 
 def paper_table(results: Table, suite: str = "") -> Table:
-    """Tabulate final median errors and accuracies, means over runs.
+    """Tabulate final median errors and accuracies by scene, then mean and TFR, means over runs.
 
-    Args:
-        results: Rows of results.csv.
-        suite: Name of the suite. Accuracy is at 1 cm and 1 deg for simulated suites, as in the
-            paper, and at 5 cm and 5 deg for others. Published numbers are added if there are any.
-
-    Returns:
-        A row per scene, then mean and TFR; three columns per strategy.
+    Accuracy is at 1 cm and 1 deg for simulated suites, as in the paper, and at 5 cm and 5 deg for
+    others. Published numbers of the suite are added if there are any.
     """
     results = complete_runs(results)
     last = results[results["stage"] == results["stage"].max()]
@@ -108,12 +103,8 @@ def paper_table(results: Table, suite: str = "") -> Table:
 def ablation_table(scores: Table, suite: str = "") -> Table:
     """Tabulate Table 4: final accuracy, and the gain of each step with its 95 % interval.
 
-    Args:
-        scores: See `run_scores`. Steps that were not run are left out.
-        suite: Name of the suite. Published numbers are added if the paper has them.
-
-    Returns:
-        Empty if fewer than two steps of every ablation were run.
+    Steps that were not run are left out, and ablations with fewer than two. Published numbers of
+    the suite are added if there are any.
     """
     final = scores[FINAL].groupby("strategy").mean()
     rows, published = [], PUBLISHED_ABLATION.get(suite)

@@ -32,14 +32,9 @@ _LINES = 7
 
 
 def write_report(folder: Path, reference: str) -> str:
-    """Write tables and figure of a folder of results.
+    """Write tables and figure of a folder of results, and return the tables as Markdown.
 
-    Args:
-        folder: Folder of results.
-        reference: Strategy that the others are compared with.
-
-    Returns:
-        The tables as Markdown.
+    All strategies are compared with `reference`.
     """
     results = stored.read(folder)
     if results.empty:

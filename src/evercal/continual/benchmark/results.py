@@ -40,8 +40,7 @@ RESULTS, FRAMES = "results.csv", "frames.csv"
 SETTINGS, STRATEGIES = "settings.json", "strategies.json"
 ENVIRONMENTS = "environments.json"
 UNALIGNED = ":unaligned"
-"""Suffix of a strategy's name for additional results of the same run: by the first pose from
-matched keyframes, before landmarks are aligned."""
+"""Suffix of a strategy for results by the first pose, before landmarks are aligned."""
 WITHIN = {
     "within_10cm_10deg": (0.10, math.radians(10.0)),
     "within_5cm_5deg": COARSE,
@@ -90,7 +89,7 @@ def scene_row(frames: Sequence[FrameResult]) -> dict[str, object]:
 
 
 def frame_row(frame: FrameResult) -> dict[str, object]:
-    """Return the columns of frames.csv that depend on the frame."""
+    """Columns of frames.csv that depend on the frame."""
     outcome = "inside" if frame.squared_mahalanobis < CHI2_6 else "outside"
     if frame.wrong_scene:
         outcome = "wrong scene"
@@ -168,7 +167,7 @@ def _read(folder: Path, name: str, required: set[str]) -> Table:
 
 
 def _remove_incomplete_line(folder: Path, path: Path) -> None:
-    """Remove a last line that an interrupted call left incomplete."""
+    # An interrupted call left it.
     with locked(folder), open(path, "r+b") as file:
         data = file.read()
         file.truncate(data.rfind(b"\n") + 1)

@@ -50,12 +50,11 @@ def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
 
 
 def _key(name: str) -> str:
-    """Sequence and number of a frame without its ending; 12-Scenes has no sequence."""
+    # Sequence and number without an ending; 12-Scenes has no sequence.
     return name.split(".color.")[0].removeprefix("data/")
 
 
 def _read(file: Path) -> dict[str, tuple[SE3, float]]:
-    """base_from_camera and focal length in pixels by frame."""
     source = "https://github.com/tsattler/visloc_pseudo_gt_limitations"
     lines = read_text(file, "pose file", f"get the folder pgt/sfm of {source}").splitlines()
     poses = {}

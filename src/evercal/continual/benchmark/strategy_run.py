@@ -3,9 +3,10 @@
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import pandas as pd
 from filelock import FileLock
@@ -22,7 +23,7 @@ from evercal.continual.learning.finish_scene import correct_lens, finished_stage
 from evercal.continual.learning.learn import learn_jointly
 from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
 from evercal.continual.learning.stage import StageOptions, unobserved
-from evercal.continual.learning.stage_rows import encode_rows, scene_buffer, view_plan
+from evercal.continual.learning.stage_rows import scene_rows
 from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer
 from evercal.continual.networks.atlas import combined_centres
 from evercal.continual.networks.buffer import FeatureBuffer
@@ -48,43 +49,60 @@ NETWORK_LOCALIZE = NetworkLocalizeOptions(refuses=False)
 whose inliers stay above the threshold that was fitted when a scene was learned."""
 
 
-@dataclass(frozen=True)
-class RunOptions:
-    """Options of a run."""
+Order = Literal["given", "reversed", "shuffled", "balanced"]
 
-    stage: StageOptions
-    """Options for learning a scene, with the seed of the run."""
-    short_side: int
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """Options of a benchmark."""
+
+    stage: Callable[[int], StageOptions]
+    """Options for learning a scene, given the seed. With `centres: fixed` and no given centres, the
+    centres of all scenes are known from the start, in the paper's combined grid."""
+    strategies: tuple[Strategy, ...]
+    """Strategies to compare, each with a unique name."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds; every strategy runs once with each."""
+    order: Order = "given"
+    """Order of the scenes; `shuffled` and `balanced` depend on the seed."""
+    short_side: int = 240
     """Working size of images, pixels."""
-    out: Path
-    """Folder of results; `runs` has the stores of runs in progress, `features` encoded views."""
-    device: str = "cpu"
+    settings: dict[str, object] = field(default_factory=dict)
+    """Further settings that decide the results, for settings.json."""
+    device: str = "auto"
     """Device of the networks, see `features.device.device_of`."""
 
 
 def run_strategy(
-    strategy: Strategy, scenes: Sequence[Recording], options: RunOptions
+    strategy: Strategy, scenes: Sequence[Recording], options: BenchOptions, seed: int, out: Path
 ) -> Iterator[StageResults]:
     """Learn the scenes in turn and evaluate all scenes learned so far after each.
 
-    Yields:
-        Results of the stages that were not complete before.
+    Yields results of the stages that were not complete before. The folder `out` has the stores of
+    runs in progress in `runs`, and encoded views in `features`.
     """
     if strategy.method is None:
-        return _MapRun(strategy, scenes, options).stages()
-    run = _NetworkRun(strategy, scenes, options)
+        return _MapRun(strategy, scenes, options, seed, out).stages()
+    run = _NetworkRun(strategy, scenes, options, seed, out)
     return run.jointly() if strategy.jointly else run.stages()
 
 
 class _Run:
-    """A strategy over a sequence of scenes; the store of the run is removed at its end."""
+    """A strategy over a sequence of scenes; its store is removed at the end."""
 
-    def __init__(self, strategy: Strategy, scenes: Sequence[Recording], options: RunOptions):
-        self.strategy, self.scenes = strategy, scenes
-        self.device = device_of(options.device)
-        self.options, self.stage = options, _with_centres(options.stage, scenes)
-        self.features = options.out.absolute() / "features"
-        self.store = options.out / "runs" / f"{strategy.name}-{options.stage.seed}"
+    def __init__(
+        self,
+        strategy: Strategy,
+        scenes: Sequence[Recording],
+        options: BenchOptions,
+        seed: int,
+        out: Path,
+    ):
+        self.strategy, self.scenes, self.out = strategy, scenes, out
+        self.device, self.short_side = device_of(options.device), options.short_side
+        self.stage = _with_centres(options.stage(seed), scenes)
+        self.features = out.absolute() / "features"
+        self.store = out / "runs" / f"{strategy.name}-{seed}"
 
     def _remove(self) -> None:
         shutil.rmtree(self.store, ignore_errors=True)
@@ -97,9 +115,9 @@ class _Run:
         newest: Keyframes | None,
         costs: Mapping[str, object],
     ) -> StageResults:
-        """Evaluate all scenes learned so far by localizers, each by the name of its results."""
+        """Evaluate all scenes learned so far by localizers, by the names of their results."""
         results, frames = [], []
-        environment = record_environment(self.options.out)
+        environment = record_environment(self.out)
         costs = {**costs, "frames_kept": len(newest.images) if newest else 0}
         for name, localizer in localizers.items():
             run = {"strategy": name, "seed": self.stage.seed, "stage": number}
@@ -117,7 +135,6 @@ class _MapRun(_Run):
     """Builds a map; it is also evaluated without alignment."""
 
     def stages(self) -> Iterator[StageResults]:
-        """Learn scene after scene into a map; see `run_strategy`."""
         if not is_store(self.store):
             self._remove()  # left by an interrupted commit
         for number in range(max(0, len(self._opened().stages) - 1), len(self.scenes)):
@@ -140,14 +157,13 @@ class _MapRun(_Run):
     def _opened(self) -> MapStore:
         if is_store(self.store):
             return MapStore.open(self.store)
-        return MapStore.create(self.store, short_side=self.options.short_side)
+        return MapStore.create(self.store, short_side=self.short_side)
 
 
 class _NetworkRun(_Run):
     """Trains a network."""
 
     def stages(self) -> Iterator[StageResults]:
-        """Learn scene after scene into a store; see `run_strategy`."""
         self._begin()
         for number in range(len(NetworkStore.open(self.store).stages) - 1, len(self.scenes)):
             if number >= len(NetworkStore.open(self.store).stages):
@@ -158,8 +174,7 @@ class _NetworkRun(_Run):
         self._remove()
 
     def jointly(self) -> Iterator[StageResults]:
-        """Learn all scenes at once; see `run_strategy`. An interrupted run starts again."""
-        self._remove()
+        self._remove()  # an interrupted run starts again
         empty = self._prepared(self._new_store().contents)
         splits = [split_held_out(scene.train) for scene in self.scenes]
         train = [replace(s, train=t.train) for s, t in zip(self.scenes, splits, strict=True)]
@@ -177,17 +192,16 @@ class _NetworkRun(_Run):
         options = NetworkLearnOptions(
             strategy=strategy,
             stage=self.stage,
-            short_side=self.options.short_side,
+            short_side=self.short_side,
             device=str(self.device),
             cache=self.features,
         )
         learn_networks(store, scene, options, unobserved)
 
     def _new_store(self) -> NetworkStore:
-        return NetworkStore.create(self.store, self.strategy.name, self.options.short_side)
+        return NetworkStore.create(self.store, self.strategy.name, self.short_side)
 
     def _prepared(self, scenes: LearnedScenes) -> LearnedScenes:
-        """Move to the device of the run and share encoded views with other runs."""
         scenes.to(self.device)
         cache_features(scenes.encoder, self.features)  # pyright: ignore[reportArgumentType]
         scenes.cache = self.features
@@ -220,12 +234,9 @@ class _NetworkRun(_Run):
         self._new_store().commit(scenes, report)
 
     def _rows(self, scenes: LearnedScenes, train: Sequence[Frame]) -> Callable[[], FeatureBuffer]:
-        """Return a function that encodes the training rows of the first scene, once."""
-
         @cache
         def rows() -> FeatureBuffer:
-            buffer = scene_buffer(0, scenes.scenes[0].cell, train, scenes.device)
-            encode_rows(buffer, train, view_plan(self.stage, scenes.short_side), scenes)
+            buffer = scene_rows(scenes, 0, scenes.scenes[0].cell, train, self.stage)
             correct_lens(buffer, scenes.scenes[0])
             return buffer
 
@@ -243,7 +254,6 @@ class _NetworkRun(_Run):
 
 
 def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOptions:
-    """Add the centres of all scenes to options that need them in advance."""
     if stage.head.centres != "fixed" or stage.fixed_centres_m:
         return stage
     positions = [stated_poses(split_held_out(scene.train).train).translation_m for scene in scenes]

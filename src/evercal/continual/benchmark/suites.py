@@ -68,14 +68,10 @@ SUITES: dict[str, Suite] = {
 def load_suite(
     name: str, data: Path | None = None, only: Sequence[str] = (), poses: Path | None = None
 ) -> list[Recording]:
-    """Load the scenes of a suite in order of learning.
+    """Load the scenes of a suite in order of learning, by default all.
 
-    Args:
-        name: Key of `SUITES`.
-        data: Folder with a folder for each scene; unused for `sim-mini`.
-        only: Names of the scenes to load. Defaults to all.
-        poses: Folder of structure-from-motion poses (Brachmann et al., ICCV 2021) for i7s or i12s.
-            Defaults to the original poses.
+    `data` has a folder for each scene. `poses` are from structure from motion (Brachmann et al.,
+    ICCV 2021), for i7s and i12s; by default they are the original ones.
     """
     if name not in SUITES:
         names = ", ".join([*SUITES, "custom", "regions"])
@@ -161,6 +157,5 @@ def regions(scene: Recording, parts: int) -> list[Recording]:
 
 
 def _ahead(frames: Sequence[Frame]) -> np.ndarray:
-    """Return the points one metre in front of the cameras, shape (n, 3)."""
     poses = stated_poses(frames)
     return poses.translation_m + poses.rotation_matrix()[:, :, 2]

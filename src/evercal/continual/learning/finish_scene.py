@@ -28,15 +28,10 @@ def finished_stage(
     rows: Callable[[], FeatureBuffer],
     options: StageOptions,
 ) -> Stage:
-    """Select what is stored of the newest scene and add it to `scenes`.
+    """Select what is stored of the newest scene and add it to `scenes`, which has its record.
 
-    Args:
-        scenes: with the scene's record and head, without its keyframes and state.
-        method: of the training.
-        frames: the scene's training frames in recorded order.
-        rows: returns their rows with the intrinsics of the training; the first views are not
-            augmented.
-        options: of the stage.
+    `rows` returns the rows of its frames with the intrinsics of the training; the first views are
+    not augmented.
     """
     newest = len(scenes.scenes) - 1
     head, local = scenes.head_for(newest)
@@ -58,7 +53,7 @@ def finished_stage(
 
 
 def _keyframes(scenes: LearnedScenes, frames: Sequence[Frame], options: StageOptions) -> Keyframes:
-    """Selected frames as they are stored; replay uses the camera as training corrected it."""
+    # Replay uses the camera as training corrected it.
     refined = scenes.scenes[-1].refined_camera
     if refined is not None:
         frames = [replace(frame, camera=refined) for frame in frames]

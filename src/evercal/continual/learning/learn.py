@@ -5,20 +5,23 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+import torch
+from torch import Tensor
+
 from evercal.continual.learning.finish_scene import correct_lens, finished_stage, trained_record
 from evercal.continual.learning.stage import OnEvent, Stage, StageOptions, unobserved
-from evercal.continual.learning.stage_head import head_for_all, head_for_scene, whiten
-from evercal.continual.learning.stage_rows import (
-    add_surfaces,
-    encode_rows,
-    remembered,
-    scene_buffer,
-    view_plan,
-)
+from evercal.continual.learning.stage_rows import remembered, scene_rows
+from evercal.continual.learning.surfaces import shared_depths, surface_points
 from evercal.continual.methods.method import Method, StageStart
+from evercal.continual.networks.atlas import Atlas, Cell, camera_clusters
+from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.head import Head, fresh_head
 from evercal.continual.networks.trainer import HeadTrainer
 from evercal.continual.scenes import LearnedScenes
 from evercal.recordings.frame import Recording, stated_poses
+
+WHITENING_ROWS = 20_000
 
 
 def learn(
@@ -28,27 +31,14 @@ def learn(
     options: StageOptions,
     on_event: OnEvent = unobserved,
 ) -> Stage:
-    """Learn one more scene.
-
-    Args:
-        scenes: what was learned before; not changed.
-        method: how the network is trained.
-        recording: its training frames are learned, its test frames are not read.
-        options: of the stage.
-        on_event: called for progress bars.
-    """
-    after, frames = scenes.copy_for_training(), recording.train
+    """Learn one more scene from the training frames of a recording; `scenes` is not changed."""
+    after = scenes.copy_for_training()
     teacher = copy.deepcopy(after.heads[-1]).eval() if after.heads else None
-    positions = stated_poses(frames).translation_m
-    cell = after.atlas(options.grid_scenes).place(positions)
-    in_atlas = cell.atlas_from_base.apply(positions)
-    head, local = head_for_scene(after, method.head_per_scene, options, in_atlas)
-    buffer = scene_buffer(local, cell, frames, scenes.device)
-    encode_rows(buffer, frames, view_plan(options, scenes.short_side), scenes, on_event)
-    if options.fit.surface_weight > 0:
-        add_surfaces(buffer, frames, scenes)
+    atlas = after.atlas(options.grid_scenes)
+    cell, buffer = _begun(after, atlas, recording, options, method.head_per_scene, on_event)
+    head = after.heads[-1]
     if teacher is None:
-        whiten(head, [buffer], options.seed)
+        _whiten(head, [buffer], options.seed)
     memories = remembered(scenes, options, on_event) if method.replays else []
     rows, states = options.fit.replay_batch, scenes.method_states
     hooks = method.begin(StageStart(head, teacher, memories, states, rows, options.seed))
@@ -57,7 +47,7 @@ def learn(
         on_event(progress)
     after.scenes.append(trained_record(recording, cell, trainer, 0))
     correct_lens(buffer, after.scenes[-1])
-    return finished_stage(after, method, frames, lambda: buffer, options)
+    return finished_stage(after, method, recording.train, lambda: buffer, options)
 
 
 def learn_jointly(
@@ -68,38 +58,73 @@ def learn_jointly(
 ) -> Stage:
     """Train one head on several scenes, with the steps and rows of the same number of stages.
 
-    A step has the rows of one that learns a scene and replays others.
-
-    Args:
-        start: without scenes; not changed.
-        recordings: their training frames are learned.
-        options: of one stage.
-        on_event: called for progress bars.
-
-    Returns:
-        The stage of all scenes.
+    A step has the rows of one that learns a scene and replays others. `start` has no scenes and is
+    not changed.
     """
     after, fit = start.copy_for_training(), options.fit
-    plan = view_plan(options, start.short_side)
-    cells, positions, buffers = [], [], []
     atlas = after.atlas(options.grid_scenes)
-    for number, recording in enumerate(recordings):
-        cameras = stated_poses(recording.train).translation_m
-        cells.append(atlas.place(cameras))
-        positions.append(cells[-1].atlas_from_base.apply(cameras))
-        buffers.append(scene_buffer(number, cells[-1], recording.train, start.device))
-        encode_rows(buffers[-1], recording.train, plan, start, on_event)
-        if fit.surface_weight > 0:
-            add_surfaces(buffers[-1], recording.train, start)
-    head = head_for_all(after, options, positions)
-    whiten(head, buffers, options.seed)
+    begun = [_begun(after, atlas, scene, options, False, on_event) for scene in recordings]
+    buffers = [buffer for _, buffer in begun]
+    (head,) = after.heads
+    _whiten(head, buffers, options.seed)
     rows = fit.batch + (fit.replay_batch if len(recordings) > 1 else 0)
     whole = replace(fit, iterations=fit.iterations * len(recordings), batch=rows)
     trainer = HeadTrainer(head, buffers, whole, options.seed)
     for progress in trainer.run():
         on_event(progress)
     for number, recording in enumerate(recordings):
-        after.scenes.append(trained_record(recording, cells[number], trainer, number))
+        after.scenes.append(trained_record(recording, begun[number][0], trainer, number))
         rows_of = partial(buffers.__getitem__, number)
         finished_stage(after, Method(), recording.train, rows_of, options)
     return Stage(after, whole.iterations, 0)
+
+
+def _begun(
+    after: LearnedScenes,
+    atlas: Atlas,
+    recording: Recording,
+    options: StageOptions,
+    own: bool,
+    on_event: OnEvent,
+) -> tuple[Cell, FeatureBuffer]:
+    """Place a scene in the atlas, grow a head by it, and encode its frames."""
+    frames, number = recording.train, len(atlas.cells)
+    positions = stated_poses(frames).translation_m
+    cell = atlas.place(positions)
+    head = _head_to_grow(after, own, options)
+    local = head.scenes
+    centres = _new_centres(head, options, cell.atlas_from_base.apply(positions))
+    head.grow(centres, options.seed + number)
+    after.heads.append(head)
+    buffer = scene_rows(after, local, cell, frames, options, on_event)
+    if options.fit.surface_weight > 0:
+        depths = shared_depths(after.cache, frames, after.encoder, after.short_side)
+        points = surface_points(buffer, frames, depths, after.encoder.stride)
+        buffer.known = points.to(buffer.device)
+    return cell, buffer
+
+
+def _head_to_grow(scenes: LearnedScenes, own: bool, options: StageOptions) -> Head:
+    """A new head, the last one, or with `own` a copy of its weights without scenes."""
+    if not scenes.heads:
+        widths = scenes.encoder.width, scenes.descriptor.width
+        return fresh_head(*widths, options.head, options.seed).to(scenes.device)
+    return scenes.heads[-1].without_scenes() if own else scenes.heads.pop()
+
+
+def _new_centres(head: Head, options: StageOptions, positions_m: np.ndarray) -> Tensor:
+    """(k, 3) centres that a scene adds, from its camera positions (n, 3) in the atlas."""
+    if head.options.centres == "grow":
+        count = head.options.centres_per_scene
+        return torch.from_numpy(camera_clusters(positions_m, count, options.seed)).float()
+    if len(head.centres):
+        return torch.zeros(0, 3)
+    return torch.tensor(options.fixed_centres_m).reshape(-1, 3)
+
+
+def _whiten(head: Head, buffers: Sequence[FeatureBuffer], seed: int) -> None:
+    if not head.options.whiten:
+        return
+    generator = torch.Generator().manual_seed(seed)
+    drawn = [buffer.draw(WHITENING_ROWS // len(buffers), generator) for buffer in buffers]
+    head.whiten(torch.cat([rows.features for rows in drawn]))

@@ -18,11 +18,7 @@ from evercal.errors import InputError
 from evercal.features.device import device_of
 from evercal.learning.scene import LearnReport
 from evercal.recordings.frame import Frame, Recording, lacks_camera_poses, posed_recording
-from evercal.recordings.held_out import (
-    named_recording,
-    require_frames,
-    split_held_out,
-)
+from evercal.recordings.held_out import named_recording, require_frames, split_held_out
 from evercal.storage.stages import is_store
 
 
@@ -64,10 +60,7 @@ class NetworkLearnOptions:
 
 
 def learn_networks(
-    store: Path,
-    recording: Recording,
-    options: NetworkLearnOptions,
-    on_event: OnEvent = unobserved,
+    store: Path, recording: Recording, options: NetworkLearnOptions, on_event: OnEvent = unobserved
 ) -> LearnReport:
     """Learn a scene into a store; an interrupted call leaves the store at its last scene.
 
@@ -76,10 +69,6 @@ def learn_networks(
         recording: its training frames are learned; a few are held out to fit the threshold.
         options: strategy and amount of training.
         on_event: called with every event, for progress bars.
-
-    Raises:
-        InputError: No such device or strategy, too few frames, a name that is taken, another
-            strategy than the store's, or another process is writing into the store.
     """
     began = time.perf_counter()
     named, stage = options.strategy, options.stage_options()
@@ -132,7 +121,6 @@ def _opened(
     options: NetworkLearnOptions,
     frames: Sequence[Frame],
 ) -> NetworkStore:
-    """The store, checked against the options."""
     if stage.memory.auto:
         raise InputError("memory auto: only a map selects its keyframes; give a share or bytes")
     if not is_store(store):

@@ -27,8 +27,7 @@ class StageOptions:
     fixed_centres_m: tuple[tuple[float, float, float], ...] = ()
     """Atlas coordinates of all centres, for HeadOptions.centres `fixed`."""
     grid_scenes: int = 0
-    """Scenes of the combined grid (`Atlas` layout `paper`); 0 gives each scene the next free
-    cell."""
+    """Scenes of `Atlas` layout `paper`; 0 gives each scene the next free cell."""
     seed: int = 0
     """Random seed."""
 

@@ -1,7 +1,6 @@
 """Depths of all frames of a recording where several agree, and scene points of their rows."""
 
 import hashlib
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.feature_cache import read_cached, write_cached
 from evercal.features.encoder import Encoder
 from evercal.features.vlad import vlad_for
 from evercal.features.weights_file import network_bytes
@@ -18,7 +18,6 @@ from evercal.geometry import SE3
 from evercal.mapping.pose_check import depth_scale, matched_pairs
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
 from evercal.recordings.frame import Frame, stated_poses
-from evercal.storage import write_bytes
 
 SOURCE_VIEWS = 8
 """Frames that a depth is swept over, at most."""
@@ -29,23 +28,13 @@ TOLERANCE = 0.04
 
 
 def frame_depths(
-    frames: Sequence[Frame],
-    encoder: Encoder,
-    short_side: int,
+    frames: Sequence[Frame], encoder: Encoder, short_side: int
 ) -> list[NDArray[np.float64]]:
     """Estimate the depth of every cell of every frame by plane sweeps.
 
     The depth of a cell counts if at least two other frames have the same surface there, as in
-    multi-view stereo (Schönberger et al., Pixelwise view selection, ECCV 2016).
-
-    Args:
-        frames: Posed frames.
-        encoder: Encoder of the cells.
-        short_side: Working size of the images, pixels.
-
-    Returns:
-        For each frame, (rows, columns) depths along the optical axis in metres; NaN where frames
-        disagree.
+    multi-view stereo (Schönberger et al., Pixelwise view selection, ECCV 2016). Depths (rows,
+    columns) are along the optical axis in metres; NaN where frames disagree.
     """
     prepared = PreparedFrames(frames, encoder, WorkingSize(short_side, short_side))
     features = [prepared.features(i) for i in range(len(prepared))]
@@ -85,11 +74,7 @@ def shared_depths(
 ) -> list[NDArray[np.float64]]:
     """Estimate the depths of frames, see `frame_depths`, or read those of an earlier run.
 
-    Args:
-        cache: Folder for the depths of all runs; None always estimates them.
-        frames: Posed frames.
-        encoder: Encoder of the cells.
-        short_side: Working size of the images, pixels.
+    `cache` is the folder of the depths of all runs; without one they are always estimated.
     """
     if cache is None:
         return frame_depths(frames, encoder, short_side)
@@ -99,14 +84,12 @@ def shared_depths(
     assert isinstance(encoder, torch.nn.Module)
     key.update(network_bytes(encoder, "encoder"))
     path = cache / f"depths-{key.hexdigest()}.npy"
-    if path.exists():
-        return list(np.load(path))
+    if (cached := read_cached(path)) is not None:
+        return list(cached.numpy())
     depths = frame_depths(frames, encoder, short_side)
     if len({depth.shape for depth in depths}) == 1:
-        buffer = io.BytesIO()
-        np.save(buffer, np.stack(depths))
         cache.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, buffer.getvalue())
+        write_cached(path, torch.from_numpy(np.stack(depths)))
     return depths
 
 
@@ -116,18 +99,10 @@ def surface_points(
     depths: Sequence[NDArray[np.float64]],
     stride: int,
 ) -> Tensor:
-    """Compute the scene points of all rows of a buffer from the depths of their frames.
+    """Compute the points (rows, 3) of a buffer in the atlas from the depths of its frames.
 
-    A row takes the depth of the nearest cell of its frame, along its own ray.
-
-    Args:
-        buffer: Rows of plain and augmented views of the frames.
-        frames: Frames in the order in which they were encoded.
-        depths: Depths of each frame, see `frame_depths`.
-        stride: Pixels per cell.
-
-    Returns:
-        (rows, 3) in the atlas; NaN where the depth is unknown.
+    Frames are in the order in which they were encoded. A row takes the depth of the nearest cell of
+    its frame, along its own ray; the point is NaN where the depth is unknown.
     """
     tensors = {name: value.cpu() for name, value in buffer.tensors.items()}
     view, points = tensors["view"].long().numpy(), np.full((len(buffer), 3), np.nan)

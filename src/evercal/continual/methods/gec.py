@@ -92,8 +92,6 @@ class EpisodicConstraint(EpisodicMemory):
 
 
 class _ConstraintHooks(MemoryHooks):
-    """Collects the gradient of every remembered scene and edits the step."""
-
     edits_steps = True
 
     def __init__(self, method: EpisodicConstraint, start: StageStart):
@@ -103,13 +101,11 @@ class _ConstraintHooks(MemoryHooks):
         self._references = torch.stack(references)
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
-        """Compute plain replay in the first steps, averaged over the scenes."""
         if self._steps >= self._method.warm_steps:
             return None
         return Reprojection()(output, None, rows, tau_px)
 
     def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
-        """Compute the loss of each remembered scene."""
         each = len(rows.scene) // len(self.memories)  # rows are ordered by scene
         parts = [slice(i * each, (i + 1) * each) for i in range(len(self.memories))]
         return [self._method.loss(output.part(part), rows.part(part)) for part in parts]
@@ -129,12 +125,8 @@ def nearest_change(changes: Tensor, g: Tensor, most: Tensor) -> Tensor:
 
     u = changes - sum_t lambda_t g_t with lambda >= 0. The dual, min 1/2 l'Gl - l'b with G = g g'
     and b = g changes - most, is a non-negative least-squares problem in the root of G. Constraints
-    are first divided by the length of their gradient, which does not change the solution.
-
-    Args:
-        changes: (p,) change of all weights.
-        g: (t, p) gradients.
-        most: (t,) largest increase of each loss.
+    are first divided by the length of their gradient, which does not change the solution. The
+    change is (p,), gradients (t, p), and bounds (t,).
     """
     size = g.norm(dim=1)
     some = size > 0  # no change affects a loss without a gradient

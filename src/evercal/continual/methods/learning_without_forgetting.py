@@ -44,7 +44,7 @@ class _DistillationHooks(TrainingHooks):
     def replayed(
         self, fresh: Rows, step: int, rate: float, generator: torch.Generator
     ) -> list[Rows]:
-        """Draw new rows once more, one part with the index of each earlier scene."""
+        # New rows once more, one part with the index of each earlier scene.
         parts = []
         for scene in range(self._teacher.scenes):
             drawn = torch.randint(

@@ -71,13 +71,10 @@ def interfered_views(
     rate: float,
     generator: torch.Generator,
 ) -> Tensor:
-    """Select the views of a remembered scene that a step on new rows harms most.
+    """Select the views (k,) of a remembered scene that a step on new rows harms most.
 
     The head is not changed. `rate` is the root mean square change of each parameter in the virtual
     step.
-
-    Returns:
-        (k,) numbers of the views.
     """
     drawn = torch.randperm(memory.views, generator=generator, device="cpu")[: method.candidates]
     view = memory.tensors["view"].cpu()

@@ -35,7 +35,6 @@ class Penalty:
 
 
 def _distance_m(student: HeadOutput, teacher: HeadOutput) -> Tensor:
-    """Compute the L1 distance (n,) between the points of both heads, metres."""
     return (student.points - teacher.points.detach()).abs().sum(-1)
 
 

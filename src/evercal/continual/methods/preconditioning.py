@@ -85,10 +85,9 @@ def owned_rows(head: Head, memories: Sequence[FeatureBuffer]) -> dict[str, Tenso
 
 
 def input_moments(head: Head, memories: Sequence[FeatureBuffer], seed: int) -> dict[str, Tensor]:
-    """Sum the second moments of each layer's inputs over scenes, with mean diagonal 1 per scene.
+    """Sum second moments (inputs, inputs) of layers over scenes, by the name of the weight.
 
-    Returns:
-        (inputs, inputs) double for every linear layer, by weight name.
+    The mean of the diagonal is 1 per scene; the moments are double.
     """
     names = {m: f"{name}.weight" for name, m in head.named_modules() if isinstance(m, nn.Linear)}
     moments: dict[str, Tensor] = {}

@@ -57,8 +57,7 @@ class Replay(EpisodicMemory):
     weight: float = 1.0
     """Weight of the penalty, the mean over the rows of all remembered scenes."""
     every_scene: bool = False
-    """Multiply the weight by the number of remembered scenes, so that each counts like the new one.
-    The paper has one weight for all of them together."""
+    """Multiply the weight by the number of remembered scenes; the paper has one for all of them."""
 
     def begin(self, start: StageStart) -> TrainingHooks:
         """Replay from the stage's memories, from the second scene on."""

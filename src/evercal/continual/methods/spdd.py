@@ -99,7 +99,6 @@ def spdd_loss(student: HeadOutput, teacher: HeadOutput, options: SpddOptions) ->
 def _prior(
     student_logits: Tensor, best: torch.return_types.topk, old: int, temperature: float
 ) -> Tensor:
-    """Return the ``(n, M_a)`` summands of ``tau^2 KL(p_T || p_S)``; 0 at masked centres."""
     dead = torch.isneginf(best.values)
     target = _log_softmax(best.values / temperature)
     logits = torch.cat([student_logits.gather(1, best.indices), student_logits[:, old:]], dim=1)

@@ -37,11 +37,9 @@ class Cell:
 class Atlas:
     """Cells in the order of their scenes.
 
-    Args:
-        layout: `open` assigns the first free position of a square spiral that is large enough, so
-            scenes need not be known in advance. `paper` is GLACE's grid: with ceil(sqrt(n))
-            columns, the cell of scene i lies at 5 m (-row, -column, 0).
-        expected: Number of scenes n in the layout `paper`.
+    The layout `open` assigns the first free position of a square spiral that is large enough, so
+    scenes need not be known in advance. `paper` is GLACE's grid for n expected scenes: with
+    ceil(sqrt(n)) columns, the cell of scene i lies at 5 m (-row, -column, 0).
     """
 
     def __init__(self, layout: Literal["open", "paper"] = "open", expected: int = 0):
@@ -49,11 +47,7 @@ class Atlas:
         self.cells: list[Cell] = []
 
     def place(self, positions_m: np.ndarray) -> Cell:
-        """Assign a cell to a new scene with (n, 3) camera positions in its base frame.
-
-        Raises:
-            InputError: Layout `paper` has no cell left.
-        """
+        """Assign a cell to a new scene with (n, 3) camera positions in its base frame."""
         origin = positions_m.mean(axis=0)
         side = max(MIN_CELL_M, 2.0 * float(np.ptp(positions_m, axis=0).max()))
         if self.layout == "paper":
@@ -65,7 +59,7 @@ class Atlas:
             centre, side = paper_grid(self.expected)[len(self.cells)], MIN_CELL_M
         else:
             centre = next(c for c in spiral() if self._free(c, side))
-        cell = Cell(_triple(centre), side, _triple(origin))
+        cell = Cell(tuple(centre.tolist()), side, tuple(origin.tolist()))
         self.cells.append(cell)
         return cell
 
@@ -105,12 +99,7 @@ def combined_centres(
     atlas = Atlas("paper", len(positions_m))
     in_atlas = [atlas.place(scene).atlas_from_base.apply(scene) for scene in positions_m]
     means = camera_clusters(np.concatenate(in_atlas), count, seed)
-    return tuple(map(_triple, means))
-
-
-def _triple(point: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = point.tolist()
-    return x, y, z
+    return tuple((x, y, z) for x, y, z in means.tolist())
 
 
 def spiral() -> Iterator[np.ndarray]:

@@ -32,8 +32,6 @@ class Rows:
     """(n, width) descriptor of each row's image."""
     target: Target
     """Observation of each row."""
-    index: Tensor
-    """(n,) position in the buffer."""
     known: Tensor | None = None
     """(n, 3) points of the atlas that are known from depths; NaN for rows without one."""
 
@@ -43,28 +41,22 @@ class Rows:
 
 
 _TARGET = "target.pixels", "target.intrinsics", "target.camera_from_atlas"
-_tensors = attrgetter("features", "scene", "descriptor", "index", *_TARGET)
+_tensors = attrgetter("features", "scene", "descriptor", *_TARGET)
 
 
 def _combined(parts: Sequence[Rows], change: Callable[[list[Tensor]], Tensor]) -> Rows:
-    """Apply a function to each kind of tensor of some batches."""
     columns = zip(*map(_tensors, parts), strict=True)
-    features, scene, descriptor, index, *target = (change(list(column)) for column in columns)
+    features, scene, descriptor, *target = (change(list(column)) for column in columns)
     known = [part.known for part in parts if part.known is not None]
     points = change(known) if known else None
-    return Rows(features, scene, descriptor, Target(*target), index, points)
+    return Rows(features, scene, descriptor, Target(*target), points)
 
 
 class FeatureBuffer:
     """Feature rows of one scene, with poses and cameras in a side table (one entry per view).
 
-    Added rows accumulate on the CPU. On first use all rows move to `device`.
-
-    Args:
-        scene: Index of the scene in the head.
-        atlas_from_base: Position of the scene's base frame in the atlas.
-        correctable: One camera took all frames, and its distortion is unknown.
-        device: Device of drawn rows.
+    Added rows accumulate on the CPU. On first use all rows move to `device`. `scene` is an index in
+    the head. With `correctable`, one camera of unknown distortion took all frames.
     """
 
     def __init__(
@@ -83,10 +75,9 @@ class FeatureBuffer:
         self._merged: dict[str, Tensor] | None = None
 
     def append(self, views: Sequence[View], encoded: tuple[Tensor, Tensor], keep: Tensor) -> None:
-        """Append rows of views.
+        """Append the rows of views that a mask (b, cells) keeps.
 
-        `encoded` are features (b, channels, h, w) and descriptors (b, width) on any device. The
-        mask `keep` (b, cells) selects rows.
+        `encoded` are features (b, channels, h, w) and descriptors (b, width) on any device.
         """
         features, descriptors = encoded
         rows = features.flatten(2).transpose(1, 2)
@@ -151,10 +142,8 @@ class FeatureBuffer:
         view = t["view"][index].long()
         target = Target(t["pixels"][index], t["intrinsics"][view], t["camera_from_atlas"][view])
         scene = torch.full((len(index),), self.scene, device=index.device)
-        rows = Rows(t["features"][index], scene, t["descriptors"][view], target, index)
-        if self.known is not None:
-            rows.known = self.known[index].float()
-        return rows
+        known = None if self.known is None else self.known[index].float()
+        return Rows(t["features"][index], scene, t["descriptors"][view], target, known)
 
 
 def join(parts: Sequence[Rows]) -> Rows:
@@ -171,10 +160,9 @@ def join(parts: Sequence[Rows]) -> Rows:
 
 
 def diffused(rows: Rows, deviation: float, generator: torch.Generator) -> Rows:
-    """Add noise to the descriptors of rows (GLACE's feature diffusion).
+    """Add noise to unit descriptors of rows (GLACE's feature diffusion); `deviation` per channel.
 
-    `deviation` is that of the noise per channel. Descriptors are normalised before and after. The
-    generator is on the device of the rows.
+    The generator is on the device of the rows.
     """
     noise = torch.randn(rows.descriptor.shape, generator=generator, device=generator.device)
     descriptor = F.normalize(rows.descriptor + deviation * noise.to(rows.descriptor), dim=-1)
@@ -202,13 +190,10 @@ def encode_frames(
     encoder: Encoder,
     descriptor: Descriptor,
 ) -> Iterator[int]:
-    """Encode every frame `plan.views_per_frame` times into a buffer.
+    """Encode every frame `plan.views_per_frame` times; yields the number of views in the buffer.
 
     Pass 0 shows the frames unchanged, later passes augmented. A view and its cells depend only on
     (seed, pass, frame).
-
-    Yields:
-        The number of views in the buffer.
     """
     for batch in encode_batches(frames, plan):
         planned = [_view(frames, number, plan, encoder.stride) for number in batch]
@@ -237,7 +222,6 @@ def encode_batches(frames: Sequence[Frame], plan: EncodePlan) -> list[list[int]]
 def _view(
     frames: Sequence[Frame], number: int, plan: EncodePlan, stride: int
 ) -> tuple[View, Tensor]:
-    """Return a view by its number, and a mask (cells,) of its rows to keep."""
     visit, position = divmod(number, len(frames))
     rng = np.random.default_rng([plan.seed, visit, position])
     if visit == 0:

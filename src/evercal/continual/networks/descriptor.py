@@ -69,11 +69,7 @@ Descriptor = GlobalDescriptor | PooledDescriptor
 
 
 def load_descriptor(path: Path | None = None) -> Descriptor:
-    """Load a descriptor for inference, by default the shipped one.
-
-    Raises:
-        InputError: The file is missing or is not a descriptor.
-    """
+    """Load a descriptor for inference, by default the shipped one."""
     from safetensors import SafetensorError, safe_open
 
     path = DESCRIPTOR_FILE if path is None else path

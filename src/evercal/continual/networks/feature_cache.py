@@ -26,12 +26,12 @@ def cache_features(encoder: nn.Module, folder: Path) -> None:
 
     def forward(grey: Tensor) -> Tensor:
         paths = [folder / _name(image) for image in grey]
-        features = [_read(path) for path in paths]
+        features = [read_cached(path) for path in paths]
         missing = [i for i, value in enumerate(features) if value is None]
         if missing:
             for i, value in zip(missing, compute(grey[missing]).half().cpu(), strict=True):
                 features[i] = value
-                _write(paths[i], value)
+                write_cached(paths[i], value)
         return torch.stack([value.float() for value in features if value is not None]).to(
             grey.device
         )
@@ -47,15 +47,19 @@ def _name(image: Tensor) -> str:
     return f"{shape}-{digest}{kind}.npy"
 
 
-def _read(path: Path) -> Tensor | None:
+def read_cached(path: Path) -> Tensor | None:
+    """Read a tensor; None if it is missing or damaged."""
     try:
         return torch.from_numpy(np.load(path))
     except (OSError, ValueError, EOFError):
         return None
 
 
-def _write(path: Path, features: Tensor) -> None:
-    # Not synced, because features lost in a power failure are encoded again.
+def write_cached(path: Path, features: Tensor) -> None:
+    """Write a tensor, unless the disk is full.
+
+    It is not synced, because what a power failure loses is computed again.
+    """
     temporary = path.with_name(f".{uuid.uuid4().hex[:8]}.npy")
     with contextlib.suppress(OSError):  # usually a full disk
         try:

@@ -40,14 +40,11 @@ class HeadOptions:
     offsets: Literal["shared", "per_centre"] = "per_centre"
     """One offset and scale for all centres (GLACE), or one for each centre (the paper)."""
     centres: Literal["grow", "fixed"] = "grow"
-    """Each scene appends its own centres, or the centres of all scenes are given in advance
-    (the paper; requires the future scenes)."""
+    """Each scene appends its own centres, or those of all scenes are given (the paper)."""
     centres_per_scene: int = 4
     """Cluster centres added per scene. With `fixed` centres, their total number."""
     whiten: bool = True
-    """Centre, scale and half decorrelate the features before the first layer. If false, they are
-    only scaled, and a few strong directions dominate the many weak ones that distinguish
-    neighbouring points."""
+    """Centre, scale and half decorrelate the features, so that weak directions count; or scale."""
     activation: Literal["gelu", "relu"] = "gelu"
     """Activation between layers; ACE and GLACE use `relu`."""
 
@@ -73,13 +70,8 @@ class HeadOutput:
 class Head(nn.Module):
     """Residual MLP whose outputs grow with every scene.
 
-    Args:
-        features: Channels of the local feature.
-        descriptor: Channels of the global descriptor; ignored with condition `code`.
-        options: Architecture.
-
-    Raises:
-        InputError: Condition `code` with fixed centres.
+    `features` and `descriptor` are the channels of the local feature and of the global descriptor,
+    which is ignored with condition `code`.
     """
 
     centres: Tensor
@@ -215,12 +207,9 @@ class Head(nn.Module):
     def forward(
         self, features: Tensor, scene: Tensor | int, descriptor: Tensor | None
     ) -> HeadOutput:
-        """Predict the scene coordinates of feature rows, in fp32 also under autocast.
+        """Predict the scene coordinates of feature rows (n, features), in fp32 under autocast, too.
 
-        Args:
-            features: (n, features).
-            scene: Index of the assumed scene, one for all rows or (n,) one per row.
-            descriptor: (n, descriptor), or None with condition `code`.
+        `scene` is the assumed one of all rows or (n,); condition `code` ignores the descriptors.
         """
         hidden = self.hidden(features, scene, descriptor)
         with torch.autocast(hidden.device.type, enabled=False):
@@ -241,7 +230,6 @@ class Head(nn.Module):
         return self._trunk(x, None)
 
     def _add_code(self, scene: Tensor | int) -> Callable[[Tensor, int], Tensor]:
-        """Return a function that adds the code of a layer to (n, width) activations in place."""
         if isinstance(scene, int):
             return lambda z, layer: z.add_(self.code[scene, layer].to(z.dtype))
         # A product with one-hot rows, because the gradient of indexing is slow.

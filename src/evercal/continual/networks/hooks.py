@@ -35,17 +35,14 @@ class TrainingHooks:
     def replayed(
         self, fresh: Rows, step: int, rate: float, generator: torch.Generator
     ) -> list[Rows]:
-        """Select remembered rows for a step: the same number of parts of equal size every time.
+        """Select remembered rows for a step: as many parts of equal size every time.
 
         `fresh` are rows of the scene being learned, and `rate` is that of AdamW.
         """
         return []
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
-        """Compute the loss of the parts of `replayed`, concatenated.
-
-        `tau_px` is the soft clamp of the loss on new rows in this step.
-        """
+        """Compute the loss of the parts of `replayed`; `tau_px` is the soft clamp of new rows."""
         return None
 
     def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:

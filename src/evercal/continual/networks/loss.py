@@ -56,16 +56,10 @@ def clamp_px(options: LossOptions, progress: float) -> float:
 def reprojection_error(
     points: Tensor, target: Target, correction: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Project points into their cameras.
+    """Project points (n, 3) of the atlas: signed residuals (n, 2), pixels, and camera coordinates.
 
-    Args:
-        points: (n, 3) points in the atlas, metres.
-        target: Observations of the points.
-        correction: (n, 5) correction of the nominal pinhole camera: relative focal length, shift of
-            the principal point in focal lengths (x, y), OpenCV's k1 and k2.
-
-    Returns:
-        Signed pixel residuals (n, 2) and camera coordinates (n, 3), both fp32.
+    A correction (n, 5) of the nominal pinhole camera is the relative focal length, the shift of the
+    principal point in focal lengths (x, y), and OpenCV's k1 and k2.
     """
     matrix = target.camera_from_atlas
     in_camera = _rotated(matrix[:, :, :3], points) + matrix[:, :, 3]
@@ -80,7 +74,6 @@ def reprojection_error(
 
 
 def _rotated(matrices: Tensor, points: Tensor) -> Tensor:
-    """Multiply (n, 3, 3) matrices and (n, 3) points in full fp32."""
     if points.device.type == "cpu":
         return torch.einsum("nij,nj->ni", matrices, points)
     # A matrix product may round to TF32, an error of millimetres in a room; a sum does not.
@@ -94,14 +87,11 @@ def reprojection_loss(
     options: LossOptions,
     correction: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Compute the loss of every row.
+    """Compute the loss (n,) of every row, and its L2 error in pixels; infinite for invalid rows.
 
     A valid row has a depth in [0.1, 1000] m and an L1 error e below 1000 px; its loss is
     tau tanh(e / tau). The loss of an invalid row is the L1 distance in metres to the point at the
-    proxy depth on its ray.
-
-    Returns:
-        Loss (n,), and L2 error in pixels (n,) without gradient, infinite for invalid rows.
+    proxy depth on its ray. Errors have no gradient.
     """
     residual, in_camera = reprojection_error(points, target, correction)
     error = residual.abs().sum(-1)
@@ -117,21 +107,13 @@ def reprojection_loss(
 
 
 def surface_loss(points: Tensor, known: Tensor, target: Target, tau_px: float) -> Tensor:
-    """Compute the robust distance of points from known ones, in pixels at their depth.
+    """Compute the robust distance (n,) of points from known ones, in pixels at their depth.
 
     With e the L1 distance along the axes of the camera, times the focal length over the known
     depth, the loss is t ln(1 + e / t), t = max(tau, 5 px). To first order, the part of e across
     the ray is the reprojection error. Unlike that of a clamp, the gradient of a far point does not
-    vanish, so every row is attracted from the first step.
-
-    Args:
-        points: (n, 3) in the atlas.
-        known: (n, 3) in the atlas; the loss is 0 where they are NaN.
-        target: Cameras of the rows.
-        tau_px: Soft clamp of the reprojection loss in this step.
-
-    Returns:
-        Loss (n,).
+    vanish, so every row is attracted from the first step. Where the known point is NaN, the loss is
+    0. tau is the soft clamp of the reprojection loss in this step.
     """
     has_point = ~known[:, 0].isnan()
     known = torch.where(has_point[:, None], known, points.detach())

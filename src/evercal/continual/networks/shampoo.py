@@ -22,10 +22,8 @@ class OneSidedShampoo(torch.optim.Optimizer):
     matrix. If C were M' M, the step would be that of Muon (Jordan et al., 2024). Two products and
     a tenth of an eigendecomposition replace the nine products of Muon.
 
-    Args:
-        groups: Each has `params`, square matrices of one size, all with gradients.
-        rate: Learning rate; the step of a matrix changes its singular values by about so much.
-        weight_decay: Decoupled weight decay, relative to the rate.
+    The `params` of a group are square matrices of one size, all with gradients. A step changes
+    singular values by about the rate; the decoupled weight decay is relative to it.
     """
 
     def __init__(self, groups: Iterable[Mapping[str, object]], rate: float, weight_decay: float):
@@ -44,7 +42,6 @@ class OneSidedShampoo(torch.optim.Optimizer):
                 matrix.add_(change, alpha=-group["lr"])
 
     def _changes(self, state: dict[str, Tensor], gradients: Tensor) -> Tensor:
-        """Return the (n, w, w) steps at rate 1."""
         if not state:
             state["momentum"] = torch.zeros_like(gradients)
             # On the CPU, so that no step waits for a GPU.

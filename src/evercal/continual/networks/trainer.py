@@ -33,8 +33,7 @@ class FitOptions:
     peak_rate: float = 4e-3
     """Peak of AdamW's one-cycle learning rate (cosine up and down)."""
     matrix_rate: float = 0.02
-    """Peak learning rate of the hidden matrices, trained by one-sided Shampoo. With 0, AdamW trains
-    them too."""
+    """Peak rate of one-sided Shampoo for the hidden matrices; with 0, AdamW trains them too."""
     warm_share: float = 0.05
     """Share of the steps during which the rate rises."""
     weight_decay: float = 0.01
@@ -42,12 +41,9 @@ class FitOptions:
     diffusion: float = 0.1
     """Standard deviation of the noise on each row's descriptor (GLACE's feature diffusion)."""
     intrinsics_rate: float = 0.3
-    """Learning rate of the camera correction (focal length, principal point, k1, k2), as a share of
-    the head's. With 0, the given intrinsics are used. Cameras with known distortion are never
-    corrected."""
+    """Rate of the correction of a pinhole camera, as a share of the head's; 0 for none."""
     surface_weight: float = 0.0
-    """Weight of the distance to points that are known from depths, beside the reprojection loss.
-    With 0, no depths are estimated."""
+    """Weight of the distance to points from depths; with 0, no depths are estimated."""
     loss: LossOptions = field(default_factory=LossOptions)
     """Reprojection loss on the scenes being learned."""
 
@@ -138,7 +134,6 @@ class HeadTrainer:
         return Progress(self.step, options.iterations, costs.detach(), errors)
 
     def _rows(self, rate: float) -> tuple[Rows, int]:
-        """Draw the rows of the step; return them and the number of new rows."""
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
         share = self.options.batch // len(self.buffers)
         parts = [buffer.draw(share, generator) for buffer in self.buffers]
@@ -152,7 +147,6 @@ class HeadTrainer:
         return join(parts), fresh * share
 
     def _fresh_costs(self, points: Tensor, rows: Rows, tau_px: float) -> tuple[Tensor, Tensor]:
-        """Compute loss and error in pixels of the new rows."""
         options, correction = self.options, None
         if options.intrinsics_rate > 0 and tau_px < CORRECTION_FROM_PX:
             share = len(points) // len(self.buffers)
@@ -165,7 +159,6 @@ class HeadTrainer:
         return costs, errors
 
     def _gradients(self, loss: Tensor) -> dict[str, Tensor]:
-        """Compute the gradient of a loss by parameter name, keeping the graph."""
         names, values = zip(*self.head.named_parameters(), strict=True)
         gradients = torch.autograd.grad(loss, values, retain_graph=True, materialize_grads=True)
         return dict(zip(names, gradients, strict=True))
@@ -173,7 +166,6 @@ class HeadTrainer:
     def _take_step(
         self, losses: Sequence[Tensor], constraints: list[dict[str, Tensor]], schedule: float
     ) -> None:
-        """Step the optimisers and let the hooks edit the change."""
         named = dict(self.head.named_parameters())
         before = {}
         if self.hooks.edits_steps:
@@ -194,7 +186,6 @@ class HeadTrainer:
 def _optimisers(
     head: Head, correction: torch.nn.Parameter, options: FitOptions
 ) -> list[torch.optim.Optimizer]:
-    """Create AdamW, and one-sided Shampoo for the hidden matrices if it has a rate."""
     hidden, decay, plain = [], [], []
     for name, parameter in head.named_parameters():
         if name.startswith(("code", "logit")):

@@ -57,7 +57,6 @@ class FrameStatistics:
 
     @cached_property
     def _first_rows(self) -> Tensor:
-        """(n + 1,) first row of each frame, and the end of the last."""
         view = self._buffer.tensors["view"].cpu()
         return torch.searchsorted(view, torch.arange(len(self) + 1, device="cpu").to(view.dtype))
 

@@ -81,12 +81,7 @@ def select_coverage(
     Frames arrive in random order and are appended until the buffer is full. Later a frame enters if
     it shows a part of the scene that no buffered frame shows. Otherwise it enters with probability
     m / n as in a reservoir (m buffered, n earlier frames). Each entering frame replaces a random
-    one, as in the released code.
-
-    Args:
-        visible: Numbers of the parts that each frame shows.
-        capacity: Frames to select.
-        rng: Source of the order and the random draws.
+    one, as in the released code. `visible` are the numbers of the parts that each frame shows.
     """
     count = 1 + max((int(parts.max()) for parts in visible if len(parts)), default=-1)
     shows = np.zeros((len(visible), count), dtype=bool)
