@@ -67,7 +67,6 @@ class MapAlignment:
 
 
 def _in_own_frame(localizer: "Localizer", name: str) -> "Localizer":
-    """Return a localizer that answers in the frame of a scene's landmarks."""
     from evercal.localization.localizer import Localizer
 
     contents, scene = localizer.contents, localizer.contents.scene(name)
@@ -94,10 +93,6 @@ def align_by_gripper(
         scale_known: Whether the scene was learned in metres.
         camera_from_board: Board poses by image name, for a fixed camera and a board in the gripper;
             images without a board are left out.
-
-    Raises:
-        InputError: The scale is unknown and a board is given, too few images were located in the
-            scene, or the motions do not determine the base frame.
     """
     localizer = _in_own_frame(localizer, scene)
     index = {name: i for i, (name, _) in enumerate(images)}
@@ -183,9 +178,6 @@ def aligned_by_points(
         points: (3,) by name, base frame, metres.
         picks: (name, (h, w, 3) uint8 RGB, pixels (2,) by name of the point) of each image.
         scale_known: Whether the scene was learned in metres.
-
-    Raises:
-        InputError: Fewer than two images were located, or too few points.
     """
     localizer, images = _in_own_frame(localizer, scene), []
     own = localizer.contents.scene(scene)
@@ -219,6 +211,5 @@ def aligned_by_points(
 
 
 def _about(point: Array, covariance: Array) -> Array:
-    """Covariance of a small motion about the origin, from that of one about a point (3,)."""
     adjoint = SE3(np.array([1.0, 0, 0, 0]), point).adjoint()
     return adjoint @ covariance @ adjoint.T

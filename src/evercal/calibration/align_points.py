@@ -51,11 +51,7 @@ class PointAlignment:
 
 
 def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignment:
-    """Estimate the pose and, unless it is known, the scale of a map in the base frame.
-
-    Raises:
-        InputError: Fewer than three points are picked in two images, or all are on one line.
-    """
+    """Estimate the pose and, unless it is known, the scale of a map in the base frame."""
     triangulated = _triangulated(images)
     if len(triangulated) < 3:
         raise InputError(
@@ -118,7 +114,6 @@ def _triangulated(images: Sequence[Picks]) -> dict[str, tuple[Array, Array]]:
 
 
 def _umeyama(source: Array, target: Array, scale_known: bool) -> Similarity:
-    """Least squares similarity (Umeyama, PAMI 1991)."""
     a, b = source - source.mean(0), target - target.mean(0)
     spread = np.linalg.svd(b, compute_uv=False)
     if spread[1] < 0.02 * spread[0]:

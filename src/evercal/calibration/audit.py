@@ -65,9 +65,6 @@ def audit(
         stated: base_from_camera of the episodes without a pose of their own.
         options: Limits of agreement.
         on_episode: Called after each episode.
-
-    Raises:
-        InputError: No episode, one without a camera pose, or a scene of unknown unit of length.
     """
     audited = []
     for episode in episode_folders(folder):

@@ -214,20 +214,12 @@ class Calibration:
 
 
 def read_calibration(path: str | os.PathLike[str]) -> Calibration:
-    """Read a calibration file.
-
-    Raises:
-        InputError: The file is missing or holds no calibration.
-    """
+    """Read a calibration file."""
     return read_record(path, "calibration file", Calibration.from_dict)
 
 
 def read_transform(path: str | os.PathLike[str]) -> SE3:
-    """Read a rigid transform from a calibration file or from a 4x4 matrix as text.
-
-    Raises:
-        InputError: The file is missing or holds neither.
-    """
+    """Read a rigid transform from a calibration file or from a 4x4 matrix as text."""
     text = read_text(Path(path), "file")
     if text.lstrip().startswith("{"):
         return read_calibration(path).parent_from_child

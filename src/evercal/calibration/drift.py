@@ -73,12 +73,7 @@ def shift_between(
     localizer: "Localizer",
     confidence: float = CONFIDENCE,
 ) -> Shift:
-    """Compare `fused`, the pose of a camera now from `located` images, with its calibration.
-
-    Raises:
-        InputError: The reference is a camera on the gripper, or the scene's unit of length is
-            unknown.
-    """
+    """Compare `fused`, the pose of a camera now from `located` images, with its calibration."""
     from scipy import stats
 
     if reference.mount != "eye_to_hand":
@@ -119,7 +114,6 @@ def shift_between(
 
 
 def _scatter(measured: Sequence[tuple[Array, int]]) -> Array:
-    """Shrink measured scatters (6, 6), each with its number of images, towards the prior."""
     total, weight = _USUAL_WEIGHT * np.diag(_USUAL_SCATTER**2), _USUAL_WEIGHT
     for scatter, count in measured:
         total, weight = total + (count - 1) * scatter, weight + count - 1

@@ -89,11 +89,7 @@ class PosedByGripper(NamedTuple):
 def posed_by_gripper(
     recording: Recording, encoder: Encoder, on_progress: OnProgress = lambda *_: None
 ) -> PosedByGripper:
-    """Estimate rough camera poses; frames without a gripper pose count as untracked.
-
-    Raises:
-        InputError: Too few frames, too little rotation, or too few frames that show one place.
-    """
+    """Estimate rough camera poses; frames without a gripper pose count as untracked."""
     frames = tuple(frame for frame in recording.train if frame.base_from_gripper is not None)
     require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
     try:
@@ -152,7 +148,6 @@ def hand_eye_report(
 
 
 def _use(frame: Frame, built: BuiltMap) -> ImageUse | None:
-    """How the adjustment used a frame; None if it left it out as redundant."""
     assert built.hand_eye is not None, "the map was built for a hand-eye calibration"
     name = str(frame.image) if isinstance(frame.image, Path) else frame.name
     if frame.name in built.adjusted.wrong_poses:
@@ -164,7 +159,6 @@ def _use(frame: Frame, built: BuiltMap) -> ImageUse | None:
 
 
 def _warnings(adjusted: Adjusted) -> tuple[str, ...]:
-    """Errors that the covariance does not contain: wrong intrinsics or wrong poses."""
     warnings = []
     if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
         warnings.append(

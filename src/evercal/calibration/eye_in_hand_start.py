@@ -99,11 +99,7 @@ def hand_eye_start(
     encoder: Encoder,
     on_progress: OnProgress = lambda *_: None,
 ) -> HandEyeStart:
-    """Estimate `gripper_from_camera` from frames that all have `base_from_gripper`.
-
-    Raises:
-        InputError: Too little rotation, or too few frames that show the same place.
-    """
+    """Estimate `gripper_from_camera` from frames that all have `base_from_gripper`."""
     poses = SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper is not None])
     refuse_poor_motion(poses)
     if len(frames) > FRAMES:
@@ -114,11 +110,7 @@ def hand_eye_start(
 
 
 def solve_motions(base_from_gripper: SE3, motions: Sequence[PairMotion]) -> HandEyeStart:
-    """Solve A X = X B for `gripper_from_camera` by motions between pairs of (n,) gripper poses.
-
-    Raises:
-        InputError: Too few pairs, or too few that agree.
-    """
+    """Solve A X = X B for `gripper_from_camera` by motions between pairs of (n,) gripper poses."""
     if len(motions) < LEAST_PAIRS:
         raise InputError(
             f"only {len(motions)} pairs of images show the same place from two sides, at least"
@@ -162,7 +154,6 @@ def _refuse_disagreement(agree: NDArray[np.bool_]) -> None:
 
 
 def _robust_rotation(gripper: Array, camera: Array) -> tuple[Rotation, Array]:
-    """The rotation that takes camera axes to gripper axes, and the distances (n,) in radians."""
     weight = np.ones(len(gripper))
     rotation, distance = Rotation.identity(), weight
     for _ in range(30):

@@ -78,9 +78,6 @@ class Images:
             robot_poses: base_from_gripper of every image: (n,) poses, or a file whose rows are
                 paired with image files by name, by time or in order.
             convention: Convention of the file's numbers, if it does not state it.
-
-        Raises:
-            InputError: A file is missing or broken, or poses do not fit the images.
         """
         single = isinstance(source, str | os.PathLike) or (
             isinstance(source, np.ndarray) and source.ndim < 4
@@ -110,10 +107,6 @@ def calibrate(
     """Estimate the pose of a camera from images of a mapped scene, see `Map.calibrate`.
 
     `mount` is eye_in_hand by default if there are gripper poses and the camera moves.
-
-    Raises:
-        InputError: No image was located, eye_in_hand without gripper poses, or the scene's unit of
-            length is unknown.
     """
     grippers = given.base_from_gripper
     if grippers is not None and len(grippers) != len(given.images):
@@ -200,7 +193,6 @@ def _stands_still(located: Sequence[ImagePose]) -> bool:
 def _from_one_spot(
     located: Sequence[ImagePose], fused: Fused
 ) -> tuple[Array, tuple[ErrorTerm, ...]]:
-    """Covariance of a fixed camera: that of one image, plus the scatter over their number."""
     used = fused.select(located)
     shared = np.mean([item.covariance for item in used], axis=0)
     own = fused.scatter / len(used)
@@ -250,7 +242,6 @@ def _from_many_spots(
 
 
 def _by_base_motion(base_from_gripper: SE3, base_from_camera: SE3) -> Array:
-    """(6, 6) change of `gripper_from_camera` by a small motion (v, w) of the base frame."""
     inverse = base_from_gripper.rotation_matrix().T
     slope = np.zeros((6, 6))
     slope[:3, :3] = inverse
@@ -276,7 +267,6 @@ def _by_cause(used: Sequence[ImagePose], spots: int = 1) -> tuple[ErrorTerm, ...
 
 
 def _spots(poses: Sequence[SE3]) -> NDArray[np.int64]:
-    """(n,) index of the spot of each pose, in order of appearance."""
     centres: list[SE3] = []
     numbers = []
     for pose in poses:

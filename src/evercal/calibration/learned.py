@@ -18,11 +18,7 @@ from evercal.storage.stages import is_store
 
 
 def calibration_at(path: str | os.PathLike[str]) -> Calibration:
-    """Read a calibration from its file, from a map (`MAP`) or from one of its scenes (`MAP:SCENE`).
-
-    Raises:
-        InputError: As `read_calibration` and `learned_calibration`.
-    """
+    """Read a calibration from its file, a map (`MAP`) or one of its scenes (`MAP:SCENE`)."""
     root, _, scene = os.fspath(path).rpartition(":")
     if is_store(Path(path)):
         return learned_calibration(Path(path))
@@ -37,9 +33,6 @@ def learned_calibration(root: Path, scene: str | None = None) -> Calibration:
     Args:
         root: Folder of the map.
         scene: Name of the scene. Default: the only one that was learned from gripper poses.
-
-    Raises:
-        InputError: Not a map, no such scene, or none or several learned from gripper poses.
     """
     from evercal.calibration.eye_in_hand import HandEyeReport
     from evercal.mapping.store import stored_scenes

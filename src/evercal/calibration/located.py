@@ -85,11 +85,7 @@ def in_gripper_frame(located: Sequence[ImagePose], base_from_gripper: SE3) -> li
 
 
 def fuse(located: Sequence[ImagePose]) -> Fused:
-    """Fuse poses of one transform, with a reason for every image that is rejected.
-
-    Raises:
-        InputError: No image was located.
-    """
+    """Fuse poses of one transform, with a reason for every image that is rejected."""
     names = Counter(item.estimate.scene for item in located if item.is_located)
     if not names:
         first = located[0].estimate.reason if located else "no image was given"

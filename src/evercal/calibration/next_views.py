@@ -43,7 +43,6 @@ Array = NDArray[np.floating]
 
 
 def _covariance(metres: float, radians: float) -> Array:
-    """(6, 6) of a pose with independent axes."""
     return np.diag(np.repeat([metres, radians], 3) ** 2)
 
 
@@ -102,9 +101,6 @@ def next_views(
         count: Largest number of poses; fewer if no other pose adds information.
         gripper_from_camera: A rough one. Default: unknown, the camera at the gripper's origin.
         excluded: Poses that are not proposed. Default: those recorded.
-
-    Raises:
-        InputError: No reachable poses.
     """
     mount = SE3.identity() if gripper_from_camera is None else gripper_from_camera
     prior = np.zeros((12, 12))
@@ -133,10 +129,6 @@ def next_views_of_fixed_camera(
         reachable: (n,) base_from_gripper that the arm can go to.
         count: Largest number of poses; fewer if no other pose adds information.
         excluded: Poses that are not proposed, such as those recorded.
-
-    Raises:
-        InputError: Not a fixed camera, a map with a frame of its own, too few landmarks, or no
-            reachable poses.
     """
     if calibration.mount != "eye_to_hand" or calibration.camera is None:
         raise InputError("next views need the calibration of a fixed camera with intrinsics")
@@ -187,7 +179,6 @@ def _chosen(
 
 
 def _of_six(information: Array) -> Array:
-    """(..., 6, 6) covariance of the first six unknowns of matrices (..., N, N)."""
     return np.linalg.solve(information, np.eye(information.shape[-1])[:, :6])[..., :6, :]
 
 
@@ -231,7 +222,6 @@ def wrist_jacobian(base_from_gripper: SE3, mount: SE3, scene_m: Array) -> Array:
 
 
 def _of_mount(pose: SE3) -> Array:
-    """(6, 6) takes an error in the convention of `UncertainPose` to a tangent on the right."""
     turned = np.eye(6)
     turned[:3, :3] = pose.rotation_matrix().T
     return turned

@@ -57,9 +57,6 @@ def rig_of(cameras: Mapping[str, Calibration]) -> Rig:
 
     The errors of two cameras are taken as independent, which overestimates them for common
     landmarks.
-
-    Raises:
-        InputError: There are fewer than two cameras, or they are in different scenes.
     """
     scenes = {name: camera.source.get("scene") for name, camera in cameras.items()}
     if len(cameras) < 2:

@@ -98,11 +98,7 @@ class BoardPoses:
 
 
 def read_board_poses(path: str | os.PathLike[str]) -> BoardPoses:
-    """Read a file written by `evercal detect`.
-
-    Raises:
-        InputError: The file is missing or does not hold board poses.
-    """
+    """Read a file written by `evercal detect`."""
     return read_record(path, "file of camera poses", BoardPoses.from_dict)
 
 

@@ -44,11 +44,7 @@ _LARGEST_DOUBLED_PX = 1400
 
 @dataclass(frozen=True)
 class Board:
-    """A printed board.
-
-    Raises:
-        InputError: A size is invalid, or the dictionary is unknown.
-    """
+    """A printed board."""
 
     kind: BoardKind
     size_m: float
@@ -149,7 +145,6 @@ def _chessboard_candidates(grey: NDArray, size: tuple[int, int]) -> Iterator[Arr
 
 
 def _is_even(grid: Array) -> bool:
-    """Return whether steps between corners (rows, columns, 2) change slowly, as on a flat board."""
     for axis in (0, 1):
         steps = np.diff(grid, axis=axis)
         change = np.linalg.norm(np.diff(steps, axis=axis), axis=2)
@@ -159,7 +154,6 @@ def _is_even(grid: Array) -> bool:
 
 
 def _no_chessboard(grey: NDArray, board: Board) -> str:
-    """Return why a chessboard was not detected."""
     import cv2
 
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -223,7 +217,6 @@ def _in_windows(grey: NDArray, pixels: Array, free_px: Array) -> Array:
 
 
 def _steps(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
-    """Return the steps in pixels (n, 2) along x and y of corners (n, 2), and their area (n,)."""
     import cv2
 
     homography = cv2.findHomography(points, pixels)[0]
@@ -235,7 +228,6 @@ def _steps(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
 
 
 def _first_square_is_bright(grey: NDArray, grid: Array) -> bool:
-    """Return whether the square between the first four corners is bright."""
     import cv2
 
     middle = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
@@ -332,7 +324,6 @@ def _edges(grey: NDArray, starts: Array, ends: Array, reach: Array, count: int =
 
 
 def _lines(points: Array) -> Array:
-    """Fit homogeneous lines (n, 3) of unit normals to points (n, k, 2)."""
     middle = points.mean(1)
     spread = np.einsum("nki,nkj->nij", points - middle[:, None], points - middle[:, None])
     normal = np.linalg.eigh(np.nan_to_num(spread))[1][:, :, 0]
@@ -342,7 +333,6 @@ def _lines(points: Array) -> Array:
 def _crossings(
     corners: Array, first: Array, second: Array, reach_px: float = _LARGEST_MOVE_PX
 ) -> Array:
-    """Return where lines (n, 3) cross; corners (n, 2) where they cross far off or not at all."""
     crossing = np.cross(first, second)
     with np.errstate(divide="ignore", invalid="ignore"):
         refined = crossing[:, :2] / crossing[:, 2:]

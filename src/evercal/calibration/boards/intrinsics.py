@@ -116,9 +116,6 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
     """Estimate focal lengths, principal point and distortion (k1 k2 p1 p2 k3).
 
     Weak priors, see `LensPrior.usual`, keep what few views leave open within what is usual.
-
-    Raises:
-        InputError: Fewer than five views, or they do not determine the focal length.
     """
     if len(views) < MIN_VIEWS:
         raise InputError(
@@ -158,7 +155,6 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
 
 
 def _consistent(views: Sequence[BoardView], camera: Camera) -> list[BoardView]:
-    """Leave out false detections: views without a pose, or with much larger residuals."""
     rms = np.full(len(views), np.inf)
     for i, view in enumerate(views):
         with suppress(ValueError):

@@ -63,7 +63,6 @@ def board_image(board: Board, unit_px: int) -> NDArray[np.uint8]:
 
 
 def _cells(board: Board) -> int:
-    """Return the number of cells along a tag with its border, or 1 for a board of squares."""
     return dictionary_of(board).markerSize + 2 if board.kind == "apriltag" else 1
 
 
@@ -72,9 +71,6 @@ def drawing(board: Board, paper: str = "a4") -> "tuple[Image, float]":
 
     Returns:
         Black and white image, and its resolution in pixels per inch.
-
-    Raises:
-        InputError: The paper is not known, or the board does not fit.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -146,11 +142,7 @@ def _sheet(board: Board, paper: str, size_mm: NDArray) -> tuple[float, float]:
 
 
 def write_board(path: Path, board: Board, paper: str = "a4") -> None:
-    """Write a board at true size to a PDF or PNG file; the resolution is stored in the file.
-
-    Raises:
-        InputError: The file has another ending, or the board does not fit the paper.
-    """
+    """Write a board at true size to a PDF or PNG file; the resolution is stored in the file."""
     kind = path.suffix.lower()
     if kind not in FILE_KINDS:
         raise InputError(f"{path}: give a file name that ends with {' or '.join(FILE_KINDS)}")

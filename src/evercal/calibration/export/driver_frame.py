@@ -46,9 +46,6 @@ def read_link_from_optical(path: str | os.PathLike[str], link: str, optical: str
     The file is YAML or JSON: the output of `ros2 topic echo --once /tf_static`, a TransformStamped,
     or an object with `parent_frame`, `child_frame`, `translation_m`, `quaternion_wxyz`. Several
     transforms are chained in either direction.
-
-    Raises:
-        InputError: The file is missing or broken, or its transforms do not connect the two frames.
     """
     transforms: _Transforms = {}
     try:

@@ -92,9 +92,6 @@ def export_files(
         format: Name of a format in `FORMATS`; hyphens count as underscores.
         path: File to write, or a new folder for COLMAP. If omitted, nothing is written.
         options: Frame names and further inputs, see `ExportOptions`.
-
-    Raises:
-        InputError: The format is unknown, a required input is missing, or a frame name is invalid.
     """
     key = format.strip().lower().replace("-", "_")
     if key not in FORMATS:

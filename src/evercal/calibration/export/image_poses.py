@@ -17,7 +17,6 @@ from evercal.geometry import SE3
 
 
 def _image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
-    """Return the names of n images and base_from_camera (n,)."""
     robot = export.robot_poses
     if not export.in_hand:
         used = tuple(image.name for image in export.calibration.images if image.used)

@@ -134,7 +134,6 @@ def _numbers(export: Export, convention: str = "xyzw") -> list[str]:
 
 
 def _transform(export: Export) -> dict[str, dict[str, float]]:
-    """Return the fields of geometry_msgs/Transform."""
     x, y, z, *rotation = export.numbers()
     quaternion = dict(zip("xyzw", rotation, strict=True))
     return {"translation": {"x": x, "y": y, "z": z}, "rotation": quaternion}
@@ -146,7 +145,6 @@ def _flags(export: Export) -> dict[str, str]:
 
 
 def _handeye_frames(export: Export) -> dict[str, str]:
-    """Return the four frames of a hand-eye setup; the calibration itself names two of them."""
     other = export.robot_frame
     return {
         "robot_base_frame": other or "base" if export.in_hand else export.parent,

@@ -79,5 +79,4 @@ def widened(equation: PoseEquation, fit: HandEyeFit) -> HandEyeFit:
 
 
 def _misfit(fit: HandEyeFit) -> float:
-    """Root mean square residual of the translations, metres."""
     return float(np.sqrt((fit.residual[fit.inliers, :3] ** 2).mean()))

@@ -191,21 +191,18 @@ def estimate_levels(system: System, start: NoiseLevels | None = None) -> NoiseLe
 
 
 def _first_levels(system: System) -> Array:
-    """Return variances that explain equal shares of the residuals."""
     metres2, radians2 = (np.mean(part**2) for part in np.split(system.residual, 2, 1))
     rotations = [kind.startswith("rotation") for kind in system.directions]
     return np.where(rotations, radians2, metres2) * 2 / len(rotations) + 1e-18
 
 
 def _weighting(system: System, spreads: Array, variance: Array) -> tuple[Array, Array, Array]:
-    """Return weights (n, 6, 6), weighted derivatives, and the inverse of the normal equations."""
     weight = np.linalg.inv(system.known + _FLOOR + np.tensordot(variance, spreads, 1))
     weighted = weight @ system.jacobian
     return weight, weighted, normal_inverse(_normal(system, weighted))
 
 
 def _level_uncertainty(spreads: Array, weight: Array, weighted: Array, inverse: Array) -> Array:
-    """Return the inverse of the Fisher information of the restricted likelihood."""
     turned = spreads @ weight
     own = np.einsum("anij,bnji->ab", turned, turned)
     sides = spreads @ weighted
@@ -223,7 +220,6 @@ def noise_of(system: System, variance: Array) -> Array:
 
 
 def _spreads(system: System) -> Array:
-    """Return the (k, n, 6, 6) covariance due to a unit of variance of each kind of noise."""
     return np.stack([part @ part.transpose(0, 2, 1) for part in system.directions.values()])
 
 
@@ -267,7 +263,6 @@ def _normal(system: System, weighted: Array) -> Array:
 
 
 def _step(system: System, information: Array) -> tuple[Array, float]:
-    """Return a Gauss-Newton step and its squared Mahalanobis length."""
     weighted = information @ system.jacobian
     normal = _normal(system, weighted)
     # Scale the unknowns so that the normal equations are well conditioned.
@@ -314,7 +309,6 @@ def _result(equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels
 
 
 def _distances(system: System, noise: Array, covariance: Array, use: Mask) -> Array:
-    """Return the (n,) squared Mahalanobis distance of each residual."""
     # Used poses have moved the estimate towards themselves. A pose that alone constrains an unknown
     # has no spread along some axis.
     sign = np.where(use, -1.0, 1.0)[:, None, None]

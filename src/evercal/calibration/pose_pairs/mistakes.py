@@ -82,10 +82,6 @@ def require_agreement(
     """Check that pose pairs agree, and diagnose them otherwise.
 
     Camera poses `of_board` must see the board; camera poses in a map may see anything.
-
-    Raises:
-        InputError: Another reading of the poses fits far better or is far more plausible, or the
-            residuals are too large.
     """
     suspect = fit.metres > _SUSPECT_M or fit.radians > _SUSPECT_RAD or fit.inliers.mean() < _FEW
     readings = [_Reading(*other, mount) for other in _other_conventions(pairs, suspect)]
@@ -142,7 +138,6 @@ def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> No
 
 
 def _clearly_better(other: Agreement, fit: Agreement) -> bool:
-    """Whether a reading improves translation or rotation by far, or explains many more poses."""
     # Residuals below 0.01 mm and 0.01 mrad are not improved.
     metres, radians = max(other.metres, 1e-5), max(other.radians, 1e-5)
     ratios = metres / max(fit.metres, 1e-5), radians / max(fit.radians, 1e-5)
@@ -151,7 +146,6 @@ def _clearly_better(other: Agreement, fit: Agreement) -> bool:
 
 
 def _plausibility(reading: _Reading, fit: Agreement) -> float:
-    """Return how usual a geometry is, the logarithm of a probability density."""
     x, z = fit.at.parent_from_camera, fit.at.fixed_from_board
     usual = (_NEAR_M, _FAR_M) if reading.mount == "eye_in_hand" else (_FAR_M, _NEAR_M)
     lengths = np.array([np.linalg.norm(x.translation_m), np.linalg.norm(z.translation_m)])
@@ -260,7 +254,6 @@ def _other_conventions(pairs: PosePairs, every: bool) -> list[tuple[str, PosePai
 
 
 def _numbers(poses: SE3, given: PoseNumbers | None) -> list[PoseNumbers]:
-    """Return the numbers of a file, or of bare poses in the likely conventions."""
     if given is not None:
         return [given]
     likely = [pose_convention(n) for n in ("wxyz", "xyzw", "rpy", "ur", "staubli:m", "kuka:m")]
@@ -296,14 +289,12 @@ def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:
 
 
 def _angles(poses: SE3) -> Array:
-    """Return the rotation angles between all pairs of poses, radians."""
     i, j = np.triu_indices(len(poses), 1)
     q = poses.rotation_wxyz
     return 2 * np.arccos(np.minimum(np.abs((q[i] * q[j]).sum(1)), 1.0))
 
 
 def _mismatch_rad(robot: SE3, camera: SE3) -> float:
-    """Return the lower quartile of the differences between angles of robot and camera."""
     return float(np.quantile(np.abs(_angles(robot) - _angles(camera)), 0.25))
 
 

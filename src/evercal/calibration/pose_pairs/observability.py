@@ -20,13 +20,7 @@ _RECORD = "record 15 to 25 poses that differ by 20 to 60 deg about two axes and 
 
 
 def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
-    """Check that the pairs determine the calibration.
-
-    Raises:
-        InputError: There are too few different poses, lengths are not in metres, robot or camera
-            never moved, or the motion is degenerate: pure translation, pure rotation, or rotation
-            about one axis.
-    """
+    """Check that the pairs determine the calibration."""
     n = len(pairs)
     if n < MIN_POSES:
         raise InputError(

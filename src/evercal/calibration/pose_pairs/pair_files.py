@@ -83,9 +83,6 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
     If both files have names, equal names are paired, without folder and suffix. Otherwise, if both
     have times, the robot poses are interpolated at the times of the images. Otherwise rows are
     paired in order; the images of `evercal detect` are sorted naturally (image-2 before image-10).
-
-    Raises:
-        InputError: A file is broken, or the poses cannot be paired.
     """
     robot, camera = _read(files, "robot"), _read(files, "camera")
     if robot.names is not None and camera.names is not None:
@@ -177,7 +174,6 @@ def _read(files: PairFiles, role: Literal["robot", "camera"]) -> _Poses:
 
 
 def _inverted(convention: PoseConvention) -> PoseConvention:
-    """Return the convention of the same numbers that states the inverse."""
     words = convention.name.split(":")
     words = [w for w in words if w != "inverse"] if "inverse" in words else [*words, "inverse"]
     return replace(convention, name=":".join(words))

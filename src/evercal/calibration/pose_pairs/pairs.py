@@ -156,7 +156,6 @@ def listed(names: Sequence[str], limit: int = 5) -> str:
 
 
 def _inverse_velocity(base_from_gripper: SE3, velocity: Array) -> Array:
-    """Return the (n, 6) velocity of the base in the gripper frame."""
     linear, angular = np.split(velocity, 2, 1)
     gripper_from_base = np.swapaxes(base_from_gripper.rotation_matrix(), 1, 2)
     moved = np.cross(angular, base_from_gripper.translation_m) - linear
@@ -165,7 +164,6 @@ def _inverse_velocity(base_from_gripper: SE3, velocity: Array) -> Array:
 
 
 def _canonical(pose: SE3) -> Array:
-    """Return (n, 4) quaternions with a unique sign for each rotation."""
     quaternion = pose.rotation_wxyz
     largest = np.take_along_axis(quaternion, np.abs(quaternion).argmax(-1)[:, None], -1)
     return quaternion * np.where(largest < 0, -1.0, 1.0)

@@ -242,5 +242,4 @@ def _log_slope(rotvec: Array) -> Array:
 
 
 def _rotated(lever: Array) -> Array:
-    """Return (n, 6, 3) residuals of unit rotations about points at a distance of `lever` (n, 3)."""
     return np.concatenate([-cross_matrix(lever), np.broadcast_to(np.eye(3), (len(lever), 3, 3))], 1)

@@ -139,7 +139,6 @@ class PairSolution:
         return {self.pairs.names[i]: value for i, used, value in named if used}
 
     def _board_poses(self) -> dict[str, object]:
-        """Return the board pose of every pair by name, as JSON values."""
         poses = zip(self.rows, self.camera_from_board, strict=True)
         return {self.pairs.names[i]: pose_dict(pose) for i, pose in poses}
 

@@ -67,10 +67,6 @@ def solve(
 
     Returns:
         `gripper_from_camera` or `base_from_camera`.
-
-    Raises:
-        InputError: The poses do not determine the calibration or do not agree, or look like another
-            convention. The message states the reason and a remedy.
     """
     return solve_pairs(pairs, mount, scale_known, corners).calibration()
 
@@ -188,7 +184,6 @@ class _Problem:
 def _lens_warnings(
     fit: HandEyeFit, equation: PoseEquation, corners: BoardCorners | None, lens: Measured | None
 ) -> list[str]:
-    """Compare a stated focal length with the estimate."""
     if corners is None or lens is None or not corners.stated:
         return []
     stated = corners.prior

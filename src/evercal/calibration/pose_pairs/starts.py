@@ -63,7 +63,6 @@ def consensus_start(equation: PoseEquation, scale_known: bool = True) -> Start:
 
 
 def _triples(n: int) -> NDArray[np.int64]:
-    """Return (h, 3) indices of distinct poses."""
     if n * (n - 1) * (n - 2) // 6 <= _SAMPLES:
         return np.array(list(combinations(range(n), 3)))
     rng = np.random.default_rng(0)
@@ -105,7 +104,6 @@ def _solve_motions(
 
 
 def _sine_axes(rotations: Array) -> Array:
-    """Return rotation axes times twice the sine of the angle, (..., 3)."""
     skew = rotations - np.swapaxes(rotations, -1, -2)
     return np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
 
@@ -131,7 +129,6 @@ def _spread(rotations: Array, translations: Array) -> tuple[Array, Array, Array]
 
 
 def _nearest(matrices: Array) -> Array:
-    """Return the rotations nearest to (h, 3, 3) matrices."""
     left, _, right = np.linalg.svd(matrices)
     left[..., -1] *= np.linalg.det(left @ right)[..., None]
     return left @ right

@@ -67,10 +67,6 @@ def solve_with_offset(
     Returns:
         Calibration as from `solve`. `time_offset_s` in its checks is the time to add to a camera
         stamp to get the robot's time, and `time_offset_sigma_s` its standard deviation.
-
-    Raises:
-        InputError: As for `solve`, or the streams do not overlap, or the motion does not determine
-            the offset.
     """
     offset = _coarse_offset(robot, camera, largest_s)
     turns = 0
@@ -148,6 +144,5 @@ def _coarse_offset(robot: PoseTrack, camera: CameraTrack, largest_s: float) -> f
 
 
 def _angles(poses: SE3) -> Array:
-    """Return the (n - 1,) angles between successive poses, radians."""
     q = poses.rotation_wxyz
     return 2 * np.arccos(np.minimum(np.abs((q[:-1] * q[1:]).sum(1)), 1.0))
