@@ -37,10 +37,10 @@ def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
             f" {'one' if len(different) == 1 else 'ones'}"
             f" ({listed([pairs.names[i] for i in different])}); repeats add nothing: {_RECORD}"
         )
-    selected = pairs[different]
-    _require_motion(selected, scale_known)
-    require_rotations(selected.base_from_gripper)
-    spread = float(np.sqrt(selected.base_from_gripper.translation_m.var(0).sum()))
+    _require_motion(pairs[different], scale_known)
+    grippers = pairs.base_from_gripper[different]
+    require_rotations(grippers)
+    spread = float(np.sqrt(grippers.translation_m.var(0).sum()))
     if spread < _MIN_TRANSLATION_M:
         raise InputError(
             f"pure rotation: the gripper only turned on the spot (its positions vary by"

@@ -40,7 +40,7 @@ class PairFiles:
 
 @dataclass(frozen=True, eq=False)
 class _Poses:
-    """The n poses of a file."""
+    """The n poses of a table, or of a file of `evercal detect`."""
 
     names: tuple[str, ...] | None
     stamps_s: NDArray[np.float64] | None
@@ -50,20 +50,15 @@ class _Poses:
     measured: NDArray[np.bool_]
     """(n,) whether the image shows a board; true for a table."""
     numbers: PoseNumbers | None = None
-    """(n, k) numbers of a table."""
     board: BoardPoses | None = None
-    """The file of `evercal detect`."""
 
     def row_names(self) -> tuple[str, ...]:
-        """Return the names, or the row numbers of a file without names."""
         return self.names or tuple(f"row {i + 1}" for i in range(len(self.poses)))
 
     def numbers_of(self, rows: Sequence[int]) -> PoseNumbers | None:
-        """Return the numbers of some rows."""
         return self.numbers and self.numbers[np.array(rows, dtype=np.int64)]
 
     def corners_of(self, rows: Sequence[int]) -> BoardCorners | None:
-        """Return the corners of images that show the board."""
         if self.board is None:
             return None
         images, printed = self.board.images, self.board.board

@@ -32,17 +32,12 @@ class PoseNumbers:
     """Whether the camera's frame is the first of the pose."""
 
     def __getitem__(self, rows: NDArray[np.int64]) -> Self:
-        """Return a subset of the rows."""
         return replace(self, numbers=self.numbers[rows])
 
 
 @dataclass(frozen=True, eq=False)
 class PosePairs:
-    """n pose pairs; the board may be any object with camera poses: a tag, a map, an SfM model.
-
-    Raises:
-        ValueError: The numbers of names and poses differ.
-    """
+    """n pose pairs; the board may be any object with camera poses: a tag, a map, an SfM model."""
 
     names: tuple[str, ...]
     """(n,) names of images or rows."""
@@ -51,15 +46,11 @@ class PosePairs:
     camera_from_board: SE3
     """(n,) poses from the images."""
     camera_covariance: Array | None = None
-    """(n, 6, 6) covariance of `camera_from_board`: (translation in the camera frame, metres;
-    rotation about the board's axes, radians). If omitted, the noise is estimated from the pairs."""
+    """(n, 6, 6) covariance of `camera_from_board`, as in `BoardPose`. Default: it is estimated."""
     velocity: Array | None = None
-    """(n, 6) gripper velocity in the base frame, m/s and rad/s; required to estimate a time
-    offset."""
+    """(n, 6) gripper velocity in the base frame, m/s and rad/s, to estimate a time offset."""
     robot_numbers: PoseNumbers | None = None
-    """Numbers of the robot's file."""
     camera_numbers: PoseNumbers | None = None
-    """Numbers of the camera's file."""
 
     def __post_init__(self) -> None:
         counts = {len(self.names), len(self.base_from_gripper), len(self.camera_from_board)}
@@ -69,11 +60,9 @@ class PosePairs:
             raise ValueError(f"names and poses of pose pairs differ in number: {sorted(counts)}")
 
     def __len__(self) -> int:
-        """Return the number of pairs."""
         return len(self.names)
 
     def __getitem__(self, index: NDArray[np.int64] | Mask) -> Self:
-        """Return a subset of the pairs."""
         rows = np.arange(len(self))[index]
         covariance = self.camera_covariance
         return replace(

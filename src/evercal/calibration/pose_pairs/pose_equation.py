@@ -71,8 +71,7 @@ class Extras:
     groups: tuple[str, ...]
     """(q,) `intrinsics`, `shared depth`, `size` or `clock`."""
     slopes: Array
-    """(n, 6, q) derivatives of `camera_from_board`: translation in the camera frame, rotation about
-    the board's axes; zero for a time offset, which moves the robot instead."""
+    """(n, 6, q) derivatives of `camera_from_board`; zero for a time offset."""
     information: Array
     """(q, q) inverse covariance of the prior; zero for an unknown without prior."""
     mean: Array
@@ -138,17 +137,15 @@ class PoseEquation:
     camera_translation: Array
     """(n, 3) metres."""
     camera_covariance: Array
-    """(n, 6, 6) known covariance of `camera_from_board`: (translation in the camera frame, rotation
-    about the board's axes); zero if it is unknown."""
+    """(n, 6, 6) known covariance of `camera_from_board`; zero if it is unknown."""
     extras: Extras
     base_is_fixed: bool = True
     """Whether `fixed` is the robot base and `parent` the gripper, not the reverse."""
     velocity: Array | None = None
-    """(n, 6) velocity of the parent in the frame `fixed`, m/s and rad/s; required for the extra
-    `clock`, which is the last: the time to add to a camera stamp."""
+    """(n, 6) velocity of the parent in the frame `fixed`, for the last extra `clock`: the time to
+    add to a camera stamp."""
 
     def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Self:
-        """Return a subset of the poses."""
         return replace(
             self,
             robot_rotation=self.robot_rotation[index],
@@ -161,7 +158,6 @@ class PoseEquation:
         )
 
     def __len__(self) -> int:
-        """Return the number of poses."""
         return len(self.robot_translation)
 
     @property
