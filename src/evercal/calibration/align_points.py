@@ -1,13 +1,12 @@
 """Pose and scale of a map in the robot's base frame, from points that the tool has touched.
 
-Every point has coordinates in the base frame and is picked in located images. Triangulated picks
-give its position in the map. A similarity (seven parameters) relates the two, by least squares of
-the reprojection errors.
+Picks in located images give the position of a point in the map. A similarity takes it to its
+position in the base frame; reprojection errors are least.
 """
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +22,7 @@ PICK_SIGMA_PX = 1.0
 """Least standard deviation of a pixel that a person picked."""
 
 
-@dataclass(frozen=True, eq=False)
-class Picks:
+class Picks(NamedTuple):
     """One image with the points that were picked in it."""
 
     map_from_camera: SE3
@@ -32,20 +30,16 @@ class Picks:
     points: Array
     """(k, 3) in the base frame, metres."""
     names: tuple[str, ...]
-    """(k,) names of the points."""
     pixels: Array
     """(k, 2)."""
 
 
-@dataclass(frozen=True, eq=False)
-class PointAlignment:
+class PointAlignment(NamedTuple):
     """Pose and scale of the map in the base frame."""
 
     similarity: Similarity
-    """From the map to the base frame."""
     covariance: Array
-    """(7, 7) of a small motion (v, w) of the base frame, metres and radians, and of the logarithm
-    of the scale."""
+    """(7, 7) of a small motion (v, w) of the base frame, and of the logarithm of the scale."""
     residual_px: float
     """Root mean square distance of the picks."""
 

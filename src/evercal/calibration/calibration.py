@@ -30,6 +30,14 @@ FORMAT, VERSION = "evercal-calibration", 1
 Mount = Literal["eye_to_hand", "eye_in_hand"]
 
 
+def pose_dict(pose: SE3) -> dict[str, list[float]]:
+    """Return a pose as JSON values."""
+    return {
+        "translation_m": pose.translation_m.tolist(),
+        "quaternion_wxyz": pose.rotation_wxyz.tolist(),
+    }
+
+
 @dataclass(frozen=True)
 class ImageUse:
     """Use of one image or pose pair."""
@@ -39,9 +47,8 @@ class ImageUse:
     reason: str = ""
     """Reason for leaving it out; empty if it was used."""
     residual_mm: float | None = None
-    """Distance of its translation from the prediction."""
+    """Distance of its translation from the prediction; `residual_deg` of its rotation."""
     residual_deg: float | None = None
-    """The same for its rotation."""
 
 
 @dataclass(frozen=True)
@@ -78,12 +85,7 @@ def largest_term(terms: Sequence[ErrorTerm]) -> tuple[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Pose of a camera: `parent_from_child`.
-
-    Raises:
-        ValueError: The covariance is not (6, 6), finite, symmetric and positive semi-definite, or
-            both frames have one name.
-    """
+    """Pose of a camera: `parent_from_child`."""
 
     mount: Mount
     """`eye_to_hand`: the camera stands still. `eye_in_hand`: the gripper carries it."""
@@ -151,8 +153,7 @@ class Calibration:
             "parent_frame": self.parent_frame,
             "child_frame": self.child_frame,
             "meaning": self.meaning,
-            "translation_m": self.parent_from_child.translation_m.tolist(),
-            "quaternion_wxyz": self.parent_from_child.rotation_wxyz.tolist(),
+            **pose_dict(self.parent_from_child),
             "matrix": self.parent_from_child.matrix().tolist(),
             "covariance": self.covariance.tolist(),
             "sigma_mm": self.sigma_mm,
@@ -168,11 +169,7 @@ class Calibration:
 
     @classmethod
     def from_dict(cls, data: object) -> Self:
-        """Create a calibration from the values of `to_dict`.
-
-        Raises:
-            ValueError: The values have another format or version, or contradict each other.
-        """
+        """Create a calibration from the values of `to_dict`, or raise ValueError."""
         return of_format(data, FORMAT, VERSION, cls._from_mapping)
 
     @classmethod
@@ -192,8 +189,8 @@ class Calibration:
             parent_frame=str(data["parent_frame"]),
             child_frame=str(data["child_frame"]),
             camera=None if lens is None else Camera.from_dict(lens),
-            images=tuple(ImageUse(**image) for image in data.get("images", [])),
-            error_terms=tuple(ErrorTerm(**term) for term in data.get("error_terms", [])),
+            images=tuple(ImageUse(**row) for row in data.get("images", [])),
+            error_terms=tuple(ErrorTerm(**row) for row in data.get("error_terms", [])),
             checks=data.get("checks", {}),
             verdict=str(data.get("verdict", "")),
             source=data.get("source", {}),

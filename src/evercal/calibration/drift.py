@@ -29,10 +29,8 @@ _LEAST_MM, _LEAST_DEG = 0.7, 0.04
 """A shift counts as a move if it exceeds one of these."""
 _FLOOR = np.repeat([0.2e-3, np.deg2rad(0.008)], 3)
 """Standard deviation per axis from changes of light and objects, metres and radians."""
-_USUAL_SCATTER = np.repeat([0.4e-3, np.deg2rad(0.01)], 3)
-"""Prior scatter of a single image per axis, metres and radians."""
-_USUAL_WEIGHT = 5.0
-"""Weight of the prior scatter, in images."""
+_USUAL_SCATTER, _USUAL_WEIGHT = np.repeat([0.4e-3, np.deg2rad(0.01)], 3), 5.0
+"""Prior scatter of a single image per axis, metres and radians, and its weight in images."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,7 @@ Martin, IEEE T-RA 1994). The length l of B's translation is unknown, so its tran
 
     (R_A - I) t_X + t_A = l R_X d,   so   [R_X d]x ((R_A - I) t_X + t_A) = 0,
 
-which is linear in t_X. Directions of short or planar motions are poor, so this translation can be
-off by centimetres. Bundle adjustment converges from there.
+which is linear in t_X. It can be off by centimetres; bundle adjustment converges from there.
 """
 
 from collections.abc import Sequence
@@ -42,8 +41,7 @@ ANGLE_DEG, ROTATION_DEG, DIRECTION_DEG = 3.0, 5.0, 10.0
 LEAST_ROTATION_DEG, LEAST_PAIRS = 4.0, 6
 """Standard deviation of the rotations about a second axis, and pairs that must agree."""
 LEAST_SHARE = 0.1
-"""Share of the pairs that must agree. Before a chessboard most pairs match the wrong squares, and
-these do not agree with each other."""
+"""Share of the pairs that must agree; before a chessboard most match the wrong squares."""
 
 
 class PairMotion(NamedTuple):
@@ -51,7 +49,6 @@ class PairMotion(NamedTuple):
 
     first: int
     second: int
-    """Index of the frame."""
     rotation: Rotation
     """second_camera_from_first_camera."""
     direction: Array
@@ -64,9 +61,8 @@ class HandEyeStart:
 
     gripper_from_camera: SE3
     pairs: int
-    """Pairs of frames that agree with it."""
+    """Pairs of frames that agree with it, of those whose motion was estimated."""
     of_pairs: int
-    """Pairs of frames whose motion was estimated."""
 
 
 def rotation_spread_deg(base_from_gripper: SE3) -> Array:
@@ -77,7 +73,7 @@ def rotation_spread_deg(base_from_gripper: SE3) -> Array:
 
 
 def refuse_poor_motion(base_from_gripper: SE3) -> None:
-    """Refuse a recording with hardly any rotation, or with rotations about one axis only."""
+    """Refuse hardly any rotation, or rotations about one axis only."""
     first, second, _ = rotation_spread_deg(base_from_gripper)
     advice = (
         "record views that tilt the camera up and down and turn it left and right by 15 to 45 deg"

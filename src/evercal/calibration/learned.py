@@ -1,18 +1,9 @@
-"""The calibration of the camera on the gripper that a map keeps.
-
-A map stores the report of every scene that was learned from gripper poses, and the intrinsics that
-bundle adjustment estimated.
-"""
+"""The calibration of the camera on the gripper that a map keeps in the report of its scene."""
 
 import os
 from pathlib import Path
 
-from evercal.calibration.calibration import (
-    Calibration,
-    ErrorTerm,
-    ImageUse,
-    read_calibration,
-)
+from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, read_calibration
 from evercal.errors import InputError
 from evercal.storage.stages import is_store
 
@@ -28,12 +19,7 @@ def calibration_at(path: str | os.PathLike[str]) -> Calibration:
 
 
 def learned_calibration(root: Path, scene: str | None = None) -> Calibration:
-    """Return the `gripper_from_camera` that a map keeps of a wrist recording.
-
-    Args:
-        root: Folder of the map.
-        scene: Name of the scene. Default: the only one that was learned from gripper poses.
-    """
+    """Return the `gripper_from_camera` of a scene, by default the only one with gripper poses."""
     from evercal.calibration.eye_in_hand import HandEyeReport
     from evercal.mapping.store import stored_scenes
 

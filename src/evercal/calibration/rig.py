@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from evercal.calibration.calibration import Calibration
+from evercal.calibration.calibration import Calibration, pose_dict
 from evercal.errors import InputError
 from evercal.geometry import UncertainPose
 from evercal.storage import write_json
@@ -38,8 +38,7 @@ class Rig:
                 {
                     "parent_frame": first,
                     "child_frame": second,
-                    "translation_m": first_from_second.pose.translation_m.tolist(),
-                    "quaternion_wxyz": first_from_second.pose.rotation_wxyz.tolist(),
+                    **pose_dict(first_from_second.pose),
                     "matrix": first_from_second.pose.matrix().tolist(),
                     "covariance": first_from_second.covariance.tolist(),
                 }
@@ -53,11 +52,7 @@ class Rig:
 
 
 def rig_of(cameras: Mapping[str, Calibration]) -> Rig:
-    """Compute the relative poses of cameras, all eye_to_hand.
-
-    The errors of two cameras are taken as independent, which overestimates them for common
-    landmarks.
-    """
+    """Compute the relative poses of eye_to_hand cameras, as if their errors were independent."""
     scenes = {name: camera.source.get("scene") for name, camera in cameras.items()}
     if len(cameras) < 2:
         raise InputError("a rig has at least two cameras: give NAME=FOLDER for each")
