@@ -8,7 +8,7 @@
      "error_terms": [...], "checks": {...}, "verdict": "...", "source": {...}, "created": "..."}
 
 Metres, radians, quaternions w, x, y, z, OpenCV camera axes. `matrix`, `meaning` and the sigmas
-repeat other values, for people and for programs that read one of them.
+repeat other values for their readers.
 """
 
 import os
@@ -28,14 +28,6 @@ from evercal.storage.records import of_format, read_record
 
 FORMAT, VERSION = "evercal-calibration", 1
 Mount = Literal["eye_to_hand", "eye_in_hand"]
-
-
-def pose_dict(pose: SE3) -> dict[str, list[float]]:
-    """Return a pose as JSON values."""
-    return {
-        "translation_m": pose.translation_m.tolist(),
-        "quaternion_wxyz": pose.rotation_wxyz.tolist(),
-    }
 
 
 @dataclass(frozen=True)
@@ -67,7 +59,7 @@ class ErrorTerm:
 
 
 def position_shares(terms: Sequence[ErrorTerm]) -> list[float]:
-    """Share of each term in the variance of the position, 0 to 1; they sum to 1."""
+    """Share of each term in the variance of the position, 0 to 1."""
     variances = [term.translation_mm**2 for term in terms]
     total = sum(variances)
     return [variance / total if total > 0 else 0.0 for variance in variances]
@@ -75,12 +67,8 @@ def position_shares(terms: Sequence[ErrorTerm]) -> list[float]:
 
 def largest_term(terms: Sequence[ErrorTerm]) -> tuple[str, float]:
     """Name and share of the largest term of the position; an empty name without terms."""
-    shares = position_shares(terms)
-    return max(
-        zip((term.name for term in terms), shares, strict=True),
-        key=lambda pair: pair[1],
-        default=("", 0.0),
-    )
+    named = zip((term.name for term in terms), position_shares(terms), strict=True)
+    return max(named, key=lambda pair: pair[1], default=("", 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +141,8 @@ class Calibration:
             "parent_frame": self.parent_frame,
             "child_frame": self.child_frame,
             "meaning": self.meaning,
-            **pose_dict(self.parent_from_child),
+            "translation_m": self.parent_from_child.translation_m.tolist(),
+            "quaternion_wxyz": self.parent_from_child.rotation_wxyz.tolist(),
             "matrix": self.parent_from_child.matrix().tolist(),
             "covariance": self.covariance.tolist(),
             "sigma_mm": self.sigma_mm,

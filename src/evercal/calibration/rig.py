@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from evercal.calibration.calibration import Calibration, pose_dict
+from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
 from evercal.geometry import UncertainPose
 from evercal.storage import write_json
@@ -38,7 +38,8 @@ class Rig:
                 {
                     "parent_frame": first,
                     "child_frame": second,
-                    **pose_dict(first_from_second.pose),
+                    "translation_m": first_from_second.pose.translation_m.tolist(),
+                    "quaternion_wxyz": first_from_second.pose.rotation_wxyz.tolist(),
                     "matrix": first_from_second.pose.matrix().tolist(),
                     "covariance": first_from_second.covariance.tolist(),
                 }

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma
 from evercal.calibration.boards.detection import Board
-from evercal.calibration.calibration import pose_dict
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
 
@@ -126,12 +125,12 @@ def board_poses(
 
 
 def _image_to_dict(image: BoardImage) -> dict[str, Any]:
-    view, pose = image.view, image.camera_from_board
+    view = image.view
     return {
         "name": image.name,
         "reason": image.reason,
         "rms_px": image.rms_px,
-        "camera_from_board": None if pose is None else pose_dict(pose),
+        "camera_from_board": pose_to_dict(image.camera_from_board),
         "covariance": None if image.covariance is None else image.covariance.tolist(),
         "points_m": None if view is None else view.points_m.tolist(),
         "pixels": None if view is None else view.pixels.tolist(),

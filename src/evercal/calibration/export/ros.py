@@ -1,8 +1,8 @@
 """Formats of ROS: tf, launch files, URDF, easy_handeye and camera_info.
 
-Checked against tf2_ros's static_transform_publisher (flags in ROS 2, nine words in ROS 1), the
-fields of geometry_msgs/TransformStamped, camera_calibration_parsers, the messages and test files of
-easy_handeye2, and easy_handeye's reader, which takes exactly the keys below.
+Checked against tf2_ros's static_transform_publisher (flags in ROS 2, nine words in ROS 1),
+camera_calibration_parsers, the messages and test files of easy_handeye2, and easy_handeye's reader,
+which takes exactly the keys below.
 """
 
 import re
@@ -72,10 +72,7 @@ def stamped(export: Export) -> str:
 
 
 def urdf(export: Export) -> str:
-    """Write a fixed joint for a URDF or xacro that defines both links.
-
-    The angles rotate about fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll), in radians.
-    """
+    """Write a fixed joint; R = Rz(yaw) Ry(pitch) Rx(roll), about fixed axes, in radians."""
     numbers, name = _numbers(export, "rpy"), _node_name(export, r"\w.-")
     return f"""<joint name={quoteattr(name)} type="fixed">
   <!-- {_xml_comment(export)} -->

@@ -1,9 +1,7 @@
 """Pose pairs whose camera poses were measured by the corners of a board.
 
-The corners of all images determine the pose of the board in each image up to the intrinsics, which
-all images share. Eliminating the poses from the normal equations leaves what the corners say about
-the intrinsics (the Schur complement of bundle adjustment), and the derivative of each pose by them.
-The hand-eye equation with the intrinsics as extras is then the full reprojection problem.
+With the intrinsics as extras, the hand-eye equation is the full reprojection problem: what the
+corners say about them, and the derivative of each pose by them, come from `boards.corners`.
 """
 
 import math

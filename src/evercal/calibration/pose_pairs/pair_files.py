@@ -75,9 +75,8 @@ class _Poses:
 def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
     """Read robot and camera poses and pair them.
 
-    If both files have names, equal names are paired, without folder and suffix. Otherwise, if both
-    have times, the robot poses are interpolated at the times of the images. Otherwise rows are
-    paired in order; the images of `evercal detect` are sorted naturally (image-2 before image-10).
+    By names without folder and suffix if both files have them, else by times, else in order; the
+    images of `evercal detect` are sorted naturally (image-2 before image-10).
     """
     robot, camera = _read(files, "robot"), _read(files, "camera")
     if robot.names is not None and camera.names is not None:

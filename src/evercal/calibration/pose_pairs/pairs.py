@@ -77,10 +77,7 @@ class PosePairs:
         )
 
     def distinct(self, scale_known: bool = True) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return indices of different pairs, sorted by value whatever their order.
-
-        The second array holds for each of the n pairs the first equal pair.
-        """
+        """Return indices of different pairs, sorted by value, and (n,) the first equal pair."""
         keys = [*self.base_from_gripper.translation_m.T, *self.camera_from_board.translation_m.T]
         keys += [*_canonical(self.base_from_gripper).T, *_canonical(self.camera_from_board).T]
         order, first = np.lexsort(keys[::-1]), np.empty(len(self), dtype=np.int64)
@@ -88,10 +85,8 @@ class PosePairs:
         return order[first[order] == order], first
 
     def repeats(self, scale_known: bool = True) -> NDArray[np.int64]:
-        """Return (n,) the index of the first equal pair; the own index for a new pair.
-
-        Equal robot poses with different camera poses are not repeats: the robot pose is stale.
-        """
+        """Return (n,) the index of the first equal pair; the own index for a new pair."""
+        # Equal robot poses with different camera poses are no repeats: the robot pose is stale.
         first = np.arange(len(self))
         positions = self.base_from_gripper.translation_m
         close = KDTree(positions).query_pairs(_SAME_ROBOT_M, output_type="ndarray")
@@ -117,10 +112,7 @@ class PosePairs:
         return replace(self, camera_from_board=moved)
 
     def equation(self, mount: Mount, extras: Extras) -> PoseEquation:
-        """Return the equation to solve.
-
-        The board is fixed in the base for a camera on the arm, otherwise in the gripper.
-        """
+        """Return the equation; the board is fixed in the base for a camera on the arm."""
         on_arm, robot = mount == "eye_in_hand", self.base_from_gripper
         fixed_from_parent = robot if on_arm else robot.inverse()
         covariance, velocity = self.camera_covariance, self.velocity

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.intrinsics import LENS, moved_camera
-from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, Mount, pose_dict
+from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, Mount
 from evercal.calibration.located import length_mm_deg
 from evercal.calibration.pose_pairs.checks import held_out_error, left_open, repeatability
 from evercal.calibration.pose_pairs.fit import HandEyeFit
@@ -17,7 +17,7 @@ from evercal.calibration.pose_pairs.measured import BoardCorners, Measured, midd
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
 from evercal.calibration.verdict import verdict
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, pose_to_dict
 
 Array = NDArray[np.floating]
 
@@ -113,11 +113,11 @@ class PairSolution:
             **held_out_error(self.equation, fit),
             **repeatability(self.equation, fit),
             "target_m": float(np.median(distance)),
-            f"{fixed}_from_board": pose_dict(self.fixed_from_board),
+            f"{fixed}_from_board": pose_to_dict(self.fixed_from_board),
             "leave_one_out_mm": self._by_name(1000 * np.linalg.norm(fit.moved[:, :3], axis=1)),
             "information_percent": self._by_name(100 * fit.information),
             "camera_from_board": {
-                self.pairs.names[i]: pose_dict(pose)
+                self.pairs.names[i]: pose_to_dict(pose)
                 for i, pose in zip(self.rows, self.camera_from_board, strict=True)
             },
             "left_open": left_open(fit, self.parent),

@@ -15,7 +15,7 @@ from evercal.calibration.pose_pairs.measured import BoardCorners
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve_pairs
 from evercal.errors import InputError
-from evercal.geometry import SE3
+from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.pose_track import PoseTrack
 
 Array = NDArray[np.floating]
@@ -140,5 +140,4 @@ def _coarse_offset(robot: PoseTrack, camera: CameraTrack, largest_s: float) -> f
 
 
 def _angles(poses: SE3) -> Array:
-    q = poses.rotation_wxyz
-    return 2 * np.arccos(np.minimum(np.abs((q[:-1] * q[1:]).sum(1)), 1.0))
+    return pose_distance(poses[:-1], poses[1:])[1]
