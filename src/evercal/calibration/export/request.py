@@ -122,11 +122,11 @@ def prepare_export(
                 f"{role} frame {frame!r} is no name of a tf frame; use letters, digits, _ . - and"
                 f" inner /, such as 'camera_color_optical_frame' (rename with --parent or --child)"
             )
-    calibration = replace(calibration, parent_frame=parent, child_frame=child)
+    calibration = replace(calibration, parent_frame=parent, child_frame=link or child)
     if link is not None:
-        at = calibration.uncertain_pose @ link_from_optical.inverse()
-        moved = {"parent_from_child": at.pose, "covariance": at.covariance}
-        calibration = replace(calibration, child_frame=link, **moved)
+        moved = calibration.uncertain_pose @ link_from_optical.inverse()
+        pose, covariance = moved.pose, moved.covariance
+        calibration = replace(calibration, parent_from_child=pose, covariance=covariance)
     robot, target = options.get("robot_poses"), options.get("target_poses")
     if robot is not None and not isinstance(robot, RobotPoses):
         what, convention = "file of robot poses", options.get("convention")

@@ -47,7 +47,7 @@ class Unknowns:
         return SE3(quaternion, np.asarray(self.translations[which], dtype=np.float64))
 
     def moved(self, step: Array) -> "Unknowns":
-        """Return the unknowns after a (12 + q,) step: (translation, rotation) of X, of Z, extras."""
+        """Return the unknowns after a (12 + q,) step of (translation, rotation) of X, Z, extras."""
         both = step[:12].reshape(2, 6)
         turned = self.rotations @ Rotation.from_rotvec(both[:, 3:]).as_matrix()
         return Unknowns(turned, self.translations + both[:, :3], self.extras + step[12:])
