@@ -1,10 +1,9 @@
 """`align`: transform a scene that was learned in a frame of its own to the robot's base frame.
 
-A phone video with poses from structure from motion or SLAM gives a map with an arbitrary frame, and
-perhaps an arbitrary scale. A few images from a camera on the gripper determine the base: with
-gripper poses A, map poses B of the camera and X = gripper_from_camera, A X = Z B holds for
-Z = base_from_map, and both are estimated together. Alternatively, points that the tool has touched
-are picked in images. The error of Z is part of every later answer.
+A phone video gives a map with an arbitrary frame, and perhaps scale. A few images from a camera on
+the gripper determine the base: with gripper poses A, map poses B of the camera and
+X = gripper_from_camera, A X = Z B holds for Z = base_from_map, and both are estimated together.
+Alternatively, points that the tool has touched are picked in images.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,9 +39,8 @@ class MapAlignment:
     base_covariance: Array
     """(6, 6), see `MapFrame.base_covariance`."""
     used: int
-    """Images or points used."""
+    """Images or points used, of those `given`."""
     given: int
-    """Images or points given."""
     residual: str
     """Root mean square residual, with its unit."""
     gripper_from_camera: SE3 | None = None
@@ -53,11 +51,7 @@ class MapAlignment:
     """What the robot's motions contradict."""
 
     def applied_to(self, scene: SceneMap) -> SceneMap:
-        """Return the scene with answers in the base frame.
-
-        The robot ties the landmarks to the base, so the frame that the recording stated, and its
-        corrections, no longer count.
-        """
+        """Return the scene with answers in the base frame, whatever its recording stated."""
         frame = MapFrame(
             pose_sigma=scene.frame.pose_sigma,
             similarity=self.similarity,
@@ -67,7 +61,6 @@ class MapAlignment:
 
 
 def _in_own_frame(localizer: "Localizer", name: str) -> "Localizer":
-    """Return a localizer that answers in the frame of a scene's landmarks."""
     from evercal.localization.localizer import Localizer
 
     contents, scene = localizer.contents, localizer.contents.scene(name)
@@ -89,15 +82,11 @@ def align_by_gripper(
     Args:
         localizer: Localizer of the store.
         scene: Name of the scene; its previous alignment is ignored.
-        images: (name, (h, w, 3) uint8 RGB), five or more from places that turn about two axes.
+        images: Names and images of five or more places that turn about two axes.
         base_from_gripper: (n,) gripper poses.
         scale_known: Whether the scene was learned in metres.
         camera_from_board: Board poses by image name, for a fixed camera and a board in the gripper;
             images without a board are left out.
-
-    Raises:
-        InputError: The scale is unknown and a board is given, too few images were located in the
-            scene, or the motions do not determine the base frame.
     """
     localizer = _in_own_frame(localizer, scene)
     index = {name: i for i, (name, _) in enumerate(images)}
@@ -110,11 +99,8 @@ def align_by_gripper(
                 " frame by a camera on the gripper or by touched points"
             )
         # The gripper carries the board, so the board replaces the camera.
-        located = [
-            replace(item, pose=item.pose @ camera_from_board[item.name])
-            for item in located
-            if item.name in camera_from_board
-        ]
+        shown = (item for item in located if item.name in camera_from_board)
+        located = [replace(i, pose=i.pose @ camera_from_board[i.name]) for i in shown]
     if len(located) < LEAST_IMAGES:
         raise InputError(
             f"{len(located)} of {len(images)} images were located in {scene}; give at least"
@@ -145,10 +131,7 @@ def align_by_gripper(
 def _frame_covariance(
     fit: HandEyeFit, similarity: Similarity, map_from_camera: SE3, size: int
 ) -> tuple[Array, tuple[float, float]]:
-    """Covariance of the base frame as one motion of it, and sigmas in the middle of the cameras.
-
-    `size` is the column of the scale in the covariance of the fit.
-    """
+    """Covariance of the base frame as one motion of it, and sigmas in the middle of the cameras."""
     whole = fit.factor * fit.covariance
     picked = np.r_[6:12, size]
     own = whole[np.ix_(picked, picked)]
@@ -183,9 +166,6 @@ def aligned_by_points(
         points: (3,) by name, base frame, metres.
         picks: (name, (h, w, 3) uint8 RGB, pixels (2,) by name of the point) of each image.
         scale_known: Whether the scene was learned in metres.
-
-    Raises:
-        InputError: Fewer than two images were located, or too few points.
     """
     localizer, images = _in_own_frame(localizer, scene), []
     own = localizer.contents.scene(scene)
@@ -219,6 +199,5 @@ def aligned_by_points(
 
 
 def _about(point: Array, covariance: Array) -> Array:
-    """Covariance of a small motion about the origin, from that of one about a point (3,)."""
     adjoint = SE3(np.array([1.0, 0, 0, 0]), point).adjoint()
     return adjoint @ covariance @ adjoint.T

@@ -1,13 +1,12 @@
 """Pose and scale of a map in the robot's base frame, from points that the tool has touched.
 
-Every point has coordinates in the base frame and is picked in located images. Triangulated picks
-give its position in the map. A similarity (seven parameters) relates the two, by least squares of
-the reprojection errors.
+Picks in located images give the position of a point in the map. A similarity takes it to its
+position in the base frame; reprojection errors are least.
 """
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +22,7 @@ PICK_SIGMA_PX = 1.0
 """Least standard deviation of a pixel that a person picked."""
 
 
-@dataclass(frozen=True, eq=False)
-class Picks:
+class Picks(NamedTuple):
     """One image with the points that were picked in it."""
 
     map_from_camera: SE3
@@ -32,30 +30,22 @@ class Picks:
     points: Array
     """(k, 3) in the base frame, metres."""
     names: tuple[str, ...]
-    """(k,) names of the points."""
     pixels: Array
     """(k, 2)."""
 
 
-@dataclass(frozen=True, eq=False)
-class PointAlignment:
+class PointAlignment(NamedTuple):
     """Pose and scale of the map in the base frame."""
 
     similarity: Similarity
-    """From the map to the base frame."""
     covariance: Array
-    """(7, 7) of a small motion (v, w) of the base frame, metres and radians, and of the logarithm
-    of the scale."""
+    """(7, 7) of a small motion (v, w) of the base frame, and of the logarithm of the scale."""
     residual_px: float
     """Root mean square distance of the picks."""
 
 
 def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignment:
-    """Estimate the pose and, unless it is known, the scale of a map in the base frame.
-
-    Raises:
-        InputError: Fewer than three points are picked in two images, or all are on one line.
-    """
+    """Estimate the pose and, unless it is known, the scale of a map in the base frame."""
     triangulated = _triangulated(images)
     if len(triangulated) < 3:
         raise InputError(
@@ -118,7 +108,6 @@ def _triangulated(images: Sequence[Picks]) -> dict[str, tuple[Array, Array]]:
 
 
 def _umeyama(source: Array, target: Array, scale_known: bool) -> Similarity:
-    """Least squares similarity (Umeyama, PAMI 1991)."""
     a, b = source - source.mean(0), target - target.mean(0)
     spread = np.linalg.svd(b, compute_uv=False)
     if spread[1] < 0.02 * spread[0]:

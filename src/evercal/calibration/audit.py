@@ -25,14 +25,11 @@ POSE_FILES = ("calibration.json", "base_from_camera.txt")
 
 @dataclass(frozen=True)
 class AuditOptions:
-    """Limits of agreement."""
+    """Images of an episode to locate, and the largest differences in agreement."""
 
     images: int = 5
-    """Images of an episode to locate, spread over it."""
     most_mm: float = 5.0
-    """Largest difference of position in agreement, millimetres."""
     most_deg: float = 0.5
-    """Largest difference of rotation in agreement, degrees."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +57,11 @@ def audit(
 
     Args:
         localizer: Localizer of a store that holds the scene.
-        folder: Folder of the episodes: recorded scenes with camera poses, or images beside a
+        folder: Holds the episodes: recordings with camera poses, or images beside a
             `calibration.json` or a 4x4 matrix `base_from_camera.txt`.
         stated: base_from_camera of the episodes without a pose of their own.
         options: Limits of agreement.
         on_episode: Called after each episode.
-
-    Raises:
-        InputError: No episode, one without a camera pose, or a scene of unknown unit of length.
     """
     audited = []
     for episode in episode_folders(folder):
@@ -121,6 +115,10 @@ def _shots(episode: Path, stated: SE3 | None) -> list[_Shot]:
     pose = stated if pose_file is None else read_transform(pose_file)
     try:
         scene = load_recording(episode)
+        every = [
+            (frame.name, frame.read_image, frame.camera, frame.base_from_camera)
+            for frame in (*scene.train, *scene.test)
+        ]
     except InputError:
         files = sorted(p for p in episode.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS)
         if files and pose is None:
@@ -129,11 +127,6 @@ def _shots(episode: Path, stated: SE3 | None) -> list[_Shot]:
                 " the pose of all episodes with --calibration"
             ) from None
         every = [(file.name, partial(read_image, file), None, pose) for file in files]
-    else:
-        every = [
-            (frame.name, frame.read_image, frame.camera, frame.base_from_camera)
-            for frame in (*scene.train, *scene.test)
-        ]
     shots = [_Shot(name, read, camera, at) for name, read, camera, at in every if at is not None]
     if not shots:
         raise InputError(f"{episode}: no images with a stated camera pose in it")

@@ -8,7 +8,7 @@
      "error_terms": [...], "checks": {...}, "verdict": "...", "source": {...}, "created": "..."}
 
 Metres, radians, quaternions w, x, y, z, OpenCV camera axes. `matrix`, `meaning` and the sigmas
-repeat other values, for people and for programs that read one of them.
+repeat other values for their readers.
 """
 
 import os
@@ -39,9 +39,8 @@ class ImageUse:
     reason: str = ""
     """Reason for leaving it out; empty if it was used."""
     residual_mm: float | None = None
-    """Distance of its translation from the prediction."""
+    """Distance of its translation from the prediction; `residual_deg` of its rotation."""
     residual_deg: float | None = None
-    """The same for its rotation."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class ErrorTerm:
 
 
 def position_shares(terms: Sequence[ErrorTerm]) -> list[float]:
-    """Share of each term in the variance of the position, 0 to 1; they sum to 1."""
+    """Share of each term in the variance of the position, 0 to 1."""
     variances = [term.translation_mm**2 for term in terms]
     total = sum(variances)
     return [variance / total if total > 0 else 0.0 for variance in variances]
@@ -68,22 +67,13 @@ def position_shares(terms: Sequence[ErrorTerm]) -> list[float]:
 
 def largest_term(terms: Sequence[ErrorTerm]) -> tuple[str, float]:
     """Name and share of the largest term of the position; an empty name without terms."""
-    shares = position_shares(terms)
-    return max(
-        zip((term.name for term in terms), shares, strict=True),
-        key=lambda pair: pair[1],
-        default=("", 0.0),
-    )
+    named = zip((term.name for term in terms), position_shares(terms), strict=True)
+    return max(named, key=lambda pair: pair[1], default=("", 0.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Pose of a camera: `parent_from_child`.
-
-    Raises:
-        ValueError: The covariance is not (6, 6), finite, symmetric and positive semi-definite, or
-            both frames have one name.
-    """
+    """Pose of a camera: `parent_from_child`."""
 
     mount: Mount
     """`eye_to_hand`: the camera stands still. `eye_in_hand`: the gripper carries it."""
@@ -168,11 +158,7 @@ class Calibration:
 
     @classmethod
     def from_dict(cls, data: object) -> Self:
-        """Create a calibration from the values of `to_dict`.
-
-        Raises:
-            ValueError: The values have another format or version, or contradict each other.
-        """
+        """Create a calibration from the values of `to_dict`, or raise ValueError."""
         return of_format(data, FORMAT, VERSION, cls._from_mapping)
 
     @classmethod
@@ -192,8 +178,8 @@ class Calibration:
             parent_frame=str(data["parent_frame"]),
             child_frame=str(data["child_frame"]),
             camera=None if lens is None else Camera.from_dict(lens),
-            images=tuple(ImageUse(**image) for image in data.get("images", [])),
-            error_terms=tuple(ErrorTerm(**term) for term in data.get("error_terms", [])),
+            images=tuple(ImageUse(**row) for row in data.get("images", [])),
+            error_terms=tuple(ErrorTerm(**row) for row in data.get("error_terms", [])),
             checks=data.get("checks", {}),
             verdict=str(data.get("verdict", "")),
             source=data.get("source", {}),
@@ -214,20 +200,12 @@ class Calibration:
 
 
 def read_calibration(path: str | os.PathLike[str]) -> Calibration:
-    """Read a calibration file.
-
-    Raises:
-        InputError: The file is missing or holds no calibration.
-    """
+    """Read a calibration file."""
     return read_record(path, "calibration file", Calibration.from_dict)
 
 
 def read_transform(path: str | os.PathLike[str]) -> SE3:
-    """Read a rigid transform from a calibration file or from a 4x4 matrix as text.
-
-    Raises:
-        InputError: The file is missing or holds neither.
-    """
+    """Read a rigid transform from a calibration file or from a 4x4 matrix as text."""
     text = read_text(Path(path), "file")
     if text.lstrip().startswith("{"):
         return read_calibration(path).parent_from_child

@@ -29,10 +29,8 @@ _LEAST_MM, _LEAST_DEG = 0.7, 0.04
 """A shift counts as a move if it exceeds one of these."""
 _FLOOR = np.repeat([0.2e-3, np.deg2rad(0.008)], 3)
 """Standard deviation per axis from changes of light and objects, metres and radians."""
-_USUAL_SCATTER = np.repeat([0.4e-3, np.deg2rad(0.01)], 3)
-"""Prior scatter of a single image per axis, metres and radians."""
-_USUAL_WEIGHT = 5.0
-"""Weight of the prior scatter, in images."""
+_USUAL_SCATTER, _USUAL_WEIGHT = np.repeat([0.4e-3, np.deg2rad(0.01)], 3), 5.0
+"""Prior scatter of a single image per axis, metres and radians, and its weight in images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,12 +71,7 @@ def shift_between(
     localizer: "Localizer",
     confidence: float = CONFIDENCE,
 ) -> Shift:
-    """Compare `fused`, the pose of a camera now from `located` images, with its calibration.
-
-    Raises:
-        InputError: The reference is a camera on the gripper, or the scene's unit of length is
-            unknown.
-    """
+    """Compare `fused`, the pose of a camera now from `located` images, with its calibration."""
     from scipy import stats
 
     if reference.mount != "eye_to_hand":
@@ -119,7 +112,6 @@ def shift_between(
 
 
 def _scatter(measured: Sequence[tuple[Array, int]]) -> Array:
-    """Shrink measured scatters (6, 6), each with its number of images, towards the prior."""
     total, weight = _USUAL_WEIGHT * np.diag(_USUAL_SCATTER**2), _USUAL_WEIGHT
     for scatter, count in measured:
         total, weight = total + (count - 1) * scatter, weight + count - 1

@@ -1,7 +1,7 @@
 """A camera on the gripper, from nothing: images and gripper poses give `gripper_from_camera`.
 
-`eye_in_hand_start` estimates a first transform from pairs of images. The map's bundle adjustment
-refines it together with all poses and landmarks. This file connects the two and reports.
+`eye_in_hand_start` estimates a first transform from pairs of images, which the map's bundle
+adjustment refines together with all poses and landmarks.
 """
 
 from collections.abc import Sequence
@@ -34,12 +34,10 @@ class HandEyeReport:
     translation_m: tuple[float, ...]
     quaternion_wxyz: tuple[float, ...]
     covariance: tuple[tuple[float, ...], ...]
-    """(6, 6) of translation in the gripper frame, metres, and rotation about camera axes,
-    radians."""
+    """(6, 6), as in `Calibration`."""
     pairs: int
-    """Pairs of frames whose motion agrees with the first estimate."""
+    """Pairs of frames whose motion agrees with the first estimate, of those estimated."""
     of_pairs: int
-    """Pairs of frames whose motion was estimated."""
     start_mm: float
     """Change of the first estimate by bundle adjustment."""
     start_deg: float
@@ -51,7 +49,6 @@ class HandEyeReport:
     created: str = ""
     """ISO 8601 time with zone."""
     error_terms: tuple[ErrorTerm, ...] = ()
-    """Parts of the covariance by cause."""
     images: tuple[ImageUse, ...] = ()
     """Use of each frame; residuals are those of its gripper pose."""
 
@@ -89,23 +86,19 @@ class PosedByGripper(NamedTuple):
 def posed_by_gripper(
     recording: Recording, encoder: Encoder, on_progress: OnProgress = lambda *_: None
 ) -> PosedByGripper:
-    """Estimate rough camera poses; frames without a gripper pose count as untracked.
-
-    Raises:
-        InputError: Too few frames, too little rotation, or too few frames that show one place.
-    """
+    """Estimate rough camera poses; frames without a gripper pose count as untracked."""
     frames = tuple(frame for frame in recording.train if frame.base_from_gripper is not None)
     require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
     try:
         start = hand_eye_start(frames, encoder, on_progress=on_progress)
     except InputError as error:
         raise InputError(f"{recording.name}: {error}") from None
-    lost = len(recording.train) - len(frames)
     train = tuple(
         replace(frame, base_from_camera=frame.base_from_gripper @ start.gripper_from_camera)
         for frame in frames
         if frame.base_from_gripper is not None
     )
+    lost = len(recording.train) - len(frames)
     posed = replace(recording, train=train, untracked=recording.untracked + lost)
     return PosedByGripper(posed, start)
 
@@ -113,13 +106,9 @@ def posed_by_gripper(
 def hand_eye_report(
     start: HandEyeStart, built: BuiltMap, frames: Sequence[Frame], given: SE3 | None = None
 ) -> HandEyeReport:
-    """Return the estimate after bundle adjustment, compared with a `given` one.
+    """Return the estimate of a map that was built from `frames` with `MapOptions.for_hand_eye`.
 
-    Args:
-        start: First estimate.
-        built: Map that was built with `MapOptions.for_hand_eye`.
-        frames: The frames that it was built from.
-        given: `gripper_from_camera` from another source, to compare with.
+    `given` is `gripper_from_camera` from another source, to compare with.
     """
     correction = built.hand_eye
     assert correction is not None, "the map was built for a hand-eye calibration"
@@ -128,9 +117,7 @@ def hand_eye_report(
     start_from_camera = UncertainPose(correction.start_camera_from_camera, covariance)
     estimate = start.gripper_from_camera @ start_from_camera
     start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.gripper_from_camera)
-    given_mm, given_deg = None, None
-    if given is not None:
-        given_mm, given_deg = pose_distance_mm_deg(estimate.pose, given)
+    from_given = (None, None) if given is None else pose_distance_mm_deg(estimate.pose, given)
     return HandEyeReport(
         translation_m=tuple(estimate.pose.translation_m.tolist()),
         quaternion_wxyz=tuple(estimate.pose.rotation_wxyz.tolist()),
@@ -139,8 +126,8 @@ def hand_eye_report(
         of_pairs=start.of_pairs,
         start_mm=start_mm,
         start_deg=start_deg,
-        given_mm=given_mm,
-        given_deg=given_deg,
+        given_mm=from_given[0],
+        given_deg=from_given[1],
         warnings=_warnings(built.adjusted),
         error_terms=(
             ErrorTerm.of("noise of images and gripper poses", correction.by_noise),
@@ -152,7 +139,6 @@ def hand_eye_report(
 
 
 def _use(frame: Frame, built: BuiltMap) -> ImageUse | None:
-    """How the adjustment used a frame; None if it left it out as redundant."""
     assert built.hand_eye is not None, "the map was built for a hand-eye calibration"
     name = str(frame.image) if isinstance(frame.image, Path) else frame.name
     if frame.name in built.adjusted.wrong_poses:
@@ -164,7 +150,6 @@ def _use(frame: Frame, built: BuiltMap) -> ImageUse | None:
 
 
 def _warnings(adjusted: Adjusted) -> tuple[str, ...]:
-    """Errors that the covariance does not contain: wrong intrinsics or wrong poses."""
     warnings = []
     if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
         warnings.append(

@@ -7,8 +7,7 @@ Martin, IEEE T-RA 1994). The length l of B's translation is unknown, so its tran
 
     (R_A - I) t_X + t_A = l R_X d,   so   [R_X d]x ((R_A - I) t_X + t_A) = 0,
 
-which is linear in t_X. Directions of short or planar motions are poor, so this translation can be
-off by centimetres. Bundle adjustment converges from there.
+which is linear in t_X. It can be off by centimetres; bundle adjustment converges from there.
 """
 
 from collections.abc import Sequence
@@ -44,8 +43,7 @@ LEAST_ROTATION_DEG, LEAST_PAIRS = 4.0, 6
 ENCODED_SIDE = 240
 """Short side of the images that are encoded, pixels."""
 LEAST_SHARE = 0.1
-"""Share of the pairs that must agree. Before a chessboard most pairs match the wrong squares, and
-these do not agree with each other."""
+"""Share of the pairs that must agree; before a chessboard most match the wrong squares."""
 
 
 class PairMotion(NamedTuple):
@@ -53,7 +51,6 @@ class PairMotion(NamedTuple):
 
     first: int
     second: int
-    """Index of the frame."""
     rotation: Rotation
     """second_camera_from_first_camera."""
     direction: Array
@@ -66,9 +63,8 @@ class HandEyeStart:
 
     gripper_from_camera: SE3
     pairs: int
-    """Pairs of frames that agree with it."""
+    """Pairs of frames that agree with it, of those whose motion was estimated."""
     of_pairs: int
-    """Pairs of frames whose motion was estimated."""
 
 
 def rotation_spread_deg(base_from_gripper: SE3) -> Array:
@@ -79,7 +75,7 @@ def rotation_spread_deg(base_from_gripper: SE3) -> Array:
 
 
 def refuse_poor_motion(base_from_gripper: SE3) -> None:
-    """Refuse a recording with hardly any rotation, or with rotations about one axis only."""
+    """Refuse hardly any rotation, or rotations about one axis only."""
     first, second, _ = rotation_spread_deg(base_from_gripper)
     advice = (
         "record views that tilt the camera up and down and turn it left and right by 15 to 45 deg"
@@ -101,11 +97,7 @@ def hand_eye_start(
     encoder: Encoder,
     on_progress: OnProgress = lambda *_: None,
 ) -> HandEyeStart:
-    """Estimate `gripper_from_camera` from frames that all have `base_from_gripper`.
-
-    Raises:
-        InputError: Too little rotation, or too few frames that show the same place.
-    """
+    """Estimate `gripper_from_camera` from frames that all have `base_from_gripper`."""
     poses = SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper is not None])
     refuse_poor_motion(poses)
     if len(frames) > FRAMES:
@@ -116,11 +108,7 @@ def hand_eye_start(
 
 
 def solve_motions(base_from_gripper: SE3, motions: Sequence[PairMotion]) -> HandEyeStart:
-    """Solve A X = X B for `gripper_from_camera` by motions between pairs of (n,) gripper poses.
-
-    Raises:
-        InputError: Too few pairs, or too few that agree.
-    """
+    """Solve A X = X B for `gripper_from_camera` by motions between pairs of (n,) gripper poses."""
     if len(motions) < LEAST_PAIRS:
         raise InputError(
             f"only {len(motions)} pairs of images show the same place from two sides, at least"
@@ -164,7 +152,6 @@ def _refuse_disagreement(agree: NDArray[np.bool_]) -> None:
 
 
 def _robust_rotation(gripper: Array, camera: Array) -> tuple[Rotation, Array]:
-    """The rotation that takes camera axes to gripper axes, and the distances (n,) in radians."""
     weight = np.ones(len(gripper))
     rotation, distance = Rotation.identity(), weight
     for _ in range(30):

@@ -70,18 +70,7 @@ class Images:
         robot_poses: str | os.PathLike[str] | SE3 | None = None,
         convention: str | None = None,
     ) -> Self:
-        """Read images from files or take them from arrays.
-
-        Args:
-            source: A folder, image files, or arrays.
-            camera: Intrinsics at any size of the same aspect ratio.
-            robot_poses: base_from_gripper of every image: (n,) poses, or a file whose rows are
-                paired with image files by name, by time or in order.
-            convention: Convention of the file's numbers, if it does not state it.
-
-        Raises:
-            InputError: A file is missing or broken, or poses do not fit the images.
-        """
+        """Read images from files or take them from arrays, see `Map.calibrate`."""
         single = isinstance(source, str | os.PathLike) or (
             isinstance(source, np.ndarray) and source.ndim < 4
         )
@@ -110,10 +99,6 @@ def calibrate(
     """Estimate the pose of a camera from images of a mapped scene, see `Map.calibrate`.
 
     `mount` is eye_in_hand by default if there are gripper poses and the camera moves.
-
-    Raises:
-        InputError: No image was located, eye_in_hand without gripper poses, or the scene's unit of
-            length is unknown.
     """
     grippers = given.base_from_gripper
     if grippers is not None and len(grippers) != len(given.images):
@@ -132,7 +117,6 @@ def calibrate(
     fused = fuse(moved)
     scene = localizer.contents.metric_scene(fused.scene)
     height, width = given.images[0][1].shape[:2]
-    # The guess fits images of another aspect ratio, too.
     stated = cameras_in_scenes(given.camera, given.images[0][1], [scene])[0]
     camera = estimated_camera(fused.select(located), stated)
     if mount == "eye_to_hand":
@@ -150,12 +134,6 @@ def calibrate(
     halves = halves_apart(SE3.stack([item.pose for item in fused.select(moved)]))
     if halves is not None:
         checks |= {"repeatability_mm": halves[0], "repeatability_deg": halves[1]}
-    source = {
-        "command": "calibrate",
-        "scene": fused.scene,
-        "map": scene.digest,
-        "intrinsics": "map" if given.camera is None else "given",
-    }
     calibration = Calibration(
         mount=mount,
         parent_from_child=fused.pose,
@@ -165,7 +143,12 @@ def calibrate(
         images=fused.uses,
         error_terms=terms,
         checks=checks,
-        source=source,
+        source={
+            "command": "calibrate",
+            "scene": fused.scene,
+            "map": scene.digest,
+            "intrinsics": "map" if given.camera is None else "given",
+        },
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
     sentences = [verdict(calibration), *_advice(calibration, fused, camera, stated)]
@@ -200,7 +183,6 @@ def _stands_still(located: Sequence[ImagePose]) -> bool:
 def _from_one_spot(
     located: Sequence[ImagePose], fused: Fused
 ) -> tuple[Array, tuple[ErrorTerm, ...]]:
-    """Covariance of a fixed camera: that of one image, plus the scatter over their number."""
     used = fused.select(located)
     shared = np.mean([item.covariance for item in used], axis=0)
     own = fused.scatter / len(used)
@@ -215,10 +197,7 @@ def _from_many_spots(
     base_from_gripper: SE3,
     base_covariance: Array | None,
 ) -> tuple[Array, tuple[ErrorTerm, ...]]:
-    """Covariance of a camera on the gripper: the scatter among spots, and that of one spot.
-
-    An error of the base frame is common to all spots, so it does not average out.
-    """
+    """Covariance of a camera on the gripper: scatter among spots, one spot's, the base frame's."""
     from scipy import stats
 
     used, cameras = fused.select(moved), [item.pose for item in fused.select(located)]
@@ -250,7 +229,6 @@ def _from_many_spots(
 
 
 def _by_base_motion(base_from_gripper: SE3, base_from_camera: SE3) -> Array:
-    """(6, 6) change of `gripper_from_camera` by a small motion (v, w) of the base frame."""
     inverse = base_from_gripper.rotation_matrix().T
     slope = np.zeros((6, 6))
     slope[:3, :3] = inverse
@@ -260,10 +238,7 @@ def _by_base_motion(base_from_gripper: SE3, base_from_camera: SE3) -> Array:
 
 
 def _by_cause(used: Sequence[ImagePose], spots: int = 1) -> tuple[ErrorTerm, ...]:
-    """The mean covariance of the images by cause, over the number of spots.
-
-    The moving axes of a gripper do not matter, since a term has one deviation for three axes.
-    """
+    """The mean covariance of the images by cause, over the number of spots."""
     total = {name: np.zeros((6, 6)) for name in get_args(Cause)}
     for item in used:
         terms = item.estimate.terms
@@ -276,7 +251,6 @@ def _by_cause(used: Sequence[ImagePose], spots: int = 1) -> tuple[ErrorTerm, ...
 
 
 def _spots(poses: Sequence[SE3]) -> NDArray[np.int64]:
-    """(n,) index of the spot of each pose, in order of appearance."""
     centres: list[SE3] = []
     numbers = []
     for pose in poses:
@@ -289,7 +263,6 @@ def _spots(poses: Sequence[SE3]) -> NDArray[np.int64]:
 
 
 def _advice(calibration: Calibration, fused: Fused, camera: Camera, stated: Camera) -> list[str]:
-    """What was done about the intrinsics, and how to improve the result."""
     advice = []
     if camera != stated:
         advice.append(
@@ -320,7 +293,6 @@ def _advice(calibration: Calibration, fused: Fused, camera: Camera, stated: Came
 
 
 def _lens_advice(calibration: Calibration) -> list[str]:
-    """What to do where the intrinsics are the largest term of the position."""
     name, share = largest_term(calibration.error_terms)
     if name != "lens":
         return []

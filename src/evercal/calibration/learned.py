@@ -1,28 +1,15 @@
-"""The calibration of the camera on the gripper that a map keeps.
-
-A map stores the report of every scene that was learned from gripper poses, and the intrinsics that
-bundle adjustment estimated.
-"""
+"""The calibration of the camera on the gripper that a map keeps in the report of its scene."""
 
 import os
 from pathlib import Path
 
-from evercal.calibration.calibration import (
-    Calibration,
-    ErrorTerm,
-    ImageUse,
-    read_calibration,
-)
+from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, read_calibration
 from evercal.errors import InputError
 from evercal.storage.stages import is_store
 
 
 def calibration_at(path: str | os.PathLike[str]) -> Calibration:
-    """Read a calibration from its file, from a map (`MAP`) or from one of its scenes (`MAP:SCENE`).
-
-    Raises:
-        InputError: As `read_calibration` and `learned_calibration`.
-    """
+    """Read a calibration from its file, a map (`MAP`) or one of its scenes (`MAP:SCENE`)."""
     root, _, scene = os.fspath(path).rpartition(":")
     if is_store(Path(path)):
         return learned_calibration(Path(path))
@@ -32,15 +19,7 @@ def calibration_at(path: str | os.PathLike[str]) -> Calibration:
 
 
 def learned_calibration(root: Path, scene: str | None = None) -> Calibration:
-    """Return the `gripper_from_camera` that a map keeps of a wrist recording.
-
-    Args:
-        root: Folder of the map.
-        scene: Name of the scene. Default: the only one that was learned from gripper poses.
-
-    Raises:
-        InputError: Not a map, no such scene, or none or several learned from gripper poses.
-    """
+    """Return the `gripper_from_camera` of a scene, by default the only one with gripper poses."""
     from evercal.calibration.eye_in_hand import HandEyeReport
     from evercal.mapping.store import stored_scenes
 

@@ -33,7 +33,7 @@ class ImagePose:
     pose: SE3
     """Pose to fuse: base_from_camera or gripper_from_camera. Identity if it was not located."""
     covariance: Array
-    """(6, 6) of translation in the parent frame and rotation about camera axes."""
+    """(6, 6), as in `Calibration`."""
 
     @property
     def is_located(self) -> bool:
@@ -55,7 +55,7 @@ class Fused:
     scene: str
 
     def select(self, items: Sequence[Item]) -> list[Item]:
-        """Return the items of the images that were used."""
+        """Return the items of the used images."""
         return [item for item, used in zip(items, self.used, strict=True) if used]
 
 
@@ -85,11 +85,7 @@ def in_gripper_frame(located: Sequence[ImagePose], base_from_gripper: SE3) -> li
 
 
 def fuse(located: Sequence[ImagePose]) -> Fused:
-    """Fuse poses of one transform, with a reason for every image that is rejected.
-
-    Raises:
-        InputError: No image was located.
-    """
+    """Fuse poses of one transform, with a reason for every image that is rejected."""
     names = Counter(item.estimate.scene for item in located if item.is_located)
     if not names:
         first = located[0].estimate.reason if located else "no image was given"

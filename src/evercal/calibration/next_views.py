@@ -1,8 +1,7 @@
 """The gripper poses whose images reduce the uncertainty of a calibration most, for both mounts.
 
-What is known is an information matrix of the unknowns, and every further image adds its own. The
-pose that lowers the mean variance of a point in front of the camera most is proposed, then the next
-one (A-optimality), so that metres and radians add up.
+Every further image adds to the information on the unknowns. The pose that lowers the mean variance
+of a point in front of the camera most is proposed, then the next one (A-optimality).
 
 **Camera on the gripper.** A view has a stated gripper pose G and a measured camera pose C in the
 scene. With X = gripper_from_camera and Z = base_from_scene, G X = Z C. The residual
@@ -10,15 +9,13 @@ log((G X)^-1 Z C) is a tangent of the camera frame, and to first order
 
     r = - (R_X^T dt, dr) + Ad(C^-1) dz - Ad(X^-1) g + c.
 
-(dt, dr) is the error of X in the convention of `UncertainPose`, dz that of Z on its right, g the
-noise of the gripper pose and c that of the camera pose, each on the right of its pose. Z is
-unknown, so X is seen only in differences between views: rotations about two axes are needed (Tsai
-and Lenz, IEEE T-RA 1989).
+(dt, dr) is the error of X in the convention of `UncertainPose`, dz that of Z on its right, g and c
+the noise of the gripper and the camera pose, each on the right of its pose. Z is unknown, so X is
+seen only in differences between views: rotations about two axes are needed.
 
 **Fixed camera.** It is located by landmarks of a map that wrist images made. A further wrist image
-shows some of them again and reduces the errors of their depths, of the keyframes' poses and of X.
-The unknowns are, in this order, errors of the fixed camera's pose, of X, of each keyframe's pose
-about G X, and of the inverse depths.
+shows some of them again. The unknowns are, in this order, errors of the fixed camera's pose, of X,
+of each keyframe's pose about G X, and of the inverse depths.
 """
 
 from dataclasses import dataclass
@@ -43,7 +40,6 @@ Array = NDArray[np.floating]
 
 
 def _covariance(metres: float, radians: float) -> Array:
-    """(6, 6) of a pose with independent axes."""
     return np.diag(np.repeat([metres, radians], 3) ** 2)
 
 
@@ -53,22 +49,18 @@ CAMERA_NOISE = _covariance(0.3e-3, np.deg2rad(0.03))
 """(6, 6) covariance of a camera pose that an image gives, in the scene."""
 PIXEL_PX = 0.3
 """Standard deviation of a landmark in an image."""
-_ROUGH = _covariance(0.05, np.deg2rad(15.0))
-"""Of a `gripper_from_camera` that is roughly known."""
-_UNKNOWN = _covariance(0.2, np.pi)
-"""Of one that is not."""
+_ROUGH, _UNKNOWN = _covariance(0.05, np.deg2rad(15.0)), _covariance(0.2, np.pi)
+"""Of a `gripper_from_camera` that is roughly known, and of one that is not."""
 _ANYWHERE = _covariance(1.0, np.pi)
 """Of the pose of the scene, or of a fixed camera, before any image."""
-_AT_M = 0.3
-"""Distance from the camera of the point whose variance counts."""
+_AT_M, _AHEAD_M = 0.3, 0.5
+"""Distance of the point whose variance counts; distance of the scene before parallel cameras."""
 _APART_M, _APART_DEG = 0.02, 4.0
 """Poses nearer than both are the same one: errors of an arm repeat where its pose does."""
-_AHEAD_M = 0.5
-"""Distance of the scene where the viewing directions do not show it."""
 MOST_LANDMARKS, LEAST_LANDMARKS = 80, 12
-"""Landmarks of a fixed camera that are used, and that a view must show to count."""
+"""Maximum number of landmarks of a fixed camera, and minimum that a view must show."""
 MOST_TURN_DEG, MOST_ZOOM = 50.0, 2.2
-"""Largest change of viewing angle and scale at which a landmark is matched."""
+"""Maximum change of viewing angle and scale at which a landmark is matched."""
 _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 2e-5, 2e-5
 """Least standard deviations of the pose of a keyframe."""
 
@@ -84,7 +76,6 @@ class NextViews:
     sigma_mm: tuple[float, ...]
     """(k + 1,) expected standard deviation per axis: now, and after each pose."""
     sigma_deg: tuple[float, ...]
-    """(k + 1,) the same of the rotation."""
 
 
 def next_views(
@@ -100,11 +91,8 @@ def next_views(
         recorded: (m,) base_from_gripper of the images so far.
         reachable: (n,) base_from_gripper that the arm can go to.
         count: Largest number of poses; fewer if no other pose adds information.
-        gripper_from_camera: A rough one. Default: unknown, the camera at the gripper's origin.
+        gripper_from_camera: A rough one. Default: unknown.
         excluded: Poses that are not proposed. Default: those recorded.
-
-    Raises:
-        InputError: No reachable poses.
     """
     mount = SE3.identity() if gripper_from_camera is None else gripper_from_camera
     prior = np.zeros((12, 12))
@@ -133,10 +121,6 @@ def next_views_of_fixed_camera(
         reachable: (n,) base_from_gripper that the arm can go to.
         count: Largest number of poses; fewer if no other pose adds information.
         excluded: Poses that are not proposed, such as those recorded.
-
-    Raises:
-        InputError: Not a fixed camera, a map with a frame of its own, too few landmarks, or no
-            reachable poses.
     """
     if calibration.mount != "eye_to_hand" or calibration.camera is None:
         raise InputError("next views need the calibration of a fixed camera with intrinsics")
@@ -187,7 +171,6 @@ def _chosen(
 
 
 def _of_six(information: Array) -> Array:
-    """(..., 6, 6) covariance of the first six unknowns of matrices (..., N, N)."""
     return np.linalg.solve(information, np.eye(information.shape[-1])[:, :6])[..., :6, :]
 
 
@@ -197,10 +180,7 @@ def _near(pose: SE3, others: SE3) -> NDArray[np.bool_]:
 
 
 def looked_at(base_from_camera: SE3) -> Array:
-    """The point (3,) nearest to the optical axes of (n,) cameras, base frame.
-
-    For parallel axes it lies half a metre ahead of them.
-    """
+    """The point (3,) nearest to the optical axes of (n,) cameras, or ahead of parallel ones."""
     axes = base_from_camera.rotation_matrix()[..., 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     ahead = (base_from_camera.translation_m + _AHEAD_M * axes).mean(0)
@@ -219,10 +199,7 @@ def wrist_information(base_from_gripper: SE3, mount: SE3, scene_m: Array) -> Arr
 
 
 def wrist_jacobian(base_from_gripper: SE3, mount: SE3, scene_m: Array) -> Array:
-    """(n, 6, 12) derivatives of the residuals by the errors of X and Z.
-
-    `mount` is a rough X; `scene_m` (3,) is the point of the base frame about which Z rotates.
-    """
+    """(n, 6, 12) derivatives of the residuals by the errors of X and of Z about `scene_m` (3,)."""
     camera_from_scene = (base_from_gripper @ mount).inverse() @ SE3.from_translation(scene_m)
     jacobian = np.zeros((len(base_from_gripper), 6, 12))
     jacobian[:, :, :6] = -_of_mount(mount)
@@ -231,7 +208,6 @@ def wrist_jacobian(base_from_gripper: SE3, mount: SE3, scene_m: Array) -> Array:
 
 
 def _of_mount(pose: SE3) -> Array:
-    """(6, 6) takes an error in the convention of `UncertainPose` to a tangent on the right."""
     turned = np.eye(6)
     turned[:3, :3] = pose.rotation_matrix().T
     return turned
@@ -242,9 +218,8 @@ class HostedLandmarks:
     """Landmarks on the rays of their keyframes, which a camera on the gripper recorded."""
 
     mount: SE3
-    """X, gripper_from_camera."""
     camera: Camera
-    """Intrinsics of the camera on the gripper."""
+    """Intrinsics of the camera on the gripper, whose `mount` is X."""
     hosts: SE3
     """(m,) base_from_camera of the keyframes."""
     host: NDArray[np.integer]
@@ -252,9 +227,8 @@ class HostedLandmarks:
     rays: Array
     """(k, 3) in the keyframe, z = 1."""
     inverse_depth: Array
-    """(k,) per metre."""
+    """(k,) per metre, with the standard deviation `sigma` (k,)."""
     sigma: Array
-    """(k,) standard deviation of the inverse depth, per metre."""
 
     @classmethod
     def of(cls, scene: SceneMap, mount: SE3) -> Self:
@@ -334,12 +308,7 @@ class HostedLandmarks:
         return added
 
     def of_wrist_image(self, base_from_gripper: SE3) -> tuple[Array, Array]:
-        """Derivatives of the pixels of the v visible landmarks in a wrist image.
-
-        Returns:
-            (v, 2, 6) by a tangent on the right of the image's own pose, and (v, 2, N) by the
-            unknowns.
-        """
+        """Derivatives of v visible pixels by the image's own pose (v, 2, 6) and the unknowns."""
         by_pose, jacobian = self._derivatives(self.camera, base_from_gripper @ self.mount)
         jacobian[:, :, 6:12] += by_pose @ _of_mount(self.mount)
         return by_pose, jacobian
@@ -364,12 +333,7 @@ class HostedLandmarks:
 
 
 def pixel_slopes(camera: Camera, points_camera: Array) -> tuple[Array, Array]:
-    """Derivatives of the pixels of (v, 3) points.
-
-    Returns:
-        (v, 2, 6) by a tangent on the right of the camera's pose, and (v, 2, 3) by the point in the
-        camera frame.
-    """
+    """Derivatives of the pixels of (v, 3) points by the camera's pose (v, 2, 6) and the points."""
     plane, depth = points_camera[:, :2] / points_camera[:, 2:], points_camera[:, 2]
     to_plane = np.zeros((len(points_camera), 2, 3))
     to_plane[:, 0, 0] = to_plane[:, 1, 1] = 1 / depth

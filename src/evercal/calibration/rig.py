@@ -53,14 +53,7 @@ class Rig:
 
 
 def rig_of(cameras: Mapping[str, Calibration]) -> Rig:
-    """Compute the relative poses of cameras, all eye_to_hand.
-
-    The errors of two cameras are taken as independent, which overestimates them for common
-    landmarks.
-
-    Raises:
-        InputError: There are fewer than two cameras, or they are in different scenes.
-    """
+    """Compute the relative poses of eye_to_hand cameras, as if their errors were independent."""
     scenes = {name: camera.source.get("scene") for name, camera in cameras.items()}
     if len(cameras) < 2:
         raise InputError("a rig has at least two cameras: give NAME=FOLDER for each")

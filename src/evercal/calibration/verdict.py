@@ -33,10 +33,8 @@ def tier(calibration: Calibration) -> Tier | None:
 def expected_error(calibration: Calibration) -> tuple[float, float]:
     """Return the root mean square error in space, millimetres and degrees.
 
-    The position counts where the camera works: at the distance of its target along the optical
-    axis (`target_m` of the checks), or at the camera if that is larger. Two halves of the data
-    differ by twice the error of their mean. The noise of a single view is no error of the
-    calibration; it is part of the covariance as far as it does not average out.
+    The position counts at the distance of the target along the optical axis (`target_m` of the
+    checks), or at the camera if that is larger. Halves of the data differ by twice the error.
     """
     target = float(calibration.checks.get("target_m") or 0.0)
     rotation = calibration.parent_from_child.rotation_matrix()
@@ -59,9 +57,7 @@ def verdict(calibration: Calibration) -> str:
         first += f", {checks['target_m']:.2f} m from the camera"
     if "held_out_mm" not in checks or "held_out_deg" not in checks:
         return f"{first}."
-    held_out = (
-        f"{_length(float(checks['held_out_mm']))} and {float(checks['held_out_deg']):.2f} deg"
-    )
+    held_out = f"{_length(checks['held_out_mm'])} and {checks['held_out_deg']:.2f} deg"
     return f"{first}; single held-out poses differ by {held_out} (median). {_advice(use)}"
 
 

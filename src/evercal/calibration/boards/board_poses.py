@@ -7,13 +7,12 @@
                  "covariance": [6][6], "points_m": [k][3], "pixels": [k][2]}, ...]}
 
 Image names are paths relative to the file. An image without a board has a reason, and null for all
-other fields. Covariances are of (translation in the camera frame, metres; rotation about the
-board's axes, radians).
+other fields. Covariances are those of `BoardPose`.
 """
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma
 from evercal.calibration.boards.detection import Board
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
 
@@ -37,10 +36,8 @@ class BoardImage:
     name: str
     """Path relative to the file of board poses, or a bare file name."""
     view: BoardView | None = None
-    """Detected corners."""
     camera_from_board: SE3 | None = None
     covariance: Array | None = None
-    """(6, 6) covariance of the pose."""
     rms_px: float | None = None
     """Root mean square reprojection error of the corners."""
     reason: str = ""
@@ -98,11 +95,7 @@ class BoardPoses:
 
 
 def read_board_poses(path: str | os.PathLike[str]) -> BoardPoses:
-    """Read a file written by `evercal detect`.
-
-    Raises:
-        InputError: The file is missing or does not hold board poses.
-    """
+    """Read a file written by `evercal detect`."""
     return read_record(path, "file of camera poses", BoardPoses.from_dict)
 
 
@@ -112,51 +105,32 @@ def board_poses(
     views: Mapping[str, BoardView | str],
     camera_from: str = "file",
 ) -> BoardPoses:
-    """Fit the pose of the board in every image.
-
-    Args:
-        board: Board in the images.
-        camera: Intrinsics of all images.
-        views: Corners by image name, or the reason for a missing board.
-        camera_from: Source of the intrinsics, `file` or `board`.
-    """
-    fits: dict[str, tuple[BoardView, BoardPose]] = {}
-    reasons: dict[str, str] = {}
+    """Fit the pose of the board in every image; a view may be the reason for a missing board."""
+    fits: dict[str, BoardPose] = {}
+    images: dict[str, BoardImage] = {}
     for name, view in views.items():
         if isinstance(view, str):
-            reasons[name] = view
+            images[name] = BoardImage(name, reason=view)
             continue
         try:
-            fits[name] = view, board_pose(view, camera)
+            fits[name] = fit = board_pose(view, camera)
+            images[name] = BoardImage(name, view, fit.camera_from_board, rms_px=fit.rms_px)
         except ValueError:
-            reasons[name] = "the detected corners fit no pose of the board"
-    sigma = pixel_sigma([fit for _, fit in fits.values()]) if fits else 0.0
-    images = []
-    for name in views:
-        if name in reasons:
-            images.append(BoardImage(name, reason=reasons[name]))
-            continue
-        view, fit = fits[name]
-        covariance = sigma**2 * fit.unit_covariance
-        images.append(BoardImage(name, view, fit.camera_from_board, covariance, fit.rms_px))
-    return BoardPoses(board, camera, tuple(images), sigma, camera_from)
-
-
-def pose_dict(pose: SE3) -> dict[str, object]:
-    """Return a pose as JSON values."""
-    return {
-        "translation_m": pose.translation_m.tolist(),
-        "quaternion_wxyz": pose.rotation_wxyz.tolist(),
-    }
+            reason = "the detected corners fit no pose of the board"
+            images[name] = BoardImage(name, reason=reason)
+    sigma = pixel_sigma([*fits.values()]) if fits else 0.0
+    for name, fit in fits.items():
+        images[name] = replace(images[name], covariance=sigma**2 * fit.unit_covariance)
+    return BoardPoses(board, camera, tuple(images.values()), sigma, camera_from)
 
 
 def _image_to_dict(image: BoardImage) -> dict[str, Any]:
-    view, pose = image.view, image.camera_from_board
+    view = image.view
     return {
         "name": image.name,
         "reason": image.reason,
         "rms_px": image.rms_px,
-        "camera_from_board": None if pose is None else pose_dict(pose),
+        "camera_from_board": pose_to_dict(image.camera_from_board),
         "covariance": None if image.covariance is None else image.covariance.tolist(),
         "points_m": None if view is None else view.points_m.tolist(),
         "pixels": None if view is None else view.pixels.tolist(),

@@ -65,11 +65,7 @@ class BoardPose:
 
 
 def board_pose(view: BoardView, camera: Camera, start: SE3 | None = None) -> BoardPose:
-    """Fit the pose of a board to its corners, from a start camera_from_board.
-
-    A small or distant flat board has two similar poses; without a start, the better one is
-    returned.
-    """
+    """Fit the pose of a board to its corners, from a start or from the better of its candidates."""
     import cv2
 
     if start is None:
@@ -116,11 +112,9 @@ def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
     flat = thickness[2] < 1e-6 * thickness[0]
     flags = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
     lens = camera.matrix(), np.array(camera.distortion)
-    _, rotvecs, translations, _ = cv2.solvePnPGeneric(
-        view.points_m, view.pixels, *lens, flags=flags
-    )
+    found = cv2.solvePnPGeneric(view.points_m, view.pixels, *lens, flags=flags)
     poses = []
-    for rotvec, translation in zip(rotvecs, translations, strict=True):
+    for rotvec, translation in zip(*found[1:3], strict=True):
         if np.isfinite(rotvec).all() and np.isfinite(translation).all() and translation[2] > 0:
             quaternion = Rotation.from_rotvec(np.ravel(rotvec)).as_quat(scalar_first=True)
             poses.append(SE3(quaternion, np.asarray(translation, dtype=np.float64).ravel()))
@@ -128,10 +122,7 @@ def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
 
 
 def pixel_sigma(poses: Sequence[BoardPose]) -> float:
-    """Return the standard deviation of a corner coordinate in pixels, over all images.
-
-    Images that fit far worse than the others are ignored.
-    """
+    """Return the standard deviation of a corner coordinate in pixels, over images that fit well."""
     squared = np.array([pose.squared_px for pose in poses])
     freedom = np.array([max(2 * pose.corners - 6, 1) for pose in poses])
     inliers = squared / freedom <= 4 * np.median(squared / freedom) + 1e-12

@@ -25,30 +25,23 @@ Image = NDArray[np.uint8]
 BoardKind = Literal["chessboard", "charuco", "apriltag"]
 
 _MIN_CORNERS = 6
-"""Minimum number of ChArUco corners for a well determined pose."""
+"""Minimum number of ChArUco corners."""
 _LARGEST_CHANGE = 0.3
 """Maximum change of the step from corner to corner, parts of the mean step."""
 _SMALLEST_WINDOW_PX = 2
-_EDGE_BLUR_PX = 2.0
-"""Width of an edge in the image."""
+_SAMPLES, _EDGE_BLUR_PX = 24, 2.0
+"""Samples along an edge, and its width in the image."""
 _LEAST_REACH_PX, _MOST_REACH_PX = 1.5, 5.0
 """Smallest and largest distance of samples from an edge."""
-_SAMPLES = 24
-"""Samples along an edge."""
 _LARGEST_MOVE_PX = 0.5
-"""Largest change of a refined corner by its edges; of a tag, whose corners blur rounds, six
-times that."""
+"""Largest change of a corner by its edges; six times that for a tag, whose corners blur rounds."""
 _LARGEST_DOUBLED_PX = 1400
 """Width of the widest image that is searched again at double size."""
 
 
 @dataclass(frozen=True)
 class Board:
-    """A printed board.
-
-    Raises:
-        InputError: A size is invalid, or the dictionary is unknown.
-    """
+    """A printed board."""
 
     kind: BoardKind
     size_m: float
@@ -116,7 +109,7 @@ def find_board(image: Image, board: Board) -> BoardView | str:
 
 
 def _find_chessboard(grey: NDArray, board: Board) -> BoardView | str:
-    x, y = np.meshgrid(np.arange(float(board.columns)), np.arange(float(board.rows)))
+    y, x = np.indices((board.rows, board.columns), dtype=np.float64)
     points = board.size_m * np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
     for pixels in _chessboard_candidates(grey, (board.columns, board.rows)):
         view = _sharpened(grey, BoardView(points, pixels), board)
@@ -132,24 +125,22 @@ def _chessboard_candidates(grey: NDArray, size: tuple[int, int]) -> Iterator[Arr
     """Yield corners (k, 2) by OpenCV's finders, the fastest first."""
     import cv2
 
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    normalized = cv2.CALIB_CB_NORMALIZE_IMAGE
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | normalized
     detected, pixels = cv2.findChessboardCorners(grey, size, flags=flags)
     if detected:
         yield pixels.reshape(-1, 2).astype(np.float64)
-    detected, pixels = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    detected, pixels = cv2.findChessboardCornersSB(grey, size, flags=normalized)
     if detected:
         yield pixels.reshape(-1, 2).astype(np.float64)
     if grey.shape[1] <= _LARGEST_DOUBLED_PX:  # for small or tilted squares
         double = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-        detected, pixels = cv2.findChessboardCornersSB(
-            double, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE
-        )
+        detected, pixels = cv2.findChessboardCornersSB(double, size, flags=normalized)
         if detected:
             yield (pixels.reshape(-1, 2).astype(np.float64) - 0.5) / 2
 
 
 def _is_even(grid: Array) -> bool:
-    """Return whether steps between corners (rows, columns, 2) change slowly, as on a flat board."""
     for axis in (0, 1):
         steps = np.diff(grid, axis=axis)
         change = np.linalg.norm(np.diff(steps, axis=axis), axis=2)
@@ -159,7 +150,6 @@ def _is_even(grid: Array) -> bool:
 
 
 def _no_chessboard(grey: NDArray, board: Board) -> str:
-    """Return why a chessboard was not detected."""
     import cv2
 
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -177,9 +167,8 @@ def _no_chessboard(grey: NDArray, board: Board) -> str:
 def _sharpened(grey: NDArray, view: BoardView, board: Board) -> BoardView:
     """Refine the corners of squares to one or two hundredths of a pixel.
 
-    First in windows around the corners, then by lines along the edges of the squares, which are
-    longer than the windows, most of all beside markers. Windows and edges keep away from markers
-    and from the next corner.
+    First in windows around them, then by lines along the edges of the squares, which are longer.
+    Windows and edges keep away from markers and from the next corner.
     """
     import cv2
 
@@ -204,10 +193,7 @@ def _sharpened(grey: NDArray, view: BoardView, board: Board) -> BoardView:
 
 
 def _in_windows(grey: NDArray, pixels: Array, free_px: Array) -> Array:
-    """Refine corners (n, 2) in windows of at most `free_px` (n,) to each side.
-
-    Corners without space for a window keep their place.
-    """
+    """Refine corners (n, 2) that have space for a window of at most `free_px` (n,) to each side."""
     import cv2
 
     half = np.minimum(free_px, 11).astype(int)
@@ -223,7 +209,6 @@ def _in_windows(grey: NDArray, pixels: Array, free_px: Array) -> Array:
 
 
 def _steps(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
-    """Return the steps in pixels (n, 2) along x and y of corners (n, 2), and their area (n,)."""
     import cv2
 
     homography = cv2.findHomography(points, pixels)[0]
@@ -235,7 +220,6 @@ def _steps(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
 
 
 def _first_square_is_bright(grey: NDArray, grid: Array) -> bool:
-    """Return whether the square between the first four corners is bright."""
     import cv2
 
     middle = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
@@ -257,9 +241,8 @@ def _find_charuco(grey: NDArray, board: Board) -> BoardView | str:
         printed.setLegacyPattern(legacy)
         pixels, ids, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(grey)
         if ids is not None and len(ids) >= _MIN_CORNERS:
-            points = np.asarray(printed.getChessboardCorners(), dtype=np.float64)[
-                np.asarray(ids, dtype=np.int64).ravel()
-            ]
+            every = np.asarray(printed.getChessboardCorners(), dtype=np.float64)
+            points = every[np.asarray(ids, dtype=np.int64).ravel()]
             corners = np.reshape(pixels, (-1, 2)).astype(np.float64)
             flat = np.linalg.svd(points - points.mean(0), compute_uv=False)
             if flat[1] > 0.5 * board.size_m:
@@ -296,8 +279,7 @@ def _find_tag(grey: NDArray, board: Board) -> BoardView | str:
 def _square_by_its_sides(grey: NDArray, square: Array) -> Array:
     """Refine the (4, 2) corners of a dark square by intersecting lines along its edges.
 
-    Blur rounds outer corners: they are detected 0.1 px or more too far inside. Edges do not move.
-    OpenCV's refinement by lines is off by half a pixel in some versions.
+    Blur moves corners inwards, but no edges. OpenCV's lines are off by half a pixel at times.
     """
     sides = np.roll(square, -1, axis=0) - square
     reach = np.clip(0.04 * np.linalg.norm(sides, axis=1), 2.0, 5.0)
@@ -307,10 +289,7 @@ def _square_by_its_sides(grey: NDArray, square: Array) -> Array:
 
 
 def _edges(grey: NDArray, starts: Array, ends: Array, reach: Array, count: int = _SAMPLES) -> Array:
-    """Return points (n, count, 2) on the edges between points (n, 2); NaN without an edge.
-
-    Edges are searched up to `reach` (n,) pixels to either side.
-    """
+    """Return points (n, count, 2) on edges up to `reach` (n,) pixels off a side, or NaN."""
     import cv2
 
     sides = ends - starts
@@ -332,7 +311,6 @@ def _edges(grey: NDArray, starts: Array, ends: Array, reach: Array, count: int =
 
 
 def _lines(points: Array) -> Array:
-    """Fit homogeneous lines (n, 3) of unit normals to points (n, k, 2)."""
     middle = points.mean(1)
     spread = np.einsum("nki,nkj->nij", points - middle[:, None], points - middle[:, None])
     normal = np.linalg.eigh(np.nan_to_num(spread))[1][:, :, 0]
@@ -342,7 +320,6 @@ def _lines(points: Array) -> Array:
 def _crossings(
     corners: Array, first: Array, second: Array, reach_px: float = _LARGEST_MOVE_PX
 ) -> Array:
-    """Return where lines (n, 3) cross; corners (n, 2) where they cross far off or not at all."""
     crossing = np.cross(first, second)
     with np.errstate(divide="ignore", invalid="ignore"):
         refined = crossing[:, :2] / crossing[:, 2:]

@@ -1,8 +1,7 @@
 """Estimate intrinsics from views of a board.
 
-The corners of an image determine the pose of the board up to the intrinsics, which all images
-share. Eliminating the poses from the normal equations leaves the information on the intrinsics (the
-Schur complement of bundle adjustment). A prior is added to it: stated intrinsics, or usual ones.
+Eliminating the poses of the board from the normal equations leaves the information on the
+intrinsics (the Schur complement of bundle adjustment). A prior is added to it.
 """
 
 from collections.abc import Sequence
@@ -22,11 +21,9 @@ Array = NDArray[np.floating]
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 MIN_VIEWS = 5
 """Minimum number of views of a flat board."""
-_USUAL_CENTRE, _USUAL_ASPECT = 0.1, 0.02
-"""Standard deviations of the principal point from the middle of the image, in widths, and of the
-ratio of both focal lengths from one."""
-_ROUGH_FOCAL = 0.5
-"""Relative standard deviation of a rough focal length."""
+_USUAL_CENTRE, _USUAL_ASPECT, _ROUGH_FOCAL = 0.1, 0.02, 0.5
+"""Standard deviations of the principal point from the middle of the image, in widths, of the ratio
+of both focal lengths from one, and of a rough focal length, relative."""
 _USUAL_DISTORTION = (0.3, 0.5, 2e-3, 2e-3, 0.5, 0.1, 0.1, 0.1)
 _STATED = 0.005
 """Standard deviation of a stated focal length and principal point, relative to the focal length."""
@@ -65,15 +62,6 @@ class LensPrior(NamedTuple):
         return cls(mean, information)
 
 
-class LensEstimate(NamedTuple):
-    """The best intrinsics relative to those that the board poses were fitted with."""
-
-    change: Array
-    """(q,)."""
-    information: Array
-    """(q, q) of the corners and the prior."""
-
-
 class Intrinsics(NamedTuple):
     """A camera with the uncertainty of its focal length."""
 
@@ -84,15 +72,18 @@ class Intrinsics(NamedTuple):
 
 def lens_estimate(
     poses: Sequence[BoardPose], sigma_px: float, camera: Camera, prior: LensPrior
-) -> LensEstimate:
-    """Estimate the change of the intrinsics `camera` from board poses fitted with them."""
+) -> tuple[Array, Array]:
+    """Estimate the change (q,) of the intrinsics that board poses were fitted with.
+
+    Also return the information (q, q) of the corners and the prior.
+    """
     variance = sigma_px**2
     information = np.sum([pose.lens_normal for pose in poses], 0) / variance + prior.information
     right = np.sum([pose.lens_gradient for pose in poses], 0) / variance
     right = right + prior.information @ (prior.mean - lens_vector(camera))
     unit = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information * np.outer(unit, unit)
-    return LensEstimate(unit * np.linalg.lstsq(scaled, unit * right, rcond=1e-13)[0], information)
+    return unit * np.linalg.lstsq(scaled, unit * right, rcond=1e-13)[0], information
 
 
 def lens_vector(camera: Camera) -> Array:
@@ -103,23 +94,13 @@ def lens_vector(camera: Camera) -> Array:
 
 
 def moved_camera(camera: Camera, change: Array) -> Camera:
-    """Return the camera after a (q,) change of its intrinsics.
-
-    Raises:
-        ValueError: A focal length is no longer positive.
-    """
+    """Return the camera after a (q,) change; raises ValueError without a positive focal length."""
     fx, fy, cx, cy, *distortion = (float(value) for value in lens_vector(camera) + change)
     return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion))
 
 
 def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Intrinsics:
-    """Estimate focal lengths, principal point and distortion (k1 k2 p1 p2 k3).
-
-    Weak priors, see `LensPrior.usual`, keep what few views leave open within what is usual.
-
-    Raises:
-        InputError: Fewer than five views, or they do not determine the focal length.
-    """
+    """Estimate focal lengths, principal point and distortion (k1 k2 p1 p2 k3), with weak priors."""
     if len(views) < MIN_VIEWS:
         raise InputError(
             f"the board was detected in {len(views)} images, intrinsics take at least {MIN_VIEWS};"
@@ -133,8 +114,9 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
         )
     camera = _rough(views, width, height)
     prior = LensPrior.usual(camera)
-    open_focal = "the images leave the focal length open{}; tilt the board by 20 to 45 deg in" + (
-        " several directions, or give --camera"
+    open_focal = (
+        "the images leave the focal length open{}; tilt the board by 20 to 45 deg in several"
+        " directions, or give --camera"
     )
     information = prior.information
     try:
@@ -158,7 +140,6 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
 
 
 def _consistent(views: Sequence[BoardView], camera: Camera) -> list[BoardView]:
-    """Leave out false detections: views without a pose, or with much larger residuals."""
     rms = np.full(len(views), np.inf)
     for i, view in enumerate(views):
         with suppress(ValueError):

@@ -30,15 +30,7 @@ _DPI = 300.0
 
 
 def board_image(board: Board, unit_px: int) -> NDArray[np.uint8]:
-    """Draw a board without a margin.
-
-    Args:
-        board: Board.
-        unit_px: Pixels along a square, or along a cell of a tag.
-
-    Returns:
-        (h, w) image, dark parts 0 and bright parts 255.
-    """
+    """Draw a board (h, w) without margin; `unit_px` lie along a square, or a cell of a tag."""
     import cv2
 
     if board.kind == "chessboard":
@@ -63,19 +55,11 @@ def board_image(board: Board, unit_px: int) -> NDArray[np.uint8]:
 
 
 def _cells(board: Board) -> int:
-    """Return the number of cells along a tag with its border, or 1 for a board of squares."""
     return dictionary_of(board).markerSize + 2 if board.kind == "apriltag" else 1
 
 
 def drawing(board: Board, paper: str = "a4") -> "tuple[Image, float]":
-    """Draw a board at true size on a sheet, upright or landscape, with a ruler.
-
-    Returns:
-        Black and white image, and its resolution in pixels per inch.
-
-    Raises:
-        InputError: The paper is not known, or the board does not fit.
-    """
+    """Draw a board on a sheet, with a ruler; also return the resolution in pixels per inch."""
     from PIL import Image, ImageDraw, ImageFont
 
     counts = {
@@ -93,14 +77,11 @@ def drawing(board: Board, paper: str = "a4") -> "tuple[Image, float]":
     top = (page.height - round(_FOOTER_MM * per_mm) - picture.shape[0]) // 2
     page.paste(Image.fromarray(picture), (left, top))
     draw, bottom = ImageDraw.Draw(page), height - _MARGIN_MM
-
-    def bar(x_mm: float, y_mm: float, width_mm: float, height_mm: float) -> None:
-        corners = np.array([x_mm, y_mm, x_mm + width_mm, y_mm + height_mm]) * per_mm
+    bars = [(0, bottom, _RULER_MM, 0.3)]
+    bars += [(tick, bottom - 2, 0.2, 2) for tick in range(0, _RULER_MM + 1, 10)]
+    for x, y, wide, high in bars:
+        corners = np.array([x + _MARGIN_MM, y, x + _MARGIN_MM + wide, y + high]) * per_mm
         draw.rectangle(corners.round().tolist(), fill=0)
-
-    bar(_MARGIN_MM, bottom, _RULER_MM, 0.3)
-    for tick in range(0, _RULER_MM + 1, 10):
-        bar(_MARGIN_MM + tick, bottom - 2, 0.2, 2)
     text_at = (_MARGIN_MM * per_mm, (bottom + 1) * per_mm)
     font = ImageFont.load_default(size=2.5 * per_mm)
     draw.text(text_at, f"{_RULER_MM} mm: {label(board)}", font=font, fill=0)
@@ -146,11 +127,7 @@ def _sheet(board: Board, paper: str, size_mm: NDArray) -> tuple[float, float]:
 
 
 def write_board(path: Path, board: Board, paper: str = "a4") -> None:
-    """Write a board at true size to a PDF or PNG file; the resolution is stored in the file.
-
-    Raises:
-        InputError: The file has another ending, or the board does not fit the paper.
-    """
+    """Write a board at true size to a PDF or PNG file; the resolution is stored in the file."""
     kind = path.suffix.lower()
     if kind not in FILE_KINDS:
         raise InputError(f"{path}: give a file name that ends with {' or '.join(FILE_KINDS)}")

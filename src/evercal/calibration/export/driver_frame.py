@@ -1,17 +1,14 @@
 """Move a calibration from the camera's optical frame to the driver's root frame.
 
-tf is a tree: a camera driver publishes `camera_link` as the parent of its optical frames. A second
-parent of an optical frame would break the tree, so the root frame is published instead:
-parent_from_link = parent_from_optical @ optical_from_link. By ROS REP 103, a link has x forward,
-y left, z up, and an optical frame has x right, y down, z forward. The offset between their origins
-depends on the camera; it is in `/tf_static` or the data sheet.
+tf is a tree: a camera driver publishes `camera_link` as the parent of its optical frames, which can
+have no second parent. By ROS REP 103, a link has x forward, y left, z up, and an optical frame has
+x right, y down, z forward. The offset between their origins is in `/tf_static` or the data sheet.
 """
 
 import os
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
@@ -19,11 +16,7 @@ import yaml
 from evercal.errors import InputError
 from evercal.geometry import SE3
 
-if TYPE_CHECKING:
-    from evercal.calibration.calibration import Calibration
-
 _Transforms = dict[tuple[str, str], SE3]
-"""parent_from_child by (parent, child)."""
 _EXPECTED = "give what 'ros2 topic echo --once /tf_static' prints, or a TransformStamped"
 
 
@@ -32,23 +25,11 @@ def standard_link_from_optical(offset_m: tuple[float, float, float] = (0.0, 0.0,
     return SE3(np.array([0.5, -0.5, 0.5, -0.5]), np.array(offset_m))
 
 
-def published_at(calibration: "Calibration", link: str, link_from_optical: SE3) -> "Calibration":
-    """Return the calibration of the driver's root frame `link`, with its covariance."""
-    pose = calibration.uncertain_pose @ link_from_optical.inverse()
-    return replace(
-        calibration, parent_from_child=pose.pose, covariance=pose.covariance, child_frame=link
-    )
-
-
 def read_link_from_optical(path: str | os.PathLike[str], link: str, optical: str) -> SE3:
-    """Read the pose of the optical frame in the driver's root frame.
+    """Read the pose of the optical frame in the driver's root frame from YAML or JSON.
 
-    The file is YAML or JSON: the output of `ros2 topic echo --once /tf_static`, a TransformStamped,
-    or an object with `parent_frame`, `child_frame`, `translation_m`, `quaternion_wxyz`. Several
-    transforms are chained in either direction.
-
-    Raises:
-        InputError: The file is missing or broken, or its transforms do not connect the two frames.
+    That is the output of `ros2 topic echo --once /tf_static`, a TransformStamped, or an object with
+    `parent_frame`, `child_frame`, `translation_m`, `quaternion_wxyz`. Transforms are chained.
     """
     transforms: _Transforms = {}
     try:

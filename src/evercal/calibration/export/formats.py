@@ -27,7 +27,6 @@ class Format:
     """Child frame. `tf`: a frame of the robot's tf tree. `optical`: only the camera's optical
     frame, so `via` is refused. `any`: plain numbers of either frame."""
     write: Callable[[Export], Content]
-    """Writer."""
     ending: str
     """Usual ending of the file; empty for a folder."""
     description: str
@@ -67,16 +66,14 @@ FORMATS = {
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """A calibration in another format."""
+    """A calibration with the exported frames in another format."""
 
     format: Format
-    """Row of the table."""
     calibration: "Calibration"
-    """Calibration with the exported frames."""
     text: str
     """Exported text; empty for a binary file or a folder."""
     files: tuple[Path, ...]
-    """Files that were written; empty without a path."""
+    """Files that were written."""
 
 
 def export_files(
@@ -92,9 +89,6 @@ def export_files(
         format: Name of a format in `FORMATS`; hyphens count as underscores.
         path: File to write, or a new folder for COLMAP. If omitted, nothing is written.
         options: Frame names and further inputs, see `ExportOptions`.
-
-    Raises:
-        InputError: The format is unknown, a required input is missing, or a frame name is invalid.
     """
     key = format.strip().lower().replace("-", "_")
     if key not in FORMATS:

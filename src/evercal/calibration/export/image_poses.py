@@ -1,9 +1,8 @@
 """Formats that hold a pose for every image: TUM, COLMAP, nerfstudio, MoveIt's pose pairs.
 
-A fixed camera has one pose, repeated for every image of the calibration. A camera on the arm has
-one pose for every robot pose. COLMAP and nerfstudio measure pixels from the corner of the first
-pixel, so their principal point is half a pixel larger. Checked against pycolmap, and against
-nerfstudio's data conventions, parser and `Cameras`.
+A fixed camera has one pose for all images, a camera on the arm one for every robot pose. COLMAP and
+nerfstudio measure pixels from the corner of the first pixel, so their principal point is half a
+pixel larger. Checked against pycolmap and nerfstudio's parser and `Cameras`.
 """
 
 import json
@@ -17,7 +16,6 @@ from evercal.geometry import SE3
 
 
 def _image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
-    """Return the names of n images and base_from_camera (n,)."""
     robot = export.robot_poses
     if not export.in_hand:
         used = tuple(image.name for image in export.calibration.images if image.used)
@@ -111,8 +109,6 @@ def moveit(export: Export) -> str:
             " image"
         )
     rows = (pose_numbers(poses, "matrix").tolist() for poses in (robot.poses, camera_from_target))
-    samples = [
-        {"effector_wrt_world": gripper, "object_wrt_sensor": board}
-        for gripper, board in zip(*rows, strict=True)
-    ]
+    names = ("effector_wrt_world", "object_wrt_sensor")
+    samples = [dict(zip(names, pair, strict=True)) for pair in zip(*rows, strict=True)]
     return yaml.safe_dump(samples, sort_keys=False, default_flow_style=None, width=1000)

@@ -73,8 +73,6 @@ def franka(export: Export) -> str:
 
 
 def _controller(convention: str, text: str) -> Callable[[Export], str]:
-    """Return a writer of a comment and one pose; `text` has a slot for each number."""
-
     def write(export: Export) -> str:
         # Nine decimals and no exponents, which some controllers cannot parse.
         numbers = [f"{round(value, 9) + 0.0:.9f}" for value in export.numbers(convention)]

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.export.driver_frame import (
-    published_at,
     read_link_from_optical,
     standard_link_from_optical,
 )
@@ -55,18 +54,15 @@ class ExportOptions(TypedDict, total=False):
 
 @dataclass(frozen=True, eq=False)
 class Export:
-    """A calibration with everything that a format writer may need."""
+    """A calibration with what a format writer may need, see `ExportOptions`."""
 
     calibration: "Calibration"
     """Calibration with the exported frames."""
     name: str
     """Name of the calibration in easy_handeye."""
     robot_frame: str | None
-    """The robot frame that is not the parent."""
     robot_poses: RobotPoses | None
-    """base_from_gripper of every image."""
     target_poses: RobotPoses | None
-    """camera_from_target of every image."""
 
     @property
     def parent(self) -> str:
@@ -126,9 +122,11 @@ def prepare_export(
                 f"{role} frame {frame!r} is no name of a tf frame; use letters, digits, _ . - and"
                 f" inner /, such as 'camera_color_optical_frame' (rename with --parent or --child)"
             )
-    calibration = replace(calibration, parent_frame=parent, child_frame=child)
+    calibration = replace(calibration, parent_frame=parent, child_frame=link or child)
     if link is not None:
-        calibration = published_at(calibration, link, link_from_optical)
+        moved = calibration.uncertain_pose @ link_from_optical.inverse()
+        pose, covariance = moved.pose, moved.covariance
+        calibration = replace(calibration, parent_from_child=pose, covariance=covariance)
     robot, target = options.get("robot_poses"), options.get("target_poses")
     if robot is not None and not isinstance(robot, RobotPoses):
         what, convention = "file of robot poses", options.get("convention")

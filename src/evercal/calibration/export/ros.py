@@ -1,8 +1,8 @@
 """Formats of ROS: tf, launch files, URDF, easy_handeye and camera_info.
 
-Checked against tf2_ros's static_transform_publisher (flags in ROS 2, nine words in ROS 1), the
-fields of geometry_msgs/TransformStamped, camera_calibration_parsers, the messages and test files of
-easy_handeye2, and easy_handeye's reader, which takes exactly the keys below.
+Checked against tf2_ros's static_transform_publisher (flags in ROS 2, nine words in ROS 1),
+camera_calibration_parsers, the messages and test files of easy_handeye2, and easy_handeye's reader,
+which takes exactly the keys below.
 """
 
 import re
@@ -72,10 +72,7 @@ def stamped(export: Export) -> str:
 
 
 def urdf(export: Export) -> str:
-    """Write a fixed joint for a URDF or xacro that defines both links.
-
-    The angles rotate about fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll), in radians.
-    """
+    """Write a fixed joint; R = Rz(yaw) Ry(pitch) Rx(roll), about fixed axes, in radians."""
     numbers, name = _numbers(export, "rpy"), _node_name(export, r"\w.-")
     return f"""<joint name={quoteattr(name)} type="fixed">
   <!-- {_xml_comment(export)} -->
@@ -134,7 +131,6 @@ def _numbers(export: Export, convention: str = "xyzw") -> list[str]:
 
 
 def _transform(export: Export) -> dict[str, dict[str, float]]:
-    """Return the fields of geometry_msgs/Transform."""
     x, y, z, *rotation = export.numbers()
     quaternion = dict(zip("xyzw", rotation, strict=True))
     return {"translation": {"x": x, "y": y, "z": z}, "rotation": quaternion}
@@ -146,7 +142,6 @@ def _flags(export: Export) -> dict[str, str]:
 
 
 def _handeye_frames(export: Export) -> dict[str, str]:
-    """Return the four frames of a hand-eye setup; the calibration itself names two of them."""
     other = export.robot_frame
     return {
         "robot_base_frame": other or "base" if export.in_hand else export.parent,

@@ -13,17 +13,14 @@ SIZE_SIGMA = 0.002
 _SIZE_SIGMAS = 3.0
 """Significance of a wrong size, standard deviations."""
 _LARGE_SIZE, _MUCH_BETTER = 0.1, 3.0
-"""An error of the size above the first number is believed only if the residuals fall by the second
-factor."""
+"""An error above the first is believed only if the residuals fall by the second factor."""
 
 
 def with_tested_size(
     equation: PoseEquation, fit: HandEyeFit, corners: BoardCorners | None, of_board: bool = True
 ) -> tuple[PoseEquation, HandEyeFit, list[str]]:
-    """Free the size of the squares, or of a map, if the robot's motions contradict it.
-
-    The noise is estimated again with the free size: a wrong size looks like noise otherwise.
-    """
+    """Free the size of the squares, or of a map, if the robot's motions contradict it."""
+    # A wrong size looks like noise, so the noise is estimated again with the free size.
     free = replace(equation, extras=equation.extras.without_prior("size"))
     freed = robust_fit(free, agreement(free, fit.at))
     k = equation.extras.names.index("size")
@@ -60,8 +57,7 @@ def with_tested_size(
 def _alike(fit: HandEyeFit) -> float:
     """Return by how much errors that are alike in similar poses enlarge the variance of the size.
 
-    Errors of an arm depend on its pose. Together as large as the noise, they may move the size by
-    as much as all poses together, where independent noise averages out.
+    Together as large as the noise, they move the size as much as all poses with independent noise.
     """
     noise = sum(
         np.trace(fit.contributions[kind][:3, :3]) for kind in KINDS if kind in fit.contributions
@@ -79,5 +75,4 @@ def widened(equation: PoseEquation, fit: HandEyeFit) -> HandEyeFit:
 
 
 def _misfit(fit: HandEyeFit) -> float:
-    """Root mean square residual of the translations, metres."""
     return float(np.sqrt((fit.residual[fit.inliers, :3] ** 2).mean()))

@@ -11,11 +11,8 @@ Array = NDArray[np.floating]
 
 FOLDS = 5
 _MIN_HALVED = 12
-"""Minimum number of poses to compare two halves."""
-_MAIN_SHARE = 0.5
-"""Share of the variance from which a cause is named."""
-_ELONGATED = 4.0
-"""Ratio of standard deviations from which a direction is named."""
+_MAIN_SHARE, _ELONGATED = 0.5, 4.0
+"""Share of the variance that names a cause, and ratio of deviations that names a direction."""
 _SMALL_MM = 0.1
 """Standard deviation below which nothing is left open."""
 _REMEDIES = {
@@ -35,13 +32,9 @@ _REMEDIES = {
 
 
 def held_out_error(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
-    """Compare each pose with the prediction from the other poses, by 5-fold cross-validation.
+    """Median and root mean square errors of poses predicted from the others, in five folds.
 
-    The error includes the noise of the held-out pose.
-
-    Returns:
-        `held_out_mm`, `held_out_deg` (medians) and `held_out_rms_mm`, `held_out_rms_deg` (root mean
-        squares); empty for fewer than six poses.
+    They include the noise of the held-out pose. Empty for fewer than six poses.
     """
     rows = np.flatnonzero(fit.inliers)
     if len(rows) <= FOLDS:
@@ -59,11 +52,7 @@ def held_out_error(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
 
 
 def repeatability(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
-    """Compare the calibrations from two halves of the sorted poses.
-
-    Returns:
-        `repeatability_mm` and `repeatability_deg`; empty for fewer than twelve poses.
-    """
+    """Compare the calibrations from two halves of the sorted poses; empty for fewer than twelve."""
     rows = np.flatnonzero(fit.inliers)
     if len(rows) < _MIN_HALVED:
         return {}

@@ -36,12 +36,10 @@ Mask = NDArray[np.bool_]
 
 
 class NoiseLevels(NamedTuple):
-    """Variance of each kind of noise, with its uncertainty."""
+    """Variances (k,) of the kinds of noise, metres^2 or radians^2, and their covariance (k, k)."""
 
     variance: Array
-    """(k,) metres^2 or radians^2, in the order of the kinds; nearly zero for absent kinds."""
     uncertainty: Array
-    """(k, k) covariance of `variance`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +58,7 @@ class HandEyeFit:
     distance2: Array
     """(n,) squared Mahalanobis distance of each residual."""
     contributions: dict[str, Array]
-    """(6, 6) covariance of `parent_from_camera` due to each kind of noise, to the noise that is
-    known (`known`) and to each group of extras."""
+    """(6, 6) covariance of `parent_from_camera` by kind of noise and group of extras."""
     weights: Array
     """(n, 6, 6) covariance of the noise."""
     moved: Array
@@ -81,9 +78,8 @@ class Agreement:
 
     at: Unknowns
     metres: float
-    """Standard deviation of the board position per axis."""
+    """Standard deviation of the board position per axis; `radians` of its rotation."""
     radians: float
-    """Standard deviation of the board rotation per axis."""
     inliers: Mask
     """(n,) poses without gross errors."""
 
@@ -121,7 +117,8 @@ def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
         used, system = equation[inliers].system(at), equation.system(at)
         levels = estimate_levels(used, levels)
         weights = noise_of(system, levels.variance)
-        covariance = normal_inverse(_normal(used, _weighted(used, weights[inliers])))
+        information = np.linalg.inv(weights[inliers])
+        covariance = normal_inverse(_normal(used, information @ used.jacobian))
         distance2 = _distances(system, weights, covariance, inliers)
         freedom = max(6 * int(inliers.sum()) - equation.unknowns, 2)
         selected = distance2 < 6 * f.ppf(1 - _REJECTION / len(inliers), 6, freedom)
@@ -134,14 +131,7 @@ def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
 
 
 def refine(equation: PoseEquation, at: Unknowns, weights: Array, use: Mask) -> Unknowns:
-    """Minimize weighted least squares by the Gauss-Newton method.
-
-    Args:
-        equation: n poses.
-        at: Start within a few degrees and centimetres.
-        weights: (n, 6, 6) covariance of the residuals.
-        use: (n,).
-    """
+    """Minimize least squares by Gauss-Newton steps; `weights` (n, 6, 6) are covariances."""
     selected, information = equation[use], np.linalg.inv(weights[use])
     for _ in range(30):
         step, length2 = _step(selected.system(at), information)
@@ -152,10 +142,9 @@ def refine(equation: PoseEquation, at: Unknowns, weights: Array, use: Mask) -> U
 
 
 def least_sigma(equation: PoseEquation, fit: HandEyeFit) -> Array:
-    """Return the (p,) standard deviations of the unknowns by the geometry of the poses alone.
+    """Return the (p,) standard deviations of the unknowns for noise of 0.1 mm and 0.01 degrees.
 
-    The noise is set to 0.1 mm and 0.01 degrees. With the estimated noise, exact poses would hide an
-    unknown that they do not constrain.
+    With the estimated noise, exact poses would hide an unknown that they do not constrain.
     """
     system = equation[fit.inliers].system(fit.at)
     information = np.repeat([1e-4, np.deg2rad(0.01)], 3) ** -2.0
@@ -163,12 +152,7 @@ def least_sigma(equation: PoseEquation, fit: HandEyeFit) -> Array:
 
 
 def estimate_levels(system: System, start: NoiseLevels | None = None) -> NoiseLevels:
-    """Estimate the variance of each kind of noise by restricted maximum likelihood.
-
-    Args:
-        system: Linear system at the estimate.
-        start: Levels of a similar fit.
-    """
+    """Estimate the variance of each kind of noise, from the `start` of a similar fit."""
     spreads = _spreads(system)
     sizes = np.einsum("knii->k", spreads)
     if start is None:
@@ -191,21 +175,18 @@ def estimate_levels(system: System, start: NoiseLevels | None = None) -> NoiseLe
 
 
 def _first_levels(system: System) -> Array:
-    """Return variances that explain equal shares of the residuals."""
     metres2, radians2 = (np.mean(part**2) for part in np.split(system.residual, 2, 1))
     rotations = [kind.startswith("rotation") for kind in system.directions]
     return np.where(rotations, radians2, metres2) * 2 / len(rotations) + 1e-18
 
 
 def _weighting(system: System, spreads: Array, variance: Array) -> tuple[Array, Array, Array]:
-    """Return weights (n, 6, 6), weighted derivatives, and the inverse of the normal equations."""
     weight = np.linalg.inv(system.known + _FLOOR + np.tensordot(variance, spreads, 1))
     weighted = weight @ system.jacobian
     return weight, weighted, normal_inverse(_normal(system, weighted))
 
 
 def _level_uncertainty(spreads: Array, weight: Array, weighted: Array, inverse: Array) -> Array:
-    """Return the inverse of the Fisher information of the restricted likelihood."""
     turned = spreads @ weight
     own = np.einsum("anij,bnji->ab", turned, turned)
     sides = spreads @ weighted
@@ -223,23 +204,16 @@ def noise_of(system: System, variance: Array) -> Array:
 
 
 def _spreads(system: System) -> Array:
-    """Return the (k, n, 6, 6) covariance due to a unit of variance of each kind of noise."""
     return np.stack([part @ part.transpose(0, 2, 1) for part in system.directions.values()])
 
 
 def ellipsoid_factor(covariance: Array, slopes: Array, uncertainty: Array) -> float:
-    """Return the factor that corrects a covariance for estimated noise levels.
+    """Return the factor on a covariance (d, d) for its chi-square quantile of 95 % to cover 95 %.
 
-    Squared distances by an estimated covariance follow an F distribution rather than chi-square. A
-    variance with nu degrees of freedom has a relative variance of 2 / nu (F. Satterthwaite, An
-    approximate distribution of estimates of variance components, 1946); the axis with the fewest
-    degrees of freedom decides. With this factor, the chi-square quantile of 95 % has a coverage of
-    95 %.
-
-    Args:
-        covariance: (d, d).
-        slopes: (k, d, d) derivatives of the covariance by the variances of the noise.
-        uncertainty: (k, k) covariance of the variances.
+    Squared distances by an estimated covariance follow an F distribution. A variance with nu
+    degrees of freedom has a relative variance of 2 / nu (F. Satterthwaite, An approximate
+    distribution of estimates of variance components, 1946); the axis with the fewest decides.
+    `slopes` (k, d, d) are the derivatives of the covariance by the variances of the noise.
     """
     d = len(covariance)
     values, axes = np.linalg.eigh(covariance)
@@ -257,17 +231,12 @@ def normal_inverse(normal: Array) -> Array:
     return np.outer(unit, unit) * ((axes / np.maximum(values, 1e-14)) @ axes.T)
 
 
-def _weighted(system: System, noise: Array) -> Array:
-    return np.linalg.inv(noise) @ system.jacobian
-
-
 def _normal(system: System, weighted: Array) -> Array:
     p = weighted.shape[2]
     return weighted.reshape(-1, p).T @ system.jacobian.reshape(-1, p) + system.prior
 
 
 def _step(system: System, information: Array) -> tuple[Array, float]:
-    """Return a Gauss-Newton step and its squared Mahalanobis length."""
     weighted = information @ system.jacobian
     normal = _normal(system, weighted)
     # Scale the unknowns so that the normal equations are well conditioned.
@@ -281,7 +250,7 @@ def _step(system: System, information: Array) -> tuple[Array, float]:
 def _result(equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels) -> HandEyeFit:
     system, used = equation.system(at), equation[use].system(at)
     noise = noise_of(system, levels.variance)
-    weighted = _weighted(used, noise[use])
+    weighted = np.linalg.inv(noise[use]) @ used.jacobian
     covariance = normal_inverse(_normal(used, weighted))
     # (n, p, 6) response of the unknowns to each residual.
     gain = covariance @ weighted.transpose(0, 2, 1)
@@ -314,9 +283,7 @@ def _result(equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels
 
 
 def _distances(system: System, noise: Array, covariance: Array, use: Mask) -> Array:
-    """Return the (n,) squared Mahalanobis distance of each residual."""
-    # Used poses have moved the estimate towards themselves. A pose that alone constrains an unknown
-    # has no spread along some axis.
+    # Used poses have moved the estimate towards themselves. Alone, one has no spread on some axis.
     sign = np.where(use, -1.0, 1.0)[:, None, None]
     explained = system.jacobian @ covariance @ system.jacobian.transpose(0, 2, 1)
     spread = (1 + 1e-3) * noise + sign * explained

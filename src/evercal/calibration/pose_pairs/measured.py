@@ -1,9 +1,7 @@
 """Pose pairs whose camera poses were measured by the corners of a board.
 
-The corners of all images determine the pose of the board in each image up to the intrinsics, which
-all images share. Eliminating the poses from the normal equations leaves what the corners say about
-the intrinsics (the Schur complement of bundle adjustment), and the derivative of each pose by them.
-The hand-eye equation with the intrinsics as extras is then the full reprojection problem.
+With the intrinsics as extras, the hand-eye equation is the full reprojection problem: what the
+corners say about them, and the derivative of each pose by them, come from `boards.corners`.
 """
 
 import math
@@ -31,13 +29,11 @@ class BoardCorners:
     views: tuple[BoardView, ...]
     """One for each pair."""
     half_turn: bool = False
-    """Whether the board looks the same after half a turn, so that its corners may be in reverse
-    order."""
+    """Whether the board looks the same after half a turn: its corners may be in reverse order."""
     quarter_turn: bool = False
     """Whether the corners are a square grid, which may be turned by 90 degrees."""
     stated: bool = False
-    """Whether the intrinsics are stated, for example by the maker; else they were estimated from
-    these corners."""
+    """Whether the intrinsics are stated by the maker; else they come from these corners."""
     size_m: float | None = None
     """Stated side of a square, or of a tag, for messages."""
 
@@ -74,11 +70,10 @@ class Measured(NamedTuple):
 
     def extras(self, prior: LensPrior) -> Extras:
         """Return the intrinsics as unknowns; the corners are part of their prior."""
-        best = lens_estimate(self.poses, self.sigma_px, self.camera, prior)
+        change, information = lens_estimate(self.poses, self.sigma_px, self.camera, prior)
         slopes = np.stack([pose.lens_slope for pose in self.poses])
-        names = LENS[: len(best.change)]
-        groups = ("intrinsics",) * len(names)
-        return Extras(names, groups, slopes, best.information, best.change)
+        names = LENS[: len(change)]
+        return Extras(names, ("intrinsics",) * len(names), slopes, information, change)
 
 
 def measured(corners: BoardCorners, camera: Camera, starts: SE3) -> Measured:

@@ -1,12 +1,11 @@
 """Mistakes in the input, found by evidence: which other reading of the poses fits them?
 
-A camera fixed to the gripper rotates by the same angle as the gripper. Poses that violate this were
+A camera on the gripper rotates by the same angle as the gripper. Poses that violate this were
 mostly read in a wrong convention: inverted, transposed, another order of angles, shifted by a row,
 another unit. Each of these readings is tested, and one that makes the pairs agree is reported.
 
-Other mistakes leave the pairs in perfect agreement: exchanged files, both files inverted, camera
-axes of OpenGL. Geometry gives them away: a camera sees its board near its optical axis, and what a
-gripper carries is near the gripper.
+Exchanged files, both files inverted or camera axes of OpenGL leave the pairs in agreement. Geometry
+gives them away: a camera sees its board near its optical axis, and a gripper carries what is near.
 """
 
 from dataclasses import replace
@@ -21,7 +20,7 @@ from evercal.calibration.pose_pairs.pairs import PoseNumbers, PosePairs
 from evercal.calibration.pose_pairs.pose_equation import Extras
 from evercal.calibration.pose_pairs.starts import consensus_start
 from evercal.errors import InputError
-from evercal.geometry import SE3
+from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.conventions import (
     CONVENTIONS,
     numbers_from_poses,
@@ -36,21 +35,19 @@ _SUSPECT_M, _SUSPECT_RAD, _FEW = 0.01, np.deg2rad(1.0), 0.8
 _HOPELESS_M, _HOPELESS_RAD = 0.05, np.deg2rad(3.0)
 """Residuals above which the pairs are refused."""
 _BETTER, _SPOILT, _MORE = 3.0, 1.2, 0.2
-"""Another reading must reduce the residuals of translation or rotation by the first factor, or
-explain this share of poses more, and must not enlarge either by more than the second factor."""
+"""A better reading reduces residuals of translation or rotation by the first factor, or explains
+this share of poses more, and enlarges neither by more than the second factor."""
 _SCREENED, _FITTED = 1.5, 30
-"""Conventions are fitted if they reduce the differences of angles by a factor; so many at most."""
+"""Least reduction of the differences of angles by conventions that are fitted; their number."""
 _NEAR_M, _FAR_M, _SPREAD = 0.1, 0.7, 0.8
-"""Usual distances of a camera or board from the gripper that carries it, and from the base;
-standard deviation of their logarithms."""
+"""Usual distances of a camera or board from gripper and base; deviation of their logarithms."""
 _FIELD_RAD, _ANYWHERE, _IMAGES = np.deg2rad(22.0), 0.03, 4.0
-"""Usual angle between board and optical axis; share of images with any angle; number of independent
-images, because all look in similar directions."""
+"""Usual angle between board and optical axis; share of any angle; number of independent images."""
 _CLEARLY = 4.0
 """Logarithm of the likelihood ratio at which another reading is more plausible."""
 _MOST, _COHERENT, _OBLIQUE, _LONG_M = 0.9, 0.8, np.cos(np.deg2rad(45.0)), 0.4
-"""A geometry is suspect if this share of the boards is behind the camera, if boards in similar
-directions (length of their mean) are far from the optical axis, or if a gripper reaches so far."""
+"""Suspect: this share of boards behind the camera, boards of similar directions (length of their
+mean) far from the optical axis, or a gripper that reaches so far."""
 _LENGTHS = {1.0: "m", 0.001: "mm"}
 _FLIP = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
 _CAUSES = (
@@ -60,10 +57,9 @@ _CAUSES = (
 
 
 class _Reading(NamedTuple):
-    """The pairs in another convention."""
+    """The pairs in another convention; the message names the mistake and its correction."""
 
     message: str
-    """The mistake and its correction."""
     pairs: PosePairs
     mount: Mount
 
@@ -79,14 +75,7 @@ def quick_fit(pairs: PosePairs, mount: Mount, scale_known: bool) -> tuple[Agreem
 def require_agreement(
     pairs: PosePairs, mount: Mount, scale_known: bool, fit: Agreement, of_board: bool = True
 ) -> None:
-    """Check that pose pairs agree, and diagnose them otherwise.
-
-    Camera poses `of_board` must see the board; camera poses in a map may see anything.
-
-    Raises:
-        InputError: Another reading of the poses fits far better or is far more plausible, or the
-            residuals are too large.
-    """
+    """Check that pose pairs agree, or name the mistake; poses `of_board` must see the board."""
     suspect = fit.metres > _SUSPECT_M or fit.radians > _SUSPECT_RAD or fit.inliers.mean() < _FEW
     readings = [_Reading(*other, mount) for other in _other_conventions(pairs, suspect)]
     if suspect:
@@ -142,7 +131,6 @@ def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> No
 
 
 def _clearly_better(other: Agreement, fit: Agreement) -> bool:
-    """Whether a reading improves translation or rotation by far, or explains many more poses."""
     # Residuals below 0.01 mm and 0.01 mrad are not improved.
     metres, radians = max(other.metres, 1e-5), max(other.radians, 1e-5)
     ratios = metres / max(fit.metres, 1e-5), radians / max(fit.radians, 1e-5)
@@ -151,7 +139,6 @@ def _clearly_better(other: Agreement, fit: Agreement) -> bool:
 
 
 def _plausibility(reading: _Reading, fit: Agreement) -> float:
-    """Return how usual a geometry is, the logarithm of a probability density."""
     x, z = fit.at.parent_from_camera, fit.at.fixed_from_board
     usual = (_NEAR_M, _FAR_M) if reading.mount == "eye_in_hand" else (_FAR_M, _NEAR_M)
     lengths = np.array([np.linalg.norm(x.translation_m), np.linalg.norm(z.translation_m)])
@@ -233,8 +220,7 @@ def _transposed(poses: SE3) -> SE3:
 def _other_conventions(pairs: PosePairs, every: bool) -> list[tuple[str, PosePairs]]:
     """Return the pairs with the numbers of one file in another convention, the best first.
 
-    Unless `every` is set, the angles of robot and camera must agree far better. An exchanged order
-    of quaternions keeps all angles.
+    Unless `every` is set, the angles of robot and camera must agree far better.
     """
     robot, camera = pairs.base_from_gripper, pairs.camera_from_board
     limit = np.inf if every else _mismatch_rad(robot, camera) / _SCREENED
@@ -245,8 +231,7 @@ def _other_conventions(pairs: PosePairs, every: bool) -> list[tuple[str, PosePai
     ):
         for given in _numbers(poses, numbers):
             for meant, corrected in _reread(given):
-                mismatch = _mismatch_rad(corrected, other)
-                if mismatch > limit:
+                if (mismatch := _mismatch_rad(corrected, other)) > limit:
                     continue
                 message = (
                     f"the {name} poses look written as {' or '.join(meant)} and read as"
@@ -260,7 +245,6 @@ def _other_conventions(pairs: PosePairs, every: bool) -> list[tuple[str, PosePai
 
 
 def _numbers(poses: SE3, given: PoseNumbers | None) -> list[PoseNumbers]:
-    """Return the numbers of a file, or of bare poses in the likely conventions."""
     if given is not None:
         return [given]
     likely = [pose_convention(n) for n in ("wxyz", "xyzw", "rpy", "ur", "staubli:m", "kuka:m")]
@@ -268,10 +252,7 @@ def _numbers(poses: SE3, given: PoseNumbers | None) -> list[PoseNumbers]:
 
 
 def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:
-    """Return the poses by other conventions of the same count and unit of length, and their names.
-
-    Of several names of one convention the shortest are given.
-    """
+    """Return the poses by other conventions of the same count and unit, with the shortest names."""
     readings: dict[bytes, tuple[list[str], SE3]] = {}
     used = given.convention
     kept = [word for word in ("inverse", "opengl") if used.has(word)]
@@ -296,14 +277,11 @@ def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:
 
 
 def _angles(poses: SE3) -> Array:
-    """Return the rotation angles between all pairs of poses, radians."""
     i, j = np.triu_indices(len(poses), 1)
-    q = poses.rotation_wxyz
-    return 2 * np.arccos(np.minimum(np.abs((q[i] * q[j]).sum(1)), 1.0))
+    return pose_distance(poses[i], poses[j])[1]
 
 
 def _mismatch_rad(robot: SE3, camera: SE3) -> float:
-    """Return the lower quartile of the differences between angles of robot and camera."""
     return float(np.quantile(np.abs(_angles(robot) - _angles(camera)), 0.25))
 
 

@@ -20,13 +20,7 @@ _RECORD = "record 15 to 25 poses that differ by 20 to 60 deg about two axes and 
 
 
 def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
-    """Check that the pairs determine the calibration.
-
-    Raises:
-        InputError: There are too few different poses, lengths are not in metres, robot or camera
-            never moved, or the motion is degenerate: pure translation, pure rotation, or rotation
-            about one axis.
-    """
+    """Check that the pairs determine the calibration."""
     n = len(pairs)
     if n < MIN_POSES:
         raise InputError(
@@ -43,10 +37,10 @@ def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
             f" {'one' if len(different) == 1 else 'ones'}"
             f" ({listed([pairs.names[i] for i in different])}); repeats add nothing: {_RECORD}"
         )
-    selected = pairs[different]
-    _require_motion(selected, scale_known)
-    require_rotations(selected.base_from_gripper)
-    spread = float(np.sqrt(selected.base_from_gripper.translation_m.var(0).sum()))
+    _require_motion(pairs[different], scale_known)
+    grippers = pairs.base_from_gripper[different]
+    require_rotations(grippers)
+    spread = float(np.sqrt(grippers.translation_m.var(0).sum()))
     if spread < _MIN_TRANSLATION_M:
         raise InputError(
             f"pure rotation: the gripper only turned on the spot (its positions vary by"

@@ -40,7 +40,7 @@ class PairFiles:
 
 @dataclass(frozen=True, eq=False)
 class _Poses:
-    """The n poses of a file."""
+    """The n poses of a table, or of a file of `evercal detect`."""
 
     names: tuple[str, ...] | None
     stamps_s: NDArray[np.float64] | None
@@ -50,20 +50,15 @@ class _Poses:
     measured: NDArray[np.bool_]
     """(n,) whether the image shows a board; true for a table."""
     numbers: PoseNumbers | None = None
-    """(n, k) numbers of a table."""
     board: BoardPoses | None = None
-    """The file of `evercal detect`."""
 
     def row_names(self) -> tuple[str, ...]:
-        """Return the names, or the row numbers of a file without names."""
         return self.names or tuple(f"row {i + 1}" for i in range(len(self.poses)))
 
     def numbers_of(self, rows: Sequence[int]) -> PoseNumbers | None:
-        """Return the numbers of some rows."""
         return self.numbers and self.numbers[np.array(rows, dtype=np.int64)]
 
     def corners_of(self, rows: Sequence[int]) -> BoardCorners | None:
-        """Return the corners of images that show the board."""
         if self.board is None:
             return None
         images, printed = self.board.images, self.board.board
@@ -80,12 +75,8 @@ class _Poses:
 def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
     """Read robot and camera poses and pair them.
 
-    If both files have names, equal names are paired, without folder and suffix. Otherwise, if both
-    have times, the robot poses are interpolated at the times of the images. Otherwise rows are
-    paired in order; the images of `evercal detect` are sorted naturally (image-2 before image-10).
-
-    Raises:
-        InputError: A file is broken, or the poses cannot be paired.
+    By names without folder and suffix if both files have them, else by times, else in order; the
+    images of `evercal detect` are sorted naturally (image-2 before image-10).
     """
     robot, camera = _read(files, "robot"), _read(files, "camera")
     if robot.names is not None and camera.names is not None:
@@ -177,7 +168,6 @@ def _read(files: PairFiles, role: Literal["robot", "camera"]) -> _Poses:
 
 
 def _inverted(convention: PoseConvention) -> PoseConvention:
-    """Return the convention of the same numbers that states the inverse."""
     words = convention.name.split(":")
     words = [w for w in words if w != "inverse"] if "inverse" in words else [*words, "inverse"]
     return replace(convention, name=":".join(words))

@@ -32,17 +32,12 @@ class PoseNumbers:
     """Whether the camera's frame is the first of the pose."""
 
     def __getitem__(self, rows: NDArray[np.int64]) -> Self:
-        """Return a subset of the rows."""
         return replace(self, numbers=self.numbers[rows])
 
 
 @dataclass(frozen=True, eq=False)
 class PosePairs:
-    """n pose pairs; the board may be any object with camera poses: a tag, a map, an SfM model.
-
-    Raises:
-        ValueError: The numbers of names and poses differ.
-    """
+    """n pose pairs; the board may be any object with camera poses: a tag, a map, an SfM model."""
 
     names: tuple[str, ...]
     """(n,) names of images or rows."""
@@ -51,15 +46,11 @@ class PosePairs:
     camera_from_board: SE3
     """(n,) poses from the images."""
     camera_covariance: Array | None = None
-    """(n, 6, 6) covariance of `camera_from_board`: (translation in the camera frame, metres;
-    rotation about the board's axes, radians). If omitted, the noise is estimated from the pairs."""
+    """(n, 6, 6) covariance of `camera_from_board`, as in `BoardPose`. Default: it is estimated."""
     velocity: Array | None = None
-    """(n, 6) gripper velocity in the base frame, m/s and rad/s; required to estimate a time
-    offset."""
+    """(n, 6) gripper velocity in the base frame, m/s and rad/s, to estimate a time offset."""
     robot_numbers: PoseNumbers | None = None
-    """Numbers of the robot's file."""
     camera_numbers: PoseNumbers | None = None
-    """Numbers of the camera's file."""
 
     def __post_init__(self) -> None:
         counts = {len(self.names), len(self.base_from_gripper), len(self.camera_from_board)}
@@ -69,11 +60,9 @@ class PosePairs:
             raise ValueError(f"names and poses of pose pairs differ in number: {sorted(counts)}")
 
     def __len__(self) -> int:
-        """Return the number of pairs."""
         return len(self.names)
 
     def __getitem__(self, index: NDArray[np.int64] | Mask) -> Self:
-        """Return a subset of the pairs."""
         rows = np.arange(len(self))[index]
         covariance = self.camera_covariance
         return replace(
@@ -88,10 +77,7 @@ class PosePairs:
         )
 
     def distinct(self, scale_known: bool = True) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return indices of different pairs, sorted by value whatever their order.
-
-        The second array holds for each of the n pairs the first equal pair.
-        """
+        """Return indices of different pairs, sorted by value, and (n,) the first equal pair."""
         keys = [*self.base_from_gripper.translation_m.T, *self.camera_from_board.translation_m.T]
         keys += [*_canonical(self.base_from_gripper).T, *_canonical(self.camera_from_board).T]
         order, first = np.lexsort(keys[::-1]), np.empty(len(self), dtype=np.int64)
@@ -99,10 +85,8 @@ class PosePairs:
         return order[first[order] == order], first
 
     def repeats(self, scale_known: bool = True) -> NDArray[np.int64]:
-        """Return (n,) the index of the first equal pair; the own index for a new pair.
-
-        Equal robot poses with different camera poses are not repeats: the robot pose is stale.
-        """
+        """Return (n,) the index of the first equal pair; the own index for a new pair."""
+        # Equal robot poses with different camera poses are no repeats: the robot pose is stale.
         first = np.arange(len(self))
         positions = self.base_from_gripper.translation_m
         close = KDTree(positions).query_pairs(_SAME_ROBOT_M, output_type="ndarray")
@@ -128,10 +112,7 @@ class PosePairs:
         return replace(self, camera_from_board=moved)
 
     def equation(self, mount: Mount, extras: Extras) -> PoseEquation:
-        """Return the equation to solve.
-
-        The board is fixed in the base for a camera on the arm, otherwise in the gripper.
-        """
+        """Return the equation; the board is fixed in the base for a camera on the arm."""
         on_arm, robot = mount == "eye_in_hand", self.base_from_gripper
         fixed_from_parent = robot if on_arm else robot.inverse()
         covariance, velocity = self.camera_covariance, self.velocity
@@ -156,7 +137,6 @@ def listed(names: Sequence[str], limit: int = 5) -> str:
 
 
 def _inverse_velocity(base_from_gripper: SE3, velocity: Array) -> Array:
-    """Return the (n, 6) velocity of the base in the gripper frame."""
     linear, angular = np.split(velocity, 2, 1)
     gripper_from_base = np.swapaxes(base_from_gripper.rotation_matrix(), 1, 2)
     moved = np.cross(angular, base_from_gripper.translation_m) - linear
@@ -165,7 +145,6 @@ def _inverse_velocity(base_from_gripper: SE3, velocity: Array) -> Array:
 
 
 def _canonical(pose: SE3) -> Array:
-    """Return (n, 4) quaternions with a unique sign for each rotation."""
     quaternion = pose.rotation_wxyz
     largest = np.take_along_axis(quaternion, np.abs(quaternion).argmax(-1)[:, None], -1)
     return quaternion * np.where(largest < 0, -1.0, 1.0)

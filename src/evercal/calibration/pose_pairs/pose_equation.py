@@ -1,13 +1,9 @@
 """The hand-eye equation with all unknowns, its derivatives and its kinds of noise.
 
 For every pose, `fixed_from_parent @ parent_from_camera @ camera_from_board = fixed_from_board`.
-For a camera on the arm, `parent` is the gripper and `fixed` is the robot base. For a fixed camera
-with the board in the gripper, `parent` is the base and `fixed` is the gripper. The noise of a robot
-rotates its gripper about the origin of the gripper or of the base. These are the origins of
-`parent` and `fixed`, so one model serves both mounts.
-
-Further unknowns, the extras, change every camera pose: intrinsics, the size of a square, a depth
-error that all images share. Each has a Gaussian prior.
+For a camera on the arm, `parent` is the gripper and `fixed` the robot base; for a fixed camera with
+the board in the gripper, the reverse. Further unknowns with a Gaussian prior, the extras, change
+every camera pose: intrinsics, the size of a square, a depth error that all images share.
 
 Residuals are (translation, rotation vector) in the frame `fixed`, metres and radians.
 """
@@ -46,17 +42,12 @@ class Unknowns:
         return self._pose(1)
 
     def _pose(self, which: int) -> SE3:
-        quaternion = Rotation.from_matrix(self.rotations[which]).as_quat(
-            canonical=True, scalar_first=True
-        )
+        rotation = Rotation.from_matrix(self.rotations[which])
+        quaternion = rotation.as_quat(canonical=True, scalar_first=True)
         return SE3(quaternion, np.asarray(self.translations[which], dtype=np.float64))
 
     def moved(self, step: Array) -> "Unknowns":
-        """Return the unknowns after a (12 + q,) step: (translation, rotation) of X, of Z, extras.
-
-        Translations change in the parent frame, rotations by a factor on the right, as in
-        `Calibration`.
-        """
+        """Return the unknowns after a (12 + q,) step of (translation, rotation) of X, Z, extras."""
         both = step[:12].reshape(2, 6)
         turned = self.rotations @ Rotation.from_rotvec(both[:, 3:]).as_matrix()
         return Unknowns(turned, self.translations + both[:, :3], self.extras + step[12:])
@@ -71,8 +62,7 @@ class Extras:
     groups: tuple[str, ...]
     """(q,) `intrinsics`, `shared depth`, `size` or `clock`."""
     slopes: Array
-    """(n, 6, q) derivatives of `camera_from_board`: translation in the camera frame, rotation about
-    the board's axes; zero for a time offset, which moves the robot instead."""
+    """(n, 6, q) derivatives of `camera_from_board`; zero for a time offset."""
     information: Array
     """(q, q) inverse covariance of the prior; zero for an unknown without prior."""
     mean: Array
@@ -138,17 +128,15 @@ class PoseEquation:
     camera_translation: Array
     """(n, 3) metres."""
     camera_covariance: Array
-    """(n, 6, 6) known covariance of `camera_from_board`: (translation in the camera frame, rotation
-    about the board's axes); zero if it is unknown."""
+    """(n, 6, 6) known covariance of `camera_from_board`; zero if it is unknown."""
     extras: Extras
     base_is_fixed: bool = True
     """Whether `fixed` is the robot base and `parent` the gripper, not the reverse."""
     velocity: Array | None = None
-    """(n, 6) velocity of the parent in the frame `fixed`, m/s and rad/s; required for the extra
-    `clock`, which is the last: the time to add to a camera stamp."""
+    """(n, 6) velocity of the parent in the frame `fixed`, for the last extra `clock`: the time to
+    add to a camera stamp."""
 
     def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Self:
-        """Return a subset of the poses."""
         return replace(
             self,
             robot_rotation=self.robot_rotation[index],
@@ -161,7 +149,6 @@ class PoseEquation:
         )
 
     def __len__(self) -> int:
-        """Return the number of poses."""
         return len(self.robot_translation)
 
     @property
@@ -180,9 +167,8 @@ class PoseEquation:
         lever = lever + self.robot_rotation @ at.translations[0]
         difference = fixed_from_camera @ turned @ at.rotations[1].T
         rotation = Rotation.from_matrix(difference, assume_valid=True).as_rotvec()
-        residual = np.concatenate(
-            [lever + self.robot_translation - at.translations[1], rotation], 1
-        )
+        shift = lever + self.robot_translation - at.translations[1]
+        residual = np.concatenate([shift, rotation], 1)
         slope = _log_slope(rotation)
         jacobian = np.zeros((n, 6, self.unknowns))
         jacobian[:, :3, 0:3] = self.robot_rotation
@@ -209,11 +195,8 @@ class PoseEquation:
         )
 
     def _noise_directions(self, at: Unknowns) -> dict[str, Array]:
-        """Return (n, 6, c) residuals due to unit errors of each kind, one metre or one radian.
-
-        A rotation about a distant point also moves the board. The last two kinds are the noise of a
-        camera, which corners tell.
-        """
+        """Return (n, 6, c) residuals due to unit errors of each kind, one metre or one radian."""
+        # A rotation about a distant point also moves the board. Corners tell a camera's noise.
         n = len(self)
         board, parent = at.translations[1], self.robot_translation
         gripper = parent if self.base_is_fixed else np.zeros((n, 3))
@@ -232,8 +215,7 @@ class PoseEquation:
 def _log_slope(rotvec: Array) -> Array:
     """Return the (n, 3, 3) derivative of a rotation vector by a small rotation on its left.
 
-    The transpose is the derivative by a rotation on the right. This is a series of the inverse
-    Jacobian of SO(3), accurate to 1e-4 up to one radian.
+    A series of the inverse Jacobian of SO(3), accurate to 1e-4 up to one radian.
     """
     matrix = cross_matrix(rotvec)
     angle2 = (rotvec**2).sum(1)[:, None, None]
@@ -242,5 +224,4 @@ def _log_slope(rotvec: Array) -> Array:
 
 
 def _rotated(lever: Array) -> Array:
-    """Return (n, 6, 3) residuals of unit rotations about points at a distance of `lever` (n, 3)."""
     return np.concatenate([-cross_matrix(lever), np.broadcast_to(np.eye(3), (len(lever), 3, 3))], 1)

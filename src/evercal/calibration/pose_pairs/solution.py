@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.boards.board_poses import pose_dict
 from evercal.calibration.boards.intrinsics import LENS, moved_camera
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, Mount
+from evercal.calibration.located import length_mm_deg
 from evercal.calibration.pose_pairs.checks import held_out_error, left_open, repeatability
 from evercal.calibration.pose_pairs.fit import HandEyeFit
 from evercal.calibration.pose_pairs.measured import BoardCorners, Measured, middle_of
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
 from evercal.calibration.verdict import verdict
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, pose_to_dict
 
 Array = NDArray[np.floating]
 
@@ -26,8 +26,6 @@ _CAUSES = {
     "depth": "distance from camera to board, image by image",
     "rotation about board": "rotation of the board in the image",
     "rotation about gripper": "rotation of the robot's gripper",
-}
-_EXTRA_CAUSES = {
     "known": "corners of the board",
     "intrinsics": "intrinsics",
     "shared depth": "distance from camera to board, all images",
@@ -41,9 +39,8 @@ class PairSolution:
 
     pairs: PosePairs
     rows: NDArray[np.int64]
-    """Pairs of the equation, sorted by value."""
+    """Pairs of the equation, sorted by value; `first` (n,) is the first pair equal to each."""
     first: NDArray[np.int64]
-    """(n,) for every pair, the first equal pair."""
     equation: PoseEquation
     fit: HandEyeFit
     mount: Mount
@@ -116,10 +113,13 @@ class PairSolution:
             **held_out_error(self.equation, fit),
             **repeatability(self.equation, fit),
             "target_m": float(np.median(distance)),
-            f"{fixed}_from_board": pose_dict(self.fixed_from_board),
+            f"{fixed}_from_board": pose_to_dict(self.fixed_from_board),
             "leave_one_out_mm": self._by_name(1000 * np.linalg.norm(fit.moved[:, :3], axis=1)),
             "information_percent": self._by_name(100 * fit.information),
-            "camera_from_board": self._board_poses(),
+            "camera_from_board": {
+                self.pairs.names[i]: pose_to_dict(pose)
+                for i, pose in zip(self.rows, self.camera_from_board, strict=True)
+            },
             "left_open": left_open(fit, self.parent),
             "warnings": list(self.warnings),
         }
@@ -138,13 +138,7 @@ class PairSolution:
         named = zip(self.rows, self.fit.inliers, values.tolist(), strict=True)
         return {self.pairs.names[i]: value for i, used, value in named if used}
 
-    def _board_poses(self) -> dict[str, object]:
-        """Return the board pose of every pair by name, as JSON values."""
-        poses = zip(self.rows, self.camera_from_board, strict=True)
-        return {self.pairs.names[i]: pose_dict(pose) for i, pose in poses}
-
     def _images(self) -> tuple[ImageUse, ...]:
-        """Return the use of every pair in the given order."""
         row_of = {int(pair): row for row, pair in enumerate(self.rows)}
         uses = []
         for i, name in enumerate(self.pairs.names):
@@ -153,8 +147,7 @@ class PairSolution:
                 uses.append(ImageUse(name, False, f"repeats {other}, which adds nothing"))
                 continue
             row = row_of[i]
-            lengths = np.linalg.norm(self.fit.residual[row].reshape(2, 3), axis=1)
-            mm, deg = 1000 * float(lengths[0]), float(np.rad2deg(lengths[1]))
+            mm, deg = length_mm_deg(self.fit.residual[row])
             sigmas = float(np.sqrt(self.fit.distance2[row] / 6))
             reason = (
                 f"disagrees with the others by {mm:.1f} mm and {deg:.2f} deg, {sigmas:.1f} times"
@@ -166,7 +159,7 @@ class PairSolution:
 
     def _error_terms(self) -> tuple[ErrorTerm, ...]:
         fit, terms = self.fit, []
-        for name, cause in (_CAUSES | _EXTRA_CAUSES).items():
+        for name, cause in _CAUSES.items():
             part = fit.contributions.get(name)
             if part is not None and np.trace(part) > 1e-6 * np.trace(fit.covariance[:6, :6]):
                 terms.append(ErrorTerm.of(cause, part))

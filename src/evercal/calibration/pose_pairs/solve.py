@@ -9,12 +9,7 @@ from evercal.calibration.boards.corners import BoardView, board_pose
 from evercal.calibration.boards.intrinsics import lens_vector, moved_camera
 from evercal.calibration.calibration import Calibration, Mount
 from evercal.calibration.pose_pairs.board_size import SIZE_SIGMA, widened, with_tested_size
-from evercal.calibration.pose_pairs.fit import (
-    HandEyeFit,
-    agreement,
-    least_sigma,
-    robust_fit,
-)
+from evercal.calibration.pose_pairs.fit import HandEyeFit, agreement, least_sigma, robust_fit
 from evercal.calibration.pose_pairs.measured import BoardCorners as BoardCorners
 from evercal.calibration.pose_pairs.measured import Measured, measured, middle_of
 from evercal.calibration.pose_pairs.mistakes import quick_fit, require_agreement
@@ -29,10 +24,8 @@ Array = NDArray[np.floating]
 
 _SCALE_SIGMA = 0.1
 """Maximum relative standard deviation of an unknown scale."""
-_MOST_LENSES = 8
-"""Number of times that the intrinsics are changed, at most."""
-_SAME_LENS = 0.01
-"""Squared Mahalanobis length of a change of the intrinsics that is not worth another round."""
+_MOST_LENSES, _SAME_LENS = 8, 0.01
+"""Maximum number of changes of the intrinsics; squared Mahalanobis length of one to ignore."""
 _LENS_WARNING = 3.0
 """Deviation of stated intrinsics from the estimate that is reported, standard deviations."""
 
@@ -45,17 +38,14 @@ def solve(
 ) -> Calibration:
     """Calibrate a camera on the gripper or beside the robot from pose pairs.
 
-    Both unknown transforms are estimated jointly: closed-form solutions of many subsets give a
-    robust start, then every pose is weighted by the noise estimated from the pairs. With corners,
-    the intrinsics are estimated together with the transforms, and each image is weighted by what
-    its corners determine.
+    Both unknown transforms are estimated jointly, and poses are weighted by the noise estimated
+    from the pairs. With corners, the intrinsics are estimated, too, and each image is weighted by
+    what its corners determine. A stated size of the squares, the scale of the camera poses and a
+    depth error that all images share are unknowns with a prior of 0.2 %. A size that the robot's
+    motions contradict is reported and estimated.
 
-    A stated size of the squares, the scale of the camera poses and a depth error that all images
-    share are unknowns with a prior of 0.2 %. A size that the robot's motions contradict is
-    reported and estimated.
-
-    The covariance is enlarged for the uncertainty of the noise estimate, so that the usual
-    chi-square quantiles hold (12.59 for 95 % in six dimensions).
+    The covariance allows for the uncertainty of the noise estimate: the usual chi-square quantiles
+    hold (12.59 for 95 % in six dimensions).
 
     Args:
         pairs: Pose pairs; their order does not matter.
@@ -67,10 +57,6 @@ def solve(
 
     Returns:
         `gripper_from_camera` or `base_from_camera`.
-
-    Raises:
-        InputError: The poses do not determine the calibration or do not agree, or look like another
-            convention. The message states the reason and a remedy.
     """
     return solve_pairs(pairs, mount, scale_known, corners).calibration()
 
@@ -82,10 +68,7 @@ def solve_pairs(
     corners: BoardCorners | None = None,
     of_board: bool = True,
 ) -> PairSolution:
-    """Solve pose pairs like `solve`, and return the fit.
-
-    Poses in a map, not `of_board`, may have any direction.
-    """
+    """Like `solve`, but return the fit. Poses in a map, not `of_board`, may have any direction."""
     require_observable(pairs, scale_known)
     rows, first = pairs.distinct(scale_known)
     start, scale = quick_fit(pairs[rows], mount, scale_known)
@@ -188,7 +171,6 @@ class _Problem:
 def _lens_warnings(
     fit: HandEyeFit, equation: PoseEquation, corners: BoardCorners | None, lens: Measured | None
 ) -> list[str]:
-    """Compare a stated focal length with the estimate."""
     if corners is None or lens is None or not corners.stated:
         return []
     stated = corners.prior
@@ -212,8 +194,7 @@ def _other_board_poses(
 ) -> tuple[BoardCorners, SE3]:
     """Fit the board pose of each outlier again, starting from the predicted pose.
 
-    A flat board has two similar poses, and the corners of a symmetric board may be in reverse
-    order.
+    A flat board has two similar poses, and a symmetric board several orders of its corners.
     """
     views, poses = list(corners.views), [pose.camera_from_board for pose in lens.poses]
     for row in np.flatnonzero(outliers):

@@ -2,10 +2,8 @@
 
 Each solves A X = X B for the motions A of the parent and B of the camera among three poses, and one
 among all poses. F. Park and B. Martin, Robot sensor calibration: solving AX = XB on the Euclidean
-group, 1994. The axes are weighted by the sine of the angle instead of the angle: the logarithm of a
-rotation by 180 degrees has no sign, and motions near 180 degrees would have the largest weight.
-
-The samples use a fixed seed, so sorted poses give the same start every time.
+group, 1994. The axes are weighted by the sine of the angle, because the logarithm of a rotation by
+180 degrees has no sign. A fixed seed gives sorted poses the same start every time.
 """
 
 from itertools import combinations
@@ -34,10 +32,7 @@ class Start(NamedTuple):
 
 
 def consensus_start(equation: PoseEquation, scale_known: bool = True) -> Start:
-    """Return the hypothesis that agrees best with the better half of three or more poses.
-
-    With `scale_known`, the camera's translations are in metres.
-    """
+    """Return the hypothesis that agrees best with the better half of three or more poses."""
     n = len(equation)
     scored = equation[np.unique(np.linspace(0, n - 1, _SCORED).round().astype(int))]
     i, j = np.triu_indices(len(scored), 1)
@@ -63,7 +58,6 @@ def consensus_start(equation: PoseEquation, scale_known: bool = True) -> Start:
 
 
 def _triples(n: int) -> NDArray[np.int64]:
-    """Return (h, 3) indices of distinct poses."""
     if n * (n - 1) * (n - 2) // 6 <= _SAMPLES:
         return np.array(list(combinations(range(n), 3)))
     rng = np.random.default_rng(0)
@@ -105,7 +99,6 @@ def _solve_motions(
 
 
 def _sine_axes(rotations: Array) -> Array:
-    """Return rotation axes times twice the sine of the angle, (..., 3)."""
     skew = rotations - np.swapaxes(rotations, -1, -2)
     return np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
 
@@ -131,7 +124,6 @@ def _spread(rotations: Array, translations: Array) -> tuple[Array, Array, Array]
 
 
 def _nearest(matrices: Array) -> Array:
-    """Return the rotations nearest to (h, 3, 3) matrices."""
     left, _, right = np.linalg.svd(matrices)
     left[..., -1] *= np.linalg.det(left @ right)[..., None]
     return left @ right

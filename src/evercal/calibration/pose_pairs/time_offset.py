@@ -15,16 +15,14 @@ from evercal.calibration.pose_pairs.measured import BoardCorners
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve_pairs
 from evercal.errors import InputError
-from evercal.geometry import SE3
+from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.pose_track import PoseTrack
 
 Array = NDArray[np.floating]
 
 _STEP_S = 0.01
-_MAX_SIGMA_S = 0.05
-"""Maximum standard deviation of the offset."""
-_HALF_S = 0.005
-"""Half the interval over which the robot's velocity is computed."""
+_MAX_SIGMA_S, _HALF_S = 0.05, 0.005
+"""Maximum standard deviation of the offset; half the interval of the robot's velocity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +38,6 @@ class CameraTrack:
     """Corners of the images, in the same order."""
 
     def __getitem__(self, index: NDArray[np.bool_]) -> "CameraTrack":
-        """Return a subset of the images."""
         rows, corners = np.flatnonzero(index), self.corners
         if corners is not None:
             corners = replace(corners, views=tuple(corners.views[row] for row in rows))
@@ -65,22 +62,17 @@ def solve_with_offset(
         largest_s: Maximum offset.
 
     Returns:
-        Calibration as from `solve`. `time_offset_s` in its checks is the time to add to a camera
-        stamp to get the robot's time, and `time_offset_sigma_s` its standard deviation.
-
-    Raises:
-        InputError: As for `solve`, or the streams do not overlap, or the motion does not determine
-            the offset.
+        Calibration whose checks hold `time_offset_s`, to add to the stamp of an image, and its
+        standard deviation `time_offset_sigma_s`.
     """
     offset = _coarse_offset(robot, camera, largest_s)
-    turns = 0
-    while True:
+    correction, sigma = np.inf, np.inf
+    for _ in range(6):
         pairs, overlapping = _pairs_at(robot, camera, offset)
         solution = solve_pairs(pairs, mount, scale_known, overlapping.corners)
         correction, sigma = float(solution.fit.at.extras[-1]), float(solution.fit.sigma[-1])
         offset += float(np.clip(correction, -largest_s, largest_s))
-        turns += 1
-        if abs(correction) < 1e-4 or turns == 6:
+        if abs(correction) < 1e-4:
             break
     if not sigma < _MAX_SIGMA_S or abs(correction) > 0.02:
         raise InputError(
@@ -92,7 +84,7 @@ def solve_with_offset(
 
 
 def interpolated_pairs(robot: PoseTrack, camera: CameraTrack) -> tuple[PosePairs, CameraTrack]:
-    """Interpolate robot poses at image times of the same clock; return the images inside, too."""
+    """Interpolate robot poses at image times; return the images within the track, too."""
     pairs, overlapping = _pairs_at(robot, camera, 0.0)
     return replace(pairs, velocity=None), overlapping
 
@@ -148,6 +140,4 @@ def _coarse_offset(robot: PoseTrack, camera: CameraTrack, largest_s: float) -> f
 
 
 def _angles(poses: SE3) -> Array:
-    """Return the (n - 1,) angles between successive poses, radians."""
-    q = poses.rotation_wxyz
-    return 2 * np.arccos(np.minimum(np.abs((q[:-1] * q[1:]).sum(1)), 1.0))
+    return pose_distance(poses[:-1], poses[1:])[1]
