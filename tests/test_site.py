@@ -54,6 +54,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_site_holds_the_reference(site: Path) -> None:
     python = (site / "reference" / "python.html").read_text(encoding="utf-8")
     for name in evercal._PUBLIC:
@@ -65,6 +66,7 @@ def test_site_holds_the_reference(site: Path) -> None:
         assert f"usage: evercal {verb}" in verbs
 
 
+@pytest.mark.slow
 def test_pages_load_nothing_from_the_internet(site: Path) -> None:
     loads = r"<(?:script|img|iframe|source)[^>]*\ssrc=[\"']?(?:https?:)?//[^\s>\"']+"
     loads += (
@@ -78,6 +80,7 @@ def test_pages_load_nothing_from_the_internet(site: Path) -> None:
         assert not re.search(r"(?:url\(|@import)\s*[\"']?(?:https?:)?//", sheet.read_text("utf-8"))
 
 
+@pytest.mark.slow
 def test_start_page_is_the_readme_and_its_links_stay_inside(site: Path) -> None:
     start = (site / "index.html").read_text(encoding="utf-8")
     assert 'href="results.html"' in start
