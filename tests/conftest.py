@@ -98,6 +98,21 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
     return get
 
 
+@pytest.fixture(scope="session")
+def cell(shared: Shared, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The packaged robot cell, learned: a folder with `cell.evercal` and `wrist.json`."""
+    from evercal.cli import main
+    from evercal.recordings.samples import CELL
+
+    def learn() -> Path:
+        root = tmp_path_factory.mktemp("cell")
+        words = ["learn", root / "cell.evercal", CELL / "wrist", "--calibration"]
+        assert main([*map(str, words), str(root / "wrist.json")]) == 0
+        return root
+
+    return shared("cell", learn)
+
+
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest) -> torch.device:
     """The CPU, and with `-m gpu` a CUDA device; the test is skipped without one."""

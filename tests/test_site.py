@@ -17,7 +17,6 @@ DOCS = ROOT / "docs"
 NAVIGATION = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("\nnav:\n")[1]
 OF_THE_ROOT = {"index.md", "changelog.md", "contributing.md", "security.md"}
 """Pages made from files of the repository's root."""
-slow = pytest.mark.slow("docs", "mkdocs.yml")
 NEEDED = ("mkdocs", "material", "mkdocstrings")
 
 
@@ -55,7 +54,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@slow
+@pytest.mark.slow("docs", "mkdocs.yml")
 def test_site_holds_the_reference(site: Path) -> None:
     python = (site / "reference" / "python.html").read_text(encoding="utf-8")
     for name in evercal._PUBLIC:
@@ -67,7 +66,7 @@ def test_site_holds_the_reference(site: Path) -> None:
         assert f"usage: evercal {verb}" in verbs
 
 
-@slow
+@pytest.mark.slow("docs", "mkdocs.yml")
 def test_pages_load_nothing_from_the_internet(site: Path) -> None:
     loads = r"<(?:script|img|iframe|source)[^>]*\ssrc=[\"']?(?:https?:)?//[^\s>\"']+"
     loads += (
@@ -81,7 +80,7 @@ def test_pages_load_nothing_from_the_internet(site: Path) -> None:
         assert not re.search(r"(?:url\(|@import)\s*[\"']?(?:https?:)?//", sheet.read_text("utf-8"))
 
 
-@slow
+@pytest.mark.slow("docs", "mkdocs.yml")
 def test_start_page_is_the_readme_and_its_links_stay_inside(site: Path) -> None:
     start = (site / "index.html").read_text(encoding="utf-8")
     assert 'href="results.html"' in start
@@ -90,7 +89,6 @@ def test_start_page_is_the_readme_and_its_links_stay_inside(site: Path) -> None:
     assert 'href="../index.html"' in (site / "tutorials" / "fleet.html").read_text(encoding="utf-8")
 
 
-@slow
 def test_drawings_are_made_by_their_command(tmp_path: Path) -> None:
     command = [sys.executable, str(DOCS / "_site" / "drawings.py"), str(tmp_path)]
     subprocess.run(command, check=True, timeout=120)
