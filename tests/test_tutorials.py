@@ -14,10 +14,13 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from docs._site.notebooks import NOTEBOOKS, Step, notebook_of, parts
+from evercal.calibration.calibration import read_transform
 from evercal.cli import main
+from evercal.geometry import SE3, pose_distance_mm_deg
 from evercal.recordings import Recording, generic, samples
 
 ROOT = Path(__file__).parents[1]
@@ -116,6 +119,12 @@ def test_commands_of_the_readme_run_on_the_packaged_cell(cell: Path, tmp_path: P
         image.unlink()  # drawing takes long
     run(f"    evercal localize{video}", tmp_path)
     assert {"report.html", "located.mp4"} <= {path.name for path in tmp_path.iterdir()}
+    truth = json.loads((tmp_path / "samples/cell/truth.json").read_text("utf-8"))
+    for file, name in (("wrist.json", "gripper_from_camera"), ("tripod.json", "base_from_camera")):
+        true = SE3(*(np.array(truth[name][key]) for key in ("quaternion_wxyz", "translation_m")))
+        millimetres, degrees = pose_distance_mm_deg(read_transform(tmp_path / file), true)
+        assert millimetres < 2
+        assert degrees < 0.1
 
 
 def test_a_wrist_camera_from_nothing(cell: Path, tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def solve_with_offset(
         standard deviation `time_offset_sigma_s`.
     """
     offset = _coarse_offset(robot, camera, largest_s)
-    correction, sigma = np.inf, np.inf
+    solution, correction, sigma = None, np.inf, np.inf
     for _ in range(6):
         pairs, overlapping = _pairs_at(robot, camera, offset)
         solution = solve_pairs(pairs, mount, scale_known, overlapping.corners)
@@ -74,7 +74,7 @@ def solve_with_offset(
         offset += float(np.clip(correction, -largest_s, largest_s))
         if abs(correction) < 1e-4:
             break
-    if not sigma < _MAX_SIGMA_S or abs(correction) > 0.02:
+    if solution is None or not sigma < _MAX_SIGMA_S or abs(correction) > 0.02:
         raise InputError(
             f"the time offset is not determined (standard deviation {1000 * sigma:.0f} ms): too few"
             f" images show the robot in motion; move it while recording, or pair images and poses"
