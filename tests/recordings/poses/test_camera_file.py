@@ -166,7 +166,7 @@ def test_missing_camera_file_is_refused(tmp_path: Path) -> None:
     refused("cannot be read", read_camera, tmp_path)
     (tmp_path / "image.png").write_bytes(b"\x89PNG\xff\xfe")
     refused("not a text file", read_camera, tmp_path / "image.png")
-    refused("has no image size", read_camera, written(tmp_path, "1 0 0 0 1 0 0 0 1"))
+    refused("no image size", read_camera, written(tmp_path, "1 0 0 0 1 0 0 0 1"))
 
 
 def test_yaml_cannot_run_code(tmp_path: Path) -> None:
@@ -236,7 +236,7 @@ def test_files_with_a_matrix_alone_have_no_distortion(tmp_path: Path) -> None:
         (CALIBRATION.replace("0.03]", "0.03, 0.5, 0.5]"), "0, 4, 5 or 8"),
         (MESSAGE.replace("x_offset: 0", "x_offset: 8"), "cut-out"),
         (MESSAGE.replace("525.25", "0.0"), "fx"),
-        ({"K": K, "D": D}, "'image_width' is missing, so it has no image size"),
+        ({"K": K, "D": D}, "'image_width' is missing .no image size"),
         ({"K": K, "D": D, "width": 640}, "'image_height' is missing"),
         ({"K": K, "distortion_parameters": D, **SIZE}, "there is distortion_parameters"),
         ({"K": K, "dist": D, "d": D, **SIZE}, "dist and d are the same; keep one"),

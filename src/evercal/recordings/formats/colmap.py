@@ -49,9 +49,7 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
     root, metric = Path(root), options is not None and options.metres
     models = {folder: _model(folder) for folder in _models(root)}
     if not models:
-        raise InputError(
-            f"{root}: no COLMAP model; expected cameras, images and points3D (.bin, .txt)"
-        )
+        raise InputError(f"{root}: no COLMAP model; expected cameras and images (.bin or .txt)")
     folder = max(models, key=lambda folder: models[folder].num_reg_images())
     model, notes = models[folder], [frame_note("COLMAP", metric)]
     if len(models) > 1:
@@ -160,6 +158,4 @@ def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:
         if all((candidate / name).is_file() for name in names):
             return candidate
     missing = next((n for n in names if not (root / "images" / n).is_file()), names[0])
-    raise InputError(
-        f"{root / 'images' / missing}: missing; put the model's images in {root}/images"
-    )
+    raise InputError(f"{root / 'images' / missing}: missing; put the model's images there")

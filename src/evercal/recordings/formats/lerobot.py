@@ -71,9 +71,7 @@ def _load(root: Path, options: ReadOptions) -> Recording:
     info = _info(root)
     key = _camera_key(root, info, options.image_topic)
     if options.camera is None:
-        raise InputError(
-            f"{root}: LeRobot datasets hold no intrinsics; give them with --camera FILE"
-        )
+        raise InputError(f"{root}: LeRobot datasets hold no intrinsics; give them with --camera")
     shape = [int(n) for n in info["features"][key]["shape"]]
     height, width = shape[1:3] if shape[0] == 3 else shape[:2]  # some state channels first
     camera = read_camera_of_size(options.camera, (width, height), key)
@@ -130,9 +128,7 @@ class _Row(NamedTuple):
 def _rows(root: Path, column: str) -> tuple[list[_Row], NDArray[np.float64]]:
     files = sorted((root / "data").glob("*/*.parquet"))
     if not files:
-        raise InputError(
-            f"{root / 'data'}: no parquet files; download the dataset's data folder too"
-        )
+        raise InputError(f"{root / 'data'}: no parquet files; download the data folder too")
     rows: list[_Row] = []
     parts = []
     for file in files:
@@ -266,9 +262,7 @@ def _pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> 
     if _STATE in keys or len(keys) == 1:
         return _STATE if _STATE in keys else keys[0]
     if keys:
-        raise InputError(
-            f"{root}: gripper poses are in {' and '.join(keys)}; name one with --gripper-frame"
-        )
+        raise InputError(f"{root}: gripper poses are in {' and '.join(keys)}; give --gripper-frame")
     named = {key: names for key, names in observed.items() if names and "image" not in key}
     listed = "; ".join(f"{key}: {', '.join(names)}" for key, names in named.items())
     raise InputError(

@@ -145,9 +145,7 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
     if len(pictures) != 1:
         refused = "; ".join(f"{t}: {reason}" for t, reason in reasons.items() if reason)
         what = f"images on {len(pictures)} topics" if pictures else f"no pictures ({refused})"
-        raise InputError(
-            f"{bag.path}: {what}; name one with --image-topic: {', '.join(pictures or topics)}"
-        )
+        raise InputError(f"{bag.path}: {what}; give --image-topic: {', '.join(pictures or topics)}")
     return pictures[0]
 
 

@@ -118,7 +118,5 @@ def read_numbers(file: Path, count: int, what: str) -> NDArray[np.float64]:
     # float() on the words: np.loadtxt takes longer per file than reading the file.
     words = read_text(file, f"{what} matrix").split()
     if len(words) != count or not all(map(is_number, words)):
-        raise InputError(
-            f"{file}: expected a {what} matrix of {count} numbers, got {len(words)} words"
-        )
+        raise InputError(f"{file}: expected a {what} matrix of {count} numbers, got {len(words)}")
     return np.array([float(word) for word in words])

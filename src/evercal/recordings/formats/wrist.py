@@ -82,9 +82,7 @@ def _urdf(root: Path, joints: Path) -> Path:
     files = sorted(root.glob("*.urdf"))
     if len(files) != 1:
         number = f"{len(files)} URDF files" if files else "no URDF"
-        raise InputError(
-            f"{root}: {joints.name} needs a URDF, and {number} is beside it; give --urdf"
-        )
+        raise InputError(f"{root}: {joints.name} needs a URDF, {number} is beside it; give --urdf")
     return files[0]
 
 

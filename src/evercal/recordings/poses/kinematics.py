@@ -131,9 +131,7 @@ class RobotModel:
             covered = f"joint {name} goes from {column.min():.2f} to {column.max():.2f}"
             if joint.type == "continuous":
                 if np.ptp(column) > _LARGEST_RAD:
-                    notes.append(
-                        f"{covered}, more than two rotations in radians; are these degrees?"
-                    )
+                    notes.append(f"{covered}, more than two rotations; are these degrees?")
                 continue
             lower = getattr(joint.limit, "lower", None)
             upper = getattr(joint.limit, "upper", None)
@@ -148,9 +146,7 @@ class RobotModel:
 
     def _ancestors(self, link: str) -> list[Any]:
         if link not in self.links:
-            raise InputError(
-                f"{self.path}: has no link {link!r}; its links are {', '.join(self.links)}"
-            )
+            raise InputError(f"{self.path}: has no link {link!r}; it has {', '.join(self.links)}")
         joints = []
         while link in self._joint_above:
             joints.append(self._joint_above[link])

@@ -99,9 +99,7 @@ class BagFile:
             for message in self._messages([topic], logged_ns, logged_ns + 1):
                 if message.repeat == repeat:
                     return message
-        raise InputError(
-            f"{self.path}: message of {topic} at {logged_ns} ns is gone; load the bag again"
-        )
+        raise InputError(f"{self.path}: a message of {topic} is gone; load the bag again")
 
     def _messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None

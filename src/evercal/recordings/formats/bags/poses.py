@@ -234,9 +234,7 @@ def _frame(
     names = [name for name in usual if name in frames]
     if len(names) != 1:
         which = f"it may be {' or '.join(names)}" if names else "no frame has a usual name"
-        raise InputError(
-            f"{bag.path}: name the frame with {option} ({which}); tf has {', '.join(frames)}"
-        )
+        raise InputError(f"{bag.path}: give {option} ({which}); tf has {', '.join(frames)}")
     return names[0]
 
 
