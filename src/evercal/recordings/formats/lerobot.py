@@ -42,6 +42,7 @@ from evercal.recordings.poses.kinematics import RobotModel, in_radians
 from evercal.recordings.read_options import ReadOptions
 from evercal.recordings.text_files import named_errors, path_inside, read_json, refuse_repeated
 
+Array = NDArray[np.float64]
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
 INFO = Path("meta") / "info.json"
 _STATE = "observation.state"
@@ -125,7 +126,7 @@ class _Row(NamedTuple):
     """Index of the row in `file`."""
 
 
-def _rows(root: Path, column: str) -> tuple[list[_Row], NDArray[np.float64]]:
+def _rows(root: Path, column: str) -> tuple[list[_Row], Array]:
     files = sorted((root / "data").glob("*/*.parquet"))
     if not files:
         raise InputError(f"{root / 'data'}: no parquet files; download the data folder too")
@@ -273,11 +274,7 @@ def _pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> 
 
 
 def _feature_poses(
-    root: Path,
-    info: Mapping[str, Any],
-    column: str,
-    values: NDArray[np.float64],
-    options: ReadOptions,
+    root: Path, info: Mapping[str, Any], column: str, values: Array, options: ReadOptions
 ) -> tuple[SE3, list[str]]:
     names = _names(info, column)
     if options.urdf is not None:
@@ -308,7 +305,7 @@ def _feature_poses(
 
 
 def _joint_poses(
-    root: Path, names: list[str], stated: NDArray[np.float64], options: ReadOptions
+    root: Path, names: list[str], stated: Array, options: ReadOptions
 ) -> tuple[SE3, list[str]]:
     assert options.urdf is not None
     unit, count = options.pose_convention, stated.shape[1]
