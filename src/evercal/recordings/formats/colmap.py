@@ -5,7 +5,6 @@ is (0, 0) here. Images without a pose count as untracked, including files beside
 model. Of several models in one folder, the one with the most images is read.
 """
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -44,9 +43,9 @@ def detect(root: Path) -> bool:
     return bool(_models(root))
 
 
-def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
+def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read the largest model and check that its images exist; no image is opened."""
-    root, metric = Path(root), options is not None and options.metres
+    metric = options is not None and options.metres
     models = {folder: _model(folder) for folder in _models(root)}
     if not models:
         raise InputError(f"{root}: no COLMAP model; expected cameras and images (.bin or .txt)")

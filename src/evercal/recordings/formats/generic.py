@@ -37,9 +37,8 @@ def detect(root: Path) -> bool:
     return (root / FILE).is_file()
 
 
-def load(root: str | os.PathLike[str]) -> Recording:
+def load(root: Path) -> Recording:
     """Read scene.json and check that its images exist; no image is opened."""
-    root = Path(root)
     file = root / FILE
     data = read_json(file, "scene file", "convert the recording again")
     with named_errors(file, "scene file"):

@@ -59,7 +59,6 @@ def detect(root: Path) -> bool:
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read the tables and decode one image; the others stay in their files until needed."""
-    root = Path(root)
     try:
         return _load(root, options or ReadOptions())
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:

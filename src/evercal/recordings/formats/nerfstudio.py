@@ -8,7 +8,6 @@ test frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data 
 """
 
 import math
-import os
 from collections.abc import Container, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -54,9 +53,9 @@ def detect(root: Path) -> bool:
     return (root / FILE).is_file() or (root.name == FILE and root.is_file())
 
 
-def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
+def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read the poses and the size of one image of every camera; no other image is opened."""
-    root, metric = Path(root), options is not None and options.metres
+    metric = options is not None and options.metres
     file = root if root.is_file() else root / FILE
     root = file.parent
     data = read_json(file, "nerfstudio file", "export it again")

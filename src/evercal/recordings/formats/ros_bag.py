@@ -66,7 +66,7 @@ def detect(root: Path) -> bool:
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read stamps, intrinsics and poses; only the first image is decoded."""
-    root, options = Path(root), options or ReadOptions()
+    options = options or ReadOptions()
     bag = BagFile(root)
     topic = _image_topic(bag, options.image_topic)
     shots, notes = _shots(bag, topic)

@@ -37,9 +37,8 @@ def detect(root: Path) -> bool:
     return any((root / name).is_file() for name in _POSES + _JOINTS)
 
 
-def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
+def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read poses, intrinsics and the size of one image; no other image is opened."""
-    root = Path(root)
     options = options or ReadOptions()
     file = _pose_file(root)
     rows, notes = _rows(root, file, options)
