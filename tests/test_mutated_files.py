@@ -39,7 +39,7 @@ from .recordings.formats import (
     test_colmap,
     test_lerobot,
     test_nerfstudio,
-    test_twelve_scenes,
+    test_scenes,
 )
 
 if TYPE_CHECKING:
@@ -196,7 +196,7 @@ def read_size(path: Path) -> object:
 
 READERS = {
     "7scenes": Reader(seven_scenes, recording, "**/*.txt"),
-    "12scenes": Reader(test_twelve_scenes.write, recording, "**/*.txt"),
+    "12scenes": Reader(test_scenes.write, recording, "**/*.txt"),
     "nerfstudio": Reader(nerfstudio, recording, "*.json"),
     "colmap-bin": Reader(colmap("bin"), recording, "sparse/0/*.bin"),
     "colmap-txt": Reader(colmap("txt"), recording, "sparse/0/*.txt"),
