@@ -123,9 +123,7 @@ class SceneWriter:
         self._cameras: dict[Camera, str] = {}
         self._entries: dict[str, dict[str, object]] = {}
         if (self._root / FILE).exists():
-            raise InputError(
-                f"{self._root / FILE}: already there; give a new folder, or remove the whole folder"
-            )
+            raise InputError(f"{self._root / FILE}: already there; give a new folder")
         (self._root / "images").mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> Self:

@@ -219,9 +219,7 @@ def image_of(message: Any) -> NDArray[np.uint8]:
     line = width * channels * size
     data = np.asarray(message.data, dtype=np.uint8).reshape(-1)
     if step < line or data.size < height * step or not line * height:
-        raise ValueError(
-            f"{width}x{height} {message.encoding} with rows of {step} bytes, but {data.size} bytes"
-        )
+        raise ValueError(f"{width}x{height} {message.encoding}, step {step}, but {data.size} bytes")
     # Rows may be padded, which the package rosbags-image ignores.
     pixels = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :line])
     if size == 2:

@@ -49,11 +49,9 @@ class BagFile:
         # Bags of ROS 2 before Iron lack type definitions; the types read here never changed.
         types = get_typestore(Stores.ROS2_HUMBLE)
         parts = _parts(path)
-        endings = {part.suffix for part in parts}
-        if len(endings) > 1:
-            raise InputError(
-                f"{path}: holds bags of several kinds ({', '.join(endings)}); name one file"
-            )
+        ends = {part.suffix for part in parts}
+        if len(ends) > 1:
+            raise InputError(f"{path}: holds several kinds of bags ({', '.join(ends)}); name one")
         try:
             self._reader = AnyReader(parts, default_typestore=types)
             self._reader.open()
