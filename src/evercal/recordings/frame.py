@@ -87,9 +87,7 @@ def require_images(frames: Iterable[Frame], file: Path) -> None:
     missing = [image for image in images if not image.is_file()]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise InputError(
-            f"{missing[0]}{more}: named in {file} but missing; restore or take the frame out"
-        )
+        raise InputError(f"{missing[0]}{more}: missing; restore it or take it out of {file}")
 
 
 def posed_recording(recording: Recording) -> Recording:

@@ -69,9 +69,7 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
         raise InputError(f"{path}: image file cannot be read ({error.strerror})") from None
     image = decode_image(data)
     if image is None:
-        raise InputError(
-            f"{path}: not a readable image ({data.size} bytes); replace it with a PNG or JPEG file"
-        )
+        raise InputError(f"{path}: not a readable image ({data.size} bytes); use PNG or JPEG")
     return image
 
 

@@ -83,7 +83,7 @@ def inspect_recording(recording: Recording) -> Inspection:
         train=len(train),
         test=len(test),
         untracked=untracked,
-        cameras=_camera_lines(cameras),
+        cameras=tuple(_camera_lines(cameras)),
         extent_m=(x, y, z),
         step_median_m=step_m,
         step_median_deg=step_deg,
@@ -94,27 +94,22 @@ def inspect_recording(recording: Recording) -> Inspection:
     )
 
 
-def _camera_lines(cameras: Counter[Camera]) -> tuple[str, ...]:
+def _camera_lines(cameras: Counter[Camera]) -> Iterator[str]:
     if len(cameras) <= MOST_CAMERAS_LISTED:
-        return tuple(_camera_line(camera, count) for camera, count in cameras.items())
-    lines = []
+        for c, count in cameras.items():
+            distortion = f"distortion {' '.join(f'{k:g}' for k in c.distortion)}"
+            yield (
+                f"{c.width}x{c.height}, fx {c.fx:.1f} fy {c.fy:.1f} cx {c.cx:.1f} cy {c.cy:.1f},"
+                f" {distortion if c.distortion else 'no distortion'}; {count} frames"
+            )
+        return
     for size in dict.fromkeys((camera.width, camera.height) for camera in cameras):
         group = {c: n for c, n in cameras.items() if (c.width, c.height) == size}
         focal = [camera.fx for camera in group]
-        lines.append(
+        yield (
             f"{size[0]}x{size[1]}, {len(group)} sets of intrinsics, fx {min(focal):.1f} to"
             f" {max(focal):.1f}; {sum(group.values())} frames"
         )
-    return tuple(lines)
-
-
-def _camera_line(camera: Camera, count: int) -> str:
-    distortion = f"distortion {' '.join(f'{k:g}' for k in camera.distortion)}"
-    return (
-        f"{camera.width}x{camera.height}, fx {camera.fx:.1f} fy {camera.fy:.1f} cx {camera.cx:.1f}"
-        f" cy {camera.cy:.1f}, {distortion if camera.distortion else 'no distortion'};"
-        f" {count} frames"
-    )
 
 
 def _frame_warnings(train: int, test: int, untracked: int, owner: str) -> Iterator[str]:

@@ -50,9 +50,7 @@ def copy_samples(target: Path) -> None:
     sources = {name: FOLDER / name for name in ROOMS} | {"cell": CELL}
     try:
         if target.is_dir() and any(target.iterdir()):
-            raise InputError(
-                f"{target}: is not empty; name a new or empty folder for the sample recordings"
-            )
+            raise InputError(f"{target}: is not empty; name a new folder for the recordings")
         for name, source in sources.items():
             # Installed packages can be read-only; copyfile leaves the copies writable.
             shutil.copytree(source, target / name, copy_function=shutil.copyfile)

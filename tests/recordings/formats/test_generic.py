@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,15 +77,9 @@ def test_depth_and_joint_angles_are_written(tmp_path: Path) -> None:
 
 
 def test_interrupted_recording_has_no_scene_file(tmp_path: Path) -> None:
-    frame = make_recording().train[0]
-
-    def record() -> None:
-        with generic.SceneWriter(tmp_path, "x") as writer:
-            writer.add(frame, "train")
-            raise RuntimeError("plug pulled")
-
-    with pytest.raises(RuntimeError, match="pulled"):
-        record()
+    with suppress(RuntimeError), generic.SceneWriter(tmp_path, "x") as writer:
+        writer.add(make_recording().train[0], "train")
+        raise RuntimeError("plug pulled")
     refused("no known scene format", load_recording, tmp_path)
 
 
@@ -152,10 +147,6 @@ def test_unknown_keys_are_ignored(tmp_path: Path) -> None:
     data["cameras"]["0"]["serial"] = 5
     for entry in data["frames"]:
         entry["exposure_ms"] = 4.5
-        entry["base_from_camera"] = entry["base_from_camera"] and {
-            **entry["base_from_camera"],
-            "covariance": [],
-        }
     file.write_text(json.dumps(data))
     assert_same(recording, load_recording(tmp_path))
 
@@ -169,7 +160,7 @@ BREAKS = [
     (("cameras",), [], "'cameras' is an object"),
     (("cameras", "1", "fx"), -1, "camera '1': camera fx"),
     (("untracked",), "many", "'untracked' is a count"),
-    ((*FIRST, "image"), "images/none.png", r"images/none\.png: named in .*scene\.json but missing"),
+    ((*FIRST, "image"), "images/none.png", r"images/none\.png: missing; .*scene\.json"),
     ((*FIRST, "image"), "../secret.png", "stays inside"),
     ((*FIRST, "image"), "images\\..\\..\\secret.png", "stays inside"),
     ((*FIRST, "image"), "C:/secret.png", "relative"),
@@ -205,10 +196,11 @@ def test_broken_files_are_refused_in_one_line(
     assert str(tmp_path) in str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["scene.json", "transforms.json"])
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", "\x00"])
-def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
-    (tmp_path / "scene.json").write_text(text)
-    refused(r"scene\.json", load_recording, tmp_path)
+def test_other_files_are_refused(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    refused(name, load_recording, tmp_path)
 
 
 def test_formats_are_recognised(tmp_path: Path) -> None:

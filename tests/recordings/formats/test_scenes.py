@@ -153,7 +153,7 @@ SEVEN = [
     ("*Split.txt", b"\n", "are empty"),
     ("seq-02/*.png", None, "seq-02: no images"),
     (POSE, None, r"seq-02/frame-000002\.pose\.txt: .*is missing"),
-    (POSE, b"1 2 3", r"frame-000002\.pose\.txt: expected.*got 3 words"),
+    (POSE, b"1 2 3", r"frame-000002\.pose\.txt: expected.*got 3"),
     (POSE, b"x " * 16, r"frame-000002\.pose\.txt: expected"),
     (POSE, b"", r"frame-000002\.pose\.txt: expected"),
     (POSE, b"2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", r"frame-000002\.pose\.txt: the left 3x3 block"),

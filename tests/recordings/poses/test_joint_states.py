@@ -130,7 +130,7 @@ def test_folder_with_joints_and_a_urdf_is_a_recording(tmp_path: Path, urdf: Path
     expected = planar(np.deg2rad(0.25), np.deg2rad(-30), 0.2)
     assert max(pose_distance(pose_in_degrees, expected)) < 1e-7
     assert recording.notes[0] == "gripper poses are those of tip in base, from planar.urdf"
-    with pytest.raises(InputError, match="has no link 'hand'; its links are base, upper"):
+    with pytest.raises(InputError, match="has no link 'hand'; it has base, upper"):
         load_recording(tmp_path, options=ReadOptions(urdf=urdf, gripper_frame="hand"))
 
 

@@ -5,7 +5,6 @@ is (0, 0) here. Images without a pose count as untracked, including files beside
 model. Of several models in one folder, the one with the most images is read.
 """
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -44,14 +43,12 @@ def detect(root: Path) -> bool:
     return bool(_models(root))
 
 
-def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
+def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read the largest model and check that its images exist; no image is opened."""
-    root, metric = Path(root), options is not None and options.metres
+    metric = options is not None and options.metres
     models = {folder: _model(folder) for folder in _models(root)}
     if not models:
-        raise InputError(
-            f"{root}: no COLMAP model; expected cameras, images and points3D (.bin, .txt)"
-        )
+        raise InputError(f"{root}: no COLMAP model; expected cameras and images (.bin or .txt)")
     folder = max(models, key=lambda folder: models[folder].num_reg_images())
     model, notes = models[folder], [frame_note("COLMAP", metric)]
     if len(models) > 1:
@@ -160,6 +157,4 @@ def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:
         if all((candidate / name).is_file() for name in names):
             return candidate
     missing = next((n for n in names if not (root / "images" / n).is_file()), names[0])
-    raise InputError(
-        f"{root / 'images' / missing}: missing; put the model's images in {root}/images"
-    )
+    raise InputError(f"{root / 'images' / missing}: missing; put the model's images there")

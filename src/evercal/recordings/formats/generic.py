@@ -37,9 +37,8 @@ def detect(root: Path) -> bool:
     return (root / FILE).is_file()
 
 
-def load(root: str | os.PathLike[str]) -> Recording:
+def load(root: Path) -> Recording:
     """Read scene.json and check that its images exist; no image is opened."""
-    root = Path(root)
     file = root / FILE
     data = read_json(file, "scene file", "convert the recording again")
     with named_errors(file, "scene file"):
@@ -124,9 +123,7 @@ class SceneWriter:
         self._cameras: dict[Camera, str] = {}
         self._entries: dict[str, dict[str, object]] = {}
         if (self._root / FILE).exists():
-            raise InputError(
-                f"{self._root / FILE}: already there; give a new folder, or remove the whole folder"
-            )
+            raise InputError(f"{self._root / FILE}: already there; give a new folder")
         (self._root / "images").mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> Self:

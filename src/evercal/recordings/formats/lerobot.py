@@ -42,6 +42,7 @@ from evercal.recordings.poses.kinematics import RobotModel, in_radians
 from evercal.recordings.read_options import ReadOptions
 from evercal.recordings.text_files import named_errors, path_inside, read_json, refuse_repeated
 
+Array = NDArray[np.float64]
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
 INFO = Path("meta") / "info.json"
 _STATE = "observation.state"
@@ -58,7 +59,6 @@ def detect(root: Path) -> bool:
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read the tables and decode one image; the others stay in their files until needed."""
-    root = Path(root)
     try:
         return _load(root, options or ReadOptions())
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
@@ -71,9 +71,7 @@ def _load(root: Path, options: ReadOptions) -> Recording:
     info = _info(root)
     key = _camera_key(root, info, options.image_topic)
     if options.camera is None:
-        raise InputError(
-            f"{root}: LeRobot datasets hold no intrinsics; give them with --camera FILE"
-        )
+        raise InputError(f"{root}: LeRobot datasets hold no intrinsics; give them with --camera")
     shape = [int(n) for n in info["features"][key]["shape"]]
     height, width = shape[1:3] if shape[0] == 3 else shape[:2]  # some state channels first
     camera = read_camera_of_size(options.camera, (width, height), key)
@@ -127,12 +125,10 @@ class _Row(NamedTuple):
     """Index of the row in `file`."""
 
 
-def _rows(root: Path, column: str) -> tuple[list[_Row], NDArray[np.float64]]:
+def _rows(root: Path, column: str) -> tuple[list[_Row], Array]:
     files = sorted((root / "data").glob("*/*.parquet"))
     if not files:
-        raise InputError(
-            f"{root / 'data'}: no parquet files; download the dataset's data folder too"
-        )
+        raise InputError(f"{root / 'data'}: no parquet files; download the data folder too")
     rows: list[_Row] = []
     parts = []
     for file in files:
@@ -266,9 +262,7 @@ def _pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> 
     if _STATE in keys or len(keys) == 1:
         return _STATE if _STATE in keys else keys[0]
     if keys:
-        raise InputError(
-            f"{root}: gripper poses are in {' and '.join(keys)}; name one with --gripper-frame"
-        )
+        raise InputError(f"{root}: gripper poses are in {' and '.join(keys)}; give --gripper-frame")
     named = {key: names for key, names in observed.items() if names and "image" not in key}
     listed = "; ".join(f"{key}: {', '.join(names)}" for key, names in named.items())
     raise InputError(
@@ -279,11 +273,7 @@ def _pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> 
 
 
 def _feature_poses(
-    root: Path,
-    info: Mapping[str, Any],
-    column: str,
-    values: NDArray[np.float64],
-    options: ReadOptions,
+    root: Path, info: Mapping[str, Any], column: str, values: Array, options: ReadOptions
 ) -> tuple[SE3, list[str]]:
     names = _names(info, column)
     if options.urdf is not None:
@@ -314,7 +304,7 @@ def _feature_poses(
 
 
 def _joint_poses(
-    root: Path, names: list[str], stated: NDArray[np.float64], options: ReadOptions
+    root: Path, names: list[str], stated: Array, options: ReadOptions
 ) -> tuple[SE3, list[str]]:
     assert options.urdf is not None
     unit, count = options.pose_convention, stated.shape[1]

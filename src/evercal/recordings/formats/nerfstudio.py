@@ -8,7 +8,6 @@ test frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data 
 """
 
 import math
-import os
 from collections.abc import Container, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -54,9 +53,9 @@ def detect(root: Path) -> bool:
     return (root / FILE).is_file() or (root.name == FILE and root.is_file())
 
 
-def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
+def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read the poses and the size of one image of every camera; no other image is opened."""
-    root, metric = Path(root), options is not None and options.metres
+    metric = options is not None and options.metres
     file = root if root.is_file() else root / FILE
     root = file.parent
     data = read_json(file, "nerfstudio file", "export it again")
@@ -164,23 +163,19 @@ def _resized(file: Path, frames: list[Frame]) -> list[Frame]:
     for frame in frames:
         stated = frame.camera.width, frame.camera.height
         if stated not in sizes:
-            sizes[stated] = _size_of_shape(frame, stated, file)
+            assert isinstance(frame.image, Path)
+            size = sizes[stated] = image_size(frame.image)
+            if abs(size[0] / size[1] / (stated[0] / stated[1]) - 1) > 0.01:
+                rotated = "the image was rotated after the intrinsics were written"
+                raise InputError(
+                    f"{frame.image}: is {size[0]}x{size[1]}, {file.name} says"
+                    f" {stated[0]}x{stated[1]} ({rotated if size == stated[::-1] else 'cropped?'});"
+                    f" give images of that shape"
+                )
         if sizes[stated] != stated:
             frame = replace(frame, camera=frame.camera.resized(*sizes[stated]))
         resized.append(frame)
     return resized
-
-
-def _size_of_shape(frame: Frame, stated: tuple[int, int], file: Path) -> tuple[int, int]:
-    assert isinstance(frame.image, Path)
-    size = image_size(frame.image)
-    if abs(size[0] / size[1] / (stated[0] / stated[1]) - 1) > 0.01:
-        rotated = "the image was rotated after the intrinsics were written"
-        raise InputError(
-            f"{frame.image}: is {size[0]}x{size[1]}, {file.name} says {stated[0]}x{stated[1]}"
-            f" ({rotated if size == stated[::-1] else 'cropped?'}); give images of that shape"
-        )
-    return size
 
 
 def _test_images(root: Path, data: Mapping[str, object], images: Container[object]) -> set[Path]:

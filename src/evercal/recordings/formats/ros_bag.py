@@ -66,7 +66,7 @@ def detect(root: Path) -> bool:
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read stamps, intrinsics and poses; only the first image is decoded."""
-    root, options = Path(root), options or ReadOptions()
+    options = options or ReadOptions()
     bag = BagFile(root)
     topic = _image_topic(bag, options.image_topic)
     shots, notes = _shots(bag, topic)
@@ -145,9 +145,7 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
     if len(pictures) != 1:
         refused = "; ".join(f"{t}: {reason}" for t, reason in reasons.items() if reason)
         what = f"images on {len(pictures)} topics" if pictures else f"no pictures ({refused})"
-        raise InputError(
-            f"{bag.path}: {what}; name one with --image-topic: {', '.join(pictures or topics)}"
-        )
+        raise InputError(f"{bag.path}: {what}; give --image-topic: {', '.join(pictures or topics)}")
     return pictures[0]
 
 
@@ -221,9 +219,7 @@ def image_of(message: Any) -> NDArray[np.uint8]:
     line = width * channels * size
     data = np.asarray(message.data, dtype=np.uint8).reshape(-1)
     if step < line or data.size < height * step or not line * height:
-        raise ValueError(
-            f"{width}x{height} {message.encoding} with rows of {step} bytes, but {data.size} bytes"
-        )
+        raise ValueError(f"{width}x{height} {message.encoding}, step {step}, but {data.size} bytes")
     # Rows may be padded, which the package rosbags-image ignores.
     pixels = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :line])
     if size == 2:

@@ -33,9 +33,8 @@ def detect(root: Path) -> bool:
     return any((root / split).is_file() for split in _SPLITS) or any(root.glob("seq-*/"))
 
 
-def load(root: str | os.PathLike[str]) -> Recording:
+def load(root: Path) -> Recording:
     """Read split files and poses, and the size of one image; no other image is opened."""
-    root = Path(root)
     splits = [_sequences(root, name) for name in _SPLITS]
     shared = sorted({folder.name for folder in splits[0]} & {folder.name for folder in splits[1]})
     if shared:
@@ -118,7 +117,5 @@ def read_numbers(file: Path, count: int, what: str) -> NDArray[np.float64]:
     # float() on the words: np.loadtxt takes longer per file than reading the file.
     words = read_text(file, f"{what} matrix").split()
     if len(words) != count or not all(map(is_number, words)):
-        raise InputError(
-            f"{file}: expected a {what} matrix of {count} numbers, got {len(words)} words"
-        )
+        raise InputError(f"{file}: expected a {what} matrix of {count} numbers, got {len(words)}")
     return np.array([float(word) for word in words])

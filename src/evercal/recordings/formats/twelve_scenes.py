@@ -5,7 +5,6 @@ info.txt are scaled to the image size. Pixel (0, 0) is taken as a pixel centre: 
 no convention, and its cy of 483.5 is then the middle of 968 rows.
 """
 
-import os
 import re
 from pathlib import Path
 
@@ -22,9 +21,8 @@ def detect(root: Path) -> bool:
     return (root / "info.txt").is_file() and (root / "data").is_dir()
 
 
-def load(root: str | os.PathLike[str]) -> Recording:
+def load(root: Path) -> Recording:
     """Read split, calibration and poses, and the size of one image; no other image is opened."""
-    root = Path(root)
     images = colour_images(root / "data")
     split = _test_count(root, len(images))
     camera = _camera(root, images[0])

@@ -37,9 +37,8 @@ def detect(root: Path) -> bool:
     return any((root / name).is_file() for name in _POSES + _JOINTS)
 
 
-def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
+def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read poses, intrinsics and the size of one image; no other image is opened."""
-    root = Path(root)
     options = options or ReadOptions()
     file = _pose_file(root)
     rows, notes = _rows(root, file, options)
@@ -82,9 +81,7 @@ def _urdf(root: Path, joints: Path) -> Path:
     files = sorted(root.glob("*.urdf"))
     if len(files) != 1:
         number = f"{len(files)} URDF files" if files else "no URDF"
-        raise InputError(
-            f"{root}: {joints.name} needs a URDF, and {number} is beside it; give --urdf"
-        )
+        raise InputError(f"{root}: {joints.name} needs a URDF, {number} is beside it; give --urdf")
     return files[0]
 
 

@@ -210,9 +210,7 @@ def _size(
     elif not isinstance(stated, list | tuple):  # a number called `size` is not one
         stated = size if len(missing) == 2 else None
     if stated is None:
-        raise ValueError(
-            f"{missing[0]!r} is missing, so it has no image size, there is {_listed(data)}"
-        )
+        raise ValueError(f"{missing[0]!r} is missing (no image size), there is {_listed(data)}")
     width, height = _numbers(list(stated), "image size (width, height)", 2)
     return width, height
 

@@ -19,6 +19,7 @@ from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import Rows, read_rows, row_labels
 from evercal.recordings.text_files import named_errors, read_json, refuse_repeated
 
+Array = NDArray[np.float64]
 _MOVING = ("revolute", "continuous", "prismatic")
 # Two full rotations: no joint of an arm exceeds them, and 12.6 in degrees is a small angle.
 _LARGEST_RAD = 4 * np.pi
@@ -72,7 +73,7 @@ class RobotModel:
     def poses(
         self,
         names: Sequence[str],
-        values: NDArray[np.float64],
+        values: Array,
         base: str | None,
         gripper: str | None,
         source: str | os.PathLike[str] = "joints",
@@ -123,7 +124,7 @@ class RobotModel:
         joint = self._urdf.joint_map.get(name)
         return joint is not None and joint.type in ("revolute", "continuous")
 
-    def _beyond_limits(self, names: Sequence[str], values: NDArray[np.float64]) -> list[str]:
+    def _beyond_limits(self, names: Sequence[str], values: Array) -> list[str]:
         """One sentence for each joint that exceeds its limits by 0.1, or two rotations."""
         notes = []
         for name, column in zip(names, values.T, strict=True):
@@ -131,9 +132,7 @@ class RobotModel:
             covered = f"joint {name} goes from {column.min():.2f} to {column.max():.2f}"
             if joint.type == "continuous":
                 if np.ptp(column) > _LARGEST_RAD:
-                    notes.append(
-                        f"{covered}, more than two rotations in radians; are these degrees?"
-                    )
+                    notes.append(f"{covered}, more than two rotations; are these degrees?")
                 continue
             lower = getattr(joint.limit, "lower", None)
             upper = getattr(joint.limit, "upper", None)
@@ -148,9 +147,7 @@ class RobotModel:
 
     def _ancestors(self, link: str) -> list[Any]:
         if link not in self.links:
-            raise InputError(
-                f"{self.path}: has no link {link!r}; its links are {', '.join(self.links)}"
-            )
+            raise InputError(f"{self.path}: has no link {link!r}; it has {', '.join(self.links)}")
         joints = []
         while link in self._joint_above:
             joints.append(self._joint_above[link])
@@ -187,11 +184,8 @@ def read_joint_poses(
 
 
 def in_radians(
-    model: RobotModel,
-    names: Sequence[str],
-    values: NDArray[np.float64],
-    units: Sequence[str | None],
-) -> NDArray[np.float64]:
+    model: RobotModel, names: Sequence[str], values: Array, units: Sequence[str | None]
+) -> Array:
     """Convert angles in degrees to radians and leave other values (n, k) as they are."""
     other = next((unit for unit in units if unit not in (None, *_UNITS)), None)
     if other is not None:
@@ -201,8 +195,8 @@ def in_radians(
 
 
 def interpolate(
-    times_s: NDArray[np.float64], positions: NDArray[np.float64], stamps_s: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    times_s: Array, positions: Array, stamps_s: Array
+) -> tuple[Array, NDArray[np.bool_]]:
     """Interpolate (n,) positions of a joint at (m,) seconds, and whether each is valid.
 
     Jumps by full rotations are removed. Validity is that of `PoseTrack.at`.

@@ -56,9 +56,7 @@ def poses_of_images(file: Path, images: Sequence[Path], convention: str | None =
     poses, _ = pair_images(images, rows, None, file)
     missing = [image.name for image, pose in zip(images, poses, strict=True) if pose is None]
     if missing:
-        raise InputError(
-            f"{file}: has no pose for {_few(missing)}; give every image one, or leave the image out"
-        )
+        raise InputError(f"{file}: has no pose for {_few(missing)}; add it or leave the image out")
     return SE3.stack([pose for pose in poses if pose is not None])
 
 

@@ -49,11 +49,9 @@ class BagFile:
         # Bags of ROS 2 before Iron lack type definitions; the types read here never changed.
         types = get_typestore(Stores.ROS2_HUMBLE)
         parts = _parts(path)
-        endings = {part.suffix for part in parts}
-        if len(endings) > 1:
-            raise InputError(
-                f"{path}: holds bags of several kinds ({', '.join(endings)}); name one file"
-            )
+        ends = {part.suffix for part in parts}
+        if len(ends) > 1:
+            raise InputError(f"{path}: holds several kinds of bags ({', '.join(ends)}); name one")
         try:
             self._reader = AnyReader(parts, default_typestore=types)
             self._reader.open()
@@ -99,9 +97,7 @@ class BagFile:
             for message in self._messages([topic], logged_ns, logged_ns + 1):
                 if message.repeat == repeat:
                     return message
-        raise InputError(
-            f"{self.path}: message of {topic} at {logged_ns} ns is gone; load the bag again"
-        )
+        raise InputError(f"{self.path}: a message of {topic} is gone; load the bag again")
 
     def _messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None

@@ -15,6 +15,7 @@ from evercal.recordings.poses.kinematics import RobotModel, interpolate
 from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.read_options import ReadOptions
 
+Array = NDArray[np.float64]
 _BASES = ("base_link", "base", "panda_link0", "fr3_link0", "fer_link0", "lbr_link_0", "link_base")
 _GRIPPERS = (
     "tool0", "flange", "ee_link", "panda_hand", "fr3_hand", "fer_hand", "lbr_link_ee", "link_eef",
@@ -77,9 +78,7 @@ class _TfTree:
     def connected(self, a: str, b: str) -> bool:
         return self._chain(a)[-1] == self._chain(b)[-1]
 
-    def a_from_b(
-        self, a: str, b: str, stamps_s: NDArray[np.float64]
-    ) -> tuple[SE3, NDArray[np.bool_]]:
+    def a_from_b(self, a: str, b: str, stamps_s: Array) -> tuple[SE3, NDArray[np.bool_]]:
         """Interpolate (n,) poses of frame b in frame a, and whether each is valid."""
         up, down = self._chain(a), self._chain(b)
         for child in (frame for frame in (*up, *down) if frame in self._edges):
@@ -128,7 +127,7 @@ class _TfTree:
                 f" them"
             )
 
-    def _at(self, child: str, stamps_s: NDArray[np.float64]) -> tuple[SE3, NDArray[np.bool_]]:
+    def _at(self, child: str, stamps_s: Array) -> tuple[SE3, NDArray[np.bool_]]:
         edge = self._edge(child)
         _, _, stamps, quaternions, translations = zip(*edge.transforms, strict=True)
         poses = SE3(np.array(quaternions), np.array(translations))
@@ -234,15 +233,11 @@ def _frame(
     names = [name for name in usual if name in frames]
     if len(names) != 1:
         which = f"it may be {' or '.join(names)}" if names else "no frame has a usual name"
-        raise InputError(
-            f"{bag.path}: name the frame with {option} ({which}); tf has {', '.join(frames)}"
-        )
+        raise InputError(f"{bag.path}: give {option} ({which}); tf has {', '.join(frames)}")
     return names[0]
 
 
-def _refuse_times(
-    bag: BagFile, stamps: NDArray[np.float64], times: Sequence[float], what: str
-) -> NoReturn:
+def _refuse_times(bag: BagFile, stamps: Array, times: Sequence[float], what: str) -> NoReturn:
     covered = f"{min(times):.1f} to {max(times):.1f} s" if len(times) else "no time"
     raise InputError(
         f"{bag.path}: no image has a pose: images were taken at {stamps.min():.1f} to"
@@ -251,11 +246,7 @@ def _refuse_times(
 
 
 def _from_joints(
-    bag: BagFile,
-    stamps: NDArray[np.float64],
-    zero_ns: int,
-    model: RobotModel,
-    options: ReadOptions,
+    bag: BagFile, stamps: Array, zero_ns: int, model: RobotModel, options: ReadOptions
 ) -> ImagePoses:
     base, gripper = model.chosen_links(options.base_frame, options.gripper_frame)
     topics = bag.topics(JOINT_STATE)
