@@ -48,8 +48,7 @@ class FrameResult:
     inlier_ratio: float
     """Share of scene points that agree with the pose, 0 to 1."""
     squared_mahalanobis: float = math.nan
-    """Squared error of the pose in units of its covariance; NaN without a pose in the right scene
-    or without a covariance."""
+    """Squared error in units of the covariance; NaN without one, or in a wrong scene."""
     estimated: SE3 | None = field(default=None, compare=False)
     """Estimated camera pose in the base frame of `found_scene`."""
 
@@ -78,8 +77,7 @@ class SceneScores:
     near_training_frame: float
     """Frames with a training frame within 5 cm and 5 deg."""
     inside_95: float = math.nan
-    """Poses in the right scene whose 95 % ellipsoid contains the true pose; NaN without
-    covariances."""
+    """Poses in the right scene whose 95 % ellipsoid contains the true one; NaN if unknown."""
 
 
 @dataclass(frozen=True)
@@ -169,14 +167,10 @@ def recall_area(translation_m: ArrayLike, within_m: float = 0.2) -> float:
 
 
 def continual_scores(accuracies: ArrayLike) -> ContinualScores:
-    """Compute final accuracy and forgetting of one run over a sequence of scenes.
+    """Final accuracy and forgetting of one run over a sequence of scenes; NaN for a single one.
 
-    Args:
-        accuracies: Shape (N, N). Row i holds the accuracies after stage i, column j those of the
-            scene learned in stage j. Entries above the diagonal are ignored and may be NaN.
-
-    Returns:
-        Scores in the unit of `accuracies`. The three scores of forgetting are NaN for N = 1.
+    Row i of `accuracies` (N, N) holds those after stage i, column j those of the scene learned in
+    stage j. Entries above the diagonal are ignored.
     """
     matrix = np.asarray(accuracies, dtype=np.float64)
     count = len(matrix) if matrix.ndim == 2 else 0

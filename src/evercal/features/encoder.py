@@ -92,10 +92,7 @@ class LocalEncoder(nn.Module):
         self.project = nn.Conv2d(inner, width, 1)
 
     def forward(self, grey: Tensor) -> Tensor:
-        """(b, 1, h, w) in [0, 1] -> (b, width, h // 8, w // 8) unit vectors.
-
-        Pixels beyond a multiple of 8 are cut off.
-        """
+        """(b, 1, h, w) in [0, 1] -> (b, width, h // 8, w // 8) unit vectors."""
         height, width = (side // 8 * 8 for side in grey.shape[-2:])
         x = standardise(grey[..., :height, :width])
         x = F.pixel_unshuffle(x, 2).contiguous(memory_format=torch.channels_last)
@@ -192,11 +189,7 @@ def own_encoder(module: nn.Module, path: Path) -> Encoder:
 
 
 def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
-    """Load an encoder for inference; by default the shipped one.
-
-    The file is a safetensors file of `training`, or ACE's published weight file, a torch state
-    dict that is read with `weights_only`.
-    """
+    """The shipped encoder, or that of a file of `training` or ACE's published weights."""
     path = ENCODER_FILE if path is None else path
     if not path.is_file():
         raise InputError(f"encoder {path}: no such file")
