@@ -94,8 +94,10 @@ class Scores:
 
     def to_dict(self) -> dict[str, object]:
         """Convert to plain values for JSON; infinity and NaN become None."""
-        scenes = {name: _plain(row) for name, row in self.scenes.items()}
-        return {**dataclasses.asdict(self), "scenes": scenes}
+        plain = dataclasses.asdict(self)
+        for row in plain["scenes"].values():
+            row |= {name: None for name, value in row.items() if not math.isfinite(value)}
+        return plain
 
 
 @dataclass(frozen=True)
@@ -107,8 +109,7 @@ class ContinualScores:
     total_forgetting: float
     """TFR: mean drop from a scene's best accuracy, the last stage included, to its final one."""
     forgetting: float
-    """Mean drop from the best accuracy before the last stage (Chaudhry et al. 2018); a negative
-    value is a gain."""
+    """Mean drop from the best accuracy before the last stage (Chaudhry et al. 2018)."""
     backward_transfer: float
     """BWT: mean change from just after learning a scene to the end (Lopez-Paz and Ranzato 2017)."""
     last_scene_accuracy: float
@@ -116,22 +117,17 @@ class ContinualScores:
     accuracy_along: float
     """ACC: mean over all stages and the scenes learned by then (Diaz-Rodriguez et al. 2018)."""
 
-    def to_dict(self) -> dict[str, object]:
-        """Convert to plain values for JSON; NaN becomes None."""
-        return _plain(self)
-
 
 def correct(
     results: Iterable[FrameResult], thresholds: tuple[float, float] = COARSE
 ) -> dict[str, NDArray[np.bool_]]:
     """Which frames (frames,) of each scene are correct, by thresholds in metres and radians."""
     metres, radians = thresholds
-    return {
-        scene: np.array(
-            [r.translation_error_m < metres and r.rotation_error_rad < radians for r in rows]
-        )
-        for scene, rows in _by_scene(results).items()
-    }
+
+    def right(row: FrameResult) -> bool:
+        return row.translation_error_m < metres and row.rotation_error_rad < radians
+
+    return {name: np.array([*map(right, rows)]) for name, rows in _by_scene(results).items()}
 
 
 def scores(results: Sequence[FrameResult]) -> Scores:
@@ -225,8 +221,3 @@ def _scene_scores(rows: list[FrameResult]) -> SceneScores:
 def _percent(flags: ArrayLike) -> float:
     flags = np.asarray(flags)
     return 100.0 * int(flags.sum()) / len(flags)
-
-
-def _plain(record: SceneScores | ContinualScores) -> dict[str, object]:
-    values = dataclasses.asdict(record).items()
-    return {key: value if math.isfinite(value) else None for key, value in values}
