@@ -133,6 +133,7 @@ def test_single_scene_has_no_forgetting() -> None:
     total = continual_scores([[70.0]])
     assert (total.final_accuracy, total.last_scene_accuracy) == (70.0, 70.0)
     assert math.isnan(total.total_forgetting)
+    assert total.to_dict()["backward_transfer"] is None
 
 
 @pytest.mark.parametrize(

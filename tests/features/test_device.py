@@ -57,7 +57,7 @@ def test_device_of_a_network_is_that_of_its_weights_or_buffers() -> None:
 
 def test_tf32_is_set_on_a_gpu_only_and_restored() -> None:
     def now() -> bool:
-        return torch.backends.cuda.matmul.allow_tf32
+        return bool(torch.backends.cuda.matmul.allow_tf32)
 
     before = now()
     with tf32(torch.device("cpu")):

@@ -94,10 +94,8 @@ class Scores:
 
     def to_dict(self) -> dict[str, object]:
         """Convert to plain values for JSON; infinity and NaN become None."""
-        plain = dataclasses.asdict(self)
-        for row in plain["scenes"].values():
-            row |= {name: None for name, value in row.items() if not math.isfinite(value)}
-        return plain
+        scenes = {name: _plain(row) for name, row in self.scenes.items()}
+        return {**dataclasses.asdict(self), "scenes": scenes}
 
 
 @dataclass(frozen=True)
@@ -116,6 +114,10 @@ class ContinualScores:
     """Accuracy on the scene learned last."""
     accuracy_along: float
     """ACC: mean over all stages and the scenes learned by then (Diaz-Rodriguez et al. 2018)."""
+
+    def to_dict(self) -> dict[str, object]:
+        """Convert to plain values for JSON; NaN becomes None."""
+        return _plain(self)
 
 
 def correct(
@@ -221,3 +223,8 @@ def _scene_scores(rows: list[FrameResult]) -> SceneScores:
 def _percent(flags: ArrayLike) -> float:
     flags = np.asarray(flags)
     return 100.0 * int(flags.sum()) / len(flags)
+
+
+def _plain(record: SceneScores | ContinualScores) -> dict[str, object]:
+    values = dataclasses.asdict(record).items()
+    return {key: value if math.isfinite(value) else None for key, value in values}
