@@ -167,6 +167,7 @@ def test_ace_file_computes_the_published_function(tmp_path: Path, width: int) ->
     assert isinstance(encoder, AceEncoder)
     assert isinstance(encoder, Encoder)
     assert encoder.width == width
+    assert sum(parameter.numel() for parameter in AceEncoder(512).parameters()) == 5_568_000
     image = images(40, 48)
     with torch.no_grad():
         torch.testing.assert_close(encoder(image), ace_by_hand(state, image), atol=1e-5, rtol=1e-5)
@@ -178,19 +179,12 @@ def test_ace_file_computes_the_published_function(tmp_path: Path, width: int) ->
         torch.testing.assert_close(again(image), expected, atol=1e-5, rtol=1e-5)
 
 
-def test_ace_layout_has_the_published_number_of_parameters() -> None:
-    assert sum(parameter.numel() for parameter in AceEncoder(512).parameters()) == 5_568_000
-    assert set(AceEncoder(512).state_dict()) == set(ace_state(8))
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"conv3.bias": None}, "conv3.bias"),
         ({"res2_skip.weight": None}, "res2_skip.weight"),
-        ({"res3_conv1.weight": torch.zeros(1)}, "res3_conv1.weight"),
         ({"conv1.weight": torch.zeros(32, 3, 3, 3)}, "conv1.weight"),
-        ({"res2_skip.weight": torch.zeros(64, 128, 1, 1)}, "res2_skip.weight"),
         ({"res2_skip.weight": torch.zeros(64)}, "ACE's layout"),
         ({"conv2.bias": "text"}, "conv2.bias"),
     ],
@@ -220,12 +214,10 @@ def test_broken_encoder_files_are_refused(tmp_path: Path) -> None:
     good = network_bytes(trained().fuse(), "encoder")
     broken = {
         "cut": good[: len(good) // 2],
-        "text": b"hello",
         "empty": b"",
         "other_kind": network_bytes(trained().fuse(), "descriptor"),
         "no_settings": save({"a": torch.zeros(1)}),
         "bad_settings": save({"a": torch.zeros(1)}, {"encoder": "{"}),
-        "other_settings": save({"a": torch.zeros(1)}, {"encoder": "{}"}),
         "unfused": network_bytes(trained(), "encoder"),
     }
     for name, data in broken.items():

@@ -169,11 +169,9 @@ def test_matrix_and_dict_round_trips() -> None:
         ({"cy": float("nan")}, "cy"),
         ({"width": 0}, "width"),
         ({"height": 10.5}, "height"),
-        ({"width": float("inf")}, "width"),
         ({"distortion": [0.1, 0.2]}, "0, 4, 5 or 8"),
         ({"distortion": "none"}, "list"),
         ({"fy": "500"}, "'fy' is a number"),
-        ({"cx": None}, "'cx' is a number"),
     ],
 )
 def test_bad_intrinsics_are_refused_by_name(change: dict[str, object], message: str) -> None:

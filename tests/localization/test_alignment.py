@@ -14,7 +14,6 @@ from evercal.localization.alignment import Alignment, AlignmentOptions, _shift_p
 from evercal.localization.intrinsics import Prior
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.localizer import Localizer
-from evercal.localization.pose_refinement import Observed, refine_pose
 from evercal.mapping.landmarks import Landmarks
 from evercal.mapping.patches import cut_patches, image_pyramid, to_level
 from evercal.mapping.scene_map import MapContents
@@ -45,35 +44,6 @@ def test_depth_errors_shift_pixels_only_away_from_the_keyframe() -> None:
     beside = SE3.exp(np.array([0.3, 0, 0, 0, 0, 0])) @ inverse
     rotation, position = beside.rotation_matrix(), beside.translation_m
     assert np.abs(_shift_px(points, along, rotation, position, CAMERA)[:, 0]).min() > 0.5
-
-
-WIDE = Camera(640, 480, 520.0, 500.0, 322.0, 238.0)
-BARREL = replace(WIDE, distortion=(-0.3, 0.0, 0.0, 0.0))
-
-
-def repeated(camera: Camera) -> tuple[Array, float]:
-    """By axis, the variance of poses over the claimed one; and the mean of median residuals."""
-    rng = np.random.default_rng(2)
-    pixels = rng.uniform([5, 5], [634, 474], (60, 2))
-    points = POSE.apply(camera.unproject(pixels) * rng.uniform(1.5, 4, (60, 1)))
-    white = np.tile(np.eye(2) / 0.2, (60, 1, 1))
-    errors, claimed, residuals = [], [], []
-    for _ in range(300):
-        observed = Observed(pixels + rng.normal(0, 0.2, (60, 2)), points, white)
-        refined = refine_pose(observed, camera, POSE)
-        errors.append((POSE.inverse() @ refined.pose.pose).log())
-        claimed.append(refined.pose.covariance)
-        residuals.append(np.median(refined.residual_px))
-    true, claim = np.cov(np.array(errors).T), np.mean(claimed, 0)
-    rotation = POSE.rotation_matrix()
-    claim[:3, :3] = rotation.T @ claim[:3, :3] @ rotation
-    return np.diag(true) / np.diag(claim), float(np.mean(residuals))
-
-
-def test_errors_are_measured_in_the_image_with_any_distortion() -> None:
-    plain, barrel = repeated(WIDE), repeated(BARREL)
-    np.testing.assert_allclose(barrel[0], plain[0], rtol=0.1)
-    assert barrel[1] == pytest.approx(plain[1], rel=0.02)
 
 
 def test_distorted_image_is_located(hall: Recording, hall_map: MapContents) -> None:

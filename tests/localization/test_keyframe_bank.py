@@ -58,17 +58,6 @@ def test_least_recently_used_keyframes_are_dropped(most: int, hall_map: MapConte
             dropped.append(recent.pop(next(iter(recent))))
 
 
-def test_a_keyframe_that_was_dropped_is_loaded_again(hall_map: MapContents) -> None:
-    bank = KeyframeBank(hall_map, 1)
-    one, _, again = bank.load(2), bank.load(3), bank.load(2)
-    assert one is not again
-    assert torch.equal(one.cells.features, again.cells.features)
-    np.testing.assert_array_equal(one.cells.points_m, again.cells.points_m)
-    for name in ("surface_m", "depth_noise", "position_m"):
-        before, after = (getattr(keyframe.landmarks, name) for keyframe in (one, again))
-        np.testing.assert_array_equal(before, after)
-
-
 def test_landmarks_project_to_their_pixels(hall_map: MapContents) -> None:
     bank, keyframes = KeyframeBank(hall_map, 9), hall_map.scenes[0].keyframes
     for i, landmarks in enumerate(keyframes.landmarks):

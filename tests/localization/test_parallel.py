@@ -23,9 +23,7 @@ def test_results_come_in_the_order_of_the_items(two_threads: None) -> None:
     assert len(workers) == 2
     assert {threads for _, threads in workers} == {1}
     assert torch.get_num_threads() == 2
-
-
-def test_one_item_has_all_threads(two_threads: None) -> None:
+    # One item has all threads.
     assert list(in_parallel(lambda _: torch.get_num_threads(), [0])) == [2]
     assert list(in_parallel(lambda item: item, [])) == []
 

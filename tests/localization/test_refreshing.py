@@ -175,7 +175,7 @@ def test_a_refresh_is_refused_or_undone_as_a_whole(
     assert tree(tmp_path / "map") == before
     image = hall.test[5].read_image()
     first = opened.localize(image).base_from_camera
-    opened.refresh([pixels for _, pixels in images])
+    opened.refresh([pixels for _, pixels in images[:6]])
     again = Map.open(tmp_path / "map", device="cpu").localize(image).base_from_camera
     assert first is not None
     assert again is not None

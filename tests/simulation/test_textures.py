@@ -20,15 +20,6 @@ def test_amplitude_falls_as_one_over_f_to_the_exponent(exponent: float) -> None:
     assert slope == pytest.approx(-exponent, abs=0.06)
 
 
-def test_noise_tiles() -> None:
-    """The step over the seam is no larger than the steps inside."""
-    noise = one_over_f(128, 1.8, np.random.default_rng(2))
-    inside = np.abs(np.diff(noise, axis=1)).mean()
-    seam = np.abs(noise[:, 0] - noise[:, -1]).mean()
-    assert seam < 2 * inside
-    assert np.abs(noise[:, 0] - noise[:, 64]).mean() > 4 * inside
-
-
 def test_pictures_repeat_with_the_generator_and_not_with_earlier_calls() -> None:
     first, other, again = (dead_leaves(40, 60, np.random.default_rng(seed)) for seed in (3, 4, 3))
     assert first.shape == (40, 60, 3)

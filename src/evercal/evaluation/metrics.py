@@ -48,8 +48,7 @@ class FrameResult:
     inlier_ratio: float
     """Share of scene points that agree with the pose, 0 to 1."""
     squared_mahalanobis: float = math.nan
-    """Squared error of the pose in units of its covariance; NaN without a pose in the right scene
-    or without a covariance."""
+    """Squared error in units of the covariance; NaN without one, or in a wrong scene."""
     estimated: SE3 | None = field(default=None, compare=False)
     """Estimated camera pose in the base frame of `found_scene`."""
 
@@ -78,8 +77,7 @@ class SceneScores:
     near_training_frame: float
     """Frames with a training frame within 5 cm and 5 deg."""
     inside_95: float = math.nan
-    """Poses in the right scene whose 95 % ellipsoid contains the true pose; NaN without
-    covariances."""
+    """Poses in the right scene whose 95 % ellipsoid contains the true one; NaN if unknown."""
 
 
 @dataclass(frozen=True)
@@ -109,8 +107,7 @@ class ContinualScores:
     total_forgetting: float
     """TFR: mean drop from a scene's best accuracy, the last stage included, to its final one."""
     forgetting: float
-    """Mean drop from the best accuracy before the last stage (Chaudhry et al. 2018); a negative
-    value is a gain."""
+    """Mean drop from the best accuracy before the last stage (Chaudhry et al. 2018)."""
     backward_transfer: float
     """BWT: mean change from just after learning a scene to the end (Lopez-Paz and Ranzato 2017)."""
     last_scene_accuracy: float
@@ -128,12 +125,11 @@ def correct(
 ) -> dict[str, NDArray[np.bool_]]:
     """Which frames (frames,) of each scene are correct, by thresholds in metres and radians."""
     metres, radians = thresholds
-    return {
-        scene: np.array(
-            [r.translation_error_m < metres and r.rotation_error_rad < radians for r in rows]
-        )
-        for scene, rows in _by_scene(results).items()
-    }
+
+    def right(row: FrameResult) -> bool:
+        return row.translation_error_m < metres and row.rotation_error_rad < radians
+
+    return {name: np.array([*map(right, rows)]) for name, rows in _by_scene(results).items()}
 
 
 def scores(results: Sequence[FrameResult]) -> Scores:
@@ -169,14 +165,10 @@ def recall_area(translation_m: ArrayLike, within_m: float = 0.2) -> float:
 
 
 def continual_scores(accuracies: ArrayLike) -> ContinualScores:
-    """Compute final accuracy and forgetting of one run over a sequence of scenes.
+    """Final accuracy and forgetting of one run over a sequence of scenes; NaN for a single one.
 
-    Args:
-        accuracies: Shape (N, N). Row i holds the accuracies after stage i, column j those of the
-            scene learned in stage j. Entries above the diagonal are ignored and may be NaN.
-
-    Returns:
-        Scores in the unit of `accuracies`. The three scores of forgetting are NaN for N = 1.
+    Row i of `accuracies` (N, N) holds those after stage i, column j those of the scene learned in
+    stage j. Entries above the diagonal are ignored.
     """
     matrix = np.asarray(accuracies, dtype=np.float64)
     count = len(matrix) if matrix.ndim == 2 else 0

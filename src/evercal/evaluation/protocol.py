@@ -31,13 +31,9 @@ def evaluate(
 
     Args:
         localizer: A localizer that learned these scenes, and possibly others.
-        scenes: Recordings or their folders. Give a mapping if the localizer has other names for
-            them.
-        seed: Seed of the random order.
+        scenes: Recordings or their folders; a mapping where the localizer has other names.
+        seed: Seed of the random order; results are in recorded order.
         on_frame: Called after each image with the numbers of images done and in total.
-
-    Returns:
-        Results scene by scene in the order of `scenes`, frames in recorded order.
     """
     named = _named(scenes)
     tests = {name: _test_frames(localizer, name, scene) for name, scene in named.items()}

@@ -18,10 +18,7 @@ ENCODE_BATCH = 8
 
 @torch.inference_mode()
 def encode_features(images: Sequence[np.ndarray], encoder: Encoder) -> Tensor:
-    """(b, channels, rows, columns) features of grey images (h, w) of one size, fp32.
-
-    They are on the device of the encoder's weights, on which it runs.
-    """
+    """(b, channels, rows, columns) of grey images (h, w) of one size, on the encoder's device."""
     device = device_of_network(encoder)
     grey = torch.from_numpy(np.stack(images))[:, None].to(device)
     with autocast(device):

@@ -20,6 +20,7 @@ from evercal.storage.tensors import load_tensors
 
 WEIGHTS = Path(__file__).parent / "weights"
 ENCODER_FILE = WEIGHTS / "encoder.safetensors"
+_SETTINGS = ("stem", "inner", "blocks", "width")
 
 
 @runtime_checkable
@@ -69,8 +70,6 @@ class LocalEncoder(nn.Module):
     """
 
     stride = 8
-    names = ("stem", "inner", "blocks", "width")
-    """Settings that a weight file states."""
 
     def __init__(
         self,
@@ -83,7 +82,7 @@ class LocalEncoder(nn.Module):
         super().__init__()
         self.width = width
         values = (list(stem), inner, blocks, width)
-        self.settings: dict[str, Any] = dict(zip(self.names, values, strict=True))
+        self.settings: dict[str, Any] = dict(zip(_SETTINGS, values, strict=True))
         half, quarter = stem
         layers = ((4, half, 3, 1), (half, half, 3, 1), (half, quarter, 2, 2))
         layers += ((quarter, quarter, 3, 1), (quarter, inner, 2, 2))
@@ -92,10 +91,7 @@ class LocalEncoder(nn.Module):
         self.project = nn.Conv2d(inner, width, 1)
 
     def forward(self, grey: Tensor) -> Tensor:
-        """(b, 1, h, w) in [0, 1] -> (b, width, h // 8, w // 8) unit vectors.
-
-        Pixels beyond a multiple of 8 are cut off.
-        """
+        """(b, 1, h, w) in [0, 1] -> (b, width, h // 8, w // 8) unit vectors."""
         height, width = (side // 8 * 8 for side in grey.shape[-2:])
         x = standardise(grey[..., :height, :width])
         x = F.pixel_unshuffle(x, 2).contiguous(memory_format=torch.channels_last)
@@ -192,11 +188,7 @@ def own_encoder(module: nn.Module, path: Path) -> Encoder:
 
 
 def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
-    """Load an encoder for inference; by default the shipped one.
-
-    The file is a safetensors file of `training`, or ACE's published weight file, a torch state
-    dict that is read with `weights_only`.
-    """
+    """The shipped encoder, or that of a file of `training` or ACE's published weights."""
     path = ENCODER_FILE if path is None else path
     if not path.is_file():
         raise InputError(f"encoder {path}: no such file")
@@ -240,7 +232,7 @@ def _load_own(path: Path) -> LocalEncoder | AceEncoder:
                 f"encoder {path}: weights of the module {settings['layout']!r}; pass that module as"
                 " encoder"
             )
-        encoder = LocalEncoder(**{name: settings[name] for name in LocalEncoder.names})
+        encoder = LocalEncoder(**{name: settings[name] for name in _SETTINGS})
     except (SafetensorError, KeyError, ValueError) as error:
         raise InputError(f"encoder {path}: not an evercal encoder file ({error!r})") from error
     load_strictly(encoder, state, f"encoder {path}: not an evercal encoder file")

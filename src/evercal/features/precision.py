@@ -29,10 +29,7 @@ def fast_bfloat16(device: torch.device | str = "cpu") -> bool:
 
 @lru_cache(maxsize=4)
 def has_bfloat16(kind: str) -> bool:
-    """Whether a kind of device has bfloat16 products.
-
-    CPUs with AVX512-BF16, AMX or Arm's BF16 have them, and CUDA devices from Ampere.
-    """
+    """Whether a device has bfloat16 products: AVX512-BF16, AMX, Arm's BF16, CUDA from Ampere."""
     if kind == "cuda":
         return torch.cuda.is_available() and torch.cuda.is_bf16_supported(False)
     try:

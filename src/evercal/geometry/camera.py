@@ -23,11 +23,9 @@ _ASPECT_TOLERANCE = 0.01
 
 
 def resize_pixels(pixels: ArrayLike, scale: float | Array) -> Array:
-    """Pixel coordinates in a resized image.
+    """Pixel coordinates in a resized image; the scale is new size over old, or one for each axis.
 
-    Resizing scales about the corner of the image, which lies at -0.5 and not at 0. Pixels (..., 2)
-    are x then y, or any coordinate along one axis. The scale is new size over old size; one number,
-    or one for each axis.
+    Resizing scales about the corner of the image, which lies at -0.5 and not at 0.
     """
     return np.asarray((np.asarray(pixels) + 0.5) * scale - 0.5)
 
@@ -142,10 +140,9 @@ class Camera:
         return replace(self, fx=factor * self.fx, fy=factor * self.fy)
 
     def project(self, points_camera: ArrayLike) -> Array:
-        """Points in the camera frame to pixels.
+        """Points (..., 3) in the camera frame to pixels (..., 2), not clipped to the image.
 
-        Points (..., 3) give pixels (..., 2), not clipped to the image; NaN for points behind the
-        camera or beyond the valid range of the distortion (`widest`).
+        NaN for points behind the camera or beyond the range of the distortion (`widest`).
         """
         points = np.asarray(points_camera, dtype=np.float64)
         if points.shape[-1:] != (3,):
@@ -159,11 +156,7 @@ class Camera:
         return plane * (self.fx, self.fy) + (self.cx, self.cy)
 
     def unproject(self, pixels: ArrayLike) -> Array:
-        """Pixels to viewing rays.
-
-        Pixels (..., 2) give rays (..., 3) in the camera frame with z = 1; x and y are NaN outside
-        the range of the distortion.
-        """
+        """Pixels (..., 2) to rays (..., 3) with z = 1; NaN outside the range of the distortion."""
         pixels = np.asarray(pixels, dtype=np.float64)
         if pixels.shape[-1:] != (2,):
             raise ValueError(f"pixels are (..., 2), got {pixels.shape}")

@@ -14,9 +14,8 @@ COARSE = (0.05, math.radians(5.0))
 def near_training(train_poses: SE3, test_poses: SE3) -> NDArray[np.bool_]:
     """Which test frames have a training frame nearer than 5 cm and 5 deg.
 
-    The bounds are those of accuracy and as strict, so that the share of such frames is what the
-    best lookup of a training frame could reach without any geometry. Poses (n,) and (m,) give (m,)
-    bool.
+    Poses (n,) and (m,) give (m,) bool. The bounds are those of accuracy, so that the share of such
+    frames is what the best lookup of a training frame could reach without any geometry.
     """
     near = np.zeros(len(test_poses), dtype=np.bool_)
     for i, pose in enumerate(test_poses):

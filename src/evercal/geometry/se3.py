@@ -197,11 +197,7 @@ def pose_to_dict(pose: SE3 | None) -> dict[str, object] | None:
 
 
 def pose_distance(a: SE3, b: SE3) -> tuple[Array, Array]:
-    """Distance between transforms into the same frame.
-
-    Metres (...) between the origins and radians (...) in [0, pi] between the rotations; batch
-    shapes broadcast.
-    """
+    """Metres (...) and radians (...) in [0, pi] between transforms into the same frame."""
     metres = np.linalg.norm(a.translation_m - b.translation_m, axis=-1)
     conjugate = a.rotation_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
     difference = _quaternion_product(conjugate, b.rotation_wxyz)

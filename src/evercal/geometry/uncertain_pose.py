@@ -25,10 +25,7 @@ def cross_matrix(v: ArrayLike) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class UncertainPose:
-    """A rigid transform with a Gaussian error.
-
-    First-order propagation: Barfoot and Furgale, IEEE T-RO 2014, for this choice of axes.
-    """
+    """A rigid transform with a Gaussian error (Barfoot and Furgale, IEEE T-RO 2014)."""
 
     pose: SE3
     """parent_from_child, a single transform."""
@@ -123,9 +120,8 @@ def axis_deviation(covariance: ArrayLike) -> tuple[float, float]:
 def frame_covariance(base_from_camera: SE3, covariance: ArrayLike) -> Array:
     """Covariance of the base frame from a motion that is common to all cameras of a map.
 
-    Landmarks move with the cameras that observe them, so an error of `gripper_from_camera` moves
-    the frame of the map by the mean over its cameras. Both covariances are (6, 6), metres and
-    radians; that of the common motion is in the camera frame.
+    Landmarks move with the cameras that observe them, so an error of `gripper_from_camera`, (6, 6)
+    in the camera frame, moves the frame of the map by the mean over its cameras.
     """
     mean = base_from_camera.adjoint().mean(0)
     return mean @ np.asarray(covariance) @ mean.T

@@ -30,10 +30,7 @@ class StreamCamera:
     A live image arrived after the call that asks for it; it was taken earlier by the delay of the
     source. A thread empties the buffer of a live source. A video or a folder gives its next frame.
 
-    Args:
-        source: number or device of a camera, address, video file or folder.
-        rate: frames per second of a folder whose file names hold no times.
-        timeout_s: longest time to wait for a live frame, seconds.
+    `rate` is that of a folder whose file names hold no times, per second.
     """
 
     def __init__(self, source: str, rate: float = 15.0, timeout_s: float = 5.0):

@@ -27,12 +27,7 @@ _COLUMNS = "x,y,z,qw,qx,qy,qz"
 
 
 class WristRecorder:
-    """Adds and removes samples of a wrist recording.
-
-    Args:
-        root: folder; created if missing, continued if it holds samples of the same camera.
-        camera: intrinsics at the size of the images.
-    """
+    """Adds and removes samples of a wrist recording; one of the same camera is continued."""
 
     def __init__(self, root: Path, camera: Camera):
         self._root, self._camera = Path(root), camera

@@ -34,13 +34,9 @@ class MovingRobot(Robot, Protocol):
 class PoseFileRobot:
     """A robot read from a table (CSV, TUM) or JSON lines that another program appends to.
 
-    The last complete line counts. A line without its line break is still being written.
-
-    Args:
-        path: the file; it may appear later.
-        convention: convention of the numbers, such as `kuka`, where no header defines it.
-        most_age_s: age of the file's last change above which its pose is refused as stale;
-            None accepts any age. Seconds.
+    The last complete line counts. The file may appear later. `convention`, such as `kuka`, is that
+    of numbers without a header. A file that was last changed more than `most_age_s` seconds ago is
+    refused as stale.
     """
 
     def __init__(

@@ -23,21 +23,17 @@ from evercal.localization.query import Hypothesis
 from evercal.mapping.scene_map import SceneMap
 
 MAX_SUPPORT = 0.5
-"""Largest threshold. One wrong pose of those measured had more support: an image of another room
-with the same curtain (docs/experiments/map.md)."""
+"""Largest threshold. Of the wrong poses measured one had more support (research/map.md)."""
 MIN_SUPPORT = 0.14
-"""Smallest threshold. Where stated poses fit the images badly, right poses have little support: the
-threshold is then half of the support of held-out frames, but at least this."""
+"""Smallest threshold, for recordings whose stated poses fit the images badly."""
 COVARIANCE_SCALE = 1.6
-"""Alignment errors of neighbouring patches are correlated, so errors exceed residuals. Chosen on
-training frames that are no keyframes (docs/experiments/map.md)."""
+"""Alignment errors of neighbouring patches are correlated, so they exceed residuals."""
 USELESS_M = 0.05
 """Answers with a larger standard deviation of the position per axis are rejected."""
 APART_SIGMAS, APART_M, APART_RAD = 5.0, 0.01, np.deg2rad(1.0)
 """Poses that differ by less are the same answer."""
 FULL_SUPPORT = 4.0
-"""Poses with less support get a wider covariance (docs/experiments/map.md): few landmarks lie on
-few surfaces, so their errors are correlated."""
+"""Poses with less support get a wider covariance: errors on few surfaces are correlated."""
 
 
 def support(hypothesis: Hypothesis) -> float:

@@ -60,8 +60,7 @@ class AlignmentOptions:
     )
     """From coarse to fine."""
     enough_matched: float = 0.4
-    """If a smaller share of the landmarks was matched in one round, the next round searches
-    proportionally more. An occluded or distant view yields few matches per landmark."""
+    """Share of matched landmarks below which the next round searches proportionally more."""
     most_more: float = 3.0
     """Largest factor on the number of landmarks."""
     min_correlation: float = 0.7
@@ -104,9 +103,8 @@ def align_pose(
     """Refine a rough pose by the landmarks of keyframes.
 
     The camera is that of the first level of the pyramid and the mean of the prior. The start is
-    map_from_camera, roughly, with a change (5,) of the intrinsics.
-    Returns None if too few landmarks match. A start that is known to some pixels needs no `coarse`
-    search.
+    map_from_camera, roughly, with a change (5,) of the intrinsics; one that is known to some pixels
+    needs no `coarse` search. Returns None if too few landmarks match.
     """
     search = _Search(pyramid, keyframes, options)
     pose, rounds = start, options.rounds if coarse else options.rounds[1:]

@@ -35,8 +35,7 @@ DOUBT = 3.0
 _REFINE_STEPS = 10
 """Gauss-Newton steps of pose and intrinsics, at most."""
 _REACHED = 0.05 * 7.815
-"""Posterior probability of a different camera at which the covariance is inflated to include that
-camera's pose: the 95 % ellipsoid (chi-squared) reaches it where the probability is 5 %."""
+"""Probability of another camera at which the 95 % ellipsoid (chi-squared) reaches its pose."""
 
 
 @dataclass(frozen=True)
@@ -109,8 +108,7 @@ class Prior:
     def other_camera(self, camera: Camera, change: Array, covariance: Array) -> float:
         """Probability that an image is of another camera of the model, by estimated intrinsics.
 
-        The change (5,) and its covariance (5, 5) were estimated without a prior. Each hypothesis
-        is a Gaussian about the intrinsics of the recording.
+        See `tested`. Each hypothesis is a Gaussian about the intrinsics of the recording.
         """
         own, other = (
             _log_density(change, self.scale * covariance + np.diag(sigma.variances(camera)))
@@ -157,10 +155,7 @@ def _contradictable(
 def _own_or_other(
     observed: Observed, camera: Camera, pose: SE3, free: RefinedPose, prior: Prior
 ) -> RefinedPose:
-    """Pose for the recording's camera; for any camera if another one is more probable.
-
-    A less probable camera widens the covariance, see `_REACHED`.
-    """
+    """Pose for the recording's camera, or any; a less probable one widens it, see `_REACHED`."""
     doubt = prior.other_camera(camera, free.change, free.change_covariance)
     if doubt > 0.5:
         return _contradictable(observed, camera, free, replace(prior, sigma=UNKNOWN))

@@ -119,10 +119,9 @@ class KeyframeBank:
         return self._contents.encoder
 
     def retrieve(self, features: Tensor) -> NDArray[np.int64]:
-        """Rank the keyframes by the similarity of their descriptors.
+        """Rank the keyframes by the similarity of their descriptors to features (cells, channels).
 
-        One matrix-vector product: 3 ms for 10,000 keyframes, so no index is needed. Features are
-        (cells, channels), on the encoder's device.
+        One matrix-vector product takes 3 ms for 10,000 keyframes, so no index is needed.
         """
         vlad = vlad_for(self._contents.encoder)(features)
         similarity = (self._descriptors @ vlad).cpu().numpy()

@@ -341,9 +341,8 @@ class Localizer:
     def _strength(self, rival: Hypothesis, best: Hypothesis) -> float:
         """How well a rival explains the image, relative to another pose; both are aligned.
 
-        The ratio of their support times that of the matches within one cell. Landmarks
-        distinguish a square of a board from the next one. Racks of one kind differ only in their
-        surroundings.
+        The ratio of their support times that of the matches within one cell. Landmarks distinguish
+        a square of a board from the next one; racks of one kind differ only in their surroundings.
         """
         ratio = support(rival) / max(support(best), 1e-9)
         if best.matches is None:

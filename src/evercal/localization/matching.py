@@ -74,10 +74,7 @@ class Matcher:
         camera: Camera,
         near: SE3 | None,
     ) -> np.ndarray:
-        """(n, 3) points of the patches that are most similar to features (n, channels).
-
-        NaN where no patch of a keyframe is `near`.
-        """
+        """(n, 3) points of the patches most similar to features (n, channels); else NaN."""
         loaded = [self._bank.load(int(index)).cells for index in keyframes]
         features = features.to(loaded[0].features.dtype)
         # One keyframe at a time: the products of all would not fit the processor's cache.
@@ -109,10 +106,7 @@ class Matcher:
 def strided_patches(
     query: Query, camera: Camera, encoder_stride: int, stride: int
 ) -> tuple[NDArray[np.int64], np.ndarray]:
-    """Every n-th row and column of patches: their indices (m,) and ideal pixels (m, 2).
-
-    Patches outside the range of the distortion are left out.
-    """
+    """Indices (m,) and ideal pixels (m, 2) of patches of every n-th row and column with a ray."""
     rows, columns = query.features.shape[1:]
     patches = np.arange(rows * columns).reshape(rows, columns)[::stride, ::stride].ravel()
     pixels = cell_pixels(camera, encoder_stride, query.turns)[patches]
@@ -139,9 +133,7 @@ def cell_pixels(camera: Camera, stride: int, turns: int) -> np.ndarray:
 
 
 def _ordered(value: Tensor) -> np.ndarray:
-    """Positive floats (n, m) as integers of the same order.
-
-    numpy finds the largest of those in a hundredth of the time that torch takes for bfloat16.
-    """
+    """Positive floats (n, m) as integers of the same order."""
+    # numpy finds the largest of those in a hundredth of the time that torch takes for bfloat16.
     kind = torch.int16 if value.dtype == torch.bfloat16 else torch.int32
     return value.contiguous().view(kind).cpu().numpy()

@@ -35,10 +35,9 @@ class PnpResult(NamedTuple):
 def solve_pnp(
     pixels: np.ndarray, points_m: np.ndarray, camera: Camera, options: PnpOptions
 ) -> PnpResult | None:
-    """Estimate the pose of a camera from 2D-3D matches.
+    """The pose of a camera from 2D-3D matches, None for fewer than 6 inliers.
 
-    Pixels (n, 2) lie in the ideal pinhole of the camera, whose distortion is ignored. Returns None
-    for fewer than 6 inliers.
+    Pixels (n, 2) lie in the ideal pinhole of the camera, whose distortion is ignored.
     """
     import poselib
 
@@ -65,10 +64,7 @@ def solve_pnp(
 def pose_covariance(
     pixels: np.ndarray, points_m: np.ndarray, camera: Camera, points_from_camera: SE3
 ) -> np.ndarray:
-    """First-order covariance (6, 6) from the reprojection Jacobian, sigma^2 (J^T J)^-1.
-
-    sigma^2 is the mean squared residual per coordinate.
-    """
+    """First-order covariance (6, 6), mean squared residual per coordinate times (J^T J)^-1."""
     rotation = points_from_camera.rotation_matrix()
     position = points_from_camera.translation_m
     residual, slope = linearise(pixels, points_m, rotation, position, camera.pinhole)

@@ -12,8 +12,7 @@ from evercal.geometry import SE3, Camera, UncertainPose
 Array = NDArray[np.floating]
 
 INTRINSICS = 5
-"""Parameters of a change of intrinsics: logarithm of the focal lengths, principal point in pixels,
-k1 and k2."""
+"""Parameters of a change: logarithm of the focal lengths, principal point in pixels, k1, k2."""
 _SMALL = 1e-5
 _DIVERGED = 10.0
 """Growth of the variance of residuals at which the step before is kept."""
@@ -40,8 +39,7 @@ class MeasuredIntrinsics:
     """Intrinsics that landmarks measure without a prior."""
 
     squares: float
-    """Squared change from the stated intrinsics, in standard deviations of independent errors of
-    the landmarks."""
+    """Squared change from the stated intrinsics in standard deviations of landmarks' errors."""
     by_shared: float
     """Factor on the variance is 1 + `by_shared` s^2, if landmarks share errors of s pixels."""
 
@@ -95,13 +93,8 @@ def refine_pose(
 ) -> RefinedPose:
     """Minimise whitened reprojection errors with Cauchy weights.
 
-    Args:
-        observed: landmarks in the image.
-        camera: intrinsics, the mean of their prior.
-        start: points_from_camera, roughly.
-        iterations: Gauss-Newton steps, at most.
-        variances: (5,) of the intrinsics about those of `camera`. None holds them fixed.
-        change: (5,) of the intrinsics to start from.
+    The start is points_from_camera, roughly, with a change (5,) of the intrinsics. These have
+    variances (5,) about those of `camera`; None holds them fixed.
     """
     count = 6 if variances is None else 6 + INTRINSICS
     moved: Array = np.zeros(INTRINSICS) if change is None else change
@@ -201,11 +194,9 @@ def linearise(
 ) -> tuple[Array, Array]:
     """Reprojection errors and their derivatives by the pose, and by intrinsics if wanted.
 
-    Pixels (n, 2) lie in the image; rotation and position are those of points_from_camera.
-
-    Returns:
-        Residuals (2, n) in pixels, and derivatives (2, 6 or 11, n) by a motion (translation,
-        rotation) in the camera frame and by a change of the intrinsics.
+    Rotation and position are those of points_from_camera. Residuals are (2, n) pixels, derivatives
+    (2, 6 or 11, n) by a motion (translation, rotation) in the camera frame and by a change of the
+    intrinsics.
     """
     local = rotation.T @ (points_m - position).T
     inverse = 1 / np.maximum(local[2], 1e-3)

@@ -48,21 +48,17 @@ class LocalizeOptions:
     promising_inliers: int = 16
     """Images with fewer PnP inliers after the quick attempts are rejected."""
     immediate: float = 3.0
-    """A pose of the first attempt is final if its support is this many times the threshold.
-    Otherwise the second attempt runs and the pose with more support is taken."""
+    """A pose of the first attempt is final if its support is this many times the threshold."""
     guided_below: float = 1.5
-    """Poses with less support are matched again near the current pose. Alignment may have converged
-    beside the true pose: guided matching, PnP and alignment repeat while the support rises."""
+    """Poses with less support are matched again near themselves while their support rises."""
     guided_gain: float = 1.1
     """Factor by which guided matching must raise the support to go on."""
     rival_px: float = 16.0
-    """A second pose is sought among matches that the first one misses by more than this, pixels at
-    the encoder's working size."""
+    """A second pose is sought among matches that the first one misses by more than this, pixels."""
     climbs: int = 5
     """Poses whose rivals are tried, at most."""
     clear_strength: float = 0.8
-    """A pose is clearly stronger than rivals with less than this strength. Otherwise the image is
-    ambiguous. The strength is the ratio of their support times that of the matches that agree."""
+    """Relative strength of a rival, see `Localizer`, from which the image is ambiguous."""
     guided_px: float = 32.0
     """Search radius of guided matching, pixels at the encoder's working size."""
     keyframes: int = 6
@@ -137,10 +133,7 @@ class Matches:
     """(m, 3) in the scene's frame."""
 
     def beside(self, camera: Camera, pose: SE3, px: float) -> "Matches":
-        """Matches that lie farther than `px` from where a pose projects their points.
-
-        The camera is of the size of the matches' pixels, the pose map_from_camera.
-        """
+        """Matches farther than `px` from where a pose map_from_camera projects their points."""
         projected = camera.pinhole.project(pose.inverse().apply(self.points_m))
         off = np.linalg.norm(projected - self.pixels, axis=1)
         rest = ~(off < px)  # points behind the camera have no projection

@@ -20,8 +20,7 @@ FREQUENT = 0.4
 ALIKE = 0.85
 """Smallest correlation of the patches of two landmarks that look alike."""
 TOLERANCE = 0.006
-"""Pairs share a displacement if it differs by less than this share of their distance from the
-camera."""
+"""Largest difference of shared displacements, as a share of the distance from the camera."""
 LEAST_STEP = 0.015
 """Smallest step, as a share of the distance from the camera: patches overlap below."""
 LEAST_PAIRS, LEAST_SHARE = 15, 0.05
@@ -29,15 +28,10 @@ LEAST_PAIRS, LEAST_SHARE = 15, 0.05
 
 
 def pattern_steps(points_m: Array, templates: Array, position_m: Array) -> Array:
-    """Displacements that many pairs of similar landmarks share, the shortest first.
+    """Displacements (k, 3) that many pairs of similar landmarks share, the shortest first.
 
-    Args:
-        points_m: (n, 3) landmarks that agree with a pose.
-        templates: (n, p) their patches with zero mean and unit deviation.
-        position_m: (3,) position of the camera.
-
-    Returns:
-        (k, 3) metres; with every step, its opposite.
+    Landmarks (n, 3) agree with a pose at a position (3,); their templates (n, p) have zero mean and
+    unit deviation. With every step its opposite is returned.
     """
     if not len(points_m):
         return np.zeros((0, 3))

@@ -53,13 +53,11 @@ class TrackOptions:
     settled: float = 2.0
     """Minimum support of the last pose, relative to the threshold, for using it as a prior."""
     at_most_ms: float | None = None
-    """Time for a frame. Where alignment fails, the frame is located in the background, and frames
-    are answered as `lost` meanwhile, see `PoseEstimate.omitted`. One alignment always runs."""
+    """Time for a frame; what alignment misses is located in the background, `lost` meanwhile."""
     smooth: float = 0.0
     """Time constant of the smoothed pose in seconds; 0 returns measurements."""
     jump_sigmas: float = 4.0
-    """A measurement so far from the smoothed pose, in standard deviations, is a jump: the smoothed
-    pose follows at once."""
+    """Deviation, in sigmas, of a jump: the smoothed pose follows at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,10 +212,7 @@ class Tracker:
         return None
 
     def _may_have_slipped(self, found: Hypothesis, predicted: SE3, stamp: float) -> bool:
-        """Whether a pose that lies a period of repeated texture away is as near the prediction.
-
-        Then the frame is located from nothing, which compares such poses.
-        """
+        """Whether a pose that lies a period of repeated texture away is as near the prediction."""
         assert found.pose is not None, "a trusted pose"
         if found.points_m is None or found.templates is None:
             return False

@@ -28,8 +28,7 @@ def record_cell(
 ) -> Iterator[None]:
     """Record a virtual cell into a new folder; yields after each image.
 
-    The wrist poses are spread over the reachable ones. The truth is in a file of its own, which no
-    other command reads.
+    The wrist poses are spread over the reachable ones. No other command reads the truth.
     """
     if out.exists() and any(out.iterdir()):
         raise InputError(f"{out}: is not empty; give a new folder")

@@ -103,10 +103,7 @@ class VirtualCell:
         self.seed, self.noise = seed, np.random.default_rng([seed, 34])
 
     def reachable_poses(self, count: int, seed: int = 0) -> SE3:
-        """Random gripper poses (count,) from which a wrist camera sees the work area.
-
-        They rely on the nominal mount (`nominal_mount`), not on the true one.
-        """
+        """Random gripper poses (count,) from which a nominally mounted camera sees the table."""
         rng = np.random.default_rng([self.seed, 35, seed])
         poses: list[SE3] = []
         while len(poses) < count:

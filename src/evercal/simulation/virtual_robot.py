@@ -54,13 +54,10 @@ class Motion:
 
 
 class VirtualRobot:
-    """An arm that moves in joint space and stops with a small error that it does not state.
-
-    `noise_m` and `noise_rad` are standard deviations of the true pose about the stated one, per
-    axis.
-    """
+    """An arm that moves in joint space and stops with a small error that it does not state."""
 
     def __init__(self, clock: Clock, noise_m: float, noise_rad: float, seed: int):
+        # Standard deviations of the true pose about the stated one, per axis.
         self._clock, self._sigma = clock, np.repeat([noise_m, noise_rad], 3)
         self._rng, self._lock = np.random.default_rng([seed, 32]), threading.Lock()
         error, now = self._draw(), clock.now()
