@@ -36,7 +36,6 @@ class StageStart:
     replay_rows: int
     """Rows to replay in a step, for all remembered scenes together."""
     seed: int
-    """Random seed."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,6 @@ class FinishedScene:
     """Inputs of a method after a scene was learned."""
 
     head: Head
-    """The trained head."""
     number: int
     """Index of the scene in the head."""
     rows: Callable[[], FeatureBuffer]
