@@ -39,9 +39,7 @@ class Encoding:
     """Images are being encoded."""
 
     done: int
-    """Views encoded."""
     total: int
-    """Views to encode."""
 
 
 OnEvent = Callable[[Encoding | Progress], object]
@@ -58,6 +56,4 @@ class Stage:
     scenes: LearnedScenes
     """Everything learned so far; thresholds are not fitted yet."""
     iterations: int
-    """Optimiser steps."""
     frames_kept: int
-    """Keyframes of this scene."""

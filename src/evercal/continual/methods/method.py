@@ -62,11 +62,9 @@ class Method:
     """Base of all methods: trains on the new scene alone and stores nothing."""
 
     citation: ClassVar[str] = ""
-    """Source of the method."""
     replays: ClassVar[bool] = False
     """Whether training needs the rows of remembered keyframes."""
     head_per_scene: ClassVar[bool] = False
-    """Whether every scene gets its own head."""
 
     def select(self, frames: FrameStatistics, capacity: int) -> np.ndarray | None:
         """Select the keyframes: sorted indices into the recorded frames, or None for no memory."""

@@ -32,7 +32,6 @@ class Rows:
     descriptor: Tensor
     """(n, width) descriptor of each row's image."""
     target: Target
-    """Observation of each row."""
     known: Tensor | None = None
     """(n, 3) points of the atlas that are known from depths; NaN for rows without one."""
 
@@ -180,7 +179,6 @@ class EncodePlan:
     """Rows taken from an augmented view; a plain view gives all rows."""
     seed: int = 0
     view: ViewOptions = field(default_factory=ViewOptions)
-    """Working size and augmentation."""
 
 
 def encode_frames(
