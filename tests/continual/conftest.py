@@ -109,8 +109,9 @@ def arc_scenes(
 
     def train() -> tuple[LearnedScenes, LearnedScenes]:
         strategy = STRATEGIES["evercal_network"]
+        options = replace(arc_stage, fit=replace(arc_stage.fit, iterations=450))
         empty = LearnedScenes(load_encoder(), load_descriptor(), strategy.name, 120)
-        one = learn(empty, strategy, arcs[0], arc_stage).scenes
-        return one, learn(one, strategy, arcs[1], arc_stage).scenes
+        one = learn(empty, strategy, arcs[0], options).scenes
+        return one, learn(one, strategy, arcs[1], options).scenes
 
     return shared("arc_scenes", train)

@@ -31,11 +31,9 @@ class SceneRecord:
     camera: Camera
     """Intrinsics of its first training frame."""
     cell: Cell
-    """Its cell of the atlas."""
     prototypes: Tensor
     """(p, width) descriptors of training frames spread over the recording, half precision."""
     train_frames: int
-    """Frames it was learned from."""
     refined_camera: Camera | None = None
     """`camera` as training corrected it; None without a correction."""
     inlier_threshold: float = 0.0
@@ -59,9 +57,7 @@ class LearnedScenes:
     """Everything that localization and the next stage need."""
 
     encoder: Encoder
-    """Frozen local encoder."""
     descriptor: Descriptor
-    """Frozen global descriptor."""
     strategy: str
     """Key of STRATEGIES."""
     short_side: int

@@ -220,10 +220,9 @@ def test_orders() -> None:
     scenes = [Recording(str(i), (), ()) for i in range(6)]
     assert in_order(scenes, "given", 3) == scenes
     assert in_order(scenes, "reversed", 3) == scenes[::-1]
-    drawn = [[s.name for s in in_order(scenes, "shuffled", seed)] for seed in range(20)]
+    drawn = [tuple(s.name for s in in_order(scenes, "shuffled", seed)) for seed in range(20)]
     assert all(sorted(order) == [s.name for s in scenes] for order in drawn)
-    assert len({tuple(order) for order in drawn}) > 15
-    assert drawn[3] == [s.name for s in in_order(scenes, "shuffled", 3)]
+    assert len(set(drawn)) > 15
     for count in (3, 5):
         orders = [in_order(scenes[:count], "balanced", seed) for seed in range(2 * count)]
         assert orders[0] == scenes[:count]

@@ -37,18 +37,10 @@ def test_reprojection_costs_the_loss_of_new_rows(tau: float) -> None:
 
 def test_old_output_by_hand() -> None:
     # The student is 3 px (6 cm) right of the target, the teacher 2 px (4 cm) left.
-    actual = cost(
-        OldOutput(), head_output([off_by(3.0)]), head_output([off_by(-2.0)]), rows(1), 1.0
-    )
-    assert actual == pytest.approx(math.tanh(3.0) + PX_PER_M * 0.10, rel=1e-5)
-    half = cost(
-        OldOutput(px_per_m=25.0),
-        head_output([off_by(3.0)]),
-        head_output([off_by(-2.0)]),
-        rows(1),
-        1.0,
-    )
-    assert actual - half == pytest.approx(2.5, rel=1e-5)
+    student, teacher = head_output([off_by(3.0)]), head_output([off_by(-2.0)])
+    for px_per_m in (PX_PER_M, 25.0):
+        actual = cost(OldOutput(px_per_m), student, teacher, rows(1), 1.0)
+        assert actual == pytest.approx(math.tanh(3.0) + px_per_m * 0.10, rel=1e-5)
 
 
 def test_teacher_bounds_only_a_worse_student() -> None:

@@ -2,7 +2,6 @@
 
 import math
 from fractions import Fraction
-from itertools import islice, pairwise
 
 import numpy as np
 import pytest
@@ -42,7 +41,7 @@ def overlap(a: Cell, b: Cell) -> float:
     return max(sides[0], 0.0) * max(sides[1], 0.0)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_cells_never_overlap(seed: int) -> None:
     atlas, _ = filled(seed, 12)
     for i, a in enumerate(atlas.cells):
@@ -50,7 +49,7 @@ def test_cells_never_overlap(seed: int) -> None:
         assert all(overlap(a, b) < 1e-9 for b in atlas.cells[:i])
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_cell_contains_the_cameras_of_its_scene(seed: int) -> None:
     atlas, scenes = filled(seed, 8)
     for i, (cell, scene) in enumerate(zip(atlas.cells, scenes, strict=True)):
@@ -91,16 +90,6 @@ def test_scene_at_a_position() -> None:
     assert atlas.scene_at(np.array([0, 0, 40.0])) == 0  # any height
     assert atlas.scene_at(np.array([1000.0, 0, 0])) is None
     assert atlas.scene_at(np.full(3, np.nan)) is None
-
-
-def test_spiral_fills_growing_squares() -> None:
-    for half in range(5):
-        side = 2 * half + 1
-        points = np.array(list(islice(spiral(), side * side))) / 5.0
-        expected = {(x, y) for x in range(-half, half + 1) for y in range(-half, half + 1)}
-        assert {(int(x), int(y)) for x, y, _ in points} == expected
-        assert all(np.abs(b - a).sum() == 1 for a, b in pairwise(points))
-        assert not points[:, 2].any()
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 7, 9, 10, 12, 16, 17, 19, 30])

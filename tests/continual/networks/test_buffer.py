@@ -151,14 +151,6 @@ def plain_views(buffer: FeatureBuffer) -> list[Tensor]:
     return [torch.nonzero(buffer.tensors["view"] == view)[:, 0] for view in range(7)]
 
 
-def test_view_does_not_depend_on_other_frames(frames: list[Frame], filled: Filled) -> None:
-    """A view depends on position and pass, not on the number of frames."""
-    whole, few = filled(), filled(some=frames[:2])
-    last = whole.rows(torch.nonzero(whole.tensors["view"] == 7)[:, 0])  # frame 0, pass 1
-    alone = few.rows(torch.nonzero(few.tensors["view"] == 2)[:, 0])
-    assert torch.equal(last.target.pixels, alone.target.pixels)
-
-
 def test_augmented_views_have_the_planned_number_of_valid_cells(
     frames: list[Frame], filled: Filled
 ) -> None:

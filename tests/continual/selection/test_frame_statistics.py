@@ -64,32 +64,26 @@ def test_neighbouring_frames_share_parts(
 
 
 def test_gradient_predicts_the_change_of_the_loss(
-    captured: tuple[FrameStatistics, Head, FeatureBuffer], monkeypatch: pytest.MonkeyPatch
+    captured: tuple[FrameStatistics, Head, FeatureBuffer],
 ) -> None:
     """A small step against the gradient lowers the loss by the predicted amount."""
     candidates, head, buffer = captured
-    gradient = candidates.gradients()[3]
-    where = torch.nonzero(buffer.tensors["view"] == 3)[:, 0]
-    generator = torch.Generator().manual_seed(5)
-    each = [torch.nonzero(buffer.tensors["view"] == i)[:, 0] for i in range(4)]
-    draws = [torch.randint(int(w[0]), int(w[-1]) + 1, (256,), generator=generator) for w in each]
-    drawn = draws[3]
-    assert set(drawn.tolist()) <= set(where.tolist())
-    rows = buffer.rows(drawn)
+    gradient = candidates.gradients()[0]
+    own = torch.nonzero(buffer.tensors["view"] == 0)[:, 0]
+    drawn = torch.randint(len(own), (256,), generator=torch.Generator().manual_seed(5))
+    rows = buffer.rows(own[drawn])
 
     def loss() -> float:
         with torch.no_grad():
             points = head(rows.features.float(), 0, rows.descriptor).points
             return float(reprojection_loss(points, rows.target, 5.0, LossOptions())[0].mean())
 
-    before, selected = loss(), head.logit.detach().clone()
+    before, selected = loss(), head.logit.data
     part = torch.from_numpy(gradient[: head.logit.numel()]).float().view_as(head.logit)
-    step = 1e-3 / float(part.norm())
-    with torch.no_grad():
-        head.logit.sub_(step * part)
+    step = 2e-2 / float(part.norm())  # much longer than rounding
+    head.logit.data = selected - step * part
     after = loss()
-    with torch.no_grad():
-        head.logit.copy_(selected)
+    head.logit.data = selected
     assert before - after == pytest.approx(step * float(part.norm()) ** 2, rel=0.1)
 
 
@@ -111,19 +105,12 @@ def test_fixed_centres_all_have_gradients(
     assert np.abs(gradients).max() > 0
 
 
-def test_poses_match_the_frames_and_draws_are_reproducible(rooms: Rooms) -> None:
-    frames = rooms[1].train
+def test_draws_depend_on_seed_and_scene(rooms: Rooms) -> None:
+    head, buffer = Head(4, 4, HeadOptions()), FeatureBuffer(0, SE3.identity())
 
-    def never() -> FeatureBuffer:
-        raise AssertionError("poses need no features")
+    def drawn(seed: int, scene: int) -> float:
+        frames = FrameStatistics(rooms[1].train, head, lambda: buffer, seed, scene)
+        assert frames.rng().random() == frames.rng().random()
+        return frames.rng().random()
 
-    candidates = FrameStatistics(frames, Head(4, 4, HeadOptions()), never, 9)
-    poses = SE3(candidates.quaternions_wxyz, candidates.positions_m)
-    for i in (0, 11):
-        pose = frames[i].base_from_camera
-        assert pose is not None
-        np.testing.assert_allclose(poses[i].matrix(), pose.matrix(), atol=1e-12)
-    assert candidates.rng().random() == candidates.rng().random()
-    for other in ((8, 0), (9, 1)):
-        drawn = FrameStatistics(frames, Head(4, 4, HeadOptions()), never, *other).rng().random()
-        assert drawn != candidates.rng().random(), other
+    assert len({drawn(9, 0), drawn(8, 0), drawn(9, 1)}) == 3

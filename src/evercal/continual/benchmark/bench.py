@@ -44,9 +44,7 @@ class Step:
     """A complete stage."""
 
     strategy: str
-    """Name of the strategy."""
     seed: int
-    """Seed of the run."""
     results: Table
     """Rows of results.csv; empty before the last stage of joint training."""
     done: int

@@ -26,7 +26,6 @@ class Suite:
     scenes: tuple[str, ...]
     """Names in order of learning; each is a folder of the data."""
     source: str
-    """Source of the data, for messages."""
 
 
 _THREE = ("bedroom", "kitchen", "living")

@@ -39,7 +39,6 @@ class NetworkLearnOptions:
     device: str = "auto"
     """Device of the networks, see `device_of`."""
     seed: int = 0
-    """Seed of everything that is drawn at random."""
     stage: StageOptions | None = None
     """Options of the stage in place of preset, memory and centres."""
     short_side: int | None = None

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Literal
 
 from evercal.continual.learning.stage import StageOptions
 from evercal.continual.networks.buffer import EncodePlan
@@ -112,8 +111,7 @@ def with_paper_head(options: StageOptions) -> StageOptions:
     return replace(options, head=head)
 
 
-Backbone = Literal["evercal", "paper", "paper_head"]
-BACKBONES: dict[Backbone, Callable[[StageOptions], StageOptions]] = {
+BACKBONES: dict[str, Callable[[StageOptions], StageOptions]] = {
     "evercal": lambda options: options,
     "paper": on_paper_backbone,
     "paper_head": with_paper_head,

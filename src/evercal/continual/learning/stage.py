@@ -17,7 +17,6 @@ class StageOptions:
     head: HeadOptions = field(default_factory=HeadOptions)
     """Shape of a new head; later stages keep it."""
     fit: FitOptions = field(default_factory=FitOptions)
-    """Training."""
     encode: EncodePlan = field(default_factory=EncodePlan)
     """Views of the new scene's frames."""
     replay_views_per_frame: int = 4
@@ -29,7 +28,6 @@ class StageOptions:
     grid_scenes: int = 0
     """Scenes of `Atlas` layout `paper`; 0 gives each scene the next free cell."""
     seed: int = 0
-    """Random seed."""
 
     def with_memory(self, memory: str | int) -> "StageOptions":
         """The same options with a memory budget such as `10%` or `5MB`."""
@@ -41,9 +39,7 @@ class Encoding:
     """Images are being encoded."""
 
     done: int
-    """Views encoded."""
     total: int
-    """Views to encode."""
 
 
 OnEvent = Callable[[Encoding | Progress], object]
@@ -60,6 +56,4 @@ class Stage:
     scenes: LearnedScenes
     """Everything learned so far; thresholds are not fitted yet."""
     iterations: int
-    """Optimiser steps."""
     frames_kept: int
-    """Keyframes of this scene."""

@@ -36,7 +36,6 @@ class StageStart:
     replay_rows: int
     """Rows to replay in a step, for all remembered scenes together."""
     seed: int
-    """Random seed."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,6 @@ class FinishedScene:
     """Inputs of a method after a scene was learned."""
 
     head: Head
-    """The trained head."""
     number: int
     """Index of the scene in the head."""
     rows: Callable[[], FeatureBuffer]
@@ -64,11 +62,9 @@ class Method:
     """Base of all methods: trains on the new scene alone and stores nothing."""
 
     citation: ClassVar[str] = ""
-    """Source of the method."""
     replays: ClassVar[bool] = False
     """Whether training needs the rows of remembered keyframes."""
     head_per_scene: ClassVar[bool] = False
-    """Whether every scene gets its own head."""
 
     def select(self, frames: FrameStatistics, capacity: int) -> np.ndarray | None:
         """Select the keyframes: sorted indices into the recorded frames, or None for no memory."""

@@ -53,7 +53,6 @@ class Replay(EpisodicMemory):
 
     citation: ClassVar[str] = "Vitter 1985; Chaudhry et al., On tiny episodic memories, 2019"
     penalty: Penalty = field(default_factory=Reprojection)
-    """Loss of replayed rows."""
     weight: float = 1.0
     """Weight of the penalty, the mean over the rows of all remembered scenes."""
     every_scene: bool = False

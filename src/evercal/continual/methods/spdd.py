@@ -48,7 +48,6 @@ class SpddTerms:
     output: Tensor
     """Distance of points, metres."""
     total: Tensor
-    """Weighted sum."""
 
 
 def spdd_loss(student: HeadOutput, teacher: HeadOutput, options: SpddOptions) -> SpddTerms:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import groupby, islice
 from operator import attrgetter
 
 import numpy as np
@@ -31,7 +32,6 @@ class Rows:
     descriptor: Tensor
     """(n, width) descriptor of each row's image."""
     target: Target
-    """Observation of each row."""
     known: Tensor | None = None
     """(n, 3) points of the atlas that are known from depths; NaN for rows without one."""
 
@@ -178,9 +178,7 @@ class EncodePlan:
     cells: int = 600
     """Rows taken from an augmented view; a plain view gives all rows."""
     seed: int = 0
-    """Seed of views and cells."""
     view: ViewOptions = field(default_factory=ViewOptions)
-    """Working size and augmentation."""
 
 
 def encode_frames(
@@ -207,15 +205,15 @@ def encode_batches(frames: Sequence[Frame], plan: EncodePlan) -> list[list[int]]
 
     View n shows frame n mod len(frames) in pass n // len(frames).
     """
-    batches: list[list[int]] = []
-    last = None
-    for number in range(plan.views_per_frame * len(frames)):
+
+    def size(number: int) -> tuple[int, int]:
         small = frames[number % len(frames)].camera.short_side_resized(plan.view.short_side)
-        size = small.width, small.height
-        if size != last or len(batches[-1]) == ENCODE_BATCH:
-            batches.append([])
-        batches[-1].append(number)
-        last = size
+        return small.width, small.height
+
+    batches = []
+    for _, same in groupby(range(plan.views_per_frame * len(frames)), size):
+        while batch := list(islice(same, ENCODE_BATCH)):
+            batches.append(batch)
     return batches
 
 

@@ -28,7 +28,6 @@ class LossOptions:
     clamp_start_px: float = 100.0
     """Soft clamp at the first step. With `circle`, its excess over `clamp_end_px`."""
     clamp_end_px: float = 1.0
-    """Soft clamp at the last step."""
     proxy_depth_m: float = 10.0
     """Invalid points are attracted to the point at this depth on their ray."""
 

@@ -25,7 +25,6 @@ class FitOptions:
     """One stage of training."""
 
     iterations: int = 4000
-    """Optimiser steps."""
     batch: int = 2048
     """Rows of the scenes being learned in a step."""
     replay_batch: int = 1024
@@ -45,7 +44,6 @@ class FitOptions:
     surface_weight: float = 0.0
     """Weight of the distance to points from depths; with 0, no depths are estimated."""
     loss: LossOptions = field(default_factory=LossOptions)
-    """Reprojection loss on the scenes being learned."""
 
 
 @dataclass
@@ -55,7 +53,6 @@ class Progress:
     step: int
     """Completed steps."""
     total: int
-    """Steps of the stage."""
     costs: Tensor
     """(n,) loss of each new row in the last step."""
     errors_px: Tensor
