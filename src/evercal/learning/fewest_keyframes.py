@@ -63,7 +63,6 @@ def _located(
     selected: NDArray[np.int64],
     frames: Sequence[Frame],
 ) -> list[SE3 | None]:
-    """Poses of frames, located by a subset of the keyframes alone."""
     scene = replace(built.take(selected).scene, min_support=MAX_SUPPORT)
     localizer = Localizer(MapContents(contents.encoder, contents.short_side, [scene]))
     return [localizer.localize(f.read_image(), f.camera).base_from_camera for f in frames]

@@ -96,7 +96,6 @@ class _Answer(NamedTuple):
 
 
 def _located(contents: MapContents, frames: Sequence[Frame], scene: str) -> list[_Answer]:
-    """Answers in one scene, with finite covariances."""
     localizer, answers = Localizer(contents), []
     for frame in frames:
         estimate, found = localizer.located(frame.read_image(), frame.camera)

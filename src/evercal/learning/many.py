@@ -75,9 +75,6 @@ def learn_scenes(
         task: Encoder and options.
         recordings: Recordings; images in memory are copied to the workers.
         workers: Processes, >= 1.
-
-    Raises:
-        InputError: Bad number of workers.
     """
     if workers < 1:
         raise InputError(f"workers {workers}: give a number >= 1")
@@ -154,7 +151,6 @@ _task: LearnTask | None = None
 
 
 def _begin(task: LearnTask, threads: int, stop: Event, centroids: torch.Tensor | None) -> None:
-    """Prepare a worker process."""
     import cv2
 
     global _task

@@ -70,9 +70,6 @@ def learn_scene(
         gripper_from_camera: A rough one that the estimate is compared with.
         options: Sizes and priors of the map; `memory` overrides theirs.
         on_progress: Called with the current step, how much of it is done, and its total.
-
-    Raises:
-        InputError: The recording cannot be used.
     """
     began = time.perf_counter()
     budget, options = MemoryBudget.parse(memory), options or MapOptions()
@@ -120,7 +117,6 @@ def learn_scene(
 
 
 def _sized(options: MapOptions, budget: MemoryBudget, short_side: int) -> MapOptions:
-    """Options with the memory of a scene and the working size of a map."""
     if budget.auto:
         from evercal.learning.fewest_keyframes import MOST_SHARE
 

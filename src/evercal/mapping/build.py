@@ -199,9 +199,6 @@ def build_map(
     """Build the map of a scene.
 
     The frames are posed, in recorded order.
-
-    Raises:
-        InputError: No two frames show the same surfaces, so nothing can be triangulated.
     """
     options = options or MapOptions()
     prepared = _prepare(frames, encoder, options, on_progress)
@@ -328,7 +325,6 @@ def _adjust(
 
 
 def _moved(stated: SE3, camera: Camera, adjustment: Adjustment) -> bool:
-    """Whether the adjustment moved the projections of landmarks noticeably."""
     change = np.linalg.norm((stated.inverse() @ adjustment.poses).log().reshape(-1, 2, 3), axis=2)
     metres, radians = np.median(change, 0)
     by_camera = 0.0

@@ -172,11 +172,7 @@ class BundleAdjustment:
         self.distorted = any(cameras[0].distortion)
 
     def solve(self, tracks: BundleTracks) -> Adjustment:
-        """Estimate all parameters.
-
-        Raises:
-            InputError: The normal equations have no finite solution.
-        """
+        """Estimate all parameters."""
         widest, estimate = self.start_variances(), self.start(tracks)
         variances = widest
         for i in range(self.options.iterations):
@@ -218,9 +214,6 @@ class BundleAdjustment:
 
         A step that raises the cost is rejected, and the damping is multiplied by 10. The first
         damping is 0: then the step is that of Gauss and Newton.
-
-        Raises:
-            InputError: No damping gives positive definite normal equations.
         """
         noise = noise_of(estimate.linearised)
         normal = self._normal_equations(tracks, estimate, variances, noise)
@@ -282,7 +275,6 @@ class BundleAdjustment:
     def _moved(
         self, tracks: BundleTracks, parameters: Parameters, solution: Solution
     ) -> Parameters:
-        """Parameters after a step; depths change by a fifth at most and stay plausible."""
         correction, shared = np.split(solution.change, [6 * self.n])
         rho, scale = parameters.inverse_depth, tracks.depth_scale
         return Parameters(
@@ -348,7 +340,6 @@ class BundleAdjustment:
         return Variances(sigma, (tail + 6) / (tail + ((off / sigma) ** 2).sum(1)), shared)
 
     def _relevant(self, values: Array, prior: Array, posterior: Array, widest: Array) -> Array:
-        """Prior variances (12,): small for groups that the images do not clearly move."""
         share = np.maximum(1 - np.minimum(posterior / prior, 1), 1e-3)
         squares, noise = (values / share) ** 2, posterior / share
         variances = prior.copy()

@@ -197,7 +197,6 @@ class StatedFrames:
         return rotation, self._position + np.einsum("nij,nj->ni", self._rotation, own[:, :3])
 
     def _by_camera(self, parameters: Parameters, frames: Index) -> list[tuple[Camera, Index]]:
-        """Each camera with the rows of `frames` that it took."""
         if self.same_camera:
             return [(self.camera(parameters), np.arange(len(frames)))]
         groups: dict[Camera, list[int]] = {}

@@ -52,11 +52,7 @@ class _Incoming:
 
 
 def remove_scenes(store: MapStore, names: Sequence[str]) -> None:
-    """Remove scenes from a map, all in one step.
-
-    Raises:
-        InputError: No such scene, or another process writes into the map.
-    """
+    """Remove scenes from a map, all in one step."""
     if not names:
         raise InputError("no scene given; name one or more to remove")
     gone = {_index(store, name) for name in names}
@@ -67,12 +63,7 @@ def remove_scenes(store: MapStore, names: Sequence[str]) -> None:
 
 
 def rename_scene(store: MapStore, name: str, new: str) -> None:
-    """Give a scene another name.
-
-    Raises:
-        InputError: No such scene, a name that is taken or unusable, or another process writes into
-            the map.
-    """
+    """Give a scene another name."""
     index, scenes = _index(store, name), list(store.contents.scenes)
     if checked_name(new) in {scene.name for scene in scenes}:
         raise InputError(f"scene {new!r}: map {store.root} has a scene of this name; give another")
@@ -94,10 +85,6 @@ def merge_maps(
         others: Folders of the other maps; they do not change.
         on_clash: For names that are taken: `refuse`; `rename` to NAME-2; `skip` the new scene;
             `replace` the scene of the map.
-
-    Raises:
-        InputError: Not a map, another encoder or image size, a name that is taken, or another
-            process writes into the map.
     """
     if on_clash not in get_args(OnClash):
         raise InputError(f"on_clash {on_clash!r}: use one of {', '.join(get_args(OnClash))}")
@@ -164,10 +151,6 @@ def unpack_map(file: Path, folder: Path, limits: ArchiveLimits | None = None) ->
 
     The archive is not trusted: paths, links, sizes, checksums and schema are checked, and every
     scene is read, before the folder appears.
-
-    Raises:
-        InputError: The folder holds something, no zip archive, or an archive that is no complete
-            map or is too large.
     """
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder}: exists; give a new folder")
@@ -198,7 +181,6 @@ def _index(store: MapStore, name: str) -> int:
 
 
 def _write_name(folder: Path, name: str) -> None:
-    """Replace the name in the files of a scene."""
     for file, key in ((SCENE, "name"), (REPORT, "scene"), (f"{PREVIOUS}{SCENE}", "name")):
         if file.startswith(PREVIOUS) and not (folder / file).exists():
             continue
@@ -214,8 +196,6 @@ def _free_name(name: str, taken: set[str]) -> str:
 
 
 def _incoming(root: Path) -> tuple[Manifest, list[_Incoming]]:
-    """Manifest and scenes of another map."""
-
     def read(manifest: Manifest) -> tuple[Manifest, list[_Incoming]]:
         stages = [str(stage) for stage in require_map(root, manifest)["stages"]]
         return manifest, [
@@ -226,7 +206,6 @@ def _incoming(root: Path) -> tuple[Manifest, list[_Incoming]]:
 
 
 def _require_same_networks(first: Manifest, other: Manifest, root: Path, path: Path) -> None:
-    """Refuse a map with another encoder, other VLAD centroids or another image size."""
     for key, what in (("short_side", "image size"), ("strategy", "strategy")):
         a, b = first.payload.get(key), other.payload.get(key)
         if a != b:
@@ -272,7 +251,6 @@ def _commit(
 
 
 def _copy(root: Path, file: str, manifest: Manifest, target: Path) -> None:
-    """Copy a file of a map, if it still is the file that the manifest lists."""
     try:
         data = (root / file).read_bytes()
     except FileNotFoundError:
@@ -283,7 +261,6 @@ def _copy(root: Path, file: str, manifest: Manifest, target: Path) -> None:
 
 
 def _require_map_of(root: Path, names: Sequence[str], file: Path) -> None:
-    """Refuse an extracted archive that is no complete map, with its file's name in the message."""
     try:
         listed = {MANIFEST, *Manifest.read(root).files}
         if extra := sorted(set(names) - listed):

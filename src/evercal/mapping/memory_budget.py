@@ -40,9 +40,6 @@ class MemoryBudget:
         """Read a budget: `10%`, `5MB`, `512KiB`, `100000` or `auto`.
 
         The default, None, is 10 % and at least `FEW_KEYFRAMES`.
-
-        Raises:
-            InputError: Another format, or a budget without room for a keyframe.
         """
         if memory is None:
             return cls(least=FEW_KEYFRAMES)

@@ -197,7 +197,6 @@ def _distinct(similar: Tensor, best: Tensor, camera: Camera, stride: int) -> Ten
 
 
 def _distance(recording: PreparedFrames, pair: MatchedPair) -> float:
-    """Median distance of matches from their segments."""
     other, scale = recording.cell_camera(pair.second), recording.depth_scale
     rotation, translation = recording.relative(pair.second, pair.first)
     start, end = (
@@ -208,7 +207,6 @@ def _distance(recording: PreparedFrames, pair: MatchedPair) -> float:
 
 
 def _triangulated(recording: PreparedFrames, pair: MatchedPair) -> Array:
-    """Depths of the matches with clear parallax near their epipolar lines."""
     other = recording.cell_camera(pair.second)
     rotation, translation = recording.relative(pair.second, pair.first)
     plane = other.pinhole.unproject(pair.pixels)[:, :2]

@@ -146,7 +146,6 @@ class _Survival:
 
 
 def _reopened(prepared: PreparedFrames, old: Keyframes, i: int) -> KeyframeTracks:
-    """Return a stored keyframe with its landmarks as tracks."""
     landmarks, pyramid = old.landmarks[i], prepared.pyramid(i)
     return KeyframeTracks(
         frame=i,
@@ -238,8 +237,6 @@ def _nearest(poses: SE3, kept: Sequence[int], new: Sequence[int]) -> dict[int, i
 def _opened(
     prepared: PreparedFrames, numbers: Sequence[int], on_progress: OnProgress
 ) -> list[KeyframeTracks]:
-    """Return new keyframes with depths and landmarks."""
-
     def open_one(frame: int) -> KeyframeTracks:
         keyframe = open_keyframe(prepared, frame)
         refine_depths(prepared, keyframe)

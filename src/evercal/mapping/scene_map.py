@@ -104,11 +104,7 @@ class MapContents:
         return MapContents(self.encoder, self.short_side, [*self.scenes, scene])
 
     def scene(self, name: str) -> SceneMap:
-        """The map of a scene.
-
-        Raises:
-            InputError: No such scene.
-        """
+        """The map of a scene."""
         for scene in self.scenes:
             if scene.name == name:
                 return scene
@@ -116,11 +112,7 @@ class MapContents:
         raise InputError(f"scene {name!r}: the map has only {names}")
 
     def metric_scene(self, name: str) -> SceneMap:
-        """The map of a scene whose answers are in metres.
-
-        Raises:
-            InputError: No such scene, or its unit of length is unknown.
-        """
+        """The map of a scene whose answers are in metres."""
         scene = self.scene(name)
         if not scene.unit_known:
             raise InputError(

@@ -75,9 +75,6 @@ class MapStore(StageStore):
 
         For a store that was made with a module of the caller's own, `encoder` is that module; its
         weights are replaced by those in the store.
-
-        Raises:
-            InputError: Not a map, or a file is missing or was changed.
         """
 
         def read(manifest: Manifest) -> Self:
@@ -103,9 +100,6 @@ class MapStore(StageStore):
 
         `root` must not exist or be empty. The encoder is a weights file, a module that is an
         `Encoder`, or by default the shipped one.
-
-        Raises:
-            InputError: `root` holds something else, or a bad encoder.
         """
         if root.exists() and not is_free(root):
             raise InputError(f"store {root}: exists and is not an evercal store; give another path")
@@ -117,11 +111,7 @@ class MapStore(StageStore):
 
     @classmethod
     def open_or_create(cls, root: Path, encoder: Path | nn.Module | None = None) -> Self:
-        """The map at a path, or a new one.
-
-        Raises:
-            InputError: As `open` and `create`; an encoder file for a map that has one.
-        """
+        """The map at a path, or a new one."""
         if not is_store(root):
             return cls.create(root, encoder)
         if isinstance(encoder, Path):
@@ -129,11 +119,7 @@ class MapStore(StageStore):
         return cls.open(root, encoder)
 
     def commit(self, scene: SceneMap, report: Mapping[str, object]) -> None:
-        """Add a scene: whole, or not at all.
-
-        Raises:
-            InputError: Another process writes into the store, or it cannot be written.
-        """
+        """Add a scene: whole, or not at all."""
 
         def write(folder: Path) -> None:
             if not self.networks:
@@ -150,9 +136,6 @@ class MapStore(StageStore):
 
         It replaces the scene of the same name. The state before a refresh was in another base
         frame, so it is dropped, and `undo` refuses.
-
-        Raises:
-            InputError: As `commit`, and where a file of the store is missing or was changed.
         """
 
         def write(folder: Path) -> None:
@@ -166,9 +149,6 @@ class MapStore(StageStore):
         """Replace a scene of the same name by its refreshed map: whole, or not at all.
 
         The state before is kept for `undo`.
-
-        Raises:
-            InputError: As `update`.
         """
 
         def write(folder: Path) -> None:
@@ -181,11 +161,7 @@ class MapStore(StageStore):
         self._exchange(scene, write)
 
     def undo(self, name: str) -> None:
-        """Bring back the state of a scene before its last refresh: whole, or not at all.
-
-        Raises:
-            InputError: As `update`, and where there was no refresh since the last `undo`.
-        """
+        """Bring back the state of a scene before its last refresh: whole, or not at all."""
         names = [stored.name for stored in self.contents.scenes]
         if name not in names:
             raise InputError(f"scene {name!r}: store {self.root} has {', '.join(names) or 'none'}")
@@ -205,7 +181,6 @@ class MapStore(StageStore):
         self.contents = replace(self.contents, scenes=scenes)
 
     def _exchange(self, scene: SceneMap, write: Callable[[Path], None]) -> None:
-        """Rewrite a stage, and replace its scene in a copy of the contents."""
         index = [stored.name for stored in self.contents.scenes].index(scene.name)
         self.replace(index, write, self.payload)
         # A localizer that still answers keeps the contents it was made with.
@@ -220,11 +195,7 @@ class MapStore(StageStore):
 
 
 def stored_scenes(root: Path) -> list[tuple[str, Camera, dict[str, Any]]]:
-    """Name, adjusted camera and report of every scene of a map; no keyframes are read.
-
-    Raises:
-        InputError: Not a map, or a file is missing or was changed.
-    """
+    """Name, adjusted camera and report of every scene of a map; no keyframes are read."""
 
     def read(manifest: Manifest) -> list[tuple[str, Camera, dict[str, Any]]]:
         folders = [root / STAGES / str(name) for name in require_map(root, manifest)["stages"]]
@@ -239,11 +210,7 @@ def stored_scenes(root: Path) -> list[tuple[str, Camera, dict[str, Any]]]:
 
 
 def require_map(root: Path, manifest: Manifest) -> dict[str, Any]:
-    """The payload of a map's manifest.
-
-    Raises:
-        InputError: The store holds networks.
-    """
+    """The payload of a map's manifest."""
     payload = manifest.payload
     if payload.get("kind") != KIND:
         raise InputError(
@@ -292,18 +259,13 @@ def refreshes(folder: Path) -> list[dict[str, Any]]:
 
 
 def _move(source: Path, target: Path) -> None:
-    """Move a file; one that does not exist leaves no target."""
     target.unlink(missing_ok=True)
     if source.exists():
         source.rename(target)
 
 
 def read_scene(folder: Path) -> SceneMap:
-    """Read a scene from its folder.
-
-    Raises:
-        InputError: Files with other content than `write_scene` writes, whose checksums are right.
-    """
+    """Read a scene from its folder."""
     try:
         return _read_scene(folder)
     except (InputError, OSError):

@@ -193,7 +193,6 @@ def bundle_tracks(recording: PreparedFrames, keyframes: list[KeyframeTracks]) ->
 
 
 def _bundled(keyframe: KeyframeTracks, most: int) -> Index:
-    """The landmarks of a keyframe that take part in bundle adjustment."""
     which = np.flatnonzero(keyframe.confirmed)
     if len(which) < most // 2:
         which = np.arange(len(keyframe.landmarks))
@@ -203,7 +202,6 @@ def _bundled(keyframe: KeyframeTracks, most: int) -> Index:
 
 
 def _tied_frames(recording: PreparedFrames, keyframes: list[KeyframeTracks]) -> list[list[int]]:
-    """Frames in which each keyframe's landmarks are observed."""
     shared = np.stack([_shared_view(recording, keyframe) for keyframe in keyframes])
     best = np.argsort(-shared, axis=0, kind="stable")[:FRAMES_PER_KEYFRAME]
     tied = np.zeros(shared.shape, bool)
@@ -281,7 +279,6 @@ def _in_front(points: Array) -> Array:
 def _update_depths(
     recording: PreparedFrames, keyframe: KeyframeTracks, observations: Observations
 ) -> None:
-    """One Gauss-Newton step of the inverse depths."""
     marks, n = keyframe.landmarks, len(keyframe.landmarks)
     _, residual, slope, weight = _residuals(recording, keyframe, observations)
     which = observations.landmark
@@ -298,7 +295,6 @@ def _confirm(
     keyframe: KeyframeTracks,
     observations: Observations,
 ) -> None:
-    """Decide which landmarks enough frames agree on, and estimate the errors of their depths."""
     n = len(keyframe.landmarks)
     pixels, residual, slope, weight = _residuals(recording, keyframe, observations)
     squares = (residual**2).sum(1)

@@ -166,7 +166,6 @@ def _with_evidence(
     image: Image,
     evidence: "LearnedLocalizer | BoardSeen | None",
 ) -> LandmarkPicture:
-    """Enlarge an image and draw corners or landmarks."""
     large = resized(image, PICTURE_PX)
     if evidence is None:
         return LandmarkPicture(large, 0, "")
@@ -200,7 +199,6 @@ def _use(use: ImageUse | None) -> str:
 
 
 def _surroundings(calibration: Calibration, localizer: "LearnedLocalizer") -> Surroundings:
-    """The map that a fixed camera was calibrated in; empty for other cameras and maps."""
     from evercal.mapping.scene_map import SceneMap
 
     name = calibration.source.get("scene")
@@ -211,7 +209,6 @@ def _surroundings(calibration: Calibration, localizer: "LearnedLocalizer") -> Su
 
 
 def _is_other_map(calibration: Calibration, localizer: "LearnedLocalizer") -> bool:
-    """Whether the map differs from that of the calibration, as far as the source states it."""
     scene, digest = calibration.source.get("scene"), calibration.source.get("map")
     if digest is None or scene not in localizer.scenes:
         return digest is not None

@@ -51,11 +51,7 @@ class Difference(NamedTuple):
 
 
 def difference(new: Calibration, old: Calibration) -> Difference:
-    """Compare two calibrations of one camera.
-
-    Raises:
-        InputError: One camera is fixed, the other is mounted on the gripper.
-    """
+    """Compare two calibrations of one camera."""
     if new.mount != old.mount:
         raise InputError(
             f"--against: it is {old.mount} and the calibration is {new.mount}; give one of the"
@@ -79,9 +75,6 @@ def calibration_page(
     `store` is the path of the store whose landmarks are drawn; `boards` says whether corners of a
     board are drawn. `point_m` is a point in the camera
     frame, metres, whose standard deviation is reported.
-
-    Raises:
-        InputError: `older` has another mount.
     """
     calibration = file.calibration
     missing = (*images.missing, *_missing(calibration))
@@ -126,7 +119,6 @@ def calibration_page(
 
 
 def _level(calibration: Calibration) -> Literal["good", "fair", "bad", ""]:
-    """Colour of the verdict; empty without any measure of quality."""
     if not _has_uncertainty(calibration) and not calibration.checks:
         return ""
     best = tier(calibration)
@@ -155,7 +147,6 @@ def _tiles(calibration: Calibration) -> list[Tile]:
 
 
 def _origin(calibration: Calibration) -> str:
-    """Where the origin of the parent frame lies in the images."""
     if calibration.camera is None:
         return ""
     pose = calibration.parent_from_child.inverse()

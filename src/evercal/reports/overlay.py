@@ -159,7 +159,6 @@ def resized(image: Image, width: int) -> Image:
 
 
 def _draw_legend(image: Image, text: str, limits: tuple[float, float]) -> None:
-    """Draw a colour bar on white in the lower right corner, if there is room."""
     import cv2
 
     scale = max(0.4, min(0.8, image.shape[1] / 1000))

@@ -33,9 +33,6 @@ class TrackFile(AbstractContextManager["TrackFile"]):
 
     `.jsonl` holds one JSON object a line; `.tum` and `.txt` hold `timestamp tx ty tz qx qy qz qw`
     of the frames with a pose.
-
-    Raises:
-        InputError: The path has another ending.
     """
 
     def __init__(self, path: Path):

@@ -39,11 +39,7 @@ _GOOD, _BAD = "#1a7f37", "#cf222e"
 
 
 def require_ending(path: Path) -> None:
-    """Check the name of a video before the images are located.
-
-    Raises:
-        InputError: Another ending.
-    """
+    """Check the name of a video before the images are located."""
     if path.suffix.lower() != ENDING:
         raise InputError(
             f"--video {path}: not a video format of evercal; help: end it with {ENDING}"
@@ -51,11 +47,7 @@ def require_ending(path: Path) -> None:
 
 
 def write_video(path: Path, frames: Iterator[Image]) -> None:
-    """Write frames (h, w, 3) as MP4; the file appears when all of them were written.
-
-    Raises:
-        InputError: OpenCV has no encoder.
-    """
+    """Write frames (h, w, 3) as MP4; the file appears when all of them were written."""
     import cv2
 
     first = next(frames)
@@ -136,7 +128,6 @@ class _MapView:
 
 
 def _words(answer: Answer) -> str:
-    """Status, inliers and uncertainty."""
     estimate, pose = answer.estimate, finite_pose(answer.estimate)
     words = [answer.path.name, estimate.status.replace("_", " "), f"{estimate.inliers} inliers"]
     if estimate.status == "ok" and pose is not None and answer.unit_known:

@@ -50,7 +50,6 @@ class LiveMap:
 
 
 def _stamp(path: Path) -> tuple[int, ...] | None:
-    """Identify a state of a map: its manifest is replaced by every change."""
     try:
         status = os.stat(path / MANIFEST)
     except OSError:

@@ -90,7 +90,6 @@ async def _poll(live: LiveMap) -> None:
 
 
 def _answer(_: Request, error: Exception) -> JSONResponse:
-    """One line for any error."""
     if isinstance(error, HTTPException):
         return _line(error.detail, error.status_code, error.headers)
     if isinstance(error, RequestValidationError):

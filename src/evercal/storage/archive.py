@@ -59,10 +59,6 @@ def check_archive(file: Path, limits: ArchiveLimits = ArchiveLimits()) -> list[s
 
     Returns:
         The paths of its files.
-
-    Raises:
-        InputError: No zip archive; an absolute path, a path with `..`, a duplicate, a link, an
-            encrypted entry; too many entries or too large ones.
     """
     with _opened(file, limits) as archive:
         return [e.filename for e in _checked(archive, file, limits) if not e.is_dir()]
@@ -72,10 +68,6 @@ def extract_archive(file: Path, folder: Path, limits: ArchiveLimits = ArchiveLim
     """Extract a zip archive into a folder that does not exist yet.
 
     Sizes are checked twice: as the archive states them, and while the files are written.
-
-    Raises:
-        InputError: As `check_archive`, or an entry does not have its stated size or checksum.
-            What was extracted before stays in the folder.
     """
     folder.mkdir(parents=True)
     with _opened(file, limits) as archive:
@@ -90,7 +82,6 @@ def extract_archive(file: Path, folder: Path, limits: ArchiveLimits = ArchiveLim
 
 @contextlib.contextmanager
 def _opened(file: Path, limits: ArchiveLimits) -> Iterator[zipfile.ZipFile]:
-    """A zip archive; what the library raises for broken ones becomes one line."""
     broken: object
     try:
         with zipfile.ZipFile(_bounded(file, limits)) as archive:
@@ -106,7 +97,6 @@ def _opened(file: Path, limits: ArchiveLimits) -> Iterator[zipfile.ZipFile]:
 
 
 def _bounded(file: Path, limits: ArchiveLimits) -> Path:
-    """The file, if its central directory is small enough to be read."""
     with open(file, "rb") as opened:
         # The library's own search, so that both find the same directory.
         end = zipfile._EndRecData(opened)  # pyright: ignore[reportAttributeAccessIssue]
@@ -152,7 +142,6 @@ def _checked(archive: zipfile.ZipFile, file: Path, limits: ArchiveLimits) -> lis
 
 
 def _stays_inside(name: str) -> bool:
-    """Whether a path is relative, plain, and no path of Windows."""
     parts = name.removesuffix("/").split("/")
     plain = all(part not in ("", ".", "..") and len(part.encode()) <= 255 for part in parts)
     return plain and not set(name) & {"\\", "\0"} and parts[0][1:2] != ":" and len(name) <= 1024

@@ -102,7 +102,6 @@ def _sync(file: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Sync renames in a folder; some systems cannot open a folder and skip this."""
     try:
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError:

@@ -43,11 +43,7 @@ class Manifest:
 
     @classmethod
     def read(cls, root: str | os.PathLike[str]) -> Self:
-        """Read a manifest; files are not checked, see `problems`.
-
-        Raises:
-            InputError: No manifest, a broken one, or one of another schema.
-        """
+        """Read a manifest; files are not checked, see `problems`."""
         whole = _read(Path(root))
         return cls(whole["payload"], whole["files"])
 
@@ -103,20 +99,12 @@ def write_manifest(
 
 
 def read_manifest(root: str | os.PathLike[str]) -> dict[str, Any]:
-    """The payload; files are not checked, see `verify`.
-
-    Raises:
-        InputError: As `Manifest.read`.
-    """
+    """The payload; files are not checked, see `verify`."""
     return Manifest.read(root).payload
 
 
 def verify(root: str | os.PathLike[str]) -> list[str]:
-    """Compare every listed file with its size and checksum; see `Manifest.problems`.
-
-    Raises:
-        InputError: As `Manifest.read`.
-    """
+    """Compare every listed file with its size and checksum; see `Manifest.problems`."""
     while True:
         manifest = Manifest.read(root)
         problems = manifest.problems(root)

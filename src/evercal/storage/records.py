@@ -34,11 +34,7 @@ def of_format(
 def read_record(
     path: str | os.PathLike[str], what: str, convert: Callable[[object], Content]
 ) -> Content:
-    """Read a JSON file and convert its values; `what` names it in messages.
-
-    Raises:
-        InputError: The file is missing, or `convert` raises ValueError.
-    """
+    """Read a JSON file and convert its values; `what` names it in messages."""
     try:
         return convert(json.loads(Path(path).read_text(encoding="utf-8")))
     except FileNotFoundError:

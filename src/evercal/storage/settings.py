@@ -12,9 +12,6 @@ def lock_settings(path: Path, settings: Mapping[str, object]) -> None:
     """Store the settings of a run that can be resumed; refuse a folder with other settings.
 
     The file is created if it is missing. Settings are JSON values, compared key by key.
-
-    Raises:
-        InputError: The file contains other settings or cannot be read.
     """
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -31,11 +28,7 @@ def lock_settings(path: Path, settings: Mapping[str, object]) -> None:
 
 
 def read_settings(path: Path) -> dict[str, object]:
-    """Read the settings that `lock_settings` stored.
-
-    Raises:
-        InputError: The file is missing or is not a JSON object.
-    """
+    """Read the settings that `lock_settings` stored."""
     try:
         settings = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(settings, dict):

@@ -41,11 +41,7 @@ def is_store(root: Path) -> bool:
 
 
 def read_store(root: Path, read: Callable[[Manifest], Result]) -> Result:
-    """Read a store; start over when a writer replaces files meanwhile.
-
-    Raises:
-        InputError: Not a store, a file missing or changed, or a store of another version.
-    """
+    """Read a store; start over when a writer replaces files meanwhile."""
     while True:
         manifest = Manifest.read(root)
         try:
@@ -104,10 +100,6 @@ class StageStore:
 
         Yields:
             The manifest that will be replaced; None for a new store.
-
-        Raises:
-            InputError: Another process writes into the store or has changed it since it was
-                opened, or it cannot be written.
         """
         # The lock file is never removed: a process that waits for it would lock a deleted file.
         lock = Path(self._lock.lock_file)
@@ -135,11 +127,7 @@ class StageStore:
         payload: Mapping[str, object],
         superseded: Callable[[str], bool] = lambda _: False,
     ) -> None:
-        """Add a stage: whole, or not at all; see `change`.
-
-        Raises:
-            InputError: As `writing`.
-        """
+        """Add a stage: whole, or not at all; see `change`."""
         self.change(self.stages, [(name, write)], payload, superseded)
 
     def change(
@@ -157,9 +145,6 @@ class StageStore:
                 of the name that a folder cannot hold are replaced.
             payload: Settings of the store.
             superseded: Files of kept stages that are dropped.
-
-        Raises:
-            InputError: As `writing`.
         """
         with self.writing() as before:
             made, new = _made(before), []
@@ -174,9 +159,6 @@ class StageStore:
         """Replace a stage: whole, or not at all.
 
         `write` changes files in a copy of the stage's folder.
-
-        Raises:
-            InputError: As `writing`, and where a file of the store is missing or was changed.
         """
         old = self.stages[index]
         stem, _, version = old.partition("~")
@@ -203,7 +185,6 @@ class StageStore:
         return {file: int(str(record["bytes"])) for file, record in manifest.files.items()}
 
     def _empty(self, stage: str) -> Path:
-        """An empty folder in which a stage is prepared."""
         folder = self.folder(f".{stage}")
         shutil.rmtree(folder, ignore_errors=True)  # left by a writer that was killed
         folder.mkdir(parents=True)
@@ -217,7 +198,6 @@ class StageStore:
         before: Manifest | None,
         superseded: Callable[[str], bool],
     ) -> None:
-        """Move prepared stages into place and write the manifest: the store is then `stages`."""
         files = [*self.networks]
         for stage in new:
             replace_folder(self.folder(f".{stage}"), self.folder(stage))
@@ -232,7 +212,6 @@ class StageStore:
         self._tidy(set(files))
 
     def _tidy(self, files: set[str]) -> None:
-        """Remove files of stages that the manifest does not list, and what killed writers left."""
         for folder in (self.root / STAGES).iterdir():
             if folder.name not in self.stages:
                 if _STAGE.fullmatch(folder.name.removeprefix(".")):
@@ -246,7 +225,6 @@ class StageStore:
 
 
 def _made(manifest: Manifest | None) -> int:
-    """Number of stages that were ever added to a store."""
     return (
         0 if manifest is None else int(manifest.payload.get(_MADE, len(manifest.payload["stages"])))
     )

@@ -22,11 +22,7 @@ def save_tensors(
 
 
 def load_tensors(path: Path) -> "dict[str, Tensor]":
-    """Read the named tensors of a file.
-
-    Raises:
-        InputError: The file cannot be read.
-    """
+    """Read the named tensors of a file."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 

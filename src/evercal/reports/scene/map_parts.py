@@ -119,5 +119,4 @@ def keyframe_views(scene: SceneMap) -> list[KeyframeView]:
 
 
 def _scale(scene: SceneMap) -> float:
-    """Metres per unit of length of the map."""
     return 1.0 if scene.frame.similarity is None else scene.frame.similarity.scale

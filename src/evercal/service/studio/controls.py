@@ -148,8 +148,6 @@ class Controls:
         )
 
     def _keep(self, handle: Any, **properties: Callable[[], Any]) -> None:
-        """Set properties of a control whenever something changes."""
-
         def update() -> None:
             for name, value in properties.items():
                 setattr(handle, name, value())
@@ -157,8 +155,6 @@ class Controls:
         self._updates.append(update)
 
     def _button(self, label: str, task: Callable[[], str], key: Any = None) -> None:
-        """Add a button, and a key, that runs a task; it is disabled while one runs."""
-
         def start(_: object) -> None:
             self._tasks.start(f"{label.lower()} ...", task)
 
@@ -179,13 +175,11 @@ class Controls:
         return self._studio.move_to(self._view.poses[0])
 
     def _message(self) -> str:
-        """What the last task did, or what the running one does."""
         tasks = self._tasks
         kind = "failed" if tasks.failed else "working" if tasks.busy else "done"
         return chip_html(kind, tasks.message) if tasks.message else ""
 
     def _coverage(self) -> str:
-        """Spread of the good samples, the next view, and the bad samples."""
         covered, rows = self._studio.coverage(), []
         axes = [(axis, "°", ROTATION_DEG) for axis in covered.rotations]
         axes += [(axis, " mm", POSITION_MM) for axis in covered.positions]
@@ -201,7 +195,6 @@ class Controls:
         return rows_html(rows + bad)
 
     def _numbers(self, which: Which) -> str:
-        """Images and calibration of a camera, as far as there are any."""
         found, rows = self._studio.calibrations.get(which), []
         if which == "fixed":
             rows.append(("images", str(len(self._studio.fixed_images))))

@@ -233,7 +233,6 @@ class Studio:
 
 
 def _free_name(name: str, taken: tuple[str, ...]) -> str:
-    """A name that no scene has: `name`, or `name-2` and so on."""
     numbered = (f"{name}-{number}" for number in range(2, len(taken) + 2))
     return name if name not in taken else next(free for free in numbered if free not in taken)
 

@@ -95,7 +95,6 @@ class Page:
         self.map.show_keyframes(True)
 
     def _begin_behind(self, scene: str) -> None:
-        """Begin above and behind the keyframes of a scene."""
         poses = SE3.stack([view.frustum.base_from_camera for view in self.map.keyframes[scene]])
         ahead = poses.rotation_matrix()[:, :, 2].mean(0) * (1, 1, 0)
         camera, middle = self.server.initial_camera, poses.translation_m.mean(0)
@@ -173,11 +172,7 @@ class _Server(viser.ViserServer):
 
 
 def start_server(host: str, port: int, label: str) -> _Server:
-    """An empty page with z up.
-
-    Raises:
-        InputError: The address cannot be used; viser alone would take the next free port.
-    """
+    """An empty page with z up."""
     if not 0 <= port <= 65_535:
         raise InputError(f"--port {port}: give 0 to 65535")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET

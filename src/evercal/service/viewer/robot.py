@@ -17,9 +17,6 @@ def add_arm(
     """Add an arm at the robot base, and a slider for each joint, which are returned.
 
     `gripper` is a node that moves with the first of `links` that the arm has.
-
-    Raises:
-        InputError: The extra `urdf` is not installed, or the URDF or a mesh cannot be read.
     """
     model = RobotModel(path)  # reports what is wrong in the file
     from viser.extras import ViserUrdf
