@@ -21,6 +21,7 @@ from evercal.features.weights_file import network_bytes
 from evercal.learning.many import LearnTask, learn_scenes
 from evercal.map import Map
 from evercal.mapping.scene_map import MapContents
+from evercal.mapping.store import MapStore
 from evercal.recordings import Recording
 from evercal.recordings.images import StoredImage
 from evercal.storage.atomic import write_bytes
@@ -48,13 +49,46 @@ def deadly(recording: Recording, marks: Path, times: int) -> Recording:
     return replace(recording, train=(replace(first, image=image), *recording.train[1:]))
 
 
-def test_the_map_is_that_of_learning_in_turn(rooms: tuple[Recording, ...], tmp_path: Path) -> None:
-    turn, many = Map.open(tmp_path / "turn"), Map.open(tmp_path / "many")
-    for recording in rooms[:2]:
-        turn.learn(recording)
+def small_map(root: Path, encoder: Path | None = None) -> Map:
+    """A new map that encodes images at 64 pixels, which is fast."""
+    MapStore.create(root, encoder, short_side=64)
+    return Map.open(root)
+
+
+def small_contents() -> MapContents:
+    return MapContents(load_encoder(), 64)
+
+
+@pytest.fixture(scope="module")
+def short(rooms: tuple[Recording, ...]) -> tuple[Recording, Recording]:
+    """The first 18 frames of two rooms."""
+    alpha, beta = (replace(room, train=room.train[:18]) for room in rooms[:2])
+    return alpha, beta
+
+
+@pytest.fixture(scope="module")
+def turn(short: tuple[Recording, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map that learned one room after the other."""
+    root = tmp_path_factory.mktemp("turn") / "map"
+    opened = small_map(root)
+    for recording in short:
+        opened.learn(recording)
+    return root
+
+
+def assert_same(one: Path, other: Path) -> None:
+    """Both rooms are the same in both maps."""
+    for name in ("keyframes.safetensors", "scene.json"):
+        for stage in ("stages/0001-alpha", "stages/0002-beta"):
+            assert (one / stage / name).read_bytes() == (other / stage / name).read_bytes()
+
+
+def test_the_map_is_that_of_learning_in_turn(
+    short: tuple[Recording, ...], turn: Path, tmp_path: Path
+) -> None:
     seen, steps = [], []
-    reports = many.learn_many(
-        rooms[:2],
+    reports = small_map(tmp_path / "many").learn_many(
+        short,
         workers=2,
         on_scene=lambda report: seen.append(report.scene),
         on_progress=lambda *step: steps.append(step),
@@ -62,41 +96,21 @@ def test_the_map_is_that_of_learning_in_turn(rooms: tuple[Recording, ...], tmp_p
     assert [report.scene for report in reports] == seen == ["alpha", "beta"]
     assert steps == [("learning", i, 2) for i in range(3)]
     assert reports[0].memory_bytes < reports[1].memory_bytes
-    for stage in ("0001-alpha", "0002-beta"):
-        for name in ("keyframes.safetensors", "scene.json"):
-            one, other = (tmp_path / root / "stages" / stage / name for root in ("turn", "many"))
-            assert one.read_bytes() == other.read_bytes()
+    assert_same(tmp_path / "many", turn)
 
 
 def test_scenes_of_another_encoder_share_their_centroids(
-    rooms: tuple[Recording, ...], tmp_path: Path
+    short: tuple[Recording, ...], tmp_path: Path
 ) -> None:
-    encoder = load_encoder()
+    encoder, own = load_encoder(), tmp_path / "own.safetensors"
     with torch.no_grad():
         next(encoder.parameters()).mul_(1.001)  # pyright: ignore[reportAttributeAccessIssue]
-    write_bytes(tmp_path / "own.safetensors", network_bytes(encoder, "encoder"))
-    turn, many = (
-        Map.open(tmp_path / name, encoder=tmp_path / "own.safetensors") for name in ("turn", "many")
-    )
-    for recording in rooms[:2]:
-        turn.learn(recording)
-    many.learn_many(rooms[:2], workers=1)
-    for stage in ("0001-alpha", "0002-beta"):
-        one, other = (
-            tmp_path / root / "stages" / stage / "keyframes.safetensors"
-            for root in ("turn", "many")
-        )
-        assert one.read_bytes() == other.read_bytes()
-
-
-def test_an_unusable_recording_does_not_stop_the_others(
-    rooms: tuple[Recording, ...], tmp_path: Path
-) -> None:
-    few = replace(rooms[0], name="few", train=rooms[0].train[:3])
-    opened = Map.open(tmp_path / "map")
-    with pytest.raises(InputError, match=r"1 of 3 recordings were not learned: few \(.*3 "):
-        opened.learn_many((rooms[0], few, rooms[1]), workers=2)
-    assert opened.scenes == Map.open(tmp_path / "map").scenes == ("alpha", "beta")
+    write_bytes(own, network_bytes(encoder, "encoder"))
+    in_turn, many = (small_map(tmp_path / name, own) for name in ("turn", "many"))
+    for recording in short:
+        in_turn.learn(recording)
+    many.learn_many(short, workers=1)
+    assert_same(tmp_path / "turn", tmp_path / "many")
 
 
 def test_names_are_checked_before_anything_is_learned(
@@ -109,19 +123,21 @@ def test_names_are_checked_before_anything_is_learned(
     assert not (tmp_path / "map/manifest.json").exists()
 
 
-def test_a_killed_worker_is_replaced(rooms: tuple[Recording, ...], tmp_path: Path) -> None:
-    once = deadly(rooms[0], tmp_path / "marks", 1)
-    opened = Map.open(tmp_path / "map")
-    reports = opened.learn_many((once, rooms[1]), workers=2)
+def test_a_killed_worker_is_replaced(
+    short: tuple[Recording, ...], turn: Path, tmp_path: Path
+) -> None:
+    once = deadly(short[0], tmp_path / "marks", 1)
+    reports = small_map(tmp_path / "map").learn_many((once, short[1]), workers=2)
     assert [report.scene for report in reports] == ["alpha", "beta"]
     assert len(list((tmp_path / "marks").iterdir())) == 1
+    assert_same(tmp_path / "map", turn)
 
 
 def test_a_worker_killed_while_the_caller_writes_a_scene_is_replaced(
-    rooms: tuple[Recording, ...],
+    short: tuple[Recording, ...],
 ) -> None:
-    many = [replace(rooms[0], name=f"{i}") for i in range(3)]
-    outcomes = learn_scenes(LearnTask(MapContents(load_encoder(), 240)), many, 2)
+    many = [replace(short[0], name=f"{i}") for i in range(3)]
+    outcomes = learn_scenes(LearnTask(small_contents()), many, 2)
     first = next(iter(outcomes))
     for child in children_of(os.getpid()):
         if is_worker(child):
@@ -132,14 +148,16 @@ def test_a_worker_killed_while_the_caller_writes_a_scene_is_replaced(
     assert all(outcome.scene is not None for outcome in (first, *rest))
 
 
-def test_a_recording_that_always_kills_is_given_up(
-    rooms: tuple[Recording, ...], tmp_path: Path
+def test_recordings_that_fail_do_not_stop_the_others(
+    short: tuple[Recording, ...], tmp_path: Path
 ) -> None:
-    always = deadly(rooms[0], tmp_path / "marks", 99)
-    opened = Map.open(tmp_path / "map")
-    with pytest.raises(InputError, match=r"alpha .*killed 3 times"):
-        opened.learn_many((always, rooms[1]), workers=2)
-    assert opened.scenes == ("beta",)
+    always = deadly(short[0], tmp_path / "marks", 99)
+    few = replace(short[0], name="few", train=short[0].train[:3])
+    opened = small_map(tmp_path / "map")
+    message = r"2 of 3 recordings were not learned: alpha .*killed 3 times.*; few \(.*3 "
+    with pytest.raises(InputError, match=message):
+        opened.learn_many((always, few, short[1]), workers=2)
+    assert opened.scenes == Map.open(tmp_path / "map").scenes == ("beta",)
     assert len(list((tmp_path / "marks").iterdir())) == 3
 
 
@@ -193,9 +211,9 @@ def wait_for(condition):
     return value
 
 
-def test_stopping_early_ends_the_workers(rooms: tuple[Recording, ...]) -> None:
-    many = [replace(rooms[0], name=f"{i}") for i in range(4)]
-    outcomes = learn_scenes(LearnTask(MapContents(load_encoder(), 240)), many, 1)
+def test_stopping_early_ends_the_workers(short: tuple[Recording, ...]) -> None:
+    many = [replace(short[0], name=f"{i}") for i in range(4)]
+    outcomes = learn_scenes(LearnTask(small_contents()), many, 1)
     assert next(iter(outcomes)).scene is not None
     outcomes.close()  # pyright: ignore[reportAttributeAccessIssue]
     wait_for(lambda: not [c for c in children_of(os.getpid()) if is_worker(c)])
