@@ -51,8 +51,7 @@ def deadly(recording: Recording, marks: Path, times: int) -> Recording:
 
 def small_map(root: Path, encoder: Path | None = None) -> Map:
     """A new map that encodes images at 64 pixels, which is fast."""
-    MapStore.create(root, encoder, short_side=64)
-    return Map.open(root)
+    return Map(MapStore.create(root, encoder, short_side=64))
 
 
 def small_contents() -> MapContents:
