@@ -52,16 +52,7 @@ settings.load_profile("busy")
 def _room(
     seed: int, name: str, size: tuple[int, int], span: int, every: int = 1, texture_px: int = 96
 ) -> Recording:
-    """A walk of half a metre that turns by 50 degrees.
-
-    Args:
-        seed: of the room and the heading.
-        name: of the recording.
-        size: width and height of its images, pixels.
-        span: number of views.
-        every: step between training views; the others are test views.
-        texture_px: side of the textures.
-    """
+    """`span` views on a walk of half a metre that turns by 50 degrees; each `every`th trains."""
     import numpy as np
 
     from evercal.recordings.frame import Frame, Recording
@@ -113,18 +104,6 @@ def cell(shared: Shared, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return shared("cell", learn)
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def device(request: pytest.FixtureRequest) -> torch.device:
-    """The CPU, and with `-m gpu` a CUDA device; the test is skipped without one."""
-    import torch
-
-    from evercal.features.device import device_of
-
-    if request.param == "cuda" and not torch.cuda.is_available():
-        pytest.skip("this machine has no CUDA device")
-    return device_of(request.param)
-
-
 @pytest.fixture
 def cuda() -> torch.device:
     """A CUDA device, for tests marked `gpu`; the test is skipped without one."""
@@ -135,6 +114,14 @@ def cuda() -> torch.device:
     if not torch.cuda.is_available():
         pytest.skip("this machine has no CUDA device")
     return device_of("cuda")
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> torch.device:
+    """The CPU, and with `-m gpu` a CUDA device; the test is skipped without one."""
+    import torch
+
+    return request.getfixturevalue("cuda") if request.param == "cuda" else torch.device("cpu")
 
 
 @pytest.fixture

@@ -9,6 +9,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 import evercal
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
@@ -94,12 +96,16 @@ def test_folders_import_only_from_folders_above() -> None:
     assert not lines, "\n" + "\n".join(lines)
 
 
-def loaded_modules(code: str, *words: Path) -> list[list[str]]:
-    """Modules of evercal that a program has loaded, each time that it calls `show`."""
-    code = f"{SHOW}\n{code}\nshow()"
+def printed(code: str, *words: Path) -> list[list[str]]:
+    """Words on each line that a program prints."""
     command = [sys.executable, "-c", code, *map(str, words)]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
     return [line.split() for line in done.stdout.splitlines()]
+
+
+def loaded_modules(code: str, *words: Path) -> list[list[str]]:
+    """Modules of evercal that a program has loaded, each time that it calls `show`."""
+    return printed(f"{SHOW}\n{code}\nshow()", *words)
 
 
 SHOW = """
@@ -144,6 +150,24 @@ def test_locating_and_calibrating_load_few_modules_and_only_the_product(
     assert "evercal.calibration.from_images" in all_modules
     assert [name for name in all_modules if outside_product(name)] == []
     assert len(localizing) <= MOST_LOCALIZING, "\n".join(localizing)
+
+
+def test_import_is_fast_and_provides_every_public_name() -> None:
+    code = "import sys, time; began = time.perf_counter(); import evercal\n"
+    code += "print(time.perf_counter() - began, *sys.modules)"
+    ((seconds, *modules),) = printed(code)
+    assert not {"torch", "cv2", "scipy", "matplotlib", "poselib", "tyro", "numpy"} & set(modules)
+    assert float(seconds) < 1.0
+    for name in dir(evercal):
+        assert getattr(evercal, name) is not None
+    with pytest.raises(AttributeError, match="'evercal' has no attribute 'Localiser'"):
+        _ = evercal.Localiser  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_geometry_and_recordings_load_no_torch_and_no_opencv() -> None:
+    code = "import sys, evercal.geometry, evercal.storage, evercal.recordings; print(*sys.modules)"
+    (modules,) = printed(code)
+    assert not {"torch", "cv2"} & set(modules)
 
 
 def test_planted_violations_are_found(tmp_path: Path) -> None:

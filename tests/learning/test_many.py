@@ -23,6 +23,7 @@ from evercal.learning.many import LearnTask, learn_scenes
 from evercal.map import Map
 from evercal.mapping.build import MapOptions
 from evercal.mapping.scene_map import MapContents
+from evercal.mapping.store import MapStore
 from evercal.recordings import Recording
 from evercal.recordings.images import StoredImage
 from evercal.storage.atomic import write_bytes
@@ -53,6 +54,11 @@ def deadly(recording: Recording, marks: Path, times: int) -> Recording:
 QUICK = MapOptions(adjust=False)
 
 
+def small_map(root: Path, encoder: Path | None = None) -> Map:
+    """A new map that encodes images at 64 pixels, which is fast."""
+    return Map(MapStore.create(root, encoder, short_side=64))
+
+
 @pytest.fixture(scope="module")
 def small(rooms: tuple[Recording, ...]) -> tuple[Recording, ...]:
     """`rooms` with as few frames as a map needs."""
@@ -72,7 +78,7 @@ def test_the_map_is_that_of_learning_in_turn(small: tuple[Recording, ...], tmp_p
         next(encoder.parameters()).mul_(1.001)  # pyright: ignore[reportAttributeAccessIssue]
     write_bytes(tmp_path / "own.safetensors", network_bytes(encoder, "encoder"))
     turn, many = (
-        Map.open(tmp_path / name, encoder=tmp_path / "own.safetensors") for name in ("turn", "many")
+        small_map(tmp_path / name, tmp_path / "own.safetensors") for name in ("turn", "many")
     )
     for recording in small:
         turn.learn(recording, options=QUICK)
@@ -98,7 +104,7 @@ def test_unusable_recordings_and_killed_workers_do_not_stop_the_others(
 ) -> None:
     once = deadly(small[0], tmp_path / "once", 1)
     always = deadly(small[2], tmp_path / "always", 99)
-    opened = Map.open(tmp_path / "map")
+    opened = small_map(tmp_path / "map")
     with pytest.raises(InputError, match=r"2 of 4 recordings were not learned") as error:
         opened.learn_many((once, few, always, small[1]), workers=2, options=QUICK)
     assert re.search(r"few \(.*3 training", str(error.value))
@@ -121,7 +127,7 @@ def test_names_are_checked_before_anything_is_learned(
 def test_a_worker_killed_while_the_caller_writes_a_scene_is_replaced(
     small: tuple[Recording, ...], few: Recording
 ) -> None:
-    task = LearnTask(MapContents(load_encoder(), 240), options=QUICK)
+    task = LearnTask(MapContents(load_encoder(), 64), options=QUICK)
     outcomes = learn_scenes(task, (few, small[0], few), 2)
     first = next(iter(outcomes))
     for child in children_of(os.getpid()):
@@ -184,7 +190,7 @@ def wait_for(condition):
 
 
 def test_stopping_early_ends_the_workers(small: tuple[Recording, ...], few: Recording) -> None:
-    task = LearnTask(MapContents(load_encoder(), 240), options=QUICK)
+    task = LearnTask(MapContents(load_encoder(), 64), options=QUICK)
     outcomes = learn_scenes(task, (few, *small), 2)
     assert next(iter(outcomes)).error
     outcomes.close()  # pyright: ignore[reportAttributeAccessIssue]
