@@ -91,26 +91,9 @@ def test_a_scale_that_the_arm_contradicts_is_estimated_and_named(
     frame = alignment.applied_to(localizer.contents.scenes[0]).frame
     exact = replace(frame, pose_sigma=(0.0, 0.0))
     for pose in map_from_camera[::3]:
-        truth = Similarity(BASE_FROM_MAP, 1.05).pose(pose)
         estimate = exact.to_base(UncertainPose.exact(pose))
-        metres, _ = pose_distance(estimate.pose, truth)
+        metres, _ = pose_distance(estimate.pose, Similarity(BASE_FROM_MAP, 1.05).pose(pose))
         assert metres < 4 * np.sqrt(np.trace(estimate.covariance[:3, :3]))
-
-
-def test_the_frame_of_the_recording_no_longer_counts(
-    arm_views: tuple[NamedImages, SE3], hall_map: MapContents
-) -> None:
-    """Landmarks tie the base frame; what the recording's poses were off is not added to answers."""
-    images, map_from_camera = arm_views
-    scene = hall_map.scenes[0]
-    off = replace(scene.frame, common=SE3.exp([0.02, -0.01, 0.01, 0.01, 0, 0]))
-    contents = MapContents(hall_map.encoder, hall_map.short_side, [replace(scene, frame=off)])
-    localizer = Localizer(contents)
-    alignment = align_by_gripper(localizer, "hall", images, gripper_poses(map_from_camera))
-    estimate = Localizer(aligned(contents, alignment)).localize(images[4][1])
-    assert estimate.base_from_camera is not None
-    truth = BASE_FROM_MAP @ map_from_camera[4]
-    assert pose_distance(estimate.base_from_camera, truth)[0] < 0.006
 
 
 def test_board_in_the_gripper_determines_the_base(
@@ -130,7 +113,7 @@ def test_board_in_the_gripper_determines_the_base(
         align_by_gripper(localizer, "hall", images, grippers, False, board_poses)
 
 
-@pytest.mark.parametrize(("scale", "longer"), [(1.0, 1.0), (0.4, 1.0), (1.0, 1.1)])
+@pytest.mark.parametrize(("scale", "longer"), [(0.4, 1.0), (1.0, 1.1)])
 def test_touched_points_determine_the_base(
     scale: float,
     longer: float,
@@ -182,16 +165,20 @@ def test_aligning_again_starts_from_the_map_and_leaves_the_localizer_unchanged(
     images, map_from_camera = arm_views
     elsewhere = Similarity(SE3.exp([5.0, 0, 0, 0, 0, 0.5]), 1.5)
     first = aligned(hall_map, MapAlignment(elsewhere, np.eye(6) * 1e-6, 10, 10, ""))
+    # What the recording's poses were off is not added to later answers.
+    off = replace(first.scenes[0].frame, common=SE3.exp([0.02, -0.01, 0.01, 0.01, 0, 0]))
+    first = replace(first, scenes=[replace(first.scenes[0], frame=off)])
     localizer = Localizer(first)
     before = localizer.localize(images[4][1])
     alignment = align_by_gripper(localizer, "hall", images, gripper_poses(map_from_camera))
     after = localizer.localize(images[4][1])
-    assert pose_distance(alignment.similarity.base_from_map, BASE_FROM_MAP)[0] < 0.01
+    again = Localizer(aligned(first, alignment)).localize(images[4][1])
     assert before.base_from_camera is not None
     assert after.base_from_camera is not None
+    assert again.base_from_camera is not None
     np.testing.assert_array_equal(before.base_from_camera.matrix(), after.base_from_camera.matrix())
-    truth = elsewhere.pose(map_from_camera[4])
-    assert pose_distance(after.base_from_camera, truth)[0] < 0.006
+    truth = BASE_FROM_MAP @ map_from_camera[4]
+    assert pose_distance(again.base_from_camera, truth)[0] < 0.006
 
 
 def test_calibration_before_a_second_alignment_is_of_another_map(

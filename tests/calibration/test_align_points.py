@@ -66,14 +66,10 @@ def test_covariance_covers_the_errors() -> None:
     assert 2.5 < np.mean(squared) < 9.0  # 7 for an exact covariance
 
 
-def test_points_on_a_line_are_refused() -> None:
-    truth, _, rng = drawn(0)
+def test_too_few_points_and_points_on_a_line_are_refused() -> None:
+    truth, points, rng = drawn(0)
     line = MIDDLE + np.linspace(-0.2, 0.2, 4)[:, None] * np.array([1.0, 0.5, 0.2])
     with pytest.raises(InputError, match="on one line"):
         align_by_points(views(truth, line, 0.0, rng), scale_known=True)
-
-
-def test_too_few_points_are_refused() -> None:
-    truth, points, rng = drawn(0)
     with pytest.raises(InputError, match="2 points were picked"):
         align_by_points(views(truth, points[:2], 0.0, rng), scale_known=True)
