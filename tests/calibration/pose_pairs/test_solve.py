@@ -61,7 +61,7 @@ def test_errors_lie_inside_the_covariance(setting: Setting) -> None:
 
 def test_the_covariance_is_not_too_large() -> None:
     distances = []
-    for seed in range(16):
+    for seed in range(24):
         truth = recording(Setting(noisy="both"), 200 + seed)
         result = solve(truth.pairs, "eye_in_hand")
         distances.append(result.uncertain_pose.squared_mahalanobis(truth.parent_from_camera))
