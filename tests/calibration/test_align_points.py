@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.align_points import Picks, align_by_points
+from evercal.calibration.align import Picks, align_by_points
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.mapping.map_frame import Similarity

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from evercal.calibration.audit import audit
-from evercal.calibration.calibration import Calibration, ErrorTerm, Mount, largest_term
+from evercal.calibration.calibration import Calibration, ErrorTerm, Mount, largest_term, rig_of
 from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
 from evercal.calibration.from_images import _lens_advice as lens_advice
 from evercal.calibration.from_images import _spots as spots_of
-from evercal.calibration.rig import rig_of
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.localization.localizer import Localizer

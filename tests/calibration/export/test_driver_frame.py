@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import yaml
 
-from evercal.calibration.export.driver_frame import (
+from evercal.calibration.export.request import (
+    ExportOptions,
+    prepare_export,
     read_link_from_optical,
     standard_link_from_optical,
 )
-from evercal.calibration.export.request import ExportOptions, prepare_export
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 
