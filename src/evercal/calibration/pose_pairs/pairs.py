@@ -71,17 +71,9 @@ class PosePairs:
 
     def __getitem__(self, index: NDArray[np.int64] | Mask) -> Self:
         rows = np.arange(len(self))[index]
-        covariance = self.camera_covariance
-        return replace(
-            self,
-            names=tuple(self.names[row] for row in rows),
-            base_from_gripper=self.base_from_gripper[rows],
-            camera_from_board=self.camera_from_board[rows],
-            camera_covariance=None if covariance is None else covariance[rows],
-            velocity=None if self.velocity is None else self.velocity[rows],
-            robot_numbers=self.robot_numbers and self.robot_numbers[rows],
-            camera_numbers=self.camera_numbers and self.camera_numbers[rows],
-        )
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        names = tuple(given.pop("names")[row] for row in rows)
+        return replace(self, names=names, **{name: value[rows] for name, value in given.items()})
 
     def distinct(self, scale_known: bool = True) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return indices of different pairs, sorted by value, and (n,) the first equal pair."""
