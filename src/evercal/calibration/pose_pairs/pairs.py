@@ -72,8 +72,8 @@ class PosePairs:
     def __getitem__(self, index: NDArray[np.int64] | Mask) -> Self:
         rows = np.arange(len(self))[index]
         given = {name: value for name, value in vars(self).items() if value is not None}
-        names = tuple(given.pop("names")[row] for row in rows)
-        return replace(self, names=names, **{name: value[rows] for name, value in given.items()})
+        changed = {name: value[rows] for name, value in given.items() if name != "names"}
+        return replace(self, names=tuple(self.names[row] for row in rows), **changed)
 
     def distinct(self, scale_known: bool = True) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return indices of different pairs, sorted by value, and (n,) the first equal pair."""
