@@ -22,8 +22,7 @@ from benchmarks.rows import save
 from evercal.calibration.boards.corners import BoardView, board_pose
 from evercal.calibration.boards.intrinsics import calibrate_camera, lens_vector, moved_camera
 from evercal.calibration.calibration import Mount
-from evercal.calibration.pose_pairs.measured import BoardCorners
-from evercal.calibration.pose_pairs.pairs import PosePairs
+from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside

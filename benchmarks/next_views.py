@@ -21,11 +21,11 @@ from evercal.calibration.next_views import (
     GRIPPER_NOISE,
     PIXEL_PX,
     next_views,
-    pixel_slopes,
     wrist_jacobian,
 )
 from evercal.geometry import SE3, pose_distance
 from evercal.geometry.uncertain_pose import axis_deviation
+from evercal.localization.pose_refinement import linearise
 from evercal.simulation.box_room import default_camera
 from evercal.simulation.cell_room import WORK_AREA_M
 from evercal.simulation.virtual_cell import VirtualCell, nominal_mount
@@ -78,10 +78,11 @@ def trial(seed: int, pool: int) -> Trial:
 def seen_covariance(base_from_camera: SE3, points_m: NDArray[np.floating]) -> NDArray[np.floating]:
     """(6, 6) covariance of a camera pose from the points that the camera sees."""
     camera = default_camera(640, 480)
-    inside = base_from_camera.inverse().apply(points_m)
-    pixels = camera.project(inside)
+    pixels = camera.project(base_from_camera.inverse().apply(points_m))
     visible = ((pixels >= 0) & (pixels <= (camera.width - 1, camera.height - 1))).all(1)
-    slopes = pixel_slopes(camera, inside[visible])[0].reshape(-1, 6)
+    at = base_from_camera.rotation_matrix(), base_from_camera.translation_m
+    slopes = linearise(pixels[visible], points_m[visible], *at, camera)[1]
+    slopes = slopes.transpose(2, 0, 1).reshape(-1, 6)
     return np.linalg.inv(slopes.T @ slopes + 1e-9 * np.eye(6)) * PIXEL_PX**2
 
 

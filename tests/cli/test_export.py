@@ -10,11 +10,11 @@ import pytest
 import yaml
 
 from evercal.calibration.calibration import Calibration, ImageUse, Mount, read_calibration
-from evercal.calibration.export.driver_frame import (
+from evercal.calibration.export.formats import FORMATS
+from evercal.calibration.export.request import (
     read_link_from_optical,
     standard_link_from_optical,
 )
-from evercal.calibration.export.formats import FORMATS
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.robot_poses import read_robot_poses
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ from evercal.recordings.images import IMAGE_ENDINGS
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
 
+_Shot = tuple[str, Callable[[], NDArray[np.uint8]], Camera | None, SE3]
+"""Name, reader, intrinsics and stated base_from_camera of an image."""
 POSE_FILES = ("calibration.json", "base_from_camera.txt")
 """Files of an episode's folder that state the pose of its camera."""
 
@@ -78,26 +80,17 @@ def episode_folders(folder: Path) -> list[Path]:
     return inside
 
 
-class _Shot(NamedTuple):
-    """An image with the pose that is stated for it."""
-
-    name: str
-    read: Callable[[], NDArray[np.uint8]]
-    camera: Camera | None
-    base_from_camera: SE3
-
-
 def _audited(
     localizer: "Localizer", episode: Path, stated: SE3 | None, options: AuditOptions
 ) -> Episode:
     shots = _shots(episode, stated)
     chosen = np.unique(np.linspace(0, len(shots) - 1, options.images).round().astype(int))
     differences, reason = [], ""
-    for shot in (shots[i] for i in chosen):
-        [item] = locate(localizer, [(shot.name, shot.read())], shot.camera)
+    for name, read, camera, base_from_camera in (shots[i] for i in chosen):
+        [item] = locate(localizer, [(name, read())], camera)
         if item.is_located:
-            in_stated = shot.base_from_camera.inverse() @ item.pose
-            differences.append(ImagePose(shot.name, item.estimate, in_stated, item.covariance))
+            in_stated = base_from_camera.inverse() @ item.pose
+            differences.append(ImagePose(name, item.estimate, in_stated, item.covariance))
         else:
             reason = item.estimate.reason
     if not differences:
@@ -127,7 +120,7 @@ def _shots(episode: Path, stated: SE3 | None) -> list[_Shot]:
                 " the pose of all episodes with --calibration"
             ) from None
         every = [(file.name, partial(read_image, file), None, pose) for file in files]
-    shots = [_Shot(name, read, camera, at) for name, read, camera, at in every if at is not None]
+    shots = [(name, read, camera, at) for name, read, camera, at in every if at is not None]
     if not shots:
         raise InputError(f"{episode}: no images with a stated camera pose in it")
     return shots

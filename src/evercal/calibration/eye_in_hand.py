@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -76,17 +75,13 @@ class HandEyeReport:
         return replace(calibration, verdict=" ".join(warnings or [verdict(calibration)]))
 
 
-class PosedByGripper(NamedTuple):
-    """A recording with rough camera poses from a first estimate of `gripper_from_camera`."""
-
-    recording: Recording
-    start: HandEyeStart
-
-
 def posed_by_gripper(
     recording: Recording, encoder: Encoder, on_progress: OnProgress = lambda *_: None
-) -> PosedByGripper:
-    """Estimate rough camera poses; frames without a gripper pose count as untracked."""
+) -> tuple[Recording, HandEyeStart]:
+    """Return the recording with rough camera poses, and the first estimate that they are from.
+
+    Frames without a gripper pose count as untracked.
+    """
     frames = tuple(frame for frame in recording.train if frame.base_from_gripper is not None)
     require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
     try:
@@ -100,7 +95,7 @@ def posed_by_gripper(
     )
     lost = len(recording.train) - len(frames)
     posed = replace(recording, train=train, untracked=recording.untracked + lost)
-    return PosedByGripper(posed, start)
+    return posed, start
 
 
 def hand_eye_report(

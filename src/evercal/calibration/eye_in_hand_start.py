@@ -192,8 +192,7 @@ def _pair_motions(
     images, cameras, features = [], [], []
     for frame in frames:
         image = frame.read_image()
-        short = min(480, *image.shape[:2])
-        grey, camera = working_image(image, frame.camera, short)
+        grey, camera = working_image(image, frame.camera, min(480, *image.shape[:2]))
         images.append(grey)
         cameras.append(camera)
         features.append(encode_image(grey, encoder, ENCODED_SIDE).cpu().flatten(1).T)

@@ -297,12 +297,12 @@ def _lens_advice(calibration: Calibration) -> list[str]:
     if name != "lens":
         return []
     moves = calibration.mount == "eye_in_hand"
-    advice = "give --camera with intrinsics from images of a board ('evercal detect')"
-    if moves:
-        advice += ", or images from more spots"
     if calibration.source["intrinsics"] == "given":
         known = f"--camera counts as known to {100 * STATED.focal:g} % of the focal length"
         more = "images from more spots determine" if moves else "a view with more depth determines"
         advice = f"{known}; {more} it better"
+    else:
+        advice = "give --camera with intrinsics from images of a board ('evercal detect')"
+        advice += ", or images from more spots" if moves else ""
     percent = f"{100 * share:.0f} %"
     return [f"The lens is the largest term, {percent} of the position's variance: {advice}."]

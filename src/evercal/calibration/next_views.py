@@ -34,6 +34,7 @@ from evercal.geometry import (
     cross_matrix,
     pose_distance,
 )
+from evercal.localization.pose_refinement import linearise
 from evercal.mapping.scene_map import SceneMap
 
 Array = NDArray[np.floating]
@@ -316,10 +317,13 @@ class HostedLandmarks:
     def _derivatives(self, camera: Camera, pose: SE3) -> tuple[Array, Array]:
         """By the camera's pose (v, 2, 6), and by keyframes and depths (v, 2, N)."""
         visible = self.visible(camera, pose)
-        by_pose, by_point = pixel_slopes(camera, pose.inverse().apply(self.points_m[visible]))
+        at = self.points_m[visible], pose.rotation_matrix(), pose.translation_m
+        by_pose = linearise(np.zeros((len(visible), 2)), *at, camera)[1].transpose(2, 0, 1)
         host, depth = self.host[visible], self.inverse_depth[visible, None]
         local = self.rays[visible] / depth
-        by_local = by_point @ pose.rotation_matrix().T @ self.hosts[host].rotation_matrix()
+        # A motion of the camera moves its points the other way.
+        by_point = -by_pose[:, :, :3] @ pose.rotation_matrix().T
+        by_local = by_point @ self.hosts[host].rotation_matrix()
         by_host = np.concatenate([by_local, -by_local @ cross_matrix(local)], 2)
         hosts, row = len(self.hosts), np.arange(len(visible))
         jacobian = np.zeros((len(visible), 2, self.size))
@@ -330,13 +334,3 @@ class HostedLandmarks:
         by_depth = -np.einsum("vij,vj->vi", by_local, local) / depth
         jacobian[row, :, 12 + 6 * hosts + visible] = by_depth
         return by_pose, jacobian
-
-
-def pixel_slopes(camera: Camera, points_camera: Array) -> tuple[Array, Array]:
-    """Derivatives of the pixels of (v, 3) points by the camera's pose (v, 2, 6) and the points."""
-    plane, depth = points_camera[:, :2] / points_camera[:, 2:], points_camera[:, 2]
-    to_plane = np.zeros((len(points_camera), 2, 3))
-    to_plane[:, 0, 0] = to_plane[:, 1, 1] = 1 / depth
-    to_plane[:, :, 2] = -plane / depth[:, None]
-    by_point = camera.slopes(plane)[0] @ to_plane
-    return np.concatenate([-by_point, by_point @ cross_matrix(points_camera)], 2), by_point

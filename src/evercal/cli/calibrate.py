@@ -21,9 +21,8 @@ from evercal.cli.options import At, Device, File, Intrinsics, Name, Store, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.calibration.calibration import Calibration, ErrorTerm
+    from evercal.calibration.calibration import Calibration, ErrorTerm, Rig
     from evercal.calibration.from_images import Images
-    from evercal.calibration.rig import Rig
     from evercal.localization.localizer import Localizer
 
 
@@ -109,7 +108,7 @@ class Calibrate(Verb):
         return replace(calibration, source={**calibration.source, "store": str(self.store)})
 
     def _rig(self, localizer: "Localizer", folders: dict[str, Path], point: Point | None) -> int:
-        from evercal.calibration.rig import rig_of
+        from evercal.calibration.calibration import rig_of
         from evercal.recordings.image_files import image_files
 
         cameras = {}

@@ -77,8 +77,8 @@ def learn_scene(
     if lacks_camera_poses(recording):
         from evercal.calibration.eye_in_hand import posed_by_gripper
 
-        posed = posed_by_gripper(recording, contents.encoder, on_progress)
-        recording, start, options = posed.recording, posed.start, options.for_hand_eye()
+        recording, start = posed_by_gripper(recording, contents.encoder, on_progress)
+        options = options.for_hand_eye()
         least, budget = MIN_GRIPPER_FRAMES, replace(budget, least=MIN_GRIPPER_FRAMES)
     recording = posed_recording(recording)
     require_frames(recording, least)

@@ -5,19 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from hypothesis import settings
 
-from evercal.calibration.export.driver_frame import (
+from evercal.calibration.export.request import (
+    ExportOptions,
+    prepare_export,
     read_link_from_optical,
     standard_link_from_optical,
 )
-from evercal.calibration.export.request import ExportOptions, prepare_export
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 
 from .random_poses import calibration_of
-
-few = settings(max_examples=15)
 
 
 def test_axes_follow_rep_103() -> None:

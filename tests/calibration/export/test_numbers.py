@@ -18,7 +18,7 @@ from evercal.recordings.poses.robot_poses import read_robot_poses
 
 from .random_poses import CAMERA, calibration_of, poses, quaternion_matrix
 
-few = settings(max_examples=15)
+few = settings(max_examples=8)
 NUMBER = r"-?\d+\.\d+"
 
 

@@ -24,7 +24,7 @@ from evercal.recordings.poses.camera_file import read_camera
 from .random_poses import calibration_of, poses, quaternion_matrix
 
 poses_and_mounts = given(poses(), st.sampled_from(["eye_to_hand", "eye_in_hand"]))
-few = settings(max_examples=15)
+few = settings(max_examples=8)
 CHILD = "cam/optical-frame"
 
 
@@ -217,11 +217,6 @@ def test_camera_info(tmp_path: Path, distortion: tuple[float, ...], model: str, 
     assert (read.width, read.height) == (640, 480)
     assert read.distortion[: len(distortion)] == distortion
     assert not any(read.distortion[len(distortion) :])
-
-
-def test_camera_info_requires_intrinsics() -> None:
-    with pytest.raises(InputError, match="camera_info: intrinsics are required"):
-        calibration_of(SE3.identity(), camera=None).export("camera_info")
 
 
 @pytest.mark.parametrize("name", ["/camera", "my camera", "a\nb", "a/", "a//b", '"', "-x", "<"])

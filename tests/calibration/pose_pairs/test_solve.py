@@ -29,7 +29,7 @@ MOUNTS: tuple[Mount, ...] = ("eye_in_hand", "eye_to_hand")
 EXACT = Setting(noise_mm=0, noise_deg=0)
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(
     st.sampled_from(MOUNTS),
     st.integers(0, 10**6),
@@ -51,7 +51,7 @@ def test_exact_poses_give_the_exact_calibration(
 @pytest.mark.parametrize("setting", [Setting(), Setting("eye_to_hand", outliers=3)])
 def test_errors_lie_inside_the_covariance(setting: Setting) -> None:
     # The benchmark runs a thousand trials; these few detect a broken covariance.
-    result = trials(setting, 20, 100)
+    result = trials(setting, 14, 100)
     assert result["median mm"] < 1.4
     assert result["median deg"] < 0.1
     assert result["largest mm"] < 6
@@ -91,13 +91,11 @@ def test_outliers_are_named_in_any_order() -> None:
 
 
 def test_a_third_of_outliers_is_tolerated() -> None:
-    for seed in range(3):
-        truth = recording(Setting(outliers=9), seed)
-        calibration = solve(truth.pairs, "eye_in_hand")
-        difference = error(calibration.parent_from_child, truth.parent_from_camera)
-        assert np.linalg.norm(difference[:3]) < 0.005
-        rejected = {i for i, image in enumerate(calibration.images) if not image.used}
-        assert rejected == set(truth.spoiled)
+    truth = recording(Setting(outliers=9), 0)
+    calibration = solve(truth.pairs, "eye_in_hand")
+    difference = error(calibration.parent_from_child, truth.parent_from_camera)
+    assert np.linalg.norm(difference[:3]) < 0.005
+    assert tuple(i for i, image in enumerate(calibration.images) if not image.used) == truth.spoiled
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -143,13 +141,8 @@ class Photographed(NamedTuple):
 
     def views(self, points: np.ndarray, noise_px: float, seed: int) -> tuple[BoardView, ...]:
         rng = np.random.default_rng(seed)
-        return tuple(
-            BoardView(
-                points,
-                self.camera.project(pose.apply(points)) + rng.normal(0, noise_px, (len(points), 2)),
-            )
-            for pose in self.pairs.camera_from_board
-        )
+        exact = [self.camera.project(pose.apply(points)) for pose in self.pairs.camera_from_board]
+        return tuple(BoardView(points, p + rng.normal(0, noise_px, p.shape)) for p in exact)
 
 
 def photographed(mount: Mount, seed: int, robot_deg: float = 0.0) -> Photographed:
@@ -175,7 +168,7 @@ def photographed(mount: Mount, seed: int, robot_deg: float = 0.0) -> Photographe
 )
 def test_corners_improve_the_calibration(mount: Mount, noise_px: float, robot_deg: float) -> None:
     distances, with_corners, without = [], [], []
-    for seed in range(6):
+    for seed in range(4):
         truth = photographed(mount, seed, robot_deg)
         views = truth.views(grid(9, 6), noise_px, seed)
         # Inaccurate board poses are refitted to the corners.

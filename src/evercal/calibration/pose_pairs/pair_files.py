@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.boards.board_poses import FORMAT, BoardPoses, read_board_poses
-from evercal.calibration.pose_pairs.measured import BoardCorners
-from evercal.calibration.pose_pairs.pairs import PoseNumbers, PosePairs
+from evercal.calibration.pose_pairs.pairs import BoardCorners, PoseNumbers, PosePairs
 from evercal.calibration.pose_pairs.time_offset import CameraTrack, interpolated_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3

@@ -137,16 +137,9 @@ class PoseEquation:
     add to a camera stamp."""
 
     def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Self:
-        return replace(
-            self,
-            robot_rotation=self.robot_rotation[index],
-            robot_translation=self.robot_translation[index],
-            camera_rotation=self.camera_rotation[index],
-            camera_translation=self.camera_translation[index],
-            camera_covariance=self.camera_covariance[index],
-            extras=replace(self.extras, slopes=self.extras.slopes[index]),
-            velocity=None if self.velocity is None else self.velocity[index],
-        )
+        arrays = {k: v[index] for k, v in vars(self).items() if isinstance(v, np.ndarray)}
+        extras = replace(self.extras, slopes=self.extras.slopes[index])
+        return replace(self, extras=extras, **arrays)
 
     def __len__(self) -> int:
         return len(self.robot_translation)

@@ -13,8 +13,7 @@ from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, Mo
 from evercal.calibration.located import length_mm_deg
 from evercal.calibration.pose_pairs.checks import held_out_error, left_open, repeatability
 from evercal.calibration.pose_pairs.fit import HandEyeFit
-from evercal.calibration.pose_pairs.measured import BoardCorners, Measured, middle_of
-from evercal.calibration.pose_pairs.pairs import PosePairs
+from evercal.calibration.pose_pairs.pairs import BoardCorners, Measured, PosePairs, middle_of
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
 from evercal.calibration.verdict import verdict
 from evercal.geometry import SE3, Camera, pose_to_dict

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, Mount
-from evercal.calibration.pose_pairs.measured import BoardCorners
-from evercal.calibration.pose_pairs.pairs import PosePairs
+from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.solve import solve_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
@@ -66,15 +65,16 @@ def solve_with_offset(
         standard deviation `time_offset_sigma_s`.
     """
     offset = _coarse_offset(robot, camera, largest_s)
-    solution, correction, sigma = None, np.inf, np.inf
-    for _ in range(6):
+    turns = 0
+    while True:
         pairs, overlapping = _pairs_at(robot, camera, offset)
         solution = solve_pairs(pairs, mount, scale_known, overlapping.corners)
         correction, sigma = float(solution.fit.at.extras[-1]), float(solution.fit.sigma[-1])
         offset += float(np.clip(correction, -largest_s, largest_s))
-        if abs(correction) < 1e-4:
+        turns += 1
+        if abs(correction) < 1e-4 or turns == 6:
             break
-    if solution is None or not sigma < _MAX_SIGMA_S or abs(correction) > 0.02:
+    if not sigma < _MAX_SIGMA_S or abs(correction) > 0.02:
         raise InputError(
             f"the time offset is not determined (standard deviation {1000 * sigma:.0f} ms): too few"
             f" images show the robot in motion; move it while recording, or pair images and poses"
