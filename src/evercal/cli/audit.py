@@ -7,9 +7,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, progress_bar
-from evercal.cli.options import Device, File, Store, Verb
-from evercal.cli.stores import open_map
+from evercal.cli.console import progress_bar
+from evercal.cli.options import Device, File, Number, Store, Verb, open_map
 from evercal.errors import InputError
 
 
@@ -23,13 +22,12 @@ class Audit(Verb):
     """
 
     store: Store
-    """Folder of the map."""
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder whose folders are the episodes: recorded scenes, or images beside a calibration.json
     or a 4x4 matrix base_from_camera.txt."""
     calibration: File = None
     """Pose of the camera in episodes that state none themselves."""
-    images: Annotated[int, arg(metavar="N")] = 5
+    images: Number = 5
     """Images per episode that are located."""
     most_mm: Annotated[float, arg(metavar="MM")] = 5.0
     """Tolerance of the position."""
@@ -38,7 +36,6 @@ class Audit(Verb):
     device: Device = "auto"
 
     def run(self) -> int:
-        """Audit every episode and print a table."""
         if self.images < 1 or self.most_mm <= 0 or self.most_deg <= 0:
             raise InputError("--images is at least 1, --most-mm and --most-deg are above 0")
         from evercal.calibration.audit import AuditOptions, audit, episode_folders
@@ -50,11 +47,10 @@ class Audit(Verb):
         options = AuditOptions(self.images, self.most_mm, self.most_deg)
         with progress_bar("episodes", total, "episode") as bar:
             episodes = audit(localizer, self.folder, stated, options, on_episode=bar.update)
-        wrong = [episode for episode in episodes if episode.verdict == "wrong"]
-        if self.json:
-            print_json({"episodes": [dataclasses.asdict(episode) for episode in episodes]})
-        else:
-            for episode in episodes:
-                print(f"{episode.verdict:8s} {episode.name}: {episode.reason}")
-            print(f"{len(wrong)} of {len(episodes)} episodes state a wrong camera pose")
+        wrong = sum(episode.verdict == "wrong" for episode in episodes)
+        self.answer(
+            {"episodes": [dataclasses.asdict(episode) for episode in episodes]},
+            *(f"{episode.verdict:8s} {episode.name}: {episode.reason}" for episode in episodes),
+            f"{wrong} of {len(episodes)} episodes state a wrong camera pose",
+        )
         return 1 if wrong else 0

@@ -4,16 +4,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
-from evercal.cli.console import print_json, print_next, progress_bar
-from evercal.cli.image_words import camera_for, read_images
-from evercal.cli.options import Device, File, Store, Verb
-from evercal.cli.stores import open_map
+from evercal.cli.console import progress_bar
+from evercal.cli.options import (
+    Device,
+    File,
+    ImageFiles,
+    Store,
+    Verb,
+    camera_for,
+    open_map,
+    read_images,
+)
 from evercal.reports.answers import check_record
 
 if TYPE_CHECKING:
     from evercal.calibration.drift import Shift
+
+Reference = Annotated[
+    Path, arg(metavar="FILE", help="The camera's calibration from 'evercal calibrate'.")
+]
 
 
 @dataclass(frozen=True)
@@ -24,17 +35,14 @@ class Check(Verb):
     """
 
     store: Store
-    """Folder of the map."""
-    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
+    images: ImageFiles
     """New images of one camera, or a folder of them; five or more reveal smaller shifts."""
-    reference: Annotated[Path, arg(metavar="FILE")]
-    """The camera's calibration from 'evercal calibrate'."""
+    reference: Reference
     camera: File = None
     """Intrinsics. Default: those of the reference."""
     device: Device = "auto"
 
     def run(self) -> int:
-        """Compare and print the shift."""
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.drift import check
         from evercal.recordings.image_files import image_files
@@ -46,15 +54,13 @@ class Check(Verb):
         localizer = open_map(self.store, self.device)
         with progress_bar("localizing", len(images), "image") as bar:
             shift = check(localizer, images, reference, camera, on_image=bar.update)
-        if self.json:
-            print_json(check_record(shift))
-        else:
-            print(shift_line(shift))
-            for use in shift.images:
-                if not use.used:
-                    print(f"  rejected  {use.name}: {use.reason}")
-            if shift.moved:
-                print_next("evercal", "calibrate", self.store, *self.images[:1])
+        rejected = [use for use in shift.images if not use.used]
+        self.answer(
+            check_record(shift),
+            shift_line(shift),
+            *(f"  rejected  {use.name}: {use.reason}" for use in rejected),
+            then=("calibrate", self.store, *self.images[:1]) if shift.moved else (),
+        )
         return 1 if shift.moved else 0
 
 

@@ -6,9 +6,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar
-from evercal.cli.options import Name, Verb
-from evercal.cli.reading import Reading
+from evercal.cli.console import progress_bar
+from evercal.cli.options import Name, Reading, Verb
 from evercal.errors import InputError
 
 
@@ -24,14 +23,12 @@ class Convert(Verb):
     out: Annotated[Positional[Path], arg(metavar="OUT")]
     """Output folder; created if it is missing."""
     reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
-    """How the recording is read."""
     name: Name = None
     """Name of the scene. Default: the recording's own name."""
     hard_link: bool = False
     """Link image files instead of copying them; changes then affect both."""
 
     def run(self) -> int:
-        """Read, write and print a summary."""
         from evercal.recordings.formats import generic
 
         if self.out.exists() and not self.out.is_dir():
@@ -52,16 +49,13 @@ class Convert(Verb):
             "with_base_from_gripper": sum(f.base_from_gripper is not None for f in frames),
             "notes": list(scene.notes),
         }
-        if self.json:
-            print_json(record)
-            return 0
-        print(
+        self.answer(
+            record,
             f"{self.out}: {scene.name}, {len(scene.train)} training and {len(scene.test)} test"
             f" frames; {record['with_base_from_camera']} with the camera's pose,"
             f" {record['with_base_from_gripper']} with the gripper's; {scene.untracked} images"
-            f" without a pose left out"
+            " without a pose left out",
+            *(f"note: {note}" for note in scene.notes),
+            then=("inspect", self.out),
         )
-        for note in scene.notes:
-            print(f"note: {note}")
-        print_next("evercal", "inspect", self.out)
         return 0

@@ -4,11 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
-from evercal.cli.console import print_json, print_next, progress_bar
-from evercal.cli.options import Device, Store, Verb
-from evercal.cli.stores import open_localizer
+from evercal.cli.console import following, progress_bar
+from evercal.cli.options import Device, Store, Verb, open_localizer, shown
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,15 +22,11 @@ class Evaluate(Verb):
     """
 
     store: Store
-    """Folder of the store."""
-    scenes: Annotated[
-        Positional[tuple[str, ...]], arg(metavar="[NAME=]SCENE...", help_behavior_hint="")
-    ]
+    scenes: Annotated[Positional[tuple[str, ...]], shown("[NAME=]SCENE...")]
     """Folders of recorded scenes. NAME is the scene's name in the store, if it differs."""
     device: Device = "auto"
 
     def run(self) -> int:
-        """Evaluate and print a table."""
         if not self.scenes:
             raise InputError("no scene given; name one or more scene folders after the store")
         scenes = load_named(self.scenes)
@@ -40,28 +35,19 @@ class Evaluate(Verb):
 
         localizer = open_localizer(self.store, self.device)
         with progress_bar("evaluating", 0, "image") as bar:
-
-            def show(done: int, total: int) -> None:
-                bar.total = total
-                bar.update(done - bar.n)
-
-            results = evaluate(localizer, scenes, on_frame=show)
+            results = evaluate(localizer, scenes, on_frame=following(bar))
         summary = scores(results)
-        if self.json:
-            print_json(summary.to_dict())
-            return 0
-        print(score_table(summary))
-        print(f"{summary.ms_per_image:.0f} ms per image, one at a time, decoding included")
-        print_next("evercal", "learn", self.store, "SCENE")
+        self.answer(
+            summary.to_dict(),
+            score_table(summary),
+            f"{summary.ms_per_image:.0f} ms per image, one at a time, decoding included",
+            then=("learn", self.store, "SCENE"),
+        )
         return 0
 
 
 def load_named(words: tuple[str, ...]) -> "dict[str, Recording]":
-    """Load scenes from the words `SCENE` and `NAME=SCENE`.
-
-    Raises:
-        InputError: A scene cannot be read, or two scenes have one name.
-    """
+    """Load scenes from the words `SCENE` and `NAME=SCENE`."""
     from evercal.recordings import load_recording
 
     scenes: dict[str, Recording] = {}

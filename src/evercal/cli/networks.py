@@ -3,8 +3,7 @@
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import arg
-
+from evercal.cli.options import option, shown
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,7 +19,7 @@ class NetworkOptions:
 
     preset: Literal["fast", "demo", "bench", "converged", "paper"] = "fast"
     """Amount of training: fast takes minutes on two cores, paper needs a GPU."""
-    centres: Annotated[int | None, arg(metavar="M", help_behavior_hint="")] = None
+    centres: Annotated[int | None, shown("M")] = None
     """Cluster centres that a scene adds to the network. Default: those of the preset."""
     seed: int = 0
     """Random seed."""
@@ -30,8 +29,8 @@ class NetworkOptions:
         for field in fields(self):
             if (value := getattr(self, field.name)) != field.default:
                 raise InputError(
-                    f"--{field.name} {value}: a map is not trained; omit the option, or choose a"
-                    " network with --strategy"
+                    f"{option(field.name)} {value}: a map is not trained; omit the option, or"
+                    " choose a network with --strategy"
                 )
 
 
@@ -40,12 +39,23 @@ def learn_into_networks(
 ) -> "LearnReport":
     """Train a network on a recording."""
     from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
+    from evercal.continual.learning.stage import Encoding
+    from evercal.continual.networks.trainer import Progress
 
     wanted = given.networks
     if wanted.centres is not None and wanted.centres < 1:
         raise InputError(f"--centres {wanted.centres}: give a number >= 1")
     if wanted.seed < 0:
         raise InputError(f"--seed {wanted.seed}: give a number >= 0")
+
+    def show(event: object) -> None:
+        if isinstance(event, Progress):
+            bar = bars.step("training", event.step, event.total)
+            text = f"loss {event.loss:.1f}, {100 * event.inlier_share:.0f} % inliers"
+            bar.set_postfix_str(text, refresh=event.step == event.total)
+        elif isinstance(event, Encoding):
+            bars.step("encoding", event.done, event.total)
+
     options = NetworkLearnOptions(
         strategy=strategy,
         preset=wanted.preset,
@@ -55,17 +65,4 @@ def learn_into_networks(
         device=given.device,
         seed=wanted.seed,
     )
-    return learn_networks(given.store, recording, options, lambda event: _show(bars, event))
-
-
-def _show(bars: "Bars", event: object) -> None:
-    """Show an event of network training."""
-    from evercal.continual.learning.stage import Encoding
-    from evercal.continual.networks.trainer import Progress
-
-    if isinstance(event, Progress):
-        bar = bars.step("training", event.step, event.total)
-        text = f"loss {event.loss:.1f}, {100 * event.inlier_share:.0f} % inliers"
-        bar.set_postfix_str(text, refresh=event.step == event.total)
-    elif isinstance(event, Encoding):
-        bars.step("encoding", event.done, event.total)
+    return learn_networks(given.store, recording, options, show)

@@ -7,8 +7,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import Bars, print_json, print_next
-from evercal.cli.options import Verb
+from evercal.cli.console import Bars
+from evercal.cli.options import Number, Verb
 
 _CONNECTED = 0.8
 """Share of the frames in one part below which the video does not hold together."""
@@ -30,29 +30,25 @@ class Reconstruct(Verb):
     """New folder: a COLMAP model and its images."""
     motion: Annotated[float, arg(metavar="SHARE")] = 0.04
     """Motion from one chosen frame of a video to the next, parts of its width."""
-    most: Annotated[int, arg(metavar="N")] = 300
+    most: Number = 300
     """Frames, at most."""
 
     def run(self) -> int:
-        """Reconstruct and print a summary."""
         from evercal.recordings.reconstruct import ReconstructOptions, reconstruct
 
         options = ReconstructOptions(motion=self.motion, most_frames=self.most)
         with Bars() as bars:
             found = reconstruct(self.source, self.out, options, bars.step)
         whole = found.posed >= _CONNECTED * found.frames
-        if self.json:
-            print_json({"out": str(self.out), **dataclasses.asdict(found)})
-            return 0 if whole else 1
-        print(
+        lines = [
             f"{self.out}: {found.posed} of {found.frames} frames have a pose, {found.points:,}"
             f" points, residual {found.residual_px:.2f} px"
-        )
+        ]
         if not whole:
-            parts = ", ".join(map(str, found.parts))
-            print(
-                f"the video does not hold together: parts of {parts} frames; move more slowly"
-                " where they end, and return to places seen before"
+            lines.append(
+                f"the video does not hold together: parts of {', '.join(map(str, found.parts))}"
+                " frames; move more slowly where they end, and return to places seen before"
             )
-        print_next("evercal", "learn", "cell.evercal", self.out)
+        record = {"out": str(self.out), **dataclasses.asdict(found)}
+        self.answer(record, *lines, then=("learn", "cell.evercal", self.out))
         return 0 if whole else 1
