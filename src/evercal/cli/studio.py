@@ -6,16 +6,19 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.options import Device
-from evercal.cli.view import prepare_page, wait_until_stopped
+from evercal.cli.options import Device, File, Name, OutFolder, Source, option, shown
+from evercal.cli.view import Page
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
     from evercal.service.studio.devices import Devices
 
+_REAL = "camera intrinsics poses pose_convention most_age reachable gripper_from_camera fixed"
+"""Options that the virtual cell refuses."""
+
 
 @dataclass(frozen=True)
-class Studio:
+class Studio(Page):
     """Calibrate a wrist camera and a fixed camera in the browser, step by step.
 
     Everything is written to --out as it is made; the same command continues there. With --virtual,
@@ -24,63 +27,56 @@ class Studio:
     Example: evercal studio --camera 0 --intrinsics camera.json --poses poses.csv
     """
 
-    map: Annotated[Positional[Path | None], arg(metavar="[MAP]", help_behavior_hint="")] = None
+    map: Annotated[Positional[Path | None], shown("[MAP]")] = None
     """Folder of the map that learns the scene. Default: a new one in --out."""
-    camera: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="")] = None
+    camera: Source = None
     """Camera on the gripper: number (0) or device, address (rtsp://...), video or folder."""
-    intrinsics: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    intrinsics: File = None
     """Intrinsics of --camera. Default: those in --out, where it was begun before."""
-    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    poses: File = None
     """Gripper poses: a table or JSON lines that your robot's program appends to."""
-    pose_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    pose_convention: Name = None
     """Convention of --poses if its header does not state it: ur, kuka, fanuc, ..."""
-    most_age: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
+    most_age: Annotated[float | None, shown("S")] = None
     """Refuse the last pose of --poses if the file was written more seconds ago. Default: any age,
     for programs that write only when the arm has moved."""
-    reachable: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    reachable: File = None
     """Gripper poses that the robot can reach, for the next best views. Default: near others."""
-    gripper_from_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    gripper_from_camera: File = None
     """A rough gripper_from_camera for the drawing and the next views: 4x4 matrix or calibration."""
-    fixed: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="")] = None
+    fixed: Source = None
     """The fixed camera; sources as for --camera."""
-    fixed_intrinsics: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    fixed_intrinsics: File = None
     """Intrinsics of --fixed. Default: those of the camera on the gripper."""
     virtual: bool = False
     """A virtual arm with a wrist camera and a tripod camera instead of yours."""
     seed: Annotated[int, arg(metavar="I")] = 0
     """Seed of the virtual cell."""
-    out: Annotated[Path, arg(metavar="DIR")] = Path("studio")
+    out: OutFolder = Path("studio")
     """Folder of the recording, images, calibrations, reports and exports."""
-    host: Annotated[str, arg(metavar="H")] = "127.0.0.1"
-    """Address to listen on."""
-    port: Annotated[int, arg(metavar="P")] = 8080
-    """Port to listen on; 0 for any free one."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object when the page is ready."""
 
     def run(self) -> int:
-        """Serve the page until Ctrl-C or SIGTERM."""
         self._refuse()
-        prepare_page(self.host, "can use the cameras and move the arm")
+        self.prepare("can use the cameras and move the arm")
         from evercal.service.studio.page import StudioPage
         from evercal.service.studio.studio import Studio as Session
 
         devices = self._virtual() if self.virtual else self._real()
         page = StudioPage(Session(devices, self.out, self.map, self.device), self.host, self.port)
         try:
-            words = f"studio in {self.out} at {page.server.url}, where the same command continues"
-            wait_until_stopped(page.server.url, None if self.json else words)
+            url = page.server.url
+            self.wait(url, f"studio in {self.out} at {url}, where the same command continues")
         finally:
             page.close()
         return 0
 
     def _refuse(self) -> None:
-        names = "camera intrinsics poses pose_convention most_age reachable gripper_from_camera"
-        given = [name for name in (*names.split(), "fixed") if getattr(self, name) is not None]
+        given = [name for name in _REAL.split() if getattr(self, name) is not None]
         if self.virtual and given:
-            option = f"--{given[0].replace('_', '-')}"
-            raise InputError(f"{option}: the virtual cell has its own; omit it or --virtual")
+            raise InputError(
+                f"{option(given[0])}: the virtual cell has its own; omit it or --virtual"
+            )
         if not self.virtual and (self.camera is None or self.poses is None):
             missing = "--camera SOURCE" if self.camera is None else "--poses FILE"
             raise InputError(f"no {missing} given; give both, or --virtual to try it without")

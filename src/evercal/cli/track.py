@@ -8,21 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, require_writable
-from evercal.cli.options import Count, Device, File, Store
-from evercal.cli.stores import open_map
+from evercal.cli.console import require_writable
+from evercal.cli.options import Count, Device, File, Store, Verb, open_map, shown, stated_camera
 from evercal.errors import InputError
 from evercal.reports.answers import unit_known
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from evercal.geometry import Camera
     from evercal.localization.tracking import TrackedFrame
 
 
 @dataclass(frozen=True)
-class Track:
+class Track(Verb):
     """Locate the frames of a camera, a video or a folder one after another.
 
     The last pose is the prior of the next one: a tracked frame takes less than half the time of a
@@ -32,16 +28,13 @@ class Track:
     """
 
     store: Store
-    """Folder of the map."""
     source: Annotated[Positional[str], arg(metavar="SOURCE")]
     """Number (0) or device of a camera, an address (rtsp://...), a video file or a folder."""
-    out: Annotated[
-        tuple[Path, ...], arg(metavar="FILE...", help_behavior_hint="(default: none)")
-    ] = ()
+    out: Annotated[tuple[Path, ...], shown("FILE...", "(default: none)")] = ()
     """Files to write: .jsonl (JSON lines), .tum or .txt (TUM)."""
     camera: File = None
     """Intrinsics. Default: those of the camera that recorded the scene."""
-    at_most: Annotated[float | None, arg(metavar="MS", help_behavior_hint="")] = None
+    at_most: Annotated[float | None, shown("MS")] = None
     """Time for a frame, milliseconds. What was left out is in the answer (`omitted`)."""
     smooth: Annotated[float, arg(metavar="SECONDS")] = 0.0
     """Time constant of smoothed poses; 0 writes measurements. A jump is followed at once."""
@@ -50,11 +43,8 @@ class Track:
     most: Count = None
     """Stop after so many frames."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object with the summary."""
 
     def run(self) -> int:
-        """Track until the source ends or Ctrl-C."""
         if self.rate <= 0 or self.smooth < 0 or (self.at_most is not None and self.at_most <= 0):
             raise InputError("--rate and --at-most are above 0, --smooth is 0 or more")
         for path in self.out:
@@ -74,15 +64,15 @@ class Track:
             files = [stack.enter_context(TrackFile(path)) for path in self.out]
             try:
                 for name, stamp, image in frames:
-                    tracker = tracker or Tracker(localizer, self._camera(image), options)
+                    if tracker is None:
+                        camera = stated_camera(self.camera, (image.shape[1], image.shape[0]))
+                        tracker = Tracker(localizer, camera, options)
                     frame = tracker.track(image, stamp)
                     states[frame.state] += 1
                     times.append(frame.estimate.milliseconds)
-                    if files:
-                        known = unit_known(localizer, frame.estimate.scene)
-                        row = track_row(frame, name, known)
-                        for file in files:
-                            file.write(frame, row)
+                    known = unit_known(localizer, frame.estimate.scene)
+                    for file in files:
+                        file.write(frame, track_row(frame, name, known))
                     if not self.json:
                         print(_line(name, frame), flush=True)
                     if self.most is not None and len(times) >= self.most:
@@ -94,30 +84,18 @@ class Track:
         self._summary(states, times)
         return 0 if states["tracking"] + states["relocalized"] else 1
 
-    def _camera(self, image: "np.ndarray") -> "Camera | None":
-        if self.camera is None:
-            return None
-        from evercal.recordings.poses.camera_file import read_camera
-
-        return read_camera(self.camera, (image.shape[1], image.shape[0]))
-
     def _summary(self, states: Counter[str], times: list[float]) -> None:
         import numpy as np
 
         middle, high = np.quantile(times, [0.5, 0.99]).tolist()
-        if self.json:
-            counts = {state: states[state] for state in ("tracking", "relocalized", "lost")}
-            files = [str(path) for path in self.out]
-            print_json(
-                {"frames": len(times), **counts, "ms_p50": middle, "ms_p99": high, "out": files}
-            )
-            return
-        print(
+        counts = {state: states[state] for state in ("tracking", "relocalized", "lost")}
+        files = [str(path) for path in self.out]
+        self.answer(
+            {"frames": len(times), **counts, "ms_p50": middle, "ms_p99": high, "out": files},
             f"{len(times)} frames: {states['tracking']} tracked, {states['relocalized']}"
-            f" relocalized, {states['lost']} lost; {middle:.0f} ms (median), {high:.0f} ms (99 %)"
+            f" relocalized, {states['lost']} lost; {middle:.0f} ms (median), {high:.0f} ms (99 %)",
+            then=() if files else ("track", self.store, self.source, "--out", "track.jsonl"),
         )
-        if not self.out:
-            print_next("evercal", "track", self.store, self.source, "--out", "track.jsonl")
 
 
 def _line(name: str, frame: "TrackedFrame") -> str:

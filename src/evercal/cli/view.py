@@ -10,17 +10,40 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
-from evercal.cli.console import print_json
-from evercal.cli.options import Device
-from evercal.cli.stores import open_map
+from evercal.cli.options import Device, File, Host, Port, Source, Store, Verb, open_map, shown
 from evercal.errors import InputError, missing_extra
 from evercal.service.hosts import is_local
 
 
+@dataclass(frozen=True, kw_only=True)
+class Page(Verb):
+    """A verb that serves a page until Ctrl-C or SIGTERM."""
+
+    host: Host = "127.0.0.1"
+    port: Port = 8080
+
+    def prepare(self, danger: str) -> None:
+        """Require the extra `view`, and warn if other machines can open the page."""
+        try:
+            import viser  # noqa: F401
+        except ImportError as error:
+            raise missing_extra(f"the page needs {error.name}", "view") from None
+        if not is_local(self.host):
+            who = "the page has no password; whoever reaches this machine"
+            print(f"warning: --host {self.host}: {who} {danger}", file=sys.stderr)
+
+    def wait(self, url: str, words: str) -> None:
+        """Print words, or the address as JSON, and wait for SIGTERM or Ctrl-C."""
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with contextlib.suppress(KeyboardInterrupt):
+            self.answer({"url": url}, f"{words}; Ctrl-C ends it")
+            threading.Event().wait()
+
+
 @dataclass(frozen=True)
-class View:
+class View(Page):
     """Show a map in 3D in the browser, with calibrations, the arm, and a tracked camera.
 
     It is stopped by Ctrl-C or SIGTERM. The page has no password and is served on 127.0.0.1, unless
@@ -29,65 +52,36 @@ class View:
     Example: evercal view cell.evercal tripod.json --live 0
     """
 
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
-    """Folder of the map."""
+    store: Store
     calibrations: Annotated[
-        Positional[tuple[Path, ...]],
-        arg(metavar="[CALIBRATION.json...]", help_behavior_hint="(default: none)"),
+        Positional[tuple[Path, ...]], shown("[CALIBRATION.json...]", "(default: none)")
     ] = ()
     """Calibration files to draw."""
-    live: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="")] = None
+    live: Source = None
     """Camera to track: its number (0) or device, an address (rtsp://...), a video or a folder."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    camera: File = None
     """Intrinsics of the live camera. Default: those of the camera that recorded the scene."""
-    urdf: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    urdf: File = None
     """Robot description of the arm; its base link is at the robot base."""
-    host: Annotated[str, arg(metavar="H")] = "127.0.0.1"
-    """Address to listen on."""
-    port: Annotated[int, arg(metavar="P")] = 8080
-    """Port to listen on; 0 for any free one."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object when the page is ready."""
 
     def run(self) -> int:
-        """Serve the page until Ctrl-C or SIGTERM."""
         if self.camera is not None and self.live is None:
             raise InputError("--camera: is that of --live, which is missing")
-        prepare_page(self.host, "sees the map and the images")
-        from evercal.service.viewer.page import Page
+        self.prepare("sees the map and the images")
+        from evercal.service.viewer.page import Page as ViewerPage
 
         address = (self.host, self.port)
-        page = Page(open_map(self.store, self.device), self.calibrations, self.urdf, address)
+        page = ViewerPage(
+            open_map(self.store, self.device), self.calibrations, self.urdf, address
+        )
         try:
             if self.live is not None:
                 page.track(self.live, self.camera)
-            port = page.server.url.rpartition(":")[2]
+            url = page.server.url
+            port = url.rpartition(":")[2]
             tunnel = shlex.join(["ssh", "-L", f"{port}:127.0.0.1:{port}", socket.gethostname()])
-            words = f"view of {self.store} at {page.server.url} (from another machine: {tunnel})"
-            wait_until_stopped(page.server.url, None if self.json else words)
+            self.wait(url, f"view of {self.store} at {url} (from another machine: {tunnel})")
         finally:
             page.close()
         return 0
-
-
-def prepare_page(host: str, danger: str) -> None:
-    """Require the extra `view`, and warn if other machines can open the page."""
-    try:
-        import viser  # noqa: F401
-    except ImportError as error:
-        raise missing_extra(f"the page needs {error.name}", "view") from None
-    if not is_local(host):
-        who = "the page has no password; whoever reaches this machine"
-        print(f"warning: --host {host}: {who} {danger}", file=sys.stderr)
-
-
-def wait_until_stopped(url: str, words: str | None) -> None:
-    """Print words, or the address as JSON, and wait for SIGTERM or Ctrl-C."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with contextlib.suppress(KeyboardInterrupt):
-        if words is None:
-            print_json({"url": url})
-        else:
-            print(f"{words}; Ctrl-C ends it", flush=True)
-        threading.Event().wait()

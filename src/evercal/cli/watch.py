@@ -13,11 +13,17 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.check import shift_line
-from evercal.cli.console import print_json
-from evercal.cli.image_words import stated_camera
-from evercal.cli.options import Device, File, Store
-from evercal.cli.stores import open_map
+from evercal.cli.check import Reference, shift_line
+from evercal.cli.options import (
+    Device,
+    File,
+    Number,
+    Seconds,
+    Store,
+    Verb,
+    open_map,
+    stated_camera,
+)
 from evercal.errors import InputError
 from evercal.reports.answers import shift_dict
 
@@ -30,34 +36,30 @@ FALSE_ALARMS = 0.01
 
 
 @dataclass(frozen=True)
-class Watch:
+class Watch(Verb):
     """Watch a folder that a camera writes images to; stop with exit code 1 when it has moved.
 
-    The newest images are tested together, so that a single outlier raises no alarm.
+    The newest images are tested together, so that a single outlier raises no alarm. With --json,
+    every image gives one object.
 
     Example: evercal watch cell.evercal incoming/ --reference tripod.json
     """
 
     store: Store
-    """Folder of the map."""
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder that images arrive in."""
-    reference: Annotated[Path, arg(metavar="FILE")]
-    """The camera's calibration from 'evercal calibrate'."""
-    window: Annotated[int, arg(metavar="N")] = 5
+    reference: Reference
+    window: Number = 5
     """Newest images that are tested together."""
     interval: Annotated[float, arg(metavar="SECONDS")] = 1.0
     """Interval between scans of the folder."""
-    idle: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None
+    idle: Seconds = None
     """Stop with exit code 0 after this time without a new image. Default: never."""
     camera: File = None
     """Intrinsics. Default: those of the reference."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object for every image."""
 
     def run(self) -> int:
-        """Check new images until the camera has moved."""
         if not self.folder.is_dir():
             raise InputError(f"{self.folder}: no such folder; give the one that images arrive in")
         if self.window < 1 or self.interval <= 0:
@@ -90,11 +92,9 @@ class Watch:
         return 0
 
     def _print(self, path: Path, record: dict[str, object], line: str = "") -> None:
-        if self.json:
-            print_json({"image": path.name, **record})
-            return
         now = datetime.now(UTC).strftime("%H:%M:%S")
-        print(f"{now} {path.name}: {line or record['reason']}", flush=True)
+        words = f"{now} {path.name}: {line or record.get('reason')}"
+        self.answer({"image": path.name, **record}, words)
 
 
 class Arrivals:
