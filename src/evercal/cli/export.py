@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
-from evercal.cli.console import print_json, print_next
-from evercal.cli.options import File, Frame, Name, Verb
+from evercal.cli.options import File, Frame, Name, Verb, shown
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,9 +24,7 @@ class Export(Verb):
     Example: evercal export tripod.json --format urdf --out camera.urdf
     """
 
-    calibration: Annotated[
-        Positional[Path | None], arg(metavar="[CALIBRATION.json]", help_behavior_hint="")
-    ] = None
+    calibration: Annotated[Positional[Path | None], shown("[CALIBRATION.json]")] = None
     """Calibration file, or a map that was learned from gripper poses (MAP or MAP:SCENE)."""
     format: Name = None
     """Format, such as easy_handeye2, urdf, opencv or kuka; `list` lists all."""
@@ -41,9 +38,7 @@ class Export(Verb):
     """Export this root frame of the camera driver, such as camera_link."""
     via_transform: File = None
     """With --via: output of `ros2 topic echo --once /tf_static`, or a TransformStamped."""
-    via_offset: Annotated[
-        tuple[float, float, float] | None, arg(metavar="X Y Z", help_behavior_hint="")
-    ] = None
+    via_offset: Annotated[tuple[float, float, float] | None, shown("X Y Z")] = None
     """With --via: offset of the optical frame (forward, left, up), metres."""
     via_optical: bool = False
     """With --via: both frames have the same origin."""
@@ -57,63 +52,52 @@ class Export(Verb):
     """Pose convention of --robot-poses if its header does not state it: ur, kuka, fanuc, ..."""
 
     def run(self) -> int:
-        """Read all inputs before writing the output."""
         from evercal.calibration.export.formats import FORMATS, export_files
         from evercal.calibration.export.request import ExportOptions
         from evercal.calibration.learned import calibration_at
 
         if self.format == "list" or (self.format is None and self.calibration is None):
-            return self._list()
+            file = self.calibration or "CALIBRATION.json"
+            self.answer(
+                {"formats": {name: row.description for name, row in FORMATS.items()}},
+                *(f"{name:27} {row.description}" for name, row in FORMATS.items()),
+                then=("export", file, "--format", "NAME"),
+            )
+            return 0
         if self.format is None:
             raise InputError(f"no format given; add --format NAME, one of {', '.join(FORMATS)}")
         if self.calibration is None:
             raise InputError("no calibration given; name its JSON file after 'export'")
         options = {key: getattr(self, key) for key in ExportOptions.__annotations__}
         calibration = calibration_at(self.calibration)
-        self._print(export_files(calibration, self.format, self.out, **options))
+        self._show(export_files(calibration, self.format, self.out, **options))
         return 0
 
-    def _print(self, exported: "Exported") -> None:
-        child, verdict = exported.calibration.child_frame, exported.calibration.verdict
+    def _show(self, exported: "Exported") -> None:
+        calibration = exported.calibration
+        child, verdict = calibration.child_frame, calibration.verdict
         if exported.format.frame == "tf" and self.via is None and "optical" in child:
             print(
                 f"note: most camera drivers publish {child} themselves; if yours does, give its"
                 f" root frame with --via, because a tf frame has only one parent",
                 file=sys.stderr,
             )
-        if self.json:
-            print_json(self._record(exported))
-        elif self.out is None:
+        if self.out is None and not self.json:
             sys.stdout.write(exported.text)
-        else:
-            print(f"wrote {', '.join(map(str, exported.files))}")
-            print(f"  {exported.calibration.meaning}")
-            if verdict:
-                print(f"  {verdict}")
-            print_next("evercal", "check", "STORE", "IMAGE", "--reference", self.calibration)
-
-    def _list(self) -> int:
-        from evercal.calibration.export.formats import FORMATS
-
-        if self.json:
-            print_json({"formats": {name: row.description for name, row in FORMATS.items()}})
-            return 0
-        for name, row in FORMATS.items():
-            print(f"{name:27} {row.description}")
-        print_next("evercal", "export", self.calibration or "CALIBRATION.json", "--format", "NAME")
-        return 0
-
-    def _record(self, exported: "Exported") -> dict[str, object]:
-        calibration = exported.calibration
-        return {
+            return
+        record = {
             "format": self.format,
             "mount": calibration.mount,
             "parent_frame": calibration.parent_frame,
-            "child_frame": calibration.child_frame,
+            "child_frame": child,
             "meaning": calibration.meaning,
             "translation_m": calibration.parent_from_child.translation_m.tolist(),
             "quaternion_wxyz": calibration.parent_from_child.rotation_wxyz.tolist(),
-            "verdict": calibration.verdict,
+            "verdict": verdict,
             "files": [str(file) for file in exported.files],
             "text": None if exported.files else exported.text,
         }
+        lines = [f"wrote {', '.join(map(str, exported.files))}", f"  {calibration.meaning}"]
+        lines += [f"  {verdict}"] if verdict else []
+        then = ("check", "MAP", "IMAGE", "--reference", self.calibration)
+        self.answer(record, *lines, then=then)

@@ -6,18 +6,16 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar, require_writable
-from evercal.cli.options import Device
-from evercal.cli.point_words import point_dict, point_of, point_text
-from evercal.cli.stores import open_localizer
+from evercal.cli.console import progress_bar, require_writable
+from evercal.cli.options import At, Device, Point, Verb, open_localizer, shown
 
 if TYPE_CHECKING:
+    from evercal.calibration.calibration import Calibration
     from evercal.reports.calibration_images import AnnotatedImages, BoardSeen
-    from evercal.reports.calibration_page import NamedCalibration
 
 
 @dataclass(frozen=True)
-class Report:
+class Report(Verb):
     """Write an HTML report of a calibration: verdict, uncertainty, residuals and overlays.
 
     Example: evercal report tripod.json --store cell.evercal
@@ -25,28 +23,20 @@ class Report:
 
     calibration: Annotated[Positional[Path], arg(metavar="CALIBRATION.json")]
     """Calibration file, or a map that was learned from gripper poses (MAP or MAP:SCENE)."""
-    store: Annotated[Path | None, arg(metavar="STORE", help_behavior_hint="")] = None
-    """Folder of the store. Its landmarks are drawn with their residuals."""
-    images: Annotated[
-        tuple[Path, ...],
-        arg(metavar="IMAGE...", help_behavior_hint="(default: images of the calibration)"),
-    ] = ()
+    store: Annotated[Path | None, shown("MAP")] = None
+    """Folder of the map. Its landmarks are drawn with their residuals."""
+    images: Annotated[tuple[Path, ...], shown("IMAGE...", "(default: those of the calibration)")] = ()
     """Images of the camera, or a folder of them."""
-    against: Annotated[Path | None, arg(metavar="OLD.json", help_behavior_hint="")] = None
+    against: Annotated[Path | None, shown("OLD.json")] = None
     """Older calibration of the same camera, to compare with."""
-    at: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None
-    """A point in the camera frame (x right, y down, z forward; metres), such as an object that the
-    camera sees: its standard deviation in the base or gripper frame is reported."""
+    at: At = None
     out: Annotated[Path, arg(metavar="FILE.html")] = Path("report.html")
     """The report, one file including its pictures."""
     device: Device = "auto"
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
-        """Write the report."""
         require_writable(self.out, "--out")
-        point = point_of(self.at)
+        point = Point.parse(self.at)
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.learned import calibration_at
         from evercal.calibration.verdict import expected_error, tier, verdict
@@ -58,59 +48,52 @@ class Report:
         older = None
         if self.against is not None:
             older = NamedCalibration(self.against.name, read_calibration(self.against))
-        file = NamedCalibration(self.calibration.name, calibration)
         boards = boards_seen(calibration, self.calibration.parent)
-        images = self._images(file, older, boards)
-        store = None if self.store is None else str(self.store)
-        page = calibration_page(file, images, store, older, point, bool(boards))
-        write_bytes(self.out, page.html.encode())
-        text = calibration.verdict or verdict(calibration)
-        if not self.json:
-            words = [] if point is None else [point_text(point, calibration.uncertain_pose)]
-            print("\n".join([text, *(f"  {line}" for line in (*words, *page.missing))]))
-            print(f"wrote {self.out}")
-            print_next("evercal", "export", self.calibration, "--format", "easy_handeye2")
-            return 0
-        against = None
-        if older is not None:
-            change = difference(calibration, older.calibration)
-            against = {"translation_mm": change.mm, "rotation_deg": change.deg}
-        best, (mm, deg) = tier(calibration), expected_error(calibration)
-        print_json(
-            {
-                "report": str(self.out),
-                "verdict": text,
-                "tier": None if best is None else best.name,
-                "expected_error_mm": mm,
-                "expected_error_deg": deg,
-                "pictures": list(images.images),
-                "against": against,
-                "missing": list(page.missing),
-                **({} if point is None else {"at": point_dict(point, calibration.uncertain_pose)}),
-            }
+        images = self._images(calibration, older and older.calibration, boards)
+        page = calibration_page(
+            NamedCalibration(self.calibration.name, calibration),
+            images,
+            None if self.store is None else str(self.store),
+            older,
+            None if point is None else (point.x, point.y, point.z),
+            bool(boards),
         )
+        write_bytes(self.out, page.html.encode())
+        change = None if older is None else difference(calibration, older.calibration)
+        best, (mm, deg) = tier(calibration), expected_error(calibration)
+        record: dict[str, object] = {
+            "report": str(self.out),
+            "verdict": calibration.verdict or verdict(calibration),
+            "tier": None if best is None else best.name,
+            "expected_error_mm": mm,
+            "expected_error_deg": deg,
+            "pictures": list(images.images),
+            "against": change and {"translation_mm": change.mm, "rotation_deg": change.deg},
+            "missing": list(page.missing),
+        }
+        lines = [str(record["verdict"])]
+        if point is not None:
+            record["at"] = point.record(calibration.uncertain_pose)
+            lines.append(f"  {point.text(calibration.uncertain_pose)}")
+        lines += [f"  {line}" for line in page.missing]
+        then = ("export", self.calibration, "--format", "easy_handeye2")
+        self.answer(record, *lines, f"wrote {self.out}", then=then)
         return 0
 
     def _images(
         self,
-        file: "NamedCalibration",
-        older: "NamedCalibration | None",
+        calibration: "Calibration",
+        older: "Calibration | None",
         boards: "dict[str, BoardSeen]",
     ) -> "AnnotatedImages":
         from evercal.recordings.image_files import image_files
         from evercal.reports.calibration_images import annotate_images, select_images
 
-        calibration = file.calibration
         given = image_files(self.images) if self.images else []
         if calibration.camera is None:
             return annotate_images(calibration, [])
         files, reason = select_images(calibration, self.calibration.parent, given)
-        localizer = None
-        if self.store is not None:
-            localizer = open_localizer(self.store, self.device)
-        before = None if older is None else older.calibration
-        if not files:
-            nothing = annotate_images(calibration, [], before, localizer, boards)
-            return replace(nothing, missing=(reason,))
+        localizer = None if self.store is None else open_localizer(self.store, self.device)
         with progress_bar("drawing", len(files), "image") as bar:
-            return annotate_images(calibration, files, before, localizer, boards, bar.update)
+            drawn = annotate_images(calibration, files, older, localizer, boards, bar.update)
+        return drawn if files else replace(drawn, missing=(reason,))
