@@ -131,9 +131,7 @@ class Align(Verb):
         )
 
 
-def read_rows(
-    path: Path, names: int, columns: str
-) -> "list[tuple[tuple[str, ...], np.ndarray]]":
+def read_rows(path: Path, names: int, columns: str) -> "list[tuple[tuple[str, ...], np.ndarray]]":
     """Words and numbers of every line of a table of these columns; a header line is skipped."""
     import csv
 

@@ -105,13 +105,12 @@ _UNITS = {
 }
 
 
-def print_table(rows: Sequence[Mapping[str, object]]) -> None:
-    """Print rows under the names of their columns; nothing without a row."""
-    from tabulate import tabulate
+def table(rows: Sequence[Mapping[str, object]]) -> list[str]:
+    """Rows under the names of their columns; nothing without a row."""
+    from evercal.evaluation.tables import table as formatted
 
-    if rows:
-        align = ("left", *("right" for _ in list(rows[0])[1:]))
-        print(tabulate(list(rows), headers="keys", colalign=align, disable_numparse=True))
+    cells = [[str(cell) for cell in row.values()] for row in rows]
+    return [formatted([*rows[0]], cells, "terminal")] if rows else []
 
 
 def size(count: float) -> str:

@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from evercal.cli.console import print_json, print_next, print_table, size
-from evercal.cli.options import Store, Verb
+from evercal.cli.console import size, table
+from evercal.cli.options import MAP, Store, Verb, strategy_of
 
 MEMORY_FILES = ("keyframes.safetensors", "state.safetensors")
 
@@ -18,26 +19,22 @@ class Info(Verb):
     """
 
     store: Store
-    """Folder of the map."""
     check: bool = False
     """Compare every file with its checksum; exit code 1 if one is damaged."""
 
     def run(self) -> int:
-        """Open the store and describe it."""
         if self.check:
             return self._check()
-        from evercal.cli.stores import MAP, strategy_of
-
         strategy = strategy_of(self.store)
         if strategy in (MAP, None):
-            scenes, short_side, heads, sizes = _map(self)
+            scenes, short_side, heads, sizes = _map(self.store)
         else:
             from evercal.continual.store import describe
 
             scenes, short_side, heads, sizes = describe(self.store)
         total = sum(file.stat().st_size for file in self.store.rglob("*") if file.is_file())
         memory = sum(bytes for file, bytes in sizes.items() if file.endswith(MEMORY_FILES))
-        content = {
+        record = {
             "store": str(self.store),
             "strategy": strategy,
             "short_side": short_side,
@@ -46,43 +43,35 @@ class Info(Verb):
             "total_bytes": total,
             "scenes": scenes,
         }
-        if self.json:
-            print_json(content)
-            return 0
-        plural = "s" if len(scenes) != 1 else ""
-        print(
-            f"{self.store}: {len(scenes)} scene{plural}, strategy {strategy}, images at"
-            f" {short_side} px"
-        )
+        count = f"{len(scenes)} scene{'' if len(scenes) == 1 else 's'}"
         network = f"networks {size(heads)}, " if heads else ""
-        print(f"{size(total)} in all: keyframes {size(memory)}, {network}the rest is the encoder")
-        print_table([_content(scene) for scene in scenes])
-        print_table([_adjusted(scene) for scene in scenes if scene.get("adjusted")])
-        print_next("evercal", "info", self.store, "--check")
+        self.answer(
+            record,
+            f"{self.store}: {count}, strategy {strategy}, images at {short_side} px",
+            f"{size(total)} in all: keyframes {size(memory)}, {network}the rest is the encoder",
+            *table([_content(scene) for scene in scenes]),
+            *table([_adjusted(scene) for scene in scenes if scene.get("adjusted")]),
+            then=("info", self.store, "--check"),
+        )
         return 0
 
     def _check(self) -> int:
         from evercal.storage import verify
 
         problems = verify(self.store)
-        if self.json:
-            print_json({"store": str(self.store), "ok": not problems, "problems": problems})
-            return 1 if problems else 0
-        for problem in problems:
-            print(problem)
+        end = f"{self.store}: all files match their checksums"
         if problems:
-            files = "1 file is" if len(problems) == 1 else f"{len(problems)} files are"
-            print(f"{files} damaged; restore from a copy of the map")
-            return 1
-        print(f"{self.store}: all files match their checksums")
-        return 0
+            end = f"damaged files: {len(problems)}; restore them from a copy of the map"
+        record = {"store": str(self.store), "ok": not problems, "problems": problems}
+        self.answer(record, *problems, end)
+        return 1 if problems else 0
 
 
-def _map(given: Info) -> tuple[Sequence[dict[str, Any]], int, int, dict[str, int]]:
+def _map(store: Path) -> tuple[Sequence[dict[str, Any]], int, int, dict[str, int]]:
     """Scenes for JSON, working size, size of networks, and files with their sizes."""
     from evercal.mapping.store import MapStore
 
-    store = MapStore.open(given.store)
+    opened = MapStore.open(store)
     scenes = [
         {
             "name": scene.name,
@@ -95,25 +84,21 @@ def _map(given: Info) -> tuple[Sequence[dict[str, Any]], int, int, dict[str, int
             "adjusted": report.get("adjusted"),
             "hand_eye": report.get("hand_eye"),
         }
-        for scene, report in zip(store.contents.scenes, store.reports(), strict=True)
+        for scene, report in zip(opened.contents.scenes, opened.reports(), strict=True)
     ]
-    return scenes, store.contents.short_side, 0, store.size_bytes()
+    return scenes, opened.contents.short_side, 0, opened.size_bytes()
 
 
 def _content(scene: dict[str, Any]) -> dict[str, object]:
-    threshold = (
-        f"support {scene['min_support']:.2f}"
-        if "min_support" in scene
-        else f"{100 * scene['inlier_threshold']:.0f} % inliers"
-    )
-    landmarks = {"landmarks": scene["landmarks"]} if "landmarks" in scene else {}
+    is_map = "landmarks" in scene
+    share = f"{100 * scene.get('inlier_threshold', 0):.0f} % inliers"
     return {
         "scene": scene["name"],
         "frames": scene["train_frames"],
         "keyframes": scene["keyframes"],
-        **landmarks,
+        **({"landmarks": scene["landmarks"]} if is_map else {}),
         "memory": size(scene["memory_bytes"]),
-        "rejected below": threshold,
+        "rejected below": f"support {scene['min_support']:.2f}" if is_map else share,
         "camera": f"{scene['camera']['width']}x{scene['camera']['height']}",
     }
 

@@ -49,9 +49,7 @@ class Inspect(Verb):
         self.answer(record, *lines, then=("learn", "MAP", self.scene, *self.reading.words()))
         return 0
 
-    def _advise(
-        self, recording: "Recording", record: dict[str, object], lines: list[str]
-    ) -> None:
+    def _advise(self, recording: "Recording", record: dict[str, object], lines: list[str]) -> None:
         """Add coverage and next poses, as far as asked for."""
         from evercal.calibration.calibration import read_transform
         from evercal.geometry import SE3

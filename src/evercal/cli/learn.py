@@ -148,7 +148,9 @@ class Learn(Verb):
             cell.calibration(report.scene).write(self.calibration)
         return report
 
-    def _next(self, recording: "Recording", report: "LearnReport", path: Path) -> tuple[object, ...]:
+    def _next(
+        self, recording: "Recording", report: "LearnReport", path: Path
+    ) -> tuple[object, ...]:
         if report.hand_eye is not None:
             return "export", self.calibration or self.store, "--format", "easy_handeye2"
         if not recording.metric:

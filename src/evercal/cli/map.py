@@ -7,93 +7,97 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from evercal.cli.console import print_json, print_next, size
-from evercal.cli.options import Store, Verb
+from evercal.cli.console import require_writable, size
+from evercal.cli.options import Store, Verb, shown
 
 if TYPE_CHECKING:
     from evercal.map import Map
 
-Folder = Store
+Archive = Annotated[Positional[Path], arg(metavar="FILE")]
 
 
 @dataclass(frozen=True)
-class List(Verb):
+class Action(Verb):
+    """An action on a map."""
+
+    def opened(self, store: Path) -> "Map":
+        """The map at a path that must exist."""
+        from evercal.map import Map
+        from evercal.storage import read_manifest
+
+        read_manifest(store)
+        return Map.open(store, device="cpu")
+
+    def done(self, cell: "Map", what: str, **more: object) -> int:
+        """Say what was done and which scenes there are."""
+        record = {"store": str(cell.path), **more, "scenes": list(cell.scenes)}
+        line = f"{what}; scenes of {cell.path}: {', '.join(cell.scenes) or 'none'}"
+        self.answer(record, line, then=("map", "list", cell.path))
+        return 0
+
+
+@dataclass(frozen=True)
+class List(Action):
     """List the scenes of a map with their size.
 
     Example: evercal map list cell.evercal
     """
 
-    store: Folder
-    """Folder of the map."""
+    store: Store
 
     def run(self) -> int:
-        """Open the map and print a line for each scene."""
         from evercal.mapping.store import MapStore
 
-        scenes = [
-            {
-                "name": scene.name,
-                "keyframes": len(scene.keyframes),
-                "landmarks": scene.landmarks,
-                "memory_bytes": scene.keyframes.bytes,
-            }
-            for scene in MapStore.open(self.store).contents.scenes
-        ]
-        if self.json:
-            print_json({"store": str(self.store), "scenes": scenes})
-            return 0
-        for scene in scenes:
-            print(
-                f"{scene['name']}: {scene['keyframes']} keyframes,"
-                f" {scene['landmarks']:,} landmarks, {size(scene['memory_bytes'])}"
-            )
-        if not scenes:
-            print(f"{self.store}: no scene")
+        scenes, lines = [], []
+        for scene in MapStore.open(self.store).contents.scenes:
+            keyframes, memory = len(scene.keyframes), scene.keyframes.bytes
+            record = {"name": scene.name, "keyframes": keyframes, "landmarks": scene.landmarks}
+            scenes.append({**record, "memory_bytes": memory})
+            counts = f"{keyframes} keyframes, {scene.landmarks:,} landmarks"
+            lines.append(f"{scene.name}: {counts}, {size(memory)}")
+        none = f"{self.store}: no scene"
+        self.answer({"store": str(self.store), "scenes": scenes}, *(lines or [none]))
         return 0
 
 
 @dataclass(frozen=True)
-class Remove(Verb):
+class Remove(Action):
     """Remove scenes from a map, all in one step.
 
     Example: evercal map remove cell.evercal kitchen
     """
 
-    store: Folder
-    """Folder of the map."""
-    names: Annotated[Positional[tuple[str, ...]], arg(metavar="SCENE...", help_behavior_hint="")]
+    store: Store
+    names: Annotated[Positional[tuple[str, ...]], shown("SCENE...")]
     """Scenes to remove."""
 
     def run(self) -> int:
-        """Remove the scenes."""
-        opened = _opened(self.store)
-        opened.remove(*self.names)
-        return _done(opened, f"removed {', '.join(self.names)}", self.json)
+        cell = self.opened(self.store)
+        cell.remove(*self.names)
+        return self.done(cell, f"removed {', '.join(self.names)}")
 
 
 @dataclass(frozen=True)
-class Rename(Verb):
+class Rename(Action):
     """Give a scene of a map another name.
 
     Example: evercal map rename cell.evercal kitchen kitchen-2025
     """
 
-    store: Folder
-    """Folder of the map."""
+    store: Store
     name: Annotated[Positional[str], arg(metavar="SCENE")]
     """Name of the scene."""
     new: Annotated[Positional[str], arg(metavar="NEW")]
     """Its new name."""
 
     def run(self) -> int:
-        """Rename the scene."""
-        opened = _opened(self.store)
-        opened.rename(self.name, self.new)
-        return _done(opened, f"renamed {self.name} to {self.new}", self.json)
+        cell = self.opened(self.store)
+        cell.rename(self.name, self.new)
+        return self.done(cell, f"renamed {self.name} to {self.new}")
 
 
 @dataclass(frozen=True)
-class Merge(Verb):
+class Merge(Action):
     """Add the scenes of other maps to a map, all in one step; a new folder becomes a new map.
 
     All maps must have one encoder and one image size.
@@ -101,73 +105,64 @@ class Merge(Verb):
     Example: evercal map merge all.evercal cell-1.evercal cell-2.evercal
     """
 
-    store: Folder
-    """Folder of the map that grows."""
-    others: Annotated[Positional[tuple[Path, ...]], arg(metavar="OTHER...", help_behavior_hint="")]
+    store: Store
+    others: Annotated[Positional[tuple[Path, ...]], shown("OTHER...")]
     """Folders of the other maps; they do not change."""
     on_clash: Literal["refuse", "rename", "skip", "replace"] = "refuse"
     """For a scene whose name is taken: refuse the merge, rename it to NAME-2, skip it, or replace
     the scene of the map."""
 
     def run(self) -> int:
-        """Merge the maps."""
         from evercal.map import Map
 
-        opened = Map.open(self.store, device="cpu")
-        merged = opened.merge(*self.others, on_clash=self.on_clash)
+        cell = Map.open(self.store, device="cpu")
+        merged = cell.merge(*self.others, on_clash=self.on_clash)
         words = [f"added {', '.join(merged.added) or 'no scene'}"]
         words += [f"{name} is now {new}" for name, new in merged.renamed]
         words += [f"skipped {name}" for name in merged.skipped]
         words += [f"replaced {name}" for name in merged.replaced]
-        return _done(opened, "; ".join(words), self.json, dataclasses.asdict(merged))
+        return self.done(cell, "; ".join(words), **dataclasses.asdict(merged))
 
 
 @dataclass(frozen=True)
-class Pack(Verb):
+class Pack(Action):
     """Write a map into one file, a zip archive with checksums.
 
     Example: evercal map pack cell.evercal cell.zip
     """
 
-    store: Folder
-    """Folder of the map."""
-    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    store: Store
+    file: Archive
     """Output file; an existing one is replaced."""
 
     def run(self) -> int:
-        """Pack the map."""
-        from evercal.cli.console import require_writable
         from evercal.mapping.manage import pack_map
 
         require_writable(self.file, "FILE")
         pack_map(self.store, self.file)
         count = self.file.stat().st_size
-        if self.json:
-            print_json({"file": str(self.file), "bytes": count})
-            return 0
-        print(f"wrote {self.file} ({size(count)})")
-        print_next("evercal", "map", "unpack", self.file, "STORE")
+        line = f"wrote {self.file} ({size(count)})"
+        then = ("map", "unpack", self.file, "MAP")
+        self.answer({"file": str(self.file), "bytes": count}, line, then=then)
         return 0
 
 
 @dataclass(frozen=True)
-class Unpack(Verb):
-    """Extract a map from a file of 'evercal map pack'; every file is checked.
+class Unpack(Action):
+    """Extract a map from a file of 'evercal map pack' into a new folder; every file is checked.
 
     Example: evercal map unpack cell.zip cell.evercal
     """
 
-    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    file: Archive
     """The archive."""
-    store: Folder
-    """New folder for the map."""
+    store: Store
 
     def run(self) -> int:
-        """Unpack the map."""
         from evercal.mapping.manage import unpack_map
 
         unpack_map(self.file, self.store)
-        return _done(_opened(self.store), f"unpacked {self.file}", self.json)
+        return self.done(self.opened(self.store), f"unpacked {self.file}")
 
 
 @dataclass(frozen=True)
@@ -189,23 +184,4 @@ class Maps:
     ]
 
     def run(self) -> int:
-        """Run the action."""
         return self.action.run()
-
-
-def _opened(store: Path) -> "Map":
-    """The map at a path that must exist."""
-    from evercal.map import Map
-    from evercal.storage import read_manifest
-
-    read_manifest(store)
-    return Map.open(store, device="cpu")
-
-
-def _done(opened: "Map", what: str, as_json: bool, more: dict[str, object] | None = None) -> int:
-    if as_json:
-        print_json({"store": str(opened.path), **(more or {}), "scenes": list(opened.scenes)})
-        return 0
-    print(f"{what}; scenes of {opened.path}: {', '.join(opened.scenes) or 'none'}")
-    print_next("evercal", "map", "list", opened.path)
-    return 0

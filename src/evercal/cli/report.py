@@ -25,7 +25,9 @@ class Report(Verb):
     """Calibration file, or a map that was learned from gripper poses (MAP or MAP:SCENE)."""
     store: Annotated[Path | None, shown("MAP")] = None
     """Folder of the map. Its landmarks are drawn with their residuals."""
-    images: Annotated[tuple[Path, ...], shown("IMAGE...", "(default: those of the calibration)")] = ()
+    images: Annotated[
+        tuple[Path, ...], shown("IMAGE...", "(default: those of the calibration)")
+    ] = ()
     """Images of the camera, or a folder of them."""
     against: Annotated[Path | None, shown("OLD.json")] = None
     """Older calibration of the same camera, to compare with."""

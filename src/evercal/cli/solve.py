@@ -42,9 +42,7 @@ class Solve(Verb):
     """Pose convention of robot poses without a header: ur, kuka, xyzw:mm, ..."""
     camera_convention: Name = None
     """Pose convention of camera poses without a header."""
-    invert: Annotated[
-        Literal["robot", "camera", "both"] | None, shown("robot|camera|both")
-    ] = None
+    invert: Annotated[Literal["robot", "camera", "both"] | None, shown("robot|camera|both")] = None
     """Invert the poses of a file: robot, camera or both."""
     out: OutFile = Path("calibration.json")
     """Calibration file to write."""

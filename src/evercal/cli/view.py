@@ -72,9 +72,7 @@ class View(Page):
         from evercal.service.viewer.page import Page as ViewerPage
 
         address = (self.host, self.port)
-        page = ViewerPage(
-            open_map(self.store, self.device), self.calibrations, self.urdf, address
-        )
+        page = ViewerPage(open_map(self.store, self.device), self.calibrations, self.urdf, address)
         try:
             if self.live is not None:
                 page.track(self.live, self.camera)
