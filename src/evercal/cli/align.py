@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.options import Device, File, Name, Store, Verb, read_images, shown
+from evercal.cli import args
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Align(Verb):
-    """Transform a scene that was learned in a frame of its own to the robot's base frame.
+class Align(args.Verb):
+    """Transform a scene in a frame of its own to the base frame.
 
     Give images of a camera on the gripper with --robot-poses, or points that the tool has touched
     with --points and --picks. The error of the alignment is part of every later answer.
@@ -26,26 +26,26 @@ class Align(Verb):
     Example: evercal align cell.evercal cell wrist/ --robot-poses poses.csv
     """
 
-    store: Store
+    store: args.Store
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
     """Name of the scene."""
-    images: Annotated[Positional[tuple[Path, ...]], shown("[IMAGE...]")] = ()
+    images: Annotated[Positional[tuple[Path, ...]], args.shown("[IMAGE...]")] = ()
     """Images of a camera on the gripper, or a folder of them."""
-    robot_poses: File = None
+    robot_poses: args.File = None
     """base_from_gripper of every image."""
-    convention: Name = None
+    convention: args.Name = None
     """Format of the robot poses, if the file does not state it."""
-    board_poses: File = None
+    board_poses: args.File = None
     """Board poses from 'evercal detect', for a fixed camera that observes a board in the
     gripper."""
-    points: File = None
+    points: args.File = None
     """Touched points in the base frame: lines of name, x, y, z in metres."""
-    picks: File = None
+    picks: args.File = None
     """Points in images: lines of image, name, u, v in pixels; images relative to this file."""
     unknown_scale: bool = False
     """Estimate the scale, for a scene that was not learned in metres. Default where the unit of
     length of its recording is unknown."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         by_points = self.points is not None or self.picks is not None
@@ -79,7 +79,7 @@ class Align(Verb):
         files = image_files(self.images)
         assert self.robot_poses is not None
         poses = poses_of_images(self.robot_poses, files, self.convention)
-        images, boards = read_images(files), None
+        images, boards = args.read_images(files), None
         if self.board_poses is not None:
             detected = read_board_poses(self.board_poses).detected
             by_name = {Path(image.name).name: image.camera_from_board for image in detected}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.options import Count, Device, Folder, OutFolder, Verb, shown
+from evercal.cli import args
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ LEAST_BATCH = 64
 
 
 @dataclass(frozen=True)
-class Bench(Verb):
+class Bench(args.Verb):
     """Compare strategies on a sequence of scenes; the same command resumes.
 
     Given a folder of results, print its tables again.
@@ -36,7 +36,7 @@ class Bench(Verb):
     suite: Annotated[Positional[str], arg(metavar="SUITE")]
     """One of sim-mini (packaged), sim, sim-7, sim-12, sim-tune, sim-unseen, sim-repeat,
     real2, i7s, i12s, custom, regions; or a folder of results."""
-    recordings: Annotated[Positional[tuple[Path, ...]], shown("[DIR...]")] = ()
+    recordings: Annotated[Positional[tuple[Path, ...]], args.shown("[DIR...]")] = ()
     """Recordings of the suite custom, in order of learning; one recording for regions."""
     strategies: Annotated[str, arg(metavar="A,B")] = "evercal,joint,finetune,er,sars_spdd"
     """Comma-separated strategies; the others are compared with the first. table4 stands for those
@@ -46,11 +46,11 @@ class Bench(Verb):
     order: Literal["given", "reversed", "shuffled", "balanced"] = "given"
     """Order in which the scenes are learned. shuffled draws one for each seed. balanced turns the
     given order by one place for each seed, and reverses it in every second round."""
-    scenes: Annotated[str, shown("A,B")] = ""
+    scenes: Annotated[str, args.shown("A,B")] = ""
     """Comma-separated scenes of the suite. Defaults to all."""
-    data: Folder = None
+    data: args.Folder = None
     """Folder of the suite's recordings, with one folder per scene."""
-    poses: Folder = None
+    poses: args.Folder = None
     """Structure-from-motion poses for i7s and i12s (Brachmann et al., ICCV 2021). Defaults to the
     original poses."""
     parts: int = 4
@@ -62,21 +62,21 @@ class Bench(Verb):
     and loss (paper) or by ours (paper_head)."""
     offsets: Literal["per_centre", "shared"] = "per_centre"
     """One offset and scale per centre (the paper), or one for all centres (GLACE)."""
-    steps: Count = None
+    steps: args.Count = None
     """Optimiser steps of a stage. Defaults to that of the preset."""
-    batch: Count = None
+    batch: args.Count = None
     """Rows of the new scene in a step; replayed rows keep the preset's proportion. Defaults to that
     of the preset."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
     """Keyframes to keep of a scene: a share of its frames (10%) or bytes (5MB)."""
     held_out: bool = False
     """Evaluate on a fifth of the training frames instead of the test frames, to choose settings."""
-    device: Device = "auto"
-    plugin: Annotated[Path | None, shown("FILE.py")] = None
+    device: args.Device = "auto"
+    plugin: Annotated[Path | None, args.shown("FILE.py")] = None
     """Python file of your own strategies (see examples/my_strategy.py)."""
-    ray: Annotated[str | None, shown("ADDRESS")] = None
+    ray: Annotated[str | None, args.shown("ADDRESS")] = None
     """Ray cluster to run on, or `local` for this machine. Without it, runs are sequential."""
-    out: OutFolder = Path("evercal-bench")
+    out: args.OutFolder = Path("evercal-bench")
     """Folder of results. The same command resumes there."""
 
     def run(self) -> int:

@@ -7,21 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional
 
+from evercal.cli import args
 from evercal.cli.console import progress_bar, require_writable
-from evercal.cli.options import (
-    At,
-    Device,
-    File,
-    Name,
-    OutFile,
-    Point,
-    Store,
-    Verb,
-    camera_for,
-    open_map,
-    read_images,
-    shown,
-)
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Calibrate(Verb):
+class Calibrate(args.Verb):
     """Calibrate a camera from images of a mapped scene; no marker is needed.
 
     A fixed camera gives base_from_camera. With --robot-poses, a camera on the gripper gives
@@ -42,37 +29,37 @@ class Calibrate(Verb):
     Example: evercal calibrate cell.evercal tripod/ --camera camera.json --out tripod.json
     """
 
-    store: Store
-    images: Annotated[Positional[tuple[str, ...]], shown("IMAGE...")]
+    store: args.Store
+    images: Annotated[Positional[tuple[str, ...]], args.shown("IMAGE...")]
     """Image files or folders of them, all of one camera; or NAME=FOLDER for each camera of a
     rig."""
-    robot_poses: File = None
+    robot_poses: args.File = None
     """base_from_gripper of every image: a pose table, JSON, NPY or NPZ."""
-    convention: Name = None
+    convention: args.Name = None
     """Format of the robot poses, if the file does not state it."""
     mount: Annotated[
-        Literal["eye_to_hand", "eye_in_hand"] | None, shown("eye_to_hand|eye_in_hand")
+        Literal["eye_to_hand", "eye_in_hand"] | None, args.shown("eye_to_hand|eye_in_hand")
     ] = None
     """eye_to_hand for a fixed camera, eye_in_hand for one on the gripper. Default: decided from
     the camera's motion."""
-    camera: File = None
+    camera: args.File = None
     """Intrinsics of these images. Default: those of the camera that recorded the scene."""
-    out: OutFile = Path("calibration.json")
+    out: args.OutFile = Path("calibration.json")
     """Output file."""
-    at: At = None
-    device: Device = "auto"
+    at: args.At = None
+    device: args.Device = "auto"
 
     def run(self) -> int:
         require_writable(self.out, "--out")
-        point = Point.parse(self.at)
+        point = args.Point.parse(self.at)
         folders = self._folders()
         from evercal.calibration.verdict import tier
         from evercal.recordings.image_files import image_files
 
         if folders:
-            return self._rig(open_map(self.store, self.device), folders, point)
+            return self._rig(args.open_map(self.store, self.device), folders, point)
         given = self._given(image_files(self.images))
-        calibration = self._calibrated(open_map(self.store, self.device), given)
+        calibration = self._calibrated(args.open_map(self.store, self.device), given)
         calibration.write(self.out)
         self.answer(
             {**calibration.to_dict(), **_at_record(calibration, point)},
@@ -100,7 +87,7 @@ class Calibrate(Verb):
         poses = None
         if self.robot_poses is not None:
             poses = poses_of_images(self.robot_poses, files, self.convention)
-        return Images(read_images(files), camera_for(self.camera, files), poses)
+        return Images(args.read_images(files), args.camera_for(self.camera, files), poses)
 
     def _calibrated(self, localizer: "Localizer", given: "Images") -> "Calibration":
         from evercal.calibration.from_images import calibrate
@@ -109,7 +96,9 @@ class Calibrate(Verb):
             calibration = calibrate(localizer, given, self.mount, on_image=bar.update)
         return replace(calibration, source={**calibration.source, "store": str(self.store)})
 
-    def _rig(self, localizer: "Localizer", folders: dict[str, Path], point: Point | None) -> int:
+    def _rig(
+        self, localizer: "Localizer", folders: dict[str, Path], point: args.Point | None
+    ) -> int:
         from evercal.calibration.rig import rig_of
         from evercal.recordings.image_files import image_files
 
@@ -126,11 +115,11 @@ class Calibrate(Verb):
         return 0
 
 
-def _at_record(calibration: "Calibration", point: Point | None) -> dict[str, object]:
+def _at_record(calibration: "Calibration", point: args.Point | None) -> dict[str, object]:
     return {} if point is None else {"at": point.record(calibration.uncertain_pose)}
 
 
-def calibration_lines(calibration: "Calibration", point: Point | None = None) -> Iterator[str]:
+def calibration_lines(calibration: "Calibration", point: args.Point | None = None) -> Iterator[str]:
     """A calibration in lines. `point` is that of --at."""
     from evercal.calibration.calibration import position_shares
 
@@ -158,7 +147,7 @@ def calibration_lines(calibration: "Calibration", point: Point | None = None) ->
     yield f"  verdict      {calibration.verdict}"
 
 
-def _rig_lines(rig: "Rig", point: Point | None) -> Iterator[str]:
+def _rig_lines(rig: "Rig", point: args.Point | None) -> Iterator[str]:
     for name, calibration in rig.cameras.items():
         first, *rest = calibration_lines(calibration, point)
         yield from (f"{name}: {first}", *rest)

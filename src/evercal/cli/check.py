@@ -6,17 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
+from evercal.cli import args
 from evercal.cli.console import progress_bar
-from evercal.cli.options import (
-    Device,
-    File,
-    ImageFiles,
-    Store,
-    Verb,
-    camera_for,
-    open_map,
-    read_images,
-)
 from evercal.reports.answers import check_record
 
 if TYPE_CHECKING:
@@ -28,19 +19,19 @@ Reference = Annotated[
 
 
 @dataclass(frozen=True)
-class Check(Verb):
+class Check(args.Verb):
     """Test whether a fixed camera has moved since it was calibrated; exit code 1 if it has.
 
     Example: evercal check cell.evercal now.png --reference tripod.json
     """
 
-    store: Store
-    images: ImageFiles
+    store: args.Store
+    images: args.ImageFiles
     """New images of one camera, or a folder of them; five or more reveal smaller shifts."""
     reference: Reference
-    camera: File = None
+    camera: args.File = None
     """Intrinsics. Default: those of the reference."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         from evercal.calibration.calibration import read_calibration
@@ -49,9 +40,9 @@ class Check(Verb):
 
         files = image_files(self.images)
         reference = read_calibration(self.reference)
-        camera = camera_for(self.camera, files)
-        images = read_images(files)
-        localizer = open_map(self.store, self.device)
+        camera = args.camera_for(self.camera, files)
+        images = args.read_images(files)
+        localizer = args.open_map(self.store, self.device)
         with progress_bar("localizing", len(images), "image") as bar:
             shift = check(localizer, images, reference, camera, on_image=bar.update)
         rejected = [use for use in shift.images if not use.used]

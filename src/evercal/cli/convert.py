@@ -6,14 +6,14 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.cli import args
 from evercal.cli.console import progress_bar
-from evercal.cli.options import Name, Reading, Verb
 from evercal.errors import InputError
 
 
 @dataclass(frozen=True)
-class Convert(Verb):
-    """Convert a recording of any format to evercal's own: one scene.json and the images.
+class Convert(args.Verb):
+    """Convert a recording of any format to evercal's own; it is scene.json and the images.
 
     Example: evercal convert recording.mcap kitchen/
     """
@@ -22,8 +22,8 @@ class Convert(Verb):
     """Folder of the recording, or file of a bag."""
     out: Annotated[Positional[Path], arg(metavar="OUT")]
     """Output folder; created if it is missing."""
-    reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
-    name: Name = None
+    reading: Annotated[args.Reading, arg(name="")] = field(default_factory=args.Reading)
+    name: args.Name = None
     """Name of the scene. Default: the recording's own name."""
     hard_link: bool = False
     """Link image files instead of copying them; changes then affect both."""

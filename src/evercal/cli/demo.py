@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from evercal.cli import args
 from evercal.cli.console import Bars, following, progress_bar, require_folder, size
-from evercal.cli.options import Device, Folder, OutFolder, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,8 +32,8 @@ PICTURES = 3
 
 
 @dataclass(frozen=True)
-class Demo(Verb):
-    """Map three rendered rooms, localize images, calibrate cameras and detect a bump.
+class Demo(args.Verb):
+    """Map three rendered rooms, localize, calibrate, detect a bump.
 
     It takes about a minute on two cores. With --copy-samples, only copy the recordings of these
     rooms and of a robot cell.
@@ -41,11 +41,11 @@ class Demo(Verb):
     Example: evercal demo --out evercal-demo/
     """
 
-    out: OutFolder = Path("evercal-demo")
+    out: args.OutFolder = Path("evercal-demo")
     """Folder for report.html, the store and a query image."""
-    copy_samples: Folder = None
+    copy_samples: args.Folder = None
     """New or empty folder to copy the packaged recordings to, instead of running the demo."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         from evercal.recordings.samples import ROOMS, copy_samples, sample_rooms

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from evercal.cli import args
 from evercal.cli.console import progress_bar, require_writable
-from evercal.cli.options import File, OutFile, Verb, shown
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,35 +22,35 @@ _DICTIONARIES = {"chessboard": "", "charuco": "4X4_50", "apriltag": "APRILTAG_36
 
 
 @dataclass(frozen=True)
-class Detect(Verb):
-    """Detect a printed board in images and estimate its pose in each, for 'evercal solve'.
+class Detect(args.Verb):
+    """Detect a printed board in images and estimate its pose in each.
 
-    Without --camera the intrinsics are estimated from the board.
+    The poses are for 'evercal solve'. Without --camera the intrinsics are estimated from the board.
 
     Example: evercal detect images/ --board chessboard --size 9x6 --square-mm 25
     """
 
     board: Literal["chessboard", "charuco", "apriltag"]
     """Printed board."""
-    images: Annotated[Positional[tuple[Path, ...]], shown("[IMAGE...]")] = ()
+    images: Annotated[Positional[tuple[Path, ...]], args.shown("[IMAGE...]")] = ()
     """Image files of one camera, or a folder of them."""
-    size: Annotated[str | None, shown("CxR")] = None
+    size: Annotated[str | None, args.shown("CxR")] = None
     """Inner corners of a chessboard (9x6), or squares of a ChArUco board."""
-    square_mm: Annotated[float | None, shown("MM")] = None
+    square_mm: Annotated[float | None, args.shown("MM")] = None
     """Side of a square, or of the black square of a tag, millimetres."""
-    marker_mm: Annotated[float, shown("MM")] = 0.0
+    marker_mm: Annotated[float, args.shown("MM")] = 0.0
     """Side of a marker of a ChArUco board, millimetres."""
     dictionary: Annotated[
-        str | None, shown("NAME", "(default: 4X4_50, APRILTAG_36h11 for tags)")
+        str | None, args.shown("NAME", "(default: 4X4_50, APRILTAG_36h11 for tags)")
     ] = None
     """Dictionary of markers or tags, OpenCV's name without DICT_."""
-    tag: Annotated[int | None, shown("ID", "(default: any)")] = None
+    tag: Annotated[int | None, args.shown("ID", "(default: any)")] = None
     """Number of the tag."""
-    camera: File = None
+    camera: args.File = None
     """File of the intrinsics; if omitted, they are estimated from the board."""
-    out: OutFile = Path("board.json")
+    out: args.OutFile = Path("board.json")
     """File of poses and corners to write."""
-    make_board: Annotated[Path | None, shown("FILE.pdf|png")] = None
+    make_board: Annotated[Path | None, args.shown("FILE.pdf|png")] = None
     """Write the board at true size, to print; detect nothing."""
     paper: Annotated[str, arg(metavar="NAME")] = "a4"
     """Paper of --make-board: a4, letter, a3, tabloid, a2, a1 or a0."""

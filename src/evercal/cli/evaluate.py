@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
+from evercal.cli import args
 from evercal.cli.console import following, progress_bar
-from evercal.cli.options import Device, Store, Verb, open_localizer, shown
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Evaluate(Verb):
+class Evaluate(args.Verb):
     """Measure the localization accuracy on the test frames of scenes.
 
     Example: evercal evaluate cell.evercal kitchen/
     """
 
-    store: Store
-    scenes: Annotated[Positional[tuple[str, ...]], shown("[NAME=]SCENE...")]
+    store: args.Store
+    scenes: Annotated[Positional[tuple[str, ...]], args.shown("[NAME=]SCENE...")]
     """Folders of recorded scenes. NAME is the scene's name in the store, if it differs."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         if not self.scenes:
@@ -33,7 +33,7 @@ class Evaluate(Verb):
         from evercal.evaluation import evaluate, scores
         from evercal.evaluation.tables import score_table
 
-        localizer = open_localizer(self.store, self.device)
+        localizer = args.open_localizer(self.store, self.device)
         with progress_bar("evaluating", 0, "image") as bar:
             results = evaluate(localizer, scenes, on_frame=following(bar))
         summary = scores(results)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
-from evercal.cli.options import File, Frame, Name, Verb, shown
+from evercal.cli import args
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Export(Verb):
+class Export(args.Verb):
     """Write a calibration in the format of another program; `--format list` lists all formats.
 
     Without `--out` the text is printed. The pose is parent_from_child: the camera in the robot base
@@ -24,31 +24,31 @@ class Export(Verb):
     Example: evercal export tripod.json --format urdf --out camera.urdf
     """
 
-    calibration: Annotated[Positional[Path | None], shown("[CALIBRATION.json]")] = None
+    calibration: Annotated[Positional[Path | None], args.shown("[CALIBRATION.json]")] = None
     """Calibration file, or a map that was learned from gripper poses (MAP or MAP:SCENE)."""
-    format: Name = None
+    format: args.Name = None
     """Format, such as easy_handeye2, urdf, opencv or kuka; `list` lists all."""
-    out: File = None
+    out: args.File = None
     """File to write; a new folder for colmap."""
-    parent: Frame = None
+    parent: args.Frame = None
     """New name of the parent frame: the robot base or the gripper."""
-    child: Frame = None
+    child: args.Frame = None
     """New name of the child frame: the camera's optical frame."""
-    via: Frame = None
+    via: args.Frame = None
     """Export this root frame of the camera driver, such as camera_link."""
-    via_transform: File = None
+    via_transform: args.File = None
     """With --via: output of `ros2 topic echo --once /tf_static`, or a TransformStamped."""
-    via_offset: Annotated[tuple[float, float, float] | None, shown("X Y Z")] = None
+    via_offset: Annotated[tuple[float, float, float] | None, args.shown("X Y Z")] = None
     """With --via: offset of the optical frame (forward, left, up), metres."""
     via_optical: bool = False
     """With --via: both frames have the same origin."""
-    robot_frame: Frame = None
+    robot_frame: args.Frame = None
     """For easy_handeye: gripper frame of a fixed camera, else base frame."""
-    robot_poses: File = None
+    robot_poses: args.File = None
     """Gripper pose of every image: moveit_samples, or tum, colmap, nerfstudio on the arm."""
-    target_poses: File = None
+    target_poses: args.File = None
     """Board pose in the camera for every image, for moveit_samples."""
-    convention: Name = None
+    convention: args.Name = None
     """Pose convention of --robot-poses if its header does not state it: ur, kuka, fanuc, ..."""
 
     def run(self) -> int:

@@ -5,28 +5,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from evercal.cli import args
 from evercal.cli.console import size, table
-from evercal.cli.options import MAP, Store, Verb, strategy_of
 
 MEMORY_FILES = ("keyframes.safetensors", "state.safetensors")
 
 
 @dataclass(frozen=True)
-class Info(Verb):
-    """Describe a map: its scenes, its size, and what bundle adjustment changed.
+class Info(args.Verb):
+    """Describe a map: scenes, size, and what bundle adjustment changed.
 
     Example: evercal info cell.evercal
     """
 
-    store: Store
+    store: args.Store
     check: bool = False
     """Compare every file with its checksum; exit code 1 if one is damaged."""
 
     def run(self) -> int:
         if self.check:
             return self._check()
-        strategy = strategy_of(self.store)
-        if strategy in (MAP, None):
+        strategy = args.strategy_of(self.store)
+        if strategy in (args.MAP, None):
             scenes, short_side, heads, sizes = _map(self.store)
         else:
             from evercal.continual.store import describe

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.options import File, Number, Reading, Verb, shown
+from evercal.cli import args
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,22 +19,22 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Inspect(Verb):
-    """Check a recording before it is learned: frames, cameras, motion, and likely mistakes.
+class Inspect(args.Verb):
+    """Check a recording before it is learned; likely mistakes are named.
 
     Example: evercal inspect wrist_recording/ --coverage --next reachable.csv
     """
 
     scene: Annotated[Positional[Path], arg(metavar="RECORDING")]
     """Folder of the recording, or file of a bag."""
-    reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
+    reading: Annotated[args.Reading, arg(name="")] = field(default_factory=args.Reading)
     coverage: bool = False
     """Also measure every image of a wrist recording: what is covered, missing, blurred, doubled."""
-    next: Annotated[Path | None, shown("POSES", "(default: none)")] = None
+    next: Annotated[Path | None, args.shown("POSES", "(default: none)")] = None
     """Gripper poses that the robot can reach; prints those whose images would help most."""
-    count: Number = 5
+    count: args.Number = 5
     """Number of poses for --next."""
-    gripper_from_camera: File = None
+    gripper_from_camera: args.File = None
     """A rough gripper_from_camera for --coverage and --next: 4x4 matrix or calibration file.
     Without it, axes are those of the gripper."""
 

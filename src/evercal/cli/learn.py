@@ -9,21 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.cli import args
 from evercal.cli.console import Bars, require_writable, size
 from evercal.cli.networks import NetworkOptions, learn_into_networks
-from evercal.cli.options import (
-    MAP,
-    Device,
-    File,
-    Name,
-    Number,
-    Reading,
-    Store,
-    Verb,
-    option,
-    shown,
-    strategy_of,
-)
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Learn(Verb):
+class Learn(args.Verb):
     """Learn a scene from a recording; scenes learned before do not change.
 
     A recording with gripper poses and no camera poses also yields gripper_from_camera. Several
@@ -42,27 +30,27 @@ class Learn(Verb):
     Example: evercal learn cell.evercal wrist_recording/ --calibration wrist.json
     """
 
-    store: Store
-    recordings: Annotated[Positional[tuple[Path, ...]], shown("RECORDING...")] = ()
+    store: args.Store
+    recordings: Annotated[Positional[tuple[Path, ...]], args.shown("RECORDING...")] = ()
     """Folders of recordings, or files of bags."""
-    name: Name = None
+    name: args.Name = None
     """Name of the scene. Default: the recording's own name."""
-    memory: Annotated[str | None, shown("SHARE|BYTES|auto")] = None
+    memory: Annotated[str | None, args.shown("SHARE|BYTES|auto")] = None
     """Keyframes to keep: a share of the frames (10%), a size (5MB), or auto for the fewest that
     locate the recording's other frames well. Default: 10%, at least eight."""
-    calibration: File = None
+    calibration: args.File = None
     """Also write the estimated gripper_from_camera to a file. The map keeps it in any case."""
-    gripper_from_camera: File = None
+    gripper_from_camera: args.File = None
     """A rough gripper_from_camera to compare the estimate with: 4x4 matrix or calibration file."""
-    encoder: File = None
+    encoder: args.File = None
     """Encoder weights from 'python -m training', for a new map. Default: the shipped weights."""
-    strategy: Name = None
+    strategy: args.Name = None
     """evercal builds a map; every other strategy trains a network. Default: that of the store."""
-    reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
+    reading: Annotated[args.Reading, arg(name="")] = field(default_factory=args.Reading)
     networks: Annotated[NetworkOptions, arg(name="")] = field(default_factory=NetworkOptions)
-    workers: Number = 1
+    workers: args.Number = 1
     """Recordings to learn in parallel."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         if not self.recordings:
@@ -79,21 +67,21 @@ class Learn(Verb):
             MemoryBudget.parse(self.memory)
         except InputError as error:
             raise InputError(f"--{error}") from None
-        made_with = strategy_of(self.store)
-        strategy = self.strategy or made_with or MAP
+        made_with = args.strategy_of(self.store)
+        strategy = self.strategy or made_with or args.MAP
         if strategy != (made_with or strategy):
             raise InputError(
                 f"--strategy {strategy}: {self.store} was made with {made_with}; omit the option or"
                 " start a new store"
             )
-        if strategy == MAP:
+        if strategy == args.MAP:
             self.networks.refuse()
         return self._run_one(self.recordings[0], strategy) if single else self._run_many(strategy)
 
     def _run_many(self, strategy: str) -> int:
         why = "several recordings are learned; omit the option or give one recording"
         self._refuse(why, "name", "calibration", "gripper_from_camera")
-        if strategy != MAP:
+        if strategy != args.MAP:
             raise InputError("several recordings: a network learns one at a time; give one")
         from evercal.map import Map
 
@@ -136,7 +124,7 @@ class Learn(Verb):
         given = self.gripper_from_camera
         rough = None if given is None else read_transform(given)
         with self._bars(f"{recording.name}: {len(recording.train)} training frames") as bars:
-            if strategy != MAP:
+            if strategy != args.MAP:
                 return learn_into_networks(self, strategy, recording, bars)
             from evercal.map import Map
 
@@ -166,7 +154,7 @@ class Learn(Verb):
         """Refuse options that were given and do not apply."""
         for name in names:
             if (value := getattr(self, name)) is not None:
-                raise InputError(f"{option(name)} {value}: {why}")
+                raise InputError(f"{args.option(name)} {value}: {why}")
 
 
 def summary(report: "LearnReport") -> Iterator[str]:

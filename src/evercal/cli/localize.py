@@ -7,20 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from evercal.cli import args
 from evercal.cli.console import progress_bar, require_folder, require_writable
-from evercal.cli.options import (
-    At,
-    Device,
-    File,
-    Folder,
-    ImageFiles,
-    Point,
-    Store,
-    Verb,
-    camera_for,
-    open_localizer,
-    shown,
-)
 from evercal.reports.answers import Answer, answer_row, budget_of, finite_pose, unit_known
 
 if TYPE_CHECKING:
@@ -31,41 +19,41 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Localize(Verb):
-    """Estimate the camera pose of images, in the base frame of the scene they show.
+class Localize(args.Verb):
+    """Estimate the camera pose of images in the base frame.
 
     Exit code 1 if no image was located.
 
     Example: evercal localize cell.evercal image.jpg --overlay overlays/
     """
 
-    store: Store
-    images: ImageFiles
+    store: args.Store
+    images: args.ImageFiles
     """Image files or folders of them."""
-    camera: File = None
+    camera: args.File = None
     """Intrinsics: 3x3 matrix as text, JSON, YAML, NPZ, ROS camera_info or OpenCV's storage.
     Default: those of the camera that recorded the scene."""
-    overlay: Folder = None
+    overlay: args.Folder = None
     """Output folder for copies of the images with their landmarks and residuals."""
-    video: Annotated[Path | None, shown("FILE.mp4")] = None
+    video: Annotated[Path | None, args.shown("FILE.mp4")] = None
     """A video of the sequence: each image with its landmarks and residuals, beside the map seen
     from above with the camera's path and its uncertainty."""
-    at: At = None
-    device: Device = "auto"
+    at: args.At = None
+    device: args.Device = "auto"
 
     def run(self) -> int:
         from evercal.recordings.image_files import image_files
 
-        point = Point.parse(self.at)
+        point = args.Point.parse(self.at)
         files = image_files(self.images)
-        camera = camera_for(self.camera, files)
+        camera = args.camera_for(self.camera, files)
         require_folder(self.overlay, "--overlay")
         if self.video is not None:
             from evercal.reports.video import require_ending
 
             require_writable(self.video, "--video")
             require_ending(self.video)
-        localizer = open_localizer(self.store, self.device)
+        localizer = args.open_localizer(self.store, self.device)
         answers = self._answers(localizer, files, camera)  # all of them before the first is printed
         lines = [line for answer in answers for line in _lines(answer, point)]
         if self.video is not None:
@@ -128,15 +116,14 @@ def _overlay_name(files: list[Path], number: int) -> str:
     return f"{stems[number]}{again}-overlay.png"
 
 
-def _record(answer: Answer, point: Point | None) -> dict[str, object]:
+def _record(answer: Answer, point: args.Point | None) -> dict[str, object]:
     record, pose = answer_row(answer), finite_pose(answer.estimate)
     if point is not None:
-        usable = pose is not None and answer.unit_known
-        record["at"] = point.record(pose) if usable else None
+        record["at"] = point.record(pose) if pose is not None and answer.unit_known else None
     return record
 
 
-def _lines(answer: Answer, point: Point | None) -> Iterator[str]:
+def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
     estimate, pose = answer.estimate, answer.estimate.base_from_camera
     share = f"{100 * estimate.inlier_ratio:.0f} %"
     inliers = f"  inliers      {estimate.inliers} ({share}), {answer.milliseconds:.0f} ms"

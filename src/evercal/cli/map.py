@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
+from evercal.cli import args
 from evercal.cli.console import require_writable, size
-from evercal.cli.options import Store, Verb, shown
 
 if TYPE_CHECKING:
     from evercal.map import Map
@@ -17,7 +17,7 @@ Archive = Annotated[Positional[Path], arg(metavar="FILE")]
 
 
 @dataclass(frozen=True)
-class Action(Verb):
+class Action(args.Verb):
     """An action on a map."""
 
     def opened(self, store: Path) -> "Map":
@@ -43,7 +43,7 @@ class List(Action):
     Example: evercal map list cell.evercal
     """
 
-    store: Store
+    store: args.Store
 
     def run(self) -> int:
         from evercal.mapping.store import MapStore
@@ -67,8 +67,8 @@ class Remove(Action):
     Example: evercal map remove cell.evercal kitchen
     """
 
-    store: Store
-    names: Annotated[Positional[tuple[str, ...]], shown("SCENE...")]
+    store: args.Store
+    names: Annotated[Positional[tuple[str, ...]], args.shown("SCENE...")]
     """Scenes to remove."""
 
     def run(self) -> int:
@@ -84,7 +84,7 @@ class Rename(Action):
     Example: evercal map rename cell.evercal kitchen kitchen-2025
     """
 
-    store: Store
+    store: args.Store
     name: Annotated[Positional[str], arg(metavar="SCENE")]
     """Name of the scene."""
     new: Annotated[Positional[str], arg(metavar="NEW")]
@@ -105,8 +105,8 @@ class Merge(Action):
     Example: evercal map merge all.evercal cell-1.evercal cell-2.evercal
     """
 
-    store: Store
-    others: Annotated[Positional[tuple[Path, ...]], shown("OTHER...")]
+    store: args.Store
+    others: Annotated[Positional[tuple[Path, ...]], args.shown("OTHER...")]
     """Folders of the other maps; they do not change."""
     on_clash: Literal["refuse", "rename", "skip", "replace"] = "refuse"
     """For a scene whose name is taken: refuse the merge, rename it to NAME-2, skip it, or replace
@@ -131,7 +131,7 @@ class Pack(Action):
     Example: evercal map pack cell.evercal cell.zip
     """
 
-    store: Store
+    store: args.Store
     file: Archive
     """Output file; an existing one is replaced."""
 
@@ -156,7 +156,7 @@ class Unpack(Action):
 
     file: Archive
     """The archive."""
-    store: Store
+    store: args.Store
 
     def run(self) -> int:
         from evercal.mapping.manage import unpack_map
@@ -167,7 +167,7 @@ class Unpack(Action):
 
 @dataclass(frozen=True)
 class Maps:
-    """Manage the scenes of a map: list, remove, rename, merge, pack, unpack.
+    """Manage scenes of a map: list, remove, rename, merge, pack, unpack.
 
     Every change is one step: it happens completely or not at all. Every action has --json.
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from evercal.cli.options import option, shown
+from evercal.cli import args
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ class NetworkOptions:
 
     preset: Literal["fast", "demo", "bench", "converged", "paper"] = "fast"
     """Amount of training: fast takes minutes on two cores, paper needs a GPU."""
-    centres: Annotated[int | None, shown("M")] = None
+    centres: Annotated[int | None, args.shown("M")] = None
     """Cluster centres that a scene adds to the network. Default: those of the preset."""
     seed: int = 0
     """Random seed."""
@@ -29,7 +29,7 @@ class NetworkOptions:
         for field in fields(self):
             if (value := getattr(self, field.name)) != field.default:
                 raise InputError(
-                    f"{option(field.name)} {value}: a map is not trained; omit the option, or"
+                    f"{args.option(field.name)} {value}: a map is not trained; omit the option, or"
                     " choose a network with --strategy"
                 )
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
+from evercal.cli import args
 from evercal.cli.console import Bars, size
-from evercal.cli.options import Device, File, Store, Verb, camera_for, shown, stated_camera
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,23 +22,23 @@ _LISTED = 5
 
 
 @dataclass(frozen=True)
-class Refresh(Verb):
-    """Follow a changed room: new images replace what is gone, in the same memory.
+class Refresh(args.Verb):
+    """Follow a changed room: new images replace what is gone.
 
-    The images need no poses: they are located in the map. What was moved or removed leaves the map,
+    The size of the map stays. The images need no poses: they are located in the map. What was moved or removed leaves the map,
     and the base frame stays where the unmoved keyframes hold it.
 
     Example: evercal refresh cell.evercal images/
     """
 
-    store: Store
-    images: Annotated[Positional[tuple[Path, ...]], shown("[RECORDING|IMAGE...]")] = ()
+    store: args.Store
+    images: Annotated[Positional[tuple[Path, ...]], args.shown("[RECORDING|IMAGE...]")] = ()
     """Images of one camera, a folder of them, or a recording."""
-    camera: File = None
+    camera: args.File = None
     """File of the intrinsics. Default: those of the camera that recorded the scene."""
-    undo: Annotated[str | None, shown("SCENE")] = None
+    undo: Annotated[str | None, args.shown("SCENE")] = None
     """Bring back the state of a scene before its last refresh."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         if (self.undo is None) == (not self.images):
@@ -57,11 +57,11 @@ class Refresh(Verb):
         with Bars(sys.stderr if self.json else sys.stdout) as bars:
             if (recording := _recording(self.images)) is not None:
                 first = recording.train[0].camera
-                camera = stated_camera(self.camera, (first.width, first.height))
+                camera = args.stated_camera(self.camera, (first.width, first.height))
                 report = cell.refresh(recording, camera=camera, on_progress=bars.step)
             else:
                 files = image_files(self.images)
-                camera = camera_for(self.camera, files)
+                camera = args.camera_for(self.camera, files)
                 report = cell.refresh(files, camera=camera, on_progress=bars.step)
         then = ("refresh", self.store, "--undo", report.scene)
         self.answer(dataclasses.asdict(report), *_lines(report), then=then)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.cli import args
 from evercal.cli.console import progress_bar, require_writable
-from evercal.cli.options import At, Device, Point, Verb, open_localizer, shown
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
@@ -15,30 +15,30 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Report(Verb):
-    """Write an HTML report of a calibration: verdict, uncertainty, residuals and overlays.
+class Report(args.Verb):
+    """Write an HTML report of a calibration: residuals and overlays.
 
     Example: evercal report tripod.json --store cell.evercal
     """
 
     calibration: Annotated[Positional[Path], arg(metavar="CALIBRATION.json")]
     """Calibration file, or a map that was learned from gripper poses (MAP or MAP:SCENE)."""
-    store: Annotated[Path | None, shown("MAP")] = None
+    store: Annotated[Path | None, args.shown("MAP")] = None
     """Folder of the map. Its landmarks are drawn with their residuals."""
     images: Annotated[
-        tuple[Path, ...], shown("IMAGE...", "(default: those of the calibration)")
+        tuple[Path, ...], args.shown("IMAGE...", "(default: those of the calibration)")
     ] = ()
     """Images of the camera, or a folder of them."""
-    against: Annotated[Path | None, shown("OLD.json")] = None
+    against: Annotated[Path | None, args.shown("OLD.json")] = None
     """Older calibration of the same camera, to compare with."""
-    at: At = None
+    at: args.At = None
     out: Annotated[Path, arg(metavar="FILE.html")] = Path("report.html")
     """The report, one file including its pictures."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         require_writable(self.out, "--out")
-        point = Point.parse(self.at)
+        point = args.Point.parse(self.at)
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.learned import calibration_at
         from evercal.calibration.verdict import expected_error, tier, verdict
@@ -95,7 +95,7 @@ class Report(Verb):
         if calibration.camera is None:
             return annotate_images(calibration, [])
         files, reason = select_images(calibration, self.calibration.parent, given)
-        localizer = None if self.store is None else open_localizer(self.store, self.device)
+        localizer = None if self.store is None else args.open_localizer(self.store, self.device)
         with progress_bar("drawing", len(files), "image") as bar:
             drawn = annotate_images(calibration, files, older, localizer, boards, bar.update)
         return drawn if files else replace(drawn, missing=(reason,))

@@ -3,14 +3,14 @@
 import os
 from dataclasses import dataclass
 
-from evercal.cli.options import Device, Host, Name, Port, Store, Verb
+from evercal.cli import args
 from evercal.errors import missing_extra
 
 TOKEN = "EVERCAL_TOKEN"
 
 
 @dataclass(frozen=True)
-class Serve(Verb):
+class Serve(args.Verb):
     """Serve a map over HTTP: localize, calibrate, check, track; see /docs of the service.
 
     It answers this machine only, unless --host names another address, which requires a token. The
@@ -20,13 +20,13 @@ class Serve(Verb):
     Example: evercal serve cell.evercal --port 8000
     """
 
-    store: Store
-    port: Port = 8000
-    host: Host = "127.0.0.1"
-    token: Name = None
+    store: args.Store
+    port: args.Port = 8000
+    host: args.Host = "127.0.0.1"
+    token: args.Name = None
     """Requests must have it as bearer token. Default: the variable EVERCAL_TOKEN, which other users
     of the machine cannot read."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         try:

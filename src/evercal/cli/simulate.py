@@ -8,14 +8,14 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from evercal.cli import args
 from evercal.cli.console import progress_bar
-from evercal.cli.options import Count, Verb, shown
 from evercal.errors import InputError
 
 
 @dataclass(frozen=True)
-class Simulate(Verb):
-    """Record a virtual robot cell: a wrist camera, a fixed camera, and the truth.
+class Simulate(args.Verb):
+    """Record a virtual robot cell: wrist camera, fixed camera, truth.
 
     Example: evercal simulate cell --out cell/
     """
@@ -24,13 +24,13 @@ class Simulate(Verb):
     """What is simulated: cell. Furnished rooms are rendered by 'python -m rooms' in a checkout."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Output folder, which is new or empty."""
-    frames: Count = None
+    frames: args.Count = None
     """Images of the wrist camera. Default: 25."""
-    size: Annotated[str | None, shown("WxH")] = None
+    size: Annotated[str | None, args.shown("WxH")] = None
     """Image size in pixels. Default: 640x480."""
     seed: int = 0
     """Seed of the cell, the motion and the noise."""
-    noise: Annotated[float | None, shown("SHARE")] = None
+    noise: Annotated[float | None, args.shown("SHARE")] = None
     """Sensor noise as a fraction of full scale. Default: 0.008."""
 
     def run(self) -> int:

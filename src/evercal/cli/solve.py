@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
+from evercal.cli import args
 from evercal.cli.calibrate import calibration_lines
 from evercal.cli.console import require_writable
-from evercal.cli.options import Name, OutFile, Verb, shown
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
@@ -20,8 +20,8 @@ _BY_IMAGE = ("camera_from_board", "leave_one_out_mm", "information_percent")
 
 
 @dataclass(frozen=True)
-class Solve(Verb):
-    """Calibrate a camera on the gripper or beside the robot from pairs of poses.
+class Solve(args.Verb):
+    """Calibrate a camera on or beside the robot from pairs of poses.
 
     Both unknown transforms are estimated jointly, robust to outliers, with their uncertainty.
 
@@ -38,13 +38,15 @@ class Solve(Verb):
     """unknown: estimate the scale of the camera poses, for structure from motion."""
     time_offset: bool = False
     """Estimate the offset between the clocks of robot and camera; both files need times."""
-    robot_convention: Name = None
+    robot_convention: args.Name = None
     """Pose convention of robot poses without a header: ur, kuka, xyzw:mm, ..."""
-    camera_convention: Name = None
+    camera_convention: args.Name = None
     """Pose convention of camera poses without a header."""
-    invert: Annotated[Literal["robot", "camera", "both"] | None, shown("robot|camera|both")] = None
+    invert: Annotated[
+        Literal["robot", "camera", "both"] | None, args.shown("robot|camera|both")
+    ] = None
     """Invert the poses of a file: robot, camera or both."""
-    out: OutFile = Path("calibration.json")
+    out: args.OutFile = Path("calibration.json")
     """Calibration file to write."""
 
     def run(self) -> int:

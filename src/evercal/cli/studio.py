@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.options import Device, File, Name, OutFolder, Source, option, shown
+from evercal.cli import args
 from evercal.cli.view import Page
 from evercal.errors import InputError
 
@@ -19,7 +19,7 @@ _REAL = "camera intrinsics poses pose_convention most_age reachable gripper_from
 
 @dataclass(frozen=True)
 class Studio(Page):
-    """Calibrate a wrist camera and a fixed camera in the browser, step by step.
+    """Calibrate wrist and fixed camera in the browser, step by step.
 
     Everything is written to --out as it is made; the same command continues there. With --virtual,
     a virtual arm with two cameras stands in for yours.
@@ -27,34 +27,34 @@ class Studio(Page):
     Example: evercal studio --camera 0 --intrinsics camera.json --poses poses.csv
     """
 
-    map: Annotated[Positional[Path | None], shown("[MAP]")] = None
+    map: Annotated[Positional[Path | None], args.shown("[MAP]")] = None
     """Folder of the map that learns the scene. Default: a new one in --out."""
-    camera: Source = None
+    camera: args.Source = None
     """Camera on the gripper: number (0) or device, address (rtsp://...), video or folder."""
-    intrinsics: File = None
+    intrinsics: args.File = None
     """Intrinsics of --camera. Default: those in --out, where it was begun before."""
-    poses: File = None
+    poses: args.File = None
     """Gripper poses: a table or JSON lines that your robot's program appends to."""
-    pose_convention: Name = None
+    pose_convention: args.Name = None
     """Convention of --poses if its header does not state it: ur, kuka, fanuc, ..."""
-    most_age: Annotated[float | None, shown("S")] = None
+    most_age: Annotated[float | None, args.shown("S")] = None
     """Refuse the last pose of --poses if the file was written more seconds ago. Default: any age,
     for programs that write only when the arm has moved."""
-    reachable: File = None
+    reachable: args.File = None
     """Gripper poses that the robot can reach, for the next best views. Default: near others."""
-    gripper_from_camera: File = None
+    gripper_from_camera: args.File = None
     """A rough gripper_from_camera for the drawing and the next views: 4x4 matrix or calibration."""
-    fixed: Source = None
+    fixed: args.Source = None
     """The fixed camera; sources as for --camera."""
-    fixed_intrinsics: File = None
+    fixed_intrinsics: args.File = None
     """Intrinsics of --fixed. Default: those of the camera on the gripper."""
     virtual: bool = False
     """A virtual arm with a wrist camera and a tripod camera instead of yours."""
     seed: Annotated[int, arg(metavar="I")] = 0
     """Seed of the virtual cell."""
-    out: OutFolder = Path("studio")
+    out: args.OutFolder = Path("studio")
     """Folder of the recording, images, calibrations, reports and exports."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         self._refuse()
@@ -75,7 +75,7 @@ class Studio(Page):
         given = [name for name in _REAL.split() if getattr(self, name) is not None]
         if self.virtual and given:
             raise InputError(
-                f"{option(given[0])}: the virtual cell has its own; omit it or --virtual"
+                f"{args.option(given[0])}: the virtual cell has its own; omit it or --virtual"
             )
         if not self.virtual and (self.camera is None or self.poses is None):
             missing = "--camera SOURCE" if self.camera is None else "--poses FILE"

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.cli import args
 from evercal.cli.console import require_writable
-from evercal.cli.options import Count, Device, File, Store, Verb, open_map, shown, stated_camera
 from evercal.errors import InputError
 from evercal.reports.answers import unit_known
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Track(Verb):
-    """Locate the frames of a camera, a video or a folder one after another.
+class Track(args.Verb):
+    """Locate the frames of a camera, video or folder one after another.
 
     The last pose is the prior of the next one: a tracked frame takes less than half the time of a
     single image. Exit code 1 if no frame was located.
@@ -27,22 +27,22 @@ class Track(Verb):
     Example: evercal track cell.evercal video.mp4 --out track.tum
     """
 
-    store: Store
+    store: args.Store
     source: Annotated[Positional[str], arg(metavar="SOURCE")]
     """Number (0) or device of a camera, an address (rtsp://...), a video file or a folder."""
-    out: Annotated[tuple[Path, ...], shown("FILE...", "(default: none)")] = ()
+    out: Annotated[tuple[Path, ...], args.shown("FILE...", "(default: none)")] = ()
     """Files to write: .jsonl (JSON lines), .tum or .txt (TUM)."""
-    camera: File = None
+    camera: args.File = None
     """Intrinsics. Default: those of the camera that recorded the scene."""
-    at_most: Annotated[float | None, shown("MS")] = None
+    at_most: Annotated[float | None, args.shown("MS")] = None
     """Time for a frame, milliseconds. What was left out is in the answer (`omitted`)."""
     smooth: Annotated[float, arg(metavar="SECONDS")] = 0.0
     """Time constant of smoothed poses; 0 writes measurements. A jump is followed at once."""
     rate: Annotated[float, arg(metavar="HZ")] = 15.0
     """Frames per second of a folder without times in its file names."""
-    most: Count = None
+    most: args.Count = None
     """Stop after so many frames."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         if self.rate <= 0 or self.smooth < 0 or (self.at_most is not None and self.at_most <= 0):
@@ -53,7 +53,7 @@ class Track(Verb):
         from evercal.recordings.streams import stream
         from evercal.reports.track_files import TrackFile, track_row
 
-        frames, localizer = stream(self.source, self.rate), open_map(self.store, self.device)
+        frames, localizer = stream(self.source, self.rate), args.open_map(self.store, self.device)
         options = TrackOptions(
             fallback_s=1 / self.rate, at_most_ms=self.at_most, smooth=self.smooth
         )
@@ -65,7 +65,7 @@ class Track(Verb):
             try:
                 for name, stamp, image in frames:
                     if tracker is None:
-                        camera = stated_camera(self.camera, (image.shape[1], image.shape[0]))
+                        camera = args.stated_camera(self.camera, (image.shape[1], image.shape[0]))
                         tracker = Tracker(localizer, camera, options)
                     frame = tracker.track(image, stamp)
                     states[frame.state] += 1

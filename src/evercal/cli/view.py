@@ -12,17 +12,17 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from evercal.cli.options import Device, File, Host, Port, Source, Store, Verb, open_map, shown
+from evercal.cli import args
 from evercal.errors import InputError, missing_extra
 from evercal.service.hosts import is_local
 
 
 @dataclass(frozen=True, kw_only=True)
-class Page(Verb):
+class Page(args.Verb):
     """A verb that serves a page until Ctrl-C or SIGTERM."""
 
-    host: Host = "127.0.0.1"
-    port: Port = 8080
+    host: args.Host = "127.0.0.1"
+    port: args.Port = 8080
 
     def prepare(self, danger: str) -> None:
         """Require the extra `view`, and warn if other machines can open the page."""
@@ -44,7 +44,7 @@ class Page(Verb):
 
 @dataclass(frozen=True)
 class View(Page):
-    """Show a map in 3D in the browser, with calibrations, the arm, and a tracked camera.
+    """Show a map, calibrations, arm and tracked camera in the browser.
 
     It is stopped by Ctrl-C or SIGTERM. The page has no password and is served on 127.0.0.1, unless
     --host names another address.
@@ -52,18 +52,18 @@ class View(Page):
     Example: evercal view cell.evercal tripod.json --live 0
     """
 
-    store: Store
+    store: args.Store
     calibrations: Annotated[
-        Positional[tuple[Path, ...]], shown("[CALIBRATION.json...]", "(default: none)")
+        Positional[tuple[Path, ...]], args.shown("[CALIBRATION.json...]", "(default: none)")
     ] = ()
     """Calibration files to draw."""
-    live: Source = None
+    live: args.Source = None
     """Camera to track: its number (0) or device, an address (rtsp://...), a video or a folder."""
-    camera: File = None
+    camera: args.File = None
     """Intrinsics of the live camera. Default: those of the camera that recorded the scene."""
-    urdf: File = None
+    urdf: args.File = None
     """Robot description of the arm; its base link is at the robot base."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         if self.camera is not None and self.live is None:
@@ -72,7 +72,9 @@ class View(Page):
         from evercal.service.viewer.page import Page as ViewerPage
 
         address = (self.host, self.port)
-        page = ViewerPage(open_map(self.store, self.device), self.calibrations, self.urdf, address)
+        page = ViewerPage(
+            args.open_map(self.store, self.device), self.calibrations, self.urdf, address
+        )
         try:
             if self.live is not None:
                 page.track(self.live, self.camera)
