@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evercal.cli.reading import Reading
+from evercal.cli.args import Reading
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings import FORMATS, ReadOptions, generic, load_recording, write_image
 
@@ -67,7 +67,7 @@ def test_next_command_repeats_the_reading_options(run: Any, wave: Path) -> None:
     assert "gripper moved in 0.20 x 0.00 x 0.00 m" in ran.out
     assert "note: images and poses were paired in order" in ran.out
     last = ran.out.splitlines()[-1]
-    assert last == f"next: evercal learn STORE {wave} --camera {camera} --every 2"
+    assert last == f"next: evercal learn MAP {wave} --camera {camera} --every 2"
 
 
 def test_options_are_those_of_load_recording(run: Any) -> None:

@@ -64,7 +64,7 @@ def test_printed_and_written_text_are_equal(run: Any, make: Any, tmp_path: Path,
     assert wrote == f"wrote {out}"
     assert meaning.strip() == "pose of camera in base: takes points from camera to base"
     assert verdict.strip() == "good"
-    assert following.startswith("next: evercal check STORE IMAGE --reference")
+    assert following.startswith("next: evercal check MAP IMAGE --reference")
     record = json.loads(run("export", file, "--format", name, "--json").out)
     assert record["text"] == printed.out
     assert record["translation_m"] == POSE.translation_m.tolist()

@@ -17,7 +17,7 @@ def test_sound_recording_has_no_warnings(run: Any, rooms: Any) -> None:
     assert record["warnings"] == []
     text = run("inspect", rooms[0]).out
     assert "24 training and 6 test frames" in text
-    assert text.splitlines()[-1] == f"next: evercal learn STORE {rooms[0]}"
+    assert text.splitlines()[-1] == f"next: evercal learn MAP {rooms[0]}"
 
 
 def test_frames_in_both_splits_are_a_warning(rooms: Any) -> None:

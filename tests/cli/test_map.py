@@ -30,7 +30,7 @@ def test_a_map_is_packed_unpacked_merged_renamed_and_emptied(
     assert ran.out.startswith("hall: 7 keyframes, ")
     ran = run("map", "pack", copy, tmp_path / "hall.zip")
     assert (ran.code, ran.err) == (0, [])
-    assert ran.out.splitlines()[-1] == f"next: evercal map unpack {tmp_path / 'hall.zip'} STORE"
+    assert ran.out.splitlines()[-1] == f"next: evercal map unpack {tmp_path / 'hall.zip'} MAP"
     record = json.loads(run("map", "pack", copy, tmp_path / "hall.zip", "--json").out)
     assert record["bytes"] == (tmp_path / "hall.zip").stat().st_size
     two = tmp_path / "two"

@@ -57,7 +57,7 @@ class Calibrate(args.Verb):
         from evercal.recordings.image_files import image_files
 
         if folders:
-            return self._rig(args.open_map(self.store, self.device), folders, point)
+            return self._rig(folders, point)
         given = self._given(image_files(self.images))
         calibration = self._calibrated(args.open_map(self.store, self.device), given)
         calibration.write(self.out)
@@ -96,12 +96,11 @@ class Calibrate(args.Verb):
             calibration = calibrate(localizer, given, self.mount, on_image=bar.update)
         return replace(calibration, source={**calibration.source, "store": str(self.store)})
 
-    def _rig(
-        self, localizer: "Localizer", folders: dict[str, Path], point: args.Point | None
-    ) -> int:
+    def _rig(self, folders: dict[str, Path], point: args.Point | None) -> int:
         from evercal.calibration.rig import rig_of
         from evercal.recordings.image_files import image_files
 
+        localizer = args.open_map(self.store, self.device)
         cameras = {
             name: self._calibrated(localizer, self._given(image_files([folder])))
             for name, folder in folders.items()

@@ -25,8 +25,8 @@ _LISTED = 5
 class Refresh(args.Verb):
     """Follow a changed room: new images replace what is gone.
 
-    The size of the map stays. The images need no poses: they are located in the map. What was moved or removed leaves the map,
-    and the base frame stays where the unmoved keyframes hold it.
+    The map keeps its size. The images need no poses: they are located in the map. What was moved or
+    removed leaves it, and the base frame stays where the unmoved keyframes hold it.
 
     Example: evercal refresh cell.evercal images/
     """

@@ -54,5 +54,5 @@ class Simulate(args.Verb):
         seconds = time.perf_counter() - began
         parts = {name: str(self.out / name) for name in ("wrist", "tripod", "truth.json")}
         record = {"scenes": [parts["wrist"]], **parts, "frames": bar.n, "seconds": seconds}
-        self.answer(record, then=("learn", "STORE", self.out / "wrist"))
+        self.answer(record, then=("learn", "MAP", self.out / "wrist"))
         return 0
