@@ -80,12 +80,6 @@ def test_unusable_input_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_folder_without_results_is_refused(run: Any, tmp_path: Path) -> None:
-    ran = run("bench", tmp_path)
-    assert ran.code == 2
-    assert "no results here" in ran.err[0]
-
-
 def test_held_out_frames_are_training_frames(
     run: Any, small: None, arcs: tuple[Recording, Recording], tmp_path: Path
 ) -> None:

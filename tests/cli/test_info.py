@@ -5,8 +5,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 MAP_KEYS = {"name", "train_frames", "memory_bytes", "keyframes", "camera", "landmarks"}
 MAP_KEYS |= {"min_support", "adjusted", "hand_eye"}
 
@@ -65,11 +63,3 @@ def test_damaged_files_are_named(run: Any, store: Path, tmp_path: Path) -> None:
     for words in (["info", copy], ["learn", copy, tmp_path], ["evaluate", copy, tmp_path]):
         ran = run(*words)
         assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-
-
-@pytest.mark.parametrize("verb", [["info"], ["info", "--check"]])
-def test_other_folders_are_refused(run: Any, tmp_path: Path, verb: list[str]) -> None:
-    for path in (tmp_path, tmp_path / "nowhere"):
-        ran = run(*verb, path)
-        assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-        assert json.loads(run(*verb, path, "--json").out).keys() == {"error"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 import signal
@@ -137,32 +136,36 @@ def test_bad_options_are_one_line_and_leave_the_store(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--calibration", "missing/c.json"], "--calibration missing/c.json: folder"),
-        (["--strategy", "joint"], "does not train a network scene by scene"),
-        (["--strategy", "nonsense"], "finetune"),
-        (["--strategy", "finetune", "--centres", "0"], "--centres 0: give a number >= 1"),
-        (["--strategy", "finetune", "--seed", "-1"], "--seed -1: give a number >= 0"),
-        (["--centres", "5"], "--centres 5: a map is not trained"),
+        (["--strategy", "evercal"], "was made with finetune"),
+        (["--strategy", "er"], "was made with finetune"),
+        (["--centres", "7"], "was made with 5"),
+        (["--centres", "0"], "--centres 0: give a number >= 1"),
+        (["--seed", "-1"], "--seed -1: give a number >= 0"),
+        (["--memory", "auto"], "memory auto"),
+        (["--name", "box-room-41"], "a scene of this name exists"),
     ],
 )
-def test_bad_options_of_a_new_store_write_nothing(
-    run: Any, wrist: Path, rooms: Any, tmp_path: Path, options: list[str], message: str
+def test_bad_options_leave_the_networks(
+    run: Any, network_store: Path, rooms: Any, snapshot: Any, options: list[str], message: str
 ) -> None:
-    recording = wrist if "--calibration" in options else rooms[0]
-    ran = run("learn", tmp_path / "s", recording, *options)
+    before = snapshot(network_store)
+    ran = run("learn", network_store, rooms[1], *options)
+    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
+    assert message in ran.err[0]
+    assert snapshot(network_store) == before
+
+
+@pytest.mark.parametrize(
+    ("strategy", "message"),
+    [("joint", "does not train a network scene by scene"), ("nonsense", "finetune")],
+)
+def test_strategies_that_cannot_grow_a_store_are_refused(
+    run: Any, rooms: Any, tmp_path: Path, strategy: str, message: str
+) -> None:
+    ran = run("learn", tmp_path / "new", rooms[0], "--strategy", strategy)
     assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
     assert message in ran.err[0]
     assert not list(tmp_path.iterdir())
-
-
-def test_a_network_keeps_its_number_of_centres(
-    run: Any, network_store: Path, rooms: Any, snapshot: Any
-) -> None:
-    before = snapshot(network_store)
-    ran = run("learn", network_store, rooms[1], "--centres", "7")
-    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-    assert "was made with 5" in ran.err[0]
-    assert snapshot(network_store) == before
 
 
 def damaged(kind: str, room: Path, folder: Path) -> Path:
@@ -225,9 +228,3 @@ def test_other_folders_are_not_overwritten(
     assert snapshot(tmp_path / "home") == {"letter.txt": b"dear"}
     (tmp_path / "file").write_text("x")
     assert run("learn", tmp_path / "file", rooms[0]).code == 2
-
-
-def test_json_fields_are_those_of_the_report() -> None:
-    from evercal.learning.scene import LearnReport
-
-    assert {field.name for field in dataclasses.fields(LearnReport)} == KEYS

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import urllib.request
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -32,41 +31,3 @@ def test_it_prints_the_address_and_ends_cleanly(hall_store: Path) -> None:
             assert (process.stdout.read(), process.stderr.read()) == ("", "")
         finally:
             process.kill()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--port", "99999"], "--port 99999: give 0 to 65535"),
-        (["gone.json"], "gone.json: calibration file is missing"),
-        (["--camera", "c.json"], "--camera: is that of --live, which is missing"),
-        (["--live", "gone.mp4"], "gone.mp4: no such folder or video"),
-    ],
-)
-def test_misuse_is_one_line(run: Any, hall_store: Path, words: list[str], message: str) -> None:
-    ran = run("view", hall_store, *words)
-    assert (ran.code, ran.out) == (2, "")
-    assert len(ran.err) == 1
-    assert ran.err[0].startswith(f"error: {message}")
-
-
-def test_another_folder_is_refused(run: Any, still_images: Path) -> None:
-    ran = run("view", still_images, "--port", "0")
-    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-    assert "no manifest.json in it, so it is not a store" in ran.err[0]
-
-
-def test_networks_are_refused(run: Any, network_store: Path) -> None:
-    ran = run("view", network_store, "--port", "0")
-    assert (ran.code, len(ran.err)) == (2, 1)
-    assert "holds networks of strategy finetune, and this needs a map" in ran.err[0]
-
-
-def test_a_missing_package_is_named(
-    run: Any, hall_store: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "viser", None)
-    ran = run("view", hall_store)
-    assert (ran.code, len(ran.err)) == (2, 1)
-    assert ran.err[0].startswith("error: the page needs viser; in the checkout of evercal, run: ")
-    assert ran.err[0].endswith("-c constraints.txt '.[view]'")
