@@ -19,24 +19,9 @@ from evercal.service.client import Client
 
 
 def started(store: Path, *words: str, **variables: str) -> tuple[subprocess.Popen[str], str]:
-    command = [
-        sys.executable,
-        "-m",
-        "evercal",
-        "serve",
-        str(store),
-        "--port",
-        "0",
-        "--json",
-        *words,
-    ]
-    process = subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, **variables},
-    )
+    serve = [sys.executable, "-m", "evercal", "serve", str(store), "--port", "0", "--json", *words]
+    pipe, env = subprocess.PIPE, {**os.environ, **variables}
+    process = subprocess.Popen(serve, stdout=pipe, stderr=pipe, text=True, env=env)
     assert process.stdout is not None
     record = json.loads(process.stdout.readline())
     assert record["store"] == str(store)

@@ -1,4 +1,4 @@
-"""`evercal view` in a process of its own: its line, its refusals, its end."""
+"""`evercal view` and `evercal studio` in processes of their own: the page, the line, the end."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ import pytest
 pytest.importorskip("viser")
 
 
-def test_it_prints_the_address_and_ends_cleanly(hall_store: Path) -> None:
-    command = [sys.executable, "-m", "evercal", "view", str(hall_store), "--port", "0", "--json"]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
+@pytest.mark.parametrize("verb", ["view", "studio"])
+def test_it_serves_a_page_and_ends_cleanly(verb: str, hall_store: Path, tmp_path: Path) -> None:
+    words = {"view": [hall_store], "studio": ["--virtual", "--out", tmp_path / "s"]}[verb]
+    command = [sys.executable, "-m", "evercal", verb, *map(str, words), "--port", "0", "--json"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
         try:
             assert process.stdout is not None
             assert process.stderr is not None
@@ -31,3 +32,4 @@ def test_it_prints_the_address_and_ends_cleanly(hall_store: Path) -> None:
             assert (process.stdout.read(), process.stderr.read()) == ("", "")
         finally:
             process.kill()
+    assert verb == "view" or (tmp_path / "s/wrist/camera.json").is_file()
