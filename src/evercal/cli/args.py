@@ -14,7 +14,7 @@ from evercal.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from evercal.geometry import Camera, UncertainPose
+    from evercal.geometry import SE3, Camera, UncertainPose
     from evercal.localization.learned import LearnedLocalizer
     from evercal.localization.localizer import Localizer
     from evercal.recordings import Recording
@@ -150,6 +150,13 @@ def stated_camera(file: Path | None, size: tuple[int, int]) -> "Camera | None":
     from evercal.recordings.poses.camera_file import read_camera
 
     return None if file is None else read_camera(file, size)
+
+
+def transform_of(file: Path | None) -> "SE3 | None":
+    """The transform in a file of --gripper-from-camera or --calibration."""
+    from evercal.calibration.calibration import read_transform
+
+    return None if file is None else read_transform(file)
 
 
 def strategy_of(store: Path) -> str | None:

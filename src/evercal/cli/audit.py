@@ -39,9 +39,8 @@ class Audit(args.Verb):
         if self.images < 1 or self.most_mm <= 0 or self.most_deg <= 0:
             raise InputError("--images is at least 1, --most-mm and --most-deg are above 0")
         from evercal.calibration.audit import AuditOptions, audit, episode_folders
-        from evercal.calibration.calibration import read_transform
 
-        stated = None if self.calibration is None else read_transform(self.calibration)
+        stated = args.transform_of(self.calibration)
         total = len(episode_folders(self.folder))
         localizer = args.open_map(self.store, self.device)
         options = AuditOptions(self.images, self.most_mm, self.most_deg)

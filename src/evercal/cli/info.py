@@ -50,7 +50,7 @@ class Info(args.Verb):
             f"{self.store}: {count}, strategy {strategy}, images at {short_side} px",
             f"{size(total)} in all: keyframes {size(memory)}, {network}the rest is the encoder",
             *table([_content(scene) for scene in scenes]),
-            *table([_adjusted(scene) for scene in scenes if scene.get("adjusted")]),
+            *table([adjusted_row(s["name"], s["adjusted"]) for s in scenes if s.get("adjusted")]),
             then=("info", self.store, "--check"),
         )
         return 0
@@ -103,9 +103,8 @@ def _content(scene: dict[str, Any]) -> dict[str, object]:
     }
 
 
-def _adjusted(scene: dict[str, Any]) -> dict[str, object]:
+def adjusted_row(scene: str, adjusted: dict[str, Any]) -> dict[str, object]:
     """Changes by bundle adjustment."""
-    adjusted = scene["adjusted"]
     shift, rotation = (
         sum(x * x for x in adjusted[key]) ** 0.5
         for key in ("common_translation_mm", "common_rotation_deg")
@@ -113,7 +112,7 @@ def _adjusted(scene: dict[str, Any]) -> dict[str, object]:
     residual = adjusted["residual_px"]
     sigma = f"{adjusted['pose_sigma_mm']:.2f} mm, {adjusted['pose_sigma_deg']:.3f} deg"
     return {
-        "bundle adjustment": scene["name"],
+        "bundle adjustment": scene,
         "median residual": "-" if residual is None else f"{residual:.2f} px",
         "error of stated poses": sigma,
         "common transform": f"{shift:.2f} mm, {rotation:.3f} deg",

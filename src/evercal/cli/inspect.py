@@ -51,7 +51,6 @@ class Inspect(args.Verb):
 
     def _advise(self, recording: "Recording", record: dict[str, object], lines: list[str]) -> None:
         """Add coverage and next poses, as far as asked for."""
-        from evercal.calibration.calibration import read_transform
         from evercal.geometry import SE3
         from evercal.live.coverage import Sample, coverage
 
@@ -61,8 +60,7 @@ class Inspect(args.Verb):
             raise InputError(
                 f"{self.scene}: states no gripper poses; --coverage and --next need them"
             )
-        given = self.gripper_from_camera
-        rough = None if given is None else read_transform(given)
+        rough = args.transform_of(self.gripper_from_camera)
         if self.coverage:
             covered = coverage([Sample.of(frame) for frame in frames], rough)
             record["coverage"] = asdict(covered)

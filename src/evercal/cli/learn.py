@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 
 from evercal.cli import args
 from evercal.cli.console import Bars, require_writable, size
+from evercal.cli.info import adjusted_row
 from evercal.cli.networks import NetworkOptions, learn_into_networks
 from evercal.errors import InputError
 
@@ -119,10 +120,7 @@ class Learn(args.Verb):
         return 0
 
     def _learned(self, recording: "Recording", strategy: str) -> "LearnReport":
-        from evercal.calibration.calibration import read_transform
-
-        given = self.gripper_from_camera
-        rough = None if given is None else read_transform(given)
+        rough = args.transform_of(self.gripper_from_camera)
         with self._bars(f"{recording.name}: {len(recording.train)} training frames") as bars:
             if strategy != args.MAP:
                 return learn_into_networks(self, strategy, recording, bars)
@@ -185,21 +183,14 @@ def summary(report: "LearnReport") -> Iterator[str]:
             far = f"{found.given_mm:.1f} mm and {found.given_deg:.1f} deg"
             yield f"distance from the given one: {far}"
     if report.adjusted is not None:
-        yield from _adjusted_lines(report.adjusted)
+        row = adjusted_row(report.scene, dataclasses.asdict(report.adjusted))
+        yield "; ".join(f"{what} {value}" for what, value in row.items())
+        yield from _warnings(report.adjusted)
 
 
-def _adjusted_lines(adjusted: "Adjusted") -> Iterator[str]:
+def _warnings(adjusted: "Adjusted") -> Iterator[str]:
     from evercal.calibration.eye_in_hand import MOST_FOCAL_PERCENT
 
-    shift = sum(x * x for x in adjusted.common_translation_mm) ** 0.5
-    rotation = sum(x * x for x in adjusted.common_rotation_deg) ** 0.5
-    residual = "-" if adjusted.residual_px is None else f"{adjusted.residual_px:.2f} px"
-    yield (
-        f"bundle adjustment: median residual {residual}; stated poses accurate to"
-        f" {adjusted.pose_sigma_mm:.1f} mm and {adjusted.pose_sigma_deg:.2f} deg per axis; common"
-        f" offset {shift:.1f} mm and {rotation:.2f} deg; focal length"
-        f" {adjusted.focal_percent:+.2f} %"
-    )
     if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
         yield (
             "warning: images and stated poses ask for a focal length"

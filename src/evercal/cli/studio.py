@@ -105,7 +105,6 @@ class Studio(Page):
 
     def _real(self) -> "Devices":
         """The cameras and the pose file that were named."""
-        from evercal.calibration.calibration import read_transform
         from evercal.live.camera import StreamCamera
         from evercal.live.robot import PoseFileRobot
         from evercal.recordings import read_robot_poses
@@ -116,7 +115,7 @@ class Studio(Page):
         assert self.camera is not None, "checked before"
         assert self.poses is not None, "checked before"
         convention, fixed = self.pose_convention, self.fixed
-        rough, fixed_intrinsics = self.gripper_from_camera, self.fixed_intrinsics
+        fixed_intrinsics = self.fixed_intrinsics
         wrist_camera = StreamCamera(self.camera)
         before = self.out / "wrist" / "camera.json"
         intrinsics = self.intrinsics or (before if before.is_file() else None)
@@ -133,6 +132,6 @@ class Studio(Page):
             fixed_camera=None if fixed is None else StreamCamera(fixed),
             fixed_intrinsics=fixed_intrinsics and read_camera(fixed_intrinsics),
             reachable=reachable,
-            rough=rough and read_transform(rough),
+            rough=args.transform_of(self.gripper_from_camera),
             live=is_live(self.camera) and (fixed is None or is_live(fixed)),
         )
