@@ -118,7 +118,7 @@ REFUSED = {
     "serve MAP --host 0.0.0.0": "--host 0.0.0.0: other machines could use the map; give --token",
     "serve MAP --token short": "--token: give at least 16 ASCII characters",
     "serve MAP --port 99999": "--port 99999: give 0 to 65535",
-    "serve empty --port 0": "is not an evercal store",
+    "serve images --port 0": "is not an evercal store",
     "simulate cell --out x --size 640": "640x480",
     "simulate cell --out x --size 20x20": "at least 64x64",
     "simulate cell --out x --frames 0": "at least 1",
