@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -106,36 +105,3 @@ def test_audit_names_the_episode_with_a_wrong_pose(
     assert verdicts == ["right", "wrong"]
     text = run("audit", hall_store, tmp_path).out
     assert text.endswith("1 of 2 episodes state a wrong camera pose\n")
-
-
-def test_align_by_points_picked_in_images_beside_the_picks_file(
-    run: Any, hall_store: Path, hall: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Points in front of two cameras, moved by a known transform, restore the transform."""
-    copy = Path(shutil.copytree(hall_store, tmp_path / "map"))
-    frames, folder = hall.test[2:12:3], tmp_path / "picks" / "images"
-    folder.mkdir(parents=True)
-    base_from_map = SE3.exp([0.1, -0.2, 0.05, 0.0, 0.0, 0.3])
-    rng, rows = np.random.default_rng(0), ["image,name,u,v"]
-    center = truth_of(frames[1])
-    points = center.apply(rng.uniform([-0.5, -0.4, 2.0], [0.5, 0.4, 3.0], (6, 3)))
-    for i, frame in enumerate(frames):
-        write_image(folder / f"{i}.png", frame.read_image())
-        pixels = frame.camera.project(truth_of(frame).inverse().apply(points))
-        rows += [f"images/{i}.png,p{j},{u},{v}" for j, (u, v) in enumerate(pixels)]
-    (tmp_path / "picks" / "picks.csv").write_text("\n".join(rows))
-    touched = base_from_map.apply(points)
-    lines = [f"p{j},{x},{y},{z}" for j, (x, y, z) in enumerate(touched)]
-    (tmp_path / "points.csv").write_text("\n".join(["name,x,y,z", *lines]))
-    monkeypatch.chdir(tmp_path)  # not the folder of the picks
-    words = ("align", copy, "hall", "--points", "points.csv", "--picks", "picks/picks.csv")
-    ran = run(*words, "--json")
-    assert ran.code == 0, ran.err
-    record = json.loads(ran.out)
-    estimate = SE3.from_matrix(np.array(record["base_from_map"]))
-    assert pose_distance(estimate, base_from_map)[0] < 0.02
-    assert record["scale"] == 1.0
-    (tmp_path / "points.csv").write_text("\n".join(["name,x,y,z", *lines[1:]]))
-    refused = run(*words)
-    assert refused.code == 2
-    assert "point 'p0' is not in points.csv" in refused.err[0]

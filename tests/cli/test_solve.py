@@ -207,16 +207,3 @@ def test_report_finds_the_images_of_detect(run: Any, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     pictures = json.loads(run("report", out, "--out", page, "--json").out)["pictures"]
     assert len(pictures) > 0
-
-
-def test_files_with_bare_image_names_are_read(run: Any, tmp_path: Path) -> None:
-    photographs(tmp_path, 7)
-    board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
-    poses, camera = tmp_path / "board.json", tmp_path / "camera.json"
-    assert run("detect", tmp_path, *board, "--camera", camera, "--out", poses).code == 0
-    (tmp_path / "elsewhere").mkdir()
-    moved = poses.rename(tmp_path / "elsewhere" / "board.json")
-    words = ["--robot-poses", tmp_path / "robot.csv", "--camera-poses", moved]
-    out = tmp_path / "out.json"
-    assert run("solve", *words, "--mount", "eye_in_hand", "--out", out).code == 0
-    assert read_calibration(out).images[0].name == "image-1.png"
