@@ -57,10 +57,6 @@ def test_cameras_of_a_rig(
     assert ran.code == 0, ran.err
     assert json.loads(ran.out) == json.loads((tmp_path / "rig.json").read_text())
     left_from_right = truth_of(hall.test[3]).inverse() @ truth_of(hall.test[6])
-    ran = run(*words, "--out", tmp_path / "rig.json", "--at", "0,0,1", "--json")
-    for camera in json.loads(ran.out)["cameras"].values():
-        assert camera["at"]["point_m"] == [0, 0, 1]
-        assert camera["at"]["sigma_mm"] > 0
     text = run(*words, "--out", tmp_path / "rig.json", "--at", "0,0,1").out
     assert text.count("mm at (0, 0, 1) m in the camera frame") == 2
     line = next(line for line in text.splitlines() if line.startswith("left_from_right: "))

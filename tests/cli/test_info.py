@@ -33,17 +33,6 @@ def test_info_of_a_map_without_reports(run: Any, hall_store: Path) -> None:
     assert "bundle adjustment" not in ran.out
 
 
-def test_info_of_a_network(run: Any, network_store: Path) -> None:
-    info = json.loads(run("info", network_store, "--json").out)
-    assert info["strategy"] == "finetune"
-    assert info["head_bytes"] > 0
-    (scene,) = info["scenes"]
-    assert "landmarks" not in scene
-    text = run("info", network_store).out
-    assert f"{100 * scene['inlier_threshold']:.0f} % inliers" in text
-    assert "landmarks" not in text
-
-
 def test_damaged_files_are_named(run: Any, store: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(store, tmp_path / "s"))
     assert run("info", "--check", copy).code == 0

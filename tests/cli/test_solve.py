@@ -15,18 +15,15 @@ from evercal.recordings import write_image
 from ..calibration.boards.printed import CAMERA, CHESSBOARD, photographed, view_of
 
 
-def write_poses(path: Path, poses: SE3, names: list[str] | None = None) -> None:
+def write_poses(path: Path, poses: SE3) -> None:
     rows = np.concatenate([poses.translation_m, rotations(poses).as_rotvec()], 1)
-    lines = ["x_m,y_m,z_m,rotvec_x,rotvec_y,rotvec_z" + (",image" if names else "")]
-    for i, row in enumerate(rows):
-        words = [f"{value:.12g}" for value in row] + ([names[i]] if names else [])
-        lines.append(",".join(words))
-    path.write_text("\n".join(lines) + "\n")
+    header = "x_m,y_m,z_m,rotvec_x,rotvec_y,rotvec_z"
+    np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.12g")
 
 
-def files(folder: Path, simulated: SimulatedPairs, names: list[str] | None = None) -> list[Any]:
-    write_poses(folder / "robot.csv", simulated.pairs.base_from_gripper, names)
-    write_poses(folder / "camera.csv", simulated.pairs.camera_from_board, names)
+def files(folder: Path, simulated: SimulatedPairs) -> list[Any]:
+    write_poses(folder / "robot.csv", simulated.pairs.base_from_gripper)
+    write_poses(folder / "camera.csv", simulated.pairs.camera_from_board)
     poses = ["--robot-poses", folder / "robot.csv", "--camera-poses", folder / "camera.csv"]
     return ["solve", *poses, "--out", folder / "out.json"]
 
@@ -87,29 +84,6 @@ def test_unknown_scale_is_estimated_on_request(run: Any, tmp_path: Path) -> None
     ran = run(*words, "--scale", "unknown", "--json")
     assert ran.code == 0
     assert json.loads(ran.out)["checks"]["scale"] == pytest.approx(0.37, rel=0.005)
-
-
-def test_named_rows_are_paired_by_name(run: Any, tmp_path: Path) -> None:
-    simulated = recording(Setting(noise_mm=0.1, noise_deg=0.01), 4)
-    names = [f"shot-{i}.png" for i in range(25)]
-    words = files(tmp_path, simulated, names)
-    order = np.random.default_rng(0).permutation(25)
-    write_poses(
-        tmp_path / "robot.csv", simulated.pairs.base_from_gripper[order], [names[i] for i in order]
-    )
-    assert run(*words, "--mount", "eye_in_hand").code == 0
-    calibration = read_calibration(tmp_path / "out.json")
-    assert (
-        np.linalg.norm(error(calibration.parent_from_child, simulated.parent_from_camera)[:3])
-        < 0.001
-    )
-
-
-def test_time_offset_requires_times(run: Any, tmp_path: Path) -> None:
-    words = files(tmp_path, recording(Setting(), 5))
-    ran = run(*words, "--mount", "eye_in_hand", "--time-offset")
-    assert ran.code == 2
-    assert "column stamp_s" in ran.err[0]
 
 
 def photographs(folder: Path, count: int) -> tuple[list[Path], SE3, SE3]:
