@@ -86,6 +86,13 @@ def test_unknown_scale_is_estimated_on_request(run: Any, tmp_path: Path) -> None
     assert json.loads(ran.out)["checks"]["scale"] == pytest.approx(0.37, rel=0.005)
 
 
+def test_time_offset_requires_times(run: Any, tmp_path: Path) -> None:
+    words = files(tmp_path, recording(Setting(), 5))
+    ran = run(*words, "--mount", "eye_in_hand", "--time-offset")
+    assert ran.code == 2
+    assert "column stamp_s" in ran.err[0]
+
+
 def photographs(folder: Path, count: int) -> tuple[list[Path], SE3, SE3]:
     """Write images of a board and the gripper poses; return paths, camera pose and board poses."""
     views = SE3.stack([view_of(CHESSBOARD, seed) for seed in range(count)])

@@ -19,37 +19,14 @@ from typing import Any
 from evercal.errors import InputError
 
 VERBS = {
-    "Map": {
-        "learn": "Learn",
-        "localize": "Localize",
-        "track": "Track",
-        "view": "View",
-        "refresh": "Refresh",
-        "evaluate": "Evaluate",
-        "info": "Info",
-        "map": "Maps",
-        "serve": "Serve",
-    },
-    "Calibrate": {
-        "studio": "Studio",
-        "calibrate": "Calibrate",
-        "check": "Check",
-        "watch": "Watch",
-        "audit": "Audit",
-        "align": "Align",
-    },
-    "Boards and pose pairs": {"detect": "Detect", "solve": "Solve"},
-    "Results": {"export": "Export", "report": "Report"},
-    "Recordings": {
-        "inspect": "Inspect",
-        "convert": "Convert",
-        "reconstruct": "Reconstruct",
-        "simulate": "Simulate",
-        "demo": "Demo",
-    },
-    "Networks": {"bench": "Bench"},
+    "Map": ["learn", "localize", "track", "view", "refresh", "evaluate", "info", "map", "serve"],
+    "Calibrate": ["studio", "calibrate", "check", "watch", "audit", "align"],
+    "Boards and pose pairs": ["detect", "solve"],
+    "Results": ["export", "report"],
+    "Recordings": ["inspect", "convert", "reconstruct", "simulate", "demo"],
+    "Networks": ["bench"],
 }
-"""Class of each verb, in the file of the verb's name; by purpose, in the order of the help."""
+"""Verbs by purpose, in the order of the help. The class `Learn` of `learn` is in `learn.py`."""
 
 _X86 = ("x86_64", "AMD64")
 _SAME_ARITHMETIC = {"OPENBLAS_CORETYPE": "Haswell", "MKL_CBWR": "COMPATIBLE"}
@@ -115,8 +92,7 @@ def _complain(message: str, as_json: bool) -> int:
 
 def verb_class(name: str) -> Any:
     """The class of a verb."""
-    kind = next(verbs[name] for verbs in VERBS.values() if name in verbs)
-    return getattr(importlib.import_module(f"evercal.cli.{name}"), kind)
+    return getattr(importlib.import_module(f"evercal.cli.{name}"), name.capitalize())
 
 
 def _help() -> str:

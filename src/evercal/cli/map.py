@@ -11,7 +11,7 @@ from evercal.cli import args
 from evercal.cli.console import require_writable, size
 
 if TYPE_CHECKING:
-    from evercal.map import Map
+    from evercal.map import Map as LearnedMap
 
 Archive = Annotated[Positional[Path], arg(metavar="FILE")]
 
@@ -20,15 +20,15 @@ Archive = Annotated[Positional[Path], arg(metavar="FILE")]
 class Action(args.Verb):
     """An action on a map."""
 
-    def opened(self, store: Path) -> "Map":
+    def opened(self, store: Path) -> "LearnedMap":
         """The map at a path that must exist."""
-        from evercal.map import Map
+        from evercal.map import Map as LearnedMap
         from evercal.storage import read_manifest
 
         read_manifest(store)
-        return Map.open(store, device="cpu")
+        return LearnedMap.open(store, device="cpu")
 
-    def done(self, cell: "Map", what: str, **more: object) -> int:
+    def done(self, cell: "LearnedMap", what: str, **more: object) -> int:
         """Say what was done and which scenes there are."""
         record = {"store": str(cell.path), **more, "scenes": list(cell.scenes)}
         line = f"{what}; scenes of {cell.path}: {', '.join(cell.scenes) or 'none'}"
@@ -113,9 +113,9 @@ class Merge(Action):
     the scene of the map."""
 
     def run(self) -> int:
-        from evercal.map import Map
+        from evercal.map import Map as LearnedMap
 
-        cell = Map.open(self.store, device="cpu")
+        cell = LearnedMap.open(self.store, device="cpu")
         merged = cell.merge(*self.others, on_clash=self.on_clash)
         words = [f"added {', '.join(merged.added) or 'no scene'}"]
         words += [f"{name} is now {new}" for name, new in merged.renamed]
@@ -166,7 +166,7 @@ class Unpack(Action):
 
 
 @dataclass(frozen=True)
-class Maps:
+class Map:
     """Manage scenes of a map: list, remove, rename, merge, pack, unpack.
 
     Every change is one step: it happens completely or not at all. Every action has --json.
