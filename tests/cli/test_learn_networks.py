@@ -35,7 +35,7 @@ def test_a_network_learns_a_second_scene(
     assert ran.code == 0, ran.err
     first, second, *_, last = ran.out.splitlines()
     assert first.startswith("box-room-42: 24 training frames")
-    assert second.startswith("learned box-room-42: 20 images, 2 keyframes, 4 steps")
+    assert second.startswith("learned box-room-42: 20 images, 0 keyframes, 4 steps")
     assert last.startswith("next: evercal evaluate ")
     info = json.loads(run("info", store, "--json").out)
     assert (info["strategy"], info["short_side"]) == ("finetune", 240)
