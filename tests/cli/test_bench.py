@@ -54,38 +54,6 @@ def test_bench_and_its_tables(
     assert "<svg" in (tmp_path / "out" / "figure.svg").read_text()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["attic"], "suite 'attic': unknown; choose one of sim-mini"),
-        (["custom"], "suite custom: give scene folders for the suites custom and regions only"),
-        (["sim-mini", "somewhere"], "suite sim-mini: give scene folders for the suites custom"),
-        (["sim-mini", "--strategies", "evercal,magic"], "strategy 'magic': unknown; choose one of"),
-        (["sim-mini", "--seeds", "0,one"], "--seeds 0,one: give comma-separated numbers"),
-        (["sim-mini", "--seeds", ","], "--seeds ,: give comma-separated numbers"),
-        (["sim-mini", "--strategies", "er@3"], "strategy 'er@3': unknown; choose one of"),
-        (["sim-mini", "--steps", "0"], "--steps 0: give a number >= 1"),
-        (["sim-mini", "--batch", "63"], "--batch 63: give a number >= 64"),
-        (["sim-mini", "--memory", "all"], "--memory all: give a share"),
-        (["sim-mini", "--scenes", "bedroom"], "two or more"),
-        (["real2"], "--data"),
-    ],
-)
-def test_unusable_input_is_refused(
-    run: Any, words: list[str], message: str, tmp_path: Path
-) -> None:
-    ran = run("bench", *words, "--out", tmp_path / "out")
-    assert ran.code == 2
-    assert message in " ".join(" ".join(ran.err).split())
-    assert not (tmp_path / "out").exists()
-
-
-def test_folder_without_results_is_refused(run: Any, tmp_path: Path) -> None:
-    ran = run("bench", tmp_path)
-    assert ran.code == 2
-    assert "no results here" in ran.err[0]
-
-
 def test_held_out_frames_are_training_frames(
     run: Any, small: None, arcs: tuple[Recording, Recording], tmp_path: Path
 ) -> None:

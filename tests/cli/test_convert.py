@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evercal.cli.reading import Reading
+from evercal.cli.args import Reading
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings import FORMATS, ReadOptions, generic, load_recording, write_image
 
@@ -36,12 +36,8 @@ def test_recording_is_converted_to_a_scene_folder(
     ran = run(*words, "--json")
     assert (ran.code, ran.err) == (0, [])
     record = json.loads(ran.out)
-    assert (record["name"], record["train"], record["test"], record["untracked"]) == (
-        "cell",
-        4,
-        0,
-        0,
-    )
+    counts = [record[key] for key in ("train", "test", "untracked")]
+    assert (record["name"], counts) == ("cell", [4, 0, 0])
     assert (record["with_base_from_camera"], record["with_base_from_gripper"]) == (0, 4)
     scene = load_recording(out)
     assert scene.name == "cell"

@@ -131,39 +131,3 @@ def test_a_camera_on_the_arm_gets_a_pose_per_robot_pose(
     assert len(read_robot_poses(tmp_path / "c.tum")) == 2
     refused = run(*words, "--robot-poses", gripper, "--convention", "xyzw")
     assert "look like millimetres; give --convention xyzw:mm" in refused.err[0]
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ((), "no format given; add --format NAME, one of easy_handeye2"),
-        (("--format", "xml"), "'xml' is not known; use one of easy_handeye2"),
-        (("--format", "urdf", "--parent", "my base"), "'my base' is no name of a tf frame"),
-        (("--format", "urdf", "--child", "/camera"), "'/camera' is no name of a tf frame"),
-        (("--format", "urdf", "--child", "base"), "both called 'base'"),
-        (("--format", "urdf", "--via", "camera_link"), "--via-optical if their origins are"),
-        (("--format", "urdf", "--via-optical"), "name the driver's root frame with --via"),
-        (
-            ("--format", "urdf", "--via", "l", "--via-optical", "--via-offset", "1", "0", "0"),
-            "give one of --via-transform FILE",
-        ),
-        (("--format", "urdf", "--via", "l", "--via-transform", "no.yaml"), "no.yaml: "),
-        (("--format", "urdf", "--via", "base", "--via-optical"), "both called 'base'"),
-        (("--format", "colmap", "--via", "l", "--via-optical"), "omit --via"),
-        (("--format", "urdf", "--robot-frame", "a b", "--via-optical"), "--via"),
-        (("--format", "tum", "--robot-poses", "no.csv"), "no.csv: file of robot poses is missing"),
-        (("--format", "moveit_samples"), "--target-poses"),
-    ],
-)
-def test_misuse_prints_one_line(run: Any, make: Any, words: tuple[str, ...], message: str) -> None:
-    ran = run("export", make(), *words)
-    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-    assert message in ran.err[0]
-    assert json.loads(run("export", make(), *words, "--json").out).keys() == {"error"}
-
-
-def test_missing_calibration_is_refused(run: Any, make: Any, tmp_path: Path) -> None:
-    assert "no calibration given" in run("export", "--format", "urdf").err[0]
-    assert "missing" in run("export", tmp_path / "no.json", "--format", "urdf").err[0]
-    refused = run("export", make("eye_in_hand"), "--format", "nerfstudio")
-    assert "give the gripper's poses with --robot-poses" in refused.err[0]

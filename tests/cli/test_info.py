@@ -5,8 +5,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 MAP_KEYS = {"name", "train_frames", "memory_bytes", "keyframes", "camera", "landmarks"}
 MAP_KEYS |= {"min_support", "adjusted", "hand_eye"}
 
@@ -35,17 +33,6 @@ def test_info_of_a_map_without_reports(run: Any, hall_store: Path) -> None:
     assert "bundle adjustment" not in ran.out
 
 
-def test_info_of_a_network(run: Any, network_store: Path) -> None:
-    info = json.loads(run("info", network_store, "--json").out)
-    assert info["strategy"] == "finetune"
-    assert info["head_bytes"] > 0
-    (scene,) = info["scenes"]
-    assert "landmarks" not in scene
-    text = run("info", network_store).out
-    assert f"{100 * scene['inlier_threshold']:.0f} % inliers" in text
-    assert "landmarks" not in text
-
-
 def test_damaged_files_are_named(run: Any, store: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(store, tmp_path / "s"))
     assert run("info", "--check", copy).code == 0
@@ -65,11 +52,3 @@ def test_damaged_files_are_named(run: Any, store: Path, tmp_path: Path) -> None:
     for words in (["info", copy], ["learn", copy, tmp_path], ["evaluate", copy, tmp_path]):
         ran = run(*words)
         assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-
-
-@pytest.mark.parametrize("verb", [["info"], ["info", "--check"]])
-def test_other_folders_are_refused(run: Any, tmp_path: Path, verb: list[str]) -> None:
-    for path in (tmp_path, tmp_path / "nowhere"):
-        ran = run(*verb, path)
-        assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-        assert json.loads(run(*verb, path, "--json").out).keys() == {"error"}

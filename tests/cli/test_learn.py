@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 import signal
@@ -103,77 +102,10 @@ def test_interrupt_leaves_no_map(rooms: Any, tmp_path: Path) -> None:
     assert not (tmp_path / "s" / "manifest.json").exists()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--strategy", "finetune"], "was made with evercal"),
-        (["--memory", "lots"], "--memory lots"),
-        (["--memory", "0%"], "--memory 0%"),
-        (["--centres", "5"], "--centres 5: a map is not trained"),
-        (["--seed", "3"], "--seed 3: a map is not trained"),
-        (["--preset", "paper"], "--preset paper: a map is not trained"),
-        (["--encoder", "missing.safetensors"], "no such file"),
-        (["--encoder", __file__], "keeps the encoder"),
-        (["--format", "png"], "generic, 7scenes"),
-        (["--format", "7scenes"], "TrainSplit.txt"),
-        (["--name", "box-room-41"], "a scene of this name"),
-        (["--name", "a/b"], "scene name"),
-        (["--name", ""], "scene name"),
-        (["--calibration", "missing/c.json"], "--calibration missing/c.json: folder"),
-        (["--calibration", "c.json"], "states camera poses"),
-        (["--gripper-from-camera", "c.json"], "states camera poses"),
-    ],
-)
-def test_bad_options_are_one_line_and_leave_the_store(
-    run: Any, store: Path, rooms: Any, snapshot: Any, options: list[str], message: str
-) -> None:
-    before = snapshot(store)
-    ran = run("learn", store, rooms[1], *options)
-    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-    assert message in ran.err[0]
-    assert snapshot(store) == before
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--calibration", "missing/c.json"], "--calibration missing/c.json: folder"),
-        (["--strategy", "joint"], "does not train a network scene by scene"),
-        (["--strategy", "nonsense"], "finetune"),
-        (["--strategy", "finetune", "--centres", "0"], "--centres 0: give a number >= 1"),
-        (["--strategy", "finetune", "--seed", "-1"], "--seed -1: give a number >= 0"),
-        (["--centres", "5"], "--centres 5: a map is not trained"),
-    ],
-)
-def test_bad_options_of_a_new_store_write_nothing(
-    run: Any, wrist: Path, rooms: Any, tmp_path: Path, options: list[str], message: str
-) -> None:
-    recording = wrist if "--calibration" in options else rooms[0]
-    ran = run("learn", tmp_path / "s", recording, *options)
-    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-    assert message in ran.err[0]
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_network_keeps_its_number_of_centres(
-    run: Any, network_store: Path, rooms: Any, snapshot: Any
-) -> None:
-    before = snapshot(network_store)
-    ran = run("learn", network_store, rooms[1], "--centres", "7")
-    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-    assert "was made with 5" in ran.err[0]
-    assert snapshot(network_store) == before
-
-
 def damaged(kind: str, room: Path, folder: Path) -> Path:
     """A recording with one mistake."""
     shutil.copytree(room, folder)
     data = json.loads((folder / "scene.json").read_text())
-    if kind == "missing scene":
-        return folder / "nowhere"
-    if kind == "no scene":
-        (folder / "scene.json").unlink()
-        return folder
     if kind == "missing image":
         (folder / "images/000003.png").unlink()
     elif kind == "few frames":
@@ -186,10 +118,9 @@ def damaged(kind: str, room: Path, folder: Path) -> Path:
     return folder
 
 
-KINDS = ["missing scene", "no scene", "missing image", "broken json", "few frames", "no poses"]
-
-
-@pytest.mark.parametrize("kind", [*KINDS, "escape"])
+@pytest.mark.parametrize(
+    "kind", ["missing image", "broken json", "few frames", "no poses", "escape"]
+)
 @pytest.mark.parametrize("new", [False, True])
 def test_bad_recordings_are_one_line_and_leave_the_store(
     run: Any, store: Path, rooms: Any, snapshot: Any, tmp_path: Path, kind: str, new: bool
@@ -225,9 +156,3 @@ def test_other_folders_are_not_overwritten(
     assert snapshot(tmp_path / "home") == {"letter.txt": b"dear"}
     (tmp_path / "file").write_text("x")
     assert run("learn", tmp_path / "file", rooms[0]).code == 2
-
-
-def test_json_fields_are_those_of_the_report() -> None:
-    from evercal.learning.scene import LearnReport
-
-    assert {field.name for field in dataclasses.fields(LearnReport)} == KEYS

@@ -16,17 +16,7 @@ import evercal
 from evercal.cli import main
 
 VERBS = {
-    "Map": [
-        "learn",
-        "localize",
-        "track",
-        "view",
-        "refresh",
-        "evaluate",
-        "info",
-        "map",
-        "serve",
-    ],
+    "Map": ["learn", "localize", "track", "view", "refresh", "evaluate", "info", "map", "serve"],
     "Calibrate": ["studio", "calibrate", "check", "watch", "audit", "align"],
     "Boards and pose pairs": ["detect", "solve"],
     "Results": ["export", "report"],
@@ -64,7 +54,7 @@ def test_help_lists_every_verb_once_in_its_group() -> None:
         elif verb := re.match(r"  (\S+)\s+[A-Z]\w+", line):
             groups[list(groups)[-1]].append(verb[1])
     assert groups == VERBS
-    assert max(map(len, done.stdout.splitlines())) <= 100
+    assert max(map(len, done.stdout.splitlines())) <= 80
     assert not {"torch", "cv2", "scipy", "matplotlib", "numpy"} & modules
     assert seconds < 5  # one second where nothing else runs
 
@@ -104,13 +94,8 @@ def test_messages_name_existing_options(run: Any, monkeypatch: pytest.MonkeyPatc
     ("words", "code"),
     [
         (["learn", "--help"], 0),
-        (["demo", "--help"], 0),
-        (["learn", "store"], 2),
         (["localize", "store", "missing.png"], 2),
-        (["calibrate", "store", "missing.png"], 2),
         (["export", "missing.json", "--format", "urdf"], 2),
-        (["lern"], 2),
-        ([], 2),
     ],
 )
 def test_help_and_misuse_do_without_torch(words: list[str], code: int) -> None:
@@ -149,10 +134,7 @@ def test_unusable_arguments_are_an_error_object(run: Any, words: list[str], mess
         (["calibrate", "S", "IMAGE", "--out", "GONE/c.json"], "--out GONE/c.json: folder"),
         (["calibrate", "S", "IMAGE", "--out", "DIR"], "--out DIR: is a folder"),
         (["detect", "IMAGE", "--board", "apriltag", "--out", "GONE/b.json"], "--out GONE/b.json"),
-        (
-            ["solve", *SOLVE, "--out", "GONE/c.json"],
-            "--out GONE/c.json: folder",
-        ),
+        (["solve", *SOLVE, "--out", "GONE/c.json"], "--out GONE/c.json: folder"),
         (["report", "C", "--out", "GONE/r.html"], "--out GONE/r.html: folder"),
         (["convert", "R", "FILE"], "FILE: is a file; give a folder"),
         (["demo", "--out", "FILE/x"], "--out FILE/x: cannot be created"),

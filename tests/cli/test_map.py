@@ -47,39 +47,6 @@ def test_a_map_is_packed_unpacked_merged_renamed_and_emptied(
     assert run("map", "list", two).out == f"{two}: no scene\n"
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["list", "GONE"], "GONE: no such folder"),
-        (["remove", "STORE", "attic"], "scene 'attic': map STORE has no scene of this name"),
-        (["remove", "STORE"], "no scene given"),
-        (["merge", "STORE"], "no map given"),
-        (["rename", "STORE", "hall", ".x"], "scene name '.x'"),
-        (["rename", "GONE", "hall", "x"], "GONE: no such folder"),
-        (["merge", "STORE", "STORE"], "is the map that scenes are merged into"),
-        (["merge", "GONE", "GONE"], "GONE: no such folder"),
-        (["merge", "STORE", "STORE", "--on-clash", "win"], "--on-clash"),
-        (["pack", "STORE", "GONE/x.zip"], "FILE GONE/x.zip: folder GONE does not exist"),
-        (["pack", "GONE", "STORE.zip"], "GONE: no such folder"),
-        (["unpack", "GONE", "NEW"], "GONE: no such file"),
-        (["unpack", "STORE/manifest.json", "NEW"], "not a zip archive"),
-        (["unpack", "STORE/manifest.json", "STORE"], "STORE: exists; give a new folder"),
-    ],
-)
-def test_misuse_is_one_line_and_changes_nothing(
-    run: Any, copy: Path, tmp_path: Path, snapshot: Any, words: list[str], message: str
-) -> None:
-    for word, path in (("STORE", copy), ("GONE", tmp_path / "gone"), ("NEW", tmp_path / "new")):
-        words = [given.replace(word, str(path)) for given in words]
-        message = message.replace(word, str(path))
-    before = snapshot(tmp_path)
-    ran = run("map", *words, "--json")
-    assert ran.code == 2
-    assert message in json.loads(ran.out)["error"]
-    assert "Traceback" not in "".join(ran.err)
-    assert {k: v for k, v in snapshot(tmp_path).items() if not k.endswith(".lock")} == before
-
-
 @pytest.mark.parametrize("action", ["list", "remove", "rename", "merge", "pack", "unpack"])
 def test_help_of_an_action_has_an_example(action: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["map", action, "--help"]) == 0

@@ -41,9 +41,3 @@ def test_the_stated_camera_is_used(
     assert given[0].fx == 250
     assert (given[0].width, given[0].height) == (320, 240)
     assert given[1] is None
-
-
-@pytest.mark.parametrize("words", [[], ["images/", "--undo", "hall"]])
-def test_images_or_undo(run: Any, hall_store: Path, words: list[str]) -> None:
-    ran = run("refresh", hall_store, *words)
-    assert (ran.code, ran.err) == (2, ["error: give images of the changed room, or --undo SCENE"])

@@ -75,31 +75,3 @@ def test_calibration_without_images_or_camera(
     assert record["tier"] is None
     assert record["pictures"] == []
     assert any(message in sentence for sentence in record["missing"])
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("gone.json",), "calibration file is missing"),
-        (("c.json", "--against", "gone.json"), "calibration file is missing"),
-        (("c.json", "--images", "gone.png"), "image file is missing"),
-        (("c.json", "--store", "gone"), "gone"),
-        (("c.json", "--out", "gone/r.html"), "gone does not exist"),
-        (("c.json", "--out", "."), "is a folder"),
-        (("c.json", "--against", "hand.json"), "same mount"),
-    ],
-)
-def test_misuse_is_refused_and_writes_nothing(
-    run: Any,
-    calibration: Path,
-    words: tuple[str, ...],
-    message: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(calibration.parent)
-    Calibration("eye_in_hand", POSE, 1e-8 * np.eye(6), "gripper").write("hand.json")
-    ran = run("report", *words)
-    assert ran.code == 2
-    assert len(ran.err) == 1
-    assert message in ran.err[0]
-    assert not Path("report.html").exists()

@@ -4,34 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from evercal.recordings import load_recording
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("lab", "--out", "x"), "lab"),
-        (("cell",), "--out"),
-        (("cell", "--out", "x", "--size", "640"), "640x480"),
-        (("cell", "--out", "x", "--size", "20x20"), "at least 64x64"),
-        (("cell", "--out", "x", "--frames", "0"), "at least 1"),
-        (("cell", "--out", "x", "--seed", "9000"), "reserved"),
-    ],
-)
-def test_bad_input_is_refused_and_nothing_is_written(
-    words: tuple[str, ...],
-    message: str,
-    run: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    ran = run("simulate", *words)
-    assert (ran.code, ran.out) == (2, "")
-    assert any(message in line for line in ran.err)
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_cell_has_the_stated_parts(run: Any, tmp_path: Path) -> None:

@@ -19,17 +19,3 @@ def test_a_folder_is_tracked_into_files(
     assert len(lines.read_text().splitlines()) == 6
     located = report["tracking"] + report["relocalized"]
     assert len(tum.read_text().splitlines()) == 1 + located
-
-
-def test_wrong_arguments_are_named(run: Run, store: Path, tmp_path: Path) -> None:
-    for words, message in (
-        (("track", store, tmp_path / "none"), "no such folder or video"),
-        (("track", store, tmp_path, "--out", tmp_path / "t.bin"), "ends with .jsonl"),
-        (("track", store, tmp_path, "--rate", 0), "above 0"),
-        (("refresh", store), "give images of the changed room, or --undo SCENE"),
-        (("refresh", store, "--undo", "attic"), "scene 'attic'"),
-        (("refresh", store, tmp_path), "image"),
-    ):
-        ran = run(*words)
-        assert ran.code == 2, words
-        assert message in ran.err[-1], (words, ran.err)

@@ -120,6 +120,10 @@ def test_alignment_gives_metres(
     touched = [f"p{j},{x},{y},{z}" for j, (x, y, z) in enumerate(points)]
     (tmp_path / "points.csv").write_text("\n".join(touched))
     files = ("--points", tmp_path / "points.csv", "--picks", tmp_path / "picks.csv")
+    (tmp_path / "fewer.csv").write_text("\n".join(touched[1:]))
+    refused = run("align", store, "hall", "--points", tmp_path / "fewer.csv", *files[2:])
+    assert refused.code == 2
+    assert f"point 'p0' is not in {tmp_path / 'fewer.csv'}" in refused.err[0]
     ran = run("align", store, "hall", *files, "--json")
     assert ran.code == 0, ran.err
     assert json.loads(ran.out)["scale"] == pytest.approx(1 / UNITS, rel=0.01)

@@ -102,34 +102,3 @@ def test_image_of_another_place_is_reported(
     record = json.loads(ran.out)
     assert record["moved"] is None
     assert record["reason"]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--window", "0"), "--window is at least 1"),
-        (("--reference", "none.json"), "calibration file is missing"),
-        (("--camera", "none.txt"), "none.txt: camera file is missing"),
-        (("--camera", "BROKEN"), "camera.txt"),
-    ],
-)
-def test_bad_options_end_the_watch(
-    options: tuple[str, str],
-    message: str,
-    run: Any,
-    words: tuple[object, ...],
-    four_images: Path,
-    tmp_path: Path,
-) -> None:
-    (tmp_path / "camera.txt").write_text("300 0 160")
-    (tmp_path / "arriving" / "0.png").write_bytes((four_images / "00.png").read_bytes())
-    given = [tmp_path / "camera.txt" if word == "BROKEN" else word for word in options]
-    ran = run(*words, "--idle", "0.2", *given)
-    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-    assert message in ran.err[0]
-
-
-def test_missing_folder_is_refused(run: Any, hall_store: Path, tmp_path: Path) -> None:
-    ran = run("watch", hall_store, tmp_path / "none", "--reference", tmp_path / "none.json")
-    assert ran.code == 2
-    assert "no such folder" in ran.err[0]

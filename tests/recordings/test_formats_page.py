@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evercal.calibration.calibration import read_transform
-from evercal.cli.align import _rows as read_points
+from evercal.cli.align import read_rows
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings import ReadOptions, Recording, load_recording, read_robot_poses, write_image
 from evercal.recordings.formats import lerobot, wrist
@@ -135,9 +135,9 @@ def test_lerobot_description(page: Path) -> None:
 
 
 def test_touched_points(page: Path) -> None:
-    points = read_points(page / "touched.csv", 1, 3, "name, x, y, z")
+    points = read_rows(page / "touched.csv", 1, "name, x, y, z")
     assert [names for names, _ in points] == [("corner",), ("screw",), ("edge",)]
-    picks = read_points(page / "picks.csv", 2, 2, "image, name, u, v")
+    picks = read_rows(page / "picks.csv", 2, "image, name, u, v")
     assert picks[0][0] == ("images/a.jpg", "corner")
     np.testing.assert_allclose(picks[0][1], [311.5, 204.0])
 

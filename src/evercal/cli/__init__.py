@@ -19,37 +19,14 @@ from typing import Any
 from evercal.errors import InputError
 
 VERBS = {
-    "Map": {
-        "learn": "Learn",
-        "localize": "Localize",
-        "track": "Track",
-        "view": "View",
-        "refresh": "Refresh",
-        "evaluate": "Evaluate",
-        "info": "Info",
-        "map": "Maps",
-        "serve": "Serve",
-    },
-    "Calibrate": {
-        "studio": "Studio",
-        "calibrate": "Calibrate",
-        "check": "Check",
-        "watch": "Watch",
-        "audit": "Audit",
-        "align": "Align",
-    },
-    "Boards and pose pairs": {"detect": "Detect", "solve": "Solve"},
-    "Results": {"export": "Export", "report": "Report"},
-    "Recordings": {
-        "inspect": "Inspect",
-        "convert": "Convert",
-        "reconstruct": "Reconstruct",
-        "simulate": "Simulate",
-        "demo": "Demo",
-    },
-    "Networks": {"bench": "Bench"},
+    "Map": ["learn", "localize", "track", "view", "refresh", "evaluate", "info", "map", "serve"],
+    "Calibrate": ["studio", "calibrate", "check", "watch", "audit", "align"],
+    "Boards and pose pairs": ["detect", "solve"],
+    "Results": ["export", "report"],
+    "Recordings": ["inspect", "convert", "reconstruct", "simulate", "demo"],
+    "Networks": ["bench"],
 }
-"""Class of each verb, in the file of the verb's name; by purpose, in the order of the help."""
+"""Verbs by purpose, in the order of the help. The class `Learn` of `learn` is in `learn.py`."""
 
 _X86 = ("x86_64", "AMD64")
 _SAME_ARITHMETIC = {"OPENBLAS_CORETYPE": "Haswell", "MKL_CBWR": "COMPATIBLE"}
@@ -96,6 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _discard_stdout() -> None:
+    """Keep Python from writing to a broken stdout again when it exits."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -114,8 +92,7 @@ def _complain(message: str, as_json: bool) -> int:
 
 def verb_class(name: str) -> Any:
     """The class of a verb."""
-    kind = next(verbs[name] for verbs in VERBS.values() if name in verbs)
-    return getattr(importlib.import_module(f"evercal.cli.{name}"), kind)
+    return getattr(importlib.import_module(f"evercal.cli.{name}"), name.capitalize())
 
 
 def _help() -> str:
@@ -126,8 +103,7 @@ def _help() -> str:
         lines += ["", f"{group}:"]
         for name in names:
             summary = " ".join((verb_class(name).__doc__ or "").split("\n\n")[0].split())
-            line = f"  {name:11s} {summary.split('; ')[0].rstrip('.')}"
-            lines += textwrap.wrap(line, 80, subsequent_indent=" " * 14)
+            lines.append(f"  {name:11s} {summary.split('; ')[0].rstrip('.')}")
     lines += [
         "",
         "'evercal VERB --help' lists the options of a verb. Every verb has --json.",
@@ -178,6 +154,7 @@ def _parse(words: list[str], as_json: bool) -> Any:
 
 
 def _wrapped(text: str) -> str:
+    """Wrap the lines of a help page that tyro leaves longer than the terminal is wide."""
     columns = shutil.get_terminal_size().columns
     lines = []
     for line in text.splitlines():
@@ -186,5 +163,6 @@ def _wrapped(text: str) -> str:
 
 
 def _box_text(box: str) -> str:
+    """The first paragraph of tyro's framed message as one line."""
     text = " ".join(line.strip("│ ") for line in box.splitlines()[1:])
     return " ".join(text.partition("──")[0].split()) or "unusable arguments"

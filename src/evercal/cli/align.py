@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.arguments import read_images
-from evercal.cli.options import Device, File, Name, SomeImages, Store, Verb
+from evercal.cli import args
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,8 +17,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Align(Verb):
-    """Transform a scene that was learned in a frame of its own to the robot's base frame.
+class Align(args.Verb):
+    """Transform a scene in a frame of its own to the base frame.
 
     Give images of a camera on the gripper with --robot-poses, or points that the tool has touched
     with --points and --picks. The error of the alignment is part of every later answer.
@@ -27,26 +26,26 @@ class Align(Verb):
     Example: evercal align cell.evercal cell wrist/ --robot-poses poses.csv
     """
 
-    store: Store
+    store: args.Store
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
     """Name of the scene."""
-    images: SomeImages = ()
+    images: Annotated[Positional[tuple[Path, ...]], args.shown("[IMAGE...]")] = ()
     """Images of a camera on the gripper, or a folder of them."""
-    robot_poses: File = None
+    robot_poses: args.File = None
     """base_from_gripper of every image."""
-    convention: Name = None
+    convention: args.Name = None
     """Format of the robot poses, if the file does not state it."""
-    board_poses: File = None
+    board_poses: args.File = None
     """Board poses from 'evercal detect', for a fixed camera that observes a board in the
     gripper."""
-    points: File = None
+    points: args.File = None
     """Touched points in the base frame: lines of name, x, y, z in metres."""
-    picks: File = None
+    picks: args.File = None
     """Points in images: lines of image, name, u, v in pixels; images relative to this file."""
     unknown_scale: bool = False
     """Estimate the scale, for a scene that was not learned in metres. Default where the unit of
     length of its recording is unknown."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         by_points = self.points is not None or self.picks is not None
@@ -68,20 +67,20 @@ class Align(Verb):
             localizer = Localizer(opened.contents.to(where))
             alignment = self._by_points(localizer) if by_points else self._by_gripper(localizer)
             opened.update(alignment.applied_to(localizer.contents.scene(self.scene)))
-        return self._print(alignment)
+        self._show(alignment)
+        return 0
 
     def _by_gripper(self, localizer: "Localizer") -> "MapAlignment":
         from evercal.calibration.align import align_by_gripper
+        from evercal.calibration.boards.board_poses import read_board_poses
         from evercal.recordings.image_files import image_files
         from evercal.recordings.poses.pairing import poses_of_images
 
         files = image_files(self.images)
         assert self.robot_poses is not None
         poses = poses_of_images(self.robot_poses, files, self.convention)
-        images, boards = read_images(files), None
+        images, boards = args.read_images(files), None
         if self.board_poses is not None:
-            from evercal.calibration.boards.board_poses import read_board_poses
-
             detected = read_board_poses(self.board_poses).detected
             by_name = {Path(image.name).name: image.camera_from_board for image in detected}
             boards = {str(f): pose for f in files if (pose := by_name.get(f.name)) is not None}
@@ -89,6 +88,7 @@ class Align(Verb):
         return align_by_gripper(localizer, self.scene, images, poses, metric, boards)
 
     def _metric(self, localizer: "Localizer") -> bool:
+        """Whether the scale is known."""
         return localizer.contents.scene(self.scene).metric and not self.unknown_scale
 
     def _by_points(self, localizer: "Localizer") -> "MapAlignment":
@@ -97,9 +97,9 @@ class Align(Verb):
 
         if self.points is None or self.picks is None:
             raise InputError("--points and --picks belong together; give both")
-        points = {name: at for (name,), at in _rows(self.points, 1, 3, "name, x, y, z")}
+        points = {name: at for (name,), at in read_rows(self.points, 1, "name, x, y, z")}
         by_image: dict[str, dict[str, np.ndarray]] = {}
-        for (image, name), pixel in _rows(self.picks, 2, 2, "image, name, u, v"):
+        for (image, name), pixel in read_rows(self.picks, 2, "image, name, u, v"):
             if name not in points:
                 raise InputError(f"{self.picks}: point {name!r} is not in {self.points}")
             by_image.setdefault(image, {})[name] = pixel
@@ -108,51 +108,44 @@ class Align(Verb):
         metric = self._metric(localizer)
         return aligned_by_points(localizer, self.scene, points, picks, metric)
 
-    def _print(self, alignment: "MapAlignment") -> int:
+    def _show(self, alignment: "MapAlignment") -> None:
         similarity, (mm, deg) = alignment.similarity, alignment.sigma
         gripper = alignment.gripper_from_camera
-        record = {
-            "scene": self.scene,
-            "base_from_map": similarity.base_from_map.matrix().tolist(),
-            "scale": similarity.scale,
-            "sigma_mm": mm,
-            "sigma_deg": deg,
-            "used": alignment.used,
-            "given": alignment.given,
-            "gripper_from_camera": None if gripper is None else gripper.matrix().tolist(),
-            "warnings": alignment.warnings,
-        }
-        lines = [
+        self.answer(
+            {
+                "scene": self.scene,
+                "base_from_map": similarity.base_from_map.matrix().tolist(),
+                "scale": similarity.scale,
+                "sigma_mm": mm,
+                "sigma_deg": deg,
+                "used": alignment.used,
+                "given": alignment.given,
+                "gripper_from_camera": None if gripper is None else gripper.matrix().tolist(),
+                "warnings": alignment.warnings,
+            },
             f"aligned {self.scene}: standard deviation {mm:.2f} mm and {deg:.3f} deg per axis in"
             f" the middle of the scene; scale {similarity.scale:.5f}; {alignment.used} of"
             f" {alignment.given} are inliers, residual {alignment.residual}",
             *(f"warning: {warning}" for warning in alignment.warnings),
-        ]
-        return self.answer(record, lines, ("calibrate", self.store, "IMAGE..."))
+            then=("calibrate", self.store, "IMAGE..."),
+        )
 
 
-def _rows(
-    path: Path, names: int, numbers: int, columns: str
-) -> "list[tuple[tuple[str, ...], np.ndarray]]":
-    """Read words and numbers of every line of a table; a header line is skipped.
-
-    Raises:
-        InputError: The file is missing, or a line does not have the columns.
-    """
+def read_rows(path: Path, names: int, columns: str) -> "list[tuple[tuple[str, ...], np.ndarray]]":
+    """Words and numbers of every line of a table of these columns; a header line is skipped."""
     import csv
 
     import numpy as np
 
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error})") from None
-    rows = []
-    for number, row in enumerate(csv.reader(text.splitlines(), skipinitialspace=True), start=1):
+    from evercal.recordings.text_files import read_text
+
+    rows, count = [], columns.count(",") + 1
+    lines = read_text(path, "table of points").splitlines()
+    for number, row in enumerate(csv.reader(lines, skipinitialspace=True), start=1):
         if not row or row[0].startswith("#"):
             continue
         try:
-            if len(row) != names + numbers:
+            if len(row) != count:
                 raise ValueError
             values = np.array([float(cell) for cell in row[names:]])
         except ValueError:

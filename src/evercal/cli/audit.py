@@ -7,49 +7,49 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.arguments import open_map
+from evercal.cli import args
 from evercal.cli.console import progress_bar
-from evercal.cli.options import Device, File, Store, Verb
 from evercal.errors import InputError
 
 
 @dataclass(frozen=True)
-class Audit(Verb):
-    """List recorded episodes whose stated camera pose disagrees with their images.
+class Audit(args.Verb):
+    """List recorded episodes whose stated camera pose is wrong.
 
-    Exit code 1 if there are any.
+    The pose is compared with the images of the episode. Exit code 1 if any is wrong.
 
     Example: evercal audit cell.evercal episodes/ --calibration tripod.json
     """
 
-    store: Store
+    store: args.Store
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder whose folders are the episodes: recorded scenes, or images beside a calibration.json
     or a 4x4 matrix base_from_camera.txt."""
-    calibration: File = None
+    calibration: args.File = None
     """Pose of the camera in episodes that state none themselves."""
-    images: Annotated[int, arg(metavar="N")] = 5
+    images: args.Number = 5
     """Images per episode that are located."""
     most_mm: Annotated[float, arg(metavar="MM")] = 5.0
     """Tolerance of the position."""
     most_deg: Annotated[float, arg(metavar="DEG")] = 0.5
     """Tolerance of the rotation."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         if self.images < 1 or self.most_mm <= 0 or self.most_deg <= 0:
             raise InputError("--images is at least 1, --most-mm and --most-deg are above 0")
         from evercal.calibration.audit import AuditOptions, audit, episode_folders
-        from evercal.calibration.calibration import read_transform
 
-        stated = None if self.calibration is None else read_transform(self.calibration)
+        stated = args.transform_of(self.calibration)
         total = len(episode_folders(self.folder))
-        localizer = open_map(self.store, self.device)
+        localizer = args.open_map(self.store, self.device)
         options = AuditOptions(self.images, self.most_mm, self.most_deg)
         with progress_bar("episodes", total, "episode") as bar:
             episodes = audit(localizer, self.folder, stated, options, on_episode=bar.update)
-        wrong = [episode for episode in episodes if episode.verdict == "wrong"]
-        lines = [f"{episode.verdict:8s} {episode.name}: {episode.reason}" for episode in episodes]
-        lines.append(f"{len(wrong)} of {len(episodes)} episodes state a wrong camera pose")
-        self.answer({"episodes": [dataclasses.asdict(episode) for episode in episodes]}, lines)
+        wrong = sum(episode.verdict == "wrong" for episode in episodes)
+        self.answer(
+            {"episodes": [dataclasses.asdict(episode) for episode in episodes]},
+            *(f"{episode.verdict:8s} {episode.name}: {episode.reason}" for episode in episodes),
+            f"{wrong} of {len(episodes)} episodes state a wrong camera pose",
+        )
         return 1 if wrong else 0

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next
-from evercal.cli.options import Device
+from evercal.cli import args
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ LEAST_BATCH = 64
 
 
 @dataclass(frozen=True)
-class Bench:
+class Bench(args.Verb):
     """Compare strategies on a sequence of scenes; the same command resumes.
 
     Given a folder of results, print its tables again.
@@ -35,9 +34,7 @@ class Bench:
     suite: Annotated[Positional[str], arg(metavar="SUITE")]
     """One of sim-mini (packaged), sim, sim-7, sim-12, sim-tune, sim-unseen, sim-repeat,
     real2, i7s, i12s, custom, regions; or a folder of results."""
-    recordings: Annotated[
-        Positional[tuple[Path, ...]], arg(metavar="[DIR...]", help_behavior_hint="")
-    ] = ()
+    recordings: Annotated[Positional[tuple[Path, ...]], args.shown("[DIR...]")] = ()
     """Recordings of the suite custom, in order of learning; one recording for regions."""
     strategies: Annotated[str, arg(metavar="A,B")] = "evercal,joint,finetune,er,sars_spdd"
     """Comma-separated strategies; the others are compared with the first. table4 stands for those
@@ -47,11 +44,11 @@ class Bench:
     order: Literal["given", "reversed", "shuffled", "balanced"] = "given"
     """Order in which the scenes are learned. shuffled draws one for each seed. balanced turns the
     given order by one place for each seed, and reverses it in every second round."""
-    scenes: Annotated[str, arg(metavar="A,B", help_behavior_hint="")] = ""
+    scenes: Annotated[str, args.shown("A,B")] = ""
     """Comma-separated scenes of the suite. Defaults to all."""
-    data: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    data: args.Folder = None
     """Folder of the suite's recordings, with one folder per scene."""
-    poses: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    poses: args.Folder = None
     """Structure-from-motion poses for i7s and i12s (Brachmann et al., ICCV 2021). Defaults to the
     original poses."""
     parts: int = 4
@@ -63,36 +60,36 @@ class Bench:
     and loss (paper) or by ours (paper_head)."""
     offsets: Literal["per_centre", "shared"] = "per_centre"
     """One offset and scale per centre (the paper), or one for all centres (GLACE)."""
-    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    steps: args.Count = None
     """Optimiser steps of a stage. Defaults to that of the preset."""
-    batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    batch: args.Count = None
     """Rows of the new scene in a step; replayed rows keep the preset's proportion. Defaults to that
     of the preset."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
     """Keyframes to keep of a scene: a share of its frames (10%) or bytes (5MB)."""
     held_out: bool = False
     """Evaluate on a fifth of the training frames instead of the test frames, to choose settings."""
-    device: Device = "auto"
-    plugin: Annotated[Path | None, arg(metavar="FILE.py", help_behavior_hint="")] = None
+    device: args.Device = "auto"
+    plugin: Annotated[Path | None, args.shown("FILE.py")] = None
     """Python file of your own strategies (see examples/my_strategy.py)."""
-    out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-bench")
+    out: args.OutFolder = Path("evercal-bench")
     """Folder of results. The same command resumes there; in a second process it shares the runs."""
-    json: bool = False
-    """Print one JSON object."""
 
     def run(self) -> int:
-        """Run what is missing and print the tables."""
         if Path(self.suite).is_dir():
             return self._show(Path(self.suite))
         seeds = _numbers(self.seeds)
         from evercal.continual.benchmark.bench import BenchOptions, run_bench
+        from evercal.continual.benchmark.suites import tuning_split
         from evercal.continual.learning.presets import short_side
         from evercal.continual.strategies import load_plugin
 
         if self.plugin is not None:
             load_plugin(self.plugin)
         strategies = self._strategies()  # refused before recordings are read
-        scenes = self._scenes()
+        scenes = self._recorded()
+        if self.held_out:
+            scenes = [tuning_split(scene) for scene in scenes]
         options = BenchOptions(
             self._stage,
             strategies,
@@ -116,13 +113,9 @@ class Bench:
         from evercal.continual.benchmark.comparison import LEGEND, summary
 
         text = report.write_report(folder, reference or _words(self.strategies)[0])
-        if self.json:
-            print_json({"strategies": summary(results.read(folder))})
-            return 0
-        print(
-            f"{text}\n\n{LEGEND}\nwrote {folder / report.TABLES}, {report.LATEX}, {report.FIGURE}"
-        )
-        print_next("evercal", "bench", folder)
+        wrote = f"wrote {folder / report.TABLES}, {report.LATEX}, {report.FIGURE}"
+        record = {"strategies": summary(results.read(folder))}
+        self.answer(record, f"{text}\n\n{LEGEND}", wrote, then=("bench", folder))
         return 0
 
     def _strategies(self) -> "tuple[Strategy, ...]":
@@ -132,12 +125,6 @@ class Bench:
         words = _words(self.strategies)
         names = [name for word in words for name in (TABLE4 if word == "table4" else (word,))]
         return tuple(strategy_named(name) for name in dict.fromkeys(names))
-
-    def _scenes(self) -> "list[Recording]":
-        from evercal.continual.benchmark.suites import tuning_split
-
-        scenes = self._recorded()
-        return [tuning_split(scene) for scene in scenes] if self.held_out else scenes
 
     def _recorded(self) -> "list[Recording]":
         from evercal.continual.benchmark.suites import load_suite, regions

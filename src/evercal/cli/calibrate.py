@@ -1,33 +1,24 @@
 """`evercal calibrate`."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
-from evercal.cli.arguments import (
-    Point,
-    camera_for,
-    open_map,
-    point_dict,
-    point_of,
-    point_text,
-    read_images,
-)
+from evercal.cli import args
 from evercal.cli.console import progress_bar, require_writable
-from evercal.cli.options import At, Device, File, Intrinsics, Name, Store, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.calibration.calibration import Calibration, ErrorTerm, Rig
+    from evercal.calibration.calibration import Calibration, Rig
     from evercal.calibration.from_images import Images
     from evercal.localization.localizer import Localizer
 
 
 @dataclass(frozen=True)
-class Calibrate(Verb):
+class Calibrate(args.Verb):
     """Calibrate a camera from images of a mapped scene; no marker is needed.
 
     A fixed camera gives base_from_camera. With --robot-poses, a camera on the gripper gives
@@ -37,49 +28,47 @@ class Calibrate(Verb):
     Example: evercal calibrate cell.evercal tripod/ --camera camera.json --out tripod.json
     """
 
-    store: Store
-    images: Annotated[Positional[tuple[str, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
+    store: args.Store
+    images: Annotated[Positional[tuple[str, ...]], args.shown("IMAGE...")]
     """Image files or folders of them, all of one camera; or NAME=FOLDER for each camera of a
     rig."""
-    robot_poses: File = None
+    robot_poses: args.File = None
     """base_from_gripper of every image: a pose table, JSON, NPY or NPZ."""
-    convention: Name = None
+    convention: args.Name = None
     """Format of the robot poses, if the file does not state it."""
     mount: Annotated[
-        Literal["eye_to_hand", "eye_in_hand"] | None,
-        arg(metavar="eye_to_hand|eye_in_hand", help_behavior_hint=""),
+        Literal["eye_to_hand", "eye_in_hand"] | None, args.shown("eye_to_hand|eye_in_hand")
     ] = None
     """eye_to_hand for a fixed camera, eye_in_hand for one on the gripper. Default: decided from
     the camera's motion."""
-    camera: Intrinsics = None
-    out: Annotated[Path, arg(metavar="FILE")] = Path("calibration.json")
+    camera: args.File = None
+    """Intrinsics of these images. Default: those of the camera that recorded the scene."""
+    out: args.OutFile = Path("calibration.json")
     """Output file."""
-    at: At = None
-    device: Device = "auto"
+    at: args.At = None
+    device: args.Device = "auto"
 
     def run(self) -> int:
         require_writable(self.out, "--out")
-        point = point_of(self.at)
-        named = {word.split("=", 1)[0]: Path(word.split("=", 1)[1]) for word in self._named()}
+        point = args.Point.parse(self.at)
+        folders = self._folders()
+        from evercal.calibration.verdict import tier
         from evercal.recordings.image_files import image_files
 
-        if named:
-            return self._rig(open_map(self.store, self.device), named, point)
-        files = image_files([Path(word) for word in self.images])
-        given = self._given(files)
-        localizer = open_map(self.store, self.device)
-        calibration = self._calibrated(localizer, given)
+        if folders:
+            return self._rig(folders, point)
+        given = self._given(image_files(self.images))
+        calibration = self._calibrated(args.open_map(self.store, self.device), given)
         calibration.write(self.out)
         self.answer(
-            {**calibration.to_dict(), **_at_dict(calibration, point)},
-            calibration_lines(calibration, point),
-            ("export", self.out, "--format", "easy_handeye2"),
+            {**calibration.to_dict(), **_at_record(calibration, point)},
+            *calibration_lines(calibration, point),
+            then=("export", self.out, "--format", "easy_handeye2"),
         )
-        from evercal.calibration.verdict import tier
-
         return 0 if tier(calibration) else 1
 
-    def _named(self) -> list[str]:
+    def _folders(self) -> dict[str, Path]:
+        """The folder of each camera of a rig; empty for one camera."""
         named = [word for word in self.images if "=" in word and not Path(word).exists()]
         if named and len(named) < len(self.images):
             raise InputError(
@@ -88,17 +77,16 @@ class Calibrate(Verb):
             )
         if named and self.robot_poses is not None:
             raise InputError("--robot-poses: the cameras of a rig are fixed; omit the option")
-        return named
+        return {name: Path(path) for name, _, path in (word.partition("=") for word in named)}
 
     def _given(self, files: list[Path]) -> "Images":
         from evercal.calibration.from_images import Images
+        from evercal.recordings.poses.pairing import poses_of_images
 
         poses = None
         if self.robot_poses is not None:
-            from evercal.recordings.poses.pairing import poses_of_images
-
             poses = poses_of_images(self.robot_poses, files, self.convention)
-        return Images(read_images(files), camera_for(self.camera, files), poses)
+        return Images(args.read_images(files), args.camera_for(self.camera, files), poses)
 
     def _calibrated(self, localizer: "Localizer", given: "Images") -> "Calibration":
         from evercal.calibration.from_images import calibrate
@@ -107,75 +95,63 @@ class Calibrate(Verb):
             calibration = calibrate(localizer, given, self.mount, on_image=bar.update)
         return replace(calibration, source={**calibration.source, "store": str(self.store)})
 
-    def _rig(self, localizer: "Localizer", folders: dict[str, Path], point: Point | None) -> int:
+    def _rig(self, folders: dict[str, Path], point: args.Point | None) -> int:
         from evercal.calibration.calibration import rig_of
         from evercal.recordings.image_files import image_files
 
-        cameras = {}
-        for name, folder in folders.items():
-            cameras[name] = self._calibrated(localizer, self._given(image_files([folder])))
+        localizer = args.open_map(self.store, self.device)
+        cameras = {
+            name: self._calibrated(localizer, self._given(image_files([folder])))
+            for name, folder in folders.items()
+        }
         rig = rig_of(cameras)
         rig.write(self.out)
         record = rig.to_dict()
         for name, calibration in rig.cameras.items():
-            record["cameras"][name] |= _at_dict(calibration, point)
-        return self.answer(record, _rig_lines(rig, point))
+            record["cameras"][name] |= _at_record(calibration, point)
+        self.answer(record, *_rig_lines(rig, point))
+        return 0
 
 
-def _at_dict(calibration: "Calibration", point: Point | None) -> dict[str, object]:
-    return {} if point is None else {"at": point_dict(point, calibration.uncertain_pose)}
+def _at_record(calibration: "Calibration", point: args.Point | None) -> dict[str, object]:
+    return {} if point is None else {"at": point.record(calibration.uncertain_pose)}
 
 
-def calibration_lines(calibration: "Calibration", point: Point | None = None) -> list[str]:
+def calibration_lines(calibration: "Calibration", point: args.Point | None = None) -> Iterator[str]:
     """A calibration in lines. `point` is that of --at."""
-    used = sum(image.used for image in calibration.images)
-    x, y, z = 1000 * calibration.parent_from_child.translation_m
-    lines = [
-        f"{calibration.parent_frame}_from_{calibration.child_frame}: the {calibration.meaning}",
-        f"  translation  {x:+.2f} {y:+.2f} {z:+.2f} mm",
-        "  quaternion   "
-        + " ".join(f"{value:+.6f}" for value in calibration.parent_from_child.rotation_wxyz)
-        + " wxyz",
-        f"  uncertainty  {calibration.sigma_mm:.2f} mm, {calibration.sigma_deg:.3f} deg"
-        " (standard deviation per axis)",
-    ]
-    lines += _budget_lines(calibration.error_terms)
-    if point is not None:
-        lines.append(f"  point        {point_text(point, calibration.uncertain_pose)}")
-    if "repeatability_mm" in calibration.checks:
-        checks = calibration.checks
-        lines.append(
-            f"  two halves   of the images differ by {checks['repeatability_mm']:.2f} mm and"
-            f" {checks['repeatability_deg']:.3f} deg"
-        )
-    if calibration.images:
-        lines.append(f"  images       {used} of {len(calibration.images)} used")
-    lines += [f"    rejected   {i.name}: {i.reason}" for i in calibration.images if not i.used]
-    return [*lines, f"  verdict      {calibration.verdict}"]
-
-
-def _budget_lines(terms: "Sequence[ErrorTerm]") -> list[str]:
     from evercal.calibration.calibration import position_shares
 
-    return [
-        f"    of it      {term.translation_mm:.2f} mm, {term.rotation_deg:.3f} deg:"
-        f" {term.name} ({100 * share:.0f} % of the position's variance)"
-        for term, share in zip(terms, position_shares(terms), strict=True)
-        if term.translation_mm >= 0.005 or term.rotation_deg >= 0.0005
-    ]
+    x, y, z = 1000 * calibration.parent_from_child.translation_m
+    quaternion = " ".join(f"{q:+.6f}" for q in calibration.parent_from_child.rotation_wxyz)
+    yield f"{calibration.parent_frame}_from_{calibration.child_frame}: the {calibration.meaning}"
+    yield f"  translation  {x:+.2f} {y:+.2f} {z:+.2f} mm"
+    yield f"  quaternion   {quaternion} wxyz"
+    spread = f"{calibration.sigma_mm:.2f} mm, {calibration.sigma_deg:.3f} deg"
+    yield f"  uncertainty  {spread} (standard deviation per axis)"
+    terms = calibration.error_terms
+    for term, share in zip(terms, position_shares(terms), strict=True):
+        if term.translation_mm >= 0.005 or term.rotation_deg >= 0.0005:
+            part = f"{term.translation_mm:.2f} mm, {term.rotation_deg:.3f} deg: {term.name}"
+            yield f"    of it      {part} ({100 * share:.0f} % of the position's variance)"
+    if point is not None:
+        yield f"  point        {point.text(calibration.uncertain_pose)}"
+    if "repeatability_mm" in (checks := calibration.checks):
+        mm, deg = checks["repeatability_mm"], checks["repeatability_deg"]
+        yield f"  two halves   of the images differ by {mm:.2f} mm and {deg:.3f} deg"
+    if calibration.images:
+        used = sum(image.used for image in calibration.images)
+        yield f"  images       {used} of {len(calibration.images)} used"
+    yield from (f"    rejected   {i.name}: {i.reason}" for i in calibration.images if not i.used)
+    yield f"  verdict      {calibration.verdict}"
 
 
-def _rig_lines(rig: "Rig", point: Point | None) -> list[str]:
-    lines = []
+def _rig_lines(rig: "Rig", point: args.Point | None) -> Iterator[str]:
     for name, calibration in rig.cameras.items():
         first, *rest = calibration_lines(calibration, point)
-        lines += [f"{name}: {first}", *rest]
-    for pair in rig.relative:
-        pose = pair.first_from_second
+        yield from (f"{name}: {first}", *rest)
+    for first, second, pose in rig.relative:
         x, y, z = 1000 * pose.pose.translation_m
-        lines.append(
-            f"{pair.first}_from_{pair.second}: {x:+.2f} {y:+.2f} {z:+.2f} mm, standard deviation"
-            f" at most {pose.sigma_mm:.2f} mm and {pose.sigma_deg:.3f} deg (independent errors"
-            " assumed)"
+        yield (
+            f"{first}_from_{second}: {x:+.2f} {y:+.2f} {z:+.2f} mm, standard deviation at most"
+            f" {pose.sigma_mm:.2f} mm and {pose.sigma_deg:.3f} deg (independent errors assumed)"
         )
-    return lines

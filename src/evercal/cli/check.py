@@ -6,30 +6,32 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from evercal.cli.arguments import camera_for, open_map, read_images
+from evercal.cli import args
 from evercal.cli.console import progress_bar
-from evercal.cli.options import Device, File, Images, Store, Verb
 from evercal.reports.answers import check_record
 
 if TYPE_CHECKING:
     from evercal.calibration.drift import Shift
 
+Reference = Annotated[
+    Path, arg(metavar="FILE", help="The camera's calibration from 'evercal calibrate'.")
+]
+
 
 @dataclass(frozen=True)
-class Check(Verb):
+class Check(args.Verb):
     """Test whether a fixed camera has moved since it was calibrated; exit code 1 if it has.
 
     Example: evercal check cell.evercal now.png --reference tripod.json
     """
 
-    store: Store
-    images: Images
+    store: args.Store
+    images: args.ImageFiles
     """New images of one camera, or a folder of them; five or more reveal smaller shifts."""
-    reference: Annotated[Path, arg(metavar="FILE")]
-    """The camera's calibration from 'evercal calibrate'."""
-    camera: File = None
+    reference: Reference
+    camera: args.File = None
     """Intrinsics. Default: those of the reference."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         from evercal.calibration.calibration import read_calibration
@@ -38,14 +40,18 @@ class Check(Verb):
 
         files = image_files(self.images)
         reference = read_calibration(self.reference)
-        camera = camera_for(self.camera, files)
-        images = read_images(files)
-        localizer = open_map(self.store, self.device)
+        camera = args.camera_for(self.camera, files)
+        images = args.read_images(files)
+        localizer = args.open_map(self.store, self.device)
         with progress_bar("localizing", len(images), "image") as bar:
             shift = check(localizer, images, reference, camera, on_image=bar.update)
-        rejected = [f"  rejected  {use.name}: {use.reason}" for use in shift.images if not use.used]
-        then = ("calibrate", self.store, *self.images[:1]) if shift.moved else ()
-        self.answer(check_record(shift), [shift_line(shift), *rejected], then)
+        rejected = [use for use in shift.images if not use.used]
+        self.answer(
+            check_record(shift),
+            shift_line(shift),
+            *(f"  rejected  {use.name}: {use.reason}" for use in rejected),
+            then=("calibrate", self.store, *self.images[:1]) if shift.moved else (),
+        )
         return 1 if shift.moved else 0
 
 

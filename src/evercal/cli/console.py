@@ -1,10 +1,10 @@
-"""Output that all verbs share: JSON, the next command, progress bars, checks of output paths."""
+"""Output that all verbs share: JSON, tables, the next command, progress bars, output paths."""
 
 import json
 import os
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -40,12 +40,20 @@ def progress_bar(what: str, total: int, unit: str, done: int = 0) -> "tqdm":
     )
 
 
+def following(bar: "tqdm") -> Callable[[int, int], None]:
+    """A callback (done, total) that a bar follows."""
+
+    def show(done: int, total: int) -> None:
+        bar.total = total
+        bar.update(done - bar.n)
+
+    return show
+
+
 class Bars:
     """Progress bars of learning on stderr, one after the other; a context that closes the last.
 
-    Args:
-        stream: Where lines go.
-        start: A line to print before the first bar.
+    The line `start` is printed to `stream` before the first bar.
     """
 
     def __init__(self, stream: TextIO | None = None, start: str = ""):
@@ -98,7 +106,7 @@ _UNITS = {
 
 
 def table(rows: Sequence[Mapping[str, object]]) -> list[str]:
-    """Lines of a table with the names of its columns; none without a row."""
+    """Rows under the names of their columns; nothing without a row."""
     from tabulate import tabulate
 
     if not rows:
@@ -117,12 +125,7 @@ def size(count: float) -> str:
 
 
 def require_writable(path: Path | None, option: str) -> None:
-    """Refuse an output file that cannot be written, before any work is done.
-
-    Args:
-        path: the file; None if the option was omitted.
-        option: its name, for the message.
-    """
+    """Refuse an output file that cannot be written, before any work is done."""
     if path is None:
         return
     folder = path.resolve().parent

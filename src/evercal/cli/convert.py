@@ -6,15 +6,14 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.cli import args
 from evercal.cli.console import progress_bar
-from evercal.cli.options import Name, Verb
-from evercal.cli.reading import Reading
 from evercal.errors import InputError
 
 
 @dataclass(frozen=True)
-class Convert(Verb):
-    """Convert a recording of any format to evercal's own: one scene.json and the images.
+class Convert(args.Verb):
+    """Convert a recording of any format to evercal's own; it is scene.json and the images.
 
     Example: evercal convert recording.mcap kitchen/
     """
@@ -23,9 +22,8 @@ class Convert(Verb):
     """Folder of the recording, or file of a bag."""
     out: Annotated[Positional[Path], arg(metavar="OUT")]
     """Output folder; created if it is missing."""
-    reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
-    """How the recording is read."""
-    name: Name = None
+    reading: Annotated[args.Reading, arg(name="")] = field(default_factory=args.Reading)
+    name: args.Name = None
     """Name of the scene. Default: the recording's own name."""
     hard_link: bool = False
     """Link image files instead of copying them; changes then affect both."""
@@ -51,11 +49,13 @@ class Convert(Verb):
             "with_base_from_gripper": sum(f.base_from_gripper is not None for f in frames),
             "notes": list(scene.notes),
         }
-        lines = [
+        self.answer(
+            record,
             f"{self.out}: {scene.name}, {len(scene.train)} training and {len(scene.test)} test"
             f" frames; {record['with_base_from_camera']} with the camera's pose,"
             f" {record['with_base_from_gripper']} with the gripper's; {scene.untracked} images"
-            f" without a pose left out",
+            " without a pose left out",
             *(f"note: {note}" for note in scene.notes),
-        ]
-        return self.answer(record, lines, ("inspect", self.out))
+            then=("inspect", self.out),
+        )
+        return 0

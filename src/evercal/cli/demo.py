@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from tyro.conf import arg
-
-from evercal.cli.console import Bars, progress_bar, require_folder, size
-from evercal.cli.options import Device, Folder, Verb
+from evercal.cli import args
+from evercal.cli.console import Bars, following, progress_bar, require_folder, size
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,7 +18,7 @@ if TYPE_CHECKING:
 
     from evercal.evaluation import FrameResult
     from evercal.geometry import SE3
-    from evercal.localization.localizer import Localizer
+    from evercal.map import Map
     from evercal.recordings import Frame, Recording
     from evercal.recordings.samples import SampleRoom
     from evercal.reports.demo_page import DemoResult, FixedCamera
@@ -34,42 +32,42 @@ PICTURES = 3
 
 
 @dataclass(frozen=True)
-class Demo(Verb):
-    """Map three rendered rooms, localize images, calibrate cameras and detect a bump.
+class Demo(args.Verb):
+    """Map three rendered rooms, localize, calibrate, detect a bump.
 
-    With --copy-samples, only copy the recordings of these rooms and of a robot cell.
+    It takes about a minute on two cores. With --copy-samples, only copy the recordings of these
+    rooms and of a robot cell.
 
     Example: evercal demo --out evercal-demo/
     """
 
-    out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-demo")
+    out: args.OutFolder = Path("evercal-demo")
     """Folder for report.html, the store and a query image."""
-    copy_samples: Folder = None
+    copy_samples: args.Folder = None
     """New or empty folder to copy the packaged recordings to, instead of running the demo."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
-        if self.copy_samples is not None:
-            return self._copy_samples(self.copy_samples)
-        from evercal.recordings.samples import sample_rooms
+        from evercal.recordings.samples import ROOMS, copy_samples, sample_rooms
 
+        if (folder := self.copy_samples) is not None:
+            copy_samples(folder)
+            cell = folder / "cell"
+            self.answer(
+                {"samples": str(folder)},
+                f"copied {', '.join(ROOMS)} and the robot cell {cell} to {folder}; the cell has"
+                " recordings of a camera on the gripper (wrist) and of a fixed camera (tripod)",
+                then=("learn", "cell.evercal", cell / "wrist", "--calibration", "wrist.json"),
+            )
+            return 0
         result = run_demo(self.out, sample_rooms(), self.device, quiet=self.json)
-        lines = [f"{number:>12}  {words}" for number, words in result.headlines().items()]
-        lines.append(f"wrote {self.out / REPORT} in {result.seconds:.0f} s")
-        then = ("localize", self.out / STORE, self.out / QUERY)
-        return self.answer(result.to_dict(), lines, then)
-
-    def _copy_samples(self, folder: Path) -> int:
-        from evercal.recordings.samples import ROOMS, copy_samples
-
-        copy_samples(folder)
-        line = (
-            f"copied {', '.join(ROOMS)} and the robot cell {folder / 'cell'} to {folder}; the cell"
-            " has recordings of a camera on the gripper (wrist) and of a fixed camera (tripod)"
+        self.answer(
+            result.to_dict(),
+            *(f"{number:>12}  {meaning}" for number, meaning in result.headlines().items()),
+            f"wrote {self.out / REPORT} in {result.seconds:.0f} s",
+            then=("localize", self.out / STORE, self.out / QUERY),
         )
-        learn = ("learn", "cell.evercal", folder / "cell" / "wrist")
-        record = {"samples": str(folder)}
-        return self.answer(record, [line], (*learn, "--calibration", "wrist.json"))
+        return 0
 
 
 def run_demo(
@@ -87,6 +85,7 @@ def run_demo(
         InputError: The folder contains other data, or the device does not exist.
     """
     from evercal.features.device import device_of
+    from evercal.map import Map
     from evercal.recordings import write_image
     from evercal.reports.demo_page import DemoResult, demo_page
     from evercal.storage import MANIFEST, replace_folder, write_bytes
@@ -99,87 +98,67 @@ def run_demo(
     result = DemoResult()
     work = Path(tempfile.mkdtemp(prefix=".demo-", dir=out))
     try:
+        cell = Map.open(work / STORE, device=device)
         for room in rooms:
             if result.learned:
-                _localize_unknown(_open(work / STORE, device), room.scene, result)
-            _learn(work / STORE, room.scene, device, result)
-            room_map = result.learned[-1]
-            if not quiet:
-                print(
-                    f"mapped {room_map.room}: {room_map.images} images, {room_map.keyframes}"
-                    f" keyframes, {room_map.landmarks} landmarks, {room_map.seconds:.0f} s"
-                )
+                _localize_unknown(cell, room.scene, result)
+            _learn(cell, room.scene, result, quiet)
         replace_folder(work / STORE, store)
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    if not quiet:
-        print(f"size of all maps: {size(result.memory_bytes)}")
-    localizer = _open(store, device)
-    result.test = _evaluate(localizer, {room.scene.name: room.scene for room in rooms})
-    result.changed = _evaluate(
-        localizer,
-        {r.scene.name: replace(r.changed, train=r.scene.train) for r in rooms if r.changed},
-    )
-    result.cameras = [_fixed_camera(localizer, room) for room in rooms]
-    pictures = [picture for room in rooms for picture in _pictures(localizer, room.scene)]
+    cell = Map.open(store, device=device)
+    result.test = _evaluate(cell, {room.scene.name: room.scene for room in rooms})
+    changed = {r.scene.name: replace(r.changed, train=r.scene.train) for r in rooms if r.changed}
+    result.changed = _evaluate(cell, changed)
+    result.cameras = [_fixed_camera(cell, room) for room in rooms]
+    pictures = [picture for room in rooms for picture in _pictures(cell, room.scene)]
     write_image(out / QUERY, _spread(rooms[0].scene.test, 1)[0].read_image())
     result.seconds = time.perf_counter() - began
     write_bytes(out / REPORT, demo_page(result, pictures).encode())
     return result
 
 
-def _open(store: Path, device: str) -> "Localizer":
-    from evercal.localization.localizer import Localizer
-
-    return Localizer.open(store, device=device)
-
-
-def _learn(store: Path, scene: "Recording", device: str, result: "DemoResult") -> None:
-    """Add a room to the store."""
-    from evercal.map import Map
+def _learn(cell: "Map", scene: "Recording", result: "DemoResult", quiet: bool) -> None:
     from evercal.reports.demo_page import LearnedRoom
 
     with Bars() as bars:
-        report = Map.open(store, device=device).learn(scene, on_progress=bars.step)
-    result.learned.append(
-        LearnedRoom(
-            report.scene,
-            report.train_frames,
-            report.frames_kept,
-            report.landmarks,
-            None if report.adjusted is None else report.adjusted.residual_px,
-            report.seconds,
-        )
+        report = cell.learn(scene, on_progress=bars.step)
+    room = LearnedRoom(
+        room=report.scene,
+        images=report.train_frames,
+        keyframes=report.frames_kept,
+        landmarks=report.landmarks,
+        residual_px=None if report.adjusted is None else report.adjusted.residual_px,
+        seconds=report.seconds,
     )
+    result.learned.append(room)
     result.memory_bytes = report.memory_bytes
+    if not quiet:
+        kept = f"{room.keyframes} keyframes, {room.landmarks} landmarks"
+        time_and_size = f"{room.seconds:.0f} s; {size(result.memory_bytes)} for all rooms"
+        print(f"mapped {room.room}: {room.images} images, {kept}, {time_and_size}")
 
 
-def _localize_unknown(localizer: "Localizer", scene: "Recording", result: "DemoResult") -> None:
+def _localize_unknown(cell: "Map", scene: "Recording", result: "DemoResult") -> None:
+    """Localize images of a room that is not in the store yet."""
     frames = _spread(scene.test, UNKNOWN_IMAGES)
     with progress_bar(f"images of unknown room {scene.name}", len(frames), "image") as bar:
         for frame in frames:
-            estimate = localizer.localize(frame.read_image(), frame.camera)
+            estimate = cell.localize(frame.read_image(), frame.camera)
             result.unknown_images += 1
             result.unknown_refused += estimate.status != "ok"
             bar.update()
 
 
-def _evaluate(localizer: "Localizer", scenes: "dict[str, Recording]") -> "list[FrameResult]":
+def _evaluate(cell: "Map", scenes: "dict[str, Recording]") -> "list[FrameResult]":
     from evercal.evaluation import evaluate
 
-    count = sum(len(scene.test) for scene in scenes.values())
-    with progress_bar("localizing", count, "image") as bar:
-
-        def advance(_done: int, _total: int) -> None:
-            bar.update()
-
-        return evaluate(localizer, scenes, on_frame=advance)
+    with progress_bar("localizing", 0, "image") as bar:
+        return evaluate(cell.localizer, scenes, on_frame=following(bar))
 
 
-def _fixed_camera(localizer: "Localizer", room: "SampleRoom") -> "FixedCamera":
+def _fixed_camera(cell: "Map", room: "SampleRoom") -> "FixedCamera":
     """Calibrate the fixed camera of a room, and check it after the bump."""
-    from evercal.calibration.drift import check
-    from evercal.calibration.from_images import Images, calibrate
     from evercal.geometry import pose_distance_mm_deg
     from evercal.reports.demo_page import FixedCamera
 
@@ -191,8 +170,8 @@ def _fixed_camera(localizer: "Localizer", room: "SampleRoom") -> "FixedCamera":
     count = len(fixed.test) + len(bumped.test)
     # An InputError means that no image was localized.
     with progress_bar(f"camera in {name}", count, "image") as bar, suppress(InputError):
-        images = Images(_images(fixed), fixed.test[0].camera)
-        calibration = calibrate(localizer, images, "eye_to_hand", on_image=bar.update)
+        lens, images = fixed.test[0].camera, _images(fixed)
+        calibration = cell.calibrate(images, camera=lens, mount="eye_to_hand", on_image=bar.update)
         if calibration.source["scene"] != name:
             return camera
         mm, deg = pose_distance_mm_deg(calibration.parent_from_child, _pose(fixed))
@@ -203,13 +182,13 @@ def _fixed_camera(localizer: "Localizer", room: "SampleRoom") -> "FixedCamera":
             error_deg=deg,
             sigma_mm=calibration.sigma_mm,
         )
-        shift = check(localizer, _images(bumped), calibration, on_image=bar.update)
+        shift = cell.check(_images(bumped), calibration, on_image=bar.update)
         camera = replace(camera, shift_mm=shift.translation_mm, bump_detected=shift.moved)
     return camera
 
 
-def _images(recording: "Recording") -> "list[tuple[str, np.ndarray]]":
-    return [(frame.name, frame.read_image()) for frame in recording.test]
+def _images(recording: "Recording") -> "list[np.ndarray]":
+    return [frame.read_image() for frame in recording.test]
 
 
 def _pose(recording: "Recording") -> "SE3":
@@ -218,21 +197,23 @@ def _pose(recording: "Recording") -> "SE3":
     return pose
 
 
-def _pictures(localizer: "Localizer", scene: "Recording") -> "list[Picture]":
+def _pictures(cell: "Map", scene: "Recording") -> "list[Picture]":
+    """Test images with detected landmarks."""
     from evercal.reports.overlay import draw_landmarks
     from evercal.reports.page import Picture
 
     pictures = []
     for frame in _spread(scene.test, PICTURES):
         image = frame.read_image()
-        estimate = localizer.localize(image, frame.camera)
-        drawn = draw_landmarks(image, estimate, localizer)
+        estimate = cell.localize(image, frame.camera)
+        drawn = draw_landmarks(image, estimate, cell.localizer)
         caption = f"{estimate.scene or estimate.status}: {drawn.summary}"
         pictures.append(Picture.photo(drawn.image, caption))
     return pictures
 
 
 def _spread(frames: "Sequence[Frame]", count: int) -> "list[Frame]":
+    """At most `count` frames, evenly spread."""
     import numpy as np
 
     indices = (np.arange(count) + 0.5) * len(frames) / count

@@ -2,15 +2,15 @@
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
+from evercal.cli import args
 from evercal.cli.console import progress_bar, require_writable
-from evercal.cli.options import File, SomeImages, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,36 +22,35 @@ _DICTIONARIES = {"chessboard": "", "charuco": "4X4_50", "apriltag": "APRILTAG_36
 
 
 @dataclass(frozen=True)
-class Detect(Verb):
-    """Detect a printed board in images and estimate its pose in each, for 'evercal solve'.
+class Detect(args.Verb):
+    """Detect a printed board in images and estimate its pose in each.
 
-    Without --camera the intrinsics are estimated from the board.
+    The poses are for 'evercal solve'. Without --camera the intrinsics are estimated from the board.
 
     Example: evercal detect images/ --board chessboard --size 9x6 --square-mm 25
     """
 
     board: Literal["chessboard", "charuco", "apriltag"]
     """Printed board."""
-    images: SomeImages = ()
+    images: Annotated[Positional[tuple[Path, ...]], args.shown("[IMAGE...]")] = ()
     """Image files of one camera, or a folder of them."""
-    size: Annotated[str | None, arg(metavar="CxR", help_behavior_hint="")] = None
+    size: Annotated[str | None, args.shown("CxR")] = None
     """Inner corners of a chessboard (9x6), or squares of a ChArUco board."""
-    square_mm: Annotated[float | None, arg(metavar="MM", help_behavior_hint="")] = None
+    square_mm: Annotated[float | None, args.shown("MM")] = None
     """Side of a square, or of the black square of a tag, millimetres."""
-    marker_mm: Annotated[float, arg(metavar="MM", help_behavior_hint="")] = 0.0
+    marker_mm: Annotated[float, args.shown("MM")] = 0.0
     """Side of a marker of a ChArUco board, millimetres."""
     dictionary: Annotated[
-        str | None,
-        arg(metavar="NAME", help_behavior_hint="(default: 4X4_50, APRILTAG_36h11 for tags)"),
+        str | None, args.shown("NAME", "(default: 4X4_50, APRILTAG_36h11 for tags)")
     ] = None
     """Dictionary of markers or tags, OpenCV's name without DICT_."""
-    tag: Annotated[int | None, arg(metavar="ID", help_behavior_hint="(default: any)")] = None
+    tag: Annotated[int | None, args.shown("ID", "(default: any)")] = None
     """Number of the tag."""
-    camera: File = None
+    camera: args.File = None
     """File of the intrinsics; if omitted, they are estimated from the board."""
-    out: Annotated[Path, arg(metavar="FILE")] = Path("board.json")
+    out: args.OutFile = Path("board.json")
     """File of poses and corners to write."""
-    make_board: Annotated[Path | None, arg(metavar="FILE.pdf|png", help_behavior_hint="")] = None
+    make_board: Annotated[Path | None, args.shown("FILE.pdf|png")] = None
     """Write the board at true size, to print; detect nothing."""
     paper: Annotated[str, arg(metavar="NAME")] = "a4"
     """Paper of --make-board: a4, letter, a3, tabloid, a2, a1 or a0."""
@@ -63,12 +62,13 @@ class Detect(Verb):
             raise InputError("no images: give image files or a folder, or --make-board FILE.pdf")
         require_writable(self.out, "--out")
         from evercal.recordings.image_files import image_files
+        from evercal.recordings.text_files import refuse_repeated
 
         board, files = self._board(), image_files(self.images)
-        names = [path.name for path in files]
-        repeated = sorted({name for name in names if names.count(name) > 1})
-        if repeated:
-            raise InputError(f"{repeated[0]}: two images of this name; give each a unique name")
+        try:
+            refuse_repeated((path.name for path in files), "give each image a unique name")
+        except ValueError as error:
+            raise InputError(str(error)) from None
         from evercal.calibration.boards.board_poses import board_poses
         from evercal.calibration.boards.corners import BoardView
         from evercal.calibration.boards.intrinsics import calibrate_camera
@@ -89,7 +89,8 @@ class Detect(Verb):
         poses = board_poses(board, camera, views, source)
         poses.write(self.out)
         words = ("--robot-poses", "FILE", "--camera-poses", self.out, "--mount", "eye_in_hand")
-        return self.answer(poses.to_dict(), _lines(poses), ("solve", *words))
+        self.answer(poses.to_dict(), *_lines(poses), then=("solve", *words))
+        return 0
 
     def _make(self, path: Path) -> int:
         from evercal.calibration.boards.printing import label, write_board
@@ -99,9 +100,11 @@ class Detect(Verb):
         require_writable(path, "--make-board")
         board = self._board()
         write_board(path, board, self.paper)
-        line = f"wrote {path} on {self.paper}: {label(board)} Measure the 100 mm ruler."
-        record = {"file": str(path), "paper": self.paper, "board": board.to_dict()}
-        return self.answer(record, [line])
+        self.answer(
+            {"file": str(path), "paper": self.paper, "board": board.to_dict()},
+            f"wrote {path} on {self.paper}: {label(board)} Measure the 100 mm ruler.",
+        )
+        return 0
 
     def _board(self) -> "Board":
         from evercal.calibration.boards.detection import Board
@@ -124,7 +127,7 @@ class Detect(Verb):
     def _detected(
         self, files: Sequence[Path], board: "Board", width: int, height: int
     ) -> "dict[str, BoardView | str]":
-        """Return the corners of each image, or the reason why there are no corners."""
+        """The corners of each image, or the reason why there are none."""
         from evercal.calibration.boards.detection import find_board
         from evercal.recordings import read_image
 
@@ -144,18 +147,16 @@ class Detect(Verb):
         return views
 
 
-def _lines(poses: "BoardPoses") -> list[str]:
-    lines = []
+def _lines(poses: "BoardPoses") -> Iterator[str]:
     for image in poses.images:
         if image.camera_from_board is None:
-            lines.append(f"{image.name}: {image.reason}")
+            yield f"{image.name}: {image.reason}"
             continue
         x, y, z = 1000 * image.camera_from_board.translation_m
-        lines.append(f"{image.name}: board at {x:+.1f} {y:+.1f} {z:+.1f} mm, {image.rms_px:.2f} px")
+        yield f"{image.name}: board at {x:+.1f} {y:+.1f} {z:+.1f} mm, {image.rms_px:.2f} px"
     camera = poses.camera
-    lines.append(
+    numbers = ", ".join(f"{key} {getattr(camera, key):.2f}" for key in ("fx", "fy", "cx", "cy"))
+    yield (
         f"{len(poses.detected)} of {len(poses.images)} images show the board; corner noise"
-        f" {poses.corner_sigma_px:.2f} px; camera (from the {poses.camera_from}) fx"
-        f" {camera.fx:.2f}, fy {camera.fy:.2f}, cx {camera.cx:.2f}, cy {camera.cy:.2f}"
+        f" {poses.corner_sigma_px:.2f} px; camera (from the {poses.camera_from}) {numbers}"
     )
-    return lines

@@ -4,11 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
-from evercal.cli.arguments import open_localizer
-from evercal.cli.console import progress_bar, table
-from evercal.cli.options import Device, Store, Verb
+from evercal.cli import args
+from evercal.cli.console import following, progress_bar, table
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,18 +15,16 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Evaluate(Verb):
+class Evaluate(args.Verb):
     """Measure the localization accuracy on the test frames of scenes.
 
     Example: evercal evaluate cell.evercal kitchen/
     """
 
-    store: Store
-    scenes: Annotated[
-        Positional[tuple[str, ...]], arg(metavar="[NAME=]SCENE...", help_behavior_hint="")
-    ]
+    store: args.Store
+    scenes: Annotated[Positional[tuple[str, ...]], args.shown("[NAME=]SCENE...")]
     """Folders of recorded scenes. NAME is the scene's name in the store, if it differs."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         if not self.scenes:
@@ -36,28 +33,21 @@ class Evaluate(Verb):
         from evercal.evaluation import evaluate, scores
         from evercal.evaluation.tables import score_rows
 
-        localizer = open_localizer(self.store, self.device)
+        localizer = args.open_localizer(self.store, self.device)
         with progress_bar("evaluating", 0, "image") as bar:
-
-            def show(done: int, total: int) -> None:
-                bar.total = total
-                bar.update(done - bar.n)
-
-            results = evaluate(localizer, scenes, on_frame=show)
+            results = evaluate(localizer, scenes, on_frame=following(bar))
         summary = scores(results)
-        lines = [
+        self.answer(
+            summary.to_dict(),
             *table(score_rows(summary)),
             f"{summary.ms_per_image:.0f} ms per image, one at a time, decoding included",
-        ]
-        return self.answer(summary.to_dict(), lines, ("learn", self.store, "SCENE"))
+            then=("learn", self.store, "SCENE"),
+        )
+        return 0
 
 
 def load_named(words: tuple[str, ...]) -> "dict[str, Recording]":
-    """Load scenes from the words `SCENE` and `NAME=SCENE`.
-
-    Raises:
-        InputError: A scene cannot be read, or two scenes have one name.
-    """
+    """Load scenes from the words `SCENE` and `NAME=SCENE`."""
     from evercal.recordings import load_recording
 
     scenes: dict[str, Recording] = {}

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
-from evercal.cli.options import File, Frame, Name, Verb
+from evercal.cli import args
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Export(Verb):
+class Export(args.Verb):
     """Write a calibration in the format of another program; `--format list` lists all formats.
 
     Without `--out` the text is printed. The pose is parent_from_child: the camera in the robot base
@@ -24,35 +24,31 @@ class Export(Verb):
     Example: evercal export tripod.json --format urdf --out camera.urdf
     """
 
-    calibration: Annotated[
-        Positional[Path | None], arg(metavar="[CALIBRATION.json]", help_behavior_hint="")
-    ] = None
+    calibration: Annotated[Positional[Path | None], args.shown("[CALIBRATION.json]")] = None
     """Calibration file, or a map that was learned from gripper poses (MAP or MAP:SCENE)."""
-    format: Name = None
+    format: args.Name = None
     """Format, such as easy_handeye2, urdf, opencv or kuka; `list` lists all."""
-    out: File = None
+    out: args.File = None
     """File to write; a new folder for colmap."""
-    parent: Frame = None
+    parent: args.Frame = None
     """New name of the parent frame: the robot base or the gripper."""
-    child: Frame = None
+    child: args.Frame = None
     """New name of the child frame: the camera's optical frame."""
-    via: Frame = None
+    via: args.Frame = None
     """Export this root frame of the camera driver, such as camera_link."""
-    via_transform: File = None
+    via_transform: args.File = None
     """With --via: output of `ros2 topic echo --once /tf_static`, or a TransformStamped."""
-    via_offset: Annotated[
-        tuple[float, float, float] | None, arg(metavar="X Y Z", help_behavior_hint="")
-    ] = None
+    via_offset: Annotated[tuple[float, float, float] | None, args.shown("X Y Z")] = None
     """With --via: offset of the optical frame (forward, left, up), metres."""
     via_optical: bool = False
     """With --via: both frames have the same origin."""
-    robot_frame: Frame = None
+    robot_frame: args.Frame = None
     """For easy_handeye: gripper frame of a fixed camera, else base frame."""
-    robot_poses: File = None
+    robot_poses: args.File = None
     """Gripper pose of every image: moveit_samples, or tum, colmap, nerfstudio on the arm."""
-    target_poses: File = None
+    target_poses: args.File = None
     """Board pose in the camera for every image, for moveit_samples."""
-    convention: Name = None
+    convention: args.Name = None
     """Pose convention of --robot-poses if its header does not state it: ur, kuka, fanuc, ..."""
 
     def run(self) -> int:
@@ -61,18 +57,25 @@ class Export(Verb):
         from evercal.calibration.learned import calibration_at
 
         if self.format == "list" or (self.format is None and self.calibration is None):
-            return self._list()
+            file = self.calibration or "CALIBRATION.json"
+            self.answer(
+                {"formats": {name: row.description for name, row in FORMATS.items()}},
+                *(f"{name:27} {row.description}" for name, row in FORMATS.items()),
+                then=("export", file, "--format", "NAME"),
+            )
+            return 0
         if self.format is None:
             raise InputError(f"no format given; add --format NAME, one of {', '.join(FORMATS)}")
         if self.calibration is None:
             raise InputError("no calibration given; name its JSON file after 'export'")
         options = {key: getattr(self, key) for key in ExportOptions.__annotations__}
         calibration = calibration_at(self.calibration)
-        self._print(export_files(calibration, self.format, self.out, **options))
+        self._show(export_files(calibration, self.format, self.out, **options))
         return 0
 
-    def _print(self, exported: "Exported") -> None:
-        child, verdict = exported.calibration.child_frame, exported.calibration.verdict
+    def _show(self, exported: "Exported") -> None:
+        calibration = exported.calibration
+        child, verdict = calibration.child_frame, calibration.verdict
         if exported.format.frame == "tf" and self.via is None and "optical" in child:
             print(
                 f"note: most camera drivers publish {child} themselves; if yours does, give its"
@@ -82,31 +85,19 @@ class Export(Verb):
         if self.out is None and not self.json:
             sys.stdout.write(exported.text)
             return
-        lines = [f"wrote {', '.join(map(str, exported.files))}"]
-        lines += [f"  {words}" for words in (exported.calibration.meaning, verdict) if words]
-        then = ("check", "MAP", "IMAGE", "--reference", self.calibration)
-        self.answer(self._record(exported), lines, then)
-
-    def _list(self) -> int:
-        from evercal.calibration.export.formats import FORMATS
-
-        return self.answer(
-            {"formats": {name: row.description for name, row in FORMATS.items()}},
-            [f"{name:27} {row.description}" for name, row in FORMATS.items()],
-            ("export", self.calibration or "CALIBRATION.json", "--format", "NAME"),
-        )
-
-    def _record(self, exported: "Exported") -> dict[str, object]:
-        calibration = exported.calibration
-        return {
+        record = {
             "format": self.format,
             "mount": calibration.mount,
             "parent_frame": calibration.parent_frame,
-            "child_frame": calibration.child_frame,
+            "child_frame": child,
             "meaning": calibration.meaning,
             "translation_m": calibration.parent_from_child.translation_m.tolist(),
             "quaternion_wxyz": calibration.parent_from_child.rotation_wxyz.tolist(),
-            "verdict": calibration.verdict,
+            "verdict": verdict,
             "files": [str(file) for file in exported.files],
             "text": None if exported.files else exported.text,
         }
+        lines = [f"wrote {', '.join(map(str, exported.files))}", f"  {calibration.meaning}"]
+        lines += [f"  {verdict}"] if verdict else []
+        then = ("check", "MAP", "IMAGE", "--reference", self.calibration)
+        self.answer(record, *lines, then=then)

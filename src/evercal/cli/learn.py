@@ -2,62 +2,76 @@
 
 import dataclasses
 import sys
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.arguments import MAP, strategy_of
+from evercal.cli import args
 from evercal.cli.console import Bars, require_writable, size
-from evercal.cli.networks import NetworkOptions, learn_into_networks
-from evercal.cli.options import Device, File, Name, Store, Verb
-from evercal.cli.reading import Reading
+from evercal.cli.info import adjusted_row
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.calibration.eye_in_hand import HandEyeReport
     from evercal.learning.scene import LearnReport
     from evercal.mapping.build import Adjusted
     from evercal.recordings import Recording
 
 
 @dataclass(frozen=True)
-class Learn(Verb):
+class NetworkOptions:
+    """Options of strategies that train a network; a map refuses them."""
+
+    preset: Literal["fast", "demo", "bench", "converged", "paper"] = "fast"
+    """Amount of training: fast takes minutes on two cores, paper needs a GPU."""
+    centres: Annotated[int | None, args.shown("M")] = None
+    """Cluster centres that a scene adds to the network. Default: those of the preset."""
+    seed: int = 0
+    """Random seed."""
+
+    def refuse(self) -> None:
+        """Refuse options that a map does not have."""
+        for given in fields(self):
+            if (value := getattr(self, given.name)) != given.default:
+                raise InputError(
+                    f"{args.option(given.name)} {value}: a map is not trained; omit the option, or"
+                    " choose a network with --strategy"
+                )
+
+
+@dataclass(frozen=True)
+class Learn(args.Verb):
     """Learn a scene from a recording; scenes learned before do not change.
 
     A recording with gripper poses and no camera poses also yields gripper_from_camera. Several
-    recordings become one scene each, several at once with --workers.
+    recordings become one scene each, several at once with --workers. A new map gets a new folder.
 
     Example: evercal learn cell.evercal wrist_recording/ --calibration wrist.json
     """
 
-    store: Store
-    """Folder of the map; created if it is missing."""
-    recordings: Annotated[
-        Positional[tuple[Path, ...]], arg(metavar="RECORDING...", help_behavior_hint="")
-    ] = ()
+    store: args.Store
+    recordings: Annotated[Positional[tuple[Path, ...]], args.shown("RECORDING...")] = ()
     """Folders of recordings, or files of bags."""
-    name: Name = None
+    name: args.Name = None
     """Name of the scene. Default: the recording's own name."""
-    memory: Annotated[str | None, arg(metavar="SHARE|BYTES|auto", help_behavior_hint="")] = None
+    memory: Annotated[str | None, args.shown("SHARE|BYTES|auto")] = None
     """Keyframes to keep: a share of the frames (10%), a size (5MB), or auto for the fewest that
     locate the recording's other frames well. Default: 10%, at least eight."""
-    calibration: File = None
+    calibration: args.File = None
     """Also write the estimated gripper_from_camera to a file. The map keeps it in any case."""
-    gripper_from_camera: File = None
+    gripper_from_camera: args.File = None
     """A rough gripper_from_camera to compare the estimate with: 4x4 matrix or calibration file."""
-    encoder: File = None
+    encoder: args.File = None
     """Encoder weights from 'python -m training', for a new map. Default: the shipped weights."""
-    strategy: Name = None
+    strategy: args.Name = None
     """evercal builds a map; every other strategy trains a network. Default: that of the store."""
-    reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
-    """How the recording is read."""
+    reading: Annotated[args.Reading, arg(name="")] = field(default_factory=args.Reading)
     networks: Annotated[NetworkOptions, arg(name="")] = field(default_factory=NetworkOptions)
-    """Strategies that train a network."""
-    workers: Annotated[int, arg(metavar="N")] = 1
+    workers: args.Number = 1
     """Recordings to learn in parallel."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         if not self.recordings:
@@ -74,31 +88,27 @@ class Learn(Verb):
             MemoryBudget.parse(self.memory)
         except InputError as error:
             raise InputError(f"--{error}") from None
-        made_with = strategy_of(self.store)
-        strategy = self.strategy or made_with or MAP
+        made_with = args.strategy_of(self.store)
+        strategy = self.strategy or made_with or args.MAP
         if strategy != (made_with or strategy):
             raise InputError(
                 f"--strategy {strategy}: {self.store} was made with {made_with}; omit the option or"
                 " start a new store"
             )
-        if strategy == MAP:
+        if strategy == args.MAP:
             self.networks.refuse()
         return self._run_one(self.recordings[0], strategy) if single else self._run_many(strategy)
 
     def _run_many(self, strategy: str) -> int:
-        self._refuse(
-            "several recordings are learned; omit the option or give one recording",
-            name=self.name,
-            calibration=self.calibration,
-            gripper_from_camera=self.gripper_from_camera,
-        )
-        if strategy != MAP:
+        why = "several recordings are learned; omit the option or give one recording"
+        self._refuse(why, "name", "calibration", "gripper_from_camera")
+        if strategy != args.MAP:
             raise InputError("several recordings: a network learns one at a time; give one")
         from evercal.map import Map
 
-        loaded = [self.reading.recording(path, None) for path in self.recordings]
+        loaded = [self.reading.recording(path) for path in self.recordings]
         cell = Map.open(self.store, device=self.device, encoder=self.encoder)
-        with Bars(self._stream, f"{len(loaded)} recordings, {self.workers} at once") as bars:
+        with self._bars(f"{len(loaded)} recordings, {self.workers} at once") as bars:
             reports = cell.learn_many(
                 loaded,
                 workers=self.workers,
@@ -107,39 +117,32 @@ class Learn(Verb):
                 on_progress=bars.step,
             )
         record = {"scenes": [dataclasses.asdict(report) for report in reports]}
-        return self.answer(record, then=("localize", self.store, "IMAGE"))
+        self.answer(record, then=("localize", self.store, "IMAGE"))
+        return 0
 
     def _run_one(self, path: Path, strategy: str) -> int:
         from evercal.recordings.frame import lacks_camera_poses
 
         recording = self.reading.recording(path, self.name)
         if not lacks_camera_poses(recording):
-            self._refuse(
-                f"{recording.name} states camera poses, so gripper_from_camera is not estimated;"
-                " omit the option",
-                gripper_from_camera=self.gripper_from_camera,
-                calibration=self.calibration,
-            )
+            why = "states camera poses, so gripper_from_camera is not estimated; omit the option"
+            self._refuse(f"{recording.name} {why}", "gripper_from_camera", "calibration")
         try:
             report = self._learned(recording, strategy)
         except KeyboardInterrupt:
             print("stopped; the same command starts again", file=sys.stderr)
             return 130
-        lines = summary(report)
+        lines = list(summary(report))
         if self.calibration is not None:
             lines.append(f"wrote {self.calibration}")
         then = self._next(recording, report, path)
-        return self.answer(dataclasses.asdict(report), lines, then)
+        self.answer(dataclasses.asdict(report), *lines, then=then)
+        return 0
 
     def _learned(self, recording: "Recording", strategy: str) -> "LearnReport":
-        from evercal.calibration.calibration import read_transform
-
-        rough = (
-            None if self.gripper_from_camera is None else read_transform(self.gripper_from_camera)
-        )
-        frames = f"{len(recording.train)} training frames"
-        with Bars(self._stream, f"{recording.name}: {frames}") as bars:
-            if strategy != MAP:
+        rough = args.transform_of(self.gripper_from_camera)
+        with self._bars(f"{recording.name}: {len(recording.train)} training frames") as bars:
+            if strategy != args.MAP:
                 return learn_into_networks(self, strategy, recording, bars)
             from evercal.map import Map
 
@@ -159,94 +162,105 @@ class Learn(Verb):
         if not recording.metric:
             return "align", self.store, report.scene, "IMAGE...", "--robot-poses", "FILE"
         if recording.test:
-            scene = str(path) if self.name is None else f"{self.name}={path}"
-            return "evaluate", self.store, scene
+            return "evaluate", self.store, f"{self.name}={path}" if self.name else path
         return "localize", self.store, "IMAGE"
 
-    @property
-    def _stream(self) -> Any:
-        return sys.stderr if self.json else sys.stdout
+    def _bars(self, start: str) -> Bars:
+        return Bars(sys.stderr if self.json else sys.stdout, start)
 
-    @staticmethod
-    def _refuse(why: str, **options: object) -> None:
-        for name, value in options.items():
-            if value is not None:
-                raise InputError(f"--{name.replace('_', '-')} {value}: {why}")
+    def _refuse(self, why: str, *names: str) -> None:
+        """Refuse options that were given and do not apply."""
+        for name in names:
+            if (value := getattr(self, name)) is not None:
+                raise InputError(f"{args.option(name)} {value}: {why}")
 
 
-def summary(report: "LearnReport") -> list[str]:
+def learn_into_networks(
+    given: Learn, strategy: str, recording: "Recording", bars: "Bars"
+) -> "LearnReport":
+    """Train a network on a recording."""
+    from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
+    from evercal.continual.learning.stage import Encoding
+    from evercal.continual.networks.trainer import Progress
+
+    wanted = given.networks
+    if wanted.centres is not None and wanted.centres < 1:
+        raise InputError(f"--centres {wanted.centres}: give a number >= 1")
+    if wanted.seed < 0:
+        raise InputError(f"--seed {wanted.seed}: give a number >= 0")
+
+    def show(event: object) -> None:
+        if isinstance(event, Progress):
+            bar = bars.step("training", event.step, event.total)
+            text = f"loss {event.loss:.1f}, {100 * event.inlier_share:.0f} % inliers"
+            bar.set_postfix_str(text, refresh=event.step == event.total)
+        elif isinstance(event, Encoding):
+            bars.step("encoding", event.done, event.total)
+
+    options = NetworkLearnOptions(
+        strategy=strategy,
+        preset=wanted.preset,
+        memory=given.memory or "10%",
+        centres=wanted.centres,
+        encoder=given.encoder,
+        device=given.device,
+        seed=wanted.seed,
+    )
+    return learn_networks(given.store, recording, options, show)
+
+
+def summary(report: "LearnReport") -> Iterator[str]:
     """The outcome in lines."""
-    lines = [
-        f"mapped {report.scene}: {report.train_frames} images, {report.frames_kept} keyframes,"
-        f" {report.landmarks:,} landmarks, {report.seconds:.0f} s; {size(report.memory_bytes)} for"
-        " all scenes"
-    ]
+    kept = f"{report.scene}: {report.train_frames} images, {report.frames_kept} keyframes"
+    memory = size(report.memory_bytes)
     if report.iterations:
-        lines = [
-            f"learned {report.scene}: {report.train_frames} images, {report.frames_kept} keyframes,"
-            f" {report.iterations} steps, {report.seconds:.0f} s; {size(report.memory_bytes)} of"
+        yield (
+            f"learned {kept}, {report.iterations} steps, {report.seconds:.0f} s; {memory} of"
             f" keyframes and {size(report.head_bytes)} of networks for all scenes"
-        ]
-    if report.hand_eye is not None:
-        lines += hand_eye_lines(report.hand_eye)
-    if report.adjusted is not None:
-        lines += adjusted_lines(report.adjusted)
-    return lines
-
-
-def hand_eye_lines(report: "HandEyeReport") -> list[str]:
-    """The estimated camera on the gripper in lines."""
-    estimate = report.gripper_from_camera
-    x, y, z = (1000 * value for value in report.translation_m)
-    quaternion = ", ".join(f"{value:.5f}" for value in report.quaternion_wxyz)
-    lines = [
-        f"gripper_from_camera: ({x:.1f}, {y:.1f}, {z:.1f}) mm, quaternion wxyz ({quaternion});"
-        f" standard deviation {estimate.sigma_mm:.2f} mm and {estimate.sigma_deg:.3f} deg per axis;"
-        f" {report.pairs} of {report.of_pairs} image pairs are inliers"
-    ]
-    lines += [f"warning: {warning}" for warning in report.warnings]
-    if report.given_mm is not None:
-        lines.append(
-            f"distance from the given one: {report.given_mm:.1f} mm and {report.given_deg:.1f} deg"
         )
-    return lines
+    else:
+        yield (
+            f"mapped {kept}, {report.landmarks:,} landmarks, {report.seconds:.0f} s; {memory} for"
+            " all scenes"
+        )
+    if (found := report.hand_eye) is not None:
+        pose = found.gripper_from_camera
+        x, y, z = (1000 * value for value in found.translation_m)
+        quaternion = ", ".join(f"{value:.5f}" for value in found.quaternion_wxyz)
+        yield (
+            f"gripper_from_camera: ({x:.1f}, {y:.1f}, {z:.1f}) mm, quaternion wxyz ({quaternion});"
+            f" standard deviation {pose.sigma_mm:.2f} mm and {pose.sigma_deg:.3f} deg per axis;"
+            f" {found.pairs} of {found.of_pairs} image pairs are inliers"
+        )
+        yield from (f"warning: {warning}" for warning in found.warnings)
+        if found.given_mm is not None:
+            far = f"{found.given_mm:.1f} mm and {found.given_deg:.1f} deg"
+            yield f"distance from the given one: {far}"
+    if report.adjusted is not None:
+        row = adjusted_row(report.scene, dataclasses.asdict(report.adjusted))
+        yield "; ".join(f"{what} {value}" for what, value in row.items())
+        yield from _warnings(report.adjusted)
 
 
-def adjusted_lines(adjusted: "Adjusted") -> list[str]:
-    """What bundle adjustment changed, in lines."""
-    shift = sum(x * x for x in adjusted.common_translation_mm) ** 0.5
-    rotation = sum(x * x for x in adjusted.common_rotation_deg) ** 0.5
-    residual = "-" if adjusted.residual_px is None else f"{adjusted.residual_px:.2f} px"
-    lines = [
-        f"bundle adjustment: median residual {residual}; stated poses accurate to"
-        f" {adjusted.pose_sigma_mm:.1f} mm and {adjusted.pose_sigma_deg:.2f} deg per axis; common"
-        f" offset {shift:.1f} mm and {rotation:.2f} deg; focal length"
-        f" {adjusted.focal_percent:+.2f} %"
-    ]
+def _warnings(adjusted: "Adjusted") -> Iterator[str]:
     from evercal.calibration.eye_in_hand import MOST_FOCAL_PERCENT
 
     if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
-        lines.append(
+        yield (
             "warning: images and stated poses ask for a focal length"
             f" {adjusted.focal_percent:+.1f} % from the stated one; the intrinsics or the scale of"
             " the poses are wrong"
         )
     if abs(adjusted.time_shift_frames) > 0.02:
-        lines.append(
+        yield (
             f"warning: the images lag their stated poses by {adjusted.time_shift_frames:+.2f} frame"
             " intervals; check the clocks"
         )
-    if adjusted.wrong_poses:
-        lines.append(
-            f"warning: poses that contradict the images, left out: {_few(adjusted.wrong_poses)}"
-        )
-    if adjusted.untracked:
-        lines.append(f"untracked images, left out: {_few(adjusted.untracked)}")
-    if adjusted.doubtful_poses:
-        lines.append(f"warning: poses with large errors: {_few(adjusted.doubtful_poses)}")
-    return lines
-
-
-def _few(names: tuple[str, ...], most: int = 8) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+    for what, names in (
+        ("warning: poses that contradict the images, left out", adjusted.wrong_poses),
+        ("untracked images, left out", adjusted.untracked),
+        ("warning: poses with large errors", adjusted.doubtful_poses),
+    ):
+        if names:
+            more = f" and {len(names) - 8} more" if len(names) > 8 else ""
+            yield f"{what}: {', '.join(names[:8])}{more}"

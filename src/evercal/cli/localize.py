@@ -2,75 +2,72 @@
 
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import arg
-
-from evercal.cli.arguments import (
-    Point,
-    camera_for,
-    open_localizer,
-    point_dict,
-    point_of,
-    point_text,
-)
+from evercal.cli import args
 from evercal.cli.console import progress_bar, require_folder, require_writable
-from evercal.cli.options import At, Device, Folder, Images, Intrinsics, Store, Verb
 from evercal.reports.answers import Answer, answer_row, budget_of, finite_pose, unit_known
 
 if TYPE_CHECKING:
     import numpy as np
 
     from evercal.geometry import Camera
-    from evercal.localization.estimate import PoseEstimate
     from evercal.localization.learned import LearnedLocalizer
 
 
 @dataclass(frozen=True)
-class Localize(Verb):
-    """Estimate the camera pose of images, in the base frame of the scene they show.
+class Localize(args.Verb):
+    """Estimate the camera pose of images in the base frame.
 
     Exit code 1 if no image was located.
 
     Example: evercal localize cell.evercal image.jpg --overlay overlays/
     """
 
-    store: Store
-    images: Images
+    store: args.Store
+    images: args.ImageFiles
     """Image files or folders of them."""
-    camera: Intrinsics = None
-    overlay: Folder = None
+    camera: args.File = None
+    """Intrinsics: 3x3 matrix as text, JSON, YAML, NPZ, ROS camera_info or OpenCV's storage.
+    Default: those of the camera that recorded the scene."""
+    overlay: args.Folder = None
     """Output folder for copies of the images with their landmarks and residuals."""
-    video: Annotated[Path | None, arg(metavar="FILE.mp4", help_behavior_hint="")] = None
+    video: Annotated[Path | None, args.shown("FILE.mp4")] = None
     """A video of the sequence: each image with its landmarks and residuals, beside the map seen
     from above with the camera's path and its uncertainty."""
-    at: At = None
-    device: Device = "auto"
+    at: args.At = None
+    device: args.Device = "auto"
 
     def run(self) -> int:
         from evercal.recordings.image_files import image_files
 
-        point = point_of(self.at)
+        point = args.Point.parse(self.at)
         files = image_files(self.images)
-        camera = camera_for(self.camera, files)
+        camera = args.camera_for(self.camera, files)
         require_folder(self.overlay, "--overlay")
         if self.video is not None:
             from evercal.reports.video import require_ending
 
             require_writable(self.video, "--video")
             require_ending(self.video)
-        localizer = open_localizer(self.store, self.device)
-        answers = self._answers(localizer, files, camera)
+        localizer = args.open_localizer(self.store, self.device)
+        answers = self._answers(localizer, files, camera)  # all of them before the first is printed
+        lines = [line for answer in answers for line in _lines(answer, point)]
         if self.video is not None:
             self._animate(self.video, localizer, answers)
-        located = sum(answer.estimate.status == "ok" for answer in answers)
-        lines = [as_text(answer, point) for answer in answers]
-        if self.video is not None:
             lines.append(f"wrote {self.video}")
-        record = {"images": [as_dict(answer, point) for answer in answers]}
-        self.answer(record, lines, self._next(files, located))
+        located = any(answer.estimate.status == "ok" for answer in answers)
+        if not located:
+            then = ("learn", self.store, "RECORDING")
+        elif self.overlay is None:
+            then = ("localize", self.store, files[0], "--overlay", "DIR")
+        else:
+            then = ("evaluate", self.store, "RECORDING")
+        record = {"images": [_record(answer, point) for answer in answers]}
+        self.answer(record, *lines, then=then)
         return 0 if located else 1
 
     def _answers(
@@ -111,63 +108,47 @@ class Localize(Verb):
 
             write_video(path, animate(answers, localizer, read))
 
-    def _next(self, files: list[Path], located: int) -> tuple[object, ...]:
-        if not located:
-            return "learn", self.store, "RECORDING"
-        if self.overlay is None:
-            return "localize", self.store, files[0], "--overlay", "DIR"
-        return "evaluate", self.store, "RECORDING"
-
 
 def _overlay_name(files: list[Path], number: int) -> str:
+    """A file name; images of one name from two folders get different ones."""
     stems = [path.stem for path in files]
     again = f"-{number + 1}" if stems.count(stems[number]) > 1 else ""
     return f"{stems[number]}{again}-overlay.png"
 
 
-def as_dict(answer: Answer, point: Point | None = None) -> dict[str, object]:
-    """One image's entry in the JSON output, see `answer_row`. `point` is that of --at."""
-    entry, uncertain = answer_row(answer), finite_pose(answer.estimate)
+def _record(answer: Answer, point: args.Point | None) -> dict[str, object]:
+    record, pose = answer_row(answer), finite_pose(answer.estimate)
     if point is not None:
-        metric = uncertain if answer.unit_known else None
-        entry["at"] = None if metric is None else point_dict(point, metric)
-    return entry
+        record["at"] = point.record(pose) if pose is not None and answer.unit_known else None
+    return record
 
 
-def as_text(answer: Answer, point: Point | None = None) -> str:
-    """One image's block of text. `point` is that of --at."""
-    estimate = answer.estimate
-    share = (
-        f"{estimate.inliers} ({100 * estimate.inlier_ratio:.0f} %), {answer.milliseconds:.0f} ms"
-    )
-    if estimate.base_from_camera is None:
-        no = estimate.status.replace("_", " ")
-        return f"{answer.path}\n  {no}: {estimate.reason}\n  inliers      {share}"
-    pose = estimate.base_from_camera
-    spread = [""] * 2
+def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
+    estimate, pose = answer.estimate, answer.estimate.base_from_camera
+    share = f"{100 * estimate.inlier_ratio:.0f} %"
+    inliers = f"  inliers      {estimate.inliers} ({share}), {answer.milliseconds:.0f} ms"
+    yield str(answer.path)
+    if pose is None:
+        yield f"  {estimate.status.replace('_', ' ')}: {estimate.reason}"
+        yield inliers
+        return
+    sd = ["", ""]
     if estimate.covariance is not None:
-        sd = estimate.covariance.diagonal().clip(0) ** 0.5
-        spread = [_numbers(1000 * sd[:3], ".2f"), _numbers(sd[3:] * 180 / math.pi, ".3f")]
-        spread = [f"  sd {spread[0]} mm", f"  sd {spread[1]} deg"]
-    unit = f"m{spread[0]}" if answer.unit_known else "in an unknown unit: run 'evercal align' first"
-    lines = [
-        str(answer.path),
-        f"  scene        {estimate.scene}",
-        f"  translation  {_numbers(pose.translation_m, '+.4f')} {unit}",
-        f"  quaternion   {_numbers(pose.rotation_wxyz, '+.4f')} wxyz{spread[1]}",
-        f"  inliers      {share}",
-    ]
-    if budget := _budget_words(estimate):
-        lines.insert(-1, f"  budget       {budget} of the position's variance")
+        spread = estimate.covariance.diagonal().clip(0) ** 0.5
+        sd[0] = f"  sd {_numbers(1000 * spread[:3], '.2f')} mm"
+        sd[1] = f"  sd {_numbers(spread[3:] * 180 / math.pi, '.3f')} deg"
+    unit = f"m{sd[0]}" if answer.unit_known else "in an unknown unit: run 'evercal align' first"
+    yield f"  scene        {estimate.scene}"
+    yield f"  translation  {_numbers(pose.translation_m, '+.4f')} {unit}"
+    yield f"  quaternion   {_numbers(pose.rotation_wxyz, '+.4f')} wxyz{sd[1]}"
+    parts = sorted(budget_of(estimate), key=lambda part: -part[1])
+    causes = ", ".join(f"{term.name} {100 * of:.0f} %" for term, of in parts if of >= 0.005)
+    if causes:
+        yield f"  budget       {causes} of the position's variance"
     uncertain = finite_pose(estimate)
     if point is not None and uncertain is not None and answer.unit_known:
-        lines.insert(-1, f"  point        sd {point_text(point, uncertain)}")
-    return "\n".join(lines)
-
-
-def _budget_words(estimate: "PoseEstimate") -> str:
-    parts = sorted(budget_of(estimate), key=lambda part: -part[1])
-    return ", ".join(f"{t.name} {100 * share:.0f} %" for t, share in parts if share >= 0.005)
+        yield f"  point        sd {point.text(uncertain)}"
+    yield inliers
 
 
 def _numbers(values: "np.ndarray", form: str) -> str:

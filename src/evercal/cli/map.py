@@ -7,81 +7,97 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
+from evercal.cli import args
 from evercal.cli.console import require_writable, size
-from evercal.cli.options import Store, Verb
 
 if TYPE_CHECKING:
-    from evercal.map import Map
+    from evercal.map import Map as LearnedMap
+
+Archive = Annotated[Positional[Path], arg(metavar="FILE")]
 
 
 @dataclass(frozen=True)
-class List(Verb):
+class Action(args.Verb):
+    """An action on a map."""
+
+    def opened(self, store: Path) -> "LearnedMap":
+        """The map at a path that must exist."""
+        from evercal.map import Map as LearnedMap
+        from evercal.storage import read_manifest
+
+        read_manifest(store)
+        return LearnedMap.open(store, device="cpu")
+
+    def done(self, cell: "LearnedMap", what: str, **more: object) -> int:
+        """Say what was done and which scenes there are."""
+        record = {"store": str(cell.path), **more, "scenes": list(cell.scenes)}
+        line = f"{what}; scenes of {cell.path}: {', '.join(cell.scenes) or 'none'}"
+        self.answer(record, line, then=("map", "list", cell.path))
+        return 0
+
+
+@dataclass(frozen=True)
+class List(Action):
     """List the scenes of a map with their size.
 
     Example: evercal map list cell.evercal
     """
 
-    store: Store
+    store: args.Store
 
     def run(self) -> int:
         from evercal.mapping.store import MapStore
 
-        scenes = [
-            {
-                "name": scene.name,
-                "keyframes": len(scene.keyframes),
-                "landmarks": scene.landmarks,
-                "memory_bytes": scene.keyframes.bytes,
-            }
-            for scene in MapStore.open(self.store).contents.scenes
-        ]
-        lines = [
-            f"{scene['name']}: {scene['keyframes']} keyframes,"
-            f" {scene['landmarks']:,} landmarks, {size(scene['memory_bytes'])}"
-            for scene in scenes
-        ]
-        record = {"store": str(self.store), "scenes": scenes}
-        return self.answer(record, lines or [f"{self.store}: no scene"])
+        scenes, lines = [], []
+        for scene in MapStore.open(self.store).contents.scenes:
+            keyframes, memory = len(scene.keyframes), scene.keyframes.bytes
+            record = {"name": scene.name, "keyframes": keyframes, "landmarks": scene.landmarks}
+            scenes.append({**record, "memory_bytes": memory})
+            counts = f"{keyframes} keyframes, {scene.landmarks:,} landmarks"
+            lines.append(f"{scene.name}: {counts}, {size(memory)}")
+        none = f"{self.store}: no scene"
+        self.answer({"store": str(self.store), "scenes": scenes}, *(lines or [none]))
+        return 0
 
 
 @dataclass(frozen=True)
-class Remove(Verb):
+class Remove(Action):
     """Remove scenes from a map, all in one step.
 
     Example: evercal map remove cell.evercal kitchen
     """
 
-    store: Store
-    names: Annotated[Positional[tuple[str, ...]], arg(metavar="SCENE...", help_behavior_hint="")]
+    store: args.Store
+    names: Annotated[Positional[tuple[str, ...]], args.shown("SCENE...")]
     """Scenes to remove."""
 
     def run(self) -> int:
-        opened = _opened(self.store)
-        opened.remove(*self.names)
-        return _done(self, opened, f"removed {', '.join(self.names)}")
+        cell = self.opened(self.store)
+        cell.remove(*self.names)
+        return self.done(cell, f"removed {', '.join(self.names)}")
 
 
 @dataclass(frozen=True)
-class Rename(Verb):
+class Rename(Action):
     """Give a scene of a map another name.
 
     Example: evercal map rename cell.evercal kitchen kitchen-2025
     """
 
-    store: Store
+    store: args.Store
     name: Annotated[Positional[str], arg(metavar="SCENE")]
     """Name of the scene."""
     new: Annotated[Positional[str], arg(metavar="NEW")]
     """Its new name."""
 
     def run(self) -> int:
-        opened = _opened(self.store)
-        opened.rename(self.name, self.new)
-        return _done(self, opened, f"renamed {self.name} to {self.new}")
+        cell = self.opened(self.store)
+        cell.rename(self.name, self.new)
+        return self.done(cell, f"renamed {self.name} to {self.new}")
 
 
 @dataclass(frozen=True)
-class Merge(Verb):
+class Merge(Action):
     """Add the scenes of other maps to a map, all in one step; a new folder becomes a new map.
 
     All maps must have one encoder and one image size.
@@ -89,35 +105,34 @@ class Merge(Verb):
     Example: evercal map merge all.evercal cell-1.evercal cell-2.evercal
     """
 
-    store: Store
-    """Folder of the map that grows."""
-    others: Annotated[Positional[tuple[Path, ...]], arg(metavar="OTHER...", help_behavior_hint="")]
+    store: args.Store
+    others: Annotated[Positional[tuple[Path, ...]], args.shown("OTHER...")]
     """Folders of the other maps; they do not change."""
     on_clash: Literal["refuse", "rename", "skip", "replace"] = "refuse"
     """For a scene whose name is taken: refuse the merge, rename it to NAME-2, skip it, or replace
     the scene of the map."""
 
     def run(self) -> int:
-        from evercal.map import Map
+        from evercal.map import Map as LearnedMap
 
-        opened = Map.open(self.store, device="cpu")
-        merged = opened.merge(*self.others, on_clash=self.on_clash)
+        cell = LearnedMap.open(self.store, device="cpu")
+        merged = cell.merge(*self.others, on_clash=self.on_clash)
         words = [f"added {', '.join(merged.added) or 'no scene'}"]
         words += [f"{name} is now {new}" for name, new in merged.renamed]
         words += [f"skipped {name}" for name in merged.skipped]
         words += [f"replaced {name}" for name in merged.replaced]
-        return _done(self, opened, "; ".join(words), dataclasses.asdict(merged))
+        return self.done(cell, "; ".join(words), **dataclasses.asdict(merged))
 
 
 @dataclass(frozen=True)
-class Pack(Verb):
+class Pack(Action):
     """Write a map into one file, a zip archive with checksums.
 
     Example: evercal map pack cell.evercal cell.zip
     """
 
-    store: Store
-    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    store: args.Store
+    file: Archive
     """Output file; an existing one is replaced."""
 
     def run(self) -> int:
@@ -126,35 +141,33 @@ class Pack(Verb):
         require_writable(self.file, "FILE")
         pack_map(self.store, self.file)
         count = self.file.stat().st_size
-        return self.answer(
-            {"file": str(self.file), "bytes": count},
-            [f"wrote {self.file} ({size(count)})"],
-            ("map", "unpack", self.file, "MAP"),
-        )
+        line = f"wrote {self.file} ({size(count)})"
+        then = ("map", "unpack", self.file, "MAP")
+        self.answer({"file": str(self.file), "bytes": count}, line, then=then)
+        return 0
 
 
 @dataclass(frozen=True)
-class Unpack(Verb):
-    """Extract a map from a file of 'evercal map pack'; every file is checked.
+class Unpack(Action):
+    """Extract a map from a file of 'evercal map pack' into a new folder; every file is checked.
 
     Example: evercal map unpack cell.zip cell.evercal
     """
 
-    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    file: Archive
     """The archive."""
-    store: Store
-    """New folder for the map."""
+    store: args.Store
 
     def run(self) -> int:
         from evercal.mapping.manage import unpack_map
 
         unpack_map(self.file, self.store)
-        return _done(self, _opened(self.store), f"unpacked {self.file}")
+        return self.done(self.opened(self.store), f"unpacked {self.file}")
 
 
 @dataclass(frozen=True)
-class Maps:
-    """Manage the scenes of a map: list, remove, rename, merge, pack, unpack.
+class Map:
+    """Manage scenes of a map: list, remove, rename, merge, pack, unpack.
 
     Every change is one step: it happens completely or not at all. Every action has --json.
 
@@ -172,19 +185,3 @@ class Maps:
 
     def run(self) -> int:
         return self.action.run()
-
-
-def _opened(store: Path) -> "Map":
-    from evercal.map import Map
-    from evercal.storage import read_manifest
-
-    read_manifest(store)
-    return Map.open(store, device="cpu")
-
-
-def _done(verb: Verb, opened: "Map", what: str, more: dict[str, object] | None = None) -> int:
-    return verb.answer(
-        {"store": str(opened.path), **(more or {}), "scenes": list(opened.scenes)},
-        [f"{what}; scenes of {opened.path}: {', '.join(opened.scenes) or 'none'}"],
-        ("map", "list", opened.path),
-    )

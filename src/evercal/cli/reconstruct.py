@@ -7,16 +7,16 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.cli import args
 from evercal.cli.console import Bars
-from evercal.cli.options import Verb
 
 _CONNECTED = 0.8
 """Share of the frames in one part below which the video does not hold together."""
 
 
 @dataclass(frozen=True)
-class Reconstruct(Verb):
-    """Estimate camera poses from a plain video or images, to learn a map from.
+class Reconstruct(args.Verb):
+    """Estimate camera poses from a plain video or images, for a map.
 
     The unit of length is arbitrary until 'evercal align'. Exit code 1 if less than 80 % of the
     frames connect.
@@ -30,7 +30,7 @@ class Reconstruct(Verb):
     """New folder: a COLMAP model and its images."""
     motion: Annotated[float, arg(metavar="SHARE")] = 0.04
     """Motion from one chosen frame of a video to the next, parts of its width."""
-    most: Annotated[int, arg(metavar="N")] = 300
+    most: args.Number = 300
     """Frames, at most."""
 
     def run(self) -> int:
@@ -44,11 +44,10 @@ class Reconstruct(Verb):
             f" points, residual {found.residual_px:.2f} px"
         ]
         if not whole:
-            parts = ", ".join(map(str, found.parts))
             lines.append(
-                f"the video does not hold together: parts of {parts} frames; move more slowly"
-                " where they end, and return to places seen before"
+                f"the video does not hold together: parts of {', '.join(map(str, found.parts))}"
+                " frames; move more slowly where they end, and return to places seen before"
             )
         record = {"out": str(self.out), **dataclasses.asdict(found)}
-        self.answer(record, lines, ("learn", "cell.evercal", self.out))
+        self.answer(record, *lines, then=("learn", "cell.evercal", self.out))
         return 0 if whole else 1

@@ -2,15 +2,15 @@
 
 import dataclasses
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
-from evercal.cli.arguments import camera_for, stated_camera
+from evercal.cli import args
 from evercal.cli.console import Bars, size
-from evercal.cli.options import Device, Intrinsics, Store, Verb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,55 +22,54 @@ _LISTED = 5
 
 
 @dataclass(frozen=True)
-class Refresh(Verb):
-    """Follow a changed room: new images replace what is gone, in the same memory.
+class Refresh(args.Verb):
+    """Follow a changed room: new images replace what is gone.
 
-    The images need no poses: they are located in the map. What was moved or removed leaves the map,
-    and the base frame stays where the unmoved keyframes hold it.
+    The map keeps its size. The images need no poses: they are located in the map. What was moved or
+    removed leaves it, and the base frame stays where the unmoved keyframes hold it.
 
     Example: evercal refresh cell.evercal images/
     """
 
-    store: Store
-    images: Annotated[
-        Positional[tuple[Path, ...]], arg(metavar="[RECORDING|IMAGE...]", help_behavior_hint="")
-    ] = ()
+    store: args.Store
+    images: Annotated[Positional[tuple[Path, ...]], args.shown("[RECORDING|IMAGE...]")] = ()
     """Images of one camera, a folder of them, or a recording."""
-    camera: Intrinsics = None
-    undo: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="")] = None
+    camera: args.File = None
+    """File of the intrinsics. Default: those of the camera that recorded the scene."""
+    undo: Annotated[str | None, args.shown("SCENE")] = None
     """Bring back the state of a scene before its last refresh."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         if (self.undo is None) == (not self.images):
             raise InputError("give images of the changed room, or --undo SCENE")
         from evercal.map import Map
+        from evercal.recordings.image_files import image_files
         from evercal.storage import read_manifest
 
         read_manifest(self.store)
         cell = Map.open(self.store, device=self.device)
         if self.undo is not None:
             cell.undo_refresh(self.undo)
-            line = f"{self.undo}: the state before its last refresh is back"
-            return self.answer({"scene": self.undo, "undone": True}, [line])
-        recording = _recording(self.images)
-        stream = sys.stderr if self.json else sys.stdout
-        with Bars(stream) as bars:
-            if recording is not None:
+            said = f"{self.undo}: the state before its last refresh is back"
+            self.answer({"scene": self.undo, "undone": True}, said)
+            return 0
+        with Bars(sys.stderr if self.json else sys.stdout) as bars:
+            if (recording := _recording(self.images)) is not None:
                 first = recording.train[0].camera
-                camera = stated_camera(self.camera, (first.width, first.height))
+                camera = args.stated_camera(self.camera, (first.width, first.height))
                 report = cell.refresh(recording, camera=camera, on_progress=bars.step)
             else:
-                from evercal.recordings.image_files import image_files
-
                 files = image_files(self.images)
-                camera = camera_for(self.camera, files)
+                camera = args.camera_for(self.camera, files)
                 report = cell.refresh(files, camera=camera, on_progress=bars.step)
         then = ("refresh", self.store, "--undo", report.scene)
-        return self.answer(dataclasses.asdict(report), _lines(report), then)
+        self.answer(dataclasses.asdict(report), *_lines(report), then=then)
+        return 0
 
 
 def _recording(paths: tuple[Path, ...]) -> "Recording | None":
+    """The recording at a single path; None for images."""
     from evercal.recordings import load_recording
 
     if len(paths) != 1 or paths[0].is_file():
@@ -81,21 +80,20 @@ def _recording(paths: tuple[Path, ...]) -> "Recording | None":
         return None
 
 
-def _lines(report: "RefreshReport") -> list[str]:
-    share = report.landmarks_gone / max(report.landmarks_checked, 1)
-    lines = [
-        f"{report.scene}: {report.located} of {report.images} images located, refreshed in"
-        f" {report.seconds:.1f} s",
-        f"  landmarks    {report.landmarks_gone:,} of {report.landmarks_checked:,} in view are gone"
-        f" ({100 * share:.0f} %)",
-        f"  keyframes    {report.keyframes_left} replaced, {report.keyframes_added} new;"
-        f" {size(report.memory_bytes)}",
+def _lines(report: "RefreshReport") -> Iterator[str]:
+    seen, gone = report.landmarks_checked, report.landmarks_gone
+    located = f"{report.located} of {report.images} images located"
+    yield f"{report.scene}: {located}, refreshed in {report.seconds:.1f} s"
+    share = f"{100 * gone / max(seen, 1):.0f} %"
+    yield f"  landmarks    {gone:,} of {seen:,} in view are gone ({share})"
+    keyframes = f"{report.keyframes_left} replaced, {report.keyframes_added} new"
+    yield f"  keyframes    {keyframes}; {size(report.memory_bytes)}"
+    yield (
         f"  base frame   moved by {report.shift_mm:.2f} mm and {report.shift_deg:.3f} deg"
         f" (standard deviation {report.shift_sigma_mm:.2f} mm, {report.shift_sigma_deg:.3f} deg;"
-        f" {report.verified} images outside the map)",
-    ]
+        f" {report.verified} images outside the map)"
+    )
     left_out = list(report.left_out.items())
-    lines += [f"  left out     {name}: {reason}" for name, reason in left_out[:_LISTED]]
+    yield from (f"  left out     {name}: {reason}" for name, reason in left_out[:_LISTED])
     if len(left_out) > _LISTED:
-        lines.append(f"  left out     and {len(left_out) - _LISTED} more images")
-    return lines
+        yield f"  left out     and {len(left_out) - _LISTED} more images"

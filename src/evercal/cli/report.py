@@ -6,41 +6,39 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.arguments import open_localizer, point_dict, point_of, point_text
+from evercal.cli import args
 from evercal.cli.console import progress_bar, require_writable
-from evercal.cli.options import At, Device, Verb
 
 if TYPE_CHECKING:
+    from evercal.calibration.calibration import Calibration
     from evercal.reports.calibration_images import AnnotatedImages, BoardSeen
-    from evercal.reports.calibration_page import NamedCalibration
 
 
 @dataclass(frozen=True)
-class Report(Verb):
-    """Write an HTML report of a calibration: verdict, uncertainty, residuals and overlays.
+class Report(args.Verb):
+    """Write an HTML report of a calibration: residuals and overlays.
 
     Example: evercal report tripod.json --store cell.evercal
     """
 
     calibration: Annotated[Positional[Path], arg(metavar="CALIBRATION.json")]
     """Calibration file, or a map that was learned from gripper poses (MAP or MAP:SCENE)."""
-    store: Annotated[Path | None, arg(metavar="MAP", help_behavior_hint="")] = None
-    """Folder of the store. Its landmarks are drawn with their residuals."""
+    store: Annotated[Path | None, args.shown("MAP")] = None
+    """Folder of the map. Its landmarks are drawn with their residuals."""
     images: Annotated[
-        tuple[Path, ...],
-        arg(metavar="IMAGE...", help_behavior_hint="(default: images of the calibration)"),
+        tuple[Path, ...], args.shown("IMAGE...", "(default: those of the calibration)")
     ] = ()
     """Images of the camera, or a folder of them."""
-    against: Annotated[Path | None, arg(metavar="OLD.json", help_behavior_hint="")] = None
+    against: Annotated[Path | None, args.shown("OLD.json")] = None
     """Older calibration of the same camera, to compare with."""
-    at: At = None
+    at: args.At = None
     out: Annotated[Path, arg(metavar="FILE.html")] = Path("report.html")
     """The report, one file including its pictures."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         require_writable(self.out, "--out")
-        point = point_of(self.at)
+        point = args.Point.parse(self.at)
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.learned import calibration_at
         from evercal.calibration.verdict import expected_error, tier, verdict
@@ -52,54 +50,52 @@ class Report(Verb):
         older = None
         if self.against is not None:
             older = NamedCalibration(self.against.name, read_calibration(self.against))
-        file = NamedCalibration(self.calibration.name, calibration)
         boards = boards_seen(calibration, self.calibration.parent)
-        images = self._images(file, older, boards)
-        store = None if self.store is None else str(self.store)
-        page = calibration_page(file, images, store, older, point, bool(boards))
+        images = self._images(calibration, older and older.calibration, boards)
+        page = calibration_page(
+            NamedCalibration(self.calibration.name, calibration),
+            images,
+            None if self.store is None else str(self.store),
+            older,
+            None if point is None else (point.x, point.y, point.z),
+            bool(boards),
+        )
         write_bytes(self.out, page.html.encode())
-        text = calibration.verdict or verdict(calibration)
-        words = [] if point is None else [point_text(point, calibration.uncertain_pose)]
-        lines = [text, *(f"  {line}" for line in (*words, *page.missing)), f"wrote {self.out}"]
-        against = None
-        if older is not None:
-            change = difference(calibration, older.calibration)
-            against = {"translation_mm": change.mm, "rotation_deg": change.deg}
+        change = None if older is None else difference(calibration, older.calibration)
         best, (mm, deg) = tier(calibration), expected_error(calibration)
-        record = {
+        record: dict[str, object] = {
             "report": str(self.out),
-            "verdict": text,
+            "verdict": calibration.verdict or verdict(calibration),
             "tier": None if best is None else best.name,
             "expected_error_mm": mm,
             "expected_error_deg": deg,
             "pictures": list(images.images),
-            "against": against,
+            "against": change and {"translation_mm": change.mm, "rotation_deg": change.deg},
             "missing": list(page.missing),
-            **({} if point is None else {"at": point_dict(point, calibration.uncertain_pose)}),
         }
+        lines = [str(record["verdict"])]
+        if point is not None:
+            record["at"] = point.record(calibration.uncertain_pose)
+            lines.append(f"  {point.text(calibration.uncertain_pose)}")
+        lines += [f"  {line}" for line in page.missing]
         then = ("export", self.calibration, "--format", "easy_handeye2")
-        return self.answer(record, lines, then)
+        self.answer(record, *lines, f"wrote {self.out}", then=then)
+        return 0
 
     def _images(
         self,
-        file: "NamedCalibration",
-        older: "NamedCalibration | None",
+        calibration: "Calibration",
+        older: "Calibration | None",
         boards: "dict[str, BoardSeen]",
     ) -> "AnnotatedImages":
         from evercal.recordings.image_files import image_files
         from evercal.reports.calibration_images import annotate_images, select_images
 
-        calibration = file.calibration
         given = image_files(self.images) if self.images else []
         if calibration.camera is None:
             return annotate_images(calibration, [])
         files, reason = select_images(calibration, self.calibration.parent, given)
-        localizer = None
-        if self.store is not None:
-            localizer = open_localizer(self.store, self.device)
-        before = None if older is None else older.calibration
-        if not files:
-            nothing = annotate_images(calibration, [], before, localizer, boards)
-            return replace(nothing, missing=(reason,))
+        localizer = None if self.store is None else args.open_localizer(self.store, self.device)
         with progress_bar("drawing", len(files), "image") as bar:
-            return annotate_images(calibration, files, before, localizer, boards, bar.update)
+            drawn = annotate_images(calibration, files, older, localizer, boards, bar.update)
+        return drawn if files else replace(drawn, missing=(reason,))

@@ -2,36 +2,31 @@
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import Positional, arg
-
-from evercal.cli.options import Device, Host, Port, Verb
+from evercal.cli import args
 from evercal.errors import missing_extra
 
 TOKEN = "EVERCAL_TOKEN"
 
 
 @dataclass(frozen=True)
-class Serve(Verb):
+class Serve(args.Verb):
     """Serve a map over HTTP: localize, calibrate, check, track; see /docs of the service.
 
-    It answers this machine only, unless --host names another address, which requires a token.
-    Scenes that `evercal learn` adds meanwhile are noticed. SIGTERM or Ctrl-C stops it after the
-    requests under way.
+    It answers this machine only, unless --host names another address, which requires a token. The
+    map may be missing until a first scene is learned; scenes that `evercal learn` adds meanwhile
+    are noticed. SIGTERM or Ctrl-C stops it after the requests under way.
 
     Example: evercal serve cell.evercal --port 8000
     """
 
-    store: Annotated[Positional[Path], arg(metavar="MAP")]
-    """Folder of the map; it may be missing until a first scene is learned."""
-    port: Port = 8000
-    host: Host = "127.0.0.1"
-    token: Annotated[str | None, arg(metavar="T", help_behavior_hint="")] = None
+    store: args.Store
+    port: args.Port = 8000
+    host: args.Host = "127.0.0.1"
+    token: args.Name = None
     """Requests must have it as bearer token. Default: the variable EVERCAL_TOKEN, which other users
     of the machine cannot read."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         try:
@@ -40,13 +35,12 @@ class Serve(Verb):
             raise missing_extra(f"the service needs {error.name}", "serve") from None
 
         token = self.token or os.environ.get(TOKEN) or None
-        serve(
-            ServeOptions(self.store, self.host, self.port, token, self.device),
-            self._ready,
-        )
+        serve(ServeOptions(self.store, self.host, self.port, token, self.device), self._ready)
         return 0
 
     def _ready(self, url: str, scenes: tuple[str, ...]) -> None:
         what = ", ".join(scenes) or "no scene yet"
-        line = f"serving {self.store} ({what}) at {url}; its page is {url}/docs"
-        self.answer({"url": url, "store": str(self.store), "scenes": list(scenes)}, [line])
+        self.answer(
+            {"url": url, "store": str(self.store), "scenes": list(scenes)},
+            f"serving {self.store} ({what}) at {url}; its page is {url}/docs",
+        )

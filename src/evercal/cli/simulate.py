@@ -1,5 +1,6 @@
 """`evercal simulate`."""
 
+import re
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -7,14 +8,14 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from evercal.cli import args
 from evercal.cli.console import progress_bar
-from evercal.cli.options import Count, Verb
 from evercal.errors import InputError
 
 
 @dataclass(frozen=True)
-class Simulate(Verb):
-    """Record a virtual robot cell: a wrist camera, a fixed camera, and the truth.
+class Simulate(args.Verb):
+    """Record a virtual robot cell: wrist camera, fixed camera, truth.
 
     Example: evercal simulate cell --out cell/
     """
@@ -23,13 +24,13 @@ class Simulate(Verb):
     """What is simulated: cell. Furnished rooms are rendered by 'python -m rooms' in a checkout."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Output folder, which is new or empty."""
-    frames: Count = None
+    frames: args.Count = None
     """Images of the wrist camera. Default: 25."""
-    size: Annotated[str | None, arg(metavar="WxH", help_behavior_hint="")] = None
+    size: Annotated[str | None, args.shown("WxH")] = None
     """Image size in pixels. Default: 640x480."""
     seed: int = 0
     """Seed of the cell, the motion and the noise."""
-    noise: Annotated[float | None, arg(metavar="SHARE", help_behavior_hint="")] = None
+    noise: Annotated[float | None, args.shown("SHARE")] = None
     """Sensor noise as a fraction of full scale. Default: 0.008."""
 
     def run(self) -> int:
@@ -39,21 +40,19 @@ class Simulate(Verb):
         began, frames = time.perf_counter(), WRIST_IMAGES if self.frames is None else self.frames
         options = CellOptions()
         if self.size is not None:
-            width, height = _size(self.size)
-            options = replace(options, width=width, height=height)
+            size = re.fullmatch(r"(\d+)x(\d+)", self.size)
+            if size is None:
+                raise InputError(
+                    f"--size {self.size}: give WIDTHxHEIGHT in pixels, such as 640x480"
+                )
+            options = replace(options, width=int(size[1]), height=int(size[2]))
         if self.noise is not None:
             options = replace(options, image_noise=self.noise)
         with progress_bar("recording", frames + TRIPOD_IMAGES, "image") as bar:
             for _ in record_cell(self.out, self.seed, frames, options):
                 bar.update()
+        seconds = time.perf_counter() - began
         parts = {name: str(self.out / name) for name in ("wrist", "tripod", "truth.json")}
-        record = {"scenes": [parts["wrist"]], **parts, "frames": bar.n}
-        record["seconds"] = time.perf_counter() - began
-        return self.answer(record, then=("learn", "MAP", self.out / "wrist"))
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, cross, height = text.partition("x")
-    if not (cross and width.isdecimal() and height.isdecimal()):
-        raise InputError(f"--size {text}: give WIDTHxHEIGHT in pixels, such as 640x480")
-    return int(width), int(height)
+        record = {"scenes": [parts["wrist"]], **parts, "frames": bar.n, "seconds": seconds}
+        self.answer(record, then=("learn", "MAP", self.out / "wrist"))
+        return 0

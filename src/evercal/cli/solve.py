@@ -1,15 +1,16 @@
 """`evercal solve`."""
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
+from evercal.cli import args
 from evercal.cli.calibrate import calibration_lines
 from evercal.cli.console import require_writable
-from evercal.cli.options import Name, Verb
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
@@ -19,8 +20,8 @@ _BY_IMAGE = ("camera_from_board", "leave_one_out_mm", "information_percent")
 
 
 @dataclass(frozen=True)
-class Solve(Verb):
-    """Calibrate a camera on the gripper or beside the robot from pairs of poses.
+class Solve(args.Verb):
+    """Calibrate a camera on or beside the robot from pairs of poses.
 
     Both unknown transforms are estimated jointly, robust to outliers, with their uncertainty.
 
@@ -37,16 +38,15 @@ class Solve(Verb):
     """unknown: estimate the scale of the camera poses, for structure from motion."""
     time_offset: bool = False
     """Estimate the offset between the clocks of robot and camera; both files need times."""
-    robot_convention: Name = None
+    robot_convention: args.Name = None
     """Pose convention of robot poses without a header: ur, kuka, xyzw:mm, ..."""
-    camera_convention: Name = None
+    camera_convention: args.Name = None
     """Pose convention of camera poses without a header."""
     invert: Annotated[
-        Literal["robot", "camera", "both"] | None,
-        arg(metavar="robot|camera|both", help_behavior_hint=""),
+        Literal["robot", "camera", "both"] | None, args.shown("robot|camera|both")
     ] = None
     """Invert the poses of a file: robot, camera or both."""
-    out: Annotated[Path, arg(metavar="FILE")] = Path("calibration.json")
+    out: args.OutFile = Path("calibration.json")
     """Calibration file to write."""
 
     def run(self) -> int:
@@ -58,11 +58,9 @@ class Solve(Verb):
         source = {"command": "solve", **options, **files}
         calibration = self._with_image_paths(replace(self._solved(), source=source))
         calibration.write(self.out)
-        self.answer(
-            calibration.to_dict(),
-            [*calibration_lines(calibration), *_check_lines(calibration)],
-            ("export", self.out, "--format", "easy_handeye2"),
-        )
+        lines = (*calibration_lines(calibration), *_check_lines(calibration))
+        then = ("export", self.out, "--format", "easy_handeye2")
+        self.answer(calibration.to_dict(), *lines, then=then)
         return 0 if tier(calibration) else 1
 
     def _solved(self) -> "Calibration":
@@ -101,32 +99,25 @@ class Solve(Verb):
         return replace(calibration, images=images, checks=checks, source=source)
 
 
-def _check_lines(calibration: "Calibration") -> list[str]:
-    checks, lines = calibration.checks, []
+def _check_lines(calibration: "Calibration") -> Iterator[str]:
+    checks, camera = calibration.checks, calibration.camera
     if "held_out_mm" in checks:
-        lines.append(
-            f"  left out     half of the poses are predicted within {checks['held_out_mm']:.2f} mm"
-            f" and {checks['held_out_deg']:.3f} deg"
-        )
-    lines.append(
-        f"  residuals    {checks['residual_mm']:.2f} mm, {checks['residual_deg']:.3f} deg (root"
-        f" mean square)"
-    )
+        error = f"{checks['held_out_mm']:.2f} mm and {checks['held_out_deg']:.3f} deg"
+        yield f"  left out     half of the poses are predicted within {error}"
+    residual = f"{checks['residual_mm']:.2f} mm, {checks['residual_deg']:.3f} deg"
+    yield f"  residuals    {residual} (root mean square)"
     if "corner_sigma_px" in checks:
-        lines.append(f"  corners      {checks['corner_sigma_px']:.2f} px (standard deviation)")
+        yield f"  corners      {checks['corner_sigma_px']:.2f} px (standard deviation)"
     if "scale" in checks:
-        scale, sigma = checks["scale"], checks["scale_sigma"]
-        lines.append(
-            f"  scale        {scale:.6g} +- {sigma:.2g} (size of the board, or metres per unit)"
-        )
-    if calibration.camera is not None and "camera_sigma" in checks:
-        camera, focal = calibration.camera, checks["camera_sigma"]["fx"]
-        lines.append(
-            f"  intrinsics   fx {camera.fx:.2f}, fy {camera.fy:.2f} +- {focal:.2f} px, cx"
-            f" {camera.cx:.2f}, cy {camera.cy:.2f} +- {checks['camera_sigma']['cx']:.2f} px"
-        )
+        scale = f"{checks['scale']:.6g} +- {checks['scale_sigma']:.2g}"
+        yield f"  scale        {scale} (size of the board, or metres per unit)"
+    if camera is not None and "camera_sigma" in checks:
+        sigma = checks["camera_sigma"]
+        focal = f"fx {camera.fx:.2f}, fy {camera.fy:.2f} +- {sigma['fx']:.2f} px"
+        centre = f"cx {camera.cx:.2f}, cy {camera.cy:.2f} +- {sigma['cx']:.2f} px"
+        yield f"  intrinsics   {focal}, {centre}"
     if "time_offset_s" in checks:
-        offset, sigma = 1000 * checks["time_offset_s"], 1000 * checks["time_offset_sigma_s"]
-        lines.append(f"  clocks       robot time = camera time {offset:+.1f} +- {sigma:.1f} ms")
-    lines += [f"  left open    {sentence}" for sentence in checks.get("left_open", ())]
-    return [*lines, *(f"warning: {warning}" for warning in checks.get("warnings", ()))]
+        offset, spread = 1000 * checks["time_offset_s"], 1000 * checks["time_offset_sigma_s"]
+        yield f"  clocks       robot time = camera time {offset:+.1f} +- {spread:.1f} ms"
+    yield from (f"  left open    {sentence}" for sentence in checks.get("left_open", ()))
+    yield from (f"warning: {warning}" for warning in checks.get("warnings", ()))

@@ -6,17 +6,20 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.options import Device, File, Host, Name, Port, Source, Verb
-from evercal.cli.view import prepare_page, wait_until_stopped
+from evercal.cli import args
+from evercal.cli.view import Page
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
     from evercal.service.studio.devices import Devices
 
+_REAL = "camera intrinsics poses pose_convention most_age reachable gripper_from_camera fixed"
+"""Options that the virtual cell refuses."""
+
 
 @dataclass(frozen=True)
-class Studio(Verb):
-    """Calibrate a wrist camera and a fixed camera in the browser, step by step.
+class Studio(Page):
+    """Calibrate wrist and fixed camera in the browser, step by step.
 
     Everything is written to --out as it is made; the same command continues there. With --virtual,
     a virtual arm with two cameras stands in for yours.
@@ -24,58 +27,56 @@ class Studio(Verb):
     Example: evercal studio --camera 0 --intrinsics camera.json --poses poses.csv
     """
 
-    map: Annotated[Positional[Path | None], arg(metavar="[MAP]", help_behavior_hint="")] = None
+    map: Annotated[Positional[Path | None], args.shown("[MAP]")] = None
     """Folder of the map that learns the scene. Default: a new one in --out."""
-    camera: Source = None
+    camera: args.Source = None
     """Camera on the gripper: number (0) or device, address (rtsp://...), video or folder."""
-    intrinsics: File = None
+    intrinsics: args.File = None
     """Intrinsics of --camera. Default: those in --out, where it was begun before."""
-    poses: File = None
+    poses: args.File = None
     """Gripper poses: a table or JSON lines that your robot's program appends to."""
-    pose_convention: Name = None
+    pose_convention: args.Name = None
     """Convention of --poses if its header does not state it: ur, kuka, fanuc, ..."""
-    most_age: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
+    most_age: Annotated[float | None, args.shown("S")] = None
     """Refuse the last pose of --poses if the file was written more seconds ago. Default: any age,
     for programs that write only when the arm has moved."""
-    reachable: File = None
+    reachable: args.File = None
     """Gripper poses that the robot can reach, for the next best views. Default: near others."""
-    gripper_from_camera: File = None
+    gripper_from_camera: args.File = None
     """A rough gripper_from_camera for the drawing and the next views: 4x4 matrix or calibration."""
-    fixed: Source = None
+    fixed: args.Source = None
     """The fixed camera; sources as for --camera."""
-    fixed_intrinsics: File = None
+    fixed_intrinsics: args.File = None
     """Intrinsics of --fixed. Default: those of the camera on the gripper."""
     virtual: bool = False
     """A virtual arm with a wrist camera and a tripod camera instead of yours."""
     seed: Annotated[int, arg(metavar="I")] = 0
     """Seed of the virtual cell."""
-    out: Annotated[Path, arg(metavar="DIR")] = Path("studio")
+    out: args.OutFolder = Path("studio")
     """Folder of the recording, images, calibrations, reports and exports."""
-    host: Host = "127.0.0.1"
-    port: Port = 8080
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         self._refuse()
-        prepare_page(self.host, "can use the cameras and move the arm")
+        self.prepare("can use the cameras and move the arm")
         from evercal.service.studio.page import StudioPage
         from evercal.service.studio.studio import Studio as Session
 
         devices = self._virtual() if self.virtual else self._real()
         page = StudioPage(Session(devices, self.out, self.map, self.device), self.host, self.port)
         try:
-            words = f"studio in {self.out} at {page.server.url}, where the same command continues"
-            wait_until_stopped(page.server.url, None if self.json else words)
+            url = page.server.url
+            self.wait(url, f"studio in {self.out} at {url}, where the same command continues")
         finally:
             page.close()
         return 0
 
     def _refuse(self) -> None:
-        names = "camera intrinsics poses pose_convention most_age reachable gripper_from_camera"
-        given = [name for name in (*names.split(), "fixed") if getattr(self, name) is not None]
+        given = [name for name in _REAL.split() if getattr(self, name) is not None]
         if self.virtual and given:
-            option = f"--{given[0].replace('_', '-')}"
-            raise InputError(f"{option}: the virtual cell has its own; omit it or --virtual")
+            raise InputError(
+                f"{args.option(given[0])}: the virtual cell has its own; omit it or --virtual"
+            )
         if not self.virtual and (self.camera is None or self.poses is None):
             missing = "--camera SOURCE" if self.camera is None else "--poses FILE"
             raise InputError(f"no {missing} given; give both, or --virtual to try it without")
@@ -104,7 +105,6 @@ class Studio(Verb):
 
     def _real(self) -> "Devices":
         """The cameras and the pose file that were named."""
-        from evercal.calibration.calibration import read_transform
         from evercal.live.camera import StreamCamera
         from evercal.live.robot import PoseFileRobot
         from evercal.recordings import read_robot_poses
@@ -115,7 +115,7 @@ class Studio(Verb):
         assert self.camera is not None, "checked before"
         assert self.poses is not None, "checked before"
         convention, fixed = self.pose_convention, self.fixed
-        rough, fixed_intrinsics = self.gripper_from_camera, self.fixed_intrinsics
+        fixed_intrinsics = self.fixed_intrinsics
         wrist_camera = StreamCamera(self.camera)
         before = self.out / "wrist" / "camera.json"
         intrinsics = self.intrinsics or (before if before.is_file() else None)
@@ -132,6 +132,6 @@ class Studio(Verb):
             fixed_camera=None if fixed is None else StreamCamera(fixed),
             fixed_intrinsics=fixed_intrinsics and read_camera(fixed_intrinsics),
             reachable=reachable,
-            rough=rough and read_transform(rough),
+            rough=args.transform_of(self.gripper_from_camera),
             live=is_live(self.camera) and (fixed is None or is_live(fixed)),
         )

@@ -8,22 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.arguments import open_map
+from evercal.cli import args
 from evercal.cli.console import require_writable
-from evercal.cli.options import Count, Device, Intrinsics, Store, Verb
 from evercal.errors import InputError
 from evercal.reports.answers import unit_known
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from evercal.geometry import Camera
     from evercal.localization.tracking import TrackedFrame
 
 
 @dataclass(frozen=True)
-class Track(Verb):
-    """Locate the frames of a camera, a video or a folder one after another.
+class Track(args.Verb):
+    """Locate the frames of a camera, video or folder one after another.
 
     The last pose is the prior of the next one: a tracked frame takes less than half the time of a
     single image. Exit code 1 if no frame was located.
@@ -31,23 +27,22 @@ class Track(Verb):
     Example: evercal track cell.evercal video.mp4 --out track.tum
     """
 
-    store: Store
+    store: args.Store
     source: Annotated[Positional[str], arg(metavar="SOURCE")]
     """Number (0) or device of a camera, an address (rtsp://...), a video file or a folder."""
-    out: Annotated[
-        tuple[Path, ...], arg(metavar="FILE...", help_behavior_hint="(default: none)")
-    ] = ()
+    out: Annotated[tuple[Path, ...], args.shown("FILE...", "(default: none)")] = ()
     """Files to write: .jsonl (JSON lines), .tum or .txt (TUM)."""
-    camera: Intrinsics = None
-    at_most: Annotated[float | None, arg(metavar="MS", help_behavior_hint="")] = None
+    camera: args.File = None
+    """Intrinsics. Default: those of the camera that recorded the scene."""
+    at_most: Annotated[float | None, args.shown("MS")] = None
     """Time for a frame, milliseconds. What was left out is in the answer (`omitted`)."""
     smooth: Annotated[float, arg(metavar="SECONDS")] = 0.0
     """Time constant of smoothed poses; 0 writes measurements. A jump is followed at once."""
     rate: Annotated[float, arg(metavar="HZ")] = 15.0
     """Frames per second of a folder without times in its file names."""
-    most: Count = None
+    most: args.Count = None
     """Stop after so many frames."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         if self.rate <= 0 or self.smooth < 0 or (self.at_most is not None and self.at_most <= 0):
@@ -58,7 +53,7 @@ class Track(Verb):
         from evercal.recordings.streams import stream
         from evercal.reports.track_files import TrackFile, track_row
 
-        frames, localizer = stream(self.source, self.rate), open_map(self.store, self.device)
+        frames, localizer = stream(self.source, self.rate), args.open_map(self.store, self.device)
         options = TrackOptions(
             fallback_s=1 / self.rate, at_most_ms=self.at_most, smooth=self.smooth
         )
@@ -69,15 +64,15 @@ class Track(Verb):
             files = [stack.enter_context(TrackFile(path)) for path in self.out]
             try:
                 for name, stamp, image in frames:
-                    tracker = tracker or Tracker(localizer, self._camera(image), options)
+                    if tracker is None:
+                        camera = args.stated_camera(self.camera, (image.shape[1], image.shape[0]))
+                        tracker = Tracker(localizer, camera, options)
                     frame = tracker.track(image, stamp)
                     states[frame.state] += 1
                     times.append(frame.estimate.milliseconds)
-                    if files:
-                        known = unit_known(localizer, frame.estimate.scene)
-                        row = track_row(frame, name, known)
-                        for file in files:
-                            file.write(frame, row)
+                    known = unit_known(localizer, frame.estimate.scene)
+                    for file in files:
+                        file.write(frame, track_row(frame, name, known))
                     if not self.json:
                         print(_line(name, frame), flush=True)
                     if self.most is not None and len(times) >= self.most:
@@ -89,25 +84,18 @@ class Track(Verb):
         self._summary(states, times)
         return 0 if states["tracking"] + states["relocalized"] else 1
 
-    def _camera(self, image: "np.ndarray") -> "Camera | None":
-        if self.camera is None:
-            return None
-        from evercal.recordings.poses.camera_file import read_camera
-
-        return read_camera(self.camera, (image.shape[1], image.shape[0]))
-
     def _summary(self, states: Counter[str], times: list[float]) -> None:
         import numpy as np
 
         middle, high = np.quantile(times, [0.5, 0.99]).tolist()
         counts = {state: states[state] for state in ("tracking", "relocalized", "lost")}
-        record = {"frames": len(times), **counts, "ms_p50": middle, "ms_p99": high}
-        line = (
+        files = [str(path) for path in self.out]
+        self.answer(
+            {"frames": len(times), **counts, "ms_p50": middle, "ms_p99": high, "out": files},
             f"{len(times)} frames: {states['tracking']} tracked, {states['relocalized']}"
-            f" relocalized, {states['lost']} lost; {middle:.0f} ms (median), {high:.0f} ms (99 %)"
+            f" relocalized, {states['lost']} lost; {middle:.0f} ms (median), {high:.0f} ms (99 %)",
+            then=() if files else ("track", self.store, self.source, "--out", "track.jsonl"),
         )
-        then = () if self.out else ("track", self.store, self.source, "--out", "track.jsonl")
-        self.answer({**record, "out": [str(path) for path in self.out]}, [line], then)
 
 
 def _line(name: str, frame: "TrackedFrame") -> str:

@@ -13,10 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.arguments import open_map, stated_camera
-from evercal.cli.check import shift_line
-from evercal.cli.console import print_json
-from evercal.cli.options import Device, File, Store, Verb
+from evercal.cli import args
+from evercal.cli.check import Reference, shift_line
 from evercal.errors import InputError
 from evercal.reports.answers import shift_dict
 
@@ -29,28 +27,28 @@ FALSE_ALARMS = 0.01
 
 
 @dataclass(frozen=True)
-class Watch(Verb):
-    """Watch a folder that a camera writes images to; stop with exit code 1 when it has moved.
+class Watch(args.Verb):
+    """Watch a folder of arriving images; stop with exit code 1 when the camera has moved.
 
-    The newest images are tested together, so that a single outlier raises no alarm.
+    The newest images are tested together, so that a single outlier raises no alarm. With --json,
+    every image gives one object.
 
     Example: evercal watch cell.evercal incoming/ --reference tripod.json
     """
 
-    store: Store
+    store: args.Store
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder that images arrive in."""
-    reference: Annotated[Path, arg(metavar="FILE")]
-    """The camera's calibration from 'evercal calibrate'."""
-    window: Annotated[int, arg(metavar="N")] = 5
+    reference: Reference
+    window: args.Number = 5
     """Newest images that are tested together."""
     interval: Annotated[float, arg(metavar="SECONDS")] = 1.0
     """Interval between scans of the folder."""
-    idle: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None
+    idle: args.Seconds = None
     """Stop with exit code 0 after this time without a new image. Default: never."""
-    camera: File = None
+    camera: args.File = None
     """Intrinsics. Default: those of the reference."""
-    device: Device = "auto"
+    device: args.Device = "auto"
 
     def run(self) -> int:
         if not self.folder.is_dir():
@@ -62,14 +60,14 @@ class Watch(Verb):
         from evercal.calibration.located import ImagePose, fuse, locate
 
         reference = read_calibration(self.reference)
-        localizer = open_map(self.store, self.device)
+        localizer = args.open_map(self.store, self.device)
         recent: deque[ImagePose] = deque(maxlen=self.window)
         arrivals = Arrivals(self.folder)
         tests, last = 0, time.monotonic()
         while self.idle is None or time.monotonic() - last < self.idle:
             for path, pixels in arrivals.scan():
                 height, width = pixels.shape[:2]
-                camera = stated_camera(self.camera, (width, height)) or reference.camera
+                camera = args.stated_camera(self.camera, (width, height)) or reference.camera
                 recent.extend(locate(localizer, [(path.name, pixels)], camera))
                 last = time.monotonic()
                 if not any(item.is_located for item in recent):
@@ -85,11 +83,9 @@ class Watch(Verb):
         return 0
 
     def _print(self, path: Path, record: dict[str, object], line: str = "") -> None:
-        if self.json:
-            print_json({"image": path.name, **record})
-            return
         now = datetime.now(UTC).strftime("%H:%M:%S")
-        print(f"{now} {path.name}: {line or record['reason']}", flush=True)
+        words = f"{now} {path.name}: {line or record.get('reason')}"
+        self.answer({"image": path.name, **record}, words)
 
 
 class Arrivals:

@@ -137,7 +137,9 @@ UNUSUAL: dict[str, tuple[Mistake, str]] = {
 @pytest.mark.parametrize("name", UNUSUAL)
 def test_mistakes_are_diagnosed(name: str) -> None:
     mistake, expected = UNUSUAL[name]
-    mount, path = (("eye_in_hand", "table"), ("eye_to_hand", "random"))[len(name) % 2]
+    in_hand = len(name) % 2 == 0
+    mount: Mount = "eye_in_hand" if in_hand else "eye_to_hand"
+    path = "table" if in_hand else "random"
     with pytest.raises(InputError) as caught:
         solve(mistake(recording(Setting(mount, path=path), 7).pairs), mount)
     message = str(caught.value)

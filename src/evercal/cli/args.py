@@ -1,0 +1,226 @@
+"""Arguments that several verbs share, and what they stand for."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from evercal.cli.console import print_json, print_next
+from evercal.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from evercal.geometry import SE3, Camera, UncertainPose
+    from evercal.localization.learned import LearnedLocalizer
+    from evercal.localization.localizer import Localizer
+    from evercal.recordings import Recording
+
+MAP = "evercal"
+"""The strategy of a map."""
+
+
+def shown(word: str, default: str = "", **how: Any) -> Any:
+    """An argument under a word of its own in the help, with its default in words or not at all."""
+    return arg(metavar=word, help_behavior_hint=default, **how)
+
+
+Store = Annotated[Positional[Path], arg(metavar="MAP", help="Folder of the map.")]
+ImageFiles = Annotated[Positional[tuple[Path, ...]], shown("IMAGE...")]
+File = Annotated[Path | None, shown("FILE")]
+Folder = Annotated[Path | None, shown("DIR")]
+Name = Annotated[str | None, shown("NAME")]
+Frame = Annotated[str | None, shown("FRAME")]
+Source = Annotated[str | None, shown("SOURCE")]
+Topic = Annotated[str | None, shown("TOPIC")]
+Seconds = Annotated[float | None, shown("SECONDS")]
+Count = Annotated[int | None, shown("N")]
+Number = Annotated[int, arg(metavar="N")]
+OutFile = Annotated[Path, arg(metavar="FILE")]
+OutFolder = Annotated[Path, arg(metavar="DIR")]
+Host = Annotated[str, arg(metavar="H", help="Address to listen on, such as 0.0.0.0 for all.")]
+Port = Annotated[int, arg(metavar="P", help="Port to listen on; 0 for any free one.")]
+At = Annotated[
+    str | None,
+    shown(
+        "X,Y,Z",
+        help="A point in the camera frame (x right, y down, z forward; metres), such as an object"
+        " that the camera sees: its standard deviation in the base or gripper frame is stated.",
+    ),
+]
+Device = Annotated[
+    Literal["auto", "cpu", "cuda"],
+    arg(help="Device of the encoder and networks; auto uses a CUDA device if there is one."),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verb:
+    """A verb with its arguments."""
+
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Run and return the exit code."""
+        raise NotImplementedError
+
+    def answer(self, record: object, *lines: str, then: Sequence[object] = ()) -> None:
+        """Print a record as JSON; else lines, and the words of the command to run next."""
+        if self.json:
+            print_json(record)
+            return
+        for line in lines:
+            print(line, flush=True)
+        if then:
+            print_next("evercal", *then)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How the recording is read; options that do not apply to its format are refused."""
+
+    format: Name = None
+    """Format of the recording: generic, 7scenes, 12scenes, nerfstudio, colmap, wrist, lerobot or
+    rosbag. Default: recognised from its files."""
+    camera: File = None
+    """Intrinsics of all images, if the recording has none: 3x3 matrix as text, JSON, YAML,
+    NPZ, ROS camera_info or OpenCV's storage."""
+    image_topic: Topic = None
+    """Images of a bag or a LeRobot dataset; required if there are several topics."""
+    pose_topic: Topic = None
+    """tf or joint states of a bag; required if there are several topics."""
+    base_frame: Name = None
+    """The robot's base, a tf frame of a bag or a link of the URDF."""
+    gripper_frame: Name = None
+    """The gripper: a tf frame of a bag, a link of the URDF, or a feature or arm of a LeRobot
+    dataset."""
+    urdf: File = None
+    """URDF of the robot, for recordings with joint angles."""
+    pose_convention: Name = None
+    """Format of the gripper poses, if the file's header does not state it; rad or deg for joint
+    angles."""
+    metres: bool = False
+    """The poses of a COLMAP or nerfstudio recording are in metres. Default: their unit is unknown
+    until 'evercal align'."""
+    every: Number = 1
+    """Use every N-th image."""
+
+    def recording(self, path: Path, name: str | None = None) -> "Recording":
+        """Read the recording."""
+        from evercal.recordings import ReadOptions, load_recording
+
+        given = {field.name: getattr(self, field.name) for field in fields(ReadOptions)}
+        return load_recording(path, self.format, name, ReadOptions(**given))
+
+    def words(self) -> list[str]:
+        """The options that were given, as words of a command."""
+        words = []
+        for field in fields(self):
+            if (value := getattr(self, field.name)) != field.default:
+                words.append(option(field.name))
+                words += [] if value is True else [str(value)]
+        return words
+
+
+def option(field: str) -> str:
+    """The option of a field."""
+    return "--" + field.replace("_", "-")
+
+
+def read_images(files: Sequence[Path]) -> "list[tuple[str, np.ndarray]]":
+    """Read image files: (path, pixels)."""
+    from evercal.recordings import read_image
+
+    return [(str(path), read_image(path)) for path in files]
+
+
+def camera_for(file: Path | None, images: Sequence[Path]) -> "Camera | None":
+    """The camera in the file of --camera, for the size of the first image."""
+    from evercal.recordings import image_size
+
+    return None if file is None else stated_camera(file, image_size(images[0]))
+
+
+def stated_camera(file: Path | None, size: tuple[int, int]) -> "Camera | None":
+    """The camera in the file of --camera, for images of (width, height)."""
+    from evercal.recordings.poses.camera_file import read_camera
+
+    return None if file is None else read_camera(file, size)
+
+
+def transform_of(file: Path | None) -> "SE3 | None":
+    """The transform in a file of --gripper-from-camera or --calibration."""
+    from evercal.calibration.calibration import read_transform
+
+    return None if file is None else read_transform(file)
+
+
+def strategy_of(store: Path) -> str | None:
+    """The strategy that a store was made with; None if there is no store yet."""
+    from evercal.storage import read_manifest
+    from evercal.storage.stages import is_store
+
+    return str(read_manifest(store)["strategy"]) if is_store(store) else None
+
+
+def open_localizer(store: Path, device: str) -> "LearnedLocalizer":
+    """The localizer of a map or a store of networks."""
+    if strategy_of(store) in (MAP, None):
+        return open_map(store, device)
+    from evercal.continual.localizer import open_networks
+
+    return open_networks(store, device)
+
+
+def open_map(store: Path, device: str) -> "Localizer":
+    """The localizer of a map; a store of networks is refused."""
+    strategy = strategy_of(store)
+    if strategy not in (MAP, None):
+        raise InputError(
+            f"{store}: holds networks of strategy {strategy}, and this needs a map; learn the scene"
+            " with the default strategy"
+        )
+    from evercal.localization.localizer import Localizer
+
+    return Localizer.open(store, device=device)
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point in the camera frame, metres."""
+
+    x: float
+    y: float
+    z: float
+
+    @classmethod
+    def parse(cls, text: str | None) -> "Point | None":
+        """The point of --at; None if the option was omitted."""
+        if text is None:
+            return None
+        try:
+            x, y, z = (float(word) for word in text.split(","))
+        except ValueError:
+            x = y = z = math.nan
+        if not all(map(math.isfinite, (x, y, z))):
+            raise InputError(f"--at {text}: give x,y,z in metres such as 0,0.05,0.4")
+        return cls(x, y, z)
+
+    def record(self, parent_from_camera: "UncertainPose") -> dict[str, object]:
+        """The point in both frames and its standard deviation per axis."""
+        point = (self.x, self.y, self.z)
+        return {
+            "point_m": list(point),
+            "in_parent_m": parent_from_camera.pose.apply(point).tolist(),
+            "sigma_mm": parent_from_camera.point_sigma_mm(point),
+        }
+
+    def text(self, parent_from_camera: "UncertainPose") -> str:
+        """The standard deviation of the point in words."""
+        sigma = parent_from_camera.point_sigma_mm((self.x, self.y, self.z))
+        where = f"({self.x:g}, {self.y:g}, {self.z:g}) m in the camera frame"
+        return f"{sigma:.2f} mm at {where}"
