@@ -55,7 +55,7 @@ REFUSED = {
     "export c.json": "no format given; add --format NAME, one of easy_handeye2",
     "export --format urdf": "no calibration given",
     "export none.json --format urdf": "missing",
-    "export hand.json --format nerfstudio": "give the gripper's poses with --robot-poses",
+    "export hand.json --format nerfstudio": "intrinsics are required",
     "export c.json --format xml": "'xml' is not known; use one of easy_handeye2",
     "export c.json --format urdf --child /camera": "'/camera' is no name of a tf frame",
     "export c.json --format urdf --child base": "both called 'base'",
