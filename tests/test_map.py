@@ -13,6 +13,7 @@ import pytest
 
 from evercal import Calibration, InputError, LearnReport, Map, Recording, Shift, read_calibration
 from evercal.geometry import SE3, pose_distance
+from evercal.mapping.build import MapOptions
 from evercal.mapping.store import MapStore
 from evercal.recordings import write_image
 from evercal.recordings.formats import generic
@@ -204,10 +205,11 @@ def test_memory_that_cannot_be_used_is_refused(
 
 
 def test_memory_in_megabytes_and_auto(arcs: tuple[Recording, Recording], tmp_path: Path) -> None:
-    opened = Map.open(tmp_path / "map", device="cpu")
-    one = opened.learn(arcs[0], name="one", memory="0.1MB")
+    opened = Map(MapStore.create(tmp_path / "map", short_side=120))
+    quick = MapOptions(adjust=False)
+    one = opened.learn(arcs[0], name="one", memory="0.1MB", options=quick)
     assert 0 < one.memory_bytes <= 100_000
-    auto = opened.learn(arcs[0], name="two", memory="auto")
+    auto = opened.learn(arcs[0], name="two", memory="auto", options=quick)
     assert 1 <= auto.frames_kept <= 8
     frame = arcs[0].test[9]
     estimate = Map.open(tmp_path / "map", device="cpu").localize(frame.read_image())
@@ -283,8 +285,8 @@ def test_stores_of_networks_and_other_folders_are_refused(hall_only: Map, tmp_pa
 def test_a_second_object_of_one_map_does_not_overwrite_its_scenes(
     rooms: tuple[Recording, ...], tmp_path: Path
 ) -> None:
-    first, second = (Map.open(tmp_path / "map", device="cpu") for _ in range(2))
-    first.learn(rooms[0])
+    first, second = (Map(MapStore.create(tmp_path / "map", short_side=64)) for _ in range(2))
+    first.learn(rooms[0], options=MapOptions(adjust=False))
     with pytest.raises(InputError, match="another process has changed it"):
         second.learn(rooms[1])
     assert Map.open(tmp_path / "map", device="cpu").scenes == ("alpha",)

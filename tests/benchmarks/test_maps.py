@@ -11,6 +11,8 @@ from benchmarks import maps
 from evercal.errors import InputError
 from evercal.recordings import Recording, generic
 
+pytestmark = pytest.mark.slow("benchmarks", "src/evercal/evaluation")
+
 
 @pytest.fixture(scope="module")
 def folders(

@@ -13,6 +13,8 @@ from rooms.paths import changed_shots, is_clear, sweep_shots
 from rooms.room import Room, room
 from rooms.shapes import box
 
+pytestmark = pytest.mark.slow("rooms", "src/evercal/simulation")
+
 Items = dict[tuple[str, bytes], Item]
 
 

@@ -13,6 +13,8 @@ from rooms.renderer import Renderer
 from rooms.room import Room, room
 from rooms.suites import SUITES
 
+pytestmark = pytest.mark.slow("rooms", "src/evercal/simulation")
+
 
 @pytest.fixture(scope="module")
 def packaged() -> SampleRoom:

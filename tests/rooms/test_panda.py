@@ -7,6 +7,8 @@ from evercal.geometry import SE3, pose_distance
 from evercal.simulation.panda_arm import HIGH_RAD, LOW_RAD, base_from_flange
 from rooms import panda
 
+pytestmark = pytest.mark.slow("rooms", "src/evercal/simulation")
+
 yourdfpy = pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
 pytest.importorskip("collada", reason="pycollada is not installed")
 

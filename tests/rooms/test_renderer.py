@@ -11,6 +11,8 @@ from rooms.materials import Material, plain
 from rooms.renderer import Renderer, RenderOptions
 from rooms.shapes import ball, box
 
+pytestmark = pytest.mark.slow("rooms", "src/evercal/simulation")
+
 pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
 
 CENTRES = np.array([[0.05, -0.3, 0.0], [0.3, 0.15, 0.2], [-0.4, 0.3, 0.1]])

@@ -10,6 +10,8 @@ from rooms.room import KINDS, REPEATED, Room, room
 from rooms.shapes import drape
 from rooms.suites import CALIBRATION_FRAMES, SUITES
 
+pytestmark = pytest.mark.slow("rooms", "src/evercal/simulation")
+
 COPIES = {
     "workshop": {"rack": 4, "table": 6, "jar": 12},
     "canteen": {"table": 8, "cupboard": 4, "jar": 12},

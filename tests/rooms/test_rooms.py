@@ -8,6 +8,8 @@ from rooms.paths import fixed_shots, sweep_shots
 from rooms.room import RESERVED, Room, room
 from rooms.suites import SUITES
 
+pytestmark = pytest.mark.slow("rooms", "src/evercal/simulation")
+
 
 @pytest.fixture(scope="module", params=SUITES["sim"].rooms, ids=lambda entry: entry[0])
 def furnished_room(request: pytest.FixtureRequest) -> Room:

@@ -5,6 +5,8 @@ import pytest
 
 from rooms.shapes import Mesh, ball, box, cushion, cylinder, lathe, sheet
 
+pytestmark = pytest.mark.slow("rooms", "src/evercal/simulation")
+
 
 def volume(mesh: Mesh) -> float:
     a, b, c = np.moveaxis(mesh.vertices_m[mesh.faces], 1, 0)

@@ -16,6 +16,8 @@ from rooms.__main__ import main
 from rooms.paths import hand_camera
 from rooms.suites import SimulateOptions, Suite, simulate
 
+pytestmark = pytest.mark.slow("rooms", "src/evercal/simulation")
+
 TINY = SimulateOptions(frames=4, size=(32, 24), samples=1)
 SUITE = Suite((("kitchen", "kitchen", 102),), 4, (32, 24), 1, changed=2)
 PARTS = {"": 4, "changed": 2, **{f"calibration/{name}": 2 for name in ("fixed", "bumped", "hand")}}

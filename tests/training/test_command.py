@@ -8,6 +8,8 @@ import pytest
 import training.__main__ as command
 from training.contrastive import PretrainOptions
 
+pytestmark = pytest.mark.slow("training", "src/evercal/features")
+
 
 def test_options_reach_the_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[Path, Path, PretrainOptions]] = []

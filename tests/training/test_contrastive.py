@@ -27,6 +27,8 @@ from training.contrastive import (
 )
 from training.pairs import HEIGHT, WIDTH, RoomViews, cell_pixels, leaf_picture
 
+pytestmark = pytest.mark.slow("training", "src/evercal/features")
+
 OPTIONS = PretrainOptions(steps=6, room_pairs=2, furnished_pairs=0, leaf_pairs=1, points=64)
 FAR = torch.tensor([[0.0, 0.0], [100.0, 0.0]])
 
@@ -213,7 +215,6 @@ def test_training_lowers_the_loss(data: PretrainData, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("small")
-@pytest.mark.slow("training")
 def test_training_starts_from_an_earlier_run(
     data: PretrainData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

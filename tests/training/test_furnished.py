@@ -35,6 +35,8 @@ from training.pairs import (
     view_pair,
 )
 
+pytestmark = pytest.mark.slow("training", "src/evercal/features")
+
 CAMERA = Camera(WIDTH, HEIGHT, 200.0, 200.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
 
@@ -110,7 +112,6 @@ def test_batch_contains_furnished_rooms() -> None:
     assert (across[:, None] - torch.tensor([0.0, 10.0, 20.0])).abs().min(1).values.max() < 1e-2
 
 
-@pytest.mark.slow("training")
 def test_rendered_pairs_correspond_and_are_cached(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
     views = furnished_views(1001, anchors=1)

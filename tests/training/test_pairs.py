@@ -19,6 +19,8 @@ from training.pairs import (
 
 from .conftest import SEED
 
+pytestmark = pytest.mark.slow("training", "src/evercal/features")
+
 
 def hit(views: RoomViews, index: int, pixels: np.ndarray) -> np.ndarray:
     """Intersect the rays of pixels with the room, (n, 3)."""

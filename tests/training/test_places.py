@@ -25,6 +25,8 @@ from training.places import (
     train_descriptor,
 )
 
+pytestmark = pytest.mark.slow("training", "src/evercal/features")
+
 T = places.TEMPERATURE
 
 
@@ -122,7 +124,6 @@ def test_pretrain_writes_loadable_files(
     assert log.splitlines()[-1].startswith("done")
 
 
-@pytest.mark.slow("training")
 def test_small_pretraining_is_complete_and_resumable(tmp_path: Path) -> None:
     options = PretrainOptions(
         steps=3, rooms=2, furnished=0, furnished_pairs=0, pictures=2, descriptor_steps=2
@@ -172,12 +173,10 @@ def ranks(seeds: range, gallery: int, queries: int) -> np.ndarray:
     return np.concatenate(actual)
 
 
-@pytest.mark.slow("training")
 def test_shipped_descriptor_separates_three_new_rooms() -> None:
     assert (ranks(range(300, 303), gallery=12, queries=4) == 0).mean() >= 0.8
 
 
-@pytest.mark.slow("training")
 def test_shipped_descriptor_separates_twelve_new_rooms() -> None:
     """Measured: 99 % of images between those of the gallery; chance is 8 %."""
     assert (ranks(range(300, 312), gallery=40, queries=8) == 0).mean() >= 0.9
