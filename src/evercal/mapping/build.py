@@ -44,7 +44,7 @@ OnProgress = Callable[[str, int, int], object]
 HAND_EYE_COVARIANCE_SCALE = 2.5
 """Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
 over many frames, which residuals do not show: the squared error in 30 trials was 1.8 times the
-formal one (docs/experiments/handeye.md)."""
+formal one (research/handeye.md)."""
 GAP, MOST_PARTS = 10, 12
 """Frames without keyframes before and after a part that is left out, and number of parts at most.
 Frames between similar keyframes are located more exactly than new images are."""

@@ -3,19 +3,22 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
-from evercal.mapping.keyframes import Keyframes, store_keyframes
 from evercal.mapping.selection import spread_poses
 from evercal.recordings.frame import Frame
+
+if TYPE_CHECKING:
+    from evercal.mapping.keyframes import Keyframes
 
 AUTO = "auto"
 FEW_KEYFRAMES = 8
 """The default keeps at least so many: two keyframes of a recording of 25 frames locate 76 to 91 %
-of its other frames within 1 cm, eight locate all (docs/experiments/map.md)."""
+of its other frames within 1 cm, eight locate all (research/map.md)."""
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
 _SAMPLED_FRAMES = 8
@@ -65,11 +68,13 @@ class MemoryBudget:
         if self.bytes is None:
             least = min(self.least, len(frames))
             return max(least, int(self.share * len(frames) + 1e-9))
+        from evercal.mapping.keyframes import store_keyframes  # loads torch, and options do not
+
         sample = frames[:: -(-len(frames) // _SAMPLED_FRAMES)]
         one = store_keyframes(sample, short_side).bytes / len(sample)
         return min(len(frames), max(1, int(self.bytes / one)))
 
-    def fitting(self, keyframes: Keyframes) -> NDArray[np.int64]:
+    def fitting(self, keyframes: "Keyframes") -> NDArray[np.int64]:
         """Indices of the keyframes that fit into the budget: spread by pose, at least one."""
         total = len(keyframes)
         if self.bytes is None or keyframes.bytes <= self.bytes:

@@ -32,7 +32,7 @@ PRESETS: dict[str, StageOptions] = {
         replay_views_per_frame=2,
     ),
     # Chosen on held-out frames of `sim-tune`; joint training still gains from more steps
-    # (docs/experiments/protocol.md).
+    # (research/protocol.md).
     "converged": StageOptions(
         head=HeadOptions(width=256),
         fit=FitOptions(iterations=1200, batch=1536, replay_batch=768, surface_weight=2.0),
