@@ -36,7 +36,7 @@ ORDER = (
     "cli",
 )
 """Folders, and the module map.py."""
-FOR_ALL = ("errors",)
+FOR_ALL = ("errors", "progress")
 FACES = ("__init__", "__main__")
 """Modules of the root that may import everything."""
 PRODUCT = ORDER[: ORDER.index("simulation")]

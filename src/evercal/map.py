@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 from evercal.errors import InputError
 from evercal.features.device import device_of
 from evercal.mapping.store import MapStore
+from evercal.progress import OnProgress, shown
 from evercal.recordings.frame import Recording
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from evercal.localization.query import LocalizeOptions
     from evercal.localization.refreshing import RefreshReport
     from evercal.localization.tracking import TrackedFrame, TrackOptions
-    from evercal.mapping.build import MapOptions, OnProgress
+    from evercal.mapping.build import MapOptions
     from evercal.mapping.manage import Merged, OnClash
     from evercal.mapping.refresh import RefreshOptions
 
@@ -114,7 +115,7 @@ class Map:
         memory: str | int | None = None,
         gripper_from_camera: SE3 | None = None,
         options: MapOptions | None = None,
-        on_progress: OnProgress = lambda *_: None,
+        on_progress: OnProgress | None = None,
     ) -> LearnReport:
         """Learn a scene; the scenes learned before do not change.
 
@@ -131,6 +132,7 @@ class Map:
             gripper_from_camera: a rough one, such as from CAD, that the estimate is compared with.
             options: sizes and priors of the map; `memory` overrides theirs.
             on_progress: called with the current step, how much of it is done, and its total.
+                Default: bars on stderr.
 
         Raises:
             InputError: A recording that cannot be used, a name that is taken, or another process
@@ -142,10 +144,10 @@ class Map:
 
         loaded = recording if isinstance(recording, Recording) else load_recording(recording)
         loaded = named_recording(loaded, name, self.scenes)
-        with self._store.writing():
+        with self._store.writing(), shown(on_progress) as step:
             contents = self._store.contents
             scene, report = learn_scene(
-                loaded, contents, memory, gripper_from_camera, options, on_progress
+                loaded, contents, memory, gripper_from_camera, options, step
             )
             self._store.commit(scene, asdict(report))
         self._localizer = None
@@ -159,7 +161,7 @@ class Map:
         memory: str | int | None = None,
         options: MapOptions | None = None,
         on_scene: Callable[[LearnReport], object] = lambda _: None,
-        on_progress: OnProgress = lambda *_: None,
+        on_progress: OnProgress | None = None,
     ) -> tuple[LearnReport, ...]:
         """Learn recordings in parallel; the result is identical to learning them one by one.
 
@@ -173,6 +175,7 @@ class Map:
             options: Sizes and priors of the map.
             on_scene: Called after each scene was added.
             on_progress: Called with the step, the recordings done, and their number.
+                Default: bars on stderr.
 
         Raises:
             InputError: A name that is taken, before anything is learned; or, after the others were
@@ -191,12 +194,12 @@ class Map:
             loaded.append(named_recording(recording, None, taken))
         reports: list[LearnReport] = []
         failed: list[str] = []
-        with self._store.writing():
+        with self._store.writing(), shown(on_progress) as step:
             task = LearnTask(self._store.contents.empty(), memory, options)
             ready: dict[int, Learned] = {}
-            on_progress("learning", 0, len(loaded))
+            step("learning", 0, len(loaded))
             for done, outcome in enumerate(learn_scenes(task, loaded, workers), 1):
-                on_progress("learning", done, len(loaded))
+                step("learning", done, len(loaded))
                 ready[outcome.number] = outcome
                 while (learned := ready.pop(len(reports) + len(failed), None)) is not None:
                     if learned.scene is None or learned.report is None:
@@ -220,7 +223,7 @@ class Map:
         *,
         camera: Camera | None = None,
         options: RefreshOptions | None = None,
-        on_progress: OnProgress = lambda *_: None,
+        on_progress: OnProgress | None = None,
     ) -> RefreshReport:
         """Follow a changed room: new images of a scene replace what is gone, in the same memory.
 
@@ -233,6 +236,7 @@ class Map:
             camera: Intrinsics. Default: those of the camera that recorded the scene.
             options: Thresholds.
             on_progress: Called with the current step, how much of it is done, and its total.
+                Default: bars on stderr.
 
         Raises:
             InputError: Too few images are located, the refreshed map would locate fewer of them, or
@@ -245,8 +249,8 @@ class Map:
             given = [(frame.name, frame.read_image()) for frame in images.train]
         else:
             given = Images.of(images, camera).images
-        with self._store.writing():
-            scene, report = refresh_scene(self.localizer, given, camera, options, on_progress)
+        with self._store.writing(), shown(on_progress) as step:
+            scene, report = refresh_scene(self.localizer, given, camera, options, step)
             self._store.refresh(scene, asdict(report))
         self._localizer = None
         return report

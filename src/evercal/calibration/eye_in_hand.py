@@ -18,7 +18,8 @@ from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
-from evercal.mapping.build import Adjusted, BuiltMap, OnProgress
+from evercal.mapping.build import Adjusted, BuiltMap
+from evercal.progress import OnProgress
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame, Recording
 from evercal.recordings.held_out import require_frames
 

@@ -27,8 +27,8 @@ from evercal.features.sift import epipolar_pair, sift_features
 from evercal.features.views import working_image
 from evercal.features.vlad import vlad_for
 from evercal.geometry import SE3
-from evercal.mapping.build import OnProgress
 from evercal.mapping.selection import spread_poses
+from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame
 
 Array = NDArray[np.float64]

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional
 
 from evercal.cli import args
-from evercal.cli.console import progress_bar, require_writable
+from evercal.cli.console import require_writable
 from evercal.errors import InputError
+from evercal.progress import progress_bar
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration, Rig

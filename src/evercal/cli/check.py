@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from evercal.cli import args
-from evercal.cli.console import progress_bar
+from evercal.progress import progress_bar
 from evercal.reports.answers import check_record
 
 if TYPE_CHECKING:

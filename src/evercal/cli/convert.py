@@ -7,8 +7,8 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
-from evercal.cli.console import progress_bar
 from evercal.errors import InputError
+from evercal.progress import progress_bar
 
 
 @dataclass(frozen=True)

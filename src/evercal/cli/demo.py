@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evercal.cli import args
-from evercal.cli.console import Bars, following, progress_bar, require_folder, size
+from evercal.cli.console import require_folder, size
 from evercal.errors import InputError
+from evercal.progress import Bars, following, progress_bar
 
 if TYPE_CHECKING:
     import numpy as np

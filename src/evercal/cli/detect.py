@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
-from evercal.cli.console import progress_bar, require_writable
+from evercal.cli.console import require_writable
 from evercal.errors import InputError
+from evercal.progress import progress_bar
 
 if TYPE_CHECKING:
     from evercal.calibration.boards.board_poses import BoardPoses

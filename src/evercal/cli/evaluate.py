@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional
 
 from evercal.cli import args
-from evercal.cli.console import following, progress_bar, table
+from evercal.cli.console import table
 from evercal.errors import InputError
+from evercal.progress import following, progress_bar
 
 if TYPE_CHECKING:
     from evercal.recordings import Recording

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
-from evercal.cli.console import Bars, require_writable, size
+from evercal.cli.console import require_writable, size
 from evercal.cli.info import adjusted_row
 from evercal.errors import InputError
+from evercal.progress import Bars
 
 if TYPE_CHECKING:
     from evercal.learning.scene import LearnReport

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from evercal.cli import args
-from evercal.cli.console import progress_bar, require_folder, require_writable
+from evercal.cli.console import require_folder, require_writable
+from evercal.progress import progress_bar
 from evercal.reports.answers import Answer, answer_row, budget_of, finite_pose, unit_known
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
-from evercal.cli.console import Bars
+from evercal.progress import Bars
 
 _CONNECTED = 0.8
 """Share of the frames in one part below which the video does not hold together."""

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional
 
 from evercal.cli import args
-from evercal.cli.console import Bars, size
+from evercal.cli.console import size
 from evercal.errors import InputError
+from evercal.progress import Bars
 
 if TYPE_CHECKING:
     from evercal.localization.refreshing import RefreshReport

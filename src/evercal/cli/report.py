@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
-from evercal.cli.console import progress_bar, require_writable
+from evercal.cli.console import require_writable
+from evercal.progress import progress_bar
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
-from evercal.cli.console import progress_bar
 from evercal.errors import InputError
+from evercal.progress import progress_bar
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from evercal.geometry import SE3, pose_distance
 from evercal.localization.acceptance import MAX_SUPPORT
 from evercal.localization.localizer import Localizer
-from evercal.mapping.build import BuiltMap, OnProgress
+from evercal.mapping.build import BuiltMap
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.selection import spread_poses
+from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame
 
 MOST_SHARE = 0.3

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 from evercal.geometry import SE3
 from evercal.learning.fit_acceptance import fit_acceptance
-from evercal.mapping.build import Adjusted, MapOptions, OnProgress, build_map
+from evercal.mapping.build import Adjusted, MapOptions, build_map
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.progress import OnProgress
 from evercal.recordings import posed_recording
 from evercal.recordings.frame import (
     MIN_GRIPPER_FRAMES,

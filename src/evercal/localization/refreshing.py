@@ -11,11 +11,11 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, average_poses
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
-from evercal.mapping.build import OnProgress
 from evercal.mapping.prepared_frames import WorkingSize
 from evercal.mapping.refresh import RefreshOptions, refreshed
 from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import spread_poses
+from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame
 
 LEAST_IMAGES = 5

@@ -4,7 +4,7 @@ The steps: select keyframes by pose, encode, check the stated poses against the 
 keyframes' depths, pick and track landmarks, adjust everything together, refine the depths.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -36,10 +36,8 @@ from evercal.mapping.tracks import (
     open_keyframe,
     refine_depths,
 )
+from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, stated_poses
-
-OnProgress = Callable[[str, int, int], object]
-"""Called with the name of the current step, its progress, and its total."""
 
 HAND_EYE_COVARIANCE_SCALE = 2.5
 """Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated

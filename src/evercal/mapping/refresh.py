@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from evercal.features.encoder import Encoder
 from evercal.features.vlad import vlad_for
 from evercal.geometry import SE3, average_poses
-from evercal.mapping.build import OnProgress
 from evercal.mapping.bundle_adjustment import BundleAdjustment, BundleOptions
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.landmarks import project_surface
@@ -34,6 +33,7 @@ from evercal.mapping.tracks import (
     open_keyframe,
     refine_depths,
 )
+from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame
 
 Mask = NDArray[np.bool_]
