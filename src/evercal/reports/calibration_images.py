@@ -22,7 +22,7 @@ from evercal.reports.overlay import (
     draw_residuals,
     resized,
 )
-from evercal.reports.scene.side_views import Surroundings
+from evercal.reports.scene import Surroundings
 
 if TYPE_CHECKING:
     from evercal.localization.learned import LearnedLocalizer
@@ -221,12 +221,7 @@ def _is_other_map(calibration: Calibration, localizer: "LearnedLocalizer") -> bo
 
 
 def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:
-    """Return the board in each image of a calibration by name; empty without corners.
-
-    Args:
-        calibration: By `evercal solve`.
-        folder: Folder of its file.
-    """
+    """The board in each image of a calibration by `evercal solve`, whose file lies in `folder`."""
     poses = calibration.checks.get("camera_from_board")
     given = Path(str(calibration.source.get("camera_poses", "")))
     file = next((f for f in (folder / given, given, folder / given.name) if f.is_file()), None)

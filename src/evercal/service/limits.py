@@ -89,13 +89,7 @@ def camera_of(data: bytes, size: tuple[int, int]) -> "Camera":
 
 
 def poses_of(data: bytes, ending: str, images: list[str]) -> "SE3":
-    """(n,) base_from_gripper of n images from a pose table.
-
-    Args:
-        data: Content of the table.
-        ending: Ending of its file name.
-        images: Names of the images, which rows are paired with.
-    """
+    """(n,) base_from_gripper of n named images, by a pose table whose file had an ending."""
     from evercal.recordings.poses.pairing import poses_of_images
 
     files = [Path(name) for name in images]
