@@ -83,8 +83,7 @@ def calibration_page(
     """Write the report of a calibration.
 
     `store` is the path of the store whose landmarks are drawn; `boards` says whether corners of a
-    board are drawn. `point_m` is a point in the camera
-    frame, metres, whose standard deviation is reported.
+    board are drawn; the report states the standard deviation of `point_m` in the camera frame.
     """
     calibration = file.calibration
     missing = (*images.missing, *_missing(calibration))
@@ -315,10 +314,7 @@ def camera_views(calibration: Calibration, around: Surroundings) -> Picture:
 
 
 def residual_chart(calibration: Calibration) -> Picture | None:
-    """Draw the residual of each image as a bar, cut at twice the largest used one.
-
-    None without residuals.
-    """
+    """Bars of the residuals of all images, cut at twice the largest used one; None without any."""
     images = calibration.images
     rows = np.array([[i.residual_mm, i.residual_deg] for i in images], np.float64).reshape(-1, 2)
     if not np.isfinite(rows).any():

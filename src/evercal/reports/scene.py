@@ -157,7 +157,7 @@ class KeyframeView:
     """Intrinsics at the size of `image`."""
     image: Image
     """(h, w, 3) RGB at working size."""
-    depths_m: Array
+    depths_m: NDArray[np.floating]
     """(n,) depths of its landmarks along the optical axis."""
 
 
