@@ -103,7 +103,7 @@ def test_health_scenes_page_and_metrics(hall_service: Any, image: Path) -> None:
         ("calibrations", {"images": "IMAGE", "robot_poses": ("p.csv", b"a,b\n1,2")}, 400, "robot_"),
         ("calibrations", {"images": "IMAGE", "mount": "table"}, 422, "mount"),
         ("check", {"images": "IMAGE"}, 422, "calibration: Field required"),
-        ("check", {"images": "IMAGE", "calibration": ("c", b"[]")}, 400, "calibration: cannot be"),
+        ("check", {"images": "IMAGE", "calibration": ("c", b"[]")}, 400, "'evercal-calibration'"),
         ("scenes", {}, 405, "Method Not Allowed"),
         ("nowhere", {}, 404, "Not Found"),
         ("scenes/..%2F..%2Fetc", {}, 404, "Not Found"),
