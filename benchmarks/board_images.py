@@ -70,7 +70,6 @@ def corner_points(board: Board) -> np.ndarray:
 
 
 def _pose(board: Board, photo: Photo, rng: np.random.Generator) -> SE3:
-    """Return camera_from_board with the given tilt about a random axis."""
     low, high = _extent(board)
     camera, size = photo.camera, high - low + 0.5 * board.size_m
     fills = max(size[0] * camera.fx / camera.width, size[1] * camera.fy / camera.height)
@@ -111,7 +110,6 @@ def _photograph(board: Board, photo: Photo, pose: SE3, rng: np.random.Generator)
 
 
 def _texture(board: Board) -> tuple[np.ndarray, float, np.ndarray]:
-    """Return a print (h, w) float32, its pixels per metre, and the place of its corner, metres."""
     image = board_image(board, _TEXELS // 2 if board.kind == "apriltag" else _TEXELS)
     low, high = _extent(board)
     per_m, margin = image.shape[1] / (high - low)[0], round(0.8 * _TEXELS)

@@ -148,7 +148,6 @@ def bumps(rooms: Sequence[Path], localizer: Localizer, draws: int) -> list[Row]:
 
 
 def _moved(reference: Calibration, rng: np.random.Generator) -> dict[str, Calibration]:
-    """Move a reference in random directions, by 2 mm, by 0.1 deg, and by both."""
     sizes = {"none": (0.0, 0.0), "2 mm": (2e-3, 0.0), "0.1 deg": (0.0, 0.1), "both": (2e-3, 0.1)}
     moved = {}
     for kind, (metres, degrees) in sizes.items():

@@ -167,7 +167,6 @@ def _rounds(root: Path, keyframes: int) -> list[dict[str, object]]:
 
 
 def _learned(recording: Recording, encoder: Encoder, keyframes: int) -> SceneMap:
-    """Learn the training frames of a recording."""
     split, options = split_held_out(recording.train), MapOptions()
     budget = MemoryBudget(share=0.0, least=keyframes)
     options = replace(options, memory=budget, size=replace(options.size, cells=240))
@@ -206,7 +205,6 @@ def _scores(estimates: list[PoseEstimate], recording: Recording) -> dict[str, ob
 
 
 def _drift(estimates: list[PoseEstimate], fixed: list[PoseEstimate]) -> float:
-    """Length of the mean difference of positions to those by the map that never changes, mm."""
     pairs = [
         (a.base_from_camera.translation_m - b.base_from_camera.translation_m)
         for a, b in zip(estimates, fixed, strict=True)

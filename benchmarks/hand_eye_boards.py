@@ -146,7 +146,6 @@ def _camera(rng: np.random.Generator) -> Camera:
 
 
 def _places(mount: Mount, rng: np.random.Generator) -> tuple[SE3, SE3]:
-    """Return parent_from_camera and fixed_from_board."""
     near = pose(Rotation.random(rng=rng), rng.uniform(-0.12, 0.12, 3))
     if mount == "eye_in_hand":
         return near, pose(Rotation.from_rotvec(rng.normal(0, 0.3, 3)), np.array([0.5, 0.1, 0.02]))

@@ -43,7 +43,6 @@ def misread(side: str, written: str, read: str) -> Mistake:
 
 
 def _later(poses: SE3) -> SE3:
-    """Return poses that are one row late."""
     return poses[np.r_[1 : len(poses), len(poses) - 1]]
 
 

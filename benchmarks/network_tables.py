@@ -47,7 +47,6 @@ def summary(name: str, single: bool = False) -> Callable[[], Table]:
 
 
 def _bench(name: str) -> Table:
-    """Read complete runs, without parts of strategies (`NAME:PART`)."""
     rows = complete_runs(results.read(FOLDER / name))
     return rows[~rows["strategy"].str.contains(":")]
 

@@ -136,7 +136,6 @@ def _orbit(rng: np.random.Generator, images: int) -> Iterator[SE3]:
 
 
 def _board(rng: np.random.Generator) -> np.ndarray:
-    """Return the board's texture, with a white margin of one square and faint dirt."""
     side = round(SQUARE_M * PIXELS_PER_M)
     squares = np.add.outer(np.arange(SQUARES[1]), np.arange(SQUARES[0])) % 2
     texture = np.pad(np.kron(squares, np.ones((side, side))), side, constant_values=1)
@@ -176,7 +175,6 @@ def draw(board: np.ndarray, back: np.ndarray, board_from_camera: SE3) -> np.ndar
 def _texture(
     texture: np.ndarray, origin: np.ndarray, rays: np.ndarray, z_m: float, per_m: float
 ) -> np.ndarray:
-    """Return the texture's values on a plane of constant z where rays hit it, else -1."""
     points = origin[:2] + rays[..., :2] * ((z_m - origin[2]) / rays[..., 2:])
     middle = (np.array(texture.shape[::-1]) - 1) / 2
     where = (points * per_m + middle).astype(np.float32)

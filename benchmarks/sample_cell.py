@@ -109,7 +109,6 @@ def _bump() -> SE3:
 
 
 def _arm_path(count: int, centre: np.ndarray, spread: np.ndarray, stream: int) -> np.ndarray:
-    """Smooth joint angles around a centre, shape (count, 7), radians."""
     rng = np.random.default_rng([_SEED, stream])
     t = np.linspace(0, 2 * np.pi, count, endpoint=False)[:, None]
     cycles = np.array([1.0, 2.0, 1.0, 2.0, 2.0, 1.0, 2.0])
@@ -119,7 +118,6 @@ def _arm_path(count: int, centre: np.ndarray, spread: np.ndarray, stream: int) -
 
 
 def _write_gripper_poses(path: Path, grippers: SE3) -> None:
-    """Write noisy gripper poses, one row for each image."""
     sigma = np.repeat([NOISE_M, NOISE_RAD], 3)
     noise = sigma * np.random.default_rng([_SEED, 4]).standard_normal((len(grippers), 6))
     rows = ["image,x,y,z,qw,qx,qy,qz"]

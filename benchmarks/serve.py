@@ -52,7 +52,6 @@ def run(
 
 
 def _located(opened: Map, recording: Recording) -> bytes:
-    """The test image that the map locates best, as a JPEG file."""
     files = []
     for frame in recording.test:
         resized = cv2.resize(frame.read_image(), (640, 480), interpolation=cv2.INTER_CUBIC)

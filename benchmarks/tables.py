@@ -44,7 +44,6 @@ def rows_of(name: str) -> Table:
 
 
 def _rows(columns: str, *names: str) -> Callable[[], Table]:
-    """Return a table of rows as they are; columns are separated by commas."""
 
     def table() -> Table:
         rows: Table = pd.concat([rows_of(name) for name in names])[columns.split(",")]
@@ -102,7 +101,6 @@ def _degraded() -> Table:
 
 
 def _fixed() -> Table:
-    """Fixed cameras, before and after a bump."""
     rows = rows_of("fixed").set_index("scene")
     bump = f"bumped by {rows['bump_mm'].iloc[0]:.0f} mm: error of the measured shift"
     cells = {
@@ -168,7 +166,6 @@ def _trials() -> Table:
 
 
 def _bump() -> Table:
-    """`calibration bump`: how often a camera is reported as moved."""
     groups = rows_of("bump").groupby("kind", sort=False)["moved"]
     title = f"bumped by (5 images, {groups.size().iloc[0]} trials each)"
     shares = (100 * groups.mean()).map("{:.1f} %".format)
@@ -197,7 +194,6 @@ def _tuning(name: str, suite: str) -> Callable[[], Table]:
 
 
 def _inside(rows: Table) -> str:
-    """Return the per cent of poses in the right scene that lie in their ellipsoid."""
     poses = rows["frames"] - rows["wrong_scene"] - rows["refused"]
     return f"{np.average(rows['inside_95'], weights=poses):.0f} %"
 

@@ -135,7 +135,6 @@ def _learned(room: BoxRoom, lens: Camera) -> MapContents:
 
 
 def _errors(answers: Iterable[tuple[PoseEstimate, SE3]]) -> list[float]:
-    """Millimetres of the answers that have a pose."""
     return [
         1000 * float(pose_distance(estimate.base_from_camera, truth)[0])
         for estimate, truth in answers
@@ -144,7 +143,6 @@ def _errors(answers: Iterable[tuple[PoseEstimate, SE3]]) -> list[float]:
 
 
 def _recovery(tracked: list[tuple[int, TrackedFrame, float]], dark: set[int]) -> int:
-    """Return the most frames from the end of a hole until a pose is found."""
     longest, waiting = 0, 0
     for i, frame, _ in tracked:
         waiting = 0 if i in dark else waiting + 1

@@ -234,7 +234,6 @@ def spread(count: int, size: int, rng: np.random.Generator) -> list[int]:
 
 
 def _mount(recording: Recording, truth: SE3, store: Path) -> Row:
-    """Learn a wrist recording: the error of the mount and what the report says, or why not."""
     try:
         row, report = learned_mount(recording, truth, store)
     except InputError as error:
@@ -275,7 +274,6 @@ def _arm_draw(room: Path, draw: int) -> Row:
 
 
 def _arm_size(exact: Recording, noisy: Recording) -> Row:
-    """Return the true errors of the arm, per axis as reports state them."""
     pairs = zip(grippers(exact), grippers(noisy), strict=True)
     sizes = np.array([pose_distance_mm_deg(*pair) for pair in pairs])
     mm, deg = np.sqrt((sizes**2).mean(0) / 3).tolist()
@@ -319,7 +317,6 @@ def frame_offset(estimated: SE3, true: SE3) -> SE3:
 
 
 def _fixed(localizer: Localizer, room: Path, frame: SE3 | None) -> Row:
-    """Calibrate the fixed camera: its error in the base frame, and after fitting the frame."""
     images, truth = fixed_images(room / "calibration" / "fixed")
     try:
         calibration = calibrate(localizer, images)
@@ -336,13 +333,11 @@ def _fixed(localizer: Localizer, room: Path, frame: SE3 | None) -> Row:
 
 @contextmanager
 def _scratch() -> Iterator[Path]:
-    """Yield the path of a store that is deleted afterwards."""
     with tempfile.TemporaryDirectory() as folder:
         yield Path(folder) / "store.evercal"
 
 
 def _file(*words: object) -> str:
-    """Return the name of a draw's file."""
     return "_".join(re.sub(r"[^\w.+-]+", "-", str(word)) for word in words) + ".json"
 
 

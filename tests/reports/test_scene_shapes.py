@@ -10,13 +10,14 @@ import pytest
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.mapping.map_frame import Similarity
 from evercal.mapping.scene_map import MapContents, SceneMap
-from evercal.reports.scene.frusta import DRAWN_M, Ellipsoid, Frustum, readable_scale
-from evercal.reports.scene.map_parts import (
-    Backdrop,
-    KeyframeView,
+from evercal.reports.overlay import resized
+from evercal.reports.scene import (
+    DRAWN_M,
+    Ellipsoid,
+    Frustum,
     Landmarks3D,
     keyframe_views,
-    resized,
+    readable_scale,
 )
 
 SIMILARITY = Similarity(SE3.exp([0.3, -0.2, 0.5, 0.4, -0.8, 0.2]), 2.5)
@@ -68,21 +69,6 @@ def test_colours_by_a_value_rise_with_it(hall_map: MapContents) -> None:
         green = colours[:, 1].astype(int)  # of viridis, it never falls
         assert (np.diff(green[np.argsort(values)]) >= 0).all()
     assert len(Landmarks3D.of(hall_map.scenes[0], 0).colours("height")) == 0
-
-
-def test_backdrop_shows_each_pixel_where_the_camera_sees_it() -> None:
-    camera = Camera(64, 48, 50.0, 55.0, 20.0, 30.0)  # its centre is far from that of the image
-    pose = SE3.exp([0.1, 0.2, 0.3, 0.5, -0.4, 0.3])
-    image = np.zeros((48, 64, 3), np.uint8)
-    view = KeyframeView("room", 0, Frustum.of(pose, camera), camera, image, np.array([2.0]))
-    backdrop: Backdrop = view.backdrop
-    across, down = pose.rotation_matrix()[:, :2].T
-    for side, edge in ((-1, -0.5), (1, 63.5)):
-        for end, border in ((-1, -0.5), (1, 47.5)):
-            corner = backdrop.centre_m + side * backdrop.width_m / 2 * across
-            corner = corner + end * backdrop.height_m / 2 * down
-            pixel = camera.project(pose.inverse().apply(corner))
-            np.testing.assert_allclose(pixel, (edge, border), atol=1e-9)
 
 
 def test_corners_of_a_frustum_are_those_of_the_image() -> None:

@@ -13,6 +13,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from evercal.errors import InputError
+from evercal.service.hosts import is_local
 from evercal.service.limits import Limits
 from evercal.service.server import ServeOptions, bound_socket
 
@@ -146,3 +147,8 @@ def test_a_token_opens_all_addresses_and_a_port_is_used_once(tmp_path: Path) -> 
         port = first.getsockname()[1]
         with pytest.raises(InputError, match=f"--port {port}: Address already in use"):
             bound_socket(ServeOptions(tmp_path, "0.0.0.0", port, TOKEN))
+
+
+def test_only_loopback_addresses_are_local() -> None:
+    assert [is_local(host) for host in ("127.0.0.1", "::1", "localhost")] == [True] * 3
+    assert [is_local(host) for host in ("0.0.0.0", "192.168.1.4", "robot")] == [False] * 3

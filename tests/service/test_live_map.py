@@ -42,7 +42,7 @@ def test_no_answer_mixes_two_states(serve: Any, copy: Path, image: Path, tmp_pat
         changing = threading.Thread(target=rename)
         changing.start()
         try:
-            rows = [service.ask("POST", "/localize", parts).json for _ in range(25)]
+            rows = [service.ask("POST", "/localize", parts).json for _ in range(10)]
         finally:
             stop.set()
             changing.join()

@@ -17,10 +17,10 @@ pytest.importorskip("viser")
 from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.service.viewer.drawing import GRIPPER, add_calibrations
+from evercal.reports.scene import Frustum, KeyframeView
+from evercal.service.viewer.drawing import GRIPPER, add_arm, add_calibrations
 from evercal.service.viewer.html import chip_html, rows_html
-from evercal.service.viewer.page import Page, start_server
-from evercal.service.viewer.robot import add_arm
+from evercal.service.viewer.page import Page, backdrop, start_server
 
 from .browsing import seen_until, shot, visited
 
@@ -59,6 +59,21 @@ def page_of(localizer: Localizer, *given: Any) -> Iterator[Page]:
 def calibration(mount: Literal["eye_in_hand", "eye_to_hand"], **more: Any) -> Calibration:
     parent = "gripper" if mount == "eye_in_hand" else "base"
     return Calibration(mount, HAND, np.diag([1e-6, 4e-6, 9e-6, 1e-8, 1e-8, 1e-8]), parent, **more)
+
+
+def test_backdrop_shows_each_pixel_where_the_camera_sees_it() -> None:
+    camera = Camera(64, 48, 50.0, 55.0, 20.0, 30.0)  # its centre is far from that of the image
+    pose = SE3.exp([0.1, 0.2, 0.3, 0.5, -0.4, 0.3])
+    image = np.zeros((48, 64, 3), np.uint8)
+    view = KeyframeView("room", 0, Frustum.of(pose, camera), camera, image, np.array([2.0]))
+    centre_m, width_m, height_m = backdrop(view)
+    across, down = pose.rotation_matrix()[:, :2].T
+    for side, edge in ((-1, -0.5), (1, 63.5)):
+        for end, border in ((-1, -0.5), (1, 47.5)):
+            corner = centre_m + side * width_m / 2 * across
+            corner = corner + end * height_m / 2 * down
+            pixel = camera.project(pose.inverse().apply(corner))
+            np.testing.assert_allclose(pixel, (edge, border), atol=1e-9)
 
 
 def test_an_address_that_cannot_be_used_is_refused() -> None:

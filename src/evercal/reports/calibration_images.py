@@ -13,6 +13,7 @@ from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, resize_pixels
+from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import read_image
 from evercal.reports.overlay import (
     PICTURE_PX,
@@ -22,7 +23,7 @@ from evercal.reports.overlay import (
     draw_residuals,
     resized,
 )
-from evercal.reports.scene.side_views import Surroundings
+from evercal.reports.scene import Surroundings
 
 if TYPE_CHECKING:
     from evercal.localization.learned import LearnedLocalizer
@@ -145,8 +146,9 @@ def annotate_images(
         missing.append("No landmarks: pass --store to draw them.")
     if localizer is None:
         return AnnotatedImages(annotated, tuple(missing))
-    other, around = _is_other_map(calibration, localizer), _surroundings(calibration, localizer)
-    return AnnotatedImages(annotated, tuple(missing), other, around)
+    scene, digest = _scene_of(calibration, localizer), calibration.source.get("map")
+    other = digest is not None and (scene is None or scene.digest != digest)
+    return AnnotatedImages(annotated, tuple(missing), other, _surroundings(calibration, scene))
 
 
 def _fitting(path: Path, camera: Camera) -> Image:
@@ -198,35 +200,20 @@ def _use(use: ImageUse | None) -> str:
     return "used" if use.used else f"rejected: {use.reason}"
 
 
-def _surroundings(calibration: Calibration, localizer: "LearnedLocalizer") -> Surroundings:
-    from evercal.mapping.scene_map import SceneMap
-
+def _scene_of(calibration: Calibration, localizer: "LearnedLocalizer") -> SceneMap | None:
     name = calibration.source.get("scene")
-    scene = next((s for s in localizer.contents.scenes if s.name == name), None)
-    if calibration.mount != "eye_to_hand" or not isinstance(scene, SceneMap):
-        return Surroundings()
-    return Surroundings.of(scene) if scene.unit_known else Surroundings()
+    maps = [scene for scene in localizer.contents.scenes if isinstance(scene, SceneMap)]
+    return next((scene for scene in maps if scene.name == name), None)
 
 
-def _is_other_map(calibration: Calibration, localizer: "LearnedLocalizer") -> bool:
-    scene, digest = calibration.source.get("scene"), calibration.source.get("map")
-    if digest is None or scene not in localizer.scenes:
-        return digest is not None
-    from evercal.localization.localizer import Localizer
-
-    return (
-        not isinstance(localizer, Localizer)
-        or localizer.contents.scene(str(scene)).digest != digest
-    )
+def _surroundings(calibration: Calibration, scene: SceneMap | None) -> Surroundings:
+    """The map that a fixed camera was calibrated in; empty for other cameras and maps."""
+    shown = calibration.mount == "eye_to_hand" and scene is not None and scene.unit_known
+    return Surroundings.of(scene) if scene is not None and shown else Surroundings()
 
 
 def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:
-    """Return the board in each image of a calibration by name; empty without corners.
-
-    Args:
-        calibration: By `evercal solve`.
-        folder: Folder of its file.
-    """
+    """The board in each image of a calibration by `evercal solve`, whose file lies in `folder`."""
     poses = calibration.checks.get("camera_from_board")
     given = Path(str(calibration.source.get("camera_poses", "")))
     file = next((f for f in (folder / given, given, folder / given.name) if f.is_file()), None)

@@ -1,27 +1,37 @@
 """The HTML report of `evercal report`: a calibration, its quality and its evidence."""
 
+import json
+import math
 import os
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from evercal.calibration.calibration import Calibration
+from evercal.calibration.calibration import Calibration, position_shares
 from evercal.calibration.located import deviations, length_mm_deg
 from evercal.calibration.verdict import TIERS, expected_error, tier, verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.reports.calibration_charts import camera_views, residual_chart
 from evercal.reports.calibration_images import AnnotatedImages
-from evercal.reports.calibration_tables import (
-    camera_table,
-    check_table,
-    deviation_table,
-    error_budget,
-    source_table,
-    use_table,
-)
+from evercal.reports.charts import COLOURS, new_figure, png_bytes, tidy
 from evercal.reports.overlay import origin_in_view
-from evercal.reports.page import Picture, Tile, render
+from evercal.reports.page import Picture, Table, Tile, render
+from evercal.reports.scene import (
+    ABOVE,
+    CHI2_95,
+    Ellipsoid,
+    Frustum,
+    Surroundings,
+    draw_view,
+    ellipse,
+    frame_lines,
+    frustum_line,
+    readable_scale,
+)
+
+_SHOWN_ELSEWHERE = ("warnings", "left_open", "camera_sigma")
+_LONGEST_CELL = 160
+USED, REJECTED = COLOURS[0], COLOURS[1]
 
 
 class NamedCalibration(NamedTuple):
@@ -73,14 +83,13 @@ def calibration_page(
     """Write the report of a calibration.
 
     `store` is the path of the store whose landmarks are drawn; `boards` says whether corners of a
-    board are drawn. `point_m` is a point in the camera
-    frame, metres, whose standard deviation is reported.
+    board are drawn; the report states the standard deviation of `point_m` in the camera frame.
     """
     calibration = file.calibration
     missing = (*images.missing, *_missing(calibration))
     headline, _, details = (calibration.verdict or verdict(calibration)).partition(". ")
     old = None if older is None else older.calibration
-    uncertain = _has_uncertainty(calibration)
+    uncertain, own_map = _has_uncertainty(calibration), calibration.source.get("map")
     html = render(
         "calibration.html",
         title=f"{file.name}: {calibration.parent_frame}_from_{calibration.child_frame}",
@@ -96,7 +105,7 @@ def calibration_page(
         deviations=deviation_table(calibration, point_m) if uncertain else None,
         older=older,
         difference=None if old is None else difference(calibration, old),
-        same_map=old is not None and _map(old) is not None and _map(old) == _map(calibration),
+        same_map=old is not None and own_map is not None and old.source.get("map") == own_map,
         images=images,
         origin=_origin(calibration),
         pictures=[
@@ -154,10 +163,6 @@ def _origin(calibration: Calibration) -> str:
     return f"lies {outside}" if outside else f"projects to pixel ({pixel[0]:.1f}, {pixel[1]:.1f})"
 
 
-def _map(calibration: Calibration) -> object:
-    return calibration.source.get("map")
-
-
 def _missing(calibration: Calibration) -> list[str]:
     checks = calibration.checks
     gaps = {
@@ -173,3 +178,160 @@ def _missing(calibration: Calibration) -> list[str]:
 
 def _has_uncertainty(calibration: Calibration) -> bool:
     return bool(np.trace(calibration.covariance) > 0)
+
+
+def deviation_table(
+    calibration: Calibration, point_m: tuple[float, float, float] | None = None
+) -> Table:
+    """Standard deviations along axes: of the position, the rotation, and a point if given."""
+    parent, child = calibration.parent_frame, calibration.child_frame
+    uncertain = calibration.uncertain_pose
+    sigma = np.sqrt(np.diag(calibration.covariance).clip(0))
+    position = [*(1000 * sigma[:3]), calibration.sigma_mm]
+    rotation = [*np.rad2deg(sigma[3:]), calibration.sigma_deg]
+    rows = [
+        (f"position along the axes of {parent} (mm)", *(f"{v:.3f}" for v in position)),
+        (f"rotation about the axes of {child} (deg)", *(f"{v:.4f}" for v in rotation)),
+    ]
+    if point_m is not None:
+        axes = 1000 * np.sqrt(np.diag(uncertain.point_covariance(point_m)).clip(0))
+        point = ", ".join(f"{value:g}" for value in point_m)
+        name = f"point ({point}) m of {child} along the axes of {parent} (mm)"
+        rows.append((name, *(f"{v:.3f}" for v in (*axes, uncertain.point_sigma_mm(point_m)))))
+    return Table(("", "x", "y", "z", "root mean square"), rows, "Standard deviations")
+
+
+def error_budget(calibration: Calibration) -> Table:
+    """The causes of the uncertainty and their sum."""
+    terms = calibration.error_terms
+    rows = [
+        (term.name, f"{term.translation_mm:.2f}", f"{term.rotation_deg:.3f}", f"{100 * share:.0f}")
+        for term, share in zip(terms, position_shares(terms), strict=True)
+    ]
+    if rows:
+        total = f"{calibration.sigma_mm:.2f}", f"{calibration.sigma_deg:.3f}"
+        rows.append(("all", *total, "100"))
+    header = ("cause", "position (mm)", "rotation (deg)", "share of the position's variance (%)")
+    return Table(header, rows, "Error budget: standard deviation per axis by cause")
+
+
+def use_table(calibration: Calibration) -> Table:
+    """All images with their use; those of boards with what they contribute."""
+    images, checks = calibration.images, calibration.checks
+    folders = {image.name[: image.name.rfind("/") + 1] for image in images}
+    folder = folders.pop() if len(folders) == 1 else ""
+    share, moved = (checks.get(key, {}) for key in ("information_percent", "leave_one_out_mm"))
+    rows = [
+        (
+            image.name.removeprefix(folder),
+            "yes" if image.used else "no",
+            image.reason,
+            _fixed(image.residual_mm, 2),
+            _fixed(image.residual_deg, 3),
+            _fixed(share.get(image.name), 1),
+            _fixed(moved.get(image.name), 3),
+        )
+        for image in images
+    ]
+    measures = ("residual (mm)", "residual (deg)", "information (%)", "moves position by (mm)")
+    used = sum(image.used for image in images)
+    caption = f"{used} of {len(images)} images used" + (f", all in {folder}" if folder else "")
+    return Table(("name", "used", "reason", *measures), rows, caption)
+
+
+def camera_table(calibration: Calibration) -> Table:
+    """The intrinsics, with standard deviations where they were estimated."""
+    camera, rows = calibration.camera, []
+    if camera is not None:
+        sigma = calibration.checks.get("camera_sigma", {})
+        values = {f"{name} (px)": getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
+        names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        values |= dict(zip(names, camera.distortion, strict=False))
+        rows = [
+            (name, f"{value:.4f}", _fixed(sigma.get(name.partition(" ")[0]), 4))
+            for name, value in values.items()
+        ]
+        rows.insert(0, ("image size (px)", f"{camera.width}x{camera.height}", "-"))
+    return Table(("intrinsics", "value", "standard deviation"), rows)
+
+
+def check_table(calibration: Calibration) -> Table:
+    """The checks that were made and other values estimated with the transform."""
+    rows = [
+        (key.replace("_", " "), _cell(value))
+        for key, value in calibration.checks.items()
+        if key not in _SHOWN_ELSEWHERE and len(_cell(value)) <= _LONGEST_CELL
+    ]
+    return Table(("check", "value"), rows)
+
+
+def source_table(name: str, calibration: Calibration) -> Table:
+    """What the calibration was made from."""
+    source = {"file": name, **calibration.source, "created": calibration.created}
+    rows = [(key.replace("_", " "), _cell(value)) for key, value in source.items() if value]
+    return Table(("property", "value"), rows)
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, str):
+        return value
+    return f"{value:.6g}" if isinstance(value, float) else json.dumps(value)
+
+
+def _fixed(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def camera_views(calibration: Calibration, around: Surroundings) -> Picture:
+    """Draw the camera and the ellipsoid of its position, from above and from the side."""
+    pose, parent = calibration.uncertain_pose, calibration.parent_frame
+    ends = np.stack([np.zeros(3), pose.pose.translation_m])
+    extent = float(np.ptp(around.bounds(ends), axis=0).max())
+    lines = frame_lines(0.1 * extent)
+    if calibration.camera is not None:
+        view = Frustum.of(pose.pose, calibration.camera)
+        lines.append(frustum_line(view, 0.09 * extent, COLOURS[1], 1.6))
+    times = readable_scale([Ellipsoid.of(pose)], 0.07 * extent)
+    variances, axes = np.linalg.eigh(pose.covariance[:3, :3])
+    half = times * np.sqrt(CHI2_95 * np.diag(pose.covariance)[:3].clip(0))
+    points = np.concatenate([ends, [ends[1] - half, ends[1] + half]])
+    bounds = around.bounds(np.concatenate([points, *(line.points_m for line in lines)]))
+    width, depth, _ = np.ptp(bounds, axis=0)
+    side = int(depth > width), 2  # the wider one
+    figure = new_figure(10.8, 4.8)
+    for panel, plane in zip(figure.subplots(1, 2), (ABOVE, side), strict=True):
+        panel.fill(*ellipse(pose, times, plane).T, color=COLOURS[1], alpha=0.3, zorder=2)
+        draw_view(panel, plane, lines, around, bounds, (parent, "m"))
+    c, b, a = 1000 * np.sqrt(CHI2_95 * variances.clip(0))
+    forward = pose.pose.rotation_matrix()[:, 2]
+    angle = np.rad2deg(np.arccos(np.clip(abs(axes[:, 2] @ forward), 0.0, 1.0)))
+    caption = (
+        f"In {parent}, from above and from the side. The 95 % ellipsoid of the position has half"
+        f" axes of {a:.2f}, {b:.2f} and {c:.2f} mm and is drawn {times} times as large. The longest"
+        f" one lies {angle:.0f} deg from the viewing direction."
+    )
+    return Picture(png_bytes(figure), caption)
+
+
+def residual_chart(calibration: Calibration) -> Picture | None:
+    """Bars of the residuals of all images, cut at twice the largest used one; None without any."""
+    images = calibration.images
+    rows = np.array([[i.residual_mm, i.residual_deg] for i in images], np.float64).reshape(-1, 2)
+    if not np.isfinite(rows).any():
+        return None
+    used = np.array([image.used for image in images])
+    numbers = np.arange(1, len(images) + 1)
+    figure = new_figure(9.0, 3.4)
+    panels = figure.subplots(2, 1, sharex=True)
+    for panel, values, unit in zip(panels, np.nan_to_num(rows).T, ("mm", "deg"), strict=True):
+        panel.bar(numbers[used], values[used], 0.8, color=USED)
+        # Hatched, so that the two kinds differ in grey print as well.
+        style = {"facecolor": "white", "edgecolor": REJECTED, "hatch": "////"}
+        panel.bar(numbers[~used], values[~used], 0.8, **style)
+        typical = float(values[used].max(initial=0.0))
+        top = min(1.1 * float(values.max()), 2 * typical or math.inf)
+        panel.set(ylim=(0, max(top, 1e-6)), ylabel=f"residual ({unit})")
+        tidy(panel)
+    panels[1].set(xlabel="number of the image in the table", xlim=(0.4, max(len(images), 5) + 0.6))
+    words = "Residual of each image; those of rejected images are hatched, and cut where larger."
+    return Picture(png_bytes(figure), words)

@@ -80,18 +80,10 @@ def draw_landmarks(
 def draw_residuals(
     image: Image, pixels: Array, vectors: Array, residuals: Array, largest: float
 ) -> tuple[Image, int]:
-    """Draw points and residual vectors over a grey copy of an image.
+    """Draw detections (n, 2) and residual vectors (n, 2) over a grey copy of an image.
 
-    Args:
-        image: (H, W, 3).
-        pixels: (n, 2) detections, x and y; 0 is the centre of the first pixel. Those that are not
-            finite are omitted.
-        vectors: (n, 2) from detections to projections, pixels of the image.
-        residuals: (n,) of the legend, any unit of pixels; NaN without a projection.
-        largest: Upper end of the colour scale.
-
-    Returns:
-        The image, and the factor by which the vectors are exaggerated.
+    Detections that are not finite are omitted. `residuals` (n,) are those of the legend, in any
+    unit of pixels, NaN without a projection. Returns the factor that enlarges the vectors, too.
     """
     import cv2
 

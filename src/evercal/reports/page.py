@@ -82,10 +82,7 @@ class Tile(NamedTuple):
 
 
 def render(template: str, **values: object) -> str:
-    """Fill in a template; all values are escaped.
-
-    The document has no references to other files.
-    """
+    """Fill in a template, escaping all values; the document refers to no other file."""
     return environment().get_template(template).render(values)
 
 

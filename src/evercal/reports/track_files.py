@@ -3,7 +3,6 @@
 import json
 from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
 
 from evercal.errors import InputError
 from evercal.geometry import pose_to_dict
@@ -49,12 +48,7 @@ class TrackFile(AbstractContextManager["TrackFile"]):
         self._file.write(line)
         self._file.flush()
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
 

@@ -15,9 +15,9 @@ from evercal.mapping.scene_map import SceneMap
 from evercal.reports.answers import Answer, finite_pose
 from evercal.reports.charts import COLOURS, plain
 from evercal.reports.overlay import draw_landmarks
-from evercal.reports.scene.frusta import Frustum
-from evercal.reports.scene.side_views import (
+from evercal.reports.scene import (
     ABOVE,
+    Frustum,
     Line,
     Surroundings,
     draw_view,

@@ -16,11 +16,7 @@ class QueueFullError(Exception):
 
 
 class Desk:
-    """Works on images in threads, one image for each, as `localize_batch` does.
-
-    Args:
-        most: Requests that wait, at most.
-    """
+    """Works on images in threads, one image for each; at most `most` requests wait."""
 
     def __init__(self, most: int):
         workers = torch.get_num_threads()

@@ -45,11 +45,7 @@ class Metrics:
 class Guard:
     """Refuses requests before their body is read; an ASGI middleware.
 
-    Args:
-        app: The service.
-        token: Bearer token that requests need. Without one, only this machine may ask.
-        limits: Largest body.
-        metrics: Counters.
+    Without a token, only this machine may ask.
     """
 
     def __init__(self, app: App, token: str | None, limits: Limits, metrics: Metrics):

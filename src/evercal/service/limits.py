@@ -1,7 +1,6 @@
 """What a request may contain: sizes, images, and small files such as intrinsics."""
 
 import io
-import json
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -15,6 +14,7 @@ import numpy as np
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
+    from evercal.calibration.calibration import Calibration
     from evercal.geometry import SE3, Camera
 
 Content = TypeVar("Content")
@@ -89,13 +89,7 @@ def camera_of(data: bytes, size: tuple[int, int]) -> "Camera":
 
 
 def poses_of(data: bytes, ending: str, images: list[str]) -> "SE3":
-    """(n,) base_from_gripper of n images from a pose table.
-
-    Args:
-        data: Content of the table.
-        ending: Ending of its file name.
-        images: Names of the images, which rows are paired with.
-    """
+    """(n,) base_from_gripper of n named images, by a pose table whose file had an ending."""
     from evercal.recordings.poses.pairing import poses_of_images
 
     files = [Path(name) for name in images]
@@ -105,11 +99,11 @@ def poses_of(data: bytes, ending: str, images: list[str]) -> "SE3":
     )
 
 
-def json_of(data: bytes, name: str, convert: Callable[[object], Content]) -> Content:
-    """Convert a JSON value that came over the network."""
-    return _from_text(
-        data, name, ".json", _TEXT_BYTES, lambda p: convert(json.loads(p.read_text()))
-    )
+def calibration_of(data: bytes) -> "Calibration":
+    """A calibration file that came over the network."""
+    from evercal.calibration.calibration import read_calibration
+
+    return _from_text(data, "calibration", ".json", _TEXT_BYTES, read_calibration)
 
 
 def _from_text(

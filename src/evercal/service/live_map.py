@@ -13,11 +13,8 @@ from evercal.storage.manifest import MANIFEST
 class LiveMap:
     """The last complete state of a map on disk.
 
-    A request takes `current` once and answers from it, so that no answer mixes two states.
-
-    Args:
-        path: Folder of the map; it may be missing until a first scene is learned.
-        device: `auto`, `cpu` or `cuda`.
+    A request takes `current` once and answers from it, so that no answer mixes two states. The
+    folder may be missing until a first scene is learned.
     """
 
     def __init__(self, path: Path, device: str = "auto"):

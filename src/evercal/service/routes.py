@@ -22,7 +22,14 @@ from evercal.reports.answers import Answer, answer_row, check_record, unit_known
 from evercal.reports.track_files import track_row
 from evercal.service.desk import Desk, QueueFullError
 from evercal.service.guard import Metrics
-from evercal.service.limits import Limits, TooLargeError, camera_of, decoded, json_of, poses_of
+from evercal.service.limits import (
+    Limits,
+    TooLargeError,
+    calibration_of,
+    camera_of,
+    decoded,
+    poses_of,
+)
 from evercal.service.live_map import LiveMap
 
 router = APIRouter()
@@ -135,10 +142,9 @@ async def check(
     service, reference = service_of(request), await calibration.read()
 
     def work() -> dict[str, Any]:
-        from evercal.calibration.calibration import Calibration
         from evercal.calibration.drift import check
 
-        stated = json_of(reference, "calibration", Calibration.from_dict)
+        stated = calibration_of(reference)
         pixels, camera = shots()
         return check_record(check(service.live.current.localizer, pixels, stated, camera))
 

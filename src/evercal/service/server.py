@@ -19,7 +19,7 @@ from evercal.errors import InputError
 from evercal.service import routes
 from evercal.service.desk import Desk, QueueFullError
 from evercal.service.guard import Guard, Metrics
-from evercal.service.hosts import is_local
+from evercal.service.hosts import is_local, listening_socket
 from evercal.service.limits import Limits, TooLargeError
 from evercal.service.live_map import LiveMap
 
@@ -53,12 +53,7 @@ class ServeOptions:
 def make_app(
     options: ServeOptions, on_ready: Callable[[tuple[str, ...]], object] = lambda _: None
 ) -> FastAPI:
-    """The application; its lifespan owns the threads.
-
-    Args:
-        options: How the map is served.
-        on_ready: Called with the names of the scenes when requests are answered.
-    """
+    """The application; `on_ready` gets the names of the scenes when requests are answered."""
     live, metrics = LiveMap(options.map, options.device), Metrics()
 
     @asynccontextmanager
@@ -119,14 +114,7 @@ def bound_socket(options: ServeOptions) -> socket.socket:
         )
     if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or " " in token):
         raise InputError(f"--token: give at least {LEAST_TOKEN} ASCII characters without spaces")
-    if not 0 <= options.port <= 65_535:  # the resolver takes the remainder
-        raise InputError(f"--port {options.port}: give 0 to 65535")
-    family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
-    try:
-        return socket.create_server((options.host, options.port), family=family)
-    except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"--host {options.host} --port {options.port}: {reason}") from None
+    return listening_socket(options.host, options.port)
 
 
 def url_of(listener: socket.socket) -> str:
@@ -157,9 +145,7 @@ def server_of(app: FastAPI) -> uvicorn.Server:
 def serve(options: ServeOptions, on_ready: Callable[[str, tuple[str, ...]], object]) -> None:
     """Serve a map until SIGTERM or SIGINT; requests under way are answered before.
 
-    Args:
-        options: How it is served.
-        on_ready: Called with the address and the names of the scenes.
+    `on_ready` gets the address and the names of the scenes.
     """
     # A second limit, in case that a decoder reads another size than the header states.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(options.limits.pixels))

@@ -9,8 +9,8 @@ import viser
 
 from evercal.calibration.next_views import NextViews
 from evercal.geometry import SE3
-from evercal.reports.scene.frusta import Frustum
-from evercal.reports.scene.map_parts import THUMBNAIL_PX, resized
+from evercal.reports.overlay import resized
+from evercal.reports.scene import THUMBNAIL_PX, Frustum
 from evercal.service.studio.controls import Controls, Tasks
 from evercal.service.studio.studio import Studio
 from evercal.service.viewer.drawing import DrawnMap, add_base, add_calibrations, add_frustum, place

@@ -3,26 +3,33 @@
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.calibration.export.formats import FORMATS, export_files
-from evercal.calibration.next_views import NextViews
+from evercal.calibration.next_views import NextViews, looked_at, next_views
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.live.coverage import IMAGES, Coverage
+from evercal.live.coverage import IMAGES, Coverage, Sample, coverage
 from evercal.live.recorder import JPEG_QUALITY, POSES, WristRecorder
 from evercal.live.robot import MovingRobot
 from evercal.map import Map
 from evercal.recordings.images import write_jpeg
 from evercal.recordings.poses.camera_file import read_camera
 from evercal.service.studio.devices import Connection, Devices, Which
-from evercal.service.studio.samples import covered, next_view
 from evercal.storage import write_json
 
 FIXED_IMAGES = 8
 """Images of a series of the fixed camera."""
+_CANDIDATES = 200
+_TURN_RAD, _ROLL_RAD, _NEARER = np.deg2rad(30.0), np.deg2rad(40.0), 0.25
+"""How far proposed views may lie from recorded ones where reachable poses are unknown."""
+
+_measured = cache(Sample.of)
 
 State = tuple[Literal["waits", "to do", "done"], str]
 """Status of a step, and what was found or what to do in one to three sentences."""
@@ -83,16 +90,28 @@ class Studio:
 
     def coverage(self) -> Coverage:
         """What the samples cover."""
-        return covered(self.recorder.frames, self.mount)
+        return coverage([_measured(frame) for frame in self.recorder.frames], self.mount)
 
     def bad_samples(self) -> list[str]:
         """Names of the samples with problems."""
         return [row.name for row in self.coverage().samples if row.problems]
 
     def next_view(self) -> NextViews | None:
-        """The next best view of the camera on the gripper."""
+        """The view that would lower the uncertainty most; None before the first good sample.
+
+        It is one of the reachable poses, else one near those of the samples.
+        """
+        rows = self.coverage().samples
+        poses = [_measured(frame).base_from_gripper for frame in self.recorder.frames]
+        good = [pose for pose, row in zip(poses, rows, strict=True) if not row.problems]
+        if not good:
+            return None
         reachable = self.connection.devices.reachable
-        return next_view(self.recorder.frames, self.mount, reachable, self._refused)
+        if reachable is None:
+            reachable = _around(SE3.stack(poses), SE3.stack(good), self.mount)
+        excluded = SE3.stack([*poses, *self._refused])
+        views = next_views(SE3.stack(good), reachable, 1, self.mount, excluded)
+        return views if len(views.poses) else None
 
     def take_sample(self) -> str:
         """Record image and pose."""
@@ -230,6 +249,21 @@ class Studio:
         self.calibrations[which] = calibration
         if which == "wrist":
             self.mount = calibration.parent_from_child
+
+
+def _around(recorded: SE3, good: SE3, gripper_from_camera: SE3 | None) -> SE3:
+    """Poses (n,) near recorded ones that look at the same point."""
+    mount = SE3.identity() if gripper_from_camera is None else gripper_from_camera
+    point_m = looked_at(good @ mount)
+    rng, cameras = np.random.default_rng(len(recorded)), recorded @ mount
+    start = cameras[rng.integers(len(cameras), size=_CANDIDATES)]
+    turns, closer = np.zeros((2, _CANDIDATES, 6))
+    turns[:, 3:] = rng.uniform(-_TURN_RAD, _TURN_RAD, (_CANDIDATES, 3))
+    distance = np.linalg.norm(start.translation_m - point_m, axis=1)
+    closer[:, 2] = distance * rng.uniform(-_NEARER, _NEARER, _CANDIDATES)
+    closer[:, 5] = rng.uniform(-_ROLL_RAD, _ROLL_RAD, _CANDIDATES)
+    there, back = SE3.from_translation(point_m), SE3.from_translation(-point_m)
+    return there @ SE3.exp(turns) @ back @ start @ SE3.exp(closer) @ mount.inverse()
 
 
 def _free_name(name: str, taken: tuple[str, ...]) -> str:

@@ -1,22 +1,27 @@
-"""Cameras, maps and calibrations in the scene of a page."""
+"""Cameras, maps, calibrations and the arm in the scene of a page."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import viser
 
 from evercal.calibration.calibration import Calibration
+from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.mapping.scene_map import SceneMap
-from evercal.reports.scene.frusta import Ellipsoid, Frustum, readable_scale
-from evercal.reports.scene.map_parts import (
+from evercal.recordings.poses.kinematics import RobotModel
+from evercal.reports.overlay import resized
+from evercal.reports.scene import (
     THUMBNAIL_PX,
     ColourBy,
+    Ellipsoid,
+    Frustum,
     KeyframeView,
     Landmarks3D,
     keyframe_views,
-    resized,
+    readable_scale,
 )
 from evercal.service.viewer.html import GREY, MAGENTA, Colour
 
@@ -155,3 +160,38 @@ def add_calibrations(
         )
         words = f"{name}: {found.sigma_mm:.2g} mm (1 sigma), ellipsoid x {scale:g}"
         server.scene.add_label(f"{node}/label", words)
+
+
+def add_arm(
+    server: viser.ViserServer, path: Path, gripper: viser.FrameHandle, links: Sequence[str]
+) -> list[viser.GuiSliderHandle[float]]:
+    """Add an arm at the robot base, and a slider for each joint, which are returned.
+
+    `gripper` is a node that moves with the first of `links` that the arm has.
+    """
+    model = RobotModel(path)  # reports what is wrong in the file
+    from viser.extras import ViserUrdf
+
+    link = next((link for link in links if link in model.links), None)
+    server.scene.add_frame("/robot", show_axes=False)
+    try:
+        shown = ViserUrdf(server, path, root_node_name="/robot")
+    except Exception as error:  # trimesh raises many types for broken meshes
+        text = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise InputError(f"{path}: cannot be drawn ({text}); check its meshes") from None
+    limits, sliders = shown.get_actuated_joint_limits(), []
+
+    def move() -> None:
+        values = np.array([slider.value for slider in sliders])
+        shown.update_cfg(values)
+        if link is not None:
+            place(gripper, model.poses(tuple(limits), values[None], None, link)[0][0])
+
+    with server.gui.add_folder("Arm", expand_by_default=False):
+        for name, (low, high) in limits.items():
+            least, most = -np.pi if low is None else low, np.pi if high is None else high
+            start = min(max(0.0, least), most)
+            sliders.append(server.gui.add_slider(name, least, most, 0.01, start))
+            sliders[-1].on_update(lambda _: move())
+    move()
+    return sliders

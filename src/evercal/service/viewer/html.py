@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from html import escape
 
 from evercal.calibration.calibration import Calibration
-from evercal.reports.scene.frusta import Ellipsoid
+from evercal.reports.scene import Ellipsoid
 
 GREEN, AMBER, RED, GREY = (22, 163, 74), (217, 119, 6), (220, 38, 38), (107, 114, 128)
 BLUE, MAGENTA = (37, 99, 235), (192, 38, 211)

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import socket
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,11 +18,18 @@ from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker
 from evercal.recordings.poses.camera_file import read_camera
 from evercal.reports.answers import unit_known
-from evercal.reports.scene.frusta import Frustum
-from evercal.reports.scene.map_parts import THUMBNAIL_PX, ColourBy, KeyframeView, resized
-from evercal.service.viewer.drawing import DrawnMap, add_base, add_calibrations, add_frustum, place
+from evercal.reports.overlay import resized
+from evercal.reports.scene import THUMBNAIL_PX, ColourBy, Frustum, KeyframeView
+from evercal.service.hosts import listening_socket
+from evercal.service.viewer.drawing import (
+    DrawnMap,
+    add_arm,
+    add_base,
+    add_calibrations,
+    add_frustum,
+    place,
+)
 from evercal.service.viewer.html import GREEN, calibration_rows, chip_html, rows_html
-from evercal.service.viewer.robot import add_arm
 
 _THROUGH = "/through"
 
@@ -71,15 +77,16 @@ class Page:
 
     def look_through(self, view: KeyframeView, client: viser.ClientHandle) -> None:
         """Show a visitor what a keyframe shows: its image stands behind its landmarks."""
-        backdrop, pose = view.backdrop, view.frustum.base_from_camera
+        pose = view.frustum.base_from_camera
+        centre_m, width_m, height_m = backdrop(view)
         with client.atomic():
             client.scene.add_image(
                 _THROUGH,
                 view.image,
-                backdrop.width_m,
-                backdrop.height_m,
+                width_m,
+                height_m,
                 wxyz=pose.rotation_wxyz,
-                position=backdrop.centre_m,
+                position=centre_m,
             )
             client.camera.position, client.camera.wxyz = pose.translation_m, pose.rotation_wxyz
             client.camera.fov = view.frustum.fov_rad
@@ -126,6 +133,7 @@ class Page:
         place(node, None)
         with server.gui.add_folder("Live"):
             text = server.gui.add_html("")
+        shown: str | None = None
         while not self._closed.is_set():
             if not server.get_clients():
                 self._closed.wait(0.1)
@@ -141,7 +149,9 @@ class Page:
             place(node, pose and pose.pose)
             rows = [("time", f"{estimate.milliseconds:.0f} ms")]
             if pose is not None:
-                self.map.show(str(estimate.scene))
+                if estimate.scene != shown:  # else the visitor's choice stays
+                    shown = str(estimate.scene)
+                    self.map.show(shown)
                 node.image = resized(image, THUMBNAIL_PX)
                 rows.append(("scene", str(estimate.scene)))
                 if unit_known(self._localizer, estimate.scene):
@@ -151,6 +161,16 @@ class Page:
             chip = chip_html(tracked.state, estimate.reason)
             text.content = chip + rows_html(rows)
         camera.close()
+
+
+def backdrop(view: KeyframeView) -> tuple[np.ndarray, float, float]:
+    """Centre, width and height of a keyframe's image as a plane behind nearly all landmarks."""
+    depth = 1.05 * float(np.percentile(view.depths_m, 98)) if len(view.depths_m) else 1.0
+    camera = view.camera
+    middle = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
+    ahead = np.append((middle - (camera.cx, camera.cy)) / (camera.fx, camera.fy), 1.0)
+    width, height = depth * camera.width / camera.fx, depth * camera.height / camera.fy
+    return view.frustum.base_from_camera.apply(depth * ahead), width, height
 
 
 class _Server(viser.ViserServer):
@@ -173,13 +193,7 @@ class _Server(viser.ViserServer):
 
 def start_server(host: str, port: int, label: str) -> _Server:
     """An empty page with z up."""
-    if not 0 <= port <= 65_535:
-        raise InputError(f"--port {port}: give 0 to 65535")
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        socket.create_server((host, port), family=family).close()
-    except OSError as error:
-        raise InputError(f"--host {host} --port {port}: {error.strerror or error}") from None
+    listening_socket(host, port).close()  # viser alone would take the next free port
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints a frame with its address
         server = _Server(host, port, label=label, verbose=False)
     server.gui.configure_theme(

@@ -1,0 +1,270 @@
+"""What is drawn of a map, of cameras in space and of their uncertainty; in the base frame.
+
+Landmarks and keyframes are shown as the map was adjusted. Answers differ from that frame by the
+corrections of `mapping.map_frame`, usually about a millimetre.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.mapping.scene_map import SceneMap
+from evercal.reports.charts import COLOURS, plain, tidy
+from evercal.reports.overlay import colour_map
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+ColourBy = Literal["image", "height", "uncertainty"]
+Plane = tuple[int, int]
+
+DRAWN_M = 0.05
+"""Longest half axis of a drawn ellipsoid."""
+_SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500)
+MOST_POINTS = 50_000
+"""Landmarks that are shown of all scenes together; more are thinned out evenly."""
+THUMBNAIL_PX = 160
+"""Width of the image in a frustum."""
+ABOVE: Plane = (0, 1)
+"""The axes of the base that a view from above shows."""
+CHI2_95 = 7.8147
+"""Squared Mahalanobis distance of 95 % of three-dimensional errors."""
+_DRAWN_POINTS = 6000
+_AXES = ("#c0392b", "#1e8449", "#2874a6")
+"""Colours of x, y and z."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frustum:
+    """The view of a pinhole camera whose principal point is the centre of its image."""
+
+    base_from_camera: SE3
+    fov_rad: float
+    """Vertical angle of view, radians."""
+    aspect: float
+    """Width of the view divided by its height."""
+
+    @classmethod
+    def of(cls, base_from_camera: SE3, camera: Camera) -> Self:
+        """The view of a camera; its distortion and the offset of its centre are left out."""
+        fov = 2 * np.arctan2(camera.height / 2, camera.fy)
+        aspect = (camera.width / camera.fx) / (camera.height / camera.fy)
+        return cls(base_from_camera, float(fov), float(aspect))
+
+    def corners(self, depth_m: float) -> Array:
+        """(4, 3) corners of the view at a depth, in the base frame, metres."""
+        high = np.tan(self.fov_rad / 2)
+        signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        plane = signs * [high * self.aspect, high]
+        return self.base_from_camera.apply(depth_m * np.column_stack([plane, np.ones(4)]))
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoid:
+    """The translation of a pose within one standard deviation."""
+
+    centre_m: Array
+    """(3,) in the base frame, metres."""
+    axes_m: Array
+    """(3,) standard deviations along the principal axes, metres, ascending."""
+    rotation_wxyz: Array
+    """(4,) from the principal axes to the base frame."""
+
+    @classmethod
+    def of(cls, pose: UncertainPose) -> Self:
+        """The ellipsoid of the translation's covariance."""
+        variance, axes = np.linalg.eigh(pose.covariance[:3, :3])
+        axes[:, 2] *= np.sign(np.linalg.det(axes))  # a rotation, and no reflection
+        matrix = np.eye(4)
+        matrix[:3, :3] = axes
+        rotation = SE3.from_matrix(matrix).rotation_wxyz
+        return cls(pose.pose.translation_m, np.sqrt(np.maximum(variance, 0)), rotation)
+
+    @property
+    def sigmas_mm(self) -> str:
+        """Standard deviations along the principal axes, the largest first."""
+        return " / ".join(f"{1000 * axis:.2g}" for axis in self.axes_m[::-1])
+
+
+def readable_scale(ellipsoids: list[Ellipsoid], drawn_m: float = DRAWN_M) -> int:
+    """The largest round factor that draws the half axes of ellipsoids no longer than `drawn_m`.
+
+    Without ellipsoids, that of a standard deviation of 1 mm.
+    """
+    longest = max((float(ellipsoid.axes_m[-1]) for ellipsoid in ellipsoids), default=0.001)
+    return max([scale for scale in _SCALES if scale * longest <= drawn_m], default=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks3D:
+    """The landmarks of a scene."""
+
+    points_m: Array
+    """(n, 3) in the base frame, metres."""
+    grey: Image
+    """(n,) the pixel of its keyframe."""
+    sigma_mm: Array
+    """(n,) standard deviation along the viewing ray of its keyframe, millimetres."""
+
+    @classmethod
+    def of(cls, scene: SceneMap, most: int = MOST_POINTS) -> Self:
+        """All landmarks, or `most` of them, drawn evenly from all keyframes."""
+        keyframes, scale = scene.keyframes, _scale(scene)
+        points, grey, sigma = [np.zeros((0, 3))], [np.zeros(0, np.uint8)], [np.zeros(0)]
+        for i, marks in enumerate(keyframes.landmarks):
+            local = marks.surface(keyframes.cameras[i])[0]
+            points.append(scene.frame.points_to_base(keyframes.base_from_camera[i].apply(local)))
+            column, row = np.round(marks.pixels).astype(int).T
+            grey.append(keyframes.grey(i)[row, column])
+            # The error of a depth 1 / d is sigma / d^2; along the ray it is as much longer.
+            along = np.linalg.norm(local, axis=1) * marks.sigma / marks.inverse_depth
+            sigma.append(1000 * scale * along)
+        joined = np.concatenate(points)
+        valid = np.flatnonzero(np.isfinite(joined).all(1))
+        if len(valid) > most:
+            valid = valid[np.linspace(0, len(valid) - 1, most).round().astype(int)]
+        return cls(joined[valid], np.concatenate(grey)[valid], np.concatenate(sigma)[valid])
+
+    def __len__(self) -> int:
+        return len(self.points_m)
+
+    def colours(self, by: ColourBy) -> Image:
+        """(n, 3) RGB: the pixel of the image, or viridis of the height or of the uncertainty."""
+        if by == "image":
+            return np.repeat(self.grey[:, None], 3, axis=1)
+        sigma = np.log(np.maximum(self.sigma_mm, 1e-6))
+        values = np.asarray(self.points_m[:, 2] if by == "height" else sigma, np.float64)
+        if not len(values):
+            return np.zeros((0, 3), np.uint8)
+        low, high = np.percentile(values, [2, 98]).tolist()
+        return colour_map(values, (low, high))
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeView:
+    """A keyframe of a scene."""
+
+    scene: str
+    number: int
+    frustum: Frustum
+    camera: Camera
+    """Intrinsics at the size of `image`."""
+    image: Image
+    """(h, w, 3) RGB at working size."""
+    depths_m: NDArray[np.floating]
+    """(n,) depths of its landmarks along the optical axis."""
+
+
+def keyframe_views(scene: SceneMap) -> list[KeyframeView]:
+    """All keyframes of a scene, with poses among the landmarks as they are shown."""
+    keyframes, scale, views = scene.keyframes, _scale(scene), []
+    for i, camera in enumerate(keyframes.cameras):
+        pose, marks = keyframes.base_from_camera[i], keyframes.landmarks[i]
+        if scene.frame.similarity is not None:
+            pose = scene.frame.similarity.pose(pose)
+        image = np.repeat(keyframes.grey(i)[..., None], 3, axis=-1)
+        frustum, depths = Frustum.of(pose, camera), scale / marks.inverse_depth
+        views.append(KeyframeView(scene.name, i, frustum, camera, image, depths))
+    return views
+
+
+def _scale(scene: SceneMap) -> float:
+    return 1.0 if scene.frame.similarity is None else scene.frame.similarity.scale
+
+
+class Line(NamedTuple):
+    """A line in space."""
+
+    points_m: Array
+    """(n, 3)."""
+    colour: str
+    width: float = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Landmarks and keyframes of a map; lengths in its unit."""
+
+    points_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    """(n, 3) landmarks."""
+    grey: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    """(n,) their pixels."""
+    keyframes: tuple[Frustum, ...] = ()
+    """Views of the map."""
+
+    @classmethod
+    def of(cls, scene: SceneMap) -> Self:
+        """The landmarks and keyframes of a map."""
+        marks = Landmarks3D.of(scene, _DRAWN_POINTS)
+        views = tuple(view.frustum for view in keyframe_views(scene))
+        return cls(np.asarray(marks.points_m, np.float64), marks.grey, views)
+
+    def bounds(self, others: Array) -> Array:
+        """(2, 3) corners of a box around the keyframes, other points, and the landmarks near by."""
+        eyes = [view.base_from_camera.translation_m for view in self.keyframes]
+        points = np.concatenate([np.reshape(eyes, (-1, 3)), others])
+        low, high = points.min(0), points.max(0)
+        reach = max(float((high - low).max()), 0.1)
+        if len(self.points_m):  # few landmarks lie far behind a window
+            far = np.percentile(self.points_m, [2, 98], axis=0)
+            low = np.minimum(low, np.maximum(far[0], low - reach))
+            high = np.maximum(high, np.minimum(far[1], high + reach))
+        return np.stack([low - 0.1 * reach, high + 0.1 * reach])
+
+
+def frustum_line(view: Frustum, length_m: float, colour: str, width: float = 0.8) -> Line:
+    """The edges of a view as one line."""
+    a, b, c, d = view.corners(length_m)
+    eye = view.base_from_camera.translation_m
+    return Line(np.array([eye, a, b, eye, c, d, eye, b, c, d, a]), colour, width)
+
+
+def frame_lines(length_m: float) -> list[Line]:
+    """The axes of the frame that is drawn: x red, y green, z blue."""
+    return [
+        Line(np.stack([np.zeros(3), length_m * axis]), colour, 2.0)
+        for axis, colour in zip(np.eye(3), _AXES, strict=True)
+    ]
+
+
+def ellipse(pose: UncertainPose, times: float, plane: Plane) -> Array:
+    """(n, 2) outline in a plane of the ellipsoid that holds a position with 95 %, enlarged."""
+    values, vectors = np.linalg.eigh(pose.covariance[np.ix_(plane, plane)])
+    half_axes = times * np.sqrt(CHI2_95 * values.clip(0))
+    angle = np.linspace(0.0, 2 * np.pi, 181)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return pose.pose.translation_m[list(plane)] + circle * half_axes @ vectors.T
+
+
+def draw_view(
+    panel: "Axes",
+    plane: Plane,
+    lines: Sequence[Line],
+    around: Surroundings,
+    bounds: Array,
+    names: tuple[str, str] = ("base", "m"),
+) -> None:
+    """Draw lines, landmarks and keyframes within a box; `names` are those of frame and unit."""
+    shades = 0.35 + 0.5 * around.grey / 255  # neither ink nor paper
+    pairs = around.points_m[:, plane]
+    panel.scatter(*pairs.T, s=2.0, c=shades, cmap="gray", vmin=0, vmax=1, linewidths=0, zorder=1)
+    length = 0.04 * float(np.ptp(bounds, axis=0).max())
+    keyframes = [frustum_line(view, length, COLOURS[0]) for view in around.keyframes]
+    for line in (*keyframes, *lines):
+        panel.plot(*line.points_m[:, plane].T, color=line.colour, linewidth=line.width, zorder=3)
+    frame, unit = names
+    (x0, y0), (x1, y1) = bounds[:, plane]
+    x, y = (plain(f"{'xyz'[axis]} of {frame[:24]} ({unit})") for axis in plane)
+    panel.set(xlabel=x, ylabel=y)
+    panel.locator_params(nbins=7)
+    tidy(panel)
+    # Where the box is narrower than the panel, more is shown, and nothing white.
+    panel.set_xlim(x0, x1, auto=True)
+    panel.set_ylim(y0, y1, auto=True)
+    panel.set_aspect("equal", adjustable="datalim")

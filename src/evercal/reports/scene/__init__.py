@@ -1,1 +1,0 @@
-"""A scene in space: what is drawn of its map, cameras and their uncertainty."""
