@@ -49,22 +49,28 @@ def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
         )
 
 
-def require_rotations(base_from_gripper: SE3) -> None:
-    """Refuse gripper poses (n,) without rotation, or with rotation about one axis only."""
+def require_rotations(
+    base_from_gripper: SE3,
+    main_deg: float = _MIN_ROTATION_DEG,
+    second_deg: float = _MIN_SECOND_DEG,
+) -> None:
+    """Refuse gripper poses (n,) without rotation, or with rotation about one axis only.
+
+    The angles are root mean squares between two poses, about the main and the second axis.
+    """
     rows = np.unique(np.linspace(0, len(base_from_gripper) - 1, 100).round().astype(int))
     i, j = np.triu_indices(len(rows), 1)
     motions = base_from_gripper[rows[i]].inverse() @ base_from_gripper[rows[j]]
     rotations = 2.0 * motions.rotation_wxyz[:, 1:]
     values, axes = np.linalg.eigh(rotations.T @ rotations / len(rotations))
-    # Root mean square angles about the main and the second axis.
     main, second = np.rad2deg(np.sqrt(np.maximum(values[[2, 1]], 0)))
-    if main < _MIN_ROTATION_DEG:
+    if main < main_deg:
         raise InputError(
-            f"pure translation: the gripper never turned (by {main:.1f} deg rms), so the position"
+            f"pure translation: the gripper hardly turned (by {main:.1f} deg rms), so the position"
             f" of the camera is not determined; turn the wrist by 20 to 60 deg between poses, about"
             f" two different axes"
         )
-    if second < _MIN_SECOND_DEG:
+    if second < second_deg:
         axis = " ".join(f"{value:+.2f}" for value in axes[:, 2])
         raise InputError(
             f"parallel axes: the gripper turned about one axis only ({axis} in the gripper frame;"
