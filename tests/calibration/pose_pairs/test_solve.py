@@ -72,7 +72,7 @@ def test_the_covariance_is_not_too_large() -> None:
 
 
 def test_outliers_are_named_in_any_order() -> None:
-    truth = recording(Setting("eye_to_hand", outliers=5), 3)
+    truth = recording(Setting("eye_to_hand", outliers=9), 3)
     first = solve(truth.pairs, "eye_to_hand")
     outliers = {i for i, image in enumerate(first.images) if not image.used}
     assert outliers == set(truth.spoiled)
@@ -88,21 +88,6 @@ def test_outliers_are_named_in_any_order() -> None:
     assert np.abs(difference).max() < 1e-12
     assert np.allclose(second.covariance, first.covariance, rtol=1e-9)
     assert [image.name for image in second.images] == [truth.pairs.names[i] for i in order]
-
-
-def test_a_third_of_outliers_is_tolerated() -> None:
-    truth = recording(Setting(outliers=9), 0)
-    calibration = solve(truth.pairs, "eye_in_hand")
-    difference = error(calibration.parent_from_child, truth.parent_from_camera)
-    assert np.linalg.norm(difference[:3]) < 0.005
-    assert tuple(i for i, image in enumerate(calibration.images) if not image.used) == truth.spoiled
-
-
-@pytest.mark.parametrize("mount", MOUNTS)
-def test_unknown_scale_is_estimated(mount: Mount) -> None:
-    result = trials(Setting(mount, scale=0.37, outliers=3), 5)
-    assert result["scale off %"] < 0.5
-    assert result["median mm"] < 2.0
 
 
 def test_repeated_pairs_do_not_change_the_covariance() -> None:
