@@ -129,10 +129,10 @@ class PosePairs:
         )
 
 
-def listed(names: Sequence[str], limit: int = 5) -> str:
-    """Return the first few names for a message."""
-    shown = ", ".join(names[:limit])
-    return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"
+def listed(names: Sequence[str]) -> str:
+    """Return the first five names for a message."""
+    shown = ", ".join(names[:5])
+    return shown if len(names) <= 5 else f"{shown} and {len(names) - 5} more"
 
 
 def _inverse_velocity(base_from_gripper: SE3, velocity: Array) -> Array:
