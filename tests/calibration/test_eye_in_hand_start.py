@@ -11,7 +11,7 @@ from evercal.calibration.eye_in_hand_start import (
     PairMotion,
     solve_motions,
 )
-from evercal.calibration.pose_pairs.observability import require_rotations
+from evercal.calibration.pose_pairs.checks import require_rotations
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.pose_pairs.observability import require_rotations
+from evercal.calibration.pose_pairs.checks import require_rotations
 from evercal.errors import InputError
 from evercal.features.encode import encode_image
 from evercal.features.encoder import Encoder

@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.hand_eye import Setting, error, recording, trials
 from evercal.calibration.boards.board_poses import board_poses
-from evercal.calibration.boards.corners import BoardView, board_pose
+from evercal.calibration.boards.corners import BoardView, board_pose, calibrate_camera
 from evercal.calibration.boards.detection import Board, find_board
-from evercal.calibration.boards.intrinsics import calibrate_camera
 from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import BoardCorners, solve

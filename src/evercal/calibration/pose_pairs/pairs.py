@@ -13,8 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma
-from evercal.calibration.boards.intrinsics import LENS, LensPrior, lens_estimate
+from evercal.calibration.boards.corners import (
+    LENS,
+    BoardPose,
+    BoardView,
+    LensPrior,
+    board_pose,
+    lens_estimate,
+    pixel_sigma,
+)
 from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
 from evercal.geometry import SE3, Camera, pose_distance
