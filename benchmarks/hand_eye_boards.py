@@ -19,8 +19,13 @@ from tyro.conf import arg
 
 from benchmarks.hand_eye import pose, rotations
 from benchmarks.rows import save
-from evercal.calibration.boards.corners import BoardView, board_pose
-from evercal.calibration.boards.intrinsics import calibrate_camera, lens_vector, moved_camera
+from evercal.calibration.boards.corners import (
+    BoardView,
+    board_pose,
+    calibrate_camera,
+    lens_vector,
+    moved_camera,
+)
 from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.solve import solve

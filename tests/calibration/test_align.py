@@ -14,7 +14,7 @@ from evercal.calibration.align import (
     Picks,
     align_by_gripper,
     align_by_points,
-    aligned_by_points,
+    fit_picks,
 )
 from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
@@ -147,13 +147,13 @@ def test_touched_points_determine_the_base(
         inside = ((pixels > 0) & (pixels < [319, 239])).all(1)
         visible = {f"p{i}": pixels[i] for i in np.flatnonzero(inside)}
         picks += [(name, image, visible)] if visible else []
-    alignment = aligned_by_points(localizer, "hall", points, picks, scale_known=scale == 1.0)
+    alignment = align_by_points(localizer, "hall", points, picks, scale_known=scale == 1.0)
     assert alignment.similarity.scale == pytest.approx(scale, rel=0.01)
     np.testing.assert_allclose(
         alignment.similarity.points(in_map), list(points.values()), atol=0.01
     )
     with pytest.raises(InputError, match="of 1 images with picks"):
-        aligned_by_points(localizer, "hall", points, picks[:1])
+        align_by_points(localizer, "hall", points, picks[:1])
 
 
 def test_too_few_images_and_unknown_scenes_are_refused(
@@ -263,19 +263,19 @@ def drawn(seed: int) -> tuple[Similarity, np.ndarray, np.random.Generator]:
 
 def test_exact_picks_give_the_exact_similarity() -> None:
     truth, points, rng = drawn(0)
-    fit = align_by_points(views(truth, points, 0.0, rng), scale_known=False)
-    assert fit.similarity.scale == pytest.approx(truth.scale, rel=1e-6)
+    similarity, _, _ = fit_picks(views(truth, points, 0.0, rng), scale_known=False)
+    assert similarity.scale == pytest.approx(truth.scale, rel=1e-6)
     in_map = truth.base_from_map.inverse().apply(points) / truth.scale
-    assert fit.similarity.points(in_map) == pytest.approx(points, abs=1e-6)
+    assert similarity.points(in_map) == pytest.approx(points, abs=1e-6)
 
 
 def test_covariance_covers_the_errors() -> None:
     squared = []
     for seed in range(25):
         truth, points, rng = drawn(seed)
-        fit = align_by_points(views(truth, points, 1.0, rng), scale_known=False)
+        similarity, covariance, _ = fit_picks(views(truth, points, 1.0, rng), scale_known=False)
         in_map = truth.base_from_map.inverse().apply(points) / truth.scale
-        estimate = fit.similarity.points(in_map)
+        estimate = similarity.points(in_map)
         # The seven parameters that map the estimates to the points, by linear least squares.
         rows = []
         for x, y, z in estimate:
@@ -283,7 +283,7 @@ def test_covariance_covers_the_errors() -> None:
             away = np.array([x, y, z]) - points.mean(0)
             rows.append(np.column_stack([np.eye(3), rotation, away]))
         error = np.linalg.lstsq(np.concatenate(rows), (points - estimate).ravel(), rcond=None)[0]
-        squared.append(error @ np.linalg.solve(fit.covariance, error))
+        squared.append(error @ np.linalg.solve(covariance, error))
     assert 2.5 < np.mean(squared) < 9.0  # 7 for an exact covariance
 
 
@@ -291,6 +291,6 @@ def test_too_few_points_and_points_on_a_line_are_refused() -> None:
     truth, points, rng = drawn(0)
     line = MIDDLE + np.linspace(-0.2, 0.2, 4)[:, None] * np.array([1.0, 0.5, 0.2])
     with pytest.raises(InputError, match="on one line"):
-        align_by_points(views(truth, line, 0.0, rng), scale_known=True)
+        fit_picks(views(truth, line, 0.0, rng), scale_known=True)
     with pytest.raises(InputError, match="2 points were picked"):
-        align_by_points(views(truth, points[:2], 0.0, rng), scale_known=True)
+        fit_picks(views(truth, points[:2], 0.0, rng), scale_known=True)

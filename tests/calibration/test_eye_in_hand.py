@@ -148,7 +148,7 @@ def test_rotation_about_one_axis_is_refused(hand: Recording, tmp_path: Path) -> 
         replace(f, base_from_camera=None, base_from_gripper=pose)
         for f, pose in zip(hand.test, poses, strict=True)
     )
-    with pytest.raises(InputError, match="arm: the gripper turns about one axis only"):
+    with pytest.raises(InputError, match="arm: parallel axes: the gripper turned"):
         Map.open(tmp_path / "map", device="cpu").learn(Recording("arm", frames, ()))
     assert not (tmp_path / "map").exists()
 

@@ -1,15 +1,17 @@
 """A first `gripper_from_camera` from the motions of pairs of images."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.eye_in_hand_start import (
+    LEAST_ROTATION_DEG,
     PairMotion,
-    refuse_poor_motion,
-    rotation_spread_deg,
     solve_motions,
 )
+from evercal.calibration.pose_pairs.checks import require_rotations
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 
@@ -66,24 +68,15 @@ def test_inverted_poses_and_too_few_pairs_are_refused() -> None:
         solve_motions(poses[:3], motions(poses[:3], TRUTH))
 
 
-def test_rotation_spread_by_axis() -> None:
-    angles = np.deg2rad([-20, -10, 0, 10, 20])
-    six = np.zeros((5, 6))
-    six[:, 4] = angles
-    expected = np.rad2deg(np.sqrt((angles**2).mean()))
-    assert rotation_spread_deg(SE3.exp(six)) == pytest.approx([expected, 0, 0], abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("axes", "message"),
-    [((0, 0, 0), "without rotation"), ((0, 20, 0), "about one axis only"), ((20, 20, 0), None)],
+    [((0, 0, 0), "hardly turned"), ((0, 20, 0), "one axis only"), ((20, 8, 0), None)],
 )
-def test_poor_motion_is_refused(axes: tuple[float, ...], message: str | None) -> None:
+def test_rotations_about_two_axes_are_required(
+    axes: tuple[float, ...], message: str | None
+) -> None:
     rng = np.random.default_rng(0)
     both = rng.normal(0, 0.2, (30, 3)), rng.normal(0, 1, (30, 3)) * np.deg2rad(axes)
-    six = np.concatenate(both, 1)
-    if message is None:
-        refuse_poor_motion(SE3.exp(six))
-        return
-    with pytest.raises(InputError, match=message):
-        refuse_poor_motion(SE3.exp(six))
+    poses = SE3.exp(np.concatenate(both, 1))
+    with pytest.raises(InputError, match=message) if message else nullcontext():
+        require_rotations(poses, LEAST_ROTATION_DEG, LEAST_ROTATION_DEG)

@@ -130,16 +130,6 @@ def test_recorded_and_excluded_poses_and_their_twins_are_not_proposed() -> None:
         next_views(used, SE3.identity((0,)))
 
 
-def test_turning_is_proposed_before_shifting() -> None:
-    """After views without rotation, a rotated view is worth more than any shifted one."""
-    still = SE3.from_translation([(0.0, 0, 0), (0.1, 0, 0), (0, 0.1, 0)])
-    shifted = SE3.from_translation(np.random.default_rng(0).uniform(-0.3, 0.3, (10, 3)))
-    turned = SE3.exp(np.array([0.0, 0, 0, 0.5, 0, 0]))
-    found = next_views(still, SE3.stack([*shifted, turned]), 1, SE3.identity())
-    assert found.index.tolist() == [10]
-    assert found.sigma_mm[1] < found.sigma_mm[0]
-
-
 def wrist_views(count: int, seed: int) -> SE3:
     """base_from_camera of views above the table."""
     rng = np.random.default_rng(seed)

@@ -153,7 +153,7 @@ def _frame_covariance(
     return _about(origin, middle), axis_deviation(middle)
 
 
-def aligned_by_points(
+def align_by_points(
     localizer: "Localizer",
     scene: str,
     points: Mapping[str, Array],
@@ -184,19 +184,19 @@ def aligned_by_points(
             f"{len(images)} of {len(picks)} images with picks were located in {scene}; at least"
             " two are needed"
         )
-    fit = align_by_points(images, scale_known)
+    similarity, whole, residual_px = fit_picks(images, scale_known)
     middle = np.mean([*points.values()], axis=0)
     radius = np.sqrt(((np.stack([*points.values()]) - middle) ** 2).sum(1).mean() / 3)
-    covariance = fit.covariance[:6, :6].copy()
-    covariance[:3, :3] += np.eye(3) * fit.covariance[6, 6] * radius**2
+    covariance = whole[:6, :6].copy()
+    covariance[:3, :3] += np.eye(3) * whole[6, 6] * radius**2
     return MapAlignment(
-        fit.similarity,
+        similarity,
         covariance,
         len(points),
         len(points),
-        f"{fit.residual_px:.1f} px root mean square",
+        f"{residual_px:.1f} px root mean square",
         None,
-        axis_deviation(_about(-middle, fit.covariance[:6, :6])),
+        axis_deviation(_about(-middle, whole[:6, :6])),
     )
 
 
@@ -221,18 +221,12 @@ class Picks(NamedTuple):
     """(k, 2)."""
 
 
-class PointAlignment(NamedTuple):
-    """Pose and scale of the map in the base frame."""
+def fit_picks(images: Sequence[Picks], scale_known: bool) -> tuple[Similarity, Array, float]:
+    """Estimate the pose and, unless it is known, the scale of a map in the base frame.
 
-    similarity: Similarity
-    covariance: Array
-    """(7, 7) of a small motion (v, w) of the base frame, and of the logarithm of the scale."""
-    residual_px: float
-    """Root mean square distance of the picks."""
-
-
-def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignment:
-    """Estimate the pose and, unless it is known, the scale of a map in the base frame."""
+    Also return the covariance (7, 7) of a small motion (v, w) of the base frame and of the
+    logarithm of the scale, and the root mean square distance of the picks in pixels.
+    """
     triangulated = _triangulated(images)
     if len(triangulated) < 3:
         raise InputError(
@@ -264,7 +258,7 @@ def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignmen
     slope = np.eye(7)
     slope[:3, 3:6] = cross_matrix(centre)
     rms = float(np.sqrt((off.reshape(-1, 2) ** 2).sum(1).mean()))
-    return PointAlignment(moved(fit.x), slope @ covariance @ slope.T, rms)
+    return moved(fit.x), slope @ covariance @ slope.T, rms
 
 
 def _distances(image: Picks, similarity: Similarity) -> Array:

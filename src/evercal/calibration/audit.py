@@ -1,6 +1,6 @@
 """Detect recorded episodes whose images disagree with the stated camera pose."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,15 +26,6 @@ POSE_FILES = ("calibration.json", "base_from_camera.txt")
 
 
 @dataclass(frozen=True)
-class AuditOptions:
-    """Images of an episode to locate, and the largest differences in agreement."""
-
-    images: int = 5
-    most_mm: float = 5.0
-    most_deg: float = 0.5
-
-
-@dataclass(frozen=True)
 class Episode:
     """Result for one episode."""
 
@@ -52,7 +43,8 @@ def audit(
     localizer: "Localizer",
     folder: Path,
     stated: SE3 | None = None,
-    options: AuditOptions | None = None,
+    images: int = 5,
+    agreement: tuple[float, float] = (5.0, 0.5),
     on_episode: Callable[[], object] = lambda: None,
 ) -> list[Episode]:
     """Compare stated camera poses with images, episode by episode.
@@ -62,12 +54,13 @@ def audit(
         folder: Holds the episodes: recordings with camera poses, or images beside a
             `calibration.json` or a 4x4 matrix `base_from_camera.txt`.
         stated: base_from_camera of the episodes without a pose of their own.
-        options: Limits of agreement.
+        images: Images of an episode to locate.
+        agreement: Largest difference that still agrees, millimetres and degrees.
         on_episode: Called after each episode.
     """
     audited = []
     for episode in episode_folders(folder):
-        audited.append(_audited(localizer, episode, stated, options or AuditOptions()))
+        audited.append(_audited(localizer, episode, _shots(episode, stated, images), agreement))
         on_episode()
     return audited
 
@@ -81,12 +74,10 @@ def episode_folders(folder: Path) -> list[Path]:
 
 
 def _audited(
-    localizer: "Localizer", episode: Path, stated: SE3 | None, options: AuditOptions
+    localizer: "Localizer", episode: Path, shots: Sequence[_Shot], agreement: tuple[float, float]
 ) -> Episode:
-    shots = _shots(episode, stated)
-    chosen = np.unique(np.linspace(0, len(shots) - 1, options.images).round().astype(int))
     differences, reason = [], ""
-    for name, read, camera, base_from_camera in (shots[i] for i in chosen):
+    for name, read, camera, base_from_camera in shots:
         [item] = locate(localizer, [(name, read())], camera)
         if item.is_located:
             in_stated = base_from_camera.inverse() @ item.pose
@@ -98,12 +89,12 @@ def _audited(
     fused = fuse(differences)
     localizer.contents.metric_scene(fused.scene)
     millimetres, degrees = pose_distance_mm_deg(fused.pose, SE3.identity())
-    wrong = millimetres > options.most_mm or degrees > options.most_deg
+    wrong = millimetres > agreement[0] or degrees > agreement[1]
     reason = f"stated pose is {millimetres:.1f} mm and {degrees:.2f} deg from the images"
     return Episode(episode.name, "wrong" if wrong else "right", reason, millimetres, degrees)
 
 
-def _shots(episode: Path, stated: SE3 | None) -> list[_Shot]:
+def _shots(episode: Path, stated: SE3 | None, count: int) -> list[_Shot]:
     pose_file = next((episode / name for name in POSE_FILES if (episode / name).is_file()), None)
     pose = stated if pose_file is None else read_transform(pose_file)
     try:
@@ -123,4 +114,5 @@ def _shots(episode: Path, stated: SE3 | None) -> list[_Shot]:
     shots = [(name, read, camera, at) for name, read, camera, at in every if at is not None]
     if not shots:
         raise InputError(f"{episode}: no images with a stated camera pose in it")
-    return shots
+    chosen = np.unique(np.linspace(0, len(shots) - 1, count).round().astype(int))
+    return [shots[i] for i in chosen]

@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from evercal.calibration.pose_pairs.checks import require_rotations
 from evercal.errors import InputError
 from evercal.features.encode import encode_image
 from evercal.features.encoder import Encoder
@@ -38,8 +39,8 @@ FRAMES, PARTNERS = 120, 6
 """Maximum number of frames, and number of most similar frames that each is matched to."""
 ANGLE_DEG, ROTATION_DEG, DIRECTION_DEG = 3.0, 5.0, 10.0
 """Largest difference of the rotation angles, the rotations and the directions of a pair."""
-LEAST_ROTATION_DEG, LEAST_PAIRS = 4.0, 6
-"""Standard deviation of the rotations about a second axis, and pairs that must agree."""
+LEAST_ROTATION_DEG, LEAST_PAIRS = 5.7, 6
+"""Root mean square angle between frames about each of two axes, and pairs that must agree."""
 ENCODED_SIDE = 240
 """Short side of the images that are encoded, pixels."""
 LEAST_SHARE = 0.1
@@ -67,31 +68,6 @@ class HandEyeStart:
     of_pairs: int
 
 
-def rotation_spread_deg(base_from_gripper: SE3) -> Array:
-    """Return (3,) standard deviations of n rotations about principal axes, largest first."""
-    rotations = Rotation.from_quat(base_from_gripper.rotation_wxyz, scalar_first=True)
-    away = (rotations.mean().inv() * rotations).as_rotvec()
-    return np.rad2deg(np.linalg.svd(away, compute_uv=False) / np.sqrt(len(away)))
-
-
-def refuse_poor_motion(base_from_gripper: SE3) -> None:
-    """Refuse hardly any rotation, or rotations about one axis only."""
-    first, second, _ = rotation_spread_deg(base_from_gripper)
-    advice = (
-        "record views that tilt the camera up and down and turn it left and right by 15 to 45 deg"
-    )
-    if first < LEAST_ROTATION_DEG:
-        raise InputError(
-            f"the gripper turns by {first:.1f} deg (standard deviation): without rotation the"
-            f" position of the camera on it is undetermined; {advice}"
-        )
-    if second < LEAST_ROTATION_DEG:
-        raise InputError(
-            f"the gripper turns about one axis only ({first:.1f} deg about it, {second:.1f} deg"
-            f" about the next): the camera's position along that axis is undetermined; {advice}"
-        )
-
-
 def hand_eye_start(
     frames: Sequence[Frame],
     encoder: Encoder,
@@ -99,7 +75,7 @@ def hand_eye_start(
 ) -> HandEyeStart:
     """Estimate `gripper_from_camera` from frames that all have `base_from_gripper`."""
     poses = SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper is not None])
-    refuse_poor_motion(poses)
+    require_rotations(poses, LEAST_ROTATION_DEG, LEAST_ROTATION_DEG)
     if len(frames) > FRAMES:
         some = spread_poses(poses, FRAMES)
         frames, poses = [frames[i] for i in some], poses[some]

@@ -92,7 +92,7 @@ class Align(args.Verb):
         return localizer.contents.scene(self.scene).metric and not self.unknown_scale
 
     def _by_points(self, localizer: "Localizer") -> "MapAlignment":
-        from evercal.calibration.align import aligned_by_points
+        from evercal.calibration.align import align_by_points
         from evercal.recordings import read_image
 
         if self.points is None or self.picks is None:
@@ -106,7 +106,7 @@ class Align(args.Verb):
         folder = self.picks.parent
         picks = [(name, read_image(folder / name), pixels) for name, pixels in by_image.items()]
         metric = self._metric(localizer)
-        return aligned_by_points(localizer, self.scene, points, picks, metric)
+        return align_by_points(localizer, self.scene, points, picks, metric)
 
     def _show(self, alignment: "MapAlignment") -> None:
         similarity, (mm, deg) = alignment.similarity, alignment.sigma

@@ -38,14 +38,14 @@ class Audit(args.Verb):
     def run(self) -> int:
         if self.images < 1 or self.most_mm <= 0 or self.most_deg <= 0:
             raise InputError("--images is at least 1, --most-mm and --most-deg are above 0")
-        from evercal.calibration.audit import AuditOptions, audit, episode_folders
+        from evercal.calibration.audit import audit, episode_folders
 
         stated = args.transform_of(self.calibration)
         total = len(episode_folders(self.folder))
         localizer = args.open_map(self.store, self.device)
-        options = AuditOptions(self.images, self.most_mm, self.most_deg)
+        most = (self.most_mm, self.most_deg)
         with progress_bar("episodes", total, "episode") as bar:
-            episodes = audit(localizer, self.folder, stated, options, on_episode=bar.update)
+            episodes = audit(localizer, self.folder, stated, self.images, most, bar.update)
         wrong = sum(episode.verdict == "wrong" for episode in episodes)
         self.answer(
             {"episodes": [dataclasses.asdict(episode) for episode in episodes]},

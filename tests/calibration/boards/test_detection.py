@@ -15,10 +15,10 @@ from evercal.calibration.boards.corners import (
     BoardView,
     board_pose,
     board_pose_candidates,
+    calibrate_camera,
     pixel_sigma,
 )
 from evercal.calibration.boards.detection import Board, find_board
-from evercal.calibration.boards.intrinsics import calibrate_camera
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 

@@ -9,15 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 
-from .random_poses import CAMERA, calibration_of, poses, quaternion_matrix, random_poses
+from .random_poses import CAMERA, calibration_of, quaternion_matrix, random_poses
 
-few = settings(max_examples=10)
 DISTORTIONS = [(), (0.1, -0.2, 0.001, 0.002), CAMERA.distortion]
 RATIONAL = (0.1, -0.2, 0.001, 0.002, 0.03, 0.01, 0.02, 0.03)
 ON_ARM = calibration_of(SE3.exp([0.05, -0.03, 0.1, 0.1, 0.2, 1.5]), "eye_in_hand")
@@ -79,10 +77,8 @@ def test_colmap_refuses_blanks_in_names(tmp_path: Path) -> None:
         ON_ARM.export("colmap", tmp_path, robot_poses=robot)
 
 
-@given(poses())
-@few
-def test_nerfstudio_rays_match_the_camera(pose: SE3) -> None:
-    camera = camera_with(())
+def test_nerfstudio_rays_match_the_camera() -> None:
+    camera, pose = camera_with(()), SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
     meta = json.loads(calibration_of(pose, camera=camera).export("nerfstudio"))
     assert [frame["file_path"] for frame in meta["frames"]] == ["a.png", "c.png"]
     assert (meta["w"], meta["h"], meta["camera_model"]) == (640, 480, "OPENCV")
@@ -91,13 +87,11 @@ def test_nerfstudio_rays_match_the_camera(pose: SE3) -> None:
     u, v = np.moveaxis(pixels + 0.5, -1, 0)
     x, y = (u - meta["cx"]) / meta["fl_x"], -(v - meta["cy"]) / meta["fl_y"]
     rays = np.stack([x, y, -np.ones_like(x)], axis=-1)
-    expected = np.eye(4)
-    expected[:3, 3] = pose.translation_m
     for frame in meta["frames"]:
         matrix = np.array(frame["transform_matrix"])
         world = camera.unproject(pixels) @ pose.rotation_matrix().T
         np.testing.assert_allclose(rays @ matrix[:3, :3].T, world, atol=1e-9)
-        np.testing.assert_allclose(matrix[:, 3], expected[:, 3], atol=1e-12)
+        np.testing.assert_allclose(matrix[:, 3], [*pose.translation_m, 1], atol=1e-12)
 
 
 @pytest.mark.parametrize("distortion", DISTORTIONS)
@@ -121,9 +115,8 @@ def test_nerfstudio_refuses_rational_distortion() -> None:
         calibration.export("nerfstudio")
 
 
-@given(poses())
-@few
-def test_tum_of_a_fixed_camera_is_one_line(pose: SE3) -> None:
+def test_tum_of_a_fixed_camera_is_one_line() -> None:
+    pose = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
     line = np.loadtxt(io.StringIO(calibration_of(pose).export("tum")))
     matrix = quaternion_matrix(*line[4:], translation=line[1:4])
     np.testing.assert_allclose(matrix, pose.matrix(), atol=1e-9)

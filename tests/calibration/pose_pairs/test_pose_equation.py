@@ -33,13 +33,6 @@ def residuals(pairs: PosePairs, mount: Mount, at: Unknowns) -> np.ndarray:
     return equation_of(pairs, mount).system(at).residual
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-def test_true_transforms_have_zero_residuals(mount: Mount) -> None:
-    simulated = exact(mount, 0)
-    at = unknowns(simulated.parent_from_camera, simulated.fixed_from_board)
-    assert np.abs(residuals(simulated.pairs, mount, at)).max() < 1e-12
-
-
 @settings(max_examples=20)
 @given(st.sampled_from(MOUNTS), st.integers(0, 1000), st.booleans())
 def test_derivatives_match_finite_differences(mount: Mount, seed: int, moving: bool) -> None:

@@ -41,7 +41,7 @@ def degenerate_motions() -> dict[str, tuple[SE3, str]]:
     return {
         "translation": (
             pose(Rotation.concatenate([first] * 25), positions),
-            "pure translation: the gripper never turned .* turn the wrist",
+            "pure translation: the gripper hardly turned .* turn the wrist",
         ),
         "rotation": (
             pose(tilted, np.tile(positions[0], (25, 1))),

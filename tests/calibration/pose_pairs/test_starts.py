@@ -52,12 +52,3 @@ def test_rotations_by_180_degrees_are_solved() -> None:
     robot = SE3(rotations.as_quat(scalar_first=True), rng.normal(size=(5, 3)))
     camera = x.inverse() @ robot.inverse() @ z
     assert close(started(robot, camera, True).at.parent_from_camera, x)
-
-
-def test_outliers_do_not_move_the_start() -> None:
-    rng, (x, z) = np.random.default_rng(7), transforms(6)
-    robot = SE3(rng.normal(size=(20, 4)), rng.normal(size=(20, 3)))
-    camera = x.inverse() @ robot.inverse() @ z
-    wrong = SE3(rng.normal(size=(8, 4)), rng.normal(size=(8, 3)))
-    mixed = SE3.stack([*wrong, *camera[8:]])
-    assert close(started(robot, mixed, True).at.parent_from_camera, x)

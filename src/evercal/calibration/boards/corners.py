@@ -1,16 +1,20 @@
-"""Pose of a board from its corners, with covariance.
+"""Pose of a board from its corners, with covariance, and intrinsics from views of a board.
 
 Depth and tilt of a small board are far less certain than its direction, so hand-eye calibration
-weights each pose by this covariance.
+weights each pose by this covariance. Eliminating the poses from the normal equations leaves the
+information on the intrinsics (the Schur complement of bundle adjustment); a prior is added to it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, cross_matrix
 
 Array = NDArray[np.floating]
@@ -127,3 +131,153 @@ def pixel_sigma(poses: Sequence[BoardPose]) -> float:
     freedom = np.array([max(2 * pose.corners - 6, 1) for pose in poses])
     inliers = squared / freedom <= 4 * np.median(squared / freedom) + 1e-12
     return max(float(np.sqrt(squared[inliers].sum() / freedom[inliers].sum())), _LEAST_PX)
+
+
+LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+MIN_VIEWS = 5
+"""Minimum number of views of a flat board."""
+_USUAL_CENTRE, _USUAL_ASPECT, _ROUGH_FOCAL = 0.1, 0.02, 0.5
+"""Standard deviations of the principal point from the middle of the image, in widths, of the ratio
+of both focal lengths from one, and of a rough focal length, relative."""
+_USUAL_DISTORTION = (0.3, 0.5, 2e-3, 2e-3, 0.5, 0.1, 0.1, 0.1)
+_STATED = 0.005
+"""Standard deviation of a stated focal length and principal point, relative to the focal length."""
+_STATED_DISTORTION = (0.02, 0.05, 5e-4, 5e-4, 0.1, 0.02, 0.02, 0.02)
+_FOCAL_SIGMA = 0.1
+"""Maximum relative standard deviation of the focal length."""
+_FALSE = 10.0
+"""Residual of a false detection, in medians of all views."""
+_ROUNDS = 25
+
+
+class LensPrior(NamedTuple):
+    """A Gaussian over the (q,) intrinsics in the order of `LENS`."""
+
+    mean: Array
+    information: Array
+    """(q, q) inverse covariance."""
+
+    @classmethod
+    def stated(cls, camera: Camera) -> "LensPrior":
+        """Prior of intrinsics from the maker or from another calibration."""
+        mean = lens_vector(camera)
+        sigma = np.r_[np.full(4, _STATED * camera.fx), _STATED_DISTORTION][: len(mean)]
+        return cls(mean, np.diag(sigma**-2.0))
+
+    @classmethod
+    def usual(cls, camera: Camera) -> "LensPrior":
+        """Prior of unknown intrinsics; `camera` gives image size and a rough focal length."""
+        mean = np.zeros(len(lens_vector(camera)))
+        mean[:2] = camera.fx
+        mean[2:4] = (camera.width - 1) / 2, (camera.height - 1) / 2
+        sigma = np.r_[np.full(4, _USUAL_CENTRE * camera.width), _USUAL_DISTORTION][: len(mean)]
+        information = np.diag(sigma**-2.0)
+        aspect = np.array([[1.0, -1.0], [-1.0, 1.0]]) / (_USUAL_ASPECT * camera.fx) ** 2
+        information[:2, :2] = aspect + np.eye(2) / (_ROUGH_FOCAL * camera.fx) ** 2
+        return cls(mean, information)
+
+
+class Intrinsics(NamedTuple):
+    """A camera with the uncertainty of its focal length."""
+
+    camera: Camera
+    focal_sigma_px: float
+    """Standard deviation of the focal length, the larger of x and y."""
+
+
+def lens_estimate(
+    poses: Sequence[BoardPose], sigma_px: float, camera: Camera, prior: LensPrior
+) -> tuple[Array, Array]:
+    """Estimate the change (q,) of the intrinsics that board poses were fitted with.
+
+    Also return the information (q, q) of the corners and the prior.
+    """
+    variance = sigma_px**2
+    information = np.sum([pose.lens_normal for pose in poses], 0) / variance + prior.information
+    right = np.sum([pose.lens_gradient for pose in poses], 0) / variance
+    right = right + prior.information @ (prior.mean - lens_vector(camera))
+    unit = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information * np.outer(unit, unit)
+    return unit * np.linalg.lstsq(scaled, unit * right, rcond=1e-13)[0], information
+
+
+def lens_vector(camera: Camera) -> Array:
+    """Return the (q,) intrinsics in the order of `LENS`, q = 9 or 12."""
+    distortion = np.zeros(max(5, len(camera.distortion)))
+    distortion[: len(camera.distortion)] = camera.distortion
+    return np.r_[camera.fx, camera.fy, camera.cx, camera.cy, distortion]
+
+
+def moved_camera(camera: Camera, change: Array) -> Camera:
+    """Return the camera after a (q,) change; raises ValueError without a positive focal length."""
+    fx, fy, cx, cy, *distortion = (float(value) for value in lens_vector(camera) + change)
+    return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion))
+
+
+def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Intrinsics:
+    """Estimate focal lengths, principal point and distortion (k1 k2 p1 p2 k3), with weak priors."""
+    if len(views) < MIN_VIEWS:
+        raise InputError(
+            f"the board was detected in {len(views)} images, intrinsics take at least {MIN_VIEWS};"
+            f" take 15 with the board tilted by 20 to 45 deg, or give --camera"
+        )
+    views = _consistent(views, _rough(views, width, height))
+    if len(views) < MIN_VIEWS:
+        raise InputError(
+            f"the corners of {len(views)} images are those of a flat board, intrinsics take at"
+            f" least {MIN_VIEWS}; check --size, or give --camera"
+        )
+    camera = _rough(views, width, height)
+    prior = LensPrior.usual(camera)
+    open_focal = (
+        "the images leave the focal length open{}; tilt the board by 20 to 45 deg in several"
+        " directions, or give --camera"
+    )
+    information = prior.information
+    try:
+        poses = [board_pose(view, camera) for view in views]
+        for _ in range(_ROUNDS):
+            change, information = lens_estimate(poses, pixel_sigma(poses), camera, prior)
+            change = change * min(1.0, 0.2 * camera.fx / np.abs(change[:2]).max())
+            camera = moved_camera(camera, change)
+            starts = [pose.camera_from_board for pose in poses]
+            poses = [board_pose(v, camera, s) for v, s in zip(views, starts, strict=True)]
+            if change @ information @ change < 1e-4:
+                break
+    except ValueError:
+        raise InputError(open_focal.format("")) from None
+    unit = 1 / np.sqrt(np.diag(information))
+    scaled = np.linalg.pinv(information * np.outer(unit, unit), 1e-13, hermitian=True)
+    focal = float(np.sqrt((np.diag(scaled) * unit**2)[:2].max()))
+    if not focal < _FOCAL_SIGMA * camera.fx:
+        raise InputError(open_focal.format(f" ({camera.fx:.0f} +- {focal:.0f} px)"))
+    return Intrinsics(camera, focal)
+
+
+def _consistent(views: Sequence[BoardView], camera: Camera) -> list[BoardView]:
+    rms = np.full(len(views), np.inf)
+    for i, view in enumerate(views):
+        with suppress(ValueError):
+            rms[i] = board_pose(view, camera).rms_px
+    most = _FALSE * np.median(rms)
+    return [view for view, error in zip(views, rms, strict=True) if error <= most < np.inf]
+
+
+def _rough(views: Sequence[BoardView], width: int, height: int) -> Camera:
+    """Return a camera without distortion whose only unknown is the focal length."""
+    import cv2
+
+    middle = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
+    points = [view.points_m.astype(np.float32) for view in views]
+    pixels = [view.pixels.astype(np.float32) for view in views]
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT
+    flags |= cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST
+    flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+    try:
+        _, matrix, *_ = cv2.calibrateCamera(
+            points, pixels, (width, height), middle.matrix(), np.zeros(5), flags=flags
+        )
+    except cv2.error:
+        return middle
+    focal = float(matrix[0, 0])
+    return replace(middle, fx=focal, fy=focal) if 0.1 * width < focal < 20 * width else middle

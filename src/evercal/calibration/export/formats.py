@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias, Unpack
 
-from evercal.calibration.export import image_poses as images
-from evercal.calibration.export import numbers, ros
+from evercal.calibration.export import writers as to
 from evercal.calibration.export.request import Export, ExportOptions, prepare_export
 from evercal.errors import InputError
 from evercal.storage import write_bytes
@@ -36,30 +35,30 @@ class Format:
 
 
 FORMATS = {
-    "easy_handeye2": Format("tf", ros.easy_handeye2, ".calib", "for ~/.ros2/easy_handeye2"),
-    "easy_handeye": Format("tf", ros.easy_handeye, ".yaml", "for ~/.ros/easy_handeye of ROS 1"),
-    "moveit_samples": Format("optical", images.moveit, ".yaml", "MoveIt Calibration's pairs", True),
-    "static_transform_publisher": Format("tf", ros.command, ".sh", "shell command for ROS 2"),
-    "launch_py": Format("tf", ros.launch_py, ".launch.py", "ROS 2 launch file with a tf publisher"),
-    "ros1_launch": Format("tf", ros.ros1_launch, ".launch", "ROS 1 launch file, like MoveIt's"),
-    "transform_stamped": Format("tf", ros.stamped, ".yaml", "geometry_msgs/TransformStamped"),
-    "camera_info": Format("optical", ros.camera_info, ".yaml", "intrinsics for ROS"),
-    "urdf": Format("tf", ros.urdf, ".urdf", "fixed joint for a URDF, rpy about fixed axes"),
-    "opencv": Format("optical", numbers.opencv, ".yml", "rvec and tvec, parent to camera"),
-    "csv": Format("any", numbers.csv, ".csv", "4x4 matrix, metres, one matrix row per line"),
-    "npy": Format("any", numbers.npy, ".npy", "4x4 matrix, metres, for numpy"),
-    "json": Format("any", numbers.as_json, ".json", "matrix, quaternion wxyz, covariance, frames"),
-    "tum": Format("optical", images.tum, ".tum", "stamp, translation, quaternion x y z w", True),
-    "colmap": Format("optical", images.colmap, "", "a model without points (folder)", True),
-    "nerfstudio": Format("optical", images.nerfstudio, ".json", "transforms.json", True),
-    "zivid": Format("any", numbers.zivid, ".txt", "4x4 matrix in millimetres for Zivid's SDK"),
-    "ur": Format("any", numbers.ur, ".txt", "Universal Robots: p[x, y, z, rx, ry, rz]"),
-    "kuka": Format("any", numbers.kuka, ".txt", "KUKA: {X, Y, Z, A, B, C}, mm and degrees"),
-    "abb": Format("any", numbers.abb, ".txt", "ABB: [[x,y,z],[q1,q2,q3,q4]], mm"),
-    "fanuc": Format("any", numbers.fanuc, ".txt", "FANUC: X Y Z W P R, mm and degrees"),
-    "yaskawa": Format("any", numbers.yaskawa, ".txt", "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"),
-    "staubli": Format("any", numbers.staubli, ".txt", "Staubli: X Y Z RX RY RZ, mm and degrees"),
-    "franka": Format("any", numbers.franka, ".txt", "Franka: 16 numbers by column, metres"),
+    "easy_handeye2": Format("tf", to.easy_handeye2, ".calib", "for ~/.ros2/easy_handeye2"),
+    "easy_handeye": Format("tf", to.easy_handeye, ".yaml", "for ~/.ros/easy_handeye of ROS 1"),
+    "moveit_samples": Format("optical", to.moveit, ".yaml", "MoveIt Calibration's pairs", True),
+    "static_transform_publisher": Format("tf", to.command, ".sh", "shell command for ROS 2"),
+    "launch_py": Format("tf", to.launch_py, ".launch.py", "ROS 2 launch file with a tf publisher"),
+    "ros1_launch": Format("tf", to.ros1_launch, ".launch", "ROS 1 launch file, like MoveIt's"),
+    "transform_stamped": Format("tf", to.stamped, ".yaml", "geometry_msgs/TransformStamped"),
+    "camera_info": Format("optical", to.camera_info, ".yaml", "intrinsics for ROS"),
+    "urdf": Format("tf", to.urdf, ".urdf", "fixed joint for a URDF, rpy about fixed axes"),
+    "opencv": Format("optical", to.opencv, ".yml", "rvec and tvec, parent to camera"),
+    "csv": Format("any", to.csv, ".csv", "4x4 matrix, metres, one matrix row per line"),
+    "npy": Format("any", to.npy, ".npy", "4x4 matrix, metres, for numpy"),
+    "json": Format("any", to.as_json, ".json", "matrix, quaternion wxyz, covariance, frames"),
+    "tum": Format("optical", to.tum, ".tum", "stamp, translation, quaternion x y z w", True),
+    "colmap": Format("optical", to.colmap, "", "a model without points (folder)", True),
+    "nerfstudio": Format("optical", to.nerfstudio, ".json", "transforms.json", True),
+    "zivid": Format("any", to.zivid, ".txt", "4x4 matrix in millimetres for Zivid's SDK"),
+    "ur": Format("any", to.ur, ".txt", "Universal Robots: p[x, y, z, rx, ry, rz]"),
+    "kuka": Format("any", to.kuka, ".txt", "KUKA: {X, Y, Z, A, B, C}, mm and degrees"),
+    "abb": Format("any", to.abb, ".txt", "ABB: [[x,y,z],[q1,q2,q3,q4]], mm"),
+    "fanuc": Format("any", to.fanuc, ".txt", "FANUC: X Y Z W P R, mm and degrees"),
+    "yaskawa": Format("any", to.yaskawa, ".txt", "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"),
+    "staubli": Format("any", to.staubli, ".txt", "Staubli: X Y Z RX RY RZ, mm and degrees"),
+    "franka": Format("any", to.franka, ".txt", "Franka: 16 numbers by column, metres"),
 }
 """All formats by name."""
 

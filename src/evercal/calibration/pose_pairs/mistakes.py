@@ -8,6 +8,7 @@ Exchanged files, both files inverted or camera axes of OpenGL leave the pairs in
 gives them away: a camera sees its board near its optical axis, and a gripper carries what is near.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -79,7 +80,7 @@ def require_agreement(
     suspect = fit.metres > _SUSPECT_M or fit.radians > _SUSPECT_RAD or fit.inliers.mean() < _FEW
     readings = [_Reading(*other, mount) for other in _other_conventions(pairs, suspect)]
     if suspect:
-        readings = [*_readings(pairs, mount, same_equation=False), *readings]
+        readings = [*_readings(pairs, mount, _OTHER_EQUATION), *readings]
     fits = [(quick_fit(r.pairs, r.mount, scale_known)[0], r) for r in readings]
     better = [(other, r) for other, r in fits if _clearly_better(other, fit)]
     if better:
@@ -115,7 +116,7 @@ def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> No
         return
     others = [
         (_plausibility(r, quick_fit(r.pairs, r.mount, scale_known)[0]), r)
-        for r in _readings(given.pairs, given.mount, same_equation=True)
+        for r in _readings(given.pairs, given.mount, _SAME_EQUATION)
     ]
     plausibility, best = max(others, key=lambda other: other[0])
     board = best.pairs.camera_from_board.translation_m
@@ -150,71 +151,57 @@ def _plausibility(reading: _Reading, fit: Agreement) -> float:
     return float(_IMAGES * seen.mean() - 0.5 * (ratio**2).sum())
 
 
-def _readings(pairs: PosePairs, mount: Mount, same_equation: bool) -> list[_Reading]:
-    """Return readings that agree as well as the given one, or those of other frames and rows."""
-    robot, camera = pairs.base_from_gripper, pairs.camera_from_board
-    other: Mount = "eye_to_hand" if mount == "eye_in_hand" else "eye_in_hand"
-
-    def reading(text: str, robot: SE3 = robot, camera: SE3 = camera, to: Mount = mount) -> _Reading:
-        return _Reading(text, replace(pairs, base_from_gripper=robot, camera_from_board=camera), to)
-
-    if same_equation:
-        exchanged = (
-            "the files look exchanged: the camera poses look like gripper poses; exchange"
-            " --robot-poses and --camera-poses"
-        )
-        inverted = (
-            "robot and camera poses look inverted (gripper_from_base and board_from_camera):"
-            " invert both (--invert both)"
-        )
-        opengl = (
-            "the board is behind the camera, as if the camera poses had OpenGL's axes (y up, z"
-            " back): append :opengl to --camera-convention, or convert the poses to OpenCV's axes"
-            " (y down, z forward)"
-        )
-        return [
-            reading(exchanged, camera, robot),
-            reading(inverted, robot.inverse(), camera.inverse()),
-            reading(opengl, camera=_FLIP @ camera),
-        ]
-    inverted = (
-        "the {0} poses look inverted ({1}): invert them (--invert {0}), or, if they are {2}, use"
-        f" --mount {other}"
-    )
-    wrong_mount = (
-        f"the mount looks wrong: use --mount {other}, or, if it is {mount}, invert the robot poses"
-        " (--invert robot)"
-    )
-    transposed = (
-        "the rotations of the {} poses look transposed (their translations do not): swap rows and"
-        " columns of the matrices, or the sign of the quaternions' x y z"
-    )
-    readings = [
-        reading(
-            inverted.format("robot", "gripper_from_base", "base_from_gripper"), robot.inverse()
-        ),
-        reading(
-            inverted.format("camera", "board_from_camera", "camera_from_board"),
-            camera=camera.inverse(),
-        ),
-        reading(wrong_mount, to=other),
-        reading(transposed.format("robot"), _transposed(robot)),
-        reading(transposed.format("camera"), camera=_transposed(camera)),
-    ]
-    if len(pairs) > MIN_POSES:
-        before, after = np.arange(len(pairs) - 1), np.arange(1, len(pairs))
-        for late, of_robot, of_camera in (("robot", after, before), ("camera", before, after)):
-            text = (
-                f"rows and images are shifted by one: the {late} poses have an extra pose at the"
-                f" beginning; pair each row with its own image"
-            )
-            shifted = replace(pairs[of_robot], camera_from_board=camera[of_camera])
-            readings.append(_Reading(text, shifted, mount))
-    return readings
-
-
 def _transposed(poses: SE3) -> SE3:
     return SE3(poses.rotation_wxyz * [1.0, -1.0, -1.0, -1.0], poses.translation_m)
+
+
+_Change = Callable[[SE3, SE3], tuple[SE3, SE3]]
+_TRANSPOSED = (
+    "the rotations of the {} poses look transposed (their translations do not): swap rows and"
+    " columns of the matrices, or the sign of the quaternions' x y z"
+)
+_SHIFTED = (
+    "rows and images are shifted by one: the {} poses have an extra pose at the beginning; pair"
+    " each row with its own image"
+)
+_WRONG_MOUNT = (
+    "the mount looks wrong: use --mount {other}, or, if it is {mount}, invert the robot poses"
+    " (--invert robot)"
+)
+_SAME_EQUATION: dict[str, _Change] = {
+    "the files look exchanged: the camera poses look like gripper poses; exchange --robot-poses"
+    " and --camera-poses": lambda robot, camera: (camera, robot),
+    "robot and camera poses look inverted (gripper_from_base and board_from_camera): invert both"
+    " (--invert both)": lambda robot, camera: (robot.inverse(), camera.inverse()),
+    "the board is behind the camera, as if the camera poses had OpenGL's axes (y up, z back):"
+    " append :opengl to --camera-convention, or convert the poses to OpenCV's axes (y down, z"
+    " forward)": lambda robot, camera: (robot, _FLIP @ camera),
+}
+"""Readings that agree as well as the given one."""
+_OTHER_EQUATION: dict[str, _Change] = {
+    "the robot poses look inverted (gripper_from_base): invert them (--invert robot), or, if they"
+    " are base_from_gripper, use --mount {other}": lambda robot, camera: (robot.inverse(), camera),
+    "the camera poses look inverted (board_from_camera): invert them (--invert camera), or, if they"
+    " are camera_from_board, use --mount {other}": lambda robot, camera: (robot, camera.inverse()),
+    _WRONG_MOUNT: lambda robot, camera: (robot, camera),
+    _TRANSPOSED.format("robot"): lambda robot, camera: (_transposed(robot), camera),
+    _TRANSPOSED.format("camera"): lambda robot, camera: (robot, _transposed(camera)),
+    _SHIFTED.format("robot"): lambda robot, camera: (robot[1:], camera[:-1]),
+    _SHIFTED.format("camera"): lambda robot, camera: (robot[:-1], camera[1:]),
+}
+"""Readings in other frames, with the other mount, or with rows shifted by one."""
+
+
+def _readings(pairs: PosePairs, mount: Mount, changes: Mapping[str, _Change]) -> list[_Reading]:
+    other: Mount = "eye_to_hand" if mount == "eye_in_hand" else "eye_in_hand"
+    readings = []
+    for message, change in changes.items():
+        robot, camera = change(pairs.base_from_gripper, pairs.camera_from_board)
+        if len(robot) >= MIN_POSES:
+            read = PosePairs(pairs.names[: len(robot)], robot, camera)
+            to = other if message == _WRONG_MOUNT else mount
+            readings.append(_Reading(message.format(other=other, mount=mount), read, to))
+    return readings
 
 
 def _other_conventions(pairs: PosePairs, every: bool) -> list[tuple[str, PosePairs]]:

@@ -1,7 +1,6 @@
 """Read pose pairs from a file of robot poses and a file of camera poses."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Literal
@@ -54,10 +53,7 @@ class _Poses:
     def row_names(self) -> tuple[str, ...]:
         return self.names or tuple(f"row {i + 1}" for i in range(len(self.poses)))
 
-    def numbers_of(self, rows: Sequence[int]) -> PoseNumbers | None:
-        return self.numbers and self.numbers[np.array(rows, dtype=np.int64)]
-
-    def corners_of(self, rows: Sequence[int]) -> BoardCorners | None:
+    def corners_of(self, rows: NDArray[np.int64]) -> BoardCorners | None:
         if self.board is None:
             return None
         images, printed = self.board.images, self.board.board
@@ -93,14 +89,14 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
     paired = [(i, row) for i, row in enumerate(rows) if row is not None and camera.measured[i]]
     if not paired:
         raise InputError(f"{files.camera}: no image has both a board and a robot pose")
-    images, robots = zip(*paired, strict=True)
+    images, robots = np.array(paired).T
     names = camera.names or robot.row_names()
     pairs = PosePairs(
         tuple(names[i] for i in images),
-        robot.poses[np.array(robots)],
-        camera.poses[np.array(images)],
-        robot_numbers=robot.numbers_of(robots),
-        camera_numbers=camera.numbers_of(images),
+        robot.poses[robots],
+        camera.poses[images],
+        robot_numbers=robot.numbers and robot.numbers[robots],
+        camera_numbers=camera.numbers and camera.numbers[images],
     )
     return pairs, camera.corners_of(images)
 
@@ -126,7 +122,7 @@ def _streams(robot: _Poses, camera: _Poses) -> tuple[PoseTrack, CameraTrack]:
         tuple(names[row] for row in rows),
         camera.stamps_s[rows],
         camera.poses[rows],
-        camera.corners_of(rows.tolist()),
+        camera.corners_of(rows),
     )
     return PoseTrack(robot.stamps_s, robot.poses), track
 

@@ -13,8 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma
-from evercal.calibration.boards.intrinsics import LENS, LensPrior, lens_estimate
+from evercal.calibration.boards.corners import (
+    LENS,
+    BoardPose,
+    BoardView,
+    LensPrior,
+    board_pose,
+    lens_estimate,
+    pixel_sigma,
+)
 from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
 from evercal.geometry import SE3, Camera, pose_distance
@@ -129,10 +136,10 @@ class PosePairs:
         )
 
 
-def listed(names: Sequence[str], limit: int = 5) -> str:
-    """Return the first few names for a message."""
-    shown = ", ".join(names[:limit])
-    return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"
+def listed(names: Sequence[str]) -> str:
+    """Return the first five names for a message."""
+    shown = ", ".join(names[:5])
+    return shown if len(names) <= 5 else f"{shown} and {len(names) - 5} more"
 
 
 def _inverse_velocity(base_from_gripper: SE3, velocity: Array) -> Array:

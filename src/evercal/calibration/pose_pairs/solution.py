@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.boards.intrinsics import LENS, moved_camera
+from evercal.calibration.boards.corners import LENS, moved_camera
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, Mount
 from evercal.calibration.located import length_mm_deg
 from evercal.calibration.pose_pairs.checks import held_out_error, left_open, repeatability

@@ -5,13 +5,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.boards.corners import BoardView, board_pose
-from evercal.calibration.boards.intrinsics import lens_vector, moved_camera
+from evercal.calibration.boards.corners import BoardView, board_pose, lens_vector, moved_camera
 from evercal.calibration.calibration import Calibration, Mount
-from evercal.calibration.pose_pairs.checks import SIZE_SIGMA, widened, with_tested_size
+from evercal.calibration.pose_pairs.checks import (
+    SIZE_SIGMA,
+    require_observable,
+    require_rotations,
+    widened,
+    with_tested_size,
+)
 from evercal.calibration.pose_pairs.fit import HandEyeFit, agreement, least_sigma, robust_fit
 from evercal.calibration.pose_pairs.mistakes import quick_fit, require_agreement
-from evercal.calibration.pose_pairs.observability import require_observable, require_rotations
 from evercal.calibration.pose_pairs.pairs import BoardCorners as BoardCorners
 from evercal.calibration.pose_pairs.pairs import Measured, PosePairs, measured, middle_of
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation, Unknowns
