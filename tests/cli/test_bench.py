@@ -25,6 +25,7 @@ def small(monkeypatch: pytest.MonkeyPatch, quick: StageOptions) -> None:
     monkeypatch.setattr(verb.Bench, "_stage", lambda self, seed: replace(quick, seed=seed))
 
 
+@pytest.mark.slow("src/evercal/continual", "src/evercal/cli/bench.py")
 def test_bench_and_its_tables(
     run: Any, small: None, arcs: tuple[Recording, Recording], tmp_path: Path
 ) -> None:

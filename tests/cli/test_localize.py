@@ -146,6 +146,7 @@ def test_video_holds_every_image_and_json_only_its_object(
     assert frames[0].shape == (560, 1280, 3)
 
 
+@pytest.mark.slow("src/evercal/features", "src/evercal/localization", "src/evercal/cli/__init__.py")
 def test_float32_gives_the_same_bytes_with_other_instructions(
     hall_store: Path, hall: Recording, tmp_path: Path
 ) -> None:
