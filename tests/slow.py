@@ -9,8 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import subprocess
-from collections import defaultdict
-from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -20,15 +18,15 @@ NOTES = Path(__file__).with_name("slow.json")
 _states = pytest.StashKey[dict[str, str]]()
 
 
-def state_of(paths: Iterable[str]) -> str:
-    """Checksum of the files below some paths that git does not ignore."""
-    command = ["git", "ls-files", "-co", "--exclude-standard", "--", *paths]
+def state_of(path: str) -> str:
+    """Checksum of the files below a path that git does not ignore."""
+    command = ["git", "ls-files", "-co", "--exclude-standard", "--", path]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     checksum = hashlib.sha256()
     for name in sorted(set(listed.splitlines())):
         if (file := ROOT / name).is_file():
             checksum.update(name.encode() + b"\0" + file.read_bytes())
-    return checksum.hexdigest()[:16]
+    return checksum.hexdigest()[:12]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -40,23 +38,29 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Leave out slow tests that are not due, unless `-m` speaks of them."""
     if "slow" in config.option.markexpr:
         return
-    named = defaultdict[str, set[str]](set)
-    for item in items:
-        for mark in item.iter_markers("slow"):
-            assert mark.args, f"{item.nodeid}: name the folders whose changes it tests"
-            file = item.path.relative_to(ROOT).as_posix()
-            named[file] |= {file, *mark.args}
-    states = {file: state_of(sorted(paths)) for file, paths in named.items()}
+    groups = [_group(item) for item in items]
+    state = {path: state_of(path) for path in {p for group in groups if group for p in group}}
+    states = {" ".join(g): " ".join(state[path] for path in g) for g in set(groups) if g}
     passed = json.loads(NOTES.read_text("utf-8")) if NOTES.exists() else {}
-    due = {ROOT / file for file, state in states.items() if passed.get(file) != state}
     kept, left = list[pytest.Item](), list[pytest.Item]()
-    for item in items:
-        is_slow = item.get_closest_marker("slow") is not None
-        wanted = item.path in due if is_slow else not config.option.due
+    for item, group in zip(items, groups, strict=True):
+        key = " ".join(group)
+        wanted = passed.get(key) != states[key] if group else not config.option.due
         (kept if wanted else left).append(item)
     config.hook.pytest_deselected(items=left)
     items[:] = kept
     config.stash[_states] = passed | states
+
+
+def _group(item: pytest.Item) -> tuple[str, ...]:
+    """The paths that a slow test depends on, with its own file; empty for other tests."""
+    paths = {path for mark in item.iter_markers("slow") for path in mark.args}
+    if item.get_closest_marker("slow") is None:
+        return ()
+    assert paths, f"{item.nodeid}: name the folders whose changes it tests"
+    file = item.path.relative_to(ROOT)
+    inside = any(file.is_relative_to(path) for path in paths)
+    return tuple(sorted(paths if inside else {*paths, file.as_posix()}))
 
 
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:

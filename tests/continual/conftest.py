@@ -24,6 +24,15 @@ if TYPE_CHECKING:
 __all__ = ["block_mean", "box", "describe", "learnable", "shoot"]
 
 
+FOLDERS = ("continual", "features", "geometry", "mapping", "recordings", "storage", "evaluation")
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """The paper's system is tested when it, or a folder that it builds on, has changed."""
+    folders = (f"src/evercal/{folder}" for folder in FOLDERS)
+    item.add_marker(pytest.mark.slow("tests/continual", *folders))
+
+
 @pytest.fixture(scope="session")
 def empty_scenes() -> EmptyScenes:
     """Make `LearnedScenes` without scenes, with tiny random networks, for a strategy."""

@@ -60,7 +60,6 @@ def learned(
     return dict(head.state_dict()) | {f"state.{k}": v for k, v in selected.items()}, chosen
 
 
-@pytest.mark.slow("src/evercal/continual/networks", "src/evercal/continual/methods")
 @pytest.mark.parametrize("backbone", BACKBONES)
 @pytest.mark.parametrize("name", METHODS)
 def test_no_tensor_is_created_on_the_default_device(name: str, backbone: str) -> None:
