@@ -40,7 +40,7 @@ FOR_ALL = ("errors", "progress")
 FACES = ("__init__", "__main__")
 """Modules of the root that may import everything."""
 PRODUCT = ORDER[: ORDER.index("simulation")]
-MOST_LOCALIZING, MOST_LEARNING = 42, 62
+MOST_LOCALIZING, MOST_LEARNING = 42, 63
 """Modules of evercal that a program loads, at most."""
 
 

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Self
 from evercal.errors import InputError
 from evercal.features.device import device_of
 from evercal.mapping.store import MapStore
-from evercal.progress import OnProgress, shown
 from evercal.recordings.frame import Recording
 
 if TYPE_CHECKING:
@@ -38,6 +37,7 @@ if TYPE_CHECKING:
     from evercal.mapping.build import MapOptions
     from evercal.mapping.manage import Merged, OnClash
     from evercal.mapping.refresh import RefreshOptions
+    from evercal.progress import OnProgress
 
 PathLike = str | os.PathLike[str]
 
@@ -139,6 +139,7 @@ class Map:
                 is writing into the map.
         """
         from evercal.learning.scene import learn_scene
+        from evercal.progress import shown
         from evercal.recordings import load_recording
         from evercal.recordings.held_out import named_recording
 
@@ -183,6 +184,7 @@ class Map:
         """
         from evercal.learning.many import LearnTask, learn_scenes
         from evercal.mapping.memory_budget import MemoryBudget
+        from evercal.progress import shown
         from evercal.recordings import load_recording
         from evercal.recordings.held_out import named_recording
 
@@ -244,6 +246,7 @@ class Map:
         """
         from evercal.calibration.from_images import Images
         from evercal.localization.refreshing import refresh_scene
+        from evercal.progress import shown
 
         if isinstance(images, Recording):
             given = [(frame.name, frame.read_image()) for frame in images.train]

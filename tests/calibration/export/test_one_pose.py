@@ -244,7 +244,8 @@ def test_opencv_projects_with_its_intrinsics() -> None:
     values = read_opencv(calibration_of(pose).export("opencv"))
     points = pose.apply([[0.1, 0.2, 1.0], [-0.3, 0.1, 2.0], [0.0, 0.0, 0.5]])
     keys = ("rvec", "tvec", "camera_matrix", "distortion_coefficients")
-    projected = cv2.projectPoints(points, *(np.asarray(values[key]) for key in keys))[0]
+    rvec, tvec, matrix, distortion = (np.asarray(values[key]) for key in keys)
+    projected = cv2.projectPoints(points, rvec, tvec, matrix, distortion)[0]
     expected = CAMERA.project(pose.inverse().apply(points))
     np.testing.assert_allclose(projected[:, 0], expected, atol=1e-6)
     assert (values["image_width"], values["image_height"]) == (640, 480)
