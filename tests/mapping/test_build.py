@@ -12,6 +12,7 @@ import pytest
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder, load_encoder
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
+from evercal.mapping import build
 from evercal.mapping.build import (
     BuiltMap,
     HandEyeCorrection,
@@ -20,7 +21,7 @@ from evercal.mapping.build import (
     build_map,
     spread_frames,
 )
-from evercal.mapping.bundle_adjustment import Adjustment
+from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.prepared_frames import WorkingSize
@@ -283,3 +284,21 @@ def test_parts_are_left_out_with_the_keyframes_near_them(
     assert built.left_out(frames[:29]) == []
     moved = HandEyeCorrection(SE3.identity(), np.eye(6), np.eye(6), {})
     assert replace(built, hand_eye=moved).left_out(frames) == []
+
+
+@pytest.mark.parametrize(("noticeable", "rounds"), [(True, 2), (False, 1)])
+def test_depths_are_refined_again_only_where_poses_moved(
+    noticeable: bool,
+    rounds: int,
+    rooms: tuple[Recording, ...],
+    encoder: Encoder,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    solved, solve = list[object](), BundleAdjustment.solve
+    monkeypatch.setattr(build, "_moved", lambda *_: noticeable)
+    monkeypatch.setattr(
+        BundleAdjustment, "solve", lambda self, tracks: solved.append(self) or solve(self, tracks)
+    )
+    options = replace(SMALL, size=WorkingSize(cells=64, patches=64))
+    build_map("room", rooms[0].train[:16], encoder, options)
+    assert len(solved) == rounds
