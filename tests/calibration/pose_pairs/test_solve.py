@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from benchmarks.hand_eye import Setting, error, recording, trials
+from benchmarks.hand_eye_boards import BoardSetting, corner_pairs, record
 from evercal.calibration.boards.board_poses import board_poses
 from evercal.calibration.boards.corners import BoardView, board_pose, calibrate_camera
 from evercal.calibration.boards.detection import Board, find_board
@@ -252,3 +253,13 @@ def test_real_recordings(
     assert np.median(pose_distance(average_poses(fixed), fixed)[0]) < apart_mm / 1000
     if published_m is not None:
         assert np.linalg.norm(solved.parent_from_child.translation_m - published_m) < 0.003
+
+
+@pytest.mark.parametrize(("factor", "warned"), [(1.0, False), (1.05, True)])
+def test_a_stated_focal_length_is_compared_with_the_corners(factor: float, warned: bool) -> None:
+    pairs, corners = corner_pairs(record(BoardSetting(), 3))
+    camera = corners.camera
+    stated = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+    solved = solve(pairs, "eye_in_hand", corners=replace(corners, camera=stated, stated=True))
+    warnings = solved.checks.get("warnings", ())
+    assert any("stated focal length" in words for words in warnings) == warned
