@@ -21,7 +21,15 @@ from evercal.service.client import Client
 def started(store: Path, *words: str, **variables: str) -> tuple[subprocess.Popen[str], str]:
     serve = [sys.executable, "-m", "evercal", "serve", str(store), "--port", "0", "--json", *words]
     pipe, env = subprocess.PIPE, {**os.environ, **variables}
-    process = subprocess.Popen(serve, stdout=pipe, stderr=pipe, text=True, env=env)
+    process = subprocess.Popen(
+        serve,
+        stdout=pipe,
+        stderr=pipe,
+        text=True,
+        env=env,
+        # A shell's background job ignores Ctrl-C, and so would the service.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     assert process.stdout is not None
     record = json.loads(process.stdout.readline())
     assert record["store"] == str(store)
