@@ -1,5 +1,6 @@
 """Pairing of two pose files, and messages that name the right file and option."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -58,3 +59,13 @@ def test_opengl_flips_the_side_of_the_camera(tmp_path: Path, inverted: bool) -> 
     )
     pairs, _ = read_pairs(files)
     assert np.max(pose_distance(pairs.camera_from_board, camera_from_board)) < 1e-12
+
+
+def test_camera_poses_in_json_are_a_table_unless_they_are_of_a_board(tmp_path: Path) -> None:
+    robot = write(tmp_path / "robot.csv", ["1", "2", "3"])
+    pose = {"x": 0.5, "y": 0.0, "z": 0.2, "qw": 1, "qx": 0, "qy": 0, "qz": 0}
+    camera = tmp_path / "camera.json"
+    camera.write_text(json.dumps([{"image": name, **pose} for name in "123"]))
+    pairs, corners = read_pairs(PairFiles(robot, camera))
+    assert len(pairs.camera_from_board) == 3
+    assert corners is None
