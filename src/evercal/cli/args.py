@@ -154,9 +154,11 @@ def stated_camera(file: Path | None, size: tuple[int, int]) -> "Camera | None":
 
 def transform_of(file: Path | None) -> "SE3 | None":
     """The transform in a file of --gripper-from-camera or --calibration."""
+    if file is None:
+        return None
     from evercal.calibration.calibration import read_transform
 
-    return None if file is None else read_transform(file)
+    return read_transform(file)
 
 
 def strategy_of(store: Path) -> str | None:
