@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from tyro.conf import Positional, arg
 
@@ -191,8 +191,7 @@ def open_map(store: Path, device: str) -> "Localizer":
     return Localizer.open(store, device=device)
 
 
-@dataclass(frozen=True)
-class Point:
+class Point(NamedTuple):
     """A point in the camera frame, metres."""
 
     x: float
@@ -214,15 +213,14 @@ class Point:
 
     def record(self, parent_from_camera: "UncertainPose") -> dict[str, object]:
         """The point in both frames and its standard deviation per axis."""
-        point = (self.x, self.y, self.z)
         return {
-            "point_m": list(point),
-            "in_parent_m": parent_from_camera.pose.apply(point).tolist(),
-            "sigma_mm": parent_from_camera.point_sigma_mm(point),
+            "point_m": list(self),
+            "in_parent_m": parent_from_camera.pose.apply(self).tolist(),
+            "sigma_mm": parent_from_camera.point_sigma_mm(self),
         }
 
     def text(self, parent_from_camera: "UncertainPose") -> str:
         """The standard deviation of the point in words."""
-        sigma = parent_from_camera.point_sigma_mm((self.x, self.y, self.z))
+        sigma = parent_from_camera.point_sigma_mm(self)
         where = f"({self.x:g}, {self.y:g}, {self.z:g}) m in the camera frame"
         return f"{sigma:.2f} mm at {where}"
