@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from benchmarks.rows import Row, save
 from evercal import InputError, Map, Recording, load_recording
+from evercal.processes import python_command
 from evercal.recordings.images import decode_image, encode_jpeg
 
 _WARM = 10
@@ -40,7 +40,7 @@ def run(
         if recording.name not in opened.scenes:
             opened.learn(recording)
         images.append(_located(opened, recording))
-    command = [sys.executable, "-m", "evercal", "serve", str(store), "--port", "0", "--json"]
+    command = python_command("-m", "evercal", "serve", str(store), "--port", "0", "--json")
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None

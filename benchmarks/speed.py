@@ -1,7 +1,5 @@
 """Time of learning, of localization, of SARS and of import."""
 
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -14,6 +12,7 @@ from benchmarks.rows import save
 from evercal.localization.parallel import in_parallel
 from evercal.map import Map
 from evercal.mapping.selection import SarsOptions, select_sars
+from evercal.processes import output_of, python_command
 from evercal.recordings.samples import sample_rooms
 
 _WARM = 5
@@ -83,10 +82,8 @@ def _others() -> None:
         ("import evercal", ["-c", "import evercal"]),
         ("evercal --help", ["-m", "evercal", "--help"]),
     ):
-        command = [sys.executable, *arguments]
-        times = _milliseconds(
-            lambda c=command: subprocess.run(c, capture_output=True, check=True), 5
-        )
+        command = python_command(*arguments)
+        times = _milliseconds(lambda c=command: output_of(*c), 5)
         print(f"{name}: median {np.median(times) / 1000:.2f} s")
 
 

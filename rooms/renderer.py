@@ -7,8 +7,6 @@ Depth is exact: one ray passes through the centre of each pixel.
 import glob
 import os
 import re
-import subprocess
-import sys
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -17,6 +15,7 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
+from evercal.processes import status_of
 from rooms.materials import Material
 from rooms.shapes import Mesh
 
@@ -107,12 +106,7 @@ def _llvm_libraries() -> list[str]:
 
 def _works(variant: str, library: str | None) -> bool:
     environment = {**os.environ, **({"DRJIT_LIBLLVM_PATH": library} if library else {})}
-    command = [sys.executable, "-c", _PROBE, variant]
-    try:
-        done = subprocess.run(command, env=environment, capture_output=True, timeout=120)
-    except subprocess.TimeoutExpired:
-        return False
-    return done.returncode == 0
+    return status_of(_PROBE, variant, seconds=120, environment=environment) == 0
 
 
 class Renderer:

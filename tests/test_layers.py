@@ -36,7 +36,7 @@ ORDER = (
     "cli",
 )
 """Folders, and the module map.py."""
-FOR_ALL = ("errors", "progress")
+FOR_ALL = ("bounds", "errors", "processes", "progress")
 FACES = ("__init__", "__main__")
 """Modules of the root that may import everything."""
 PRODUCT = ORDER[: ORDER.index("simulation")]

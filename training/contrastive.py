@@ -5,7 +5,6 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -18,6 +17,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from evercal.errors import InputError
 from evercal.features.encoder import LocalEncoder
 from evercal.features.precision import autocast
+from evercal.processes import started_safely
 from evercal.storage.atomic import write_bytes
 from rooms.renderer import mitsuba
 from training.furnished import cached_furnished_views
@@ -121,7 +121,7 @@ def make_data(options: PretrainOptions, folder: Path) -> PretrainData:
         )
     if options.furnished:
         mitsuba()  # fails early without it
-    with get_context("spawn").Pool() as pool:
+    with started_safely() as context, context.Pool() as pool:
         seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.rooms)
         rooms = pool.map(room_views, seeds, chunksize=4)
         seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.pictures)
@@ -274,7 +274,9 @@ def train_encoder(
         multiprocessing_context="spawn",
     )
     began, losses = time.perf_counter(), []
-    for images, pixels, valid in loader:
+    with started_safely():
+        batches = iter(loader)
+    for images, pixels, valid in batches:
         with autocast():
             maps = encoder(images.flatten(0, 1)).float().unflatten(0, images.shape[:2])
         points = torch.stack([sample_features(*of) for of in zip(maps, pixels, strict=True)])

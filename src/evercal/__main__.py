@@ -2,6 +2,9 @@
 
 import sys
 
+if not sys.flags.safe_path:
+    del sys.path[0]  # the current folder, which may hold any file
+
 from evercal.cli import main
 
 sys.exit(main())

@@ -1,18 +1,10 @@
 """Many recordings at once: every scene is independent, so each is learned in a process of its own.
 
-A process that is killed, for example for its memory, costs its recordings another try, alone.
+A process that is killed, for example for its memory, costs its recording another try, alone.
 """
 
-import multiprocessing
-import os
-import signal
-import threading
-from collections.abc import Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
-from multiprocessing.synchronize import Event
 
 import torch
 
@@ -21,11 +13,11 @@ from evercal.features.vlad import keep_centroids, known_centroids, lacks_centroi
 from evercal.learning.scene import LearnReport, learn_scene
 from evercal.mapping.build import MapOptions
 from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.processes import Worker, cause_of, first_answers
 from evercal.recordings.frame import Recording
 
 TRIES = 3
 """Attempts before a recording whose process is killed is given up."""
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +54,8 @@ class LearnTask:
 
 
 Item = tuple[int, Recording]
+_State = tuple[LearnTask, int, torch.Tensor | None]
+"""Task, threads of a worker, and centroids, which do not travel with the encoder."""
 
 
 def learn_scenes(
@@ -82,103 +76,63 @@ def learn_scenes(
     # All scenes share the centroids, which the first recording of another encoder determines.
     while waiting and lacks_centroids(task.contents.encoder):
         yield task.learn(*waiting.pop(0))
-    while waiting:
-        killed, waiting = yield from _attempt(task, waiting, workers)
-        for item in killed:
-            # Alone, so that it neither takes others with it nor shares their memory.
-            for _ in range(TRIES - 1):
-                again, _none = yield from _attempt(task, [item], 1)
-                if not again:
-                    break
-            else:
-                error = f"its process was killed {TRIES} times; is there enough memory?"
-                yield Learned(item[0], error=error)
+    ended = yield from _in_turn(task, waiting, workers)
+    for item, status in ended:
+        tries = 1
+        while status < 0 and tries < TRIES:  # alone, so that others do not share its memory
+            again = yield from _in_turn(task, [item], 1)
+            if not again:
+                break
+            status, tries = again[0][1], tries + 1
+        else:
+            yield Learned(item[0], error=cause_of(status, tries))
 
 
-def _attempt(
+def _in_turn(
     task: LearnTask, items: Sequence[Item], workers: int
-) -> Generator[Learned, None, tuple[list[Item], list[Item]]]:
-    """Learn items until a worker is killed; return those that were under way, and the rest."""
-    waiting, running = list(items), dict[Future[Learned], Item]()
-    stop = multiprocessing.get_context("spawn").Event()
-    with _pool(task, min(workers, len(items)), stop) as pool:
-        try:
-            while waiting or running:
-                while waiting and len(running) < workers:
-                    try:
-                        future = pool.submit(_learn, *waiting[0])
-                    except BrokenProcessPool:  # killed while the caller used a result
-                        return list(running.values()), waiting
-                    running[future] = waiting.pop(0)
-                ready, _ = wait(running, return_when=FIRST_COMPLETED)
-                for future in ready:
-                    if not isinstance(future.exception(), BrokenProcessPool):
-                        yield future.result()
-                        del running[future]
-                if any(future in running for future in ready):
-                    break
-        except BaseException:  # also when the caller stops iterating
-            stop.set()
-            raise
-    return list(running.values()), waiting
-
-
-@contextmanager
-def _pool(task: LearnTask, workers: int, stop: Event) -> Iterator[ProcessPoolExecutor]:
-    """A pool whose workers share the threads of this machine."""
-    threads = max(1, torch.get_num_threads() // workers)
-    before = {name: os.environ.get(name) for name in _THREADS}
-    # Read when a process loads its libraries; inherited from this one.
-    os.environ.update(dict.fromkeys(_THREADS, str(threads)))
+) -> Generator[Learned, None, list[tuple[Item, int]]]:
+    """Learn items; return those whose process ended, each with its exit status."""
+    waiting, ended = list(items), list[tuple[Item, int]]()
+    workers = min(workers, len(waiting))
+    threads = max(1, torch.get_num_threads() // max(workers, 1))
+    state: _State = (task, threads, known_centroids(task.contents.encoder))
+    idle, busy = list[Worker](), dict[Worker, Item]()
     try:
-        with ProcessPoolExecutor(
-            workers,
-            multiprocessing.get_context("spawn"),  # threads of torch do not survive a fork
-            _begin,
-            (task, threads, stop, known_centroids(task.contents.encoder)),
-        ) as pool:
-            yield pool
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        while waiting or busy:
+            while waiting and len(busy) < workers:
+                worker = idle.pop() if idle else Worker(_begin, state, _few_threads(threads))
+                if worker.ask(waiting[0]):
+                    busy[worker] = waiting.pop(0)
+                else:  # killed while it waited
+                    worker.end()
+            for worker in first_answers([*busy]):
+                item = busy.pop(worker)
+                try:
+                    outcome = worker.answer()
+                except EOFError:
+                    ended.append((item, worker.end(patience_s=10.0)))
+                else:
+                    idle.append(worker)
+                    yield outcome
+    finally:  # also when the caller stops iterating
+        for worker in (*idle, *busy):
+            worker.end()
+    return ended
 
 
-_task: LearnTask | None = None
-"""In a worker process: its task."""
+def _few_threads(threads: int) -> dict[str, str]:
+    """Variables that libraries read when a process loads them."""
+    return dict.fromkeys(
+        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(threads)
+    )
 
 
-def _begin(task: LearnTask, threads: int, stop: Event, centroids: torch.Tensor | None) -> None:
+def _begin(state: _State) -> Callable[[Item], Learned]:
     import cv2
 
-    global _task
-    _task = task
-    if centroids is not None:  # they do not travel with the encoder
+    task, threads, centroids = state
+    if centroids is not None:
         keep_centroids(task.contents.encoder, centroids)
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it
-    end_with_parent(stop)
-
-
-def end_with_parent(stop: Event | None = None) -> None:
-    """End this process when its parent is gone, or when `stop` is set; returns at once.
-
-    For processes that work for another one, which may be killed.
-    """
-    parent, ended = multiprocessing.parent_process(), stop or threading.Event()
-    assert parent is not None, "called in a process that multiprocessing started"
-
-    def watch() -> None:
-        while not ended.wait(1.0) and parent.is_alive():
-            pass
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _learn(number: int, recording: Recording) -> Learned:
-    assert _task is not None, "set by _begin"
-    return _task.learn(number, recording)
+    return lambda item: task.learn(*item)

@@ -1,10 +1,11 @@
 """Where a result was measured: commit, versions, processor."""
 
 import platform
-import subprocess
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+
+from evercal.processes import output_of
 
 
 @cache
@@ -34,15 +35,14 @@ def environment() -> dict[str, str]:
 
 def _commit() -> str:
     def git(*words: str) -> str:
-        command = ["git", "-C", str(Path(__file__).parent), *words]
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+        return output_of("git", "-C", str(Path(__file__).parent), *words)
 
     try:
         if not git("ls-files", Path(__file__).name):
             raise FileNotFoundError(__file__)
         changed = git("diff", "HEAD")
         return git("rev-parse", "HEAD")[:12] + ("-dirty" if changed else "")
-    except (OSError, subprocess.CalledProcessError):
+    except OSError:
         return f"evercal {version('evercal')}"
 
 

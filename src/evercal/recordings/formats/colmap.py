@@ -5,8 +5,6 @@ is (0, 0) here. Images without a pose count as untracked, including files beside
 model. Of several models in one folder, the one with the most images is read.
 """
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ import numpy as np
 
 from evercal.errors import InputError, missing_extra
 from evercal.geometry import SE3, Camera
+from evercal.processes import status_of
 from evercal.recordings.formats.nerfstudio import frame_note
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS
@@ -117,14 +116,10 @@ def _require_ends(folder: Path) -> None:
         if size < 8 or count > (size - 8) / 8:  # no entry is shorter
             raise InputError(f"{file}: {size} bytes, too few for what it lists; copy it again")
     seconds = _LEAST_S + sum(sizes.values()) / _SLOWEST_BYTES_PER_S
-    command = [sys.executable, "-c", _READ, str(folder)]
-    try:
-        if sizes:
-            subprocess.run(command, capture_output=True, timeout=seconds, check=False)
-    except subprocess.TimeoutExpired:
+    if sizes and status_of(_READ, str(folder), seconds=seconds) is None:
         raise InputError(
             f"{folder}: pycolmap does not finish reading it; a file is incomplete, copy it again"
-        ) from None
+        )
 
 
 def _camera(folder: Path, camera: Any) -> Camera:

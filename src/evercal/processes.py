@@ -1,0 +1,152 @@
+"""Processes that evercal starts.
+
+Python puts the current folder first on a child's import path, where a recording may lie that holds
+any file. So every child is started here, with `-P` or `PYTHONSAFEPATH`.
+"""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnContext
+from multiprocessing.process import parent_process
+from typing import Any
+
+
+@contextmanager
+def started_safely(variables: Mapping[str, str] = {}) -> Iterator[SpawnContext]:
+    """The context for starting processes; those started meanwhile inherit the variables."""
+    variables = {"PYTHONSAFEPATH": "1", **variables}
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        # Threads of torch do not survive a fork.
+        yield multiprocessing.get_context("spawn")
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def python_command(*words: str) -> list[str]:
+    """The command that runs this Python."""
+    return [sys.executable, "-P", *words]
+
+
+def status_of(
+    code: str, *words: str, seconds: float, environment: Mapping[str, str] | None = None
+) -> int | None:
+    """Exit status of Python code in a process of its own; None if it does not end in time."""
+    command = python_command("-c", code, *words)
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=seconds, env=environment)
+    except subprocess.TimeoutExpired:
+        return None
+    return done.returncode
+
+
+def output_of(*command: str) -> str:
+    """What a program prints; OSError if it is missing or fails."""
+    try:
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+    except subprocess.CalledProcessError as error:
+        raise OSError(error.returncode, error.stderr) from None
+    return done.stdout.strip()
+
+
+class Worker:
+    """A process that answers one request at a time; it ends with this process.
+
+    Args:
+        begin: Called in the process with `state`; returns the function that answers requests.
+        state: Copied to the process.
+        variables: Variables of the process.
+    """
+
+    def __init__(
+        self,
+        begin: Callable[[Any], Callable[[Any], Any]],
+        state: object,
+        variables: Mapping[str, str] = {},
+    ):
+        with started_safely(variables) as context:
+            self.answers, theirs = context.Pipe()
+            self._process = context.Process(target=_work, args=(theirs, begin, state), daemon=True)
+            self._process.start()
+        theirs.close()  # so that the end of the process ends the pipe
+
+    def ask(self, request: object) -> bool:
+        """Send a request; False if the process has ended."""
+        try:
+            self.answers.send(request)
+        except OSError:
+            return False
+        return True
+
+    def answer(self) -> Any:
+        """The answer, or EOFError if the process has ended; its exceptions are raised here."""
+        try:
+            answer = self.answers.recv()
+        except OSError:
+            raise EOFError from None
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def end(self, patience_s: float = 0.0) -> int:
+        """End the process, after a time if it is about to end; its exit status, or minus a signal."""
+        self.answers.close()
+        self._process.join(patience_s)
+        self._process.terminate()
+        self._process.join()
+        status = self._process.exitcode
+        assert status is not None, "it has been joined"
+        return status
+
+
+def first_answers(workers: list[Worker]) -> list[Worker]:
+    """The workers that have answered or ended; waits for the first."""
+    ready = wait([worker.answers for worker in workers])
+    return [worker for worker in workers if worker.answers in ready]
+
+
+def cause_of(status: int, times: int = 1) -> str:
+    """Why processes ended, in words."""
+    if status >= 0:
+        return f"its process ended with status {status}, see the lines above"
+    name = signal.Signals(-status).name
+    often = f" {times} times" if times > 1 else ""
+    hint = "; is there enough memory?" if name == "SIGKILL" else ""
+    return f"its process was killed{often} by {name}{hint}"
+
+
+def _work(pipe: Connection, begin: Callable[[Any], Callable[[Any], Any]], state: object) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    work = begin(state)
+    while True:
+        try:
+            request = pipe.recv()
+        except EOFError:
+            return
+        try:
+            answer = work(request)
+        except Exception as error:
+            error.add_note(traceback.format_exc())
+            answer = error
+        pipe.send(answer)
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None, "called in a process that multiprocessing started"
+    parent.join()
+    os._exit(1)
