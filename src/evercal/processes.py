@@ -102,7 +102,7 @@ class Worker:
         return answer
 
     def end(self, patience_s: float = 0.0) -> int:
-        """End the process, after a time if it is about to end; its exit status, or minus a signal."""
+        """End the process, and return its exit status, or minus the signal that ended it."""
         self.answers.close()
         self._process.join(patience_s)
         self._process.terminate()
