@@ -15,6 +15,7 @@ import pytest
 
 pytest.importorskip("fastapi")
 
+from evercal.errors import InputError
 from evercal.service.client import Client
 
 
@@ -57,3 +58,13 @@ def test_requests_under_way_are_answered_before_the_end(
         assert process.stderr is not None
         assert "Traceback" not in process.stderr.read()
     assert len(answers[0].images) == 20
+
+
+def test_the_token_comes_from_a_file(hall_store: Path, tmp_path: Path) -> None:
+    (tmp_path / "token").write_text("0123456789abcdef\n")
+    process, url = started(hall_store, "--token-file", str(tmp_path / "token"))
+    with process:
+        assert Client(url, "0123456789abcdef").scenes == ("hall",)
+        with pytest.raises(InputError, match="Bearer TOKEN"):
+            _ = Client(url).scenes
+        process.terminate()

@@ -79,7 +79,7 @@ def running(map: Path, **options: Any) -> Iterator[Running]:
     ready = threading.Event()
     with bound_socket(chosen) as listener:
         app = make_app(chosen, lambda _: ready.set())
-        server = server_of(app)
+        server = server_of(app, chosen.limits)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         try:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from evercal.errors import InputError
@@ -128,11 +129,14 @@ def test_what_is_no_http_is_refused(hall_service: Any, data: bytes) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"host": "0.0.0.0"}, "--host 0.0.0.0: other machines could use the map; give --token"),
+        (
+            {"host": "0.0.0.0"},
+            "--host 0.0.0.0: other machines could use the map; give --token-",
+        ),
         ({"host": "::"}, "--host ::: other machines"),
         ({"host": "example.invalid"}, "other machines"),
-        ({"token": "short"}, "--token: give at least 16"),
-        ({"token": "x" * 20 + " "}, "--token: give at least 16"),
+        ({"token": "short"}, "token: give at least 16"),
+        ({"token": "x" * 20 + " "}, "token: give at least 16"),
         ({"host": "example.invalid", "token": TOKEN}, "--host example.invalid --port 0: "),
         ({"port": 70_000}, "--port 70000: "),
     ],
@@ -152,3 +156,65 @@ def test_a_token_opens_all_addresses_and_a_port_is_used_once(tmp_path: Path) -> 
 def test_only_loopback_addresses_are_local() -> None:
     assert [is_local(host) for host in ("127.0.0.1", "::1", "localhost")] == [True] * 3
     assert [is_local(host) for host in ("0.0.0.0", "192.168.1.4", "robot")] == [False] * 3
+
+
+def test_what_serve_takes_for_local_is_answered(hall_store: Path) -> None:
+    from .conftest import running
+
+    with running(hall_store, host="127.0.0.2") as service:
+        assert service.url.startswith("http://127.0.0.2:")
+        assert service.ask("GET", "/scenes").status == 200
+
+
+@pytest.fixture(scope="module")
+def hasty(hall_store: Path) -> Iterator[Any]:
+    """A service with few connections, which waits for half a second."""
+    from .conftest import running
+
+    with running(hall_store, limits=Limits(connections=8, streams=2, wait_s=0.5)) as service:
+        yield service
+
+
+def open_socket(service: Any, data: bytes) -> socket.socket:
+    host, port = service.url.removeprefix("http://").split(":")
+    connection = socket.create_connection((host, int(port)), timeout=10)
+    connection.sendall(data)
+    return connection
+
+
+def test_half_a_header_is_closed_and_does_not_hold_a_connection(hasty: Any) -> None:
+    half = [open_socket(hasty, b"GET /health HTTP/1.1\r\nHost: localhost\r\n") for _ in range(30)]
+    began = time.perf_counter()
+    assert hasty.ask("GET", "/health").status == 200
+    assert time.perf_counter() - began < 0.4
+    first = open_socket(hasty, b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    assert b"200 OK" in first.recv(10_000)
+    first.sendall(b"GET /hea")  # after a whole request
+    with suppress(ConnectionResetError):
+        assert first.recv(10_000) == b""
+    for connection in (first, *half):
+        connection.close()
+
+
+def test_a_body_has_a_deadline(hasty: Any) -> None:
+    head = b"POST /localize HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n"
+    head += b"Content-Type: multipart/form-data; boundary=a\r\n\r\n"
+    head += b'--a\r\nContent-Disposition: form-data; name="image"; filename="b"\r\n\r\n'
+    with open_socket(hasty, head) as slow:
+        for _ in range(20):
+            time.sleep(0.1)
+            with suppress(OSError):
+                slow.sendall(b"-")
+        assert slow.recv(10_000).startswith(b"HTTP/1.1 408 ")
+
+
+def test_streams_are_bounded_in_number_and_size(hasty: Any) -> None:
+    url = hasty.url.replace("http", "ws") + "/track"
+    with connect(url), connect(url), pytest.raises(InvalidStatus, match="403"):
+        connect(url)
+    with connect(url) as stream:
+        with suppress(ConnectionClosed):
+            stream.send(bytes(20_000_000))
+        with pytest.raises(ConnectionClosed):
+            stream.recv()
+    assert hasty.ask("GET", "/health").status == 200

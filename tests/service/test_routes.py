@@ -121,15 +121,58 @@ def test_refusals_are_one_line(
 
 
 def test_limits_of_images_and_of_the_queue(serve: Any, hall_store: Path, image: Path) -> None:
-    with serve(hall_store, limits=Limits(images=2, queue=0, pixels=1000)) as service:
+    limits = Limits(images=2, pixels=1000, held_bytes=10 * image.stat().st_size)
+    with serve(hall_store, limits=limits) as service:
         got = service.ask("POST", "/calibrations", [("images", part(image))] * 3)
         assert (got.status, got.json["error"]) == (413, "images: 3 given; at most 2")
         got = service.ask("POST", "/localize", [("image", part(image))])
         assert (got.status, got.json["error"].partition(":")[0]) == (413, "hall.png")
-        service.service.desk.waiting = 1000
-        got = service.ask("POST", "/localize", [("image", part(image))])
+        got = service.ask("POST", "/localize", [("image", ("a.png", bytes(limits.held_bytes)))])
         assert (got.status, got.json["error"]) == (429, "too many requests wait; try again")
-        service.service.desk.waiting = 0
+    with serve(hall_store, limits=Limits(requests=0)) as service:
+        got = service.ask("POST", "/localize", [("image", part(image))])
+        assert got.status == 429
+    with serve(hall_store, limits=Limits(request_pixels=100_000)) as service:
+        got = service.ask("POST", "/calibrations", [("images", part(image))] * 2)
+        assert (got.status, got.json["error"]) == (
+            413, "images: 153,600 pixels in all; at most 100,000"
+        )  # fmt: skip
+
+
+def test_other_fields_of_a_form_are_refused_by_name(hall_service: Any, image: Path) -> None:
+    for name in ("camra", "Image", "x" * 500):
+        got = hall_service.ask("POST", "/localize", [("image", part(image)), (name, part(image))])
+        assert (got.status, got.json["error"]) == (
+            400, f"{name[:100]!r} is no field of this form; it has image, camera"
+        )  # fmt: skip
+    got = hall_service.ask("POST", "/localize", [("image", part(image))] * 2)
+    assert (got.status, got.json["error"]) == (400, "image: given 2 times; give it once")
+    parts = [("images", part(image)), ("mount", "eye_to_hand"), ("mount", "eye_in_hand")]
+    got = hall_service.ask("POST", "/calibrations", parts)
+    assert (got.status, got.json["error"]) == (400, "mount: given 2 times; give it once")
+
+
+def test_the_page_comes_from_the_service_alone_and_sends_the_token(
+    hall_service: Any, serve: Any, hall_store: Path
+) -> None:
+    import re
+
+    got = hall_service.ask("GET", "/")
+    assert (got.status, got.headers["location"]) == (307, "docs")
+    page = hall_service.ask("GET", "/docs")
+    assert "frame-ancestors 'none'" in page.headers["content-security-policy"]
+    addresses = re.findall(r"""(?:href|src|url)[=:]\s*["']([^"']+)""", page.body.decode())
+    assert len(addresses) == 4
+    for address in addresses:
+        assert "//" not in address
+        assert hall_service.ask("GET", f"/{address}").status == 200
+    assert (
+        "security" not in hall_service.ask("GET", "/openapi.json").json["paths"]["/check"]["post"]
+    )
+    with serve(hall_store, token="a-token-of-16-characters") as service:
+        assert service.ask("GET", "/pages/swagger-ui.css").status == 200
+        asked = service.ask("GET", "/openapi.json").json
+        assert asked["paths"]["/check"]["post"]["security"] == [{"HTTPBearer": []}]
 
 
 def test_stream_of_frames(hall_service: Any, image: Path, hall: Recording) -> None:

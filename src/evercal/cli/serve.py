@@ -4,7 +4,7 @@ import os
 from dataclasses import dataclass
 
 from evercal.cli import args
-from evercal.errors import missing_extra
+from evercal.errors import InputError, missing_extra
 
 TOKEN = "EVERCAL_TOKEN"
 
@@ -23,9 +23,9 @@ class Serve(args.Verb):
     store: args.Store
     port: args.Port = 8000
     host: args.Host = "127.0.0.1"
-    token: args.Name = None
-    """Requests must have it as bearer token. Default: the variable EVERCAL_TOKEN, which other users
-    of the machine cannot read."""
+    token_file: args.File = None
+    """File of the bearer token that requests must have, readable by you alone. Default: the
+    variable EVERCAL_TOKEN."""
     device: args.Device = "auto"
 
     def run(self) -> int:
@@ -34,7 +34,12 @@ class Serve(args.Verb):
         except ImportError as error:
             raise missing_extra(f"the service needs {error.name}", "serve") from None
 
-        token = self.token or os.environ.get(TOKEN) or None
+        token = os.environ.pop(TOKEN, None) or None  # other processes do not inherit it
+        if self.token_file is not None:
+            try:
+                token = self.token_file.read_text(encoding="utf-8").strip()
+            except (OSError, ValueError) as error:
+                raise InputError(f"--token-file {self.token_file}: {error}") from None
         serve(ServeOptions(self.store, self.host, self.port, token, self.device), self._ready)
         return 0
 

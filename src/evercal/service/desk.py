@@ -1,4 +1,4 @@
-"""`Desk`: a bounded queue before a few threads that locate images."""
+"""`Desk`: a few threads that locate images."""
 
 import asyncio
 from collections.abc import Callable
@@ -11,22 +11,17 @@ import torch
 Result = TypeVar("Result")
 
 
-class QueueFullError(Exception):
-    """Too many requests wait; status 429."""
-
-
 class Desk:
-    """Works on images in threads, one image for each; at most `most` requests wait."""
+    """Works on images in threads, one image for each."""
 
-    def __init__(self, most: int):
-        workers = torch.get_num_threads()
-        self._most, self.waiting = most + workers, 0
-        self._pool = ThreadPoolExecutor(workers, "image", torch.set_num_threads, (1,))
+    def __init__(self) -> None:
+        self.waiting = 0
+        self._pool = ThreadPoolExecutor(
+            torch.get_num_threads(), "image", torch.set_num_threads, (1,)
+        )
 
     async def run(self, work: Callable[..., Result], *args: Any) -> Result:
-        """The result of a function, called in a thread; `QueueFullError` if too many wait."""
-        if self.waiting >= self._most:
-            raise QueueFullError("too many requests wait; try again")
+        """The result of a function, called in a thread."""
         self.waiting += 1
         try:
             loop = asyncio.get_running_loop()

@@ -1,4 +1,4 @@
-"""Checks before a request is handled: token, origin, size. Requests are counted here, too."""
+"""Checks before a request is handled: token, origin, size, queue. Requests are counted, too."""
 
 import asyncio
 import hmac
@@ -6,20 +6,27 @@ import time
 from collections.abc import Awaitable, Callable, MutableMapping
 from contextlib import suppress
 from typing import Any
-from urllib.parse import urlsplit
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 
-from evercal.service.hosts import is_local
+from evercal.service.hosts import foreign
 from evercal.service.limits import Limits
 
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 App = Callable[[MutableMapping[str, Any], Receive, Send], Awaitable[None]]
-OPEN = ("/health", "/docs", "/openapi.json")
+OPEN = ("/", "/health", "/docs", "/openapi.json")
+PAGES = "/pages/"
 """Paths without a token: they reveal nothing of the map."""
+SECURE = {
+    "Content-Security-Policy": "default-src 'self'; script-src 'self' 'unsafe-inline';"
+    " style-src 'self' 'unsafe-inline'; img-src 'self' data:; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+}
+"""Headers of every answer: its pages load nothing from elsewhere, and no page shows them."""
 _METHODS = ("GET", "POST", "DELETE", "HEAD", "OPTIONS", "PUT", "PATCH")
 
 
@@ -45,12 +52,15 @@ class Metrics:
 class Guard:
     """Refuses requests before their body is read; an ASGI middleware.
 
-    Without a token, only this machine may ask.
+    Without a token, only this machine may ask. The bodies of the requests under way are counted:
+    those beyond the limits wait at the client.
     """
 
     def __init__(self, app: App, token: str | None, limits: Limits, metrics: Metrics):
-        self._app, self._most, self._metrics = app, limits.body_bytes, metrics
+        self._app, self._limits, self._metrics = app, limits, metrics
         self._token = None if token is None else token.encode()
+        self._bodies: dict[object, int] = {}
+        self._streams = 0
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
         """Answer a request."""
@@ -59,14 +69,19 @@ class Guard:
         headers = dict(scope["headers"])
         refusal = self._refusal(scope["path"], headers)
         if scope["type"] == "websocket":
-            if refusal is not None:  # the handshake gets status 403
-                return await send({"type": "websocket.close", "code": 1008, "reason": refusal[1]})
-            return await self._app(scope, receive, send)
+            return await self._stream(refusal, scope, receive, send)
         began, status, ended = time.perf_counter(), 500, False
+        length = int(headers.get(b"content-length", b"0"))  # the server has checked that it is one
+        latest = began + self._limits.wait_s + length / self._limits.bytes_per_s
 
         async def part() -> Message:
             nonlocal ended
-            message = await receive()
+            seconds = None if ended else max(latest - time.perf_counter(), 0.0)
+            try:
+                message = await asyncio.wait_for(receive(), seconds)
+            except TimeoutError:
+                ended = True
+                raise HTTPException(408, "the body did not arrive in time; send it again") from None
             ended = not message.get("more_body", False)
             return message
 
@@ -75,49 +90,66 @@ class Guard:
             status = message.get("status", status)
             if "status" in message and status >= 400 and b"expect" not in headers:
                 # A connection that is closed with unread bytes is reset: the answer would be lost.
-                with suppress(TimeoutError):
+                with suppress(TimeoutError, HTTPException):
                     async with asyncio.timeout(1.0):
                         while not ended:
                             await part()
+            if "status" in message:
+                given = [(k.lower().encode(), v.encode()) for k, v in SECURE.items()]
+                message = {**message, "headers": [*message.get("headers", ()), *given]}
             await send(message)
 
+        if refusal is None and length:
+            self._bodies[part] = length
         try:
             answer = self._app if refusal is None else _refused(*refusal)
             await answer(scope, part, counted)
         finally:
+            self._bodies.pop(part, None)
             route = getattr(scope.get("route"), "path", "other")
             method = scope["method"] if scope["method"] in _METHODS else "other"
             self._metrics.requests.labels(method, route, status).inc()
             self._metrics.seconds.labels(route).observe(time.perf_counter() - began)
 
+    async def _stream(
+        self,
+        refusal: tuple[int, str] | None,
+        scope: MutableMapping[str, Any],
+        receive: Receive,
+        send: Send,
+    ) -> None:
+        if refusal is None and self._streams >= self._limits.streams:
+            refusal = 429, "too many streams"
+        if refusal is not None:  # the handshake gets status 403
+            return await send({"type": "websocket.close", "code": 1008, "reason": refusal[1]})
+        self._streams += 1
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            self._streams -= 1
+
     def _refusal(self, path: str, headers: dict[bytes, bytes]) -> tuple[int, str] | None:
         """Status and reason for refusing a request."""
-        if self._token is not None and path not in OPEN:
+        if self._token is not None and path not in OPEN and not path.startswith(PAGES):
             given = headers.get(b"authorization", b"")
             # Compared in constant time, so that its duration reveals nothing of the token.
             if not hmac.compare_digest(given, b"Bearer " + self._token):
                 return 401, "send 'Authorization: Bearer TOKEN'"
         elif self._token is None:
             # Pages that a browser on this machine shows must not reach the map.
-            host = headers.get(b"host", b"").decode("latin-1")
-            if not is_local(_hostname(host)):
-                return 403, f"host {host[:100]!r} is not this machine; a token is needed"
-            origin = headers.get(b"origin")
-            if origin is not None and origin.decode("latin-1").partition("://")[2] != host:
-                return 403, "requests of other web pages are refused; a token is needed"
+            host, origin = (headers.get(name) for name in (b"host", b"origin"))
+            stated = None if origin is None else origin.decode("latin-1")
+            if reason := foreign((host or b"").decode("latin-1"), stated, local=True):
+                return 403, f"{reason}; a token is needed"
         if b"transfer-encoding" in headers:
             return 411, "bodies of unknown length are refused; send content-length"
         length = int(headers.get(b"content-length", b"0"))  # the server has checked that it is one
-        if length > self._most:
-            return 413, f"body of {length} bytes; at most {self._most}"
+        if length > self._limits.body_bytes:
+            return 413, f"body of {str(length)[:20]} bytes; at most {self._limits.body_bytes}"
+        waits = len(self._bodies) >= self._limits.requests
+        if length and (waits or sum(self._bodies.values()) + length > self._limits.held_bytes):
+            return 429, "too many requests wait; try again"
         return None
-
-
-def _hostname(host: str) -> str:
-    try:
-        return urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        return ""
 
 
 def _refused(status: int, reason: str) -> JSONResponse:

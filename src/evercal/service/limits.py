@@ -3,11 +3,11 @@
 import io
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -21,22 +21,36 @@ Content = TypeVar("Content")
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
 _SMALL_BYTES = 64 * 1024
 """Largest file of intrinsics."""
-_TEXT_BYTES = 4 * 1024 * 1024
+_TEXT_BYTES = 1024 * 1024
 """Largest file of robot poses, and largest calibration."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Sizes above which a request is refused, and how many wait."""
+    """What a request may hold, and how many requests may wait."""
 
     body_bytes: int = 128 * 10**6
     """Body of a request with images."""
     pixels: int = 50 * 10**6
     """Pixels of one image."""
+    request_pixels: int = 500 * 10**6
+    """Pixels of all images of a request."""
     images: int = 500
     """Images of one calibration."""
-    queue: int = 64
-    """Images that wait to be located; requests beyond are refused with status 429."""
+    requests: int = 64
+    """Requests with a body under way; those beyond are refused with status 429."""
+    held_bytes: int = 256 * 10**6
+    """Bytes of their bodies."""
+    connections: int = 100
+    """Open connections; the oldest without a request gives way to a new one."""
+    streams: int = 16
+    """Streams of frames among them."""
+    frame_bytes: int = 16 * 10**6
+    """A frame of a stream."""
+    wait_s: float = 10.0
+    """Time for headers, and for a body beyond its length, in seconds."""
+    bytes_per_s: float = 250_000.0
+    """Slowest body."""
 
 
 class TooLargeError(InputError):
@@ -62,6 +76,33 @@ def decoded(data: bytes, name: str, limits: Limits) -> np.ndarray:
     if image is None or image.shape[0] * image.shape[1] > limits.pixels:
         raise InputError(f"{name}: not a readable image ({len(data)} bytes)")
     return image
+
+
+class Sent(Sequence[tuple[str, np.ndarray]]):
+    """Images of a request: names, and pixels that are decoded whenever they are asked for."""
+
+    def __init__(self, files: Sequence[tuple[str, bytes]], limits: Limits):
+        if len(files) > limits.images:
+            raise TooLargeError(f"images: {len(files)} given; at most {limits.images}")
+        self._files, self._limits = files, limits
+
+    def check_pixels(self) -> None:
+        """Refuse more pixels than a request may hold, by the headers of the images."""
+        sizes = [_header_size(data, name) for name, data in self._files]
+        if (total := sum(w * h for w, h in sizes)) > (most := self._limits.request_pixels):
+            raise TooLargeError(f"images: {total:,} pixels in all; at most {most:,}")
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the images."""
+        return [name for name, _ in self._files]
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def __getitem__(self, index: Any) -> Any:
+        name, data = self._files[index]
+        return name, decoded(data, name, self._limits)
 
 
 def _header_size(data: bytes, name: str) -> tuple[int, int]:

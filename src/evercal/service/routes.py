@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable
+from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from fastapi import APIRouter, Depends, File, Form, Request, Response, UploadFile, WebSocket
-from fastapi.responses import PlainTextResponse
+from fastapi.responses import PlainTextResponse, RedirectResponse
 from prometheus_client import generate_latest
 from starlette.websockets import WebSocketDisconnect
 
@@ -20,11 +20,11 @@ from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker
 from evercal.reports.answers import Answer, answer_row, check_record, unit_known
 from evercal.reports.track_files import track_row
-from evercal.service.desk import Desk, QueueFullError
+from evercal.service.desk import Desk
 from evercal.service.guard import Metrics
 from evercal.service.limits import (
     Limits,
-    TooLargeError,
+    Sent,
     calibration_of,
     camera_of,
     decoded,
@@ -36,8 +36,8 @@ router = APIRouter()
 CameraFile = Annotated[
     UploadFile | None, File(description="Intrinsics: JSON, YAML or a 3x3 matrix as text.")
 ]
-Shots = tuple[list[tuple[str, np.ndarray]], Camera | None]
-"""Names and pixels of images, and their intrinsics."""
+_NAME = 100
+"""Characters of a file name that are kept."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,28 @@ def service_of(request: Request | WebSocket) -> Service:
     return request.app.state.service
 
 
+def form(one: str, many: str = "") -> Any:
+    """Refuse other fields of a form, and all but `many` of them more than once."""
+    known = [*one.split(), *many.split()]
+
+    async def check(request: Request) -> None:
+        given = Counter(key for key, _ in (await request.form()).multi_items())
+        for name, count in given.items():
+            if name not in known:
+                fields = ", ".join(known)
+                raise InputError(f"{name[:_NAME]!r} is no field of this form; it has {fields}")
+            if count > 1 and name not in many.split():
+                raise InputError(f"{name}: given {count} times; give it once")
+
+    return Depends(check)
+
+
+@router.get("/", include_in_schema=False)
+async def index() -> Response:
+    """The page of the service."""
+    return RedirectResponse("docs")
+
+
 @router.get("/health")
 async def health(request: Request) -> dict[str, Any]:
     """Whether the service answers."""
@@ -67,12 +89,12 @@ async def scenes(request: Request) -> dict[str, Any]:
     return {"scenes": list(service_of(request).live.current.scenes)}
 
 
-@router.post("/localize")
+@router.post("/localize", dependencies=[form("image camera")])
 async def localize(
     request: Request, image: UploadFile, camera: CameraFile = None
 ) -> dict[str, Any]:
     """Estimate the camera pose of one image: the row of `evercal localize --json`."""
-    service, name = service_of(request), image.filename or "image"
+    service, name = service_of(request), _name(image, "image")
     data, intrinsics = await image.read(), await _content(camera)
 
     def work() -> dict[str, Any]:
@@ -88,29 +110,19 @@ async def localize(
     return row
 
 
-async def _shots(
-    request: Request,
-    images: Annotated[list[UploadFile], File(description="Image files, all of one camera.")],
-    camera: CameraFile = None,
-) -> Callable[[], Shots]:
-    """Decode the images of a request and their intrinsics, later and in another thread."""
-    limits = service_of(request).limits
-    if len(images) > limits.images:
-        raise TooLargeError(f"images: {len(images)} given; at most {limits.images}")
-    files = [(image.filename or f"image {i}", await image.read()) for i, image in enumerate(images)]
-    intrinsics = await _content(camera)
-
-    def decode() -> Shots:
-        pixels = [(name, decoded(data, name, limits)) for name, data in files]
-        return pixels, _camera(intrinsics, pixels[0][1])
-
-    return decode
+Shots = Annotated[list[UploadFile], File(description="Image files, all of one camera.")]
 
 
-@router.post("/calibrations")
+async def _sent(request: Request, images: list[UploadFile]) -> Sent:
+    files = [(_name(image, f"image {i}"), await image.read()) for i, image in enumerate(images)]
+    return Sent(files, service_of(request).limits)
+
+
+@router.post("/calibrations", dependencies=[form("camera robot_poses mount", "images")])
 async def calibrations(
     request: Request,
-    shots: Annotated[Callable[[], Shots], Depends(_shots)],
+    images: Shots,
+    camera: CameraFile = None,
     robot_poses: Annotated[
         UploadFile | None,
         File(description="base_from_gripper of every image: a table as text, or JSON."),
@@ -118,37 +130,45 @@ async def calibrations(
     mount: Annotated[Literal["eye_to_hand", "eye_in_hand"] | None, Form()] = None,
 ) -> dict[str, Any]:
     """Calibrate a camera from its images: the calibration file."""
-    service, table = service_of(request), await _content(robot_poses)
+    service, sent = service_of(request), await _sent(request, images)
+    table, intrinsics = await _content(robot_poses), await _content(camera)
     ending = "" if robot_poses is None else Path(robot_poses.filename or "").suffix
 
     def work() -> dict[str, Any]:
         from evercal.calibration.from_images import Images, calibrate
 
-        pixels, camera = shots()
-        poses = None if table is None else poses_of(table, ending, [name for name, _ in pixels])
-        given = Images(pixels, camera, poses)
+        sent.check_pixels()
+        poses = None if table is None else poses_of(table, ending, sent.names)
+        given = Images(sent, _camera(intrinsics, sent[0][1]), poses)
         return calibrate(service.live.current.localizer, given, mount).to_dict()
 
     return await service.desk.run(work)
 
 
-@router.post("/check")
+@router.post("/check", dependencies=[form("camera calibration", "images")])
 async def check(
     request: Request,
-    shots: Annotated[Callable[[], Shots], Depends(_shots)],
+    images: Shots,
     calibration: Annotated[UploadFile, File(description="The calibration file of the camera.")],
+    camera: CameraFile = None,
 ) -> dict[str, Any]:
     """Test whether a fixed camera has moved: the object of `evercal check --json`."""
-    service, reference = service_of(request), await calibration.read()
+    service, sent = service_of(request), await _sent(request, images)
+    reference, intrinsics = await calibration.read(), await _content(camera)
 
     def work() -> dict[str, Any]:
         from evercal.calibration.drift import check
 
         stated = calibration_of(reference)
-        pixels, camera = shots()
-        return check_record(check(service.live.current.localizer, pixels, stated, camera))
+        sent.check_pixels()
+        given = _camera(intrinsics, sent[0][1])
+        return check_record(check(service.live.current.localizer, sent, stated, given))
 
     return await service.desk.run(work)
+
+
+def _name(file: UploadFile, default: str) -> str:
+    return (file.filename or default)[-_NAME:]
 
 
 async def _content(file: UploadFile | None) -> bytes | None:
@@ -200,7 +220,7 @@ async def track(socket: WebSocket) -> None:
             name, number = f"frame {number}", number + 1
             try:
                 answer = await service.desk.run(row, message["bytes"], name)
-            except (InputError, QueueFullError) as error:
+            except InputError as error:
                 answer = {"path": name, "error": one_line(error)}
             await socket.send_text(json.dumps(answer, allow_nan=False))
 

@@ -1,7 +1,7 @@
 """The HTTP service: the application, and the process that serves it."""
 
 import asyncio
-import os
+import logging
 import signal
 import socket
 from collections.abc import AsyncIterator, Callable, Mapping
@@ -10,16 +10,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import uvicorn
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, Request, Security
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
+from fastapi.openapi.docs import get_swagger_ui_html
+from fastapi.responses import HTMLResponse, JSONResponse
+from fastapi.security import HTTPBearer
 from starlette.exceptions import HTTPException
+from starlette.staticfiles import StaticFiles
 
 from evercal.errors import InputError
-from evercal.service import routes
-from evercal.service.desk import Desk, QueueFullError
-from evercal.service.guard import Guard, Metrics
-from evercal.service.hosts import is_local, listening_socket
+from evercal.service import hosts, routes
+from evercal.service.connection import connection_class
+from evercal.service.desk import Desk
+from evercal.service.guard import PAGES, Guard, Metrics
 from evercal.service.limits import Limits, TooLargeError
 from evercal.service.live_map import LiveMap
 
@@ -58,7 +61,7 @@ def make_app(
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        desk = Desk(options.limits.queue)
+        desk = Desk()
         app.state.service = routes.Service(live, desk, options.limits, metrics)
         polling = asyncio.create_task(_poll(live))
         on_ready(live.current.scenes)
@@ -70,12 +73,28 @@ def make_app(
                 await polling
             desk.close()
 
-    app = FastAPI(title="evercal", version="1", redoc_url=None, lifespan=lifespan)
-    app.include_router(routes.router)
+    app = FastAPI(title="evercal", version="1", docs_url=None, redoc_url=None, lifespan=lifespan)
+    # Only for the page, which then can send the token; the guard compares it.
+    bearer = [Security(HTTPBearer(auto_error=False))] if options.token else None
+    app.include_router(routes.router, dependencies=bearer)
+    app.mount(PAGES, StaticFiles(packages=[("fastapi_swagger", "resources")]))
+    app.get("/docs", include_in_schema=False)(_page)
     app.add_middleware(Guard, token=options.token, limits=options.limits, metrics=metrics)  # pyright: ignore[reportArgumentType]
     for kind in (*_STATUS, HTTPException, RequestValidationError, Exception):
         app.add_exception_handler(kind, _answer)
     return app
+
+
+def _page() -> HTMLResponse:
+    files = PAGES.lstrip("/")
+    return get_swagger_ui_html(
+        openapi_url="openapi.json",
+        title="evercal",
+        swagger_js_url=f"{files}swagger-ui-bundle.js",
+        swagger_css_url=f"{files}swagger-ui.css",
+        swagger_favicon_url=f"{files}favicon-32x32.png",
+        swagger_ui_parameters={"tryItOutEnabled": True},
+    )
 
 
 async def _poll(live: LiveMap) -> None:
@@ -101,38 +120,39 @@ def _line(error: object, status: int, headers: Mapping[str, str] | None = None) 
     return JSONResponse({"error": routes.one_line(error)}, status, headers)
 
 
-_STATUS = {TooLargeError: 413, InputError: 400, QueueFullError: 429}
+_STATUS = {TooLargeError: 413, InputError: 400}
 
 
 def bound_socket(options: ServeOptions) -> socket.socket:
     """A socket that listens where the options ask for."""
     token = options.token
-    if token is None and not is_local(options.host):
+    if token is None and not hosts.is_local(options.host):
         raise InputError(
-            f"--host {options.host}: other machines could use the map; give --token, or set"
+            f"--host {options.host}: other machines could use the map; give --token-file, or set"
             " EVERCAL_TOKEN"
         )
     if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or " " in token):
-        raise InputError(f"--token: give at least {LEAST_TOKEN} ASCII characters without spaces")
-    return listening_socket(options.host, options.port)
+        raise InputError(f"token: give at least {LEAST_TOKEN} ASCII characters without spaces")
+    return hosts.listening_socket(options.host, options.port)
 
 
 def url_of(listener: socket.socket) -> str:
     """Address of a service for its clients."""
-    host, port = listener.getsockname()[:2]
-    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+    return hosts.url_of(*listener.getsockname()[:2])
 
 
-def server_of(app: FastAPI) -> uvicorn.Server:
+def server_of(app: FastAPI, limits: Limits) -> uvicorn.Server:
     """The server of what `make_app` returns."""
+    # It logs every malformed form.
+    logging.getLogger("python_multipart").setLevel(logging.CRITICAL)
     return uvicorn.Server(
         uvicorn.Config(
             app,
-            http="h11",
+            http=connection_class(limits),
             h11_max_incomplete_event_size=HEADER_BYTES,
             ws="websockets-sansio",
-            ws_max_size=64 * 1024 * 1024,
-            ws_max_queue=4,
+            ws_max_size=limits.frame_bytes,
+            ws_per_message_deflate=False,
             loop="asyncio",
             log_level="error",
             access_log=False,
@@ -147,10 +167,8 @@ def serve(options: ServeOptions, on_ready: Callable[[str, tuple[str, ...]], obje
 
     `on_ready` gets the address and the names of the scenes.
     """
-    # A second limit, in case that a decoder reads another size than the header states.
-    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(options.limits.pixels))
     with bound_socket(options) as listener:
         app = make_app(options, lambda scenes: on_ready(url_of(listener), scenes))
         # The server raises the signal again after it has drained.
         signal.signal(signal.SIGTERM, lambda *_: None)
-        server_of(app).run(sockets=[listener])
+        server_of(app, options.limits).run(sockets=[listener])

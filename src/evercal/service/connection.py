@@ -1,0 +1,56 @@
+"""Connections of the service: bounded in number, and in the time until they ask something."""
+
+import asyncio
+from typing import Any
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from evercal.service.limits import Limits
+
+
+def connection_class(limits: Limits) -> type[H11Protocol]:
+    """The protocol of a service with limits."""
+
+    class Connection(H11Protocol):
+        """A connection that is closed if no whole header arrives in time."""
+
+        latest: asyncio.TimerHandle | None = None
+
+        @property
+        def waits(self) -> bool:
+            """Whether no request is under way."""
+            return self.cycle is None or self.cycle.response_complete
+
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            self._wait()
+            if len(self.connections) > limits.connections:
+                others = [c for c in self.connections if isinstance(c, Connection) and c.waits]
+                others.sort(key=lambda c: c.latest.when() if c.latest else 0.0)
+                others[0].transport.abort()  # at worst this one
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            self._stop_waiting()
+            super().connection_lost(exc)
+
+        def on_response_complete(self) -> None:
+            super().on_response_complete()
+            self._wait()
+
+        def handle_websocket_upgrade(self, event: Any) -> None:
+            self._stop_waiting()
+            super().handle_websocket_upgrade(event)
+
+        def _wait(self) -> None:
+            self._stop_waiting()
+            self.latest = self.loop.call_later(limits.wait_s, self._late)
+
+        def _stop_waiting(self) -> None:
+            if self.latest is not None:
+                self.latest.cancel()
+
+        def _late(self) -> None:
+            if self.waits:
+                self.transport.abort()
+
+    return Connection
