@@ -120,6 +120,25 @@ def test_a_pose_out_of_reach_is_not_proposed_again(cell: VirtualCell, tmp_path: 
     assert studio.next_view() is None
 
 
+def test_the_arm_moves_only_while_somebody_sees_it(cell: VirtualCell, tmp_path: Path) -> None:
+    studio, looks = studio_in(tmp_path, cell), iter([True, True, True])
+    studio.take_sample()
+    studio.watched = lambda: next(looks, False)
+    with pytest.raises(InputError, match="open its page"):
+        studio.record(silent)
+    assert len(studio.recorder.frames) == 2  # each view asks twice
+    page = StudioPage(studio, "127.0.0.1", 0)
+    try:
+        before = cell.robot.joints_rad()
+        view = studio.next_view()
+        assert view is not None
+        with pytest.raises(InputError, match="open its page"):
+            studio.move_to(view.poses[0])
+        assert cell.robot.joints_rad() == before
+    finally:
+        page.close()
+
+
 def test_without_reachable_poses_views_near_the_recorded_ones_are_proposed(
     cell: VirtualCell, tmp_path: Path
 ) -> None:

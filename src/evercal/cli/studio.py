@@ -58,7 +58,7 @@ class Studio(Page):
 
     def run(self) -> int:
         self._refuse()
-        self.prepare("can use the cameras and move the arm")
+        self.prepare()
         from evercal.service.studio.page import StudioPage
         from evercal.service.studio.studio import Studio as Session
 

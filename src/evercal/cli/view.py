@@ -4,7 +4,6 @@ import contextlib
 import shlex
 import signal
 import socket
-import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,6 @@ from tyro.conf import Positional
 
 from evercal.cli import args
 from evercal.errors import InputError, missing_extra
-from evercal.service.hosts import is_local
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,15 +22,12 @@ class Page(args.Verb):
     host: args.Host = "127.0.0.1"
     port: args.Port = 8080
 
-    def prepare(self, danger: str) -> None:
-        """Require the extra `view`, and warn if other machines can open the page."""
+    def prepare(self) -> None:
+        """Require the extra `view`."""
         try:
             import viser  # noqa: F401
         except ImportError as error:
             raise missing_extra(f"the page needs {error.name}", "view") from None
-        if not is_local(self.host):
-            who = "the page has no password; whoever reaches this machine"
-            print(f"warning: --host {self.host}: {who} {danger}", file=sys.stderr)
 
     def wait(self, url: str, words: str) -> None:
         """Print words, or the address as JSON, and wait for SIGTERM or Ctrl-C."""
@@ -46,8 +41,8 @@ class Page(args.Verb):
 class View(Page):
     """Show a map, calibrations, arm and tracked camera in the browser.
 
-    It is stopped by Ctrl-C or SIGTERM. The page has no password and is served on 127.0.0.1, unless
-    --host names another address.
+    It is stopped by Ctrl-C or SIGTERM. The printed address holds the key of the page. It is served
+    on 127.0.0.1, unless --host names another address.
 
     Example: evercal view cell.evercal tripod.json --live 0
     """
@@ -68,7 +63,7 @@ class View(Page):
     def run(self) -> int:
         if self.camera is not None and self.live is None:
             raise InputError("--camera: is that of --live, which is missing")
-        self.prepare("sees the map and the images")
+        self.prepare()
         from evercal.service.viewer.page import Page as ViewerPage
 
         address = (self.host, self.port)
@@ -79,7 +74,7 @@ class View(Page):
             if self.live is not None:
                 page.track(self.live, self.camera)
             url = page.server.url
-            port = url.rpartition(":")[2]
+            port = page.server.get_port()
             tunnel = shlex.join(["ssh", "-L", f"{port}:127.0.0.1:{port}", socket.gethostname()])
             self.wait(url, f"view of {self.store} at {url} (from another machine: {tunnel})")
         finally:

@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from contextlib import suppress
 
 import numpy as np
 import viser
@@ -19,6 +20,8 @@ from evercal.service.viewer.page import start_server
 
 _LIVE_S, _REFRESH_S = 0.25, 0.5
 """Between live images, and between reports of progress."""
+_DRAWN_S = 10.0
+"""Time in which a browser that shows the page draws it."""
 _SIZE_M = 0.045
 """Length of a drawn camera."""
 
@@ -30,6 +33,7 @@ class StudioPage:
         self.studio, self.tasks = studio, Tasks(self._progressed)
         self.server = start_server(host, port, "evercal studio")
         self._closed, self._lock, self._refreshed = threading.Event(), threading.RLock(), 0.0
+        studio.watched = self.watched
         self.controls = Controls(self.server, studio, self.tasks)
         self._drawing = _Drawing(self.server, studio)
         self.refresh()
@@ -42,6 +46,14 @@ class StudioPage:
         self.tasks.stop.set()
         self._live.join(5)
         self.server.stop()
+
+    def watched(self) -> bool:
+        """Whether a browser shows the page; one in the background draws nothing."""
+        for client in self.server.get_clients().values():
+            with suppress(RuntimeError, TimeoutError):
+                client.get_render(8, 8, timeout=_DRAWN_S)
+                return True
+        return False
 
     def refresh(self) -> None:
         """Show what has changed."""

@@ -50,6 +50,8 @@ class Studio:
         self.recorder = WristRecorder(out / "wrist", devices.intrinsics)
         self.mount = devices.rough
         """gripper_from_camera, rough or calibrated; None if nothing is known."""
+        self.watched: Callable[[], bool] = lambda: True
+        """Whether somebody sees what the arm does; it moves only then."""
         self._refused: list[SE3] = []
         self._fixed_camera = out / "fixed_camera.json"
         if devices.fixed_intrinsics is not None:
@@ -130,6 +132,7 @@ class Studio:
         robot = self.connection.devices.robot
         if not isinstance(robot, MovingRobot):
             raise InputError("this robot does not move on request; move it by hand")
+        self._require_watched()
         try:
             robot.move_to(base_from_gripper)
         except InputError:
@@ -149,6 +152,7 @@ class Studio:
             if not reached.missing or view is None or good >= 2 * IMAGES:
                 break
             on_step(f"recording, {good} good images", min(good, IMAGES), IMAGES)
+            self._require_watched()
             try:
                 self.move_to(view.poses[0])
             except InputError:  # out of reach, and never proposed again
@@ -239,6 +243,10 @@ class Studio:
         path = folder / f"{name}{FORMATS[format].ending}"
         files = export_files(calibration, format, path, **options).files
         return f"Wrote {', '.join(map(str, files))}."
+
+    def _require_watched(self) -> None:
+        if not self.watched():
+            raise InputError("the arm moves only while a browser shows the studio; open its page")
 
     def _made(self, which: Which) -> Calibration:
         if which not in self.calibrations:

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import secrets
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +21,7 @@ from evercal.recordings.poses.camera_file import read_camera
 from evercal.reports.answers import unit_known
 from evercal.reports.overlay import resized
 from evercal.reports.scene import THUMBNAIL_PX, ColourBy, Frustum, KeyframeView
-from evercal.service.hosts import listening_socket
+from evercal.service.hosts import is_local, listening_socket, url_of
 from evercal.service.viewer.drawing import (
     DrawnMap,
     add_arm,
@@ -29,6 +30,7 @@ from evercal.service.viewer.drawing import (
     add_frustum,
     place,
 )
+from evercal.service.viewer.gate import gated
 from evercal.service.viewer.html import GREEN, calibration_rows, chip_html, rows_html
 
 _THROUGH = "/through"
@@ -176,12 +178,13 @@ def backdrop(view: KeyframeView) -> tuple[np.ndarray, float, float]:
 class _Server(viser.ViserServer):
     """A silent server that is not shared over viser's public relay, whatever a visitor asks."""
 
+    key = ""
+    """First part of the path; who does not know it is refused."""
+
     @property
     def url(self) -> str:
-        """Address that a browser on this machine opens."""
-        host = self.get_host()
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.get_port()}"
+        """Address that a browser on this machine opens, with the key."""
+        return f"{url_of(self.get_host(), self.get_port())}/{self.key}/"
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
@@ -192,10 +195,12 @@ class _Server(viser.ViserServer):
 
 
 def start_server(host: str, port: int, label: str) -> _Server:
-    """An empty page with z up."""
+    """An empty page with z up, for those who know its address."""
     listening_socket(host, port).close()  # viser alone would take the next free port
-    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a frame with its address
+    key = secrets.token_urlsafe(16)
+    with gated(key, is_local(host)), contextlib.redirect_stdout(io.StringIO()):  # viser prints
         server = _Server(host, port, label=label, verbose=False)
+    server.key = key
     server.gui.configure_theme(
         dark_mode=True, show_logo=False, show_share_button=False, control_width="large"
     )

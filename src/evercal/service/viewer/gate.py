@@ -1,0 +1,58 @@
+"""The gate of viser's server: who lacks the key of the printed address comes no further.
+
+viser checks neither where a request comes from nor who sends it, and has no setting for that. So
+the function that opens its server is replaced while it starts.
+"""
+
+import hmac
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
+from typing import Any
+
+import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+from evercal.errors import InputError
+from evercal.service.hosts import foreign
+
+
+def refusal(request: Request, key: str, local: bool) -> str | None:
+    """Why a page's request, or the handshake of its connection, is refused; None if it is not."""
+    given = f"{request.path}/".split("/")[1].partition("?")[0]
+    if not hmac.compare_digest(given.encode("utf-8", "surrogateescape"), key.encode()):
+        return "open the address that evercal printed, with its key"
+    hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+    if len(hosts) != 1 or len(origins) > 1:
+        return "one Host and at most one Origin are needed"
+    return foreign(hosts[0], next(iter(origins), None), local)
+
+
+@contextmanager
+def gated(key: str, local: bool) -> Iterator[None]:
+    """Gate the servers that are opened meanwhile.
+
+    Args:
+        key: First part of the path of every request.
+        local: Whether only names of this machine are right.
+    """
+    opened, serve = [], websockets.asyncio.server.serve
+
+    def gated_serve(handler: Any, *address: Any, process_request: Any, **options: Any) -> Any:
+        def process(connection: ServerConnection, request: Request) -> Response | None:
+            if reason := refusal(request, key, local):
+                return connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
+            path = request.path.removeprefix(f"/{key}")
+            return process_request(connection, Request(path or "/", request.headers))
+
+        opened.append(address)
+        return serve(handler, *address, process_request=process, **options)
+
+    websockets.asyncio.server.serve = gated_serve  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
+    if not opened:  # it would be open to everyone
+        raise InputError("this version of viser opens its server otherwise; see constraints.txt")
