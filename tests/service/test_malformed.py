@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from benchmarks.malformed import malformed
 from evercal.service.limits import Limits
-
-from .malformed import malformed
 
 # The parser of forms leaves the last part of a truncated body to the garbage collector.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

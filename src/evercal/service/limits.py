@@ -31,9 +31,9 @@ class Limits:
 
     body_bytes: int = 128 * 10**6
     """Body of a request with images."""
-    pixels: int = 50 * 10**6
+    pixels: int = 25 * 10**6
     """Pixels of one image."""
-    request_pixels: int = 500 * 10**6
+    request_pixels: int = 300 * 10**6
     """Pixels of all images of a request."""
     images: int = 500
     """Images of one calibration."""
