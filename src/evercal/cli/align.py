@@ -139,9 +139,13 @@ def read_rows(path: Path, names: int, columns: str) -> "list[tuple[tuple[str, ..
 
     from evercal.recordings.text_files import read_text
 
-    rows, count = [], columns.count(",") + 1
-    lines = read_text(path, "table of points").splitlines()
-    for number, row in enumerate(csv.reader(lines, skipinitialspace=True), start=1):
+    count, lines = columns.count(",") + 1, read_text(path, "table of points").splitlines()
+    try:
+        cells = list(csv.reader(lines, skipinitialspace=True))
+    except csv.Error as error:
+        raise InputError(f"{path}: no table ({error}); expected {columns}") from None
+    rows = []
+    for number, row in enumerate(cells, start=1):
         if not row or row[0].startswith("#"):
             continue
         try:

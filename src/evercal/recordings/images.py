@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evercal.bounds import bounds
 from evercal.errors import InputError
 from evercal.storage.atomic import write_bytes
 
@@ -69,7 +70,10 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
         raise InputError(f"{path}: image file cannot be read ({error.strerror})") from None
     image = decode_image(data)
     if image is None:
-        raise InputError(f"{path}: not a readable image ({data.size} bytes); use PNG or JPEG")
+        raise InputError(
+            f"{path}: not a readable image ({data.size} bytes) of at most {bounds().pixels:,}"
+            " pixels; use PNG or JPEG, or add --limits pixels=NUMBER"
+        )
     return image
 
 
@@ -79,7 +83,10 @@ def decode_image(data: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
 
     # IMREAD_UNCHANGED would ignore the orientation; ANYDEPTH keeps 16 bits for as_rgb to round.
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
-    image = cv2.imdecode(data, flags) if data.size else None
+    try:
+        image = cv2.imdecode(data, flags) if data.size else None
+    except cv2.error:
+        return None
     return as_rgb(image) if image is not None and image.dtype in (np.uint8, np.uint16) else None
 
 

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
+from evercal.bounds import bounds, require_at_most
 from evercal.errors import InputError
 
 
@@ -24,6 +25,8 @@ def named_errors(path: Path | str, what: str, remedy: str = "check the path") ->
         raise InputError(f"{path}: {what} cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: {what} is not a text file; {remedy}") from None
+    except (RecursionError, MemoryError):
+        raise InputError(f"{path}: {what} is nested too deeply or too large") from None
     except (ValueError, TypeError, OverflowError, EOFError) as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -40,6 +43,7 @@ def naming(what: str) -> Iterator[None]:
 def read_text(path: Path, what: str, remedy: str = "check the path") -> str:
     """Read a UTF-8 text file; `what` names its contents in messages."""
     with named_errors(path, what, remedy):
+        require_at_most(path.stat().st_size, "text_bytes", "bytes")
         return path.read_text(encoding="utf-8-sig")
 
 
@@ -47,11 +51,31 @@ def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str
     """Read a JSON object; `what` names its contents in messages."""
     try:
         data = json.loads(read_text(path, what, remedy))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not valid JSON ({error}); {remedy}") from None
     if not isinstance(data, dict):
         raise InputError(f"{path}: holds no JSON object; {remedy}")
     return data
+
+
+def yaml_documents(text: str) -> list[Any]:
+    """The documents of a YAML text; ValueError for other text, references and deep nesting.
+
+    A reference repeats a value, and references of references multiply it without limit.
+    """
+    import yaml
+
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    depth = 0
+    try:
+        for event in yaml.parse(text, loader):
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.AliasEvent) or depth > bounds().depth:
+                raise ValueError("it holds references (*name) or is nested too deeply")
+        return list(yaml.load_all(text, loader))
+    except yaml.YAMLError as error:
+        raise ValueError(f"not valid YAML ({' '.join(str(error).split())})") from None
 
 
 def refuse_repeated(names: Iterable[str], remedy: str) -> None:

@@ -122,7 +122,7 @@ def _read(root: Path) -> dict[str, dict]:
         data = json.loads(file.read_bytes())
     except OSError:
         raise InputError(f"{root}: no {MANIFEST} in it, so it is not a store") from None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise InputError(f"{file}: broken, not valid JSON; restore it from a copy") from None
     if not isinstance(data, dict) or data.get("format") != _FORMAT:
         raise InputError(f"{file}: 'format' is not '{_FORMAT}'; this is another program's file")

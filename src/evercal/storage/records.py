@@ -41,5 +41,5 @@ def read_record(
         raise InputError(f"{path}: {what} is missing; check the path") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: {error}; give the JSON that evercal wrote") from None

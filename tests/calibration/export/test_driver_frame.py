@@ -91,10 +91,10 @@ def test_exported_and_written_transforms_are_read(tmp_path: Path) -> None:
     ("text", "message"),
     [
         (yaml.safe_dump(entry("camera_link", "other", SE3.identity())), "leads from 'camera_link'"),
-        ("a: [", "neither YAML nor JSON"),
+        ("a: [", "not valid YAML"),
         ("hello", "contains no transform"),
         ("", "contains no transform"),
-        ("transform: {translation: {x: 1, y: 2, z: 3}}", "incomplete"),
+        ("transform: {translation: {x: 1, y: 2, z: 3}}", "no complete transform"),
         (
             yaml.safe_dump(entry("camera_link", "optical", SE3.identity())).replace(
                 "w: 1.0", "w: 2.0"
@@ -110,7 +110,7 @@ def test_broken_files_are_refused(tmp_path: Path, text: str, message: str) -> No
 
 
 def test_missing_file_and_equal_frame_names_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="is missing"):
         read_link_from_optical(tmp_path / "no.yaml", "camera_link", "optical")
     calibration = calibration_of(SE3.identity())
     with pytest.raises(InputError, match="both called 'base_link'"):

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, Unpack
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
+from evercal.recordings.text_files import read_text, yaml_documents
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
@@ -172,14 +172,10 @@ def read_link_from_optical(path: str | os.PathLike[str], link: str, optical: str
     """
     transforms: _Transforms = {}
     try:
-        for document in yaml.safe_load_all(Path(path).read_text(encoding="utf-8")):
+        for document in yaml_documents(read_text(Path(path), "transforms")):
             transforms |= _transforms(document)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except (UnicodeDecodeError, yaml.YAMLError):
-        raise InputError(f"{path}: neither YAML nor JSON; {_EXPECTED}") from None
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: a transform is incomplete ({error}); {_EXPECTED}") from None
+        raise InputError(f"{path}: no complete transform ({error}); {_EXPECTED}") from None
     if not transforms:
         raise InputError(f"{path}: contains no transform; {_EXPECTED}")
     transforms |= {(child, parent): pose.inverse() for (parent, child), pose in transforms.items()}

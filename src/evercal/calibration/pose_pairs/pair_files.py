@@ -1,6 +1,5 @@
 """Read pose pairs from a file of robot poses and a file of camera poses."""
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Literal
@@ -17,6 +16,7 @@ from evercal.recordings.poses.conventions import PoseConvention
 from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.poses.robot_poses import read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, times_in_names, without_ending
+from evercal.recordings.text_files import read_json
 
 Inverted = Literal["robot", "camera", "both"]
 
@@ -172,10 +172,9 @@ def _is_board_file(path: Path) -> bool:
     if path.suffix.lower() != ".json":
         return False
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return read_json(path, "poses").get("format") == FORMAT
+    except InputError:
         return False  # read_robot_poses reports the error
-    return isinstance(data, dict) and data.get("format") == FORMAT
 
 
 def _rows_by_name(

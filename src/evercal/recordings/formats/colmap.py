@@ -18,7 +18,7 @@ from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS
 from evercal.recordings.poses.row_files import natural_key
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import named_errors
+from evercal.recordings.text_files import named_errors, path_inside
 
 USES = ("metres",)
 
@@ -147,6 +147,9 @@ def _base_from_camera(folder: Path, image: Any) -> SE3:
 
 
 def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:
+    with named_errors(folder, "COLMAP model"):
+        for name in names:
+            path_inside(name, "the name of an image")
     beside = (parent / "images" for parent in folder.resolve().parents[:3])
     for candidate in (root / "images", root, *beside):
         if all((candidate / name).is_file() for name in names):

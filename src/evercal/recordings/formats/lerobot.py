@@ -16,6 +16,7 @@ arm, such as left_ee, if one feature holds left_ee.x and right_ee.x.
 """
 
 import functools
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -167,8 +168,12 @@ def _video_starts(
 ) -> dict[int, tuple[Path, float]]:
     """By episode: its video, and the time in the video at which it starts."""
 
-    def video(**numbers: int) -> Path:
-        path = str(info["video_path"]).format(video_key=key, **numbers)
+    def video(**fields: object) -> Path:
+        def field(match: re.Match[str]) -> str:
+            return str({"video_key": key, **fields}[match[1]]).zfill(int(match[2] or 0))
+
+        # Not by `str.format`, where the dataset would choose widths without limit.
+        path = re.sub(r"\{(\w+)(?::0(\d)d)?\}", field, str(info["video_path"]))
         return root / path_inside(path, "'video_path'")
 
     if str(info["codebase_version"]).startswith("v2"):

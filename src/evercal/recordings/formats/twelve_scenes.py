@@ -44,7 +44,8 @@ def _test_count(root: Path, frames: int) -> int:
 def _camera(root: Path, image: Path) -> Camera:
     file = root / "info.txt"
     text = read_text(file, "calibration", "it holds m_calibrationColorIntrinsic")
-    values = dict(re.findall(r"^\s*(\w+)\s*=\s*(.+?)\s*$", text, re.MULTILINE))
+    lines = (line.partition("=") for line in text.splitlines())
+    values = {name.strip(): value for name, _, value in lines}
     try:
         numbers = [float(word) for word in values["m_calibrationColorIntrinsic"].split()]
         size = int(values["m_colorWidth"]), int(values["m_colorHeight"])

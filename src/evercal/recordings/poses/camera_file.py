@@ -17,7 +17,7 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.recordings.poses.row_files import arrays_as_lists, is_number
-from evercal.recordings.text_files import named_errors, read_text
+from evercal.recordings.text_files import named_errors, read_text, yaml_documents
 
 _MODELS = (
     "plumbbob", "rationalpolynomial", "brownconrady", "radtan", "opencv", "pinhole", "none", "",
@@ -100,8 +100,6 @@ def camera_from_fields(data: Mapping[str, Any], size: tuple[int, int] | None = N
 
 
 def _fields_of(path: Path) -> Mapping[str, Any]:
-    import yaml
-
     with path.open("rb") as file:
         zipped = file.read(2) == b"PK"
     if zipped:
@@ -118,11 +116,11 @@ def _fields_of(path: Path) -> Mapping[str, Any]:
         # OpenCV's %YAML:1.0 is not valid YAML. cv2.FileStorage can end the process on such files.
         plain = re.sub(r"^%.*$|!!opencv-[a-z-]+", "", text, flags=re.MULTILINE)
         # A printed message ends with '---', which opens a second, empty document.
-        data = next(yaml.safe_load_all(plain), None)
+        data = next(iter(yaml_documents(plain)), None)
     except json.JSONDecodeError as error:
         raise ValueError(f"not valid JSON ({error}); {_EXPECTED}") from None
-    except yaml.YAMLError as error:
-        raise ValueError(f"not valid YAML ({' '.join(str(error).split())}); {_EXPECTED}") from None
+    except ValueError as error:
+        raise ValueError(f"{error}; {_EXPECTED}") from None
     if not isinstance(data, dict):
         raise ValueError(f"no camera in it; {_EXPECTED}")
     return data

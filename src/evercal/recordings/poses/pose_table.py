@@ -24,6 +24,7 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
 )
 from evercal.recordings.poses.row_files import (
+    Cells,
     Names,
     cell_numbers,
     in_unit,
@@ -90,8 +91,9 @@ HEADERS = {
 """Columns of a position and of rotations; definite rotations come first."""
 _AXES = {"quaternion": "wxyz", "angles": "xyz", "roll pitch yaw": "xyz"}
 """Columns that conventions order by axis; rx and roll rotate about x."""
-_NOTATION = re.compile(r'(?:([^\s\[\](){}=,;:"]+)[\s=,;:"]+)?(p\[|\{)([^\[\]{}]*)[\]}]')
-"""A word, if there is one, the bracket and what it holds."""
+_WORD = r'[^\s\[\](){}=,;:"]'
+_NOTATION = re.compile(rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?(p\[|\{{)([^\[\]{{}}]*)[\]}}]')
+"""A word, if there is one, the bracket and what it holds. A word is read once, from its start."""
 
 _Groups = dict[str, tuple[list[int], str | None]]
 """Columns and their unit, if stated, by key of `HEADERS`."""
@@ -127,9 +129,7 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     return plain_numbers(numbers.reshape(-1, height, 4), given)
 
 
-def named_numbers(
-    words: Sequence[str], rows: NDArray[np.str_], given: PoseConvention | None
-) -> PoseTable:
+def named_numbers(words: Sequence[str], rows: Cells, given: PoseConvention | None) -> PoseTable:
     """Numbers of rows (n, k) whose columns have names."""
     groups = _groups(words)
     names, stamps, others = row_labels(words, rows.T.tolist(), len(rows))

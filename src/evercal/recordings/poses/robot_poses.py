@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.bounds import require_at_most
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.conventions import (
@@ -35,6 +36,7 @@ from evercal.recordings.poses.row_files import (
     arrays_as_lists,
     number_array,
     row_labels,
+    text_cells,
 )
 from evercal.recordings.text_files import named_errors, read_text, refuse_repeated
 
@@ -162,12 +164,14 @@ def _data_table(data: Any, given: PoseConvention | None) -> PoseTable:
     if not entries or not all(isinstance(entry, Mapping) for entry in entries):
         raise ValueError("poses are a list of objects, or of lists of numbers, not of both")
     keys = dict.fromkeys(key for entry in entries for key in entry)
+    require_at_most(len(keys), "columns", "keys")
+    require_at_most(len(keys) * len(entries), "numbers", "values")
     columns = {key: [entry.get(key) for entry in entries] for key in keys}
     if all("matrix" in entry for entry in entries):
         return _labelled(_data_table(columns["matrix"], given), columns)
     rows = [_flat(entry) for entry in entries]
     words = [*rows[0]]
-    cells = np.array([[str(row.get(word)) for word in words] for row in rows])
+    cells = text_cells([str(row.get(word)) for word in words] for row in rows)
     table = _labelled(named_numbers(words, cells, given), columns)
     return table._replace(fixed="quaternion_wxyz" in columns)
 
@@ -183,6 +187,7 @@ def _labelled(
 def _flat(entry: Mapping[str, Any]) -> dict[str, object]:
     cells: dict[str, object] = {}
     for key, value in entry.items():
+        require_at_most(len(key), "name_characters", "characters of a key")
         if isinstance(value, Mapping):
             cells |= _flat({f"{key}_{inner}": each for inner, each in value.items()})
         elif isinstance(value, list):

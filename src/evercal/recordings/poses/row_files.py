@@ -6,18 +6,23 @@ have any name. In JSON lists beside the poses, names are in the plural: `images`
 """
 
 import io
+import math
 import re
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePath
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.bounds import bounds, require_at_most
 from evercal.recordings.images import IMAGE_ENDINGS
 from evercal.recordings.text_files import named_errors, read_text
 
 Array = NDArray[np.float64]
+Cells = NDArray[np.object_]
+"""(n, k) str, each of its own length."""
 Names = tuple[str, ...] | None
 
 _NAMES = (
@@ -25,7 +30,9 @@ _NAMES = (
     "file_path", "filepath", "path", "name", "frame",
 )  # fmt: skip
 _STAMPS = ("stamp", "timestamp", "time_stamp", "time", "t")
-_UNIT = re.compile(r"[\s_]*[\s_\[(](mm|m|degrees|deg|radians|rad|ns|us|ms|s)[\])]?$|\s*\[\s*\]$")
+_UNIT = re.compile(
+    r"(?<![\s_])[\s_]*[\s_\[(](mm|m|degrees|deg|radians|rad|ns|us|ms|s)[\])]?$|(?<!\s)\s*\[\s*\]$"
+)
 _SHORT = {"degrees": "deg", "radians": "rad"}
 _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _EARLIEST_S, _LATEST_S = 1e9, 4e9  # 2001 and 2096 in seconds since 1970
@@ -57,7 +64,7 @@ def read_rows(path: Path, contents: str) -> Rows:
         return Rows(names, stamps, columns, cell_numbers(rows[:, others], columns))
 
 
-def table_cells(lines: Sequence[str]) -> NDArray[np.str_]:
+def table_cells(lines: Sequence[str]) -> Cells:
     """(n, k) cells of lines of text; missing cells at the end of a line are empty.
 
     Semicolons, commas, tabs or blanks of the first line separate them. If it is semicolons, the
@@ -67,6 +74,9 @@ def table_cells(lines: Sequence[str]) -> NDArray[np.str_]:
 
     first = next((line for line in lines if line.strip()), "")
     separator = next((s for s in (";", ",", "\t") if s in first), " ")
+    count = len(first.split()) if separator == " " else first.count(separator) + 1
+    require_at_most(count, "columns", "columns")
+    require_at_most(count * len(lines), "numbers", "cells")
     # Empty cells at the end of a line are missing cells.
     text = "\n".join(line.lstrip(" ").rstrip(f" \r\n{separator}") for line in lines)
     try:
@@ -79,15 +89,25 @@ def table_cells(lines: Sequence[str]) -> NDArray[np.str_]:
             skipinitialspace=True,
         )
     except pd.errors.EmptyDataError:
-        return np.empty((0, 0), dtype=np.str_)
+        return np.empty((0, 0), dtype=object)
     except pd.errors.ParserError as error:
         raise ValueError(f"no table: {str(error).strip().rpartition('error: ')[2]}") from None
     if separator == ";":
         table = table.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
-    return np.char.strip(table.to_numpy(dtype=np.str_))
+    return text_cells([map(str.strip, row) for row in table.itertuples(index=False, name=None)])
 
 
-def cell_numbers(cells: NDArray[np.str_], words: Sequence[str] = ()) -> Array:
+def text_cells(rows: Iterable[Iterable[str]]) -> Cells:
+    """(n, k) cells of rows."""
+    cells = np.array([list(row) for row in rows], dtype=object)
+    for (row, column), cell in np.ndenumerate(cells):
+        if len(cell) > (most := bounds().cell_characters):
+            where = f"row {row + 1}, column {column + 1}"
+            raise ValueError(f"{where}: {len(cell):,} characters, at most {most:,} are read")
+    return cells
+
+
+def cell_numbers(cells: Cells, words: Sequence[str] = ()) -> Array:
     """Convert cells (n, k) to finite numbers; ValueError names the first other cell."""
     for (row, column), cell in np.ndenumerate(cells):
         if not is_number(cell) or not np.isfinite(float(cell)):
@@ -98,6 +118,7 @@ def cell_numbers(cells: NDArray[np.str_], words: Sequence[str] = ()) -> Array:
 
 def name_and_unit(cell: str) -> tuple[str, str | None]:
     """Split a column's name into its plain name and its unit."""
+    require_at_most(len(cell), "name_characters", "characters of a name")
     name = re.sub(r"^(pose|transform)[._/]", "", cell.strip().lower())
     match = _UNIT.search(name)
     unit = match.group(1) if match else None
@@ -150,12 +171,31 @@ def arrays_as_lists(path: Path) -> Any:
     """An array of NPY as lists, or the arrays of NPZ by name; ValueError for damaged files."""
     with path.open("rb") as file:
         try:
+            if zipfile.is_zipfile(file):
+                with zipfile.ZipFile(file) as archive:
+                    for entry in archive.infolist():
+                        with archive.open(entry) as member:
+                            _require_few_numbers(member)
+            else:
+                file.seek(0)
+                _require_few_numbers(file)
+            file.seek(0)
             loaded = np.load(file, allow_pickle=False)
             if isinstance(loaded, np.ndarray):
                 return loaded.tolist()
             return {key: loaded[key].tolist() for key in loaded.files}
         except Exception as error:  # numpy raises many types for damaged files
             raise ValueError(f"no readable arrays ({' '.join(str(error).split())[:200]})") from None
+
+
+def _require_few_numbers(file: IO[bytes]) -> None:
+    """Check the shape that an array states, before its numbers are read."""
+    version = np.lib.format.read_magic(file)
+    read = {(1, 0): np.lib.format.read_array_header_1_0}.get(
+        version, np.lib.format.read_array_header_2_0
+    )
+    shape, _, dtype = read(file)
+    require_at_most(math.prod(shape) * max(dtype.itemsize, 8) // 8, "numbers", "numbers")
 
 
 def in_unit(stamps: Array, unit: str | None = None) -> Array:
@@ -207,5 +247,8 @@ def without_ending(name: str) -> str:
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Sorting key that puts `image-2` before `image-10`."""
-    parts = re.findall(r"\d+|\D+", name)
-    return tuple((0, int(p), p) if p.isdigit() else (1, 0, p) for p in parts)
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    return tuple(
+        (0, len(p.lstrip("0")), f"{p.lstrip('0')} {p}") if p[0] in "0123456789" else (1, 0, p)
+        for p in parts
+    )

@@ -1,0 +1,163 @@
+"""Sizes of files are bounded before the work that they make."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+import tracemalloc
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evercal.bounds import VARIABLE, bounds
+from evercal.calibration.calibration import read_calibration
+from evercal.calibration.export.request import read_link_from_optical
+from evercal.errors import InputError
+from evercal.recordings import read_image, read_robot_poses, write_image
+from evercal.recordings.poses.camera_file import read_camera
+from evercal.recordings.poses.row_files import natural_key
+
+Read = Callable[[Path], object]
+HEADER = "image,x,y,z,qw,qx,qy,qz\n"
+ROW = "a.png,0,0,0,1,0,0,0\n"
+
+
+@contextmanager
+def frugal(seconds: float, megabytes: float) -> Iterator[None]:
+    """What happens inside takes little time and memory."""
+    tracemalloc.start()
+    began = time.process_time()
+    try:
+        yield
+        took = time.process_time() - began
+        most = tracemalloc.get_traced_memory()[1] / 1e6
+    finally:
+        tracemalloc.stop()
+    assert took < seconds
+    assert most < megabytes
+
+
+def refused(read: Read, path: Path, content: str | bytes, message: str) -> None:
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(InputError, match=message) as error:
+        read(path)
+    assert len(str(error.value)) < 3000
+    assert "\n" not in str(error.value)
+
+
+def aliased(levels: int) -> str:
+    """A few lines whose references repeat references."""
+    lines = ["a0: &a0 [word, word]"]
+    lines += [f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]" for i in range(1, levels)]
+    return "\n".join([*lines, f"camera_matrix: [*a{levels - 1}]"])
+
+
+@pytest.mark.parametrize("read", [read_camera, lambda p: read_link_from_optical(p, "a", "b")])
+@pytest.mark.parametrize("content", [aliased(3), "a: &a 1\nb: *a", "a: " + "[" * 51 + "]" * 51])
+def test_yaml_with_references_or_deep_nesting_is_refused(
+    tmp_path: Path, read: Read, content: str
+) -> None:
+    refused(read, tmp_path / "a.yaml", content, "references .* or is nested too deeply")
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("a.json", read_camera),
+        ("a.json", read_robot_poses),
+        ("a.json", read_calibration),
+    ],
+)
+def test_deep_json_is_refused(tmp_path: Path, name: str, read: Read) -> None:
+    refused(read, tmp_path / name, '{"poses": ' * 20_000, "nested too deep|recursion|valid JSON")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("underscores.csv", HEADER.replace("x", "x" + "_" * 16_000) + ROW, "16,001 characters"),
+        ("cell.csv", HEADER + ROW + ROW.replace("a", "a" * 10_000), "row 3, column 1: 10,004 ch"),
+        ("columns.csv", HEADER.strip() + ",a" * 50_000 + "\n" + ROW, "50,008 columns, at most 1,0"),
+        ("names.csv", HEADER + ROW * 20_000, "'a.png' comes twice"),
+        ("word.txt", "x" * 300_000, "is not a finite number|no line|characters"),
+        ("brackets.txt", "p[" * 100_000 + "]" * 100_000, "[a-z]"),
+        ("braces.txt", "{" * 200_000 + "X 1, Y 2", "[a-z]"),
+        ("key.json", json.dumps([{"k" * 300: {"a": 1}}]), "300 characters of a key"),
+        ("keys.json", json.dumps([{f"k{i}": 0} for i in range(5_000)]), "5,000 keys, at most"),
+        ("cell.json", json.dumps([{"x": "1" * 5_000}] * 500), "5,000 characters, at most 1,000"),
+    ],
+)
+def test_a_pose_table_takes_little_time_and_memory(
+    tmp_path: Path, name: str, content: str, message: str
+) -> None:
+    with frugal(seconds=5, megabytes=100):
+        refused(read_robot_poses, tmp_path / name, content, message)
+
+
+def npz(shape: tuple[int, ...], **more: Any) -> bytes:
+    """An archive of one array of ones that states a shape."""
+    array, file = io.BytesIO(), io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        array, {"shape": shape, "fortran_order": False, "descr": "<f8"}
+    )
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("poses.npy", array.getvalue() + bytes(8_000))
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("read", [read_camera, read_robot_poses])
+def test_arrays_are_measured_before_they_are_read(tmp_path: Path, read: Read) -> None:
+    with frugal(seconds=5, megabytes=20):
+        message = "200,000,000 numbers, at most 10,000,000"
+        refused(read, tmp_path / "a.npz", npz((2 * 10**8,)), message)
+
+
+def test_the_bounds_are_raised_by_the_variable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(HEADER.replace("image", "image," + ",".join(["more"] * 1_500)) + ROW)
+    with pytest.raises(InputError, match=r"--limits columns=1508"):
+        read_robot_poses(path)
+    monkeypatch.setenv(VARIABLE, "columns=2000, pixels=1e6")
+    assert (bounds().columns, bounds().pixels) == (2000, 10**6)
+    with pytest.raises(InputError, match="row"):
+        read_robot_poses(path)
+    for wrong in ("columns", "columns=x", "rows=1", "columns=inf"):
+        monkeypatch.setenv(VARIABLE, wrong)
+        with pytest.raises(InputError, match=r"limit .*give NAME=NUMBER, the name one of"):
+            bounds()
+
+
+def test_text_is_measured_before_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(VARIABLE, "text_bytes=100")
+    refused(read_camera, tmp_path / "a.json", " " * 101, "101 bytes, at most 100 are read")
+
+
+def test_an_image_that_opencv_refuses_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import cv2
+
+    def refuse(*_: object) -> None:
+        raise cv2.error("too many pixels")
+
+    write_image(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
+    monkeypatch.setattr(cv2, "imdecode", refuse)
+    with pytest.raises(InputError, match=r"at most 100,000,000 pixels.* --limits pixels=NUMBER"):
+        read_image(tmp_path / "a.png")
+
+
+def test_names_are_sorted_by_their_numbers_whatever_they_hold() -> None:
+    names = ["image-10", "image-2", "image-²", "image-" + "9" * 5_000, "image-007"]
+    assert [name[:9] for name in sorted(names, key=natural_key)] == [
+        "image-2", "image-007", "image-10", "image-999", "image-²"
+    ]  # fmt: skip
