@@ -7,9 +7,11 @@ the work: in headers before bodies, and before patterns, tables and decoders.
 import os
 from dataclasses import dataclass, fields
 from functools import cache
+from typing import TypeVar
 
 from evercal.errors import InputError
 
+Kind = TypeVar("Kind", bound="Bounds")
 VARIABLE = "EVERCAL_LIMITS"
 """`NAME=NUMBER,...`; worker processes inherit it."""
 
@@ -34,14 +36,50 @@ class Bounds:
     """Pixels of an image."""
 
 
+@dataclass(frozen=True)
+class RequestBounds(Bounds):
+    """Sizes above which a request is refused, and how many requests may wait."""
+
+    text_bytes: int = 1_000_000
+    """Intrinsics, robot poses or a calibration."""
+    pixels: int = 25_000_000
+    """Pixels of one image."""
+    body_bytes: int = 128 * 10**6
+    """Body of a request with images."""
+    request_pixels: int = 300 * 10**6
+    """Pixels of all images of a request."""
+    images: int = 500
+    """Images of one calibration."""
+    requests: int = 64
+    """Requests with a body under way; those beyond are refused with status 429."""
+    held_bytes: int = 256 * 10**6
+    """Bytes of their bodies."""
+    connections: int = 100
+    """Open connections; the oldest without a request gives way to a new one."""
+    streams: int = 16
+    """Streams of frames among them."""
+    frame_bytes: int = 16 * 10**6
+    """A frame of a stream."""
+    wait_s: float = 10.0
+    """Time for headers, and for a body beyond its length, in seconds."""
+    bytes_per_s: float = 250_000.0
+    """Slowest body."""
+
+
 def bounds() -> Bounds:
-    """The bounds in force: the default ones, changed by `EVERCAL_LIMITS`."""
-    return _changed(os.environ.get(VARIABLE, ""))
+    """The bounds of files in force: the default ones, changed by `EVERCAL_LIMITS`."""
+    return _changed(Bounds, os.environ.get(VARIABLE, ""))
+
+
+def request_bounds() -> RequestBounds:
+    """The bounds of requests in force."""
+    return _changed(RequestBounds, os.environ.get(VARIABLE, ""))
 
 
 @cache
-def _changed(changes: str) -> Bounds:
-    known, values = {field.name for field in fields(Bounds)}, {}
+def _changed(kind: type[Kind], changes: str) -> Kind:
+    own, values = {field.name for field in fields(kind)}, {}
+    known = {field.name for field in fields(RequestBounds)}
     for change in filter(None, changes.split(",")):
         name, _, number = change.strip().partition("=")
         try:
@@ -51,7 +89,7 @@ def _changed(changes: str) -> Bounds:
         if not values.keys() <= known:
             names = ", ".join(sorted(known))
             raise InputError(f"limit {change!r}: give NAME=NUMBER, the name one of {names}")
-    return Bounds(**values)
+    return kind(**{name: value for name, value in values.items() if name in own})
 
 
 def require_at_most(count: int, name: str, what: str) -> None:

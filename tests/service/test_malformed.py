@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from benchmarks.malformed import malformed
-from evercal.service.limits import Limits
+from evercal.bounds import RequestBounds
 
 # The parser of forms leaves the last part of a truncated body to the garbage collector.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -26,7 +26,7 @@ def narrow(hall_store: Path) -> Iterator[Any]:
     """A service whose images may be small only."""
     from .conftest import running
 
-    with running(hall_store, limits=Limits(pixels=10**6)) as service:
+    with running(hall_store, limits=RequestBounds(pixels=10**6)) as service:
         yield service
 
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from evercal.bounds import RequestBounds
 from evercal.map import Map
 from evercal.recordings import read_image
 from evercal.reports.answers import Answer, answer_row
-from evercal.service.limits import Limits
 
 if TYPE_CHECKING:
     from evercal.recordings import Recording
@@ -97,7 +97,7 @@ def test_health_scenes_page_and_metrics(hall_service: Any, image: Path) -> None:
         ("localize", {"image": "IMAGE", "camera": ("c", b"{")}, 400, "camera: "),
         ("localize", {"image": "IMAGE", "camera": ("c", b"PK")}, 400, "not a text"),
         ("localize", {"image": "IMAGE", "camera": ("c", b"[" * 60_000)}, 400, "camera"),
-        ("localize", {"image": "IMAGE", "camera": ("c", b" " * 70_000)}, 413, "camera"),
+        ("localize", {"image": "IMAGE", "camera": ("c", b" " * 1_000_001)}, 413, "camera"),
         ("calibrations", {}, 422, "images: Field required"),
         ("calibrations", {"images": ("a", b"x")}, 400, "a: not a readable image"),
         ("calibrations", {"images": "IMAGE", "robot_poses": ("p.csv", b"a,b\n1,2")}, 400, "robot_"),
@@ -121,7 +121,7 @@ def test_refusals_are_one_line(
 
 
 def test_limits_of_images_and_of_the_queue(serve: Any, hall_store: Path, image: Path) -> None:
-    limits = Limits(images=2, pixels=1000, held_bytes=10 * image.stat().st_size)
+    limits = RequestBounds(images=2, pixels=1000, held_bytes=10 * image.stat().st_size)
     with serve(hall_store, limits=limits) as service:
         got = service.ask("POST", "/calibrations", [("images", part(image))] * 3)
         assert (got.status, got.json["error"]) == (413, "images: 3 given; at most 2")
@@ -129,10 +129,10 @@ def test_limits_of_images_and_of_the_queue(serve: Any, hall_store: Path, image: 
         assert (got.status, got.json["error"].partition(":")[0]) == (413, "hall.png")
         got = service.ask("POST", "/localize", [("image", ("a.png", bytes(limits.held_bytes)))])
         assert (got.status, got.json["error"]) == (429, "too many requests wait; try again")
-    with serve(hall_store, limits=Limits(requests=0)) as service:
+    with serve(hall_store, limits=RequestBounds(requests=0)) as service:
         got = service.ask("POST", "/localize", [("image", part(image))])
         assert got.status == 429
-    with serve(hall_store, limits=Limits(request_pixels=100_000)) as service:
+    with serve(hall_store, limits=RequestBounds(request_pixels=100_000)) as service:
         got = service.ask("POST", "/calibrations", [("images", part(image))] * 2)
         assert (got.status, got.json["error"]) == (
             413, "images: 153,600 pixels in all; at most 100,000"

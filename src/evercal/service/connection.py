@@ -5,10 +5,10 @@ from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from evercal.service.limits import Limits
+from evercal.bounds import RequestBounds
 
 
-def connection_class(limits: Limits) -> type[H11Protocol]:
+def connection_class(limits: RequestBounds) -> type[H11Protocol]:
     """The protocol of a service with limits."""
 
     class Connection(H11Protocol):

@@ -11,8 +11,8 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 
+from evercal.bounds import RequestBounds
 from evercal.service.hosts import foreign
-from evercal.service.limits import Limits
 
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
@@ -56,7 +56,7 @@ class Guard:
     those beyond the limits wait at the client.
     """
 
-    def __init__(self, app: App, token: str | None, limits: Limits, metrics: Metrics):
+    def __init__(self, app: App, token: str | None, limits: RequestBounds, metrics: Metrics):
         self._app, self._limits, self._metrics = app, limits, metrics
         self._token = None if token is None else token.encode()
         self._bodies: dict[object, int] = {}

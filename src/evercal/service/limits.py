@@ -4,13 +4,13 @@ import io
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from evercal.bounds import RequestBounds, request_bounds
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,45 +19,13 @@ if TYPE_CHECKING:
 
 Content = TypeVar("Content")
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
-_SMALL_BYTES = 64 * 1024
-"""Largest file of intrinsics."""
-_TEXT_BYTES = 1024 * 1024
-"""Largest file of robot poses, and largest calibration."""
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What a request may hold, and how many requests may wait."""
-
-    body_bytes: int = 128 * 10**6
-    """Body of a request with images."""
-    pixels: int = 25 * 10**6
-    """Pixels of one image."""
-    request_pixels: int = 300 * 10**6
-    """Pixels of all images of a request."""
-    images: int = 500
-    """Images of one calibration."""
-    requests: int = 64
-    """Requests with a body under way; those beyond are refused with status 429."""
-    held_bytes: int = 256 * 10**6
-    """Bytes of their bodies."""
-    connections: int = 100
-    """Open connections; the oldest without a request gives way to a new one."""
-    streams: int = 16
-    """Streams of frames among them."""
-    frame_bytes: int = 16 * 10**6
-    """A frame of a stream."""
-    wait_s: float = 10.0
-    """Time for headers, and for a body beyond its length, in seconds."""
-    bytes_per_s: float = 250_000.0
-    """Slowest body."""
 
 
 class TooLargeError(InputError):
     """More than a limit allows; status 413."""
 
 
-def decoded(data: bytes, name: str, limits: Limits) -> np.ndarray:
+def decoded(data: bytes, name: str, limits: RequestBounds) -> np.ndarray:
     """Pixels (h, w, 3) uint8 RGB of an image file.
 
     The size in the file's header is checked before anything is decoded.
@@ -81,7 +49,7 @@ def decoded(data: bytes, name: str, limits: Limits) -> np.ndarray:
 class Sent(Sequence[tuple[str, np.ndarray]]):
     """Images of a request: names, and pixels that are decoded whenever they are asked for."""
 
-    def __init__(self, files: Sequence[tuple[str, bytes]], limits: Limits):
+    def __init__(self, files: Sequence[tuple[str, bytes]], limits: RequestBounds):
         if len(files) > limits.images:
             raise TooLargeError(f"images: {len(files)} given; at most {limits.images}")
         self._files, self._limits = files, limits
@@ -121,12 +89,12 @@ def _header_size(data: bytes, name: str) -> tuple[int, int]:
         ) from None
 
 
-@lru_cache(maxsize=64)  # a robot sends the same intrinsics with every image
+@lru_cache(maxsize=8)  # a robot sends the same intrinsics with every image
 def camera_of(data: bytes, size: tuple[int, int]) -> "Camera":
     """Intrinsics in a file that `--camera` would read, for images of a size (width, height)."""
     from evercal.recordings.poses.camera_file import read_camera
 
-    return _from_text(data, "camera", ".json", _SMALL_BYTES, lambda path: read_camera(path, size))
+    return _from_text(data, "camera", ".json", lambda path: read_camera(path, size))
 
 
 def poses_of(data: bytes, ending: str, images: list[str]) -> "SE3":
@@ -135,26 +103,22 @@ def poses_of(data: bytes, ending: str, images: list[str]) -> "SE3":
 
     files = [Path(name) for name in images]
     ending = ending.lower() if ending.lower() in (".csv", ".txt", ".json", ".tum") else ".csv"
-    return _from_text(
-        data, "robot_poses", ending, _TEXT_BYTES, lambda path: poses_of_images(path, files)
-    )
+    return _from_text(data, "robot_poses", ending, lambda path: poses_of_images(path, files))
 
 
 def calibration_of(data: bytes) -> "Calibration":
     """A calibration file that came over the network."""
     from evercal.calibration.calibration import read_calibration
 
-    return _from_text(data, "calibration", ".json", _TEXT_BYTES, read_calibration)
+    return _from_text(data, "calibration", ".json", read_calibration)
 
 
-def _from_text(
-    data: bytes, name: str, ending: str, most: int, read: Callable[[Path], Content]
-) -> Content:
+def _from_text(data: bytes, name: str, ending: str, read: Callable[[Path], Content]) -> Content:
     """Read text that came over the network as a file.
 
     One line for whatever a reader raises, with the name of the request's part.
     """
-    if len(data) > most:
+    if len(data) > (most := request_bounds().text_bytes):
         raise TooLargeError(f"{name}: {len(data)} bytes; at most {most}")
     if data[:2] == b"PK" or b"\0" in data:
         raise InputError(f"{name}: not a text file; send JSON, YAML or a table as text")

@@ -14,6 +14,7 @@ from fastapi.responses import PlainTextResponse, RedirectResponse
 from prometheus_client import generate_latest
 from starlette.websockets import WebSocketDisconnect
 
+from evercal.bounds import RequestBounds
 from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.localization.localizer import Localizer
@@ -23,7 +24,6 @@ from evercal.reports.track_files import track_row
 from evercal.service.desk import Desk
 from evercal.service.guard import Metrics
 from evercal.service.limits import (
-    Limits,
     Sent,
     calibration_of,
     camera_of,
@@ -46,7 +46,7 @@ class Service:
 
     live: LiveMap
     desk: Desk
-    limits: Limits
+    limits: RequestBounds
     metrics: Metrics
 
 

@@ -18,12 +18,13 @@ from fastapi.security import HTTPBearer
 from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
 
+from evercal.bounds import RequestBounds, request_bounds
 from evercal.errors import InputError
 from evercal.service import hosts, routes
 from evercal.service.connection import connection_class
 from evercal.service.desk import Desk
 from evercal.service.guard import PAGES, Guard, Metrics
-from evercal.service.limits import Limits, TooLargeError
+from evercal.service.limits import TooLargeError
 from evercal.service.live_map import LiveMap
 
 POLL_S = 0.5
@@ -49,7 +50,7 @@ class ServeOptions:
     """Requests must have it as bearer token."""
     device: str = "auto"
     """`auto`, `cpu` or `cuda`."""
-    limits: Limits = field(default_factory=Limits)
+    limits: RequestBounds = field(default_factory=request_bounds)
     """Sizes above which a request is refused."""
 
 
@@ -141,7 +142,7 @@ def url_of(listener: socket.socket) -> str:
     return hosts.url_of(*listener.getsockname()[:2])
 
 
-def server_of(app: FastAPI, limits: Limits) -> uvicorn.Server:
+def server_of(app: FastAPI, limits: RequestBounds) -> uvicorn.Server:
     """The server of what `make_app` returns."""
     # It logs every malformed form.
     logging.getLogger("python_multipart").setLevel(logging.CRITICAL)
