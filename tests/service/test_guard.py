@@ -189,7 +189,9 @@ def test_half_a_header_is_closed_and_does_not_hold_a_connection(hasty: Any) -> N
         with suppress(ConnectionResetError):
             assert connection.recv(10_000) == b""
     first = open_socket(hasty, b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n")
-    assert b"200 OK" in first.recv(10_000)
+    answer = b""
+    while not answer.endswith(b"}"):
+        answer += first.recv(10_000)
     first.sendall(b"GET /hea")  # after a whole request
     with suppress(ConnectionResetError):
         assert first.recv(10_000) == b""
