@@ -292,6 +292,8 @@ def full_disk(
     The context holds the number of operations so far.
     """
 
+    real_open = open
+
     @contextmanager
     def full(last: int, once: bool = False) -> Iterator[list[int]]:
         count = [0]
@@ -299,7 +301,7 @@ def full_disk(
         def failing(function: Callable[..., object]) -> Callable[..., object]:
             def call(*args: Any, **kwargs: Any) -> object:
                 mode = args[1] if len(args) > 1 else kwargs.get("mode", "r")
-                if function is open and not set(mode) & set("wxa+"):
+                if function is real_open and not set(mode) & set("wxa+"):
                     return function(*args, **kwargs)
                 count[0] += 1
                 if count[0] == last or (count[0] > last and not once):
@@ -311,7 +313,7 @@ def full_disk(
         with monkeypatch.context() as patch:
             for name in ("replace", "fsync", "mkdir", "rename"):
                 patch.setattr(os, name, failing(getattr(os, name)))
-            opening = failing(open)
+            opening = failing(real_open)
             patch.setattr("builtins.open", opening)
             patch.setattr("io.open", opening)
             yield count

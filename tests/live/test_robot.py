@@ -80,9 +80,8 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
     os.utime(path, (1e9, 1e9))
     with pytest.raises(InputError, match="last written"):
         robot.base_from_gripper()
-    os.utime(path, (time.time() + 3600,) * 2)
-    with pytest.raises(
-        InputError, match=r"last written 3[56]\d\d\.\d s in the future; set the clock"
-    ):
+    ahead = time.time() + 3600
+    os.utime(path, (ahead, ahead))
+    with pytest.raises(InputError, match=r"written 3[56]\d\d\.\d s in the future; set"):
         robot.base_from_gripper()
     PoseFileRobot(path).base_from_gripper()

@@ -77,7 +77,7 @@ def test_a_name_that_evercal_does_not_give_is_refused(
     manifest = Manifest.read(root)
     write_manifest(root, manifest.payload, list(manifest.files))
     for read in (MapStore.open, stored_scenes):
-        with pytest.raises(InputError, match="scene name .*: give one of at most 200") as error:
+        with pytest.raises(InputError, match=r"scene name .*: give one of at most 200") as error:
             read(root)
         assert str(error.value).isprintable()
 
