@@ -13,6 +13,7 @@ import os
 import pickle
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -280,6 +281,58 @@ def every_step(
         return snapshots
 
     return record
+
+
+@pytest.fixture
+def full_disk(
+    monkeypatch: pytest.MonkeyPatch,
+) -> Callable[..., AbstractContextManager[list[int]]]:
+    """A disk where the n-th operation that needs space fails, and all later ones or only it.
+
+    The context holds the number of operations so far.
+    """
+
+    real_open = open
+
+    @contextmanager
+    def full(last: int, once: bool = False) -> Iterator[list[int]]:
+        count = [0]
+
+        def failing(function: Callable[..., object]) -> Callable[..., object]:
+            def call(*args: Any, **kwargs: Any) -> object:
+                mode = args[1] if len(args) > 1 else kwargs.get("mode", "r")
+                if function is real_open and not set(mode) & set("wxa+"):
+                    return function(*args, **kwargs)
+                count[0] += 1
+                if count[0] == last or (count[0] > last and not once):
+                    raise OSError(28, "No space left on device")
+                return function(*args, **kwargs)
+
+            return call
+
+        with monkeypatch.context() as patch:
+            for name in ("replace", "fsync", "mkdir", "rename"):
+                patch.setattr(os, name, failing(getattr(os, name)))
+            opening = failing(real_open)
+            patch.setattr("builtins.open", opening)
+            patch.setattr("io.open", opening)
+            yield count
+
+    return full
+
+
+@pytest.fixture
+def everything() -> Callable[[Path], dict[str, bytes | None]]:
+    """Every file and folder below a folder, with its content; locks are left out."""
+
+    def read(root: Path) -> dict[str, bytes | None]:
+        return {
+            str(path.relative_to(root)): path.read_bytes() if path.is_file() else None
+            for path in sorted(root.rglob("*"))
+            if path.suffix != ".lock"
+        }
+
+    return read
 
 
 @pytest.fixture

@@ -6,11 +6,19 @@ class InputError(Exception):
 
     The message is one line that names the thing, shows what came and says what to do next. The
     command line prints it and exits with status 2; anything else that is raised is a bug. Line
-    breaks become spaces: names from damaged files can hold any character.
+    breaks become spaces, and other control characters are escaped: names from damaged files can
+    hold any character.
     """
 
     def __init__(self, message: str = ""):
-        super().__init__(" ".join(str(message).splitlines()))
+        super().__init__(printable(" ".join(str(message).splitlines())))
+
+
+def printable(text: str) -> str:
+    """Escape the characters that a terminal obeys or that cannot be seen, but line breaks."""
+    return "".join(
+        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
+    )
 
 
 def missing_extra(need: str, extra: str) -> InputError:

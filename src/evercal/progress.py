@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TextIO
 
+from evercal.errors import printable
+
 if TYPE_CHECKING:
     from tqdm import tqdm
 
@@ -24,7 +26,7 @@ def progress_bar(what: str, total: int, unit: str, done: int = 0) -> "tqdm":
     from tqdm import tqdm
 
     return tqdm(
-        desc=what,
+        desc=printable(what),
         total=total,
         unit=unit,
         initial=done,
@@ -65,7 +67,7 @@ class Bars:
     def step(self, name: str, done: int, total: int) -> "tqdm":
         """Show that part of a step is done; a new step gets a new bar."""
         if self._start:
-            print(self._start, file=self._stream, flush=True)
+            print(printable(self._start), file=self._stream, flush=True)
             self._start = ""
         bar = self._bar
         if bar is None or name != self._step or total != bar.total or done < bar.n:
@@ -83,7 +85,7 @@ class Bars:
         """Print lines above the bar."""
         from tqdm import tqdm
 
-        tqdm.write(text, file=self._stream)
+        tqdm.write(printable(text), file=self._stream)
 
     def _close(self) -> None:
         if self._bar is not None:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from evercal.cli import main
+from evercal.storage import Manifest, write_manifest
 
 
 @pytest.fixture
@@ -53,3 +54,40 @@ def test_help_of_an_action_has_an_example(action: str, capsys: pytest.CaptureFix
     page = capsys.readouterr().out
     assert f"Example: evercal map {action} " in page
     assert "--json" in page
+
+
+def test_control_characters_reach_no_terminal(
+    run: Any, copy: Path, four_images: Path, tmp_path: Path
+) -> None:
+    images = tmp_path / "a\x1b]0;title\x07"
+    images.mkdir()
+    for number, path in enumerate(sorted(four_images.iterdir())[:2]):
+        shutil.copy(path, images / f"{number}\x1b[31m\x9b2J\u202e.png")
+    moved = Path(shutil.move(copy, tmp_path / "map\x1b[2J"))
+
+    def shown(*words: object) -> str:
+        ran = run(*words)
+        text = ran.out + "\n".join(ran.err)
+        assert text.replace("\n", "").isprintable(), text
+        return text
+
+    assert "0\\x1b[31m\\x9b2J\\u202e.png" in shown("localize", moved, images)
+    assert "map\\x1b[2J: 1 scene" in shown("info", moved)
+    shown("map", "list", moved)
+    shown("localize", moved, tmp_path / "\x1b[31m")
+    shown("inspect", images)
+    shown("no\x1b[31m", moved)
+    shown("info", moved, "--\x1b[31m")
+    (file,) = moved.rglob("scene.json")
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps({**content, "name": "hall\x1b[2J\x1b]0;\x07\x9bm\nx"}))
+    manifest = Manifest.read(moved)
+    write_manifest(moved, manifest.payload, list(manifest.files))
+    for words in (
+        ("map", "list", moved),
+        ("map", "rename", moved, "a", "b"),
+        ("info", moved),
+        ("localize", moved, images),
+    ):
+        text = shown(*words)
+        assert "scene name 'hall\\x1b[2J" in text

@@ -1,5 +1,6 @@
 """Images of sources in order, and the newest image of a live one."""
 
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,7 +36,7 @@ def test_a_live_image_is_not_older_than_the_call(monkeypatch: pytest.MonkeyPatch
     def frames(source: str, rate: float) -> Iterator[StreamFrame]:
         try:
             for i in range(400):
-                yield StreamFrame(str(i), time.time(), picture(i % 250))
+                yield StreamFrame(str(i), time.time(), picture(i % 250), time.monotonic())
                 time.sleep(0.005)
         finally:
             closed.append(source)
@@ -47,6 +48,23 @@ def test_a_live_image_is_not_older_than_the_call(monkeypatch: pytest.MonkeyPatch
             before = time.time()
             assert source.read()[0] >= before
     assert closed == ["0"]
+
+
+def test_an_image_from_before_the_call_is_not_given_after_the_clock_steps_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    waiting = threading.Event()
+
+    def frames(source: str, rate: float) -> Iterator[StreamFrame]:
+        yield StreamFrame("0", time.time() + 3600, picture(0), time.monotonic())
+        waiting.set()
+        time.sleep(0.1)
+        yield StreamFrame("1", time.time(), picture(1), time.monotonic())
+
+    monkeypatch.setattr(camera, "stream", frames)
+    with StreamCamera("0") as source:
+        assert waiting.wait(5)
+        assert int(source.read()[1][0, 0, 0]) == 1
 
 
 def test_a_live_source_that_stops_or_fails_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

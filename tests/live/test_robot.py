@@ -2,6 +2,7 @@
 
 import json
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -79,3 +80,8 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
     os.utime(path, (1e9, 1e9))
     with pytest.raises(InputError, match="last written"):
         robot.base_from_gripper()
+    ahead = time.time() + 3600
+    os.utime(path, (ahead, ahead))
+    with pytest.raises(InputError, match=r"written 3[56]\d\d\.\d s in the future; set"):
+        robot.base_from_gripper()
+    PoseFileRobot(path).base_from_gripper()

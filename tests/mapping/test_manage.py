@@ -6,12 +6,15 @@ import json
 import os
 import shutil
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from evercal.continual.store import NetworkStore
 from evercal.errors import InputError
 from evercal.mapping import manage
 from evercal.mapping.manage import (
@@ -270,52 +273,66 @@ def test_a_kill_at_any_step_leaves_the_old_state_or_the_new_one(
         assert tree(again) == final
 
 
-@pytest.mark.parametrize("action", ["remove", "rename", "merge", "unpack", "pack"])
-def test_a_full_disk_at_any_step_leaves_the_old_state(
-    action: str,
+def test_changes_that_a_full_disk_refuses_leave_nothing(
     root: Path,
     other: Path,
+    scenes: list[SceneMap],
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    content: Contents,
+    full_disk: Callable[..., AbstractContextManager[list[int]]],
+    everything: Callable[[Path], dict[str, bytes | None]],
 ) -> None:
-    pack_map(root, tmp_path / "packed.zip")
-    before, sync, failures = content(MapStore.open(root).contents), os.fsync, 0
-    for last in range(100):
-        left = [last]
-
-        def full(descriptor: int, left: list[int] = left) -> None:
-            left[0] -= 1
-            if left[0] < 0:
-                raise OSError(28, "No space left on device")
-            sync(descriptor)
-
-        store, target = MapStore.open(root), tmp_path / "target"
-        with monkeypatch.context() as patch:
-            patch.setattr(os, "fsync", full)
+    """One after the other, each refused at each of its steps until it succeeds."""
+    packed = tmp_path / "packed.zip"
+    pack_map(root, packed)
+    store = MapStore.open(root)
+    new, merged = (MapStore.create(tmp_path / name, short_side=48) for name in ("new", "merged"))
+    left: dict[str, Callable[[], object]] = {
+        "merge": lambda: merge_maps(store, [other], "replace"),
+        "merge into new": lambda: merge_maps(merged, [other]),
+        "first scene": lambda: new.commit(scenes[0], {}),
+        "commit": lambda: store.commit(replace(scenes[1], name="more"), {}),
+        "rename": lambda: rename_scene(store, "gamma", "g"),
+        "refresh": lambda: store.refresh(scenes[0], {}),
+        "unpack": lambda: unpack_map(packed, tmp_path / "copy"),
+        "pack": lambda: pack_map(root, tmp_path / "again.zip"),
+        "remove": lambda: remove_scenes(store, ["beta"]),
+    }
+    refused: Counter[str] = Counter()
+    for last in range(1, 200):
+        for name, change in [*left.items()]:
+            before = everything(tmp_path)
             try:
-                if action == "remove":
-                    remove_scenes(store, ["beta"])
-                elif action == "rename":
-                    rename_scene(store, "beta", "b")
-                elif action == "merge":
-                    merge_maps(store, [other], "rename")
-                elif action == "unpack":
-                    unpack_map(tmp_path / "packed.zip", target)
-                else:
-                    pack_map(root, target)
+                with full_disk(last):
+                    change()
+                del left[name]
             except OSError:
-                failures += 1
-        if action in ("pack", "unpack"):
-            if target.exists():
-                break
-            assert not [
-                p for p in tmp_path.iterdir() if "target" in p.name and ".lock" not in p.name
-            ]
-        elif content(MapStore.open(root).contents) != before:
-            break
-    assert failures >= 2
-    assert verify(root) == []
+                refused[name] += 1
+                assert everything(tmp_path) == before, (name, last)
+    assert not left
+    assert len(refused) == 9
+    assert min(refused.values()) >= 3
+    assert sorted(names(root)) == ["alpha", "beta", "delta", "g", "more"]
+    assert (names(new.root), names(merged.root)) == (["alpha"], ["beta", "delta"])
+    for where in (root, new.root, merged.root, tmp_path / "copy"):
+        assert verify(where) == []
+
+
+def test_a_map_that_lost_its_manifest_keeps_its_scenes(
+    root: Path, other: Path, everything: Callable[[Path], dict[str, bytes | None]]
+) -> None:
+    packed = other.parent / "packed.zip"
+    pack_map(other, packed)
+    (root / MANIFEST).unlink()
+    before = everything(root)
+    for change in (
+        lambda: MapStore.create(root),
+        lambda: merge_maps(MapStore.open_or_create(root), [other]),
+        lambda: NetworkStore.create(root, "finetune"),
+        lambda: unpack_map(packed, root),
+    ):
+        with pytest.raises(InputError, match=r"store: holds scenes but no manifest\.json; restore"):
+            change()
+        assert everything(root) == before
 
 
 def test_a_packed_map_is_unpacked_to_the_same_files(root: Path, tmp_path: Path, tree: Tree) -> None:

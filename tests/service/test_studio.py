@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -253,7 +254,11 @@ def test_samples_learned_again_replace_their_scene_and_no_other(
         again = studio_in(tmp_path, cell)
         assert (again.scene, again.samples_changed) == ("wrist-3", False)
         assert status(again, "3 Learn") == "done"
+        os.utime(tmp_path / "wrist" / "base_from_gripper.csv")  # the same samples
+        assert not again.samples_changed
         again.take_sample()
+        os.utime(tmp_path / "wrist" / "base_from_gripper.csv", (1e9, 1e9))  # the clock was set back
+        assert again.samples_changed
 
     def fail(*_: object, **__: object) -> None:
         raise InputError("too few images")

@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -87,6 +89,19 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(
         write_bytes(file, b"new")
     assert file.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["a"]
+
+
+def test_a_folder_that_cannot_be_replaced_stays(
+    tmp_path: Path, full_disk: Callable[..., AbstractContextManager[list[int]]]
+) -> None:
+    for name in ("fresh", "stage"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a").write_text(name)
+    # The folder and its file are synced, and the old folder is renamed.
+    with full_disk(4, once=True), pytest.raises(OSError, match="No space"):
+        replace_folder(tmp_path / "fresh", tmp_path / "stage")
+    assert sorted(os.listdir(tmp_path)) == ["fresh", "stage"]
+    assert (tmp_path / "stage/a").read_text() == "stage"
 
 
 def test_a_folder_is_created(tmp_path: Path) -> None:

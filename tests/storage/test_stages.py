@@ -11,13 +11,14 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from evercal.errors import InputError
-from evercal.storage import MANIFEST, Manifest, verify, write_manifest
+from evercal.storage import MANIFEST, Manifest, verify, write_bytes, write_manifest
 from evercal.storage import manifest as module
-from evercal.storage.stages import SCHEMA, StageStore, is_store, read_store
+from evercal.storage.stages import SCHEMA, StageStore, is_store, read_store, require_free
 
 Tree = Callable[[Path], dict[str, str]]
 PAYLOAD = {"kind": "test"}
@@ -34,9 +35,9 @@ def opened(root: Path) -> StageStore:
 def add(store: StageStore, name: str, text: str = "") -> None:
     def write(folder: Path) -> None:
         if not store.networks:
-            (store.root / "encoder-1.bin").write_text("weights")
+            write_bytes(store.root / "encoder-1.bin", b"weights")
             store.networks = ("encoder-1.bin",)
-        (folder / "scene.json").write_text(json.dumps(name + text))
+        write_bytes(folder / "scene.json", json.dumps(name + text).encode())
         (folder / "head.bin").write_bytes(bytes(100))
 
     store.add(name, write, PAYLOAD)
@@ -158,6 +159,87 @@ def test_writer_killed_at_any_step(
     assert len(snapshots) > 6
     assert outcomes[0] == before
     assert outcomes[-2] == after
+
+
+Everything = Callable[[Path], dict[str, "bytes | None"]]
+
+
+def change_by(action: str, store: StageStore) -> None:
+    if action == "replace":
+        store.replace(0, lambda folder: write_bytes(folder / "scene.json", b'"new"'), PAYLOAD)
+    elif action == "remove":
+        store.change(store.stages[1:], [], PAYLOAD)
+    else:
+        add(store, "attic")
+
+
+@pytest.mark.parametrize("once", [False, True])
+@pytest.mark.parametrize("action", ["first", "add", "replace", "remove"])
+def test_a_change_that_is_refused_at_any_step_leaves_nothing(
+    action: str, once: bool, root: Path, tmp_path: Path, full_disk: Any, everything: Everything
+) -> None:
+    if action == "first":
+        shutil.rmtree(root)
+    expected, refused, count = tmp_path / "expected", 0, [0]
+    if root.exists():
+        shutil.copytree(root, expected)
+    change_by(action, opened(expected))
+    for last in range(1, 200):
+        where = tmp_path / str(last) / "store"
+        where.parent.mkdir()
+        if root.exists():
+            shutil.copytree(root, where)
+        store, before = opened(where), everything(where.parent)
+        memory = list(store.stages), store.networks
+        try:
+            with full_disk(last, once) as count:
+                change_by(action, store)
+        except OSError:
+            refused += 1
+            assert everything(where.parent) == before
+            assert (store.stages, store.networks) == memory
+            change_by(action, store)  # the same object, once there is space
+        assert everything(where) == everything(expected)
+        if count[0] < last:
+            break
+    assert count[0] < 200
+    assert refused >= 6
+
+
+def test_what_a_killed_change_dropped_is_removed_by_the_next(
+    root: Path, every_step: Callable[[Path, Callable[[], object]], list[Path]]
+) -> None:
+    for snapshot in every_step(root, lambda: change_by("remove", opened(root))):
+        add(opened(snapshot), "attic")
+        assert sorted(os.listdir(snapshot / "stages")) == sorted(opened(snapshot).stages)
+        assert sorted(os.listdir(snapshot)) == ["encoder-1.bin", MANIFEST, "stages"]
+
+
+@pytest.mark.parametrize(
+    "journal", [None, "", "[]", '{"new": [7]}', '{"dropped": ["0001-kitchen"]}']
+)
+def test_scenes_without_a_manifest_are_refused_and_never_removed(
+    journal: str | None, root: Path, everything: Everything
+) -> None:
+    (root / MANIFEST).unlink()
+    if journal is not None:
+        (root / ".writing").write_text(journal)
+    before = everything(root)
+    for action in (lambda: add(opened(root), "attic"), lambda: require_free(root)):
+        with pytest.raises(InputError, match=r"holds scenes but no manifest\.json; restore it"):
+            action()
+        assert everything(root) == before
+
+
+def test_a_stage_that_no_change_has_made_is_neither_removed_nor_replaced(root: Path) -> None:
+    for name in ("0003-attic", "0001-kitchen~2"):
+        shutil.copytree(root / "stages" / "0001-kitchen", root / "stages" / name)
+    store = opened(root)
+    add(store, "attic")
+    change_by("replace", store)
+    assert store.stages == ["0001-kitchen~3", "0002-hall", "0004-attic"]
+    for name in ("0003-attic", "0001-kitchen~2"):
+        assert (root / "stages" / name / "scene.json").read_text() == '"kitchen"'
 
 
 def test_one_process_writes_at_a_time(root: Path, tree: Tree) -> None:

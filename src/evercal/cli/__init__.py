@@ -16,7 +16,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any
 
-from evercal.errors import InputError
+from evercal.errors import InputError, printable
 
 VERBS = {
     "Map": ["learn", "localize", "track", "view", "refresh", "evaluate", "info", "map", "serve"],
@@ -78,10 +78,10 @@ def _discard_stdout() -> None:
 
 
 def _complain(message: str, as_json: bool) -> int:
-    from evercal.cli.console import print_json
+    from evercal.cli.console import print_json, say
 
     message = " ".join(message.split())
-    print(f"error: {message}", file=sys.stderr)
+    say(f"error: {message}", sys.stderr)
     if as_json:
         try:
             print_json({"error": message})
@@ -144,7 +144,7 @@ def _parse(words: list[str], as_json: bool) -> Any:
         shown.seek(0)
         page = shown.read()
         sys.stdout.write(_wrapped(page) if page else "")
-        sys.stderr.write(caught.getvalue())
+        sys.stderr.write(printable(caught.getvalue()))
         code = 0 if stop.code in (0, None) else 2
         if code and as_json:
             from evercal.cli.console import print_json

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next
+from evercal.cli.console import print_json, print_next, say
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class Verb:
             print_json(record)
             return
         for line in lines:
-            print(line, flush=True)
+            say(line)
         if then:
             print_next("evercal", *then)
 

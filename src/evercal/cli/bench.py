@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
+from evercal.cli.console import say
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ class Bench(args.Verb):
             device=self.device,
         )
         for step in run_bench(scenes, options, self.out):
-            print(_progress(step), file=sys.stderr if self.json else sys.stdout, flush=True)
+            say(_progress(step), sys.stderr if self.json else sys.stdout)
         return self._show(self.out, strategies[0].name)
 
     def _show(self, folder: Path, reference: str = "") -> int:

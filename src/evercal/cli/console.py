@@ -5,8 +5,14 @@ import os
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TextIO
 
-from evercal.errors import InputError
+from evercal.errors import InputError, printable
+
+
+def say(text: str, file: TextIO | None = None) -> None:
+    """Print text, to stdout by default, with control characters escaped."""
+    print(printable(text), file=file, flush=True)
 
 
 def print_json(record: object) -> None:
@@ -16,7 +22,7 @@ def print_json(record: object) -> None:
 
 def print_next(*words: object) -> None:
     """Print the command to run next; words in capitals are placeholders."""
-    print("next: " + shlex.join(str(word) for word in words))
+    say("next: " + shlex.join(str(word) for word in words))
 
 
 def table(rows: Sequence[Mapping[str, object]]) -> list[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evercal.cli import args
-from evercal.cli.console import require_folder, size
+from evercal.cli.console import require_folder, say, size
 from evercal.errors import InputError
 from evercal.progress import Bars, following, progress_bar
 
@@ -137,7 +137,7 @@ def _learn(cell: "Map", scene: "Recording", result: "DemoResult", quiet: bool) -
     if not quiet:
         kept = f"{room.keyframes} keyframes, {room.landmarks} landmarks"
         time_and_size = f"{room.seconds:.0f} s; {size(result.memory_bytes)} for all rooms"
-        print(f"mapped {room.room}: {room.images} images, {kept}, {time_and_size}")
+        say(f"mapped {room.room}: {room.images} images, {kept}, {time_and_size}")
 
 
 def _localize_unknown(cell: "Map", scene: "Recording", result: "DemoResult") -> None:

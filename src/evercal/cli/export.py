@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional
 
 from evercal.cli import args
-from evercal.errors import InputError
+from evercal.cli.console import say
+from evercal.errors import InputError, printable
 
 if TYPE_CHECKING:
     from evercal.calibration.export.formats import Exported
@@ -77,13 +78,13 @@ class Export(args.Verb):
         calibration = exported.calibration
         child, verdict = calibration.child_frame, calibration.verdict
         if exported.format.frame == "tf" and self.via is None and "optical" in child:
-            print(
+            say(
                 f"note: most camera drivers publish {child} themselves; if yours does, give its"
                 f" root frame with --via, because a tf frame has only one parent",
-                file=sys.stderr,
+                sys.stderr,
             )
         if self.out is None and not self.json:
-            sys.stdout.write(exported.text)
+            sys.stdout.write(printable(exported.text))
             return
         record = {
             "format": self.format,

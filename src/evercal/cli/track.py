@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
-from evercal.cli.console import require_writable
+from evercal.cli.console import require_writable, say
 from evercal.errors import InputError
 from evercal.reports.answers import unit_known
 
@@ -63,7 +63,7 @@ class Track(args.Verb):
         with ExitStack() as stack:
             files = [stack.enter_context(TrackFile(path)) for path in self.out]
             try:
-                for name, stamp, image in frames:
+                for name, stamp, image, _ in frames:
                     if tracker is None:
                         camera = args.stated_camera(self.camera, (image.shape[1], image.shape[0]))
                         tracker = Tracker(localizer, camera, options)
@@ -74,7 +74,7 @@ class Track(args.Verb):
                     for file in files:
                         file.write(frame, track_row(frame, name, known))
                     if not self.json:
-                        print(_line(name, frame), flush=True)
+                        say(_line(name, frame))
                     if self.most is not None and len(times) >= self.most:
                         break
             except KeyboardInterrupt:

@@ -15,6 +15,7 @@ from tyro.conf import Positional, arg
 
 from evercal.cli import args
 from evercal.cli.check import Reference, shift_line
+from evercal.cli.console import say
 from evercal.errors import InputError
 from evercal.reports.answers import shift_dict
 
@@ -114,7 +115,7 @@ class Arrivals:
         for path in sorted(states, key=lambda path: (states[path][0], path.name)):
             if self._broken.get(path) == states[path]:
                 self._done.add(path)
-                print(f"warning: {path}: not a readable image, skipped", file=sys.stderr)
+                say(f"warning: {path}: not a readable image, skipped", sys.stderr)
                 continue
             try:
                 pixels = read_image(path)

@@ -28,10 +28,11 @@ from evercal.features.encoder import load_encoder
 from evercal.features.weights_file import network_bytes
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.store import KEYFRAMES, is_free, write_encoder
+from evercal.mapping.store import KEYFRAMES, write_encoder
+from evercal.recordings.frame import checked_name
 from evercal.storage.atomic import write_bytes, write_json
 from evercal.storage.manifest import Manifest
-from evercal.storage.stages import STAGES, StageStore, read_store, write_report
+from evercal.storage.stages import STAGES, StageStore, read_store, require_free, write_report
 from evercal.storage.tensors import load_tensors, save_tensors
 
 HEAD, RECORD = "head.safetensors", "network.json"
@@ -60,8 +61,7 @@ class NetworkStore(StageStore):
         By default it has the shipped weights. The sibling `descriptor.safetensors` of another
         encoder's file is used, if it fits.
         """
-        if root.exists() and not is_free(root):
-            raise InputError(f"store {root}: exists and is not an evercal store; give another path")
+        require_free(root)
         if encoder is None:
             networks = load_encoder(), load_descriptor()
         else:
@@ -193,6 +193,7 @@ def _plain(record: SceneRecord) -> dict[str, Any]:
 
 def _read_record(folder: Path) -> SceneRecord:
     content = json.loads((folder / RECORD).read_text())
+    checked_name(content["name"])
     cell, refined = content["cell"], content["refined_camera"]
     read = {
         "camera": Camera.from_dict(content["camera"]),

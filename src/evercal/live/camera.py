@@ -45,7 +45,7 @@ class StreamCamera:
 
     def read(self) -> tuple[float, Image]:
         """Take the next image; an error of a live source is raised here."""
-        frame = next(self._frames, None) if self._thread is None else self._after(time.time())
+        frame = next(self._frames, None) if self._thread is None else self._after(time.monotonic())
         if frame is None:
             raise InputError(f"{self._source}: no more frames; check the camera or give another")
         return frame.stamp_s, frame.image
@@ -68,11 +68,11 @@ class StreamCamera:
         """Release the source."""
         self.close()
 
-    def _after(self, stamp_s: float) -> StreamFrame | None:
-        """The first live frame at or after a time; None if the stream ends or none arrives."""
+    def _after(self, asked_s: float) -> StreamFrame | None:
+        """The first frame that arrives after a time; None if the stream ends or none arrives."""
 
         def arrived() -> bool:
-            return self._frame is not None and self._frame.stamp_s >= stamp_s
+            return self._frame is not None and self._frame.arrived_s >= asked_s
 
         with self._changed:
             self._changed.wait_for(lambda: self._ended or arrived(), self._timeout_s)

@@ -36,7 +36,7 @@ class PoseFileRobot:
 
     The last complete line counts. The file may appear later. `convention`, such as `kuka`, is that
     of numbers without a header. A file that was last changed more than `most_age_s` seconds ago is
-    refused as stale.
+    refused as stale, as is one that was changed in the future.
     """
 
     def __init__(
@@ -48,7 +48,13 @@ class PoseFileRobot:
         """Read the pose of the last complete line, or raise InputError if there is none."""
         pose = read_last_robot_pose(self._path, self._convention)
         if self._most_age_s is not None:
-            age = time.time() - self._path.stat().st_mtime
+            changed_s = self._path.stat().st_mtime  # first: it may be written at any time
+            age = time.time() - changed_s
+            if age < 0:
+                raise InputError(
+                    f"{self._path}: last written {-age:.1f} s in the future; set the clocks of this"
+                    " machine and of the one that writes it"
+                )
             if age > self._most_age_s:
                 raise InputError(
                     f"{self._path}: last written {age:.1f} s ago, at most {self._most_age_s:g} s"

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from evercal.errors import InputError
-from evercal.mapping.scene_map import SceneMap
+from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.mapping.store import PREVIOUS, SCENE, MapStore, read_scene, require_map
-from evercal.recordings.held_out import checked_name
+from evercal.recordings.frame import checked_name
 from evercal.storage.archive import ArchiveLimits, check_archive, extract_archive, write_archive
 from evercal.storage.atomic import replace_folder, write_bytes, write_json
 from evercal.storage.manifest import MANIFEST, Manifest
-from evercal.storage.stages import REPORT, STAGES, StageStore, is_store, read_store
+from evercal.storage.stages import REPORT, STAGES, StageStore, is_store, read_store, require_free
 
 OnClash = Literal["refuse", "rename", "skip", "replace"]
 """What `merge` does with a scene whose name is taken."""
@@ -92,9 +92,9 @@ def merge_maps(
         raise InputError("no map given; name one or more to merge")
     is_new = not is_store(store.root)
     maps = [_incoming(Path(other)) for other in others]
+    contents = store.contents
     if is_new:
-        opened = MapStore.open(Path(others[0])).contents
-        store.contents = opened.empty().to(store.contents.device)
+        contents = MapStore.open(Path(others[0])).contents.empty().to(contents.device)
     first = maps[0][0] if is_new else Manifest.read(store.root)
     incoming: dict[str, _Incoming] = {}
     kept = {scene.name: i for i, scene in enumerate(store.contents.scenes)}
@@ -123,7 +123,8 @@ def merge_maps(
                     renamed.append((item.scene.name, name))
             incoming[name] = item
     if incoming:
-        _commit(store, list(kept.values()), incoming, first if is_new else None, Path(others[0]))
+        networks = first if is_new else None
+        _commit(store, list(kept.values()), incoming, contents, networks, Path(others[0]))
     return Merged(tuple(incoming), tuple(renamed), tuple(skipped), tuple(replaced))
 
 
@@ -152,6 +153,8 @@ def unpack_map(file: Path, folder: Path, limits: ArchiveLimits | None = None) ->
     The archive is not trusted: paths, links, sizes, checksums and schema are checked, and every
     scene is read, before the folder appears.
     """
+    if folder.is_dir() and not is_store(folder):
+        require_free(folder)
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder}: exists; give a new folder")
     if not file.is_file():
@@ -226,6 +229,7 @@ def _commit(
     store: MapStore,
     kept: Sequence[int],
     incoming: dict[str, _Incoming],
+    contents: MapContents,
     networks: Manifest | None,
     source: Path,
 ) -> None:
@@ -244,10 +248,11 @@ def _commit(
             _write_name(folder, name)
 
     added = [(name, partial(copy, name, item)) for name, item in incoming.items()]
-    store.change([store.stages[i] for i in kept], added, store.payload)
+    payload = {**store.payload, "short_side": contents.short_side}
+    store.change([store.stages[i] for i in kept], added, payload)
     new = [replace(item.scene, name=name) for name, item in incoming.items()]
-    scenes = [*(store.contents.scenes[i] for i in kept), *new]
-    store.contents = replace(store.contents, scenes=scenes)
+    scenes = [*(contents.scenes[i] for i in kept), *new]
+    store.contents = replace(contents, scenes=scenes)
 
 
 def _copy(root: Path, file: str, manifest: Manifest, target: Path) -> None:

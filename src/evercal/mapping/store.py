@@ -27,6 +27,7 @@ from evercal.geometry import SE3, Camera
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity
 from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.recordings.frame import checked_name
 from evercal.storage.atomic import write_bytes, write_json
 from evercal.storage.manifest import Manifest
 from evercal.storage.stages import (
@@ -35,6 +36,7 @@ from evercal.storage.stages import (
     StageStore,
     is_store,
     read_store,
+    require_free,
     write_report,
 )
 from evercal.storage.tensors import load_tensors, save_tensors
@@ -101,8 +103,7 @@ class MapStore(StageStore):
         `root` must not exist or be empty. The encoder is a weights file, a module that is an
         `Encoder`, or by default the shipped one.
         """
-        if root.exists() and not is_free(root):
-            raise InputError(f"store {root}: exists and is not an evercal store; give another path")
+        require_free(root)
         if isinstance(encoder, nn.Module):
             local: Encoder = checked_encoder(encoder)
         else:
@@ -202,7 +203,7 @@ def stored_scenes(root: Path) -> list[tuple[str, Camera, dict[str, Any]]]:
         scenes = [json.loads((folder / SCENE).read_text()) for folder in folders]
         reports = [json.loads((folder / REPORT).read_text()) for folder in folders]
         return [
-            (scene["name"], Camera.from_dict(scene["adjusted_camera"]), report)
+            (checked_name(scene["name"]), Camera.from_dict(scene["adjusted_camera"]), report)
             for scene, report in zip(scenes, reports, strict=True)
         ]
 
@@ -217,16 +218,6 @@ def require_map(root: Path, manifest: Manifest) -> dict[str, Any]:
             f"store {root}: holds networks of strategy {payload.get('strategy')!r}, not a map"
         )
     return payload
-
-
-def is_free(root: Path) -> bool:
-    """Whether a store can be made at a path: nothing there, or what a killed writer left."""
-    if not root.is_dir():
-        return False
-    return all(
-        path.name == "stages" or path.name.startswith(("encoder-", "vlad-", "descriptor-", "."))
-        for path in root.iterdir()
-    )
 
 
 def write_encoder(root: Path, encoder: Encoder, centroids: bool = True) -> tuple[str, ...]:
@@ -283,6 +274,7 @@ def _read_scene(folder: Path) -> SceneMap:
     values: dict[str, Any] = {name: content[name] for name in _FIELDS}
     for name in ("camera", "adjusted_camera"):
         values[name] = Camera.from_dict(values[name])
+    checked_name(values["name"])
     return SceneMap(
         keyframes=Keyframes.from_tensors(load_tensors(folder / KEYFRAMES)),
         frame=frame_of(content["frame"], correction),

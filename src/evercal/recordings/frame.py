@@ -1,5 +1,6 @@
 """Frames with camera and poses, in recordings with a split into training and test frames."""
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from evercal.recordings.images import StoredImage, as_rgb, read_image
 
 MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
 MIN_GRIPPER_FRAMES = 8  # the same for a camera on the gripper: a few views around one place
+_NAME = 200  # most characters of a name
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +81,17 @@ class Recording:
     metric: bool = True
     """Whether lengths are metres; False where their unit is unknown, as in structure from motion.
     `base_from_camera` is then in that unit."""
+
+
+def checked_name(name: str) -> str:
+    """A name that a scene can have."""
+    plain = name.isprintable() and not re.search(r"[/\\=]", name)
+    if not name.strip() or name.startswith(".") or len(name) > _NAME or not plain:
+        raise InputError(
+            f"scene name {name[:_NAME]!r}: give one of at most {_NAME} characters that is not"
+            " empty, does not begin with a dot and holds no slash, '=' or control character"
+        )
+    return name
 
 
 def require_images(frames: Iterable[Frame], file: Path) -> None:

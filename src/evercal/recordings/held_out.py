@@ -1,11 +1,10 @@
 """Before a recording is learned: its name, its frames and poses, and the held-out frames."""
 
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from evercal.errors import InputError
-from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording
+from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording, checked_name
 
 EVERY, BLOCK = 100, 4
 
@@ -39,16 +38,6 @@ def named_recording(recording: Recording, name: str | None, taken: Iterable[str]
     if name in taken:
         raise InputError(f"scene {name!r}: a scene of this name exists; give another with --name")
     return replace(recording, name=name)
-
-
-def checked_name(name: str) -> str:
-    """A name that a scene can have."""
-    if not name.strip() or name.startswith(".") or re.search(r"[/\\=\x00-\x1f]", name):
-        raise InputError(
-            f"scene name {name!r}: give one that is not empty, does not begin with a dot and holds"
-            " no slash, '=' or line break"
-        )
-    return name
 
 
 def require_frames(recording: Recording, least: int = MIN_TRAIN_FRAMES) -> None:

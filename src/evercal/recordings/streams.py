@@ -29,6 +29,8 @@ class StreamFrame(NamedTuple):
     """Seconds: in the file's name, since the start of a video, or of arrival (Unix time)."""
     image: NDArray[np.uint8]
     """(H, W, 3) RGB."""
+    arrived_s: float = 0.0
+    """Time of arrival of a live frame by `time.monotonic`, which cannot be set back."""
 
 
 def is_live(source: str) -> bool:
@@ -79,9 +81,10 @@ def _captured(source: str) -> Iterator[StreamFrame]:
                 if not good:
                     unreadable += 1
                     continue
+                arrived = time.monotonic()
                 stamp = time.time() if live else capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
                 image = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-                yield StreamFrame(str(number), stamp, image)
+                yield StreamFrame(str(number), stamp, image, arrived)
                 number, unreadable = number + 1, 0
         finally:
             capture.release()

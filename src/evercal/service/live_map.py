@@ -5,7 +5,7 @@ import os
 import threading
 from pathlib import Path
 
-from evercal.errors import InputError
+from evercal.errors import InputError, printable
 from evercal.map import Map
 from evercal.storage.manifest import MANIFEST
 
@@ -34,7 +34,9 @@ class LiveMap:
             except Exception as error:
                 if not isinstance(error, InputError):  # perhaps for a moment only: try again
                     self._stamp = None
-                logging.getLogger(__name__).warning("%s; the last state is served", error)
+                logging.getLogger(__name__).warning(
+                    "%s; the last state is served", printable(str(error))
+                )
             return True
 
     def _opened(self) -> Map:

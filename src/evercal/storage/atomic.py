@@ -72,11 +72,14 @@ def replace_folder(temporary: str | os.PathLike[str], final: str | os.PathLike[s
     aside = _aside(final)
     if final.exists():
         os.replace(final, aside)
-    os.replace(temporary, final)
+    try:
+        os.replace(temporary, final)
+    except BaseException:
+        recover_folder(final)
+        raise
     _sync_folder(final.parent)
-    if aside.exists():
-        shutil.rmtree(aside)
-        _sync_folder(final.parent)
+    shutil.rmtree(aside, ignore_errors=True)
+    _sync_folder(final.parent)
 
 
 def recover_folder(final: str | os.PathLike[str]) -> None:
@@ -102,11 +105,10 @@ def _sync(file: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    try:
+    # An error is no refusal, as in SQLite: the rename is done, and some systems cannot sync it.
+    with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

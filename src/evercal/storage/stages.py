@@ -8,13 +8,16 @@
 A file that the manifest does not list is not part of the store. One process writes at a time, under
 a lock beside the folder. Readers need no lock: they read again if a writer replaced files.
 What the files mean is up to the kind of store: a map or networks.
+
+A change first writes `.writing`, the names of the stages that it adds and drops, and removes it
+last. After a crash the next change removes those that the manifest does not list, and no others.
 """
 
 import json
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,7 +30,10 @@ from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
 SCHEMA = 6
 STAGES = "stages"
 REPORT = "report.json"
-_STAGE = re.compile(r"\d{4,}-[\w.~-]*")
+_STAGE = re.compile(r"(\d{4,})-[\w.~-]*")
+_JOURNAL = ".writing"
+_NETWORKS = ("encoder-", "vlad-", "descriptor-")
+"""Beginnings of the names of network files."""
 _MADE = "made"
 """Key of the payload: the stages ever added. No name is used again after its stage was removed."""
 Result = TypeVar("Result")
@@ -38,6 +44,27 @@ Write = Callable[[Path], None]
 def is_store(root: Path) -> bool:
     """Whether a folder holds a store."""
     return (root / MANIFEST).is_file()
+
+
+def require_free(root: Path) -> None:
+    """Refuse a path where no store can be made; what a killed writer left does not count."""
+    if not root.exists():
+        return
+    if not root.is_dir() or not all(
+        path.name == STAGES or path.name.startswith((*_NETWORKS, ".")) for path in root.iterdir()
+    ):
+        raise InputError(f"store {root}: exists and is not an evercal store; give another path")
+    _require_no_scenes(root)
+
+
+def _require_no_scenes(root: Path) -> None:
+    left = {*_journal(root, "new")}
+    for path in (root / STAGES).glob("*"):
+        if not path.name.startswith(".") and path.name not in left:
+            raise InputError(
+                f"store {root}: holds scenes but no {MANIFEST}; restore it from a copy, or give"
+                " another path"
+            )
 
 
 def read_store(root: Path, read: Callable[[Manifest], Result]) -> Result:
@@ -116,6 +143,8 @@ class StageStore:
             before = Manifest.read(self.root) if is_store(self.root) else None
             if self.stages != (before.payload["stages"] if before else []):
                 raise InputError(f"store {self.root}: another process has changed it; run it again")
+            if before is None:
+                _require_no_scenes(self.root)
             yield before
         finally:
             self._lock.release()
@@ -146,14 +175,16 @@ class StageStore:
             payload: Settings of the store.
             superseded: Files of kept stages that are dropped.
         """
-        with self.writing() as before:
-            made, new = _made(before), []
-            for number, (name, write) in enumerate(added, made + 1):
+        with self._changing() as before:
+            made, new = _made(before), {}
+            # A folder that the manifest does not list keeps its name.
+            names = map(_STAGE.fullmatch, _names(self.root / STAGES))
+            first = 1 + max([made, *(int(name[1]) for name in names if name)])
+            for number, (name, write) in enumerate(added, first):
                 legal = re.sub(r"[^\w.-]", "_", name)[:60]
-                new.append(f"{number:04d}-{legal}")
-                write(self._empty(new[-1]))
-            settings = {**payload, _MADE: made + len(new)}
-            self._publish([*kept, *new], new, settings, before, superseded)
+                new[f"{number:04d}-{legal}"] = write
+            made = max([made, *range(first, first + len(new))])
+            self._publish([*kept, *new], new, {**payload, _MADE: made}, before, superseded)
 
     def replace(self, index: int, write: Write, payload: Mapping[str, object]) -> None:
         """Replace a stage: whole, or not at all.
@@ -161,19 +192,24 @@ class StageStore:
         `write` changes files in a copy of the stage's folder.
         """
         old = self.stages[index]
-        stem, _, version = old.partition("~")
-        stage = f"{stem}~{int(version or 1) + 1}"
-        with self.writing() as before:
+
+        def write_copy(folder: Path) -> None:
+            for file in before.files if before else ():
+                if file.startswith(f"{STAGES}/{old}/"):
+                    shutil.copyfile(self.root / file, folder / Path(file).name)
+            write(folder)
+
+        with self._changing() as before:
             assert before is not None, "a store with stages has a manifest"
             _check(self.root, before)  # copies get checksums of their own
-            temporary = self._empty(stage)
-            for file in before.files:
-                if file.startswith(f"{STAGES}/{old}/"):
-                    shutil.copyfile(self.root / file, temporary / Path(file).name)
-            write(temporary)
+            stem, _, version = old.partition("~")
+            number, taken = int(version or 1) + 1, _names(self.root / STAGES)
+            while f"{stem}~{number}" in taken:
+                number += 1
+            stage = f"{stem}~{number}"
             stages = [*self.stages[:index], stage, *self.stages[index + 1 :]]
             settings = {**payload, _MADE: _made(before)}
-            self._publish(stages, [stage], settings, before, lambda _: False)
+            self._publish(stages, {stage: write_copy}, settings, before, lambda _: False)
 
     def reports(self) -> list[dict[str, Any]]:
         """`report.json` of every stage, in order."""
@@ -184,20 +220,43 @@ class StageStore:
         manifest = Manifest.read(self.root)
         return {file: int(str(record["bytes"])) for file, record in manifest.files.items()}
 
-    def _empty(self, stage: str) -> Path:
-        folder = self.folder(f".{stage}")
-        shutil.rmtree(folder, ignore_errors=True)  # left by a writer that was killed
-        folder.mkdir(parents=True)
-        return folder
+    @contextmanager
+    def _changing(self) -> Iterator[Manifest | None]:
+        """As `writing`; a change that is refused leaves no file, on disk or in memory."""
+        networks = self.networks
+        with self.writing() as before:
+            _tidy(self.root)
+            exists, there = self.root.exists(), _names(self.root)
+            try:
+                yield before
+            except BaseException:
+                self.networks = networks
+                _tidy(self.root)
+                if not is_store(self.root):
+                    for name in _names(self.root) - there:
+                        if name.startswith(_NETWORKS):
+                            (self.root / name).unlink(missing_ok=True)
+                new = [] if STAGES in there else [self.root / STAGES]
+                for folder in new if exists else [*new, self.root]:
+                    with suppress(OSError):  # it is not there, or holds something else
+                        folder.rmdir()
+                raise
+            _tidy(self.root)
 
     def _publish(
         self,
         stages: list[str],
-        new: Sequence[str],
+        new: Mapping[str, Write],
         payload: Mapping[str, object],
         before: Manifest | None,
         superseded: Callable[[str], bool],
     ) -> None:
+        self.root.mkdir(parents=True, exist_ok=True)
+        dropped = [stage for stage in self.stages if stage not in stages]
+        write_json(self.root / _JOURNAL, {"new": [*new], "dropped": dropped})
+        for stage, write in new.items():
+            self.folder(f".{stage}").mkdir(parents=True)
+            write(self.folder(f".{stage}"))
         files = [*self.networks]
         for stage in new:
             replace_folder(self.folder(f".{stage}"), self.folder(stage))
@@ -209,19 +268,43 @@ class StageStore:
         settings = {"schema": SCHEMA, **payload, "networks": list(self.networks), "stages": stages}
         write_manifest(self.root, settings, files, before)
         self.stages = stages
-        self._tidy(set(files))
 
-    def _tidy(self, files: set[str]) -> None:
-        for folder in (self.root / STAGES).iterdir():
-            if folder.name not in self.stages:
-                if _STAGE.fullmatch(folder.name.removeprefix(".")):
-                    shutil.rmtree(folder, ignore_errors=True)
-                continue
-            for path in folder.iterdir():
-                if f"{STAGES}/{folder.name}/{path.name}" not in files:
-                    path.unlink(missing_ok=True)
-        for unfinished in self.root.glob(".*.tmp"):
-            unfinished.unlink(missing_ok=True)
+
+def _tidy(root: Path) -> None:
+    """Remove what a change has dropped, or has left because it was refused or killed."""
+    manifest = Manifest.read(root) if is_store(root) else None
+    stages, files = (manifest.payload["stages"], manifest.files) if manifest else ([], {})
+    left = {*_journal(root, "new"), *_journal(root, "dropped")}.difference(stages)
+    for name in _names(root / STAGES):
+        folder = root / STAGES / name
+        if name in left or (name.startswith(".") and _STAGE.fullmatch(name[1:])):
+            shutil.rmtree(folder, ignore_errors=True)
+        elif name in stages:
+            for file in _names(folder):
+                if f"{STAGES}/{name}/{file}" not in files:
+                    with suppress(OSError):
+                        (folder / file).unlink()
+    with suppress(OSError):
+        for unfinished in root.glob(".*.tmp"):
+            unfinished.unlink()
+        if not left & _names(root / STAGES):
+            (root / _JOURNAL).unlink()
+
+
+def _journal(root: Path, key: str) -> list[str]:
+    """Stages in `.writing`; none where another program has written it."""
+    try:
+        names = json.loads((root / _JOURNAL).read_bytes())[key]
+        return [name for name in names if _STAGE.fullmatch(name)]
+    except (OSError, ValueError, TypeError, KeyError):
+        return []
+
+
+def _names(folder: Path) -> set[str]:
+    try:
+        return {path.name for path in folder.iterdir()}
+    except OSError:
+        return set()
 
 
 def _made(manifest: Manifest | None) -> int:

@@ -21,13 +21,15 @@ from evercal.map import Map
 from evercal.recordings.images import write_jpeg
 from evercal.recordings.poses.camera_file import read_camera
 from evercal.service.studio.devices import Connection, Devices, Which
-from evercal.storage import write_json
+from evercal.storage import sha256_file, write_json
 
 FIXED_IMAGES = 8
 """Images of a series of the fixed camera."""
 _CANDIDATES = 200
 _TURN_RAD, _ROLL_RAD, _NEARER = np.deg2rad(30.0), np.deg2rad(40.0), 0.25
 """How far proposed views may lie from recorded ones where reachable poses are unknown."""
+_TABLE = "robot_poses_sha256"
+"""Entry of a calibration's source: checksum of the samples' table of poses."""
 
 _measured = cache(Sample.of)
 
@@ -81,9 +83,12 @@ class Studio:
     @property
     def samples_changed(self) -> bool:
         """Whether samples were added or removed since they were learned."""
-        files = self.out / "wrist" / POSES, self.calibration_file("wrist")
-        times = [file.stat().st_mtime_ns for file in files if file.is_file()]
-        return len(times) < 2 or times[0] > times[1]
+        found = self.calibrations.get("wrist")
+        return found is None or found.source.get(_TABLE) != self._table_sha256()
+
+    def _table_sha256(self) -> str | None:
+        table = self.out / "wrist" / POSES
+        return sha256_file(table) if table.is_file() else None
 
     @property
     def fixed_images(self) -> list[Path]:
@@ -166,6 +171,7 @@ class Studio:
         The scene that the studio learned before is replaced once the new one is in the map.
         """
         old, cell, path = self.scene, self.cell, self.calibration_file("wrist")
+        table = self._table_sha256()
         scene = _free_name("wrist", cell.scenes)
         report = cell.learn(self.out / "wrist", name=scene, on_progress=on_step)
         if old is not None:
@@ -176,6 +182,7 @@ class Studio:
         scenes = cell.localizer.contents.scenes
         camera = next(found.adjusted_camera for found in scenes if found.name == scene)
         calibration = report.hand_eye.calibration(camera, scene, report.train_frames)
+        calibration = replace(calibration, source={**calibration.source, _TABLE: table})
         calibration.write(path)
         self._keep("wrist", calibration)
         return f"Learned {report.train_frames} images; wrote {path}."
