@@ -1,5 +1,8 @@
 """The one exception that a user is meant to read."""
 
+_LONGEST = 2_000
+"""Characters of a message, which may repeat what came from outside."""
+
 
 class InputError(Exception):
     """Misuse or bad input.
@@ -11,7 +14,9 @@ class InputError(Exception):
     """
 
     def __init__(self, message: str = ""):
-        super().__init__(printable(" ".join(str(message).splitlines())))
+        text = str(message)
+        text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
+        super().__init__(printable(" ".join(text.splitlines())))
 
 
 def printable(text: str) -> str:

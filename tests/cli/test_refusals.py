@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -251,3 +252,17 @@ def test_missing_device_is_refused(run: Any, hall_store: Path, folder: Path) -> 
     ran = run("localize", hall_store, "image.png", "--device", "cuda")
     assert (ran.code, len(ran.err)) == (2, 1)
     assert ran.err[0].startswith("error: device 'cuda': ")
+
+
+def test_limits_hold_for_files_and_for_opencv(tmp_path: Path) -> None:
+    """In a process of its own: OpenCV reads its limit once, when it is loaded."""
+    write_image(tmp_path / "a.png", np.zeros((40, 50, 3), np.uint8))
+    command = [sys.executable, "-m", "evercal", "detect", str(tmp_path / "a.png")]
+    command += ["--board", "chessboard", "--size", "9x6", "--square-mm", "25"]
+    ends = []
+    for limits in ("pixels=1999", "pixels=2e3"):
+        words = [*command, "--limits", limits, "--out", str(tmp_path / "found.json")]
+        ends.append(subprocess.run(words, capture_output=True, text=True).stderr)
+    assert "a.png: not a readable image" in ends[0]
+    assert "of at most 1,999 pixels" in ends[0]
+    assert "not a readable image" not in ends[1]

@@ -52,9 +52,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             os.environ.setdefault(name, value)
     try:
         command = _parse(words, as_json)
-        code = command if isinstance(command, int) else command.run()
+        if not isinstance(command, int):
+            command.set_limits()
+            command = command.run()
         sys.stdout.flush()  # here, where a closed pipe is handled
-        return code
+        return command
     except InputError as error:
         return _complain(str(error), as_json)
     except BrokenPipeError:

@@ -1,6 +1,7 @@
 """Arguments that several verbs share, and what they stand for."""
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from tyro.conf import Positional, arg
 
+from evercal.bounds import VARIABLE, bounds
 from evercal.cli.console import print_json, print_next, say
 from evercal.errors import InputError
 
@@ -63,10 +65,18 @@ class Verb:
 
     json: bool = False
     """Print one JSON object."""
+    limits: Annotated[str, shown("NAME=N,...", "(default: none)")] = ""
+    """Read larger files than usual; a refusal names the limit, such as pixels or text_bytes."""
 
     def run(self) -> int:
         """Run and return the exit code."""
         raise NotImplementedError
+
+    def set_limits(self) -> None:
+        """Bound what is read, also in worker processes; called before OpenCV is loaded."""
+        if self.limits:
+            os.environ[VARIABLE] = self.limits
+        os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(bounds().pixels))
 
     def answer(self, record: object, *lines: str, then: Sequence[object] = ()) -> None:
         """Print a record as JSON; else lines, and the words of the command to run next."""
