@@ -1,11 +1,15 @@
 """The wheel contains everything the package reads."""
 
+import re
 import subprocess
 import sys
 import zipfile
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "evercal"
@@ -43,3 +47,44 @@ def test_wheel_contains_every_module_and_nothing_else(wheel: set[str]) -> None:
     assert modules <= wheel
     assert {name.split("/")[0].split("-")[0] for name in wheel} == {"evercal"}
     assert not [name for name in wheel if name.startswith("evercal/") and "test" in name]
+
+
+def brought(name: str, extras: frozenset[str], found: dict[str, str]) -> dict[str, str]:
+    """Versions of a distribution and of all that its installation brings, by name."""
+    try:
+        installed = distribution(name)
+    except PackageNotFoundError:  # of another system, or of a tool that is not installed
+        return found
+    found[canonicalize_name(name)] = installed.version.partition("+")[0]
+    for line in installed.requires or ():
+        wanted = Requirement(line)
+        key = canonicalize_name(wanted.name)
+        applies = wanted.marker is None or any(
+            wanted.marker.evaluate({"extra": extra}) for extra in (*extras, "")
+        )
+        if applies and (key not in found or wanted.extras):
+            brought(wanted.name, frozenset(wanted.extras), found)
+    return found
+
+
+def pins() -> dict[str, str]:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pairs = (line.split("==") for line in lines if not line.startswith("#"))
+    return {canonicalize_name(name): version for name, version in pairs}
+
+
+def test_every_version_that_an_installation_brings_is_pinned() -> None:
+    everything = brought("evercal", frozenset({"dev"}), {})
+    del everything["evercal"]
+    assert len(everything) > 120
+    pinned = pins()
+    lacking = {n: v for n, v in everything.items() if pinned.get(n) != v}
+    assert not lacking, "constraints.txt was made from other versions"
+
+
+def test_the_licence_of_every_package_is_listed() -> None:
+    page = (ROOT / "docs" / "licences.md").read_text(encoding="utf-8")
+    listed = {canonicalize_name(name) for name in re.findall(r"^\| ([\w.-]+) \|", page, re.M)}
+    for extras in ((), ("serve", "bags", "colmap", "lerobot", "urdf", "view")):
+        everything = brought("evercal", frozenset(extras), {})
+        assert everything.keys() - {"evercal"} <= listed
