@@ -40,7 +40,7 @@ FOR_ALL = ("bounds", "errors", "processes", "progress")
 FACES = ("__init__", "__main__")
 """Modules of the root that may import everything."""
 PRODUCT = ORDER[: ORDER.index("simulation")]
-MOST_LOCALIZING, MOST_LEARNING = 42, 63
+MOST_LOCALIZING, MOST_LEARNING = 43, 64
 """Modules of evercal that a program loads, at most."""
 
 

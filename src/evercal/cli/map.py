@@ -183,5 +183,8 @@ class Map:
         | Annotated[Unpack, subcommand("unpack")]
     ]
 
+    def set_limits(self) -> None:
+        self.action.set_limits()
+
     def run(self) -> int:
         return self.action.run()
