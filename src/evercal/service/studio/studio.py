@@ -83,8 +83,8 @@ class Studio:
     @property
     def samples_changed(self) -> bool:
         """Whether samples were added or removed since they were learned."""
-        found = self.calibrations.get("wrist")
-        return found is None or found.source.get(_TABLE) != self._table_sha256()
+        found, table = self.calibrations.get("wrist"), self._table_sha256()
+        return found is None or table is None or found.source.get(_TABLE) != table
 
     def _table_sha256(self) -> str | None:
         table = self.out / "wrist" / POSES
