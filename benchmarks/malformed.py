@@ -88,13 +88,6 @@ def _text(rng: random.Random) -> bytes:
     return _request("POST", path, body, "multipart/form-data; boundary=edge")
 
 
-def _black(rng: random.Random) -> bytes:
-    """Images that are small as files and large as pixels; their last bytes are missing."""
-    data = png(4_900)[:-8]
-    body = _form(*[("images", f"{i}.png", data) for i in range(rng.choice([1, 15]))])
-    return _request("POST", "/calibrations", body, "multipart/form-data; boundary=edge")
-
-
 def _wrong_length(rng: random.Random) -> bytes:
     length = rng.choice([10**12, 10**30])
     return _request("POST", rng.choice(PATHS[:3]), b"x", "application/octet-stream", length=length)
@@ -122,7 +115,7 @@ def _no_http(rng: random.Random) -> bytes:
 
 
 KINDS: tuple[Callable[[random.Random], bytes], ...] = (
-    _images, _images, _images, _text, _text, _black, _traversal, _wrong_length, _no_http,
+    _images, _images, _images, _text, _text, _traversal, _wrong_length, _no_http,
 )  # fmt: skip
 
 
@@ -130,3 +123,11 @@ def malformed(seed: int) -> bytes:
     """A request that no service may accept."""
     rng = random.Random(seed)
     return rng.choice(KINDS)(rng)
+
+
+def heavy(seed: int) -> bytes:
+    """A request for black images that are small as files and large as pixels."""
+    rng = random.Random(seed)
+    data = png(4_900)[:-8]
+    body = _form(*[("images", f"{i}.png", data) for i in range(rng.choice([1, 15]))])
+    return _request("POST", "/calibrations", body, "multipart/form-data; boundary=edge")

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 import urllib3
 
-from benchmarks.malformed import malformed
+from benchmarks.malformed import heavy, malformed
 from benchmarks.rows import Row, save
 from evercal import InputError, Map, Recording, load_recording
 from evercal.processes import python_command
@@ -206,7 +206,7 @@ def _bad(service: _Service, count: int) -> Row:
     times = []
 
     def send(number: int) -> None:
-        status = service.send(malformed(number))
+        status = service.send(malformed(number) if number % 20 else heavy(number))
         statuses[f"{status // 100}xx" if status else "closed"] += 1
 
     for number in range(count):

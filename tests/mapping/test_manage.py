@@ -330,7 +330,9 @@ def test_a_map_that_lost_its_manifest_keeps_its_scenes(
         lambda: NetworkStore.create(root, "finetune"),
         lambda: unpack_map(packed, root),
     ):
-        with pytest.raises(InputError, match=r"store: (holds scenes but no manifest\.json; restore|exists)"):
+        with pytest.raises(
+            InputError, match=r"store: (holds scenes but no manifest\.json; restore|exists)"
+        ):
             change()
         assert everything(root) == before
 
