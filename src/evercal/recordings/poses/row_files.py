@@ -100,10 +100,12 @@ def table_cells(lines: Sequence[str]) -> Cells:
 def text_cells(rows: Iterable[Iterable[str]]) -> Cells:
     """(n, k) cells of rows."""
     cells = np.array([list(row) for row in rows], dtype=object)
-    for (row, column), cell in np.ndenumerate(cells):
-        if len(cell) > (most := bounds().cell_characters):
-            where = f"row {row + 1}, column {column + 1}"
-            raise ValueError(f"{where}: {len(cell):,} characters, at most {most:,} are read")
+    lengths = [len(cell) for cell in cells.flat]
+    longest = max(lengths, default=0)
+    if longest > (most := bounds().cell_characters):
+        row, column = divmod(lengths.index(longest), cells.shape[1])
+        where = f"row {row + 1}, column {column + 1}"
+        raise ValueError(f"{where}: {longest:,} characters, at most {most:,} are read")
     return cells
 
 
