@@ -81,7 +81,7 @@ def test_deep_json_is_refused(tmp_path: Path, name: str, read: Read) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("underscores.csv", HEADER.replace("x", "x" + "_" * 16_000) + ROW, "16,001 characters"),
+        ("underscores.csv", HEADER.replace("x", "x" + "_" * 16_000) + ROW, "16,002 characters"),
         ("cell.csv", HEADER + ROW + ROW.replace("a", "a" * 10_000), "row 3, column 1: 10,004 ch"),
         ("columns.csv", HEADER.strip() + ",a" * 50_000 + "\n" + ROW, "50,008 columns, at most 1,0"),
         ("names.csv", HEADER + ROW * 20_000, "'a.png' comes twice"),
