@@ -116,3 +116,10 @@ def test_broken_files_are_refused(tmp_path: Path) -> None:
     refused("pycolmap cannot read the model", load_recording, tmp_path)
     (tmp_path / "none/sparse/0").mkdir(parents=True)
     refused("no COLMAP model", load_recording, tmp_path / "none", format="colmap")
+
+
+def test_names_of_images_stay_inside_the_folder(tmp_path: Path) -> None:
+    make(tmp_path, kind="txt")
+    file = tmp_path / "sparse" / "0" / "images.txt"
+    file.write_text(file.read_text().replace("sub/image-8.png", "../elsewhere.png"))
+    refused("the name of an image stays inside the folder", load_recording, tmp_path)

@@ -1,6 +1,7 @@
 """The folder formats of 7-Scenes and 12-Scenes."""
 
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -191,3 +192,11 @@ def test_missing_folders_are_refused(kitchen: Path) -> None:
     for folder, message in ((kitchen / "seq-02", "seq-02"), (kitchen, "no such folder")):
         shutil.rmtree(folder)
         refused(message, load_recording, kitchen)
+
+
+def test_blank_lines_of_a_calibration_cost_nothing(apartment: Path) -> None:
+    info, before = apartment / "info.txt", load_recording(apartment)
+    info.write_text("\n" * 100_000 + info.read_text())
+    began = time.process_time()
+    assert load_recording(apartment).train[0].camera == before.train[0].camera
+    assert time.process_time() - began < 2
