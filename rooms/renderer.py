@@ -20,7 +20,7 @@ from rooms.materials import Material
 from rooms.shapes import Mesh
 
 _PROBE = """
-import drjit as dr, sys
+import drjit as dr, sys; print(flush=True)
 dr.set_thread_count(1)
 import mitsuba as mi
 mi.set_variant(sys.argv[1])

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import resource
 import shutil
 import time
 import warnings
@@ -232,6 +233,7 @@ def outcomes(name: str, reader: Reader, root: Path) -> Counter[str]:
     files = sorted(path for path in root.glob(reader.pattern) if path.is_file())
     assert files, "there is something to damage"
     counts: Counter[str] = Counter()
+    longest, before_kb = 0.0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for seed in range(COUNT):
         rng = random.Random(f"{name} {seed}")
         victim = rng.choice(files)
@@ -247,9 +249,12 @@ def outcomes(name: str, reader: Reader, root: Path) -> Counter[str]:
             counts["refused" if len(str(error).splitlines()) == 1 else str(error)] += 1
         except Exception as error:
             raise AssertionError(f"{name}: damage {seed} of {victim.name}") from error
-        assert time.monotonic() - began < LONGEST_S, (name, seed)
+        longest = max(longest, time.monotonic() - began)
+        assert longest < LONGEST_S, (name, seed)
         victim.write_bytes(whole)
-    print(f"\n{name}: {dict(counts)}")  # noqa: T201
+    peak_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    memory = f"{before_kb / 1000:.0f} to {peak_kb / 1000:.0f} MB"
+    print(f"\n{name}: {dict(counts)}, most {longest:.2f} s, {memory}")  # noqa: T201
     assert counts.keys() <= {"read", "refused"}
     return counts
 

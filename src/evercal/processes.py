@@ -44,13 +44,21 @@ def python_command(*words: str) -> list[str]:
 def status_of(
     code: str, *words: str, seconds: float, environment: Mapping[str, str] | None = None
 ) -> int | None:
-    """Exit status of Python code in a process of its own; None if it does not end in time."""
-    command = python_command("-c", code, *words)
-    try:
-        done = subprocess.run(command, capture_output=True, timeout=seconds, env=environment)
-    except subprocess.TimeoutExpired:
-        return None
-    return done.returncode
+    """Exit status of Python code in a process of its own; None if it does not end in time.
+
+    The time begins when the code prints a line, after its imports.
+    """
+    command, pipe = python_command("-c", code, *words), subprocess.PIPE
+    with subprocess.Popen(
+        command, stdout=pipe, stderr=subprocess.DEVNULL, env=environment
+    ) as process:
+        assert process.stdout is not None, "it is a pipe"
+        process.stdout.readline()
+        try:
+            return process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            return None
 
 
 def output_of(*command: str) -> str:

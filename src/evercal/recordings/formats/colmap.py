@@ -32,8 +32,8 @@ _PARAMETERS: dict[str, tuple[int, int, int, int, tuple[int | None, ...]]] = {
     "OPENCV": (0, 1, 2, 3, (4, 5, 6, 7)),
     "FULL_OPENCV": (0, 1, 2, 3, (4, 5, 6, 7, 8, 9, 10, 11)),
 }
-_READ = "import pycolmap, sys; pycolmap.Reconstruction(sys.argv[1])"
-_LEAST_S, _SLOWEST_BYTES_PER_S = 10.0, 5e6
+_READ = "import pycolmap, sys; print(flush=True); pycolmap.Reconstruction(sys.argv[1])"
+_LEAST_S, _SLOWEST_BYTES_PER_S = 1.0, 5e6
 """Time for reading a binary model."""
 
 
