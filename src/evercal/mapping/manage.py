@@ -21,7 +21,14 @@ from evercal.recordings.frame import checked_name
 from evercal.storage.archive import ArchiveLimits, check_archive, extract_archive, write_archive
 from evercal.storage.atomic import replace_folder, write_bytes, write_json
 from evercal.storage.manifest import MANIFEST, Manifest
-from evercal.storage.stages import REPORT, STAGES, StageStore, is_store, read_store, require_free
+from evercal.storage.stages import (
+    REPORT,
+    STAGES,
+    StageStore,
+    is_store,
+    read_store,
+    require_no_scenes,
+)
 
 OnClash = Literal["refuse", "rename", "skip", "replace"]
 """What `merge` does with a scene whose name is taken."""
@@ -153,8 +160,8 @@ def unpack_map(file: Path, folder: Path, limits: ArchiveLimits | None = None) ->
     The archive is not trusted: paths, links, sizes, checksums and schema are checked, and every
     scene is read, before the folder appears.
     """
-    if folder.is_dir() and not is_store(folder):
-        require_free(folder)
+    if not is_store(folder):
+        require_no_scenes(folder)
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder}: exists; give a new folder")
     if not file.is_file():

@@ -54,10 +54,11 @@ def require_free(root: Path) -> None:
         path.name == STAGES or path.name.startswith((*_NETWORKS, ".")) for path in root.iterdir()
     ):
         raise InputError(f"store {root}: exists and is not an evercal store; give another path")
-    _require_no_scenes(root)
+    require_no_scenes(root)
 
 
-def _require_no_scenes(root: Path) -> None:
+def require_no_scenes(root: Path) -> None:
+    """Refuse a folder without manifest that holds scenes; a new store would replace them."""
     left = {*_journal(root, "new")}
     for path in (root / STAGES).glob("*"):
         if not path.name.startswith(".") and path.name not in left:
@@ -144,7 +145,7 @@ class StageStore:
             if self.stages != (before.payload["stages"] if before else []):
                 raise InputError(f"store {self.root}: another process has changed it; run it again")
             if before is None:
-                _require_no_scenes(self.root)
+                require_no_scenes(self.root)
             yield before
         finally:
             self._lock.release()
