@@ -29,5 +29,5 @@ def test_without_a_checkout_the_version_is_recorded(monkeypatch: pytest.MonkeyPa
     def missing(*_: object, **__: object) -> None:
         raise FileNotFoundError("git")
 
-    monkeypatch.setattr(module.subprocess, "run", missing)
+    monkeypatch.setattr(module, "output_of", missing)
     assert module._commit().startswith("evercal ")
