@@ -5,6 +5,9 @@ the work: in headers before bodies, and before patterns, tables and decoders.
 """
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import TypeVar
@@ -28,8 +31,8 @@ class Bounds:
     """Columns of a table."""
     text_bytes: int = 100_000_000
     """Text file."""
-    depth: int = 50
-    """Nested lists in YAML."""
+    nodes: int = 20_000
+    """Values in a YAML file."""
     numbers: int = 10_000_000
     """Numbers of an array, and cells of a table."""
     pixels: int = 100_000_000
@@ -42,7 +45,11 @@ class RequestBounds(Bounds):
 
     text_bytes: int = 1_000_000
     """Intrinsics, robot poses or a calibration."""
-    pixels: int = 25_000_000
+    columns: int = 100
+    """Columns of a table."""
+    numbers: int = 200_000
+    """Numbers of an array, and cells of a table."""
+    pixels: int = 16_000_000
     """Pixels of one image."""
     body_bytes: int = 128 * 10**6
     """Body of a request with images."""
@@ -56,24 +63,37 @@ class RequestBounds(Bounds):
     """Bytes of their bodies."""
     connections: int = 100
     """Open connections; the oldest without a request gives way to a new one."""
-    streams: int = 16
+    streams: int = 8
     """Streams of frames among them."""
-    frame_bytes: int = 16 * 10**6
+    frame_bytes: int = 8 * 10**6
     """A frame of a stream."""
     wait_s: float = 10.0
-    """Time for headers, and for a body beyond its length, in seconds."""
+    """Time for headers, for reading an answer, and for a body beyond its length, seconds."""
     bytes_per_s: float = 250_000.0
     """Slowest body."""
 
 
+_in_force: ContextVar[type[Bounds]] = ContextVar("_in_force", default=Bounds)
+
+
 def bounds() -> Bounds:
-    """The bounds of files in force: the default ones, changed by `EVERCAL_LIMITS`."""
-    return _changed(Bounds, os.environ.get(VARIABLE, ""))
+    """The bounds in force: the default ones, changed by `EVERCAL_LIMITS`."""
+    return _changed(_in_force.get(), os.environ.get(VARIABLE, ""))
 
 
 def request_bounds() -> RequestBounds:
     """The bounds of requests in force."""
     return _changed(RequestBounds, os.environ.get(VARIABLE, ""))
+
+
+@contextmanager
+def reading_a_request() -> Iterator[None]:
+    """Bound what is read inside as a part of a request."""
+    token = _in_force.set(RequestBounds)
+    try:
+        yield
+    finally:
+        _in_force.reset(token)
 
 
 @cache

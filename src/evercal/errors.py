@@ -1,5 +1,7 @@
 """The one exception that a user is meant to read."""
 
+import unicodedata
+
 _LONGEST = 2_000
 """Characters of a message, which may repeat what came from outside."""
 
@@ -19,10 +21,15 @@ class InputError(Exception):
         super().__init__(printable(" ".join(text.splitlines())))
 
 
+def is_plain(character: str) -> bool:
+    """Whether a terminal shows a character; it may be a wide or unbreakable space."""
+    return character.isprintable() or unicodedata.category(character) == "Zs"
+
+
 def printable(text: str) -> str:
     """Escape the characters that a terminal obeys or that cannot be seen, but line breaks."""
     return "".join(
-        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
+        c if is_plain(c) or c == "\n" else c.encode("unicode_escape").decode() for c in text
     )
 
 

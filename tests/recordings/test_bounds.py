@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evercal.bounds import VARIABLE, bounds
+from evercal.bounds import VARIABLE, bounds, reading_a_request
 from evercal.calibration.calibration import read_calibration
 from evercal.calibration.export.request import read_link_from_optical
 from evercal.errors import InputError
 from evercal.recordings import read_image, read_robot_poses, write_image
+from evercal.recordings.images import as_rgb
 from evercal.recordings.poses.camera_file import read_camera
 from evercal.recordings.poses.row_files import natural_key
 
@@ -59,11 +60,24 @@ def aliased(levels: int) -> str:
 
 
 @pytest.mark.parametrize("read", [read_camera, lambda p: read_link_from_optical(p, "a", "b")])
-@pytest.mark.parametrize("content", [aliased(3), "a: &a 1\nb: *a", "a: " + "[" * 51 + "]" * 51])
+@pytest.mark.parametrize(
+    "content",
+    [
+        aliased(3),
+        "a: &a 1\nb: *a",
+        "a: " + "[" * 51 + "]" * 51,
+        "<<: {a: 1}",
+        "a: !!set {b, c}",
+        "a: " + ":".join(["1"] * 600),
+        "- 1\n" * 20_001,
+    ],
+)
 def test_yaml_with_references_or_deep_nesting_is_refused(
     tmp_path: Path, read: Read, content: str
 ) -> None:
-    refused(read, tmp_path / "a.yaml", content, "references .* or is nested too deeply")
+    message = r"references .* or nests too deeply|characters of a value|values in YAML"
+    with frugal(seconds=5, megabytes=50):
+        refused(read, tmp_path / "a.yaml", content, message)
 
 
 @pytest.mark.parametrize(
@@ -90,6 +104,8 @@ def test_deep_json_is_refused(tmp_path: Path, name: str, read: Read) -> None:
         ("braces.txt", "{" * 200_000 + "X 1, Y 2", "[a-z]"),
         ("key.json", json.dumps([{"k" * 300: {"a": 1}}]), "300 characters of a key"),
         ("keys.json", json.dumps([{f"k{i}": 0} for i in range(5_000)]), "5,000 keys, at most"),
+        ("list.json", json.dumps([{"a": [0] * 5_000}]), "5,000 numbers of one key"),
+        ("ragged.json", json.dumps({"x": ["A" * 3_000, *[""] * 9_000]}), "none of its keys"),
         ("cell.json", json.dumps([{"x": "1" * 5_000}] * 500), "5,000 characters, at most 1,000"),
     ],
 )
@@ -164,3 +180,24 @@ def test_names_are_sorted_by_their_numbers_whatever_they_hold() -> None:
     assert [name[:9] for name in sorted(names, key=natural_key)] == [
         "image-2", "image-007", "image-10", "image-999", "image-²"
     ]  # fmt: skip
+
+
+def test_a_request_is_bounded_more_tightly() -> None:
+    assert bounds().text_bytes == 10**8
+    with reading_a_request():
+        assert (bounds().text_bytes, bounds().columns) == (10**6, 100)
+    assert bounds().text_bytes == 10**8
+
+
+def test_a_jpeg_of_many_scans_is_no_image(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.jpg", np.zeros((8, 8, 3), np.uint8))
+    data = (tmp_path / "a.jpg").read_bytes()
+    refused(read_image, tmp_path / "b.jpg", data + b"\xff\xda" * 100, "not a readable image")
+
+
+def test_wide_pixels_are_converted_in_parts() -> None:
+    wide = np.arange(2**16, dtype=np.uint16).reshape(512, 128)
+    expected = (wide.astype(np.uint32) + 128) // 257
+    with frugal(seconds=5, megabytes=0.4):
+        grey = as_rgb(wide)
+    np.testing.assert_array_equal(grey[..., 0], expected)

@@ -43,6 +43,12 @@ class Running:
     url: str
     map: Path
     service: Any
+    server: Any = None
+
+    @property
+    def connections(self) -> list[Any]:
+        """Protocols of the open connections."""
+        return list(self.server.server_state.connections)
 
     def ask(
         self,
@@ -84,7 +90,7 @@ def running(map: Path, **options: Any) -> Iterator[Running]:
         thread.start()
         try:
             assert ready.wait(30)
-            yield Running(url_of(listener), map, app.state.service)
+            yield Running(url_of(listener), map, app.state.service, server)
         finally:
             server.should_exit = True
             thread.join()

@@ -221,3 +221,31 @@ def test_streams_are_bounded_in_number_and_size(hasty: Any) -> None:
         with pytest.raises(ConnectionClosed):
             stream.recv()
     assert hasty.ask("GET", "/health").status == 200
+
+
+def test_forms_of_other_encodings_are_refused(hall_service: Any) -> None:
+    kind = {"Content-Type": "multipart/form-data; boundary=a; charset=punycode"}
+    got = hall_service.ask("POST", "/localize", body=b"--a--", headers=kind)
+    assert (got.status, got.json) == (415, {"error": "send forms in UTF-8"})
+
+
+def test_who_reads_no_answers_is_closed(hasty: Any) -> None:
+    page = b"GET /pages/swagger-ui-bundle.js HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with open_socket(hasty, page * 20) as silent:
+        wait_until_closed(hasty, silent)
+
+
+def test_a_handshake_has_a_deadline(hasty: Any) -> None:
+    head = b"POST /track HTTP/1.1\r\nHost: localhost\r\nConnection: upgrade\r\n"
+    with open_socket(hasty, head + b"Upgrade: websocket\r\n\r\n") as odd:
+        wait_until_closed(hasty, odd)
+
+
+def wait_until_closed(service: Any, connection: socket.socket) -> None:
+    """The service keeps no connection with the other end of this one."""
+    mine = connection.getsockname()[1]
+    deadline = time.monotonic() + 20
+    while any(c.client == ("127.0.0.1", mine) for c in service.connections):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert service.ask("GET", "/health").status == 200

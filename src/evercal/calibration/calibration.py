@@ -166,6 +166,9 @@ class Calibration:
     def _from_mapping(cls, data: Mapping[str, Any]) -> Self:
         if data.get("mount") not in get_args(Mount):
             raise ValueError(f"'mount' is one of {get_args(Mount)}, got {data.get('mount')!r}")
+        for name in ("checks", "source"):
+            if not isinstance(data.get(name, {}), Mapping):
+                raise ValueError(f"{name!r} is an object")
         pose, lens = SE3(data["quaternion_wxyz"], data["translation_m"]), data.get("camera")
         if "matrix" in data and max(pose_distance(pose, SE3.from_matrix(data["matrix"]))) > 1e-6:
             raise ValueError(

@@ -217,6 +217,8 @@ def require_map(root: Path, manifest: Manifest) -> dict[str, Any]:
         raise InputError(
             f"store {root}: holds networks of strategy {payload.get('strategy')!r}, not a map"
         )
+    if not isinstance(payload.get("short_side"), int):
+        raise InputError(f"store {root}: 'short_side' in the manifest is not a number; restore it")
     return payload
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError
+from evercal.errors import InputError, is_plain
 from evercal.geometry import SE3, Camera
 from evercal.recordings.images import StoredImage, as_rgb, read_image
 
@@ -85,7 +85,7 @@ class Recording:
 
 def checked_name(name: str) -> str:
     """A name that a scene can have."""
-    plain = name.isprintable() and not re.search(r"[/\\=]", name)
+    plain = all(map(is_plain, name)) and not re.search(r"[/\\=]", name)
     if not name.strip() or name.startswith(".") or len(name) > _NAME or not plain:
         raise InputError(
             f"scene name {name[:_NAME]!r}: give one of at most {_NAME} characters that is not"

@@ -13,6 +13,8 @@ from evercal.storage.atomic import write_bytes
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 """Endings of image files, in lower case."""
+_JPEG, _SCAN, _MOST_SCANS = b"\xff\xd8", b"\xff\xda", 100
+"""Beginning of a JPEG file, and of a scan in it: progressive files have about ten."""
 
 
 class StoredImage(ABC):
@@ -50,7 +52,9 @@ def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
             f" (H, W, 3) RGB or (H, W, 4) RGBA as uint8 or uint16"
         )
     if pixels.dtype == np.uint16:
-        pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
+        wide, pixels = pixels, np.empty(pixels.shape, np.uint8)
+        for row in range(0, len(wide), 64):  # in parts, because the sums take four bytes each
+            pixels[row : row + 64] = (wide[row : row + 64].astype(np.uint32) + 128) // 257
     if channels == (1,):
         pixels = np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, axis=2)
     return np.ascontiguousarray(pixels[:, :, :3])
@@ -83,6 +87,8 @@ def decode_image(data: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
 
     # IMREAD_UNCHANGED would ignore the orientation; ANYDEPTH keeps 16 bits for as_rgb to round.
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
+    if data[:2].tobytes() == _JPEG and data.tobytes().count(_SCAN) > _MOST_SCANS:
+        return None  # each scan takes as long as a whole image
     try:
         image = cv2.imdecode(data, flags) if data.size else None
     except cv2.error:

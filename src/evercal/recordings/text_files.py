@@ -6,8 +6,11 @@ from contextlib import contextmanager
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
-from evercal.bounds import bounds, require_at_most
+from evercal.bounds import require_at_most
 from evercal.errors import InputError
+
+_DEPTH = 50
+"""Nested lists and objects in YAML."""
 
 
 @contextmanager
@@ -59,20 +62,25 @@ def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str
 
 
 def yaml_documents(text: str) -> list[Any]:
-    """The documents of a YAML text; ValueError for other text, references and deep nesting.
+    """The documents of a YAML text; ValueError for other text, references, tags, deep nesting.
 
-    A reference repeats a value, and references of references multiply it without limit.
+    A reference repeats a value, and references of references multiply it without limit. Some values
+    take long to construct, too, such as integers of base 60; so all are bounded before.
     """
     import yaml
 
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    depth = 0
+    depth = nodes = 0
     try:
         for event in yaml.parse(text, loader):
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
-            if isinstance(event, yaml.AliasEvent) or depth > bounds().depth:
-                raise ValueError("it holds references (*name) or is nested too deeply")
+            nodes += isinstance(event, yaml.NodeEvent)
+            word, tag = getattr(event, "value", ""), getattr(event, "tag", None)
+            if isinstance(event, yaml.AliasEvent) or word == "<<" or tag or depth > _DEPTH:
+                raise ValueError("it holds references (*name), tags (!name) or nests too deeply")
+            require_at_most(nodes, "nodes", "values in YAML")
+            require_at_most(len(word), "cell_characters", "characters of a value")
         return list(yaml.load_all(text, loader))
     except yaml.YAMLError as error:
         raise ValueError(f"not valid YAML ({' '.join(str(error).split())})") from None

@@ -4,15 +4,43 @@ import asyncio
 from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from evercal.bounds import RequestBounds
 
 
-def connection_class(limits: RequestBounds) -> type[H11Protocol]:
-    """The protocol of a service with limits."""
+def protocols(limits: RequestBounds) -> tuple[type[H11Protocol], type[WebSocketsSansIOProtocol]]:
+    """The protocols of a service with limits: of requests, and of streams."""
 
-    class Connection(H11Protocol):
-        """A connection that is closed if no whole header arrives in time."""
+    class Patient:
+        """Closes a connection whose answers are not read in time."""
+
+        loop: asyncio.AbstractEventLoop
+        transport: Any
+        unread: asyncio.TimerHandle | None = None
+
+        def pause_writing(self) -> None:
+            super().pause_writing()  # pyright: ignore[reportAttributeAccessIssue]
+            self.unread = self.loop.call_later(limits.wait_s, self.transport.abort)
+
+        def resume_writing(self) -> None:
+            super().resume_writing()  # pyright: ignore[reportAttributeAccessIssue]
+            if self.unread is not None:
+                self.unread.cancel()
+
+    class Stream(Patient, WebSocketsSansIOProtocol):
+        """A stream that is closed if its handshake takes too long."""
+
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            self.loop.call_later(limits.wait_s, self._late)
+
+        def _late(self) -> None:
+            if not self.handshake_complete:
+                self.transport.abort()
+
+    class Connection(Patient, H11Protocol):
+        """A connection that is closed if a header takes too long."""
 
         latest: asyncio.TimerHandle | None = None
 
@@ -53,4 +81,4 @@ def connection_class(limits: RequestBounds) -> type[H11Protocol]:
             if self.waits:
                 self.transport.abort()
 
-    return Connection
+    return Connection, Stream

@@ -141,6 +141,9 @@ class Guard:
             stated = None if origin is None else origin.decode("latin-1")
             if reason := foreign((host or b"").decode("latin-1"), stated, local=True):
                 return 403, f"{reason}; a token is needed"
+        kind = headers.get(b"content-type", b"").lower()
+        if b"charset" in kind and b"utf-8" not in kind:  # some take very long, or break names
+            return 415, "send forms in UTF-8"
         if b"transfer-encoding" in headers:
             return 411, "bodies of unknown length are refused; send content-length"
         length = int(headers.get(b"content-length", b"0"))  # the server has checked that it is one

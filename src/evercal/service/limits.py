@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from evercal.bounds import RequestBounds, request_bounds
+from evercal.bounds import RequestBounds, reading_a_request, request_bounds
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -126,7 +126,8 @@ def _from_text(data: bytes, name: str, ending: str, read: Callable[[Path], Conte
         path = Path(folder, name + ending)
         path.write_bytes(data)
         try:
-            return read(path)
+            with reading_a_request():
+                return read(path)
         except InputError as error:
             raise InputError(str(error).replace(str(path), name)) from None
         except Exception as error:  # deep nesting, infinite numbers, wrong types

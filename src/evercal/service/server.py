@@ -21,7 +21,7 @@ from starlette.staticfiles import StaticFiles
 from evercal.bounds import RequestBounds, request_bounds
 from evercal.errors import InputError
 from evercal.service import hosts, routes
-from evercal.service.connection import connection_class
+from evercal.service.connection import protocols
 from evercal.service.desk import Desk
 from evercal.service.guard import PAGES, Guard, Metrics
 from evercal.service.limits import TooLargeError
@@ -146,12 +146,13 @@ def server_of(app: FastAPI, limits: RequestBounds) -> uvicorn.Server:
     """The server of what `make_app` returns."""
     # It logs every malformed form.
     logging.getLogger("python_multipart").setLevel(logging.CRITICAL)
+    requests, streams = protocols(limits)
     return uvicorn.Server(
         uvicorn.Config(
             app,
-            http=connection_class(limits),
+            http=requests,
             h11_max_incomplete_event_size=HEADER_BYTES,
-            ws="websockets-sansio",
+            ws=streams,
             ws_max_size=limits.frame_bytes,
             ws_per_message_deflate=False,
             loop="asyncio",

@@ -57,6 +57,13 @@ def require_free(root: Path) -> None:
     _require_no_scenes(root)
 
 
+def _require_no_links(root: Path) -> None:
+    """Refuse folders that lie elsewhere: what a change removes there may be another map's."""
+    for folder in (root / STAGES, *(root / STAGES).glob("*")):
+        if folder.is_symlink():
+            raise InputError(f"store {root}: {folder} is a link; copy the whole map instead")
+
+
 def _require_no_scenes(root: Path) -> None:
     left = {*_journal(root, "new")}
     for path in (root / STAGES).glob("*"):
@@ -91,6 +98,8 @@ def _check(root: Path, manifest: Manifest) -> None:
     problems = manifest.problems(root)
     if problems:
         raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
+    if not isinstance(manifest.payload.get(_MADE, 0), int):
+        raise InputError(f"store {root}: {_MADE!r} in the manifest is not a number; restore it")
     for name in _listed(root, manifest, "networks"):
         if name not in manifest.files:
             raise InputError(f"store {root}: network {name!r} is not in the manifest; restore it")
@@ -140,6 +149,7 @@ class StageStore:
         except OSError as error:
             raise InputError(f"store {self.root}: cannot be written ({error.strerror})") from error
         try:
+            _require_no_links(self.root)
             before = Manifest.read(self.root) if is_store(self.root) else None
             if self.stages != (before.payload["stages"] if before else []):
                 raise InputError(f"store {self.root}: another process has changed it; run it again")

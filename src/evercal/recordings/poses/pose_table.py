@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.bounds import require_at_most
 from evercal.recordings.poses.conventions import (
     KNOWN_CONVENTIONS,
     UNITS,
@@ -131,6 +132,7 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
 
 def named_numbers(words: Sequence[str], rows: Cells, given: PoseConvention | None) -> PoseTable:
     """Numbers of rows (n, k) whose columns have names."""
+    require_at_most(len(words), "columns", "columns")
     groups = _groups(words)
     names, stamps, others = row_labels(words, rows.T.tolist(), len(rows))
     convention = given or pose_convention(_defined(groups, words))

@@ -7,7 +7,6 @@ has examples of all kinds.
 import json
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -191,6 +190,7 @@ def _flat(entry: Mapping[str, Any]) -> dict[str, object]:
         if isinstance(value, Mapping):
             cells |= _flat({f"{key}_{inner}": each for inner, each in value.items()})
         elif isinstance(value, list):
+            require_at_most(len(value), "columns", "numbers of one key")
             names = _LISTS.get(key, [f"{key}_{i}" for i in range(len(value))])
             cells |= dict(zip(names, value, strict=False))
         else:
@@ -198,13 +198,17 @@ def _flat(entry: Mapping[str, Any]) -> dict[str, object]:
     return cells
 
 
+def _shape(value: object) -> tuple[int, ...]:
+    """Lengths of nested lists, by the first of each: all are compared when numbers are read."""
+    return (len(value), *_shape(value[0] if value else None)) if isinstance(value, list) else ()
+
+
 def _pose_key(data: Mapping[str, Any]) -> str:
     keys = [key for key in data if key in _KEYS]
     for key in () if keys else data:
-        with suppress(ValueError):  # ragged
-            shape = np.shape(data[key])
-            table = len(shape) == 2 and shape[1] in _WIDTHS
-            keys += [key] if table or shape[-2:] in ((4, 4), (3, 4)) else []
+        shape = _shape(data[key])
+        table = len(shape) == 2 and shape[1] in _WIDTHS
+        keys += [key] if table or shape[-2:] in ((4, 4), (3, 4)) else []
     if len(keys) != 1:
         raise ValueError(
             f"{' and '.join(keys) or 'none'} of its keys ({', '.join(data)}) may hold the poses;"
