@@ -57,6 +57,8 @@ def test_sigmas_are_root_mean_squares_over_the_axes() -> None:
         ({"covariance": (-np.eye(6)).tolist()}, "negative eigenvalue"),
         ({"images": [{"nam": 1}]}, "wrong kind"),
         ({"child_frame": "panda_hand"}, "both called"),
+        ({"source": 5}, "'source' is an object"),
+        ({"checks": [7]}, "'checks' is an object"),
     ],
 )
 def test_contradictions_are_refused(tmp_path: Path, change: dict, message: str) -> None:

@@ -134,6 +134,9 @@ def test_stores_of_networks_are_refused(
     with pytest.raises(InputError, match=f"{root}.*: holds networks of strategy 'sars'"):
         MapStore.open(root)
     assert tree(root) == before
+    write_manifest(root, manifest["payload"] | {"short_side": "a"}, list(manifest["files"]))
+    with pytest.raises(InputError, match="'short_side' in the manifest is not a number"):
+        MapStore.open(root)
 
 
 def test_unlisted_files_are_ignored(
