@@ -128,6 +128,6 @@ def malformed(seed: int) -> bytes:
 def heavy(seed: int) -> bytes:
     """A request for black images that are small as files and large as pixels."""
     rng = random.Random(seed)
-    data = png(4_900)[:-8]
-    body = _form(*[("images", f"{i}.png", data) for i in range(rng.choice([1, 15]))])
+    data = png(3_900)[:-8]
+    body = _form(*[("images", f"{i}.png", data) for i in range(rng.choice([1, 25]))])
     return _request("POST", "/calibrations", body, "multipart/form-data; boundary=edge")

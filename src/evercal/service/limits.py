@@ -6,17 +6,23 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
+import cv2
 import numpy as np
+import pandas as pd
+from PIL import Image
 
 from evercal.bounds import RequestBounds, reading_a_request, request_bounds
+from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.errors import InputError
+from evercal.geometry import SE3, Camera
+from evercal.recordings.images import decode_image
+from evercal.recordings.poses.camera_file import read_camera
+from evercal.recordings.poses.pairing import poses_of_images
 
-if TYPE_CHECKING:
-    from evercal.calibration.calibration import Calibration
-    from evercal.geometry import SE3, Camera
-
+_ = pd  # loading it takes a while, and no request should wait for it
+Image.preinit()
 Content = TypeVar("Content")
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
 
@@ -30,10 +36,6 @@ def decoded(data: bytes, name: str, limits: RequestBounds) -> np.ndarray:
 
     The size in the file's header is checked before anything is decoded.
     """
-    import cv2
-
-    from evercal.recordings.images import decode_image
-
     width, height = _header_size(data, name)
     if width * height > limits.pixels:
         raise TooLargeError(f"{name}: {width}x{height} pixels; at most {limits.pixels:,} in all")
@@ -74,8 +76,6 @@ class Sent(Sequence[tuple[str, np.ndarray]]):
 
 
 def _header_size(data: bytes, name: str) -> tuple[int, int]:
-    from PIL import Image
-
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about images that the caller refuses
@@ -90,26 +90,20 @@ def _header_size(data: bytes, name: str) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=8)  # a robot sends the same intrinsics with every image
-def camera_of(data: bytes, size: tuple[int, int]) -> "Camera":
+def camera_of(data: bytes, size: tuple[int, int]) -> Camera:
     """Intrinsics in a file that `--camera` would read, for images of a size (width, height)."""
-    from evercal.recordings.poses.camera_file import read_camera
-
     return _from_text(data, "camera", ".json", lambda path: read_camera(path, size))
 
 
-def poses_of(data: bytes, ending: str, images: list[str]) -> "SE3":
+def poses_of(data: bytes, ending: str, images: list[str]) -> SE3:
     """(n,) base_from_gripper of n named images, by a pose table whose file had an ending."""
-    from evercal.recordings.poses.pairing import poses_of_images
-
     files = [Path(name) for name in images]
     ending = ending.lower() if ending.lower() in (".csv", ".txt", ".json", ".tum") else ".csv"
     return _from_text(data, "robot_poses", ending, lambda path: poses_of_images(path, files))
 
 
-def calibration_of(data: bytes) -> "Calibration":
+def calibration_of(data: bytes) -> Calibration:
     """A calibration file that came over the network."""
-    from evercal.calibration.calibration import read_calibration
-
     return _from_text(data, "calibration", ".json", read_calibration)
 
 

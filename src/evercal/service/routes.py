@@ -15,6 +15,8 @@ from prometheus_client import generate_latest
 from starlette.websockets import WebSocketDisconnect
 
 from evercal.bounds import RequestBounds
+from evercal.calibration import drift
+from evercal.calibration.from_images import Images, calibrate
 from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.localization.localizer import Localizer
@@ -135,8 +137,6 @@ async def calibrations(
     ending = "" if robot_poses is None else Path(robot_poses.filename or "").suffix
 
     def work() -> dict[str, Any]:
-        from evercal.calibration.from_images import Images, calibrate
-
         sent.check_pixels()
         poses = None if table is None else poses_of(table, ending, sent.names)
         given = Images(sent, _camera(intrinsics, sent[0][1]), poses)
@@ -157,12 +157,10 @@ async def check(
     reference, intrinsics = await calibration.read(), await _content(camera)
 
     def work() -> dict[str, Any]:
-        from evercal.calibration.drift import check
-
         stated = calibration_of(reference)
         sent.check_pixels()
         given = _camera(intrinsics, sent[0][1])
-        return check_record(check(service.live.current.localizer, sent, stated, given))
+        return check_record(drift.check(service.live.current.localizer, sent, stated, given))
 
     return await service.desk.run(work)
 
