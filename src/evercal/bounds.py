@@ -47,7 +47,7 @@ class RequestBounds(Bounds):
     """Intrinsics, robot poses or a calibration."""
     columns: int = 100
     """Columns of a table."""
-    numbers: int = 200_000
+    numbers: int = 50_000
     """Numbers of an array, and cells of a table."""
     pixels: int = 16_000_000
     """Pixels of one image."""
