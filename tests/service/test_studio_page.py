@@ -44,6 +44,7 @@ def test_from_an_empty_folder_to_both_calibrations(browser: Any, tmp_path: Path)
             calibrate(visit, tmp_path)
             assert page.watched()
             visit.evaluate("window.requestAnimationFrame = () => 0")  # as for a hidden page
+            time.sleep(2)  # the frame that was requested before is drawn
             assert not page.watched()
         wait_until = time.monotonic() + 20
         while page.server.get_clients():
