@@ -147,7 +147,7 @@ def test_missing_camera_file_is_refused(tmp_path: Path) -> None:
 def test_yaml_cannot_run_code(tmp_path: Path) -> None:
     bait = tmp_path / "bait"
     text = f"width: !!python/object/apply:os.mkdir ['{bait}']\n"
-    refused("not valid YAML", read_camera, written(tmp_path, text))
+    refused("tags", read_camera, written(tmp_path, text))
     assert not bait.exists()
 
 
