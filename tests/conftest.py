@@ -322,17 +322,24 @@ def full_disk(
 
 
 @pytest.fixture
-def everything() -> Callable[[Path], dict[str, bytes | None]]:
-    """Every file and folder below a folder, with its content; locks are left out."""
+def snapshot() -> Callable[[Path], dict[str, bytes | None]]:
+    """Every file and folder below a folder with its content."""
 
-    def read(root: Path) -> dict[str, bytes | None]:
+    def take(folder: Path) -> dict[str, bytes | None]:
         return {
-            str(path.relative_to(root)): path.read_bytes() if path.is_file() else None
-            for path in sorted(root.rglob("*"))
-            if path.suffix != ".lock"
+            str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+            for path in sorted(folder.rglob("*"))
         }
 
-    return read
+    return take
+
+
+@pytest.fixture
+def everything(
+    snapshot: Callable[[Path], dict[str, bytes | None]],
+) -> Callable[[Path], dict[str, bytes | None]]:
+    """As `snapshot`; locks are left out."""
+    return lambda root: {n: c for n, c in snapshot(root).items() if not n.endswith(".lock")}
 
 
 @pytest.fixture

@@ -105,8 +105,8 @@ def _changed(kind: type[Kind], changes: str) -> Kind:
         try:
             values[name] = int(float(number))
         except (ValueError, OverflowError):
-            values = {"": 0}
-        if not values.keys() <= known:
+            name = ""
+        if name not in known:
             names = ", ".join(sorted(known))
             raise InputError(f"limit {change!r}: give NAME=NUMBER, the name one of {names}")
     return kind(**{name: value for name, value in values.items() if name in own})

@@ -115,16 +115,3 @@ def network_store(tmp_path_factory: pytest.TempPathFactory, rooms: tuple[Path, P
         patch.setitem(PRESETS, "demo", small)
         assert main([*words, "--preset", "demo", "--seed", "1"]) == 0
     return folder
-
-
-@pytest.fixture
-def snapshot() -> Callable[[Path], dict[str, bytes | None]]:
-    """Every file and folder below a folder with its content."""
-
-    def take(folder: Path) -> dict[str, bytes | None]:
-        return {
-            str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
-            for path in sorted(folder.rglob("*"))
-        }
-
-    return take

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import struct
-import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
+from benchmarks.malformed import png
 from evercal.bounds import RequestBounds
 from evercal.map import Map
 from evercal.recordings import read_image
@@ -22,18 +21,6 @@ if TYPE_CHECKING:
 
 def part(path: Path) -> tuple[str, bytes]:
     return path.name, path.read_bytes()
-
-
-def huge_png(side: int) -> bytes:
-    """A PNG of 100 bytes whose header states `side` x `side` pixels."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        crc = struct.pack(">I", zlib.crc32(kind + data))
-        return struct.pack(">I", len(data)) + kind + data + crc
-
-    header = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
-    data = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + data
 
 
 def test_localize_gives_the_row_of_the_command(
@@ -91,9 +78,9 @@ def test_health_scenes_page_and_metrics(hall_service: Any, image: Path) -> None:
         ("localize", {"image": "text"}, 422, "image: "),
         ("localize", {"image": ("a.png", b"")}, 400, "a.png: not a readable image"),
         ("localize", {"image": ("a.png", b"x" * 99)}, 400, "a.png: not a readable"),
-        ("localize", {"image": ("a", huge_png(60_000))}, 413, "a: too many pixels"),
-        ("localize", {"image": ("a", huge_png(8_000))}, 413, "a: 8000x8000 pixels"),
-        ("localize", {"image": ("a", huge_png(20))}, 400, "a: not a readable image"),
+        ("localize", {"image": ("a", png(60_000, 2, 0))}, 413, "a: too many pixels"),
+        ("localize", {"image": ("a", png(8_000, 2, 0))}, 413, "a: 8000x8000 pixels"),
+        ("localize", {"image": ("a", png(20, 2, 0))}, 400, "a: not a readable image"),
         ("localize", {"image": "IMAGE", "camera": ("c", b"{")}, 400, "camera: "),
         ("localize", {"image": "IMAGE", "camera": ("c", b"PK")}, 400, "not a text"),
         ("localize", {"image": "IMAGE", "camera": ("c", b"[" * 60_000)}, 400, "camera"),

@@ -116,8 +116,8 @@ def calibrate(
         moved = in_gripper_frame(located, grippers)
     fused = fuse(moved)
     scene = localizer.contents.metric_scene(fused.scene)
-    height, width = given.images[0][1].shape[:2]
-    stated = cameras_in_scenes(given.camera, given.images[0][1], [scene])[0]
+    first = given.images[0][1]  # once: it may be decoded on request
+    stated = cameras_in_scenes(given.camera, first, [scene])[0]
     camera = estimated_camera(fused.select(located), stated)
     if mount == "eye_to_hand":
         covariance, terms = _from_one_spot(moved, fused)
@@ -139,7 +139,7 @@ def calibrate(
         parent_from_child=fused.pose,
         covariance=covariance,
         parent_frame="base" if mount == "eye_to_hand" else "gripper",
-        camera=camera.resized(width, height),
+        camera=camera.resized(first.shape[1], first.shape[0]),
         images=fused.uses,
         error_terms=terms,
         checks=checks,

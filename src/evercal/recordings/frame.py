@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.bounds import bounds
 from evercal.errors import InputError, is_plain
 from evercal.geometry import SE3, Camera
 from evercal.recordings.images import StoredImage, as_rgb, read_image
 
 MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
 MIN_GRIPPER_FRAMES = 8  # the same for a camera on the gripper: a few views around one place
-_NAME = 200  # most characters of a name
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +85,11 @@ class Recording:
 
 def checked_name(name: str) -> str:
     """A name that a scene can have."""
+    most = bounds().name_characters
     plain = all(map(is_plain, name)) and not re.search(r"[/\\=]", name)
-    if not name.strip() or name.startswith(".") or len(name) > _NAME or not plain:
+    if not name.strip() or name.startswith(".") or len(name) > most or not plain:
         raise InputError(
-            f"scene name {name[:_NAME]!r}: give one of at most {_NAME} characters that is not"
+            f"scene name {name[:most]!r}: give one of at most {most} characters that is not"
             " empty, does not begin with a dot and holds no slash, '=' or control character"
         )
     return name

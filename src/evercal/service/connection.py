@@ -54,8 +54,8 @@ def protocols(limits: RequestBounds) -> tuple[type[H11Protocol], type[WebSockets
             self._wait()
             if len(self.connections) > limits.connections:
                 others = [c for c in self.connections if isinstance(c, Connection) and c.waits]
-                others.sort(key=lambda c: c.latest.when() if c.latest else 0.0)
-                others[0].transport.abort()  # at worst this one
+                oldest = min(others, key=lambda c: c.latest.when() if c.latest else 0.0)
+                oldest.transport.abort()  # at worst this one
 
         def connection_lost(self, exc: Exception | None) -> None:
             self._stop_waiting()

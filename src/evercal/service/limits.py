@@ -67,6 +67,10 @@ class Sent(Sequence[tuple[str, np.ndarray]]):
         """Names of the images."""
         return [name for name, _ in self._files]
 
+    def camera(self, intrinsics: bytes | None) -> Camera | None:
+        """The camera in a file of intrinsics, by the size of the first image."""
+        return None if intrinsics is None else camera_of(intrinsics, self[0][1].shape[1::-1])
+
     def __len__(self) -> int:
         return len(self._files)
 

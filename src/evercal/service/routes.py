@@ -139,7 +139,7 @@ async def calibrations(
     def work() -> dict[str, Any]:
         sent.check_pixels()
         poses = None if table is None else poses_of(table, ending, sent.names)
-        given = Images(sent, _camera(intrinsics, sent[0][1]), poses)
+        given = Images(sent, sent.camera(intrinsics), poses)
         return calibrate(service.live.current.localizer, given, mount).to_dict()
 
     return await service.desk.run(work)
@@ -159,7 +159,7 @@ async def check(
     def work() -> dict[str, Any]:
         stated = calibration_of(reference)
         sent.check_pixels()
-        given = _camera(intrinsics, sent[0][1])
+        given = sent.camera(intrinsics)
         return check_record(drift.check(service.live.current.localizer, sent, stated, given))
 
     return await service.desk.run(work)

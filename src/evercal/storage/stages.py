@@ -65,13 +65,12 @@ def _require_no_links(root: Path) -> None:
 
 
 def _require_no_scenes(root: Path) -> None:
-    left = {*_journal(root, "new")}
-    for path in (root / STAGES).glob("*"):
-        if not path.name.startswith(".") and path.name not in left:
-            raise InputError(
-                f"store {root}: holds scenes but no {MANIFEST}; restore it from a copy, or give"
-                " another path"
-            )
+    scenes = _names(root / STAGES).difference(_journal(root, "new"))
+    if any(not name.startswith(".") for name in scenes):
+        raise InputError(
+            f"store {root}: holds scenes but no {MANIFEST}; restore it from a copy, or give another"
+            " path"
+        )
 
 
 def read_store(root: Path, read: Callable[[Manifest], Result]) -> Result:
@@ -193,7 +192,7 @@ class StageStore:
             for number, (name, write) in enumerate(added, first):
                 legal = re.sub(r"[^\w.-]", "_", name)[:60]
                 new[f"{number:04d}-{legal}"] = write
-            made = max([made, *range(first, first + len(new))])
+            made = first + len(new) - 1 if new else made
             self._publish([*kept, *new], new, {**payload, _MADE: made}, before, superseded)
 
     def replace(self, index: int, write: Write, payload: Mapping[str, object]) -> None:
