@@ -14,18 +14,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from evercal.errors import InputError
-from evercal.features.device import device_of
 from evercal.mapping.store import MapStore
 from evercal.recordings.frame import Recording
 
 if TYPE_CHECKING:
     import numpy as np
-    from torch import nn
 
     from evercal.calibration.calibration import Calibration, Mount
     from evercal.calibration.drift import Shift
     from evercal.calibration.from_images import ImageSource
     from evercal.evaluation import Scores
+    from evercal.features.encoder import Features
     from evercal.geometry import SE3, Camera
     from evercal.learning.many import Learned
     from evercal.learning.scene import LearnReport
@@ -61,26 +60,22 @@ class Map:
         cls,
         path: PathLike,
         *,
-        device: str = "auto",
-        encoder: Path | nn.Module | None = None,
+        encoder: Path | Features | None = None,
         options: LocalizeOptions | None = None,
     ) -> Self:
         """Open a map, or prepare a new one that the first `learn` writes.
 
         Args:
             path: folder of the map.
-            device: `auto` (a CUDA device if there is one), `cpu` or `cuda`.
-            encoder: for a new map, a weights file of `training`; or a module of the
-                caller's own, which then must be given every time. Default: the shipped encoder.
+            encoder: for a new map, an ONNX file; or a function of the caller's own on arrays (see
+                `features.encoder.Features`), which then must be given every time. Default: the
+                shipped encoder.
             options: effort and thresholds of localization.
 
         Raises:
             InputError: The folder holds something else, or a file is missing or was changed.
         """
-        where = device_of(device)
-        store = MapStore.open_or_create(Path(path), encoder)
-        store.contents.to(where)
-        return cls(store, options)
+        return cls(MapStore.open_or_create(Path(path), encoder), options)
 
     @property
     def path(self) -> Path:

@@ -26,7 +26,7 @@ def started_safely(variables: Mapping[str, str] = {}) -> Iterator[SpawnContext]:
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
-        # Threads of torch do not survive a fork.
+        # Threads of libraries do not survive a fork.
         yield multiprocessing.get_context("spawn")
     finally:
         for name, value in before.items():
@@ -34,6 +34,13 @@ def started_safely(variables: Mapping[str, str] = {}) -> Iterator[SpawnContext]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+def cores() -> int:
+    """Processor cores that this process may use; OMP_NUM_THREADS bounds them."""
+    most = os.environ.get("OMP_NUM_THREADS", "")
+    free = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(free, int(most))) if most.isdecimal() and int(most) else free
 
 
 def python_command(*words: str) -> list[str]:

@@ -16,19 +16,18 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.pose_pairs.checks import require_rotations
 from evercal.errors import InputError
-from evercal.features.encode import encode_image
 from evercal.features.encoder import Encoder
 from evercal.features.sift import epipolar_pair, sift_features
 from evercal.features.views import working_image
-from evercal.features.vlad import vlad_for
+from evercal.features.vlad import similar_pairs
 from evercal.geometry import SE3
 from evercal.mapping.selection import spread_poses
+from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame
 
@@ -171,14 +170,10 @@ def _pair_motions(
         grey, camera = working_image(image, frame.camera, min(480, *image.shape[:2]))
         images.append(grey)
         cameras.append(camera)
-        features.append(encode_image(grey, encoder, ENCODED_SIDE).cpu().flatten(1).T)
-    vlad = vlad_for(encoder, features)
-    descriptors = torch.stack([vlad(rows) for rows in features])
-    similarity = (descriptors @ descriptors.T).fill_diagonal_(-1)
-    nearest = similarity.topk(min(PARTNERS, len(frames) - 1)).indices.tolist()
-    pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(nearest) for j in row})
+        features.append(encoder.encode(grey, ENCODED_SIDE).reshape(-1, encoder.width))
+    pairs = similar_pairs(features, encoder.vlad(features), PARTNERS)
     motions: list[PairMotion] = []
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         points = list(pool.map(sift_features, images))
 
         def motion_of(pair: tuple[int, int]) -> PairMotion | None:

@@ -45,7 +45,6 @@ class Align(args.Verb):
     unknown_scale: bool = False
     """Estimate the scale, for a scene that was not learned in metres. Default where the unit of
     length of its recording is unknown."""
-    device: args.Device = "auto"
 
     def run(self) -> int:
         by_points = self.points is not None or self.picks is not None
@@ -57,14 +56,12 @@ class Align(args.Verb):
                 "--points: images, --convention and --board-poses belong to --robot-poses; omit"
                 " them"
             )
-        from evercal.features.device import device_of
-        from evercal.localization.localizer import Localizer
+            from evercal.localization.localizer import Localizer
         from evercal.mapping.store import MapStore
 
-        where = device_of(self.device)
         opened = MapStore.open(self.store)
         with opened.writing():
-            localizer = Localizer(opened.contents.to(where))
+            localizer = Localizer(opened.contents)
             alignment = self._by_points(localizer) if by_points else self._by_gripper(localizer)
             opened.update(alignment.applied_to(localizer.contents.scene(self.scene)))
         self._show(alignment)

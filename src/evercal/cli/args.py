@@ -55,7 +55,7 @@ At = Annotated[
 ]
 Device = Annotated[
     Literal["auto", "cpu", "cuda"],
-    arg(help="Device of the encoder and networks; auto uses a CUDA device if there is one."),
+    arg(help="Device of networks (not of a map); auto uses a CUDA device if there is one."),
 ]
 
 
@@ -179,16 +179,16 @@ def strategy_of(store: Path) -> str | None:
     return str(read_manifest(store)["strategy"]) if is_store(store) else None
 
 
-def open_localizer(store: Path, device: str) -> "LearnedLocalizer":
+def open_localizer(store: Path, device: str = "auto") -> "LearnedLocalizer":
     """The localizer of a map or a store of networks."""
     if strategy_of(store) in (MAP, None):
-        return open_map(store, device)
+        return open_map(store)
     from evercal.continual.localizer import open_networks
 
     return open_networks(store, device)
 
 
-def open_map(store: Path, device: str) -> "Localizer":
+def open_map(store: Path) -> "Localizer":
     """The localizer of a map; a store of networks is refused."""
     strategy = strategy_of(store)
     if strategy not in (MAP, None):
@@ -198,7 +198,7 @@ def open_map(store: Path, device: str) -> "Localizer":
         )
     from evercal.localization.localizer import Localizer
 
-    return Localizer.open(store, device=device)
+    return Localizer.open(store)
 
 
 class Point(NamedTuple):

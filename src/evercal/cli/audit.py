@@ -33,7 +33,6 @@ class Audit(args.Verb):
     """Tolerance of the position."""
     most_deg: Annotated[float, arg(metavar="DEG")] = 0.5
     """Tolerance of the rotation."""
-    device: args.Device = "auto"
 
     def run(self) -> int:
         if self.images < 1 or self.most_mm <= 0 or self.most_deg <= 0:
@@ -42,7 +41,7 @@ class Audit(args.Verb):
 
         stated = args.transform_of(self.calibration)
         total = len(episode_folders(self.folder))
-        localizer = args.open_map(self.store, self.device)
+        localizer = args.open_map(self.store)
         most = (self.most_mm, self.most_deg)
         with progress_bar("episodes", total, "episode") as bar:
             episodes = audit(localizer, self.folder, stated, self.images, most, bar.update)

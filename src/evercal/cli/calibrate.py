@@ -47,7 +47,6 @@ class Calibrate(args.Verb):
     out: args.OutFile = Path("calibration.json")
     """Output file."""
     at: args.At = None
-    device: args.Device = "auto"
 
     def run(self) -> int:
         require_writable(self.out, "--out")
@@ -59,7 +58,7 @@ class Calibrate(args.Verb):
         if folders:
             return self._rig(folders, point)
         given = self._given(image_files(self.images))
-        calibration = self._calibrated(args.open_map(self.store, self.device), given)
+        calibration = self._calibrated(args.open_map(self.store), given)
         calibration.write(self.out)
         self.answer(
             {**calibration.to_dict(), **_at_record(calibration, point)},
@@ -100,7 +99,7 @@ class Calibrate(args.Verb):
         from evercal.calibration.calibration import rig_of
         from evercal.recordings.image_files import image_files
 
-        localizer = args.open_map(self.store, self.device)
+        localizer = args.open_map(self.store)
         cameras = {
             name: self._calibrated(localizer, self._given(image_files([folder])))
             for name, folder in folders.items()

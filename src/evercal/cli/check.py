@@ -31,7 +31,6 @@ class Check(args.Verb):
     reference: Reference
     camera: args.File = None
     """Intrinsics. Default: those of the reference."""
-    device: args.Device = "auto"
 
     def run(self) -> int:
         from evercal.calibration.calibration import read_calibration
@@ -42,7 +41,7 @@ class Check(args.Verb):
         reference = read_calibration(self.reference)
         camera = args.camera_for(self.camera, files)
         images = args.read_images(files)
-        localizer = args.open_map(self.store, self.device)
+        localizer = args.open_map(self.store)
         with progress_bar("localizing", len(images), "image") as bar:
             shift = check(localizer, images, reference, camera, on_image=bar.update)
         rejected = [use for use in shift.images if not use.used]

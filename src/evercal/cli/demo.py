@@ -46,7 +46,6 @@ class Demo(args.Verb):
     """Folder for report.html, the store and a query image."""
     copy_samples: args.Folder = None
     """New or empty folder to copy the packaged recordings to, instead of running the demo."""
-    device: args.Device = "auto"
 
     def run(self) -> int:
         from evercal.recordings.samples import ROOMS, copy_samples, sample_rooms
@@ -61,7 +60,7 @@ class Demo(args.Verb):
                 then=("learn", "cell.evercal", cell / "wrist", "--calibration", "wrist.json"),
             )
             return 0
-        result = run_demo(self.out, sample_rooms(), self.device, quiet=self.json)
+        result = run_demo(self.out, sample_rooms(), quiet=self.json)
         self.answer(
             result.to_dict(),
             *(f"{number:>12}  {meaning}" for number, meaning in result.headlines().items()),
@@ -72,20 +71,18 @@ class Demo(args.Verb):
 
 
 def run_demo(
-    out: Path, rooms: "Sequence[SampleRoom]", device: str = "auto", quiet: bool = True
+    out: Path, rooms: "Sequence[SampleRoom]", quiet: bool = True
 ) -> "DemoResult":
     """Map the rooms, measure, and write the report.
 
     Args:
         out: Output folder; results of an earlier demo are replaced.
         rooms: Rooms with a fixed camera, a bump and a change.
-        device: Device of the networks, see `features.device.device_of`.
         quiet: Whether to print nothing but progress bars.
 
     Raises:
-        InputError: The folder contains other data, or the device does not exist.
+        InputError: The folder contains other data.
     """
-    from evercal.features.device import device_of
     from evercal.map import Map
     from evercal.recordings import write_image
     from evercal.reports.demo_page import DemoResult, demo_page
@@ -94,12 +91,11 @@ def run_demo(
     began, store = time.perf_counter(), out / STORE
     if store.exists() and not (store / MANIFEST).is_file():
         raise InputError(f"{store}: exists and is not an evercal store; pass another --out")
-    device_of(device)
     require_folder(out, "--out")
     result = DemoResult()
     work = Path(tempfile.mkdtemp(prefix=".demo-", dir=out))
     try:
-        cell = Map.open(work / STORE, device=device)
+        cell = Map.open(work / STORE)
         for room in rooms:
             if result.learned:
                 _localize_unknown(cell, room.scene, result)
@@ -107,7 +103,7 @@ def run_demo(
         replace_folder(work / STORE, store)
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    cell = Map.open(store, device=device)
+    cell = Map.open(store)
     result.test = _evaluate(cell, {room.scene.name: room.scene for room in rooms})
     changed = {r.scene.name: replace(r.changed, train=r.scene.train) for r in rooms if r.changed}
     result.changed = _evaluate(cell, changed)

@@ -108,7 +108,7 @@ class Learn(args.Verb):
         from evercal.map import Map
 
         loaded = [self.reading.recording(path) for path in self.recordings]
-        cell = Map.open(self.store, device=self.device, encoder=self.encoder)
+        cell = Map.open(self.store, encoder=self.encoder)
         with self._bars(f"{len(loaded)} recordings, {self.workers} at once") as bars:
             reports = cell.learn_many(
                 loaded,
@@ -147,7 +147,7 @@ class Learn(args.Verb):
                 return learn_into_networks(self, strategy, recording, bars)
             from evercal.map import Map
 
-            cell = Map.open(self.store, device=self.device, encoder=self.encoder)
+            cell = Map.open(self.store, encoder=self.encoder)
             report = cell.learn(
                 recording, memory=self.memory, gripper_from_camera=rough, on_progress=bars.step
             )

@@ -26,7 +26,7 @@ class Action(args.Verb):
         from evercal.storage import read_manifest
 
         read_manifest(store)
-        return LearnedMap.open(store, device="cpu")
+        return LearnedMap.open(store)
 
     def done(self, cell: "LearnedMap", what: str, **more: object) -> int:
         """Say what was done and which scenes there are."""
@@ -115,7 +115,7 @@ class Merge(Action):
     def run(self) -> int:
         from evercal.map import Map as LearnedMap
 
-        cell = LearnedMap.open(self.store, device="cpu")
+        cell = LearnedMap.open(self.store)
         merged = cell.merge(*self.others, on_clash=self.on_clash)
         words = [f"added {', '.join(merged.added) or 'no scene'}"]
         words += [f"{name} is now {new}" for name, new in merged.renamed]

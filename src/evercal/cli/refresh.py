@@ -39,7 +39,6 @@ class Refresh(args.Verb):
     """File of the intrinsics. Default: those of the camera that recorded the scene."""
     undo: Annotated[str | None, args.shown("SCENE")] = None
     """Bring back the state of a scene before its last refresh."""
-    device: args.Device = "auto"
 
     def run(self) -> int:
         if (self.undo is None) == (not self.images):
@@ -49,7 +48,7 @@ class Refresh(args.Verb):
         from evercal.storage import read_manifest
 
         read_manifest(self.store)
-        cell = Map.open(self.store, device=self.device)
+        cell = Map.open(self.store)
         if self.undo is not None:
             cell.undo_refresh(self.undo)
             said = f"{self.undo}: the state before its last refresh is back"

@@ -35,7 +35,6 @@ class Report(args.Verb):
     at: args.At = None
     out: Annotated[Path, arg(metavar="FILE.html")] = Path("report.html")
     """The report, one file including its pictures."""
-    device: args.Device = "auto"
 
     def run(self) -> int:
         require_writable(self.out, "--out")
@@ -96,7 +95,7 @@ class Report(args.Verb):
         if calibration.camera is None:
             return annotate_images(calibration, [])
         files, reason = select_images(calibration, self.calibration.parent, given)
-        localizer = None if self.store is None else args.open_localizer(self.store, self.device)
+        localizer = None if self.store is None else args.open_localizer(self.store)
         with progress_bar("drawing", len(files), "image") as bar:
             drawn = annotate_images(calibration, files, older, localizer, boards, bar.update)
         return drawn if files else replace(drawn, missing=(reason,))

@@ -26,7 +26,6 @@ class Serve(args.Verb):
     token_file: args.File = None
     """File of the bearer token that requests must have, readable by you alone. Default: the
     variable EVERCAL_TOKEN."""
-    device: args.Device = "auto"
 
     def run(self) -> int:
         try:
@@ -40,7 +39,7 @@ class Serve(args.Verb):
                 token = self.token_file.read_text(encoding="utf-8").strip()
             except (OSError, ValueError) as error:
                 raise InputError(f"--token-file {self.token_file}: {error}") from None
-        serve(ServeOptions(self.store, self.host, self.port, token, self.device), self._ready)
+        serve(ServeOptions(self.store, self.host, self.port, token), self._ready)
         return 0
 
     def _ready(self, url: str, scenes: tuple[str, ...]) -> None:

@@ -54,7 +54,6 @@ class Studio(Page):
     """Seed of the virtual cell."""
     out: args.OutFolder = Path("studio")
     """Folder of the recording, images, calibrations, reports and exports."""
-    device: args.Device = "auto"
 
     def run(self) -> int:
         self._refuse()
@@ -63,7 +62,7 @@ class Studio(Page):
         from evercal.service.studio.studio import Studio as Session
 
         devices = self._virtual() if self.virtual else self._real()
-        page = StudioPage(Session(devices, self.out, self.map, self.device), self.host, self.port)
+        page = StudioPage(Session(devices, self.out, self.map), self.host, self.port)
         try:
             url = page.server.url
             self.wait(url, f"studio in {self.out} at {url}, where the same command continues")

@@ -5,128 +5,78 @@ the shipped encoder come from procedural rooms. Centroids of another encoder are
 recording that is learned with it, and travel with the map.
 """
 
-import hashlib
 from collections.abc import Sequence
-from pathlib import Path
-from weakref import WeakKeyDictionary
 
-import torch
-from safetensors import safe_open
-from torch import Tensor, nn
-from torch.nn import functional as F
+import numpy as np
+from numpy.typing import NDArray
 
-from evercal.errors import InputError
-from evercal.features.encoder import WEIGHTS, Encoder
-from evercal.features.weights_file import network_bytes
-from evercal.storage.atomic import write_bytes
-
-VLAD_FILE = WEIGHTS / "vlad.safetensors"
 CENTROIDS = 32
 WIDTH = 1024
 _ROUNDS = 15
 _ROWS = 40_000
 """Features that centroids are fitted to, at most."""
 
+Array = NDArray[np.float32]
+
 
 class Vlad:
-    """Aggregate the features of an image in one vector.
+    """Aggregate the features of an image in one vector; centroids (k, channels) are unit vectors.
 
-    Centroids (k, channels) are unit vectors; the projection is (k * channels, width).
+    More numbers than `WIDTH` are projected to so many.
     """
 
-    def __init__(self, centroids: Tensor, projection: Tensor):
-        self.centroids, self.projection = centroids, projection
-        self._copies: dict[torch.device, tuple[Tensor, Tensor]] = {}
+    def __init__(self, centroids: Array):
+        self.centroids = centroids
+        size = centroids.size
+        self._projection = _random_projection(size) if size > WIDTH else None
 
-    @torch.inference_mode()
-    def __call__(self, features: Tensor) -> Tensor:
-        """(cells, channels) unit vectors of an image -> (width,) unit vector, on their device."""
-        centroids, projection = self._on(features.device)
-        nearest = (features @ centroids.T).argmax(1)
-        difference = features - centroids[nearest]
-        if features.device.type == "cpu":
-            sums = torch.zeros_like(centroids).index_add_(0, nearest, difference)
-        else:  # `index_add_` on CUDA is not deterministic
-            sums = F.one_hot(nearest, len(centroids)).to(difference.dtype).T @ difference
-        vector = F.normalize(sums, dim=1).flatten()
-        return F.normalize(vector @ projection, dim=0)
-
-    def _on(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        if device not in self._copies:
-            self._copies[device] = self.centroids.to(device), self.projection.to(device)
-        return self._copies[device]
+    def __call__(self, features: Array) -> Array:
+        """(cells, channels) unit vectors of an image -> unit vector of at most `WIDTH` numbers."""
+        sums = _sums(features, self.centroids, self.centroids)
+        vector = _unit(sums).ravel()
+        return _unit(vector if self._projection is None else vector @ self._projection)
 
 
-_by_encoder: WeakKeyDictionary[Encoder, Vlad] = WeakKeyDictionary()
-
-
-def vlad_for(encoder: Encoder, features: Sequence[Tensor] = ()) -> Vlad:
-    """The VLAD of an encoder; missing centroids are fitted to features (cells, channels)."""
-    if encoder not in _by_encoder:
-        centroids = shipped_centroids(encoder)
-        if centroids is None and not features:
-            raise InputError("the encoder has no VLAD centroids; learn a recording with it first")
-        keep_centroids(encoder, fit_centroids(features) if centroids is None else centroids)
-    return _by_encoder[encoder]
-
-
-def lacks_centroids(encoder: Encoder) -> bool:
-    """Whether centroids are still to be fitted."""
-    return encoder not in _by_encoder and shipped_centroids(encoder) is None
-
-
-def known_centroids(encoder: Encoder) -> Tensor | None:
-    """(k, channels) centroids that were fitted or loaded in this process; None without any."""
-    return _by_encoder[encoder].centroids if encoder in _by_encoder else None
-
-
-def keep_centroids(encoder: Encoder, centroids: Tensor) -> None:
-    """Use centroids (k, channels), fitted or loaded here or in another process."""
-    # A fixed random projection to fewer numbers preserves angles.
-    shape = (centroids.numel(), WIDTH)
-    generator = torch.Generator().manual_seed(1)
-    projection = torch.randn(shape, generator=generator, device="cpu")
-    _by_encoder[encoder] = Vlad(centroids, projection / shape[0] ** 0.5)
-
-
-def shipped_centroids(encoder: Encoder) -> Tensor | None:
-    """(k, channels) centroids of the shipped encoder; None for another encoder."""
-    if isinstance(encoder, nn.Module) and VLAD_FILE.exists():
-        with safe_open(VLAD_FILE, "pt") as file:
-            if (file.metadata() or {}).get("encoder") == _digest(encoder):
-                return file.get_tensor("centroids").float()
-    return None
-
-
-def save_centroids(encoder: Encoder, path: Path) -> None:
-    """Write the centroids of an encoder with the digest of its weights."""
-    from safetensors.torch import save
-
-    assert isinstance(encoder, nn.Module), "only modules have weights"
-    centroids = vlad_for(encoder).centroids.contiguous()
-    write_bytes(path, save({"centroids": centroids}, {"encoder": _digest(encoder)}))
-
-
-def load_centroids(encoder: Encoder, path: Path) -> None:
-    """Load the centroids of an encoder from a file of `save_centroids`."""
-    with safe_open(path, "pt") as file:
-        keep_centroids(encoder, file.get_tensor("centroids").float())
-
-
-def fit_centroids(features: Sequence[Tensor]) -> Tensor:
+def fit_centroids(features: Sequence[Array]) -> Array:
     """(k, channels) centroids of unit features (cells, channels) of images, spherical k-means."""
-    rows = torch.cat(list(features)).float().cpu()
-    generator = torch.Generator().manual_seed(0)
-    rows = rows[torch.randperm(len(rows), generator=generator)[:_ROWS]]
+    rows = np.concatenate(list(features)).astype(np.float32)
+    rows = np.random.default_rng(0).permutation(rows)[:_ROWS]
     centroids = rows[:CENTROIDS]
     for _ in range(_ROUNDS):
-        nearest = (rows @ centroids.T).argmax(1)
-        sums = torch.zeros_like(centroids).index_add_(0, nearest, rows)
+        sums = _sums(rows, centroids)
         # A centroid without members stays where it is.
-        used = sums.norm(dim=1, keepdim=True) > 0
-        centroids = torch.where(used, F.normalize(sums, dim=1), centroids)
+        centroids = np.where(np.abs(sums).sum(1, keepdims=True) > 0, _unit(sums), centroids)
     return centroids
 
 
-def _digest(encoder: nn.Module) -> str:
-    return hashlib.sha256(network_bytes(encoder, "encoder")).hexdigest()
+def _sums(rows: Array, centroids: Array, origin: Array | None = None) -> Array:
+    """(k, channels) sums of the rows nearest to each centroid, as differences from an origin."""
+    nearest = (rows @ centroids.T).argmax(1)
+    member = np.zeros((len(centroids), len(rows)), np.float32)
+    member[nearest, np.arange(len(rows))] = 1
+    sums = member @ rows
+    return sums if origin is None else sums - member.sum(1, keepdims=True) * origin
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def _random_projection(size: int) -> Array:
+    """(size, WIDTH) fixed random projection, which preserves angles: Box-Muller by blocks of 16."""
+    # The numbers are part of every map that was ever made with a projection.
+    count = size * WIDTH
+    bits = np.random.RandomState(1).randint(0, 2**32, count, dtype=np.uint32)
+    uniform = ((bits & 0xFFFFFF) * np.float32(2**-24)).astype(np.float32).reshape(-1, 2, 8)
+    radius = np.sqrt(-2 * np.log1p(-uniform[:, 0])) / np.float32(size) ** 0.5
+    angle = np.float32(2 * np.pi) * uniform[:, 1]
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1).reshape(size, WIDTH)
+
+
+def similar_pairs(features: Sequence[Array], vlad: Vlad, partners: int) -> list[tuple[int, int]]:
+    """Pairs of images, each with the most similar other ones, by features (cells, channels)."""
+    descriptors = np.stack([vlad(rows) for rows in features])
+    similarity = descriptors @ descriptors.T
+    np.fill_diagonal(similarity, -np.inf)
+    nearest = np.argsort(-similarity, 1, kind="stable")[:, : min(partners, len(features) - 1)]
+    return sorted({(min(i, j), max(i, j)) for i, row in enumerate(nearest.tolist()) for j in row})

@@ -6,14 +6,11 @@ A process that is killed, for example for its memory, costs its recording anothe
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 
-import torch
-
 from evercal.errors import InputError
-from evercal.features.vlad import keep_centroids, known_centroids, lacks_centroids
 from evercal.learning.scene import LearnReport, learn_scene
 from evercal.mapping.build import MapOptions
 from evercal.mapping.scene_map import MapContents, SceneMap
-from evercal.processes import Worker, cause_of, first_answers
+from evercal.processes import Worker, cause_of, cores, first_answers
 from evercal.recordings.frame import Recording
 
 TRIES = 3
@@ -54,8 +51,8 @@ class LearnTask:
 
 
 Item = tuple[int, Recording]
-_State = tuple[LearnTask, int, torch.Tensor | None]
-"""Task, threads of a worker, and centroids, which do not travel with the encoder."""
+_State = tuple[LearnTask, int]
+"""Task and threads of a worker."""
 
 
 def learn_scenes(
@@ -74,7 +71,7 @@ def learn_scenes(
         raise InputError(f"workers {workers}: give a number >= 1")
     waiting = list(enumerate(recordings))
     # All scenes share the centroids, which the first recording of another encoder determines.
-    while waiting and lacks_centroids(task.contents.encoder):
+    while waiting and task.contents.encoder.centroids is None:
         yield task.learn(*waiting.pop(0))
     ended = yield from _in_turn(task, waiting, workers)
     for item, status in ended:
@@ -94,8 +91,8 @@ def _in_turn(
     """Learn items; return those whose process ended, each with its exit status."""
     waiting, ended = list(items), list[tuple[Item, int]]()
     workers = min(workers, len(waiting))
-    threads = max(1, torch.get_num_threads() // max(workers, 1))
-    state: _State = (task, threads, known_centroids(task.contents.encoder))
+    threads = max(1, cores() // max(workers, 1))
+    state: _State = (task, threads)
     idle, busy = list[Worker](), dict[Worker, Item]()
     try:
         while waiting or busy:
@@ -130,9 +127,6 @@ def _few_threads(threads: int) -> dict[str, str]:
 def _begin(state: _State) -> Callable[[Item], Learned]:
     import cv2
 
-    task, threads, centroids = state
-    if centroids is not None:
-        keep_centroids(task.contents.encoder, centroids)
-    torch.set_num_threads(threads)
+    task, threads = state
     cv2.setNumThreads(threads)
     return lambda item: task.learn(*item)

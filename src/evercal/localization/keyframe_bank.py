@@ -5,15 +5,10 @@ from dataclasses import dataclass
 from threading import Lock
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from evercal.features.encode import encode_image
 from evercal.features.encoder import Encoder
-from evercal.features.precision import fast_bfloat16
 from evercal.features.views import ideal_cell_pixels
-from evercal.features.vlad import vlad_for
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.patches import Patches, cut_patches, image_pyramid, to_level
 from evercal.mapping.scene_map import MapContents
@@ -25,8 +20,8 @@ ALIGNED_LEVELS = 2
 class MatchedCells:
     """Patches of a keyframe that an image is matched to, in the map's frame."""
 
-    features: Tensor
-    """(cells, channels) on the encoder's device, bfloat16 where that is fast."""
+    features: NDArray[np.float32]
+    """(cells, channels)."""
     points_m: np.ndarray
     """(cells, 3) surface points of the patches."""
 
@@ -75,15 +70,14 @@ class LoadedKeyframe:
         contents, keyframes, number = self._contents, self._keyframes, self._number
         camera, pose = keyframes.cameras[number], keyframes.base_from_camera[number]
         grey, encoder = keyframes.grey(number), contents.encoder
-        features = encode_image(grey, encoder, contents.short_side).flatten(1).T
+        features = encoder.encode(grey, contents.short_side).reshape(-1, encoder.width)
         small = camera.short_side_resized(contents.short_side)
         rays = small.pinhole.unproject(ideal_cell_pixels(small, encoder.stride))
-        depth = 1 / keyframes.inverse_depth[number].double().numpy()
-        kind = torch.bfloat16 if fast_bfloat16(features.device) else torch.float32
+        depth = 1 / keyframes.inverse_depth[number].astype(np.float64)
         points = rays * depth[:, None]
         # Corners of a strongly distorted image have no rays.
         valid = np.flatnonzero(np.isfinite(points).all(1))
-        return MatchedCells(features[valid].to(kind), pose.apply(points[valid]))
+        return MatchedCells(features[valid], pose.apply(points[valid]))
 
     def _cut(self) -> AlignedLandmarks:
         keyframes, number = self._keyframes, self._number
@@ -111,20 +105,19 @@ class KeyframeBank:
         self.scene = np.repeat(np.arange(len(counts)), counts)
         self._number = np.concatenate([np.arange(count) for count in counts])
         descriptors = [k.descriptors for k in keyframes if k.descriptors is not None]
-        self._descriptors = torch.cat(descriptors).float().to(contents.device)
+        self._descriptors = np.concatenate(descriptors).astype(np.float32)
 
     @property
     def encoder(self) -> Encoder:
         """The encoder of the map."""
         return self._contents.encoder
 
-    def retrieve(self, features: Tensor) -> NDArray[np.int64]:
+    def retrieve(self, features: NDArray[np.float32]) -> NDArray[np.int64]:
         """Rank the keyframes by the similarity of their descriptors to features (cells, channels).
 
         One matrix-vector product takes 3 ms for 10,000 keyframes, so no index is needed.
         """
-        vlad = vlad_for(self._contents.encoder)(features)
-        similarity = (self._descriptors @ vlad).cpu().numpy()
+        similarity = self._descriptors @ self._contents.encoder.vlad()(features)
         return np.argsort(-similarity, kind="stable")
 
     def load(self, index: int) -> LoadedKeyframe:

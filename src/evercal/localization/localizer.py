@@ -13,11 +13,9 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import nn
 
 from evercal.errors import InputError
-from evercal.features.device import device_of
-from evercal.features.encode import encode_image
+from evercal.features.encoder import Features
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg, resize_pixels
 from evercal.localization.acceptance import (
     USELESS_M,
@@ -83,10 +81,7 @@ class _Rough:
 
 
 class Localizer:
-    """Locates images in the scenes of a map.
-
-    Images are encoded and matched on the encoder's device; poses are computed on the CPU.
-    """
+    """Locates images in the scenes of a map."""
 
     def __init__(self, contents: MapContents, options: LocalizeOptions | None = None):
         self.contents, self.options = contents, options or LocalizeOptions()
@@ -98,18 +93,16 @@ class Localizer:
         cls,
         store: str | os.PathLike[str],
         options: LocalizeOptions | None = None,
-        encoder: nn.Module | None = None,
-        device: str = "auto",
+        encoder: Features | None = None,
     ) -> Self:
-        """A localizer for a map on disk, on a device as for `device_of`.
+        """A localizer for a map on disk.
 
-        For a map that was made with a module of the caller's own, `encoder` is that module.
+        For a map that was made with a function of the caller's own, `encoder` is that function.
         """
-        where = device_of(device)
         contents = MapStore.open(Path(store), encoder).contents
         if not contents.scenes:
             raise InputError(f"store {store}: no scene learned yet; run 'evercal learn' first")
-        return cls(contents.to(where), options)
+        return cls(contents, options)
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -136,7 +129,7 @@ class Localizer:
         cameras = cameras_in_scenes(camera, image, contents.scenes)
         query = Query(
             image,
-            encode_image(image, contents.encoder, contents.short_side),
+            contents.encoder.encode(image, contents.short_side),
             self.options.patches_short_side,
             tuple(prior_of(camera, image, scene) for scene in contents.scenes),
         )
@@ -206,7 +199,7 @@ class Localizer:
 
     def _turned(self, query: Query, turns: int) -> Query:
         image = np.ascontiguousarray(np.rot90(query.image, -turns))
-        features = encode_image(image, self.contents.encoder, self.contents.short_side)
+        features = self.contents.encoder.encode(image, self.contents.short_side)
         return replace(query, features=features, turns=turns)
 
     def _guided(self, query: Query, candidate: Candidate, camera: Camera) -> Hypothesis:

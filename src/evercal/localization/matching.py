@@ -1,10 +1,8 @@
 """Candidate scenes and keyframes of an image, and the 2D-3D matches of its patches."""
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
-from torch import Tensor
 
 from evercal.features.views import cell_centres, ideal_cell_pixels
 from evercal.geometry import SE3, Camera
@@ -18,7 +16,6 @@ class Matcher:
     def __init__(self, bank: KeyframeBank, options: LocalizeOptions):
         self._bank, self._options = bank, options
 
-    @torch.inference_mode()
     def candidates(self, query: Query, attempt: Attempt) -> list[Candidate]:
         """Scenes to try, most likely first.
 
@@ -26,14 +23,14 @@ class Matcher:
         scene is tried with the keyframes that got most votes. If these are too few, its next
         keyframes in the ranking are added.
         """
-        features = query.features.flatten(1).T
+        features = _rows(query.features)
         ranked = self._bank.retrieve(features)
         proposed, rest = ranked[: attempt.retrieved], ranked[attempt.retrieved :]
         sample = features[:: self._options.retrieval_stride]
         best = []
         for index in proposed:
             keys = self._bank.load(int(index)).cells.features
-            best.append(_ordered(sample.to(keys.dtype) @ keys.T).max(1))
+            best.append((sample @ keys.T).max(1))
         votes = np.bincount(np.argmax(best, 0), minlength=len(proposed))
         order = np.argsort(-votes, kind="stable")
         scene = self._bank.scene[proposed]
@@ -50,7 +47,6 @@ class Matcher:
             candidates.append(Candidate(s, keyframes, attempt.match_stride, attempt.unknown_camera))
         return candidates
 
-    @torch.inference_mode()
     def matches(
         self, query: Query, candidate: Candidate, camera: Camera, near: SE3 | None = None
     ) -> Matches:
@@ -61,14 +57,14 @@ class Matcher:
         """
         stride = candidate.match_stride if self._options.align else 1
         patches, pixels = strided_patches(query, camera, self._bank.encoder.stride, stride)
-        features = query.features.flatten(1).T[patches]
+        features = _rows(query.features)[patches]
         points = self._nearest(features, candidate.keyframes, pixels, camera, near)
         valid = np.isfinite(points).all(1)
         return Matches(pixels[valid], points[valid])
 
     def _nearest(
         self,
-        features: Tensor,
+        features: NDArray[np.float32],
         keyframes: NDArray[np.int64],
         pixels: np.ndarray,
         camera: Camera,
@@ -76,9 +72,8 @@ class Matcher:
     ) -> np.ndarray:
         """(n, 3) points of the patches most similar to features (n, channels); else NaN."""
         loaded = [self._bank.load(int(index)).cells for index in keyframes]
-        features = features.to(loaded[0].features.dtype)
         # One keyframe at a time: the products of all would not fit the processor's cache.
-        similarity = [_ordered(features @ keyframe.features.T) for keyframe in loaded]
+        similarity = [features @ keyframe.features.T for keyframe in loaded]
         if near is not None:
             similarity = [
                 values * self._within(pixels, keyframe.points_m, camera, near)
@@ -107,7 +102,7 @@ def strided_patches(
     query: Query, camera: Camera, encoder_stride: int, stride: int
 ) -> tuple[NDArray[np.int64], np.ndarray]:
     """Indices (m,) and ideal pixels (m, 2) of patches of every n-th row and column with a ray."""
-    rows, columns = query.features.shape[1:]
+    rows, columns = query.features.shape[:2]
     patches = np.arange(rows * columns).reshape(rows, columns)[::stride, ::stride].ravel()
     pixels = cell_pixels(camera, encoder_stride, query.turns)[patches]
     valid = np.isfinite(pixels).all(1)
@@ -132,8 +127,5 @@ def cell_pixels(camera: Camera, stride: int, turns: int) -> np.ndarray:
     return camera.pinhole.project(camera.unproject(np.stack(back, -1)))
 
 
-def _ordered(value: Tensor) -> np.ndarray:
-    """Positive floats (n, m) as integers of the same order."""
-    # numpy finds the largest of those in a hundredth of the time that torch takes for bfloat16.
-    kind = torch.int16 if value.dtype == torch.bfloat16 else torch.int32
-    return value.contiguous().view(kind).cpu().numpy()
+def _rows(features: NDArray[np.float32]) -> NDArray[np.float32]:
+    return features.reshape(-1, features.shape[2])

@@ -6,7 +6,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from evercal.features.views import working_image
 from evercal.geometry import SE3, Camera, UncertainPose
@@ -85,8 +84,8 @@ class Query:
 
     image: np.ndarray
     """(h, w, 3) or (h, w) uint8."""
-    features: Tensor
-    """(channels, rows, columns) on the encoder's device."""
+    features: NDArray[np.float32]
+    """(rows, columns, channels)."""
     short_side: int
     """Short side of `grey`, pixels, at most."""
     priors: Sequence[IntrinsicsPrior] = ()

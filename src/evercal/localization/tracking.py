@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, pose_distance
@@ -190,7 +189,8 @@ class Tracker:
         localizer, contents = self.localizer, self.localizer.contents
         cameras = cameras_in_scenes(self.camera, image, contents.scenes)
         priors = tuple(prior_of(self.camera, image, scene) for scene in contents.scenes)
-        query = Query(image, torch.zeros(0), localizer.options.patches_short_side, priors)
+        nothing = np.zeros((0, 0, 0), np.float32)
+        query = Query(image, nothing, localizer.options.patches_short_side, priors)
         candidate = Candidate(self._scene, self._next_keyframes(predicted))
         change = np.zeros(5) if self._change is None else self._change
         for coarse in (True,) if adopted else (False, True):

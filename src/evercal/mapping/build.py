@@ -10,12 +10,10 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
-from evercal.features.vlad import vlad_for
 from evercal.geometry import SE3, Camera
 from evercal.geometry.uncertain_pose import frame_covariance
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment, BundleOptions
@@ -36,6 +34,7 @@ from evercal.mapping.tracks import (
     open_keyframe,
     refine_depths,
 )
+from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, stated_poses
 
@@ -235,7 +234,7 @@ def _prepare(
     for i in range(len(prepared)):
         features.append(prepared.features(i))
         on_progress("encoding", i + 1, len(prepared))
-    pairs = matched_pairs(prepared, vlad_for(encoder, features))
+    pairs = matched_pairs(prepared, encoder.vlad(features))
     prepared.depth_scale = depth_scale(prepared, pairs)
     check = check_poses(prepared, pairs)
     wrong, untracked = (
@@ -267,7 +266,7 @@ def _open_keyframes(
         return keyframe
 
     keyframes = []
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         for keyframe in pool.map(open_one, prepared.keyframes):
             keyframes.append(keyframe)
             on_progress("mapping", len(keyframes), len(prepared.keyframes))
@@ -315,7 +314,7 @@ def _adjust(
         if not _moved(prepared.stated, stated_cameras[0], adjustment):
             break
         again = partial(refine_depths, prepared, again=True)
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        with ThreadPoolExecutor(cores()) as pool:
             list(pool.map(again, keyframes))
     on_progress("adjusting", options.rounds, options.rounds)
     assert adjustment is not None, "at least one round"
@@ -385,14 +384,14 @@ def _finish(
 
 
 def _keyframes(frames: PreparedFrames, tracks: list[KeyframeTracks]) -> Keyframes:
-    numbers, vlad = [keyframe.frame for keyframe in tracks], vlad_for(frames.encoder)
+    numbers, vlad = [keyframe.frame for keyframe in tracks], frames.encoder.vlad()
     return Keyframes(
         tuple(jpeg(frames.grey[i]) for i in numbers),
         tuple(frames.cameras[i] for i in numbers),
         frames.poses[np.array(numbers)],
-        tuple(torch.from_numpy(k.cell_inverse_depth).half() for k in tracks),
+        tuple(k.cell_inverse_depth.astype(np.float16) for k in tracks),
         tuple(k.landmarks.take(np.flatnonzero(k.confirmed)) for k in tracks),
-        torch.stack([vlad(frames.features(i)) for i in numbers]).half(),
+        np.stack([vlad(frames.features(i)) for i in numbers]).astype(np.float16),
     )
 
 

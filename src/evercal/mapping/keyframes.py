@@ -5,13 +5,12 @@ its 1,200 features of 128 half floats 307 kB. The frozen encoder computes the sa
 image in milliseconds. A map adds depths, landmarks and a descriptor to each.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from evercal.features.views import working_image
 from evercal.geometry.camera import Camera
@@ -22,10 +21,10 @@ from evercal.recordings.images import encode_jpeg
 
 JPEG_QUALITY = 95
 _LANDMARK_FIELDS = {
-    "pixels": torch.int16,
-    "inverse_depth": torch.float32,
-    "slope": torch.float32,
-    "sigma": torch.float32,
+    "pixels": np.int16,
+    "inverse_depth": np.float32,
+    "slope": np.float32,
+    "sigma": np.float32,
 }
 """Fields of `Landmarks`, in order, and how they are stored: 20 bytes a landmark."""
 
@@ -40,11 +39,11 @@ class Keyframes:
     """Intrinsics at working size, one per image."""
     base_from_camera: SE3
     """(n,) poses in the scene's base frame."""
-    inverse_depth: tuple[Tensor, ...] = ()
+    inverse_depth: tuple[NDArray[np.float16], ...] = ()
     """(cells,) half floats of each image, per metre along the optical axis; empty without a map."""
     landmarks: tuple[Landmarks, ...] = ()
     """Of each image; empty without a map."""
-    descriptors: Tensor | None = None
+    descriptors: NDArray[np.float16] | None = None
     """(n, width) VLAD of each image, half floats; None without a map."""
 
     @property
@@ -81,8 +80,8 @@ class Keyframes:
         views = zip(images, self.cameras, self.base_from_camera, strict=True)
         return [Frame(f"memory-{i:05d}", *view) for i, view in enumerate(views)]
 
-    def to_tensors(self) -> dict[str, Tensor]:
-        """Convert to named tensors.
+    def to_tensors(self) -> dict[str, NDArray[Any]]:
+        """Convert to named arrays.
 
         Returns:
             `images` (bytes, concatenated), `lengths` (n,), `cameras` (n, 14), `distortion` (n,)
@@ -98,37 +97,38 @@ class Keyframes:
         pose = self.base_from_camera
         poses = np.concatenate([pose.rotation_wxyz, pose.translation_m], -1)
         tensors = {
-            "images": torch.from_numpy(joined),
-            "lengths": torch.tensor([len(image) for image in self.images]),
-            "cameras": torch.from_numpy(cameras),
-            "distortion": torch.tensor([len(c.distortion) for c in self.cameras]),
-            "poses": torch.from_numpy(poses.reshape(-1, 7)),
+            "images": joined,
+            "lengths": np.array([len(image) for image in self.images], np.int64),
+            "cameras": cameras,
+            "distortion": np.array([len(c.distortion) for c in self.cameras], np.int64),
+            "poses": poses.reshape(-1, 7),
         }
         if self.inverse_depth:
-            tensors["inverse_depth"] = torch.cat(self.inverse_depth)
-            tensors["cells"] = torch.tensor([len(depth) for depth in self.inverse_depth])
+            tensors["inverse_depth"] = np.concatenate(self.inverse_depth)
+            tensors["cells"] = np.array([len(depth) for depth in self.inverse_depth], np.int64)
         if self.descriptors is not None:
             tensors["descriptors"] = self.descriptors
         if self.landmarks:
-            tensors["landmark_counts"] = torch.tensor([len(marks) for marks in self.landmarks])
+            counts = [len(marks) for marks in self.landmarks]
+            tensors["landmark_counts"] = np.array(counts, np.int64)
             for name, kind in _LANDMARK_FIELDS.items():
                 joined = np.concatenate([getattr(marks, name) for marks in self.landmarks])
-                tensors[f"landmark_{name}"] = torch.from_numpy(joined).to(kind)
+                tensors[f"landmark_{name}"] = joined.astype(kind)
         return tensors
 
     @classmethod
-    def from_tensors(cls, tensors: dict[str, Tensor]) -> "Keyframes":
+    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> "Keyframes":
         """The inverse of `to_tensors`."""
-        joined = tensors["images"].numpy().tobytes()
-        ends = np.cumsum(tensors["lengths"].numpy())
+        joined = tensors["images"].tobytes()
+        ends = np.cumsum(tensors["lengths"])
         images = tuple(
             joined[end - n : end] for end, n in zip(ends, tensors["lengths"].tolist(), strict=True)
         )
         cameras = zip(tensors["cameras"].tolist(), tensors["distortion"].tolist(), strict=True)
-        poses = tensors["poses"].numpy()
-        depths: tuple[Tensor, ...] = ()
+        poses = tensors["poses"]
+        depths: tuple[NDArray[np.float16], ...] = ()
         if "cells" in tensors:
-            depths = tensors["inverse_depth"].split(tensors["cells"].tolist())
+            depths = _split(tensors["inverse_depth"], tensors["cells"])
         return cls(
             images=images,
             cameras=tuple(Camera(*row[:6], distortion=row[6 : 6 + k]) for row, k in cameras),
@@ -139,13 +139,17 @@ class Keyframes:
         )
 
 
-def _landmarks_of(tensors: dict[str, Tensor]) -> tuple[Landmarks, ...]:
-    counts = tensors["landmark_counts"].tolist()
+def _landmarks_of(tensors: Mapping[str, NDArray[Any]]) -> tuple[Landmarks, ...]:
+    counts = tensors["landmark_counts"]
     columns = [
-        [part.double().numpy() for part in tensors[f"landmark_{name}"].split(counts)]
+        [part.astype(np.float64) for part in _split(tensors[f"landmark_{name}"], counts)]
         for name in _LANDMARK_FIELDS
     ]
     return tuple(Landmarks(*fields) for fields in zip(*columns, strict=True))
+
+
+def _split(joined: NDArray[Any], counts: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    return tuple(np.split(joined, np.cumsum(counts)[:-1])) if len(counts) else ()
 
 
 def store_keyframes(frames: Sequence[Frame], short_side: int) -> Keyframes:

@@ -68,7 +68,7 @@ class MemoryBudget:
         if self.bytes is None:
             least = min(self.least, len(frames))
             return max(least, int(self.share * len(frames) + 1e-9))
-        from evercal.mapping.keyframes import store_keyframes  # loads torch, and options do not
+        from evercal.mapping.keyframes import store_keyframes
 
         sample = frames[:: -(-len(frames) // _SAMPLED_FRAMES)]
         one = store_keyframes(sample, short_side).bytes / len(sample)

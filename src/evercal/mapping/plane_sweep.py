@@ -7,14 +7,15 @@ space-sweep approach, CVPR 1996).
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-import torch
-from torch import Tensor
-from torch.nn import functional as F
+from numpy.typing import NDArray
 
 from evercal.features.views import ideal_cell_pixels
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
+
+Array = NDArray[np.floating]
 
 NEAR_M, USUAL_M, FAR_M = 0.25, 1.5, 12.0
 """Depths in a room; other recordings scale them (`pose_check.depth_scale`)."""
@@ -31,6 +32,7 @@ MIN_USEFULNESS = 0.1
 PROBED_CELLS = 64
 """Cells of a view that are projected into other views."""
 MIN_PEAK_SIMILARITY = 0.4
+_MOST_ROWS = 30_000  # cv2.remap takes images of up to 32,767 rows
 OUTLIER_PX = 4.0
 """Residuals beyond this have little weight in the refinement."""
 
@@ -39,7 +41,7 @@ OUTLIER_PX = 4.0
 class PosedCells:
     """The encoded cells of a plain view."""
 
-    features: Tensor
+    features: Array
     """(h * w, channels) unit vectors, row-major over the grid of cells."""
     camera: Camera
     """At working size."""
@@ -95,7 +97,7 @@ def inverse_depths(
     others: Sequence[PosedCells],
     guess_m: np.ndarray,
     scale: float = 1.0,
-) -> Tensor:
+) -> NDArray[np.float32]:
     """Inverse depth of every cell along the optical axis.
 
     The plane with the most similar features is refined by two Gauss-Newton steps along the ray,
@@ -111,25 +113,27 @@ def inverse_depths(
         (h * w,) per metre, within 1 / 12 and 1 / 0.25 over the scale.
     """
     least, most = 1 / (scale * FAR_M), 1 / (scale * NEAR_M)
-    guess = torch.from_numpy((1 / guess_m).clip(least, most)).float()
     if not others:
-        return guess
+        return (1 / guess_m).clip(least, most).astype(np.float32)
     sources = [_SourceView(view, other) for other in others]
-    planes = torch.linspace(least, most, PLANES)
-    spread = planes.expand(len(guess), PLANES)
-    similarity = torch.stack([source.along(spread) for source in sources])
-    score = similarity.topk(min(SEEN_BY, len(sources)), 0).values.mean(0)
-    volume = score.T.reshape(1, PLANES, *view.grid)
-    near = F.avg_pool2d(volume, 3, 1, 1, count_include_pad=False)
-    score = (volume + SMOOTHING * (near - volume)).view(PLANES, -1).T
+    planes = np.linspace(least, most, PLANES, dtype=np.float32)
+    similarity = np.stack([source.along(planes) for source in sources])
+    if len(sources) > SEEN_BY:
+        similarity = np.partition(similarity, -SEEN_BY, 0)[-SEEN_BY:]
+    score = similarity.mean(0)
+    # The mean of a cell's neighbours, without those beyond the border.
+    volume, kind = score.reshape(*view.grid, PLANES), {"borderType": cv2.BORDER_CONSTANT}
+    count = cv2.boxFilter(np.ones(view.grid, np.float32), -1, (3, 3), normalize=False, **kind)
+    near = cv2.boxFilter(volume, -1, (3, 3), normalize=False, **kind) / count[..., None]
+    score = (volume + SMOOTHING * (near - volume)).reshape(-1, PLANES)
     inverse = planes[score.argmax(1)]
     for _ in range(2):
-        gradient, hessian = torch.zeros_like(inverse), torch.full_like(inverse, 1e-3)
+        gradient, hessian = np.zeros_like(inverse), np.full_like(inverse, 1e-3)
         for source in sources:
             slope, curvature = source.normal_equation(inverse)
             gradient, hessian = gradient + slope, hessian + curvature
-        step = (gradient / hessian).clamp(-0.1 / scale, 0.1 / scale)
-        inverse = (inverse + step).clamp(least, most)
+        step = (gradient / hessian).clip(-0.1 / scale, 0.1 / scale)
+        inverse = (inverse + step).clip(least, most).astype(np.float32)
     return inverse
 
 
@@ -141,9 +145,9 @@ class _SourceView:
         other_from_view = other.base_from_camera.inverse() @ view.base_from_camera
         self.ray = view.rays() @ other_from_view.rotation_matrix().T
         self.translation = other_from_view.translation_m
-        self.similarity = (view.features @ other.features.T).view(-1, *other.grid)
+        self.similarity = (view.features @ other.features.T).reshape(-1, *other.grid)
 
-    def pixels(self, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def pixels(self, inverse: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Pixels (..., 2) of cells at inverse depths (cells, ...), and whether they are visible."""
         ray = self.ray.reshape(len(self.ray), *[1] * (inverse.ndim - 1), 3)
         point = ray + inverse[..., None] * self.translation
@@ -151,37 +155,45 @@ class _SourceView:
         pixels = self.other.camera.project(np.where(front[..., None], point, [0, 0, 1]))
         return np.nan_to_num(pixels), front & np.isfinite(pixels).all(-1)
 
-    def along(self, inverse: Tensor) -> Tensor:
+    def along(self, planes: Array) -> Array:
         """(cells, planes) similarity at inverse depths, 0 outside this view."""
-        pixels, front = self.pixels(inverse.double().numpy())
+        cells = len(self.ray)
+        pixels, front = self.pixels(np.broadcast_to(planes, (cells, len(planes))))
         size = np.array([self.columns, self.rows]) * self.other.stride
         inside = front & (pixels > -4).all(-1) & (pixels < size + 4).all(-1)
-        grid = torch.from_numpy((pixels + 0.5) / size * 2 - 1).float()
-        sampled = F.grid_sample(
-            self.similarity[:, None], grid[:, None], align_corners=False, padding_mode="border"
-        )
-        return sampled[:, 0, 0].clamp(min=0) * torch.from_numpy(inside)
+        last = np.array([self.columns - 1, self.rows - 1])
+        at = ((pixels + 0.5) / self.other.stride - 0.5).clip(0, last).astype(np.float32)
+        sampled = np.empty((cells, len(planes)), np.float32)
+        # The grids of many cells one below the other are one image.
+        block = _MOST_ROWS // self.rows
+        for start in range(0, cells, block):
+            part = slice(start, start + block)
+            image = self.similarity[part].reshape(-1, self.columns)
+            top = np.arange(len(image) // self.rows, dtype=np.float32)[:, None] * self.rows
+            right, down = at[part, :, 0], at[part, :, 1] + top
+            sampled[part] = cv2.remap(image, right, down, cv2.INTER_LINEAR)
+        return np.maximum(sampled, 0) * inside
 
-    def normal_equation(self, inverse: Tensor) -> tuple[Tensor, Tensor]:
+    def normal_equation(self, inverse: Array) -> tuple[Array, Array]:
         """Gradient and Hessian (cells,) of least squares in the inverse depth of each cell."""
-        rho = inverse.double().numpy()
-        pixels, front = self.pixels(rho)
-        delta = 1e-4
-        slope = torch.from_numpy((self.pixels(rho + delta)[0] - pixels) / delta).float()
-        here = torch.from_numpy(pixels).float()
-        stride = self.other.stride
-        cell = ((here - (stride - 1) / 2) / stride).round()
-        last = torch.tensor([self.columns - 2, self.rows - 2])
-        inside = torch.from_numpy(front) & (cell >= 1).all(1) & (cell <= last).all(1)
-        column, row = cell.clamp(min=1).minimum(last.float()).long().unbind(1)
+        rho = inverse.astype(np.float64)
+        here, front = self.pixels(rho)
+        delta, stride = 1e-4, self.other.stride
+        slope = (self.pixels(rho + delta)[0] - here) / delta
+        cell = np.rint((here - (stride - 1) / 2) / stride).astype(int)
+        last = np.array([self.columns - 2, self.rows - 2])
+        inside = front & (cell >= 1).all(1) & (cell <= last).all(1)
+        column, row = cell.clip(1, last).T
         position, similarity = peak(self.similarity, row, column)
         residual = stride * position + (stride - 1) / 2 - here
-        weight = inside * (similarity - MIN_PEAK_SIMILARITY).clamp(min=0) ** 2
-        weight = weight / (1 + (residual.norm(dim=1) / OUTLIER_PX) ** 2)
+        weight = inside * np.maximum(similarity - MIN_PEAK_SIMILARITY, 0) ** 2
+        weight = weight / (1 + (residual**2).sum(1) / OUTLIER_PX**2)
         return weight * (slope * residual).sum(1), weight * (slope * slope).sum(1)
 
 
-def peak(similarity: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
+def peak(similarity: Array, row: NDArray[np.integer], column: NDArray[np.integer]) -> tuple[
+    Array, Array
+]:
     """The most similar cell of the 3x3 around a cell, to a fraction of a cell.
 
     The similarity (n, h, w) is that of n cells to all cells of another view; rows and columns (n,)
@@ -189,19 +201,19 @@ def peak(similarity: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tenso
     cell.
     """
     _, height, width = similarity.shape
-    n = torch.arange(len(similarity))
-    steps = torch.tensor([(v, u) for v in (-1, 0, 1) for u in (-1, 0, 1)])
+    n = np.arange(len(similarity))
+    steps = np.array([(v, u) for v in (-1, 0, 1) for u in (-1, 0, 1)])
     patch = similarity[n[:, None], row[:, None] + steps[:, 0], column[:, None] + steps[:, 1]]
     best = steps[patch.argmax(1)]
-    row = (row + best[:, 0]).clamp(1, height - 2)
-    column = (column + best[:, 1]).clamp(1, width - 2)
+    row = (row + best[:, 0]).clip(1, height - 2)
+    column = (column + best[:, 1]).clip(1, width - 2)
     middle = similarity[n, row, column]
     du = parabola(similarity[n, row, column - 1], middle, similarity[n, row, column + 1])
     dv = parabola(similarity[n, row - 1, column], middle, similarity[n, row + 1, column])
-    return torch.stack([column + du, row + dv], 1), middle
+    return np.stack([column + du, row + dv], 1), middle
 
 
-def parabola(before: Tensor, middle: Tensor, after: Tensor) -> Tensor:
+def parabola(before: Array, middle: Array, after: Array) -> Array:
     """Maximum of a parabola through three values, relative to the middle; at most half a step."""
-    curvature = (before - 2 * middle + after).clamp(max=-1e-3)
-    return (0.5 * (before - after) / curvature).clamp(-0.5, 0.5)
+    curvature = np.minimum(before - 2 * middle + after, -1e-3)
+    return (0.5 * (before - after) / curvature).clip(-0.5, 0.5)

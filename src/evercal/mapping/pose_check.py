@@ -10,16 +10,15 @@ an essential matrix decide: they confirm the pose, contradict it, or cannot trac
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from scipy.spatial.distance import cdist
 
-from evercal.features.precision import fast_bfloat16
 from evercal.features.sift import SiftFeatures, epipolar_pair, sift_features
-from evercal.features.views import ideal_cell_pixels
-from evercal.features.vlad import Vlad
+from evercal.features.views import cell_centres, ideal_cell_pixels
+from evercal.features.vlad import Vlad, similar_pairs
 from evercal.geometry import Camera
 from evercal.mapping.plane_sweep import FAR_M, NEAR_M, USUAL_M
 from evercal.mapping.prepared_frames import PreparedFrames
@@ -79,11 +78,7 @@ class PoseCheck:
 
 def matched_pairs(recording: PreparedFrames, vlad: Vlad) -> list[MatchedPair]:
     """Match every frame with the most similar ones."""
-    count = len(recording)
-    descriptors = torch.stack([vlad(recording.features(i)) for i in range(count)])
-    similarity = (descriptors @ descriptors.T).fill_diagonal_(-1)
-    partners = similarity.topk(min(PARTNERS, count - 1)).indices.tolist()
-    pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(partners) for j in row})
+    pairs = similar_pairs([recording.features(i) for i in range(len(recording))], vlad, PARTNERS)
     matched = [_matched(recording, i, j) for i, j in pairs]
     return [pair for pair in matched if len(pair.ray) >= MIN_MATCHES]
 
@@ -165,35 +160,28 @@ def scale_of_depths(depth: np.ndarray) -> float:
 def _matched(recording: PreparedFrames, i: int, j: int) -> MatchedPair:
     """Mutual best matches of two frames."""
     a, b = recording.features(i)[::STRIDE], recording.features(j)
-    if fast_bfloat16(a.device):
-        a, b = a.bfloat16(), b.bfloat16()
     similar = a @ b.T
-    best = similar.max(1)
-    back = similar.argmax(0)
-    rows = torch.arange(len(a))
-    mutual = (back[best.indices] == rows) & (best.values > MIN_MATCH_SIMILARITY)
+    best, back, rows = similar.argmax(1), similar.argmax(0), np.arange(len(a))
+    first = similar[rows, best]
     stride = recording.encoder.stride
     camera, other = recording.cell_camera(i), recording.cell_camera(j)
-    rows = rows[mutual]
-    rows = rows[_distinct(similar[rows].float(), best.indices[rows], other, stride)]
-    pixels = ideal_cell_pixels(camera, stride)[(rows * STRIDE).numpy()]
+    rows = rows[(back[best] == rows) & (first > MIN_MATCH_SIMILARITY)]
+    apart = _apart(other.height // stride, other.width // stride)[best[rows]]
+    second = np.where(apart, similar[rows], -1).max(1, initial=-1)
+    rows = rows[1 - first[rows] < RATIO**2 * (1 - second)]
+    pixels = ideal_cell_pixels(camera, stride)[rows * STRIDE]
     ray = camera.pinhole.unproject(pixels)
-    matched = ideal_cell_pixels(other, stride)[best.indices[rows].numpy()].astype(np.float64)
+    matched = ideal_cell_pixels(other, stride)[best[rows]].astype(np.float64)
     # Near the edge, the distortion can have no ray for a cell.
     valid = np.isfinite(ray).all(1) & np.isfinite(matched).all(1)
     return MatchedPair(i, j, ray[valid], matched[valid])
 
 
-def _distinct(similar: Tensor, best: Tensor, camera: Camera, stride: int) -> Tensor:
-    """(n,) matches without a similar cell elsewhere.
-
-    The similarities are (n, cells), and `best` (n,) are the matched cells of the camera's image.
-    """
-    centres = torch.tensor(ideal_cell_pixels(camera, stride), dtype=torch.float32)
-    apart = torch.cdist(centres[best], centres) > NEIGHBOURS * stride
-    second = similar.where(apart, -1.0).amax(1)
-    first = similar.gather(1, best[:, None])[:, 0]
-    return 1 - first < RATIO**2 * (1 - second)
+@lru_cache(maxsize=4)
+def _apart(rows: int, columns: int) -> NDArray[np.bool_]:
+    """(cells, cells) whether two cells of a grid are no neighbours."""
+    centres = cell_centres(rows, columns, 1)
+    return cdist(centres, centres) > NEIGHBOURS
 
 
 def _distance(recording: PreparedFrames, pair: MatchedPair) -> float:

@@ -7,9 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
-from evercal.features.encode import encode_image
 from evercal.features.encoder import Encoder
 from evercal.features.views import working_image
 from evercal.geometry import SE3, Camera
@@ -53,7 +51,7 @@ class PreparedFrames:
             self.cameras.append(camera)
         self.depth_scale = 1.0
         """Factor on the depths that are searched, see `plane_sweep.NEAR_M`."""
-        self._features: dict[int, Tensor] = {}
+        self._features: dict[int, NDArray[np.float16]] = {}
         self._cache_pyramids()
 
     def without(self, excluded: NDArray[np.int64]) -> "PreparedFrames":
@@ -85,19 +83,19 @@ class PreparedFrames:
         """Side of a cell of the feature grid, in pixels of the image that patches are cut from."""
         return self.encoder.stride * self.cameras[i].width / self.cell_camera(i).width
 
-    def features(self, i: int) -> Tensor:
-        """(cells, channels) features of a frame on the CPU, cached in half precision."""
+    def features(self, i: int) -> NDArray[np.float32]:
+        """(cells, channels) features of a frame, cached in half precision."""
         if i not in self._features:
-            features = encode_image(self.grey[i], self.encoder, self.size.cells)
-            self._features[i] = features.flatten(1).T.half().cpu()
-        return self._features[i].float()
+            features = self.encoder.encode(self.grey[i], self.size.cells)
+            self._features[i] = features.reshape(-1, features.shape[2]).astype(np.float16)
+        return self._features[i].astype(np.float32)
 
     def posed_cells(self, i: int) -> PosedCells:
         """The encoded cells of a frame with its pose and camera."""
         camera, stride = self.cell_camera(i), self.encoder.stride
         return PosedCells(self.features(i), camera, self.poses[i], stride)
 
-    def swept(self, i: int, source_views: int) -> tuple[Tensor, list[int]]:
+    def swept(self, i: int, source_views: int) -> tuple[NDArray[np.float32], list[int]]:
         """Inverse depths (cells,) of a frame by a plane sweep, and the frames it was swept over.
 
         At most `source_views` frames are used, selected at the usual depth of the recording.

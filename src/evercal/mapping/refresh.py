@@ -10,11 +10,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from evercal.features.encoder import Encoder
-from evercal.features.vlad import vlad_for
 from evercal.geometry import SE3, average_poses
 from evercal.mapping.bundle_adjustment import BundleAdjustment, BundleOptions
 from evercal.mapping.keyframes import Keyframes, jpeg
@@ -33,6 +31,7 @@ from evercal.mapping.tracks import (
     open_keyframe,
     refine_depths,
 )
+from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame
 
@@ -150,7 +149,7 @@ def _reopened(prepared: PreparedFrames, old: Keyframes, i: int) -> KeyframeTrack
     return KeyframeTracks(
         frame=i,
         landmarks=landmarks,
-        cell_inverse_depth=old.inverse_depth[i].double().numpy(),
+        cell_inverse_depth=old.inverse_depth[i].astype(np.float64),
         patches=tuple(
             cut_patches(pyramid[level], to_level(landmarks.pixels, level))
             for level in range(PYRAMID_LEVELS)
@@ -243,7 +242,7 @@ def _opened(
         return keyframe
 
     opened = []
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         for keyframe in pool.map(open_one, numbers):
             opened.append(keyframe)
             on_progress("mapping", len(opened), len(numbers))
@@ -288,10 +287,10 @@ def _joined(
     opened: Sequence[KeyframeTracks],
 ) -> Keyframes:
     """Return kept keyframes without what is gone, and the new ones."""
-    vlad, numbers = vlad_for(prepared.encoder), [keyframe.frame for keyframe in opened]
+    vlad, numbers = prepared.encoder.vlad(), [keyframe.frame for keyframe in opened]
     stay = old.take(np.array(kept, np.int64))
     assert stay.descriptors is not None, "a map has descriptors"
-    rows = [vlad(prepared.features(i)).half() for i in numbers]
+    rows = [vlad(prepared.features(i)).astype(np.float16) for i in numbers]
     poses = [*stay.base_from_camera, *(prepared.poses[i] for i in numbers)]
     return Keyframes(
         images=(*stay.images, *(jpeg(prepared.grey[i]) for i in numbers)),
@@ -299,12 +298,12 @@ def _joined(
         base_from_camera=SE3.stack(poses),
         inverse_depth=(
             *stay.inverse_depth,
-            *(torch.from_numpy(k.cell_inverse_depth).half() for k in opened),
+            *(k.cell_inverse_depth.astype(np.float16) for k in opened),
         ),
         landmarks=(
             *(marks.take(np.flatnonzero(mask))
               for marks, mask in zip(stay.landmarks, alive, strict=True)),
             *(k.landmarks.take(np.flatnonzero(k.confirmed)) for k in opened),
         ),
-        descriptors=torch.cat([stay.descriptors, *(row[None] for row in rows)]),
+        descriptors=np.concatenate([stay.descriptors, *(row[None] for row in rows)]),
     )  # fmt: skip

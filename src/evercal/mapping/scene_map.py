@@ -2,15 +2,12 @@
 
 import hashlib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import nn
 
 from evercal.errors import InputError
-from evercal.features.device import device_of_network
 from evercal.features.encoder import Encoder
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
@@ -82,17 +79,6 @@ class MapContents:
     """Shorter image side that the encoder works on, pixels."""
     scenes: list[SceneMap] = field(default_factory=list)
     """In order of learning."""
-
-    @property
-    def device(self) -> torch.device:
-        """Device of the encoder's weights."""
-        return device_of_network(self.encoder)
-
-    def to(self, device: torch.device) -> Self:
-        """Move the encoder to a device, in place; keyframes stay on the CPU."""
-        if isinstance(self.encoder, nn.Module):
-            self.encoder.to(device)
-        return self
 
     @property
     def memory_bytes(self) -> int:

@@ -8,7 +8,6 @@ stages/0001-NAME/
   refreshes.json           reports of refreshes, and previous-* files: the state before the last one
 """
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -16,19 +15,16 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import torch
-from torch import nn
+from numpy.typing import NDArray
 
 from evercal.errors import InputError
-from evercal.features.encoder import Encoder, checked_encoder, load_encoder, own_encoder
-from evercal.features.vlad import load_centroids, save_centroids, shipped_centroids
-from evercal.features.weights_file import network_bytes
+from evercal.features.encoder import Encoder, Features, load_encoder
 from evercal.geometry import SE3, Camera
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.recordings.frame import checked_name
-from evercal.storage.atomic import write_bytes, write_json
+from evercal.storage.atomic import write_json
 from evercal.storage.manifest import Manifest
 from evercal.storage.stages import (
     REPORT,
@@ -72,20 +68,19 @@ class MapStore(StageStore):
         self.contents = contents
 
     @classmethod
-    def open(cls, root: Path, encoder: nn.Module | None = None) -> Self:
+    def open(cls, root: Path, encoder: Features | Encoder | None = None) -> Self:
         """Open a map at its last complete scene.
 
-        For a store that was made with a module of the caller's own, `encoder` is that module; its
-        weights are replaced by those in the store.
+        For a store that was made with a function of the caller's own, `encoder` is that function.
         """
 
         def read(manifest: Manifest) -> Self:
             payload = require_map(root, manifest)
             first, *centroids = (str(name) for name in payload["networks"])
             path = root / first
-            local = load_encoder(path) if encoder is None else own_encoder(encoder, path)
+            local = load_encoder(encoder, path)
             for name in centroids:
-                load_centroids(local, root / name)
+                local.centroids = load_tensors(root / name)["centroids"].astype(np.float32)
             contents = MapContents(local, int(payload["short_side"]))
             stages = [str(name) for name in payload["stages"]]
             store = cls(root, contents, stages, (first, *centroids))
@@ -96,22 +91,17 @@ class MapStore(StageStore):
 
     @classmethod
     def create(
-        cls, root: Path, encoder: Path | nn.Module | None = None, short_side: int = 240
+        cls, root: Path, encoder: Path | Features | Encoder | None = None, short_side: int = 240
     ) -> Self:
         """An empty map; nothing is written before the first `commit`.
 
-        `root` must not exist or be empty. The encoder is a weights file, a module that is an
-        `Encoder`, or by default the shipped one.
+        `root` must not exist or be empty. The encoder is as for `load_encoder`.
         """
         require_free(root)
-        if isinstance(encoder, nn.Module):
-            local: Encoder = checked_encoder(encoder)
-        else:
-            local = load_encoder() if encoder is None else load_encoder(encoder)
-        return cls(root, MapContents(local, short_side))
+        return cls(root, MapContents(load_encoder(encoder), short_side))
 
     @classmethod
-    def open_or_create(cls, root: Path, encoder: Path | nn.Module | None = None) -> Self:
+    def open_or_create(cls, root: Path, encoder: Path | Features | None = None) -> Self:
         """The map at a path, or a new one."""
         if not is_store(root):
             return cls.create(root, encoder)
@@ -124,7 +114,7 @@ class MapStore(StageStore):
 
         def write(folder: Path) -> None:
             if not self.networks:
-                self.networks = write_encoder(self.root, self.contents.encoder)
+                self.networks = self.contents.encoder.write(self.root)
             write_scene(folder, scene)
             save_tensors(folder / KEYFRAMES, scene.keyframes.to_tensors())
             write_report(folder, report)
@@ -222,19 +212,6 @@ def require_map(root: Path, manifest: Manifest) -> dict[str, Any]:
     return payload
 
 
-def write_encoder(root: Path, encoder: Encoder, centroids: bool = True) -> tuple[str, ...]:
-    """Write an encoder and, if it is not the shipped one, its centroids; return the file names."""
-    assert isinstance(encoder, nn.Module), "only modules have weights"
-    data = network_bytes(encoder, "encoder")
-    name = f"encoder-{hashlib.sha256(data).hexdigest()[:12]}.safetensors"
-    write_bytes(root / name, data)
-    if not centroids or shipped_centroids(encoder) is not None:
-        return (name,)
-    vlad = name.replace("encoder", "vlad", 1)
-    save_centroids(encoder, root / vlad)
-    return name, vlad
-
-
 def write_scene(folder: Path, scene: SceneMap) -> None:
     """Write everything of a scene but its keyframes into its folder."""
     values = {name: getattr(scene, name) for name in _FIELDS}
@@ -314,19 +291,19 @@ def frame_of(content: Mapping[str, object], correction: FrameCorrection | None) 
     )
 
 
-def correction_tensors(correction: FrameCorrection) -> dict[str, torch.Tensor]:
-    """Slowly varying corrections as named tensors."""
+def correction_tensors(correction: FrameCorrection) -> dict[str, NDArray[Any]]:
+    """Slowly varying corrections as named arrays."""
     rows = [correction.poses.rotation_wxyz, correction.poses.translation_m]
     return {
-        "poses": torch.from_numpy(np.concatenate(rows, -1)),
-        "correction": torch.from_numpy(np.asarray(correction.correction)),
-        "radius": torch.tensor(correction.radius, dtype=torch.float64),
+        "poses": np.concatenate(rows, -1),
+        "correction": np.asarray(correction.correction),
+        "radius": np.asarray(correction.radius, np.float64),
     }
 
 
-def correction_of(tensors: Mapping[str, torch.Tensor]) -> FrameCorrection:
+def correction_of(tensors: Mapping[str, NDArray[Any]]) -> FrameCorrection:
     """The inverse of `correction_tensors`."""
-    poses, (metres, radians) = tensors["poses"].numpy(), tensors["radius"].tolist()
+    poses, (metres, radians) = tensors["poses"], tensors["radius"].tolist()
     return FrameCorrection(
-        SE3(poses[:, :4], poses[:, 4:]), tensors["correction"].numpy(), (metres, radians)
+        SE3(poses[:, :4], poses[:, 4:]), tensors["correction"], (metres, radians)
     )

@@ -91,7 +91,7 @@ def open_keyframe(recording: PreparedFrames, frame: int) -> KeyframeTracks:
     """Landmarks of a keyframe, with depths from a plane sweep over other frames."""
     view = recording.posed_cells(frame)
     swept, _ = recording.swept(frame, SWEPT_FRAMES)
-    inverse = swept.double().numpy()
+    inverse = swept.astype(np.float64)
     near = recording.source_views(1 / inverse, view, SWEPT_FRAMES)
     cell_px = recording.cell_px(frame)
     pixels, cells = detect(recording.grey[frame], view.grid, cell_px)

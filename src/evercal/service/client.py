@@ -93,7 +93,7 @@ class Client:
 
         `Shift.images` holds only the images that were left out.
         """
-        from evercal.calibration.drift import Shift  # loads torch
+        from evercal.calibration.drift import Shift
 
         reference = json.dumps(calibration.to_dict()).encode()
         parts = [*_image_parts(images), *_camera_part(camera)]

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, TypeVar
 
-import torch
+from evercal.processes import cores
 
 Result = TypeVar("Result")
 
@@ -16,9 +16,7 @@ class Desk:
 
     def __init__(self) -> None:
         self.waiting = 0
-        self._pool = ThreadPoolExecutor(
-            torch.get_num_threads(), "image", torch.set_num_threads, (1,)
-        )
+        self._pool = ThreadPoolExecutor(cores(), "image")
 
     async def run(self, work: Callable[..., Result], *args: Any) -> Result:
         """The result of a function, called in a thread."""

@@ -17,8 +17,8 @@ class LiveMap:
     folder may be missing until a first scene is learned.
     """
 
-    def __init__(self, path: Path, device: str = "auto"):
-        self._path, self._device, self._lock = path, device, threading.Lock()
+    def __init__(self, path: Path):
+        self._path, self._lock = path, threading.Lock()
         self.current = self._opened()
 
     def refresh(self) -> bool:
@@ -42,7 +42,7 @@ class LiveMap:
     def _opened(self) -> Map:
         # Read first: a change while the map is opened is then noticed the next time.
         self._stamp = _stamp(self._path)
-        opened = Map.open(self._path, device=self._device)
+        opened = Map.open(self._path)
         if opened.scenes:
             _ = opened.localizer  # loaded before requests wait for it
         return opened

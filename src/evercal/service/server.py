@@ -48,8 +48,6 @@ class ServeOptions:
     """0 for any free port."""
     token: str | None = None
     """Requests must have it as bearer token."""
-    device: str = "auto"
-    """`auto`, `cpu` or `cuda`."""
     limits: RequestBounds = field(default_factory=request_bounds)
     """Sizes above which a request is refused."""
 
@@ -58,7 +56,7 @@ def make_app(
     options: ServeOptions, on_ready: Callable[[tuple[str, ...]], object] = lambda _: None
 ) -> FastAPI:
     """The application; `on_ready` gets the names of the scenes when requests are answered."""
-    live, metrics = LiveMap(options.map, options.device), Metrics()
+    live, metrics = LiveMap(options.map), Metrics()
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:

@@ -1,30 +1,30 @@
-"""Named tensors in safetensors files."""
+"""Named arrays in safetensors files."""
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.storage.atomic import write_bytes
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
 
 def save_tensors(
-    path: Path, tensors: "Mapping[str, Tensor]", metadata: dict[str, str] | None = None
+    path: Path, arrays: Mapping[str, NDArray[np.generic]], metadata: dict[str, str] | None = None
 ) -> None:
-    """Write named tensors, whole or not at all."""
-    from safetensors.torch import save
+    """Write named arrays, whole or not at all."""
+    from safetensors.numpy import save
 
-    plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    # The writer stores the memory of an array as it lies, also of a transposed one.
+    plain = {name: np.asarray(value, order="C") for name, value in arrays.items()}
     write_bytes(path, save(plain, metadata))
 
 
-def load_tensors(path: Path) -> "dict[str, Tensor]":
-    """Read the named tensors of a file."""
+def load_tensors(path: Path) -> dict[str, NDArray[np.generic]]:
+    """Read the named arrays of a file."""
     from safetensors import SafetensorError
-    from safetensors.torch import load
+    from safetensors.numpy import load
 
     try:
         return load(path.read_bytes())

@@ -45,10 +45,10 @@ class Studio:
     Actions return what was done, in one line, and raise `InputError` if it cannot be done.
     """
 
-    def __init__(self, devices: Devices, out: Path, map: Path | None = None, device: str = "auto"):
+    def __init__(self, devices: Devices, out: Path, map: Path | None = None):
         self.connection, self.out = Connection(devices), out
         out.mkdir(parents=True, exist_ok=True)
-        self.cell = Map.open(map or out / "map", device=device)
+        self.cell = Map.open(map or out / "map")
         self.recorder = WristRecorder(out / "wrist", devices.intrinsics)
         self.mount = devices.rough
         """gripper_from_camera, rough or calibrated; None if nothing is known."""
