@@ -134,7 +134,16 @@ class SE3:
 
     def rotation_matrix(self) -> Array:
         """(..., 3, 3)."""
-        return self._rotation().as_matrix()
+        # Written out because it is an inner loop.
+        w, x, y, z = np.moveaxis(self.rotation_wxyz, -1, 0)
+        matrix = np.empty((*self.shape, 3, 3))
+        matrix[..., 0, 0] = 1 - 2 * (y * y + z * z)
+        matrix[..., 0, 1], matrix[..., 0, 2] = 2 * (x * y - w * z), 2 * (x * z + w * y)
+        matrix[..., 1, 0], matrix[..., 1, 2] = 2 * (x * y + w * z), 2 * (y * z - w * x)
+        matrix[..., 1, 1] = 1 - 2 * (x * x + z * z)
+        matrix[..., 2, 0], matrix[..., 2, 1] = 2 * (x * z - w * y), 2 * (y * z + w * x)
+        matrix[..., 2, 2] = 1 - 2 * (x * x + y * y)
+        return matrix
 
     def matrix(self) -> Array:
         """(..., 4, 4) homogeneous matrices."""

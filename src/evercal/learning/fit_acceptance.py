@@ -8,8 +8,8 @@ import numpy as np
 
 from evercal.geometry.near import COARSE
 from evercal.localization.acceptance import COVARIANCE_SCALE, MAX_SUPPORT, MIN_SUPPORT
+from evercal.localization.intrinsics import MeasuredIntrinsics
 from evercal.localization.localizer import Localizer
-from evercal.localization.pose_refinement import MeasuredIntrinsics
 from evercal.mapping.scene_map import SHARED_PX, LeftOut, MapContents, SceneMap
 from evercal.recordings.frame import Frame
 

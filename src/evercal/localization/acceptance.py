@@ -43,9 +43,9 @@ def support(hypothesis: Hypothesis) -> float:
     return ratio * exact**2 * (ratio * hypothesis.planned) ** 0.5
 
 
-def better(trial: Hypothesis, best: Hypothesis) -> bool:
-    """Whether a pose has more support, or more PnP inliers where neither pose has any."""
-    return (support(trial), trial.pnp_inliers) > (support(best), best.pnp_inliers)
+def order(hypothesis: Hypothesis) -> tuple[float, int]:
+    """Poses are ordered by their support, and by PnP inliers where they have none."""
+    return support(hypothesis), hypothesis.pnp_inliers
 
 
 def accepted(hypothesis: Hypothesis, scene: SceneMap, times: float = 1.0) -> bool:

@@ -8,20 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera
-from evercal.localization.intrinsics import Prior, self_calibrated
+from evercal.localization.intrinsics import Prior, RefinedPose, self_calibrated
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import (
     INTRINSICS,
     Observed,
-    RefinedPose,
     changed_camera,
-    refine_pose,
+    minimise,
 )
 from evercal.mapping.landmarks import project_surface
 from evercal.mapping.patches import Patches, align_patches, from_level, to_level, whitening
 
 Array = NDArray[np.floating]
+Pose = tuple[Array, Array]
+"""Rotation (3, 3) and position (3,) of map_from_camera."""
 
 _MOST_AGAIN = 8
 """Searches after a change of the intrinsics, at most."""
@@ -107,7 +108,8 @@ def align_pose(
     needs no `coarse` search. Returns None if too few landmarks match.
     """
     search = _Search(pyramid, keyframes, options)
-    pose, rounds = start, options.rounds if coarse else options.rounds[1:]
+    pose = start.rotation_matrix(), start.translation_m
+    rounds = options.rounds if coarse else options.rounds[1:]
     change = np.zeros(INTRINSICS) if change is None else change
     found, again = None, 0
     while True:
@@ -125,7 +127,9 @@ def align_pose(
             if prior.sigma.other_camera:
                 break  # both are good, and it is undecided between them
             return None  # the intrinsics do not converge
-        pose, change, again = refined.pose.pose, refined.change, again + 1
+        at = refined.pose.pose
+        pose, change = (at.rotation_matrix(), at.translation_m), refined.change
+        again += 1
         rounds = options.rounds if moved > _FAR_PX else options.rounds[-1:]
     inliers = refined.residual_px < options.inlier_px
     if inliers.sum() < options.min_matches:
@@ -142,18 +146,22 @@ def align_pose(
 
 
 def _moved_px(camera: Camera, before: Array, after: Array) -> float:
+    if np.array_equal(before, after):
+        return 0.0
     across = [np.linspace(0, side - 1, 5) for side in (camera.width, camera.height)]
     plane = camera.pinhole.unproject(np.stack(np.meshgrid(*across), -1))
     pixels = [changed_camera(camera, change).project(plane) for change in (before, after)]
     return float(np.nanquantile(np.linalg.norm(pixels[1] - pixels[0], axis=-1), 0.75))
 
 
-def _consistent(observed: Observed, camera: Camera) -> SE3 | None:
+def _consistent(observed: Observed, camera: Camera) -> Pose | None:
     loose = PnpOptions(threshold_px=4.0, max_iterations=200, min_iterations=20)
     ideal = camera.pinhole.project(camera.unproject(observed.pixels))
     valid = np.isfinite(ideal).all(1)
     rough = solve_pnp(ideal[valid], observed.points_m[valid], camera, loose)
-    return None if rough is None else rough.pose.pose
+    if rough is None:
+        return None
+    return rough.pose.rotation_matrix(), rough.pose.translation_m
 
 
 class _Found(NamedTuple):
@@ -193,36 +201,36 @@ class _Search:
         )
 
     def rounds(
-        self, rounds: Sequence[AlignmentRound], camera: Camera, pose: SE3, found: _Found | None
-    ) -> tuple[SE3, _Found] | None:
-        """Search coarse to fine and refine the pose after every round."""
+        self, rounds: Sequence[AlignmentRound], camera: Camera, pose: Pose, found: _Found | None
+    ) -> tuple[Pose, _Found] | None:
+        """Search coarse to fine; return the matches of the last round and where it began."""
         for step in rounds:
             found = self.run(step, camera, pose, found)
             if found is None:
                 return None
+            if step is rounds[-1]:
+                return pose, found
+            rough = pose
             if step.level:
                 # Many matches of the first round are wrong; RANSAC selects a consistent set.
                 rough = _consistent(found.observed, camera)
-                if rough is None:
-                    return None
-                pose = rough
-            pose = refine_pose(found.observed, camera, pose, step.steps).pose.pose
-        assert found is not None, "at least one round"
-        return pose, found
+            if rough is None:
+                return None
+            at = minimise(found.observed, camera, rough, step.steps)
+            pose = at.rotation, at.position
+        raise AssertionError("at least one round")
 
     def run(
-        self, step: AlignmentRound, camera: Camera, pose: SE3, before: _Found | None
+        self, step: AlignmentRound, camera: Camera, pose: Pose, before: _Found | None
     ) -> _Found | None:
         """Match landmarks near their expected positions; None for too few matches."""
-        options, inverse = self.options, pose.inverse()
+        options = self.options
         share = 1.0 if before is None else len(before.landmark) / before.expected
         more = max(1.0, options.enough_matched / max(share, 1e-3))
         most = int(min(more, options.most_more) * step.landmarks)
-        rotation, shift = inverse.rotation_matrix(), inverse.translation_m
-        which, pixels, affines = project_surface(self.surface_m, rotation, shift, camera)
-        if len(which) > most:
-            spread = np.linspace(0, len(which) - 1, most).round().astype(int)
-            which, pixels, affines = which[spread], pixels[spread], affines[spread]
+        rotation = pose[0].T
+        shift = -rotation @ pose[1]
+        which, pixels, affines = project_surface(self.surface_m, rotation, shift, camera, most)
         if not len(which):
             return None
         patches, level = self.patches(step.level, which), step.level

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from scipy.special import expit, logit
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.geometry import Camera, UncertainPose
 from evercal.localization.pose_refinement import (
-    MeasuredIntrinsics,
+    Minimum,
     Observed,
-    RefinedPose,
-    refine_pose,
+    in_parent_axes,
+    inverse_of,
+    minimise,
 )
 from evercal.mapping.scene_map import SHARED_PX
 
@@ -34,6 +35,8 @@ DOUBT = 3.0
 
 _REFINE_STEPS = 10
 """Gauss-Newton steps of pose and intrinsics, at most."""
+_BETTER = 0.7
+"""Relative variance below which other intrinsics fit so much better that a linear step is rough."""
 _REACHED = 0.05 * 7.815
 """Probability of another camera at which the 95 % ellipsoid (chi-squared) reaches its pose."""
 
@@ -117,61 +120,100 @@ class Prior:
         return float(expit(logit(self.sigma.other_camera) + other - own))
 
 
+    def decided(
+        self, camera: Camera, change: Array, covariance: Array
+    ) -> tuple[float, Array | None]:
+        """Probability of another camera, and variances (5,) that an estimate asks for.
+
+        The variances are None where the prior holds; the estimate is as for `tested`.
+        """
+        if not self.sigma.other_camera:
+            variances = self.tested(camera, change, covariance)
+            holds = np.allclose(variances, self.tight(camera))
+            return 0.0, None if holds else variances
+        doubt = self.other_camera(camera, change, covariance)
+        if doubt <= 0.5:
+            return doubt, None
+        return doubt, replace(self, sigma=UNKNOWN).tested(camera, change, covariance)
+
+
 def _log_density(change: Array, covariance: Array) -> float:
     squares = change @ np.linalg.solve(covariance, change)
     return float(-(squares + np.linalg.slogdet(covariance)[1]) / 2)
 
 
+@dataclass(frozen=True, eq=False)
+class MeasuredIntrinsics:
+    """Intrinsics that landmarks measure without a prior."""
+
+    squares: float
+    """Squared change from the stated intrinsics in standard deviations of landmarks' errors."""
+    by_shared: float
+    """Factor on the variance is 1 + `by_shared` s^2, if landmarks share errors of s pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedPose:
+    """A pose, intrinsics and the residuals of the observations."""
+
+    pose: UncertainPose
+    """points_from_camera; the uncertainty of the intrinsics is part of its covariance."""
+    residual_px: Array
+    """(n,) reprojection errors, pixels of the image."""
+    camera: Camera
+    """Refined intrinsics."""
+    change: Array
+    """(5,) change of the intrinsics."""
+    by_intrinsics: Array
+    """(6, 6) share of the pose's covariance that is due to the intrinsics."""
+    measured: MeasuredIntrinsics
+
+
 def self_calibrated(
-    observed: Observed, camera: Camera, pose: SE3, change: Array, prior: Prior
+    observed: Observed, camera: Camera, start: tuple[Array, Array], change: Array, prior: Prior
 ) -> RefinedPose:
-    """Pose and intrinsics; the prior gives way where the image contradicts it."""
-    free = refine_pose(observed, camera, pose, _REFINE_STEPS, prior.free(camera), change)
+    """Pose and intrinsics; the prior gives way where the image contradicts it.
+
+    The start is rotation and position of points_from_camera. Other priors than the stated one are
+    a linear step away, unless the image contradicts it.
+    """
+    own = minimise(observed, camera, start, _REFINE_STEPS, prior.tight(camera), change)
     # Errors that neighbouring landmarks share do not average out.
-    by_shared = float((observed.whitening**2).sum()) / (2 * free.variance)
+    by_shared = float((observed.whitening**2).sum()) / (2 * own.variance)
     shared = 1 + prior.shared_px**2 * by_shared
     prior = replace(prior, scale=shared * prior.scale)
-    if prior.sigma.other_camera:
-        refined = _own_or_other(observed, camera, pose, free, prior)
-    else:
-        refined = _contradictable(observed, camera, free, prior)
-    squares = free.change @ np.linalg.solve(free.change_covariance, free.change)
-    wider = refined.pose.covariance + (shared - 1) * refined.by_intrinsics
-    return replace(
-        refined,
-        pose=UncertainPose(refined.pose.pose, wider),
-        by_intrinsics=shared * refined.by_intrinsics,
-        measured=MeasuredIntrinsics(float(squares), by_shared),
-    )
+    step, inverse = own.moved(own.variance / prior.free(camera))
+    variance, free = own.variance_after(step), own.change + step[6:]
+    doubt, variances = prior.decided(camera, free, variance * inverse[6:, 6:])
+    if variances is not None or variance < _BETTER * own.variance:
+        best = minimise(observed, camera, start, _REFINE_STEPS, prior.free(camera), free)
+        variance, inverse, free = best.variance, inverse_of(best.data), best.change
+        doubt, variances = prior.decided(camera, free, variance * inverse[6:, 6:])
+        if variances is not None:
+            start = best.rotation, best.position
+            own = minimise(observed, camera, start, _REFINE_STEPS, variances, free)
+    squares = free @ np.linalg.solve(variance * inverse[6:, 6:], free)
+    limits = prior.tight(camera) if variances is None else variances
+    covariance, lens = _covariances(own, limits)
+    if variances is None and doubt:
+        # A covariance whose deviation reaches to the pose of another camera of the model.
+        # Covariances are scaled by the caller, distances are not.
+        other = replace(prior, sigma=SAME_MODEL).tight(camera)
+        off = (own.moved(own.variance / other)[0] - own.moved(own.variance / limits)[0])[:6]
+        wider = _covariances(own, other)[1] - lens + np.outer(off, off) / prior.scale
+        more = min(1.0, doubt / _REACHED) * wider
+        covariance, lens = covariance + more, lens + more / shared
+    lens = shared * lens
+    pose = own.pose(covariance + (1 - 1 / shared) * lens)
+    by_lens = in_parent_axes(own.rotation, lens)
+    measured = MeasuredIntrinsics(float(squares), by_shared)
+    return RefinedPose(pose, own.residual_px, own.camera, own.change, by_lens, measured)
 
 
-def _contradictable(
-    observed: Observed, camera: Camera, free: RefinedPose, prior: Prior
-) -> RefinedPose:
-    variances = prior.tested(camera, free.change, free.change_covariance)
-    return refine_pose(observed, camera, free.pose.pose, _REFINE_STEPS, variances, free.change)
-
-
-def _own_or_other(
-    observed: Observed, camera: Camera, pose: SE3, free: RefinedPose, prior: Prior
-) -> RefinedPose:
-    """Pose for the recording's camera, or any; a less probable one widens it, see `_REACHED`."""
-    doubt = prior.other_camera(camera, free.change, free.change_covariance)
-    if doubt > 0.5:
-        return _contradictable(observed, camera, free, replace(prior, sigma=UNKNOWN))
-    own = refine_pose(observed, camera, pose, _REFINE_STEPS, prior.tight(camera))
-    other = _contradictable(observed, camera, free, replace(prior, sigma=SAME_MODEL))
-    # A covariance whose deviation reaches from one pose to the other. Covariances are scaled by the
-    # caller, distances are not.
-    turn = (own.pose.pose.inverse() @ other.pose.pose).log()[3:]
-    off = np.r_[other.pose.pose.translation_m - own.pose.pose.translation_m, turn]
-    apart = np.outer(off, off) / prior.scale
-    more = min(1.0, doubt / _REACHED) * (other.by_intrinsics - own.by_intrinsics + apart)
-    return replace(
-        own,
-        pose=UncertainPose(own.pose.pose, own.pose.covariance + more),
-        by_intrinsics=own.by_intrinsics + more,
-    )
+def _covariances(minimum: Minimum, variances: Array) -> tuple[Array, Array]:
+    """(6, 6) covariance of a pose in camera axes, and the share of the intrinsics in it."""
+    whole = minimum.variance * minimum.moved(minimum.variance / variances)[1][:6, :6]
+    return whole, whole - minimum.variance * inverse_of(minimum.data[:6, :6])
 
 
 def cameras_in_scenes(

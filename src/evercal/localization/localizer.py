@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.features.encoder import Features
+from evercal.features.views import working_image
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg, resize_pixels
 from evercal.localization.acceptance import (
     USELESS_M,
     accepted,
-    better,
+    order,
     differ,
     in_base,
     rejection,
@@ -38,7 +39,7 @@ from evercal.localization.intrinsics import (
 )
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.matching import Matcher
-from evercal.localization.pnp import PnpResult, solve_pnp
+from evercal.localization.pnp import PnpResult, solve_pnp, uncertain
 from evercal.localization.pose_refinement import INTRINSICS, changed_camera
 from evercal.localization.query import (
     Attempt,
@@ -56,6 +57,11 @@ from evercal.recordings.images import as_rgb
 _ALONG_FOCAL = np.eye(INTRINSICS)[0]
 
 
+def turned(image: np.ndarray, turns: int) -> np.ndarray:
+    """An image after quarter turns clockwise."""
+    return np.ascontiguousarray(np.rot90(image, -turns))
+
+
 @dataclass(frozen=True, eq=False)
 class _Rough:
     """A pose before alignment."""
@@ -65,12 +71,14 @@ class _Rough:
     change: NDArray[np.floating]
     """(5,) change of the intrinsics, see `changed_camera`."""
 
-    def as_answer(self, scene: int) -> Hypothesis:
+    def as_answer(self, scene: int, camera: Camera) -> Hypothesis:
         """The PnP pose as the answer, for the ablation of alignment."""
         count, inliers = len(self.matches.pixels), self.pnp.inliers
         return Hypothesis(
             scene,
-            self.pnp.pose,
+            uncertain(
+                self.matches.pixels[inliers], self.matches.points_m[inliers], camera, self.pnp.pose
+            ),
             None,
             self.matches.pixels[inliers],
             self.matches.points_m[inliers],
@@ -153,54 +161,44 @@ class Localizer:
 
     def _best_hypothesis(self, query: Query, cameras: Sequence[Camera]) -> Hypothesis:
         """The pose with the most support, from as few attempts as it takes."""
-        first, other_camera = self.options.quick
+        first, second, *thorough = self.options.attempts
         best, view = self._tried(query, first, cameras), query
         if self.accepts(best, self.options.immediate):
             return best
-        for turns in (2, 1, 3):
-            turned = self._turned(query, turns)
-            trial = self._tried(turned, first, cameras)
-            if self.accepts(trial, self.options.immediate):
-                return trial
-            if better(trial, best):
-                best, view = trial, turned
-        if not self.accepts(best):
-            unknown = self._tried(view, other_camera, cameras)
-            best = unknown if better(unknown, best) else best
-            if best.pnp_inliers < self.options.promising_inliers:
-                return best
-        done: set[tuple[int, int, bool, bytes]] = set()
-        # A pose that is barely accepted in the first attempt may be beaten in the second.
-        for attempt in self.options.thorough:
-            trial = self._tried(view, attempt, cameras, done)
-            best = trial if support(trial) > support(best) else best
-            if self.accepts(best):
+        if best.pnp_inliers < self.options.aligned_inliers:  # turned, or of another room
+            view = self._upright(query)
+        best = max(best, self._tried(view, second, cameras), key=order)
+        for attempt in thorough:
+            if self.accepts(best) or best.pnp_inliers < self.options.promising_inliers:
                 break
+            best = max(best, self._tried(view, attempt, cameras), key=order)
         return best
 
-    def _tried(
-        self,
-        query: Query,
-        attempt: Attempt,
-        cameras: Sequence[Camera],
-        done: set[tuple[int, int, bool, bytes]] | None = None,
-    ) -> Hypothesis:
-        """The pose with the most support of one attempt; candidates that are `done` are skipped."""
-        done, best = set() if done is None else done, Hypothesis(0)
+    def _upright(self, query: Query) -> Query:
+        """The image in the quarter turn whose middle is most similar to keyframes."""
+        grey = working_image(query.image, query.plain, self.contents.short_side)[0]
+        side = self.options.middle_px
+        top, left = ((whole - side) // 2 for whole in grey.shape)
+        middle = grey[top : top + side, left : left + side]
+        features = [self.contents.encoder(turned(middle, turns)) for turns in range(4)]
+        similar = [self._matcher.similarity(rows) for rows in features]
+        turns = int(np.argmax(similar))
+        if not turns:
+            return query
+        features = self.contents.encoder(turned(grey, turns))
+        return replace(query, features=features, turns=turns, similar={}, tried=set())
+
+    def _tried(self, query: Query, attempt: Attempt, cameras: Sequence[Camera]) -> Hypothesis:
+        """The pose with the most support of one attempt."""
+        best = Hypothesis(0)
         for candidate in self._matcher.candidates(query, attempt):
-            if candidate.key in done:
+            if candidate.key in query.tried:
                 continue  # in a small map a wider attempt often repeats the one before
-            done.add(candidate.key)
-            trial = self._guided(query, candidate, cameras[candidate.scene])
-            best = trial if best.pose is None or better(trial, best) else best
-            if self.accepts(trial, self.options.immediate):
+            query.tried.add(candidate.key)
+            best = max(best, self._guided(query, candidate, cameras[candidate.scene]), key=order)
+            if self.accepts(best, self.options.immediate):
                 break
         return best
-
-    def _turned(self, query: Query, turns: int) -> Query:
-        image = np.ascontiguousarray(np.rot90(query.image, -turns))
-        features = self.contents.encoder.encode(image, self.contents.short_side)
-        return replace(query, features=features, turns=turns)
 
     def _guided(self, query: Query, candidate: Candidate, camera: Camera) -> Hypothesis:
         best = self._hypothesis(query, candidate, camera)
@@ -226,14 +224,14 @@ class Localizer:
         if rough is None:
             return Hypothesis(candidate.scene)
         if not self.options.align:
-            return rough.as_answer(candidate.scene)
+            return rough.as_answer(candidate.scene, camera)
         inliers = int(rough.pnp.inliers.sum())
         pose = rough.pnp.pose
         if near is None and inliers < self.options.aligned_inliers:
-            return Hypothesis(candidate.scene, pose, pnp_inliers=inliers)
-        aligned = self.aligned(query, candidate, camera, pose.pose, rough.change)
+            return Hypothesis(candidate.scene, pnp_inliers=inliers)
+        aligned = self.aligned(query, candidate, camera, pose, rough.change)
         if aligned is None:
-            return Hypothesis(candidate.scene, pose, pnp_inliers=inliers)
+            return Hypothesis(candidate.scene, pnp_inliers=inliers)
         return replace(aligned, pnp_inliers=inliers, matches=rough.matches)
 
     def aligned(
@@ -388,7 +386,7 @@ class Localizer:
             milliseconds=milliseconds,
             support=support(best),
         )
-        if best.pose is None:
+        if best.pose is None and not best.pnp_inliers:
             return replace(rejected, status="failed", reason="fewer than 6 inliers")
         if not self.accepts(best):
             return replace(rejected, reason=rejection(best, scene))

@@ -6,7 +6,7 @@ from scipy.spatial.distance import cdist
 
 from evercal.features.views import cell_centres, ideal_cell_pixels
 from evercal.geometry import SE3, Camera
-from evercal.localization.keyframe_bank import KeyframeBank
+from evercal.localization.keyframe_bank import KeyframeBank, MatchedCells
 from evercal.localization.query import Attempt, Candidate, LocalizeOptions, Matches, Query
 
 
@@ -23,14 +23,10 @@ class Matcher:
         scene is tried with the keyframes that got most votes. If these are too few, its next
         keyframes in the ranking are added.
         """
-        features = _rows(query.features)
-        ranked = self._bank.retrieve(features)
+        ranked = self._bank.retrieve(_rows(query.features))
         proposed, rest = ranked[: attempt.retrieved], ranked[attempt.retrieved :]
-        sample = features[:: self._options.retrieval_stride]
-        best = []
-        for index in proposed:
-            keys = self._bank.load(int(index)).cells.features
-            best.append((sample @ keys.T).max(1))
+        stride = self._options.retrieval_stride
+        best = [self._most_similar(query, stride, int(index))[1] for index in proposed]
         votes = np.bincount(np.argmax(best, 0), minlength=len(proposed))
         order = np.argsort(-votes, kind="stable")
         scene = self._bank.scene[proposed]
@@ -47,6 +43,16 @@ class Matcher:
             candidates.append(Candidate(s, keyframes, attempt.match_stride, attempt.unknown_camera))
         return candidates
 
+    def similarity(self, features: NDArray[np.float32]) -> float:
+        """Mean similarity of every second row and column of features (rows, columns, channels).
+
+        Each is compared to its most similar cell in the keyframes that match best.
+        """
+        proposed = self._bank.retrieve(_rows(features))[: self._options.keyframes]
+        rows = _rows(features[::2, ::2])
+        best = [(rows @ self._bank.load(int(k)).cells.features.T).max(1) for k in proposed]
+        return float(np.max(best, 0).mean())
+
     def matches(
         self, query: Query, candidate: Candidate, camera: Camera, near: SE3 | None = None
     ) -> Matches:
@@ -56,57 +62,58 @@ class Matcher:
         patch is matched only to points that project within `LocalizeOptions.guided_px` of it.
         """
         stride = candidate.match_stride if self._options.align else 1
-        patches, pixels = strided_patches(query, camera, self._bank.encoder.stride, stride)
-        features = _rows(query.features)[patches]
-        points = self._nearest(features, candidate.keyframes, pixels, camera, near)
-        valid = np.isfinite(points).all(1)
+        pixels = cell_pixels(camera, self._bank.encoder.stride, query.turns)
+        pixels = pixels[_grid(query, stride)]
+        loaded = [self._bank.load(int(index)).cells for index in candidate.keyframes]
+        if near is None:
+            found = [self._most_similar(query, stride, int(k)) for k in candidate.keyframes]
+        else:
+            rows = _rows(query.features)[_grid(query, stride)]
+            found = [self._near(rows, pixels, cells, camera, near) for cells in loaded]
+        nearest, height = (np.array(values) for values in zip(*found, strict=True))
+        best = height.argmax(0)
+        points = np.empty((len(pixels), 3))
+        for number, cells in enumerate(loaded):
+            points[best == number] = cells.points_m[nearest[number, best == number]]
+        valid = np.isfinite(pixels).all(1) & (height.max(0) > 0)
         return Matches(pixels[valid], points[valid])
 
-    def _nearest(
+    def _most_similar(
+        self, query: Query, stride: int, keyframe: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Index and similarity (n,) of the cell of a keyframe that is most similar to each patch.
+
+        Patches are those of every `stride`-th row and column. Retrieval and matches share them.
+        """
+        key = stride, keyframe
+        if key not in query.similar:
+            rows = _rows(query.features)[_grid(query, stride)]
+            similarity = rows @ self._bank.load(keyframe).cells.features.T
+            nearest = similarity.argmax(1)
+            query.similar[key] = nearest, similarity[np.arange(len(rows)), nearest]
+        return query.similar[key]
+
+    def _near(
         self,
-        features: NDArray[np.float32],
-        keyframes: NDArray[np.int64],
+        rows: NDArray[np.float32],
         pixels: np.ndarray,
+        cells: MatchedCells,
         camera: Camera,
-        near: SE3 | None,
-    ) -> np.ndarray:
-        """(n, 3) points of the patches most similar to features (n, channels); else NaN."""
-        loaded = [self._bank.load(int(index)).cells for index in keyframes]
-        # One keyframe at a time: the products of all would not fit the processor's cache.
-        similarity = [features @ keyframe.features.T for keyframe in loaded]
-        if near is not None:
-            similarity = [
-                values * self._within(pixels, keyframe.points_m, camera, near)
-                for values, keyframe in zip(similarity, loaded, strict=True)
-            ]
-        nearest = np.array([values.argmax(1) for values in similarity])
-        rows = np.arange(len(features))
-        height = np.array([v[rows, k] for v, k in zip(similarity, nearest, strict=True)])
-        best = height.argmax(0)
-        points = np.empty((len(features), 3))
-        for number, keyframe in enumerate(loaded):
-            points[best == number] = keyframe.points_m[nearest[number, best == number]]
-        if near is not None:
-            points[height.max(0) <= 0] = np.nan
-        return points
-
-    def _within(
-        self, pixels: np.ndarray, points_m: np.ndarray, camera: Camera, near: SE3
-    ) -> NDArray[np.bool_]:
-        projected = camera.pinhole.project(near.inverse().apply(points_m))
+        near: SE3,
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """The same among the cells that project near each patch; similarity 0 without any."""
+        projected = camera.pinhole.project(near.inverse().apply(cells.points_m))
         projected = np.where(np.isnan(projected), np.inf, projected)
-        return cdist(pixels, projected, "sqeuclidean") < self._options.guided_px**2
+        within = cdist(pixels, projected, "sqeuclidean") < self._options.guided_px**2
+        similarity = (rows @ cells.features.T) * within
+        nearest = similarity.argmax(1)
+        return nearest, similarity[np.arange(len(rows)), nearest]
 
 
-def strided_patches(
-    query: Query, camera: Camera, encoder_stride: int, stride: int
-) -> tuple[NDArray[np.int64], np.ndarray]:
-    """Indices (m,) and ideal pixels (m, 2) of patches of every n-th row and column with a ray."""
+def _grid(query: Query, stride: int) -> NDArray[np.int64]:
+    """Indices (n,) of the patches of every `stride`-th row and column."""
     rows, columns = query.features.shape[:2]
-    patches = np.arange(rows * columns).reshape(rows, columns)[::stride, ::stride].ravel()
-    pixels = cell_pixels(camera, encoder_stride, query.turns)[patches]
-    valid = np.isfinite(pixels).all(1)
-    return patches[valid], pixels[valid]
+    return np.arange(rows * columns).reshape(rows, columns)[::stride, ::stride].ravel()
 
 
 def cell_pixels(camera: Camera, stride: int, turns: int) -> np.ndarray:

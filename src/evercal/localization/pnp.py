@@ -26,8 +26,8 @@ class PnpOptions:
 class PnpResult(NamedTuple):
     """A pose and its inliers."""
 
-    pose: UncertainPose
-    """From the frame of the points to the camera's: points_from_camera."""
+    pose: SE3
+    """points_from_camera."""
     inliers: np.ndarray
     """(n,) bool."""
 
@@ -57,18 +57,17 @@ def solve_pnp(
     if not enough or not np.isfinite(pose.t).all():
         return None
     points_from_camera = SE3(np.asarray(pose.q, float), np.asarray(pose.t, float)).inverse()
-    covariance = pose_covariance(pixels[inliers], points_m[inliers], camera, points_from_camera)
-    return PnpResult(UncertainPose(points_from_camera, covariance), inliers)
+    return PnpResult(points_from_camera, inliers)
 
 
-def pose_covariance(
+def uncertain(
     pixels: np.ndarray, points_m: np.ndarray, camera: Camera, points_from_camera: SE3
-) -> np.ndarray:
-    """First-order covariance (6, 6), mean squared residual per coordinate times (J^T J)^-1."""
+) -> UncertainPose:
+    """The pose with its first-order covariance: mean squared residual times (J^T J)^-1."""
     rotation = points_from_camera.rotation_matrix()
     position = points_from_camera.translation_m
     residual, slope = linearise(pixels, points_m, rotation, position, camera.pinhole)
-    rows = slope.transpose(1, 0, 2).reshape(6, -1)
+    rows = slope.reshape(6, -1)
     variance = float((residual**2).mean()) + 1e-6
     covariance = variance * np.linalg.pinv(rows @ rows.T, hermitian=True)
-    return in_parent_axes(rotation, covariance)
+    return UncertainPose(points_from_camera, in_parent_axes(rotation, covariance))

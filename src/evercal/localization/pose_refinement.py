@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3, Camera, UncertainPose
 
@@ -13,7 +12,8 @@ Array = NDArray[np.floating]
 
 INTRINSICS = 5
 """Parameters of a change: logarithm of the focal lengths, principal point in pixels, k1, k2."""
-_SMALL = 1e-5
+_CONVERGED = 1e-3
+"""Squared length of the last step, in standard deviations."""
 _DIVERGED = 10.0
 """Growth of the variance of residuals at which the step before is kept."""
 _FOCAL_CHANGE = 1.0
@@ -31,132 +31,124 @@ class Observed:
     points_m: Array
     """(n, 3) in the map's frame."""
     whitening: Array
-    """(n, 2, 2) that gives errors in the image unit variance."""
+    """(2, 2, n) that gives errors in the image unit variance."""
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredIntrinsics:
-    """Intrinsics that landmarks measure without a prior."""
+class Minimum:
+    """Pose and intrinsics with the least errors, and the equations there."""
 
-    squares: float
-    """Squared change from the stated intrinsics in standard deviations of landmarks' errors."""
-    by_shared: float
-    """Factor on the variance is 1 + `by_shared` s^2, if landmarks share errors of s pixels."""
-
-
-@dataclass(frozen=True, eq=False)
-class RefinedPose:
-    """A pose, intrinsics and the residuals of the observations."""
-
-    pose: UncertainPose
-    """points_from_camera; the uncertainty of the intrinsics is part of its covariance."""
-    residual_px: Array
-    """(n,) reprojection errors, pixels of the image."""
+    rotation: Array
+    """(3, 3) and `position` (3,) are those of points_from_camera."""
+    position: Array
     camera: Camera
-    """Refined intrinsics; the given ones without a prior."""
+    """With `change`."""
     change: Array
-    """(5,) change of the intrinsics."""
-    change_covariance: Array
-    """(5, 5)."""
+    """(5,) of the intrinsics."""
     variance: float
     """Robust variance of the whitened errors."""
-    by_intrinsics: Array
-    """(6, 6) share of the pose's covariance that is due to the intrinsics."""
-    measured: MeasuredIntrinsics | None = None
-    """Intrinsics without a prior, where they were estimated."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Iterate:
-    """Pose and intrinsics of an iteration, and the normal equations that led to them."""
-
-    rotation: NDArray[np.float64]
-    position: NDArray[np.float64]
-    change: Array
-    camera: Camera
-    """With the change of the intrinsics."""
-    variance: float
-    """Robust variance of the whitened errors; infinite before the first iteration."""
-    information: Array
-    """(6, 6) or (11, 11), with the prior."""
     data: Array
-    """The same without the prior."""
+    """(6, 6) or (11, 11) information of the observations: of translation and rotation in camera
+    axes, and of the intrinsics. Divided by `variance` it is that of the errors."""
+    gradient: Array
+    """(6,) or (11,) of the observations."""
+    residual: Array
+    """(2, n) whitened errors."""
+    slope: Array
+    """(6 or 11, 2, n) their derivatives."""
+    residual_px: Array
+    """(n,) errors, pixels of the image."""
+
+    def moved(self, prior: Array) -> tuple[Array, Array]:
+        """Step (k,) to the minimum with another prior, and its covariance (k, k).
+
+        The prior is the information (5,) about unchanged intrinsics, times `variance`; empty where
+        they are fixed. The errors are linear in steps of this size.
+        """
+        count = len(prior)
+        data, gradient = self.data.copy(), self.gradient.copy()
+        data[range(6, 6 + count), range(6, 6 + count)] += prior
+        gradient[6:] += prior * self.change[:count]
+        inverse = inverse_of(data)
+        return -inverse @ gradient, inverse
+
+    def variance_after(self, step: Array) -> float:
+        """Robust variance of the errors after a step (k,)."""
+        return robust_variance(((self.residual + np.tensordot(step, self.slope, 1)) ** 2).sum(0))
+
+    def pose(self, covariance: Array) -> UncertainPose:
+        """points_from_camera with a covariance (6, 6) in camera axes."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.rotation, self.position
+        return UncertainPose(SE3.from_matrix(matrix), in_parent_axes(self.rotation, covariance))
 
 
-def refine_pose(
+def minimise(
     observed: Observed,
     camera: Camera,
-    start: SE3,
+    start: tuple[Array, Array],
     iterations: int = 10,
     variances: Array | None = None,
     change: Array | None = None,
-) -> RefinedPose:
+) -> Minimum:
     """Minimise whitened reprojection errors with Cauchy weights.
 
-    The start is points_from_camera, roughly, with a change (5,) of the intrinsics. These have
-    variances (5,) about those of `camera`; None holds them fixed.
+    The start is rotation and position of points_from_camera, roughly, with a change (5,) of the
+    intrinsics. These have variances (5,) about those of `camera`; None holds them fixed.
     """
     count = 6 if variances is None else 6 + INTRINSICS
+    (rotation, position), best = start, None
     moved: Array = np.zeros(INTRINSICS) if change is None else change
-    current = camera if variances is None else changed_camera(camera, moved)
-    seen = observed.pixels, observed.points_m
-    white = np.ascontiguousarray(observed.whitening.transpose(1, 2, 0))
-    nothing = np.inf, np.eye(count), np.eye(count)
-    best = at = _Iterate(start.rotation_matrix(), start.translation_m, moved, current, *nothing)
+    prior = np.zeros(count - 6)
     for _ in range(max(iterations, 1)):
-        raw, slope = linearise(*seen, at.rotation, at.position, at.camera, variances is not None)
-        residual = _whitened(white, raw)
-        slope = white[:, 0, None] * slope[0] + white[:, 1, None] * slope[1]
-        squares = (residual**2).sum(0)
-        variance = _robust_variance(squares)
-        if variance > _DIVERGED * best.variance:
-            at = best
-            break
+        now = camera if variances is None else changed_camera(camera, moved)
+        raw, slope = linearise(
+            observed.pixels, observed.points_m, rotation, position, now, count > 6
+        )
+        white = observed.whitening
+        residual = white[:, 0] * raw[0] + white[:, 1] * raw[1]
+        slope = white[None, :, 0] * slope[:, 0, None] + white[None, :, 1] * slope[:, 1, None]
+        squares = (residual * residual).sum(0)
+        variance = robust_variance(squares)
+        if best is not None and variance > _DIVERGED * best.variance:
+            return best
         root = 1 / np.sqrt(1 + squares / variance)
-        rows = (slope * root).transpose(1, 0, 2).reshape(count, -1)
-        data = rows @ rows.T + 1e-9 * np.eye(count)
-        gradient = rows @ (residual * root).ravel()
-        information = data
+        rows = (slope * root).reshape(count, -1)
+        data, gradient = rows @ rows.T, rows @ (residual * root).ravel()
+        best = Minimum(
+            rotation, position, now, moved, variance, data, gradient, residual, slope,
+            np.hypot(*raw),
+        )  # fmt: skip
         if variances is not None:
-            prior = np.r_[np.zeros(6), variance / variances]
-            information = data + np.diag(prior)
-            gradient[6:] += prior[6:] * at.change
-        at = replace(at, variance=variance, information=information, data=data)
-        if variance <= best.variance:
-            best = at
-        step = -_inverse(information) @ gradient
+            prior = variance / variances
+        step, _ = best.moved(prior)
         if variances is not None:
-            moved = at.change + step[6:]
+            moved = moved + step[6:]
             moved[0] = np.clip(moved[0], -_FOCAL_CHANGE, _FOCAL_CHANGE)
-            at = replace(at, change=moved, camera=changed_camera(camera, moved))
-        position = at.position + at.rotation @ step[:3]
-        at = replace(at, rotation=at.rotation @ cv2.Rodrigues(step[3:6])[0], position=position)
-        if np.abs(step[:6]).max() < _SMALL:
-            break
-    raw, _ = linearise(*seen, at.rotation, at.position, at.camera)
-    if _robust_variance((_whitened(white, raw) ** 2).sum(0)) > _DIVERGED * best.variance:
-        at = best
-        raw, _ = linearise(*seen, at.rotation, at.position, at.camera)
-    quaternion = Rotation.from_matrix(at.rotation).as_quat(scalar_first=True)
-    covariance = at.variance * _inverse(at.information)
-    fixed = at.variance * _inverse(at.data[:6, :6])
-    own = np.asarray(in_parent_axes(at.rotation, covariance[:6, :6]), np.float64)
-    pose = UncertainPose(SE3(quaternion, at.position), own)
-    by_intrinsics = np.asarray(in_parent_axes(at.rotation, covariance[:6, :6] - fixed), np.float64)
-    return RefinedPose(
-        pose, np.hypot(*raw), at.camera, at.change, covariance[6:, 6:], at.variance, by_intrinsics
-    )
+        position = position + rotation @ step[:3]
+        rotation = rotation @ cv2.Rodrigues(step[3:6])[0]
+        if step @ data @ step + prior @ step[6:] ** 2 < _CONVERGED * variance:
+            camera_now = camera if variances is None else changed_camera(camera, moved)
+            return replace(
+                best, rotation=rotation, position=position, change=moved, camera=camera_now,
+                gradient=gradient + data @ step,
+            )  # fmt: skip
+    assert best is not None, "at least one iteration"
+    return best
 
 
-def _median(values: Array) -> float:
-    """Median of (n,) values; np.median takes three times as long for some hundred of them."""
-    half = len(values) // 2
-    middle = np.partition(values, (half - 1, half))[half - 1 : half + 1]
-    return float(middle[1] if len(values) % 2 else middle.mean())
+def robust_variance(squares: Array) -> float:
+    """Variance of 2-D errors from their squared norms (n,), at least 0.05."""
+    # The median of a 2-D Gaussian's squared norm is 1.386 variances.
+    half = len(squares) // 2
+    # np.median takes three times as long for some hundred values.
+    return max(float(np.partition(squares, half)[half]) / 1.386, 0.05)
 
 
 def changed_camera(camera: Camera, change: Array) -> Camera:
     """A camera with changed intrinsics."""
+    if not change.any():
+        return camera
     factor, (k1, k2, *others) = float(np.exp(change[0])), camera.coefficients
     return replace(
         camera,
@@ -168,20 +160,12 @@ def changed_camera(camera: Camera, change: Array) -> Camera:
     )
 
 
-def _whitened(white: Array, raw: Array) -> Array:
-    return white[:, 0] * raw[0] + white[:, 1] * raw[1]
-
-
-def _robust_variance(squares: Array) -> float:
-    # The median of a 2-D Gaussian's squared norm is 1.386 variances.
-    return max(_median(squares) / 1.386, 0.05)
-
-
-def _inverse(information: Array) -> Array:
+def inverse_of(information: Array) -> Array:
     """Inverse of a positive semi-definite matrix whose units differ by orders of magnitude."""
-    scale = np.sqrt(np.diag(information))
-    scaled = information / np.outer(scale, scale) + _OPEN * np.eye(len(scale))
-    return np.linalg.inv(scaled) / np.outer(scale, scale)
+    scale = 1 / np.sqrt(np.diag(information) + 1e-300)
+    scaled = information * scale * scale[:, None]
+    scaled[np.diag_indices_from(scaled)] += _OPEN
+    return np.linalg.inv(scaled) * scale * scale[:, None]
 
 
 def linearise(
@@ -195,33 +179,35 @@ def linearise(
     """Reprojection errors and their derivatives by the pose, and by intrinsics if wanted.
 
     Rotation and position are those of points_from_camera. Residuals are (2, n) pixels, derivatives
-    (2, 6 or 11, n) by a motion (translation, rotation) in the camera frame and by a change of the
+    (6 or 11, 2, n) by a motion (translation, rotation) in the camera frame and by a change of the
     intrinsics.
     """
     local = rotation.T @ (points_m - position).T
     inverse = 1 / np.maximum(local[2], 1e-3)
     x, y = local[0] * inverse, local[1] * inverse
-    slope = np.empty((2, 6 + INTRINSICS * intrinsics, len(x)))
-    slope[0, 0], slope[0, 1], slope[0, 2] = -inverse, 0, x * inverse
-    slope[0, 3], slope[0, 4], slope[0, 5] = x * y, -1 - x * x, y
-    slope[1, 0], slope[1, 1], slope[1, 2] = 0, -inverse, y * inverse
-    slope[1, 3], slope[1, 4], slope[1, 5] = 1 + y * y, -slope[0, 3], -x
-    if not (camera.distortion or intrinsics):
-        focal = np.array([camera.fx, camera.fy])
-        projected = np.stack([x * camera.fx + camera.cx, y * camera.fy + camera.cy])
-        slope *= focal[:, None, None]
-        return projected - pixels.T, slope
-    plane = np.stack([x, y], -1)
-    by_plane, by_intrinsics = camera.slopes(plane)
-    # Written out: einsum takes four times as long for products of this shape.
-    chain = np.ascontiguousarray(by_plane.transpose(1, 2, 0))
-    by_pose = [chain[i, 0] * slope[0, :6] + chain[i, 1] * slope[1, :6] for i in (0, 1)]
-    slope[0, :6], slope[1, :6] = by_pose
-    if intrinsics:
-        slope[:, 6:] = by_intrinsics.transpose(1, 2, 0)
-    # The derivative by the logarithm of the focal length is the pixel beside the principal point.
-    projected = by_intrinsics[..., 0] + [camera.cx, camera.cy]
-    return (projected - pixels).T, slope
+    slope = np.zeros((6 + INTRINSICS * intrinsics, 2, len(x)))
+    slope[0, 0], slope[2, 0], slope[3, 0] = -inverse, x * inverse, x * y
+    slope[4, 0], slope[5, 0] = -1 - x * x, y
+    slope[1, 1], slope[2, 1], slope[3, 1] = -inverse, y * inverse, 1 + y * y
+    slope[4, 1], slope[5, 1] = -slope[3, 0], -x
+    if camera.distortion:
+        # Written out: products of small matrices take four times as long.
+        by_plane, lens = camera.slopes(np.stack([x, y], -1))
+        chain = np.ascontiguousarray(by_plane.transpose(1, 2, 0))
+        slope[:6] = chain[None, :, 0] * slope[:6, 0, None] + chain[None, :, 1] * slope[:6, 1, None]
+        if intrinsics:
+            slope[6:] = lens.transpose(2, 1, 0)
+        # The derivative by the logarithm of the focal length is the pixel beside the centre.
+        u, v = lens[:, 0, 0], lens[:, 1, 0]
+    else:
+        u, v = camera.fx * x, camera.fy * y
+        slope[:6] *= np.array([camera.fx, camera.fy])[:, None]
+        if intrinsics:
+            r2 = x * x + y * y
+            slope[6, 0], slope[6, 1], slope[7, 0], slope[8, 1] = u, v, 1, 1
+            slope[9] = slope[6] * r2
+            slope[10] = slope[9] * r2
+    return np.stack([u + camera.cx - pixels[:, 0], v + camera.cy - pixels[:, 1]]), slope
 
 
 def in_parent_axes(rotation: Array, covariance: Array) -> Array:

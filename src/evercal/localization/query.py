@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from evercal.features.views import working_image
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.localization.alignment import AlignmentOptions
-from evercal.localization.intrinsics import IntrinsicsPrior
+from evercal.localization.intrinsics import IntrinsicsPrior, RefinedPose
 from evercal.localization.pnp import PnpOptions
-from evercal.localization.pose_refinement import RefinedPose
 from evercal.mapping.patches import image_pyramid
 
 
@@ -34,18 +33,21 @@ class LocalizeOptions:
 
     candidates: int = 3
     """Scenes that are tried per image, at most."""
-    quick: tuple[Attempt, Attempt] = (Attempt(12, 2), Attempt(12, 2, unknown_camera=True))
-    """The first attempt, and one for images that it does not locate, turned or not."""
-    thorough: tuple[Attempt, ...] = (
+    attempts: tuple[Attempt, ...] = (
+        Attempt(12, 4),
+        Attempt(12, 2),
+        Attempt(12, 2, unknown_camera=True),
         Attempt(48, 1),
         Attempt(48, 1, unknown_camera=True),
         Attempt(200, 1),
     )
-    """Attempts for images that are promising, until a pose is accepted."""
+    """Until a pose is accepted. From the third on, images must be promising."""
+    middle_px: int = 160
+    """Side of the middle of an image that its quarter turn is judged by, at working size."""
     aligned_inliers: int = 12
     """Poses with fewer PnP inliers are not aligned."""
     promising_inliers: int = 16
-    """Images with fewer PnP inliers after the quick attempts are rejected."""
+    """Images with fewer PnP inliers after two attempts are rejected."""
     immediate: float = 3.0
     """A pose of the first attempt is final if its support is this many times the threshold."""
     guided_below: float = 1.5
@@ -62,8 +64,8 @@ class LocalizeOptions:
     """Search radius of guided matching, pixels at the encoder's working size."""
     keyframes: int = 6
     """Keyframes of a scene that an image is matched and aligned to."""
-    retrieval_stride: int = 16
-    """Every n-th patch of the image votes for the proposed keyframes."""
+    retrieval_stride: int = 4
+    """Patches of every n-th row and column vote for the proposed keyframes."""
     votes: float = 0.2
     """Scenes with a smaller share of the best scene's votes are not tried."""
     pnp: PnpOptions = field(default_factory=PnpOptions)
@@ -90,15 +92,26 @@ class Query:
     """Short side of `grey`, pixels, at most."""
     priors: Sequence[IntrinsicsPrior] = ()
     """Of the intrinsics in each scene."""
+    similar: dict[tuple[int, int], tuple[NDArray[np.int64], NDArray[np.float32]]] = field(
+        default_factory=dict
+    )
+    """Most similar cells of keyframes, see `Matcher`."""
+    tried: set[tuple[int, int, bool, bytes]] = field(default_factory=set)
+    """Candidates that were tried."""
     turns: int = 0
     """Quarter turns clockwise of the image before it was encoded."""
+
+    @property
+    def plain(self) -> Camera:
+        """A camera of the size of the image."""
+        height, width = self.image.shape[:2]
+        return Camera(width, height, 1, 1, 0, 0)
 
     @cached_property
     def grey(self) -> np.ndarray:
         """The image that landmarks are aligned in."""
-        height, width = self.image.shape[:2]
-        plain = Camera(width, height, 1, 1, 0, 0)
-        return working_image(self.image, plain, min(self.short_side, height, width))[0]
+        least = min(self.short_side, *self.image.shape[:2])
+        return working_image(self.image, self.plain, least)[0]
 
     @cached_property
     def pyramid(self) -> list[np.ndarray]:

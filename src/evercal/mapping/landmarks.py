@@ -66,12 +66,12 @@ class ProjectedPatches(NamedTuple):
 
 
 def project_surface(
-    points: Array, rotation: Array, translation_m: Array, camera: Camera
+    points: Array, rotation: Array, translation_m: Array, camera: Camera, most: int | None = None
 ) -> ProjectedPatches:
     """Predict positions and warps of patches in an image.
 
     A patch is visible if it lies in front of the camera, inside the image by a margin, and its size
-    is similar to that in its keyframe. Points (3, n, 3) are those of `Landmarks.surface`, in any
+    is similar to that in its keyframe. At most `most` are taken, evenly spread. Points (3, n, 3) are those of `Landmarks.surface`, in any
     frame; rotation and translation lead from there to the camera.
     """
     centre = points[0] @ rotation.T + translation_m
@@ -80,6 +80,9 @@ def project_surface(
     high = np.array([camera.width, camera.height]) - BORDER_PX - 1
     inside = ((pixels > BORDER_PX) & (pixels < high)).all(1)
     visible, pixels = front[inside], pixels[inside]
+    if most is not None and len(visible) > most:
+        spread = np.linspace(0, len(visible) - 1, most).round().astype(int)
+        visible, pixels = visible[spread], pixels[spread]
     beside = points[1:, visible] @ rotation.T + translation_m
     tangents = camera.project(np.maximum(beside, [-np.inf, -np.inf, NEAREST_M])) - pixels
     affines = tangents.transpose(1, 2, 0) / _TANGENT_PX

@@ -60,7 +60,7 @@ class Patches(NamedTuple):
     intensity: Array
     """(n, p) zero mean, unit deviation."""
     descent: Array
-    """(n, 2, p) step in keyframe pixels for a difference of intensities."""
+    """(n, 2, p) step in keyframe pixels for a difference of intensities, zero mean."""
     inverse_hessian: Array
     """(n, 2, 2) covariance of the aligned position in pixels per unit of intensity noise."""
     rest: Array
@@ -93,6 +93,7 @@ def cut_patches(image: Array, pixels: Array) -> Patches:
     # Beside a flat patch the slopes are so large that the damping needs double precision.
     inverse = np.linalg.inv(hessian + _DAMPING * np.eye(2)).astype(np.float32)
     descent = np.ascontiguousarray((gradient @ inverse).transpose(0, 2, 1))
+    descent -= descent.mean(2, keepdims=True)
     intensity = patch / deviation
     return Patches(intensity, descent, inverse, np.einsum("nkp,np->nk", descent, intensity))
 
@@ -116,15 +117,21 @@ def align_patches(
     affines = affines.astype(np.float32)
     # One array for each coordinate: interleaved ones take three times as long to add.
     right, down = affines[:, 0] @ _OFFSETS.T, affines[:, 1] @ _OFFSETS.T
-    centre = centres.astype(np.float32)
-    for _ in range(iterations):
-        values, deviation = _centred(_sample(image, centre[:, :1] + right, centre[:, 1:] + down))
-        step = np.einsum("nkp,np->nk", patches.descent, values) / deviation - patches.rest
+    centre, (x, y) = centres.astype(np.float32), np.empty((2, *right.shape), np.float32)
+    for last in (*(False,) * iterations, True):
+        values = _sample(
+            image, np.add(right, centre[:, :1], out=x), np.add(down, centre[:, 1:], out=y)
+        )
+        # Templates have zero mean, so that the mean of the values drops out of products with them.
+        square = np.einsum("np,np->n", values, values) / values.shape[1]
+        deviation = np.sqrt(np.maximum(square - (values @ _MEAN) ** 2, 0)) + _FLAT
+        if last:
+            break
+        step = np.einsum("nkp,np->nk", patches.descent, values) / deviation[:, None] - patches.rest
         step = step.clip(-_LONGEST_STEP, _LONGEST_STEP)
         centre = centre - (affines @ step[..., None])[..., 0]
-    values, deviation = _centred(_sample(image, centre[:, :1] + right, centre[:, 1:] + down))
     product = np.einsum("np,np->n", values, patches.intensity)
-    return centre, product / (deviation[:, 0] * values.shape[1])
+    return centre, product / (deviation * values.shape[1])
 
 
 def align_down(
@@ -155,7 +162,7 @@ def whitening(
     noise: float,
     shift_px: Array | None = None,
 ) -> Array:
-    """(n, 2, 2) matrices that make the errors of aligned positions independent, of unit variance.
+    """(2, 2, n) matrices that make the errors of aligned positions independent, of unit variance.
 
     A patch on an edge is located well across the edge and badly along it, as its Hessian shows.
 
@@ -168,10 +175,18 @@ def whitening(
             line of a landmark with an uncertain depth.
     """
     spread = (affines @ inverse_hessian @ affines.transpose(0, 2, 1)).astype(np.float64)
-    spread = noise**2 * (spread + floor_px**2 * np.eye(2))
+    a, b, c = spread[:, 0, 0] + floor_px**2, spread[:, 0, 1], spread[:, 1, 1] + floor_px**2
+    a, b, c = noise**2 * a, noise**2 * b, noise**2 * c
     if shift_px is not None:
-        spread += shift_px[:, :, None] * shift_px[:, None]
-    return np.linalg.cholesky(np.linalg.inv(spread)).transpose(0, 2, 1)
+        u, v = shift_px.T
+        a, b, c = a + u * u, b + u * v, c + v * v
+    # The transposed Cholesky factor of the inverse, written out for 2x2.
+    inside = 1 / (a * c - b * b)
+    white = np.zeros((2, 2, len(a)))
+    white[0, 0] = np.sqrt(c * inside)
+    white[0, 1] = -b * inside / white[0, 0]
+    white[1, 1] = np.sqrt(1 / c)
+    return white
 
 
 def _sample(image: Array, right: Array, down: Array) -> Array:
@@ -180,10 +195,3 @@ def _sample(image: Array, right: Array, down: Array) -> Array:
         return np.zeros(right.shape, np.float32)
     values = cv2.remap(image, right, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, np.float32)
-
-
-def _centred(patches: Array) -> tuple[Array, Array]:
-    """Patches (n, p), in place, with zero mean, and their deviations (n, 1)."""
-    patches -= (patches @ _MEAN)[:, None]
-    square = np.einsum("np,np->n", patches, patches) / patches.shape[1]
-    return patches, (np.sqrt(square) + _FLAT)[:, None]

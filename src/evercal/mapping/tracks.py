@@ -134,7 +134,7 @@ def observe(
     good &= np.linalg.norm(pixels - expected, axis=1) < reach_px
     last = steps[-1][0]
     spread = templates[last].inverse_hessian[good]
-    white = whitening(affines[good], spread, FLOOR_PX, NOISE) / 2**last
+    white = whitening(affines[good], spread, FLOOR_PX, NOISE).transpose(2, 0, 1) / 2**last
     return Observations(which[good], np.full(good.sum(), frame), pixels[good], white)
 
 
