@@ -147,7 +147,9 @@ class Camera:
         points = np.asarray(points_camera, dtype=np.float64)
         if points.shape[-1:] != (3,):
             raise ValueError(f"points are (..., 3), got {points.shape}")
-        depth = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
+        depth = points[..., 2:]
+        if not (depth > 0).all():
+            depth = np.where(depth > 0, depth, np.nan)
         plane = points[..., :2] / depth
         if self.distortion:
             within = (plane**2).sum(-1, keepdims=True) < self.widest**2

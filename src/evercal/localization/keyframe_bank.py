@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import cached_property
 from threading import Lock
 
 import numpy as np
@@ -11,6 +12,7 @@ from evercal.features.encoder import Encoder
 from evercal.features.views import ideal_cell_pixels
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.patches import Patches, cut_patches, image_pyramid, to_level
+from evercal.localization.repetition import pattern_steps
 from evercal.mapping.scene_map import MapContents
 
 ALIGNED_LEVELS = 2
@@ -38,6 +40,11 @@ class AlignedLandmarks:
     """(3,) position of the keyframe's camera."""
     patches: tuple[Patches, ...]
     """Templates of the landmarks, one set for each pyramid level."""
+
+    @cached_property
+    def pattern(self) -> np.ndarray:
+        """(k, 3) displacements between landmarks that look alike, see `pattern_steps`."""
+        return pattern_steps(self.surface_m[0], self.patches[1].templates[:, 2], self.position_m)
 
 
 class LoadedKeyframe:
@@ -119,6 +126,10 @@ class KeyframeBank:
         """
         similarity = self._descriptors @ self._contents.encoder.vlad()(features)
         return np.argsort(-similarity, kind="stable")
+
+    def pattern(self, keyframes: NDArray[np.int64]) -> np.ndarray:
+        """(k, 3) displacements by which a pose before the best keyframes may have slipped."""
+        return np.concatenate([self.load(int(k)).landmarks.pattern for k in keyframes[:1]])
 
     def load(self, index: int) -> LoadedKeyframe:
         """A keyframe of the bank, by its index."""

@@ -1,13 +1,12 @@
 """`Localizer`: an image in, a `PoseEstimate` out.
 
-The way of an image: prepare, encode, retrieve keyframes, match, PnP, align landmarks, match again
-near a pose with little support, accept.
+The way of an image: prepare, encode, retrieve keyframes, match, PnP, align landmarks, accept.
 """
 
 import os
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
@@ -21,9 +20,9 @@ from evercal.geometry import SE3, Camera, pose_distance_mm_deg, resize_pixels
 from evercal.localization.acceptance import (
     USELESS_M,
     accepted,
-    order,
     differ,
     in_base,
+    order,
     rejection,
     support,
 )
@@ -32,15 +31,14 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import (
     FOCAL_FACTORS,
     UNKNOWN,
-    IntrinsicsPrior,
     Prior,
     cameras_in_scenes,
     prior_of,
 )
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.matching import Matcher
-from evercal.localization.pnp import PnpResult, solve_pnp, uncertain
-from evercal.localization.pose_refinement import INTRINSICS, changed_camera
+from evercal.localization.pnp import solve_pnp, uncertain
+from evercal.localization.pose_refinement import INTRINSICS
 from evercal.localization.query import (
     Attempt,
     Candidate,
@@ -49,7 +47,7 @@ from evercal.localization.query import (
     Matches,
     Query,
 )
-from evercal.localization.repetition import displaced, pattern_steps
+from evercal.localization.repetition import displaced
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
 from evercal.recordings.images import as_rgb
@@ -60,32 +58,6 @@ _ALONG_FOCAL = np.eye(INTRINSICS)[0]
 def turned(image: np.ndarray, turns: int) -> np.ndarray:
     """An image after quarter turns clockwise."""
     return np.ascontiguousarray(np.rot90(image, -turns))
-
-
-@dataclass(frozen=True, eq=False)
-class _Rough:
-    """A pose before alignment."""
-
-    matches: Matches
-    pnp: PnpResult
-    change: NDArray[np.floating]
-    """(5,) change of the intrinsics, see `changed_camera`."""
-
-    def as_answer(self, scene: int, camera: Camera) -> Hypothesis:
-        """The PnP pose as the answer, for the ablation of alignment."""
-        count, inliers = len(self.matches.pixels), self.pnp.inliers
-        return Hypothesis(
-            scene,
-            uncertain(
-                self.matches.pixels[inliers], self.matches.points_m[inliers], camera, self.pnp.pose
-            ),
-            None,
-            self.matches.pixels[inliers],
-            self.matches.points_m[inliers],
-            expected=count,
-            matched=int(inliers.sum()),
-            planned=count,
-        )
 
 
 class Localizer:
@@ -146,6 +118,11 @@ class Localizer:
             best, rival = self._settled(query, best, cameras)
         return self.answer(query, best, 1000 * (time.perf_counter() - began), rival), best
 
+    def slips(self, hypothesis: Hypothesis) -> NDArray[np.floating]:
+        """(k, 3) displacements, by which an aligned pose may have slipped, the shortest first."""
+        found = hypothesis.candidate
+        return np.zeros((0, 3)) if found is None else self._bank.pattern(found.keyframes)
+
     def accepts(self, hypothesis: Hypothesis, times: float = 1.0) -> bool:
         """Whether a pose has `times` the support that its scene requires."""
         return accepted(hypothesis, self.contents.scenes[hypothesis.scene], times)
@@ -161,54 +138,37 @@ class Localizer:
 
     def _best_hypothesis(self, query: Query, cameras: Sequence[Camera]) -> Hypothesis:
         """The pose with the most support, from as few attempts as it takes."""
-        first, second, *thorough = self.options.attempts
-        best, view = self._tried(query, first, cameras), query
-        if self.accepts(best, self.options.immediate):
-            return best
-        if best.pnp_inliers < self.options.aligned_inliers:  # turned, or of another room
-            view = self._upright(query)
-        best = max(best, self._tried(view, second, cameras), key=order)
-        for attempt in thorough:
-            if self.accepts(best) or best.pnp_inliers < self.options.promising_inliers:
+        best = Hypothesis(0)
+        for number, attempt in enumerate(self.options.attempts):
+            best = max(best, self._tried(query, attempt, cameras), key=order)
+            if self.accepts(best) or (number and best.pnp_inliers < self.options.promising_inliers):
                 break
-            best = max(best, self._tried(view, attempt, cameras), key=order)
+            if not number and best.pnp_inliers < self.options.aligned_inliers:
+                query = self._upright(query)  # turned, or of another room
         return best
 
     def _upright(self, query: Query) -> Query:
         """The image in the quarter turn whose middle is most similar to keyframes."""
         grey = working_image(query.image, query.plain, self.contents.short_side)[0]
         side = self.options.middle_px
-        top, left = ((whole - side) // 2 for whole in grey.shape)
+        top, left = (max(whole - side, 0) // 2 for whole in grey.shape)
         middle = grey[top : top + side, left : left + side]
-        features = [self.contents.encoder(turned(middle, turns)) for turns in range(4)]
-        similar = [self._matcher.similarity(rows) for rows in features]
+        turned = [np.ascontiguousarray(np.rot90(middle, -turns)) for turns in range(4)]
+        similar = [self._matcher.similarity(self.contents.encoder(image)) for image in turned]
         turns = int(np.argmax(similar))
         if not turns:
             return query
-        features = self.contents.encoder(turned(grey, turns))
-        return replace(query, features=features, turns=turns, similar={}, tried=set())
+        features = self.contents.encoder(np.ascontiguousarray(np.rot90(grey, -turns)))
+        return replace(query, features=features, turns=turns, similar={})
 
     def _tried(self, query: Query, attempt: Attempt, cameras: Sequence[Camera]) -> Hypothesis:
         """The pose with the most support of one attempt."""
         best = Hypothesis(0)
         for candidate in self._matcher.candidates(query, attempt):
-            if candidate.key in query.tried:
-                continue  # in a small map a wider attempt often repeats the one before
-            query.tried.add(candidate.key)
-            best = max(best, self._guided(query, candidate, cameras[candidate.scene]), key=order)
+            trial = self._hypothesis(query, candidate, cameras[candidate.scene])
+            best = max(best, trial, key=order)
             if self.accepts(best, self.options.immediate):
                 break
-        return best
-
-    def _guided(self, query: Query, candidate: Candidate, camera: Camera) -> Hypothesis:
-        best = self._hypothesis(query, candidate, camera)
-        dense = replace(candidate, match_stride=1)
-        while best.inliers and best.pose and support(best) < self.options.guided_below:
-            again = self._hypothesis(query, dense, camera, best)
-            if support(again) < self.options.guided_gain * support(best):
-                break
-            # Rivals are sought among all matches, and not only near this pose.
-            best = replace(again, matches=best.matches or again.matches)
         return best
 
     def _hypothesis(
@@ -216,23 +176,36 @@ class Localizer:
         query: Query,
         candidate: Candidate,
         camera: Camera,
-        near: Hypothesis | None = None,
         matches: Matches | None = None,
     ) -> Hypothesis:
         """A pose in one scene: match, PnP, align; `matches` are used instead of new ones."""
-        rough = self._rough(query, candidate, camera, near, matches)
-        if rough is None:
+        height, width = query.grey.shape
+        small = camera.resized(width, height).short_side_resized(self.contents.short_side)
+        matches = matches or self._matcher.matches(query, candidate, small)
+        unknown = query.priors[candidate.scene] is UNKNOWN
+        poses = [
+            (pose, factor)
+            for factor in (FOCAL_FACTORS if unknown else (1.0,))
+            if (pose := solve_pnp(*matches, small.zoomed(factor), self.options.pnp))
+        ]
+        if not poses:
             return Hypothesis(candidate.scene)
+        pnp, factor = max(poses, key=lambda pose: pose[0].inliers.sum())
+        inliers = int(pnp.inliers.sum())
         if not self.options.align:
-            return rough.as_answer(candidate.scene, camera)
-        inliers = int(rough.pnp.inliers.sum())
-        pose = rough.pnp.pose
-        if near is None and inliers < self.options.aligned_inliers:
-            return Hypothesis(candidate.scene, pnp_inliers=inliers)
-        aligned = self.aligned(query, candidate, camera, pose, rough.change)
+            pixels, points = (values[pnp.inliers] for values in matches)
+            pose = uncertain(pixels, points, small.zoomed(factor), pnp.pose)
+            count = len(pnp.inliers)
+            return Hypothesis(
+                candidate.scene, pose, None, pixels, points, count, inliers, count, inliers
+            )
+        aligned = None
+        if inliers >= self.options.aligned_inliers:
+            change = np.log(factor) * _ALONG_FOCAL
+            aligned = self.aligned(query, candidate, camera, pnp.pose, change)
         if aligned is None:
             return Hypothesis(candidate.scene, pnp_inliers=inliers)
-        return replace(aligned, pnp_inliers=inliers, matches=rough.matches)
+        return replace(aligned, pnp_inliers=inliers, matches=matches)
 
     def aligned(
         self,
@@ -252,7 +225,7 @@ class Localizer:
             [self._bank.load(int(index)).landmarks for index in candidate.keyframes],
             start,
             self.options.alignment,
-            Prior(self._prior(query, candidate), scene.covariance_scale, scene.shared_px),
+            Prior(query.priors[candidate.scene], scene.covariance_scale, scene.shared_px),
             change,
             coarse,
         )
@@ -269,37 +242,7 @@ class Localizer:
             aligned.matched,
             aligned.planned,
             candidate=candidate,
-            templates=aligned.templates,
         )
-
-    @staticmethod
-    def _prior(query: Query, candidate: Candidate) -> IntrinsicsPrior:
-        return UNKNOWN if candidate.unknown_camera else query.priors[candidate.scene]
-
-    def _rough(
-        self,
-        query: Query,
-        candidate: Candidate,
-        camera: Camera,
-        near: Hypothesis | None,
-        matches: Matches | None = None,
-    ) -> _Rough | None:
-        """Pose and focal length by PnP."""
-        refined = near.refined if near is not None else None
-        change: NDArray[np.floating] = refined.change if refined else np.zeros(INTRINSICS)
-        height, width = query.grey.shape
-        now = changed_camera(camera.resized(width, height), change)
-        small = now.short_side_resized(self.contents.short_side)
-        where = None if near is None or near.pose is None else near.pose.pose
-        sigma = self._prior(query, candidate)
-        matches = matches or self._matcher.matches(query, candidate, small, where)
-        best: _Rough | None = None
-        for factor in FOCAL_FACTORS if sigma is UNKNOWN and near is None else (1.0,):
-            tried = small.zoomed(factor)
-            found = solve_pnp(matches.pixels, matches.points_m, tried, self.options.pnp)
-            if found and (best is None or found.inliers.sum() > best.pnp.inliers.sum()):
-                best = _Rough(matches, found, change + np.log(factor) * _ALONG_FOCAL)
-        return best
 
     def _settled(
         self, query: Query, best: Hypothesis, cameras: Sequence[Camera]
@@ -320,6 +263,8 @@ class Localizer:
             if support(higher) <= support(front):
                 break
             front = higher  # several periods away, the way leads over poses of rising support
+        if len(seen) == 1:
+            return best, None
         strongest = max(seen, key=lambda rival: self._strength(rival, best))
         if self._strength(strongest, best) * self.options.clear_strength > 1:
             best = strongest
@@ -360,11 +305,9 @@ class Localizer:
             small = best.refined.camera.short_side_resized(self.contents.short_side)
             rest = best.matches.beside(small, pose, self.options.rival_px)
             if len(rest.pixels) >= self.options.aligned_inliers:
-                left_over = self._hypothesis(query, best.candidate, camera, None, rest)
+                left_over = self._hypothesis(query, best.candidate, camera, rest)
                 yield replace(left_over, matches=best.matches)
-        assert best.points_m is not None, "an aligned pose"
-        assert best.templates is not None, "an aligned pose"
-        for step in pattern_steps(best.points_m, best.templates, pose.translation_m):
+        for step in self.slips(best):
             start = displaced(pose, step)
             rival = self.aligned(query, best.candidate, camera, start, change, coarse=False)
             if rival is not None:

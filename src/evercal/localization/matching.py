@@ -2,11 +2,10 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from evercal.features.views import cell_centres, ideal_cell_pixels
-from evercal.geometry import SE3, Camera
-from evercal.localization.keyframe_bank import KeyframeBank, MatchedCells
+from evercal.geometry import Camera
+from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.query import Attempt, Candidate, LocalizeOptions, Matches, Query
 
 
@@ -40,7 +39,7 @@ class Matcher:
             voted = proposed[order[scene[order] == s]]
             others = rest[self._bank.scene[rest] == s]
             keyframes = np.concatenate([voted, others])[: self._options.keyframes]
-            candidates.append(Candidate(s, keyframes, attempt.match_stride, attempt.unknown_camera))
+            candidates.append(Candidate(s, keyframes, attempt.stride))
         return candidates
 
     def similarity(self, features: NDArray[np.float32]) -> float:
@@ -53,30 +52,19 @@ class Matcher:
         best = [(rows @ self._bank.load(int(k)).cells.features.T).max(1) for k in proposed]
         return float(np.max(best, 0).mean())
 
-    def matches(
-        self, query: Query, candidate: Candidate, camera: Camera, near: SE3 | None = None
-    ) -> Matches:
-        """Match patches of the image to the points of a scene's keyframes.
-
-        The camera is at the encoder's working size. If `near`, roughly map_from_camera, is given, a
-        patch is matched only to points that project within `LocalizeOptions.guided_px` of it.
-        """
-        stride = candidate.match_stride if self._options.align else 1
-        pixels = cell_pixels(camera, self._bank.encoder.stride, query.turns)
-        pixels = pixels[_grid(query, stride)]
-        loaded = [self._bank.load(int(index)).cells for index in candidate.keyframes]
-        if near is None:
-            found = [self._most_similar(query, stride, int(k)) for k in candidate.keyframes]
-        else:
-            rows = _rows(query.features)[_grid(query, stride)]
-            found = [self._near(rows, pixels, cells, camera, near) for cells in loaded]
+    def matches(self, query: Query, candidate: Candidate, camera: Camera) -> Matches:
+        """Match patches to the points of a scene's keyframes; camera at the working size."""
+        stride = candidate.stride if self._options.align else 1
+        patches, pixels = strided_patches(query, camera, self._bank.encoder.stride, stride)
+        found = [self._most_similar(query, stride, int(k)) for k in candidate.keyframes]
         nearest, height = (np.array(values) for values in zip(*found, strict=True))
-        best = height.argmax(0)
+        with_ray = np.isin(_grid(query, stride), patches)
+        nearest, best = nearest[:, with_ray], height[:, with_ray].argmax(0)
         points = np.empty((len(pixels), 3))
-        for number, cells in enumerate(loaded):
-            points[best == number] = cells.points_m[nearest[number, best == number]]
-        valid = np.isfinite(pixels).all(1) & (height.max(0) > 0)
-        return Matches(pixels[valid], points[valid])
+        for number, keyframe in enumerate(candidate.keyframes):
+            chosen = best == number
+            points[chosen] = self._bank.load(int(keyframe)).cells.points_m[nearest[number, chosen]]
+        return Matches(pixels, points)
 
     def _most_similar(
         self, query: Query, stride: int, keyframe: int
@@ -93,27 +81,20 @@ class Matcher:
             query.similar[key] = nearest, similarity[np.arange(len(rows)), nearest]
         return query.similar[key]
 
-    def _near(
-        self,
-        rows: NDArray[np.float32],
-        pixels: np.ndarray,
-        cells: MatchedCells,
-        camera: Camera,
-        near: SE3,
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """The same among the cells that project near each patch; similarity 0 without any."""
-        projected = camera.pinhole.project(near.inverse().apply(cells.points_m))
-        projected = np.where(np.isnan(projected), np.inf, projected)
-        within = cdist(pixels, projected, "sqeuclidean") < self._options.guided_px**2
-        similarity = (rows @ cells.features.T) * within
-        nearest = similarity.argmax(1)
-        return nearest, similarity[np.arange(len(rows)), nearest]
-
-
 def _grid(query: Query, stride: int) -> NDArray[np.int64]:
     """Indices (n,) of the patches of every `stride`-th row and column."""
     rows, columns = query.features.shape[:2]
     return np.arange(rows * columns).reshape(rows, columns)[::stride, ::stride].ravel()
+
+
+def strided_patches(
+    query: Query, camera: Camera, encoder_stride: int, stride: int
+) -> tuple[NDArray[np.int64], np.ndarray]:
+    """Indices (m,) and ideal pixels (m, 2) of patches of every n-th row and column with a ray."""
+    patches = _grid(query, stride)
+    pixels = cell_pixels(camera, encoder_stride, query.turns)[patches]
+    valid = np.isfinite(pixels).all(1)
+    return patches[valid], pixels[valid]
 
 
 def cell_pixels(camera: Camera, stride: int, turns: int) -> np.ndarray:

@@ -12,7 +12,7 @@ Array = NDArray[np.floating]
 
 INTRINSICS = 5
 """Parameters of a change: logarithm of the focal lengths, principal point in pixels, k1, k2."""
-_CONVERGED = 1e-3
+_CONVERGED = 1e-2
 """Squared length of the last step, in standard deviations."""
 _DIVERGED = 10.0
 """Growth of the variance of residuals at which the step before is kept."""
@@ -67,7 +67,7 @@ class Minimum:
         """
         count = len(prior)
         data, gradient = self.data.copy(), self.gradient.copy()
-        data[range(6, 6 + count), range(6, 6 + count)] += prior
+        data.flat[6 * len(data) + 6 :: len(data) + 1] += prior
         gradient[6:] += prior * self.change[:count]
         inverse = inverse_of(data)
         return -inverse @ gradient, inverse
@@ -94,29 +94,30 @@ def minimise(
     """Minimise whitened reprojection errors with Cauchy weights.
 
     The start is rotation and position of points_from_camera, roughly, with a change (5,) of the
-    intrinsics. These have variances (5,) about those of `camera`; None holds them fixed.
+    intrinsics. These have variances (5,) about those of `camera`; None holds them fixed. Errors are
+    linear in them: the caller repeats it after a large change.
     """
     count = 6 if variances is None else 6 + INTRINSICS
     (rotation, position), best = start, None
-    moved: Array = np.zeros(INTRINSICS) if change is None else change
-    prior = np.zeros(count - 6)
+    change = np.zeros(INTRINSICS) if change is None else change
+    now, moved, prior, white = changed_camera(camera, change), change, np.zeros(0), observed.whitening
     for _ in range(max(iterations, 1)):
-        now = camera if variances is None else changed_camera(camera, moved)
         raw, slope = linearise(
             observed.pixels, observed.points_m, rotation, position, now, count > 6
         )
-        white = observed.whitening
+        if variances is not None:
+            raw += np.tensordot(moved - change, slope[6:], 1)
         residual = white[:, 0] * raw[0] + white[:, 1] * raw[1]
         slope = white[None, :, 0] * slope[:, 0, None] + white[None, :, 1] * slope[:, 1, None]
-        squares = (residual * residual).sum(0)
+        squares = residual[0] * residual[0] + residual[1] * residual[1]
         variance = robust_variance(squares)
         if best is not None and variance > _DIVERGED * best.variance:
-            return best
+            break
         root = 1 / np.sqrt(1 + squares / variance)
         rows = (slope * root).reshape(count, -1)
         data, gradient = rows @ rows.T, rows @ (residual * root).ravel()
         best = Minimum(
-            rotation, position, now, moved, variance, data, gradient, residual, slope,
+            rotation, position, camera, moved, variance, data, gradient, residual, slope,
             np.hypot(*raw),
         )  # fmt: skip
         if variances is not None:
@@ -128,13 +129,13 @@ def minimise(
         position = position + rotation @ step[:3]
         rotation = rotation @ cv2.Rodrigues(step[3:6])[0]
         if step @ data @ step + prior @ step[6:] ** 2 < _CONVERGED * variance:
-            camera_now = camera if variances is None else changed_camera(camera, moved)
-            return replace(
-                best, rotation=rotation, position=position, change=moved, camera=camera_now,
-                gradient=gradient + data @ step,
-            )  # fmt: skip
+            gradient = gradient + data @ step
+            best = replace(
+                best, rotation=rotation, position=position, change=moved, gradient=gradient
+            )
+            break
     assert best is not None, "at least one iteration"
-    return best
+    return replace(best, camera=changed_camera(camera, best.change))
 
 
 def robust_variance(squares: Array) -> float:
@@ -162,10 +163,11 @@ def changed_camera(camera: Camera, change: Array) -> Camera:
 
 def inverse_of(information: Array) -> Array:
     """Inverse of a positive semi-definite matrix whose units differ by orders of magnitude."""
-    scale = 1 / np.sqrt(np.diag(information) + 1e-300)
-    scaled = information * scale * scale[:, None]
-    scaled[np.diag_indices_from(scaled)] += _OPEN
-    return np.linalg.inv(scaled) * scale * scale[:, None]
+    scale = 1 / np.sqrt(information.diagonal() + 1e-300)
+    scales = scale * scale[:, None]
+    scaled = information * scales
+    scaled.flat[:: len(scale) + 1] += _OPEN
+    return np.linalg.inv(scaled) * scales
 
 
 def linearise(

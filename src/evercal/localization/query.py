@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +16,13 @@ from evercal.localization.pnp import PnpOptions
 from evercal.mapping.patches import image_pyramid
 
 
-@dataclass(frozen=True)
-class Attempt:
+class Attempt(NamedTuple):
     """Effort of one attempt to locate an image."""
 
     retrieved: int
     """Keyframes that the global descriptor proposes."""
-    match_stride: int
+    stride: int
     """Matches every n-th row and column of patches."""
-    unknown_camera: bool = False
-    """Estimate the intrinsics of an unknown camera."""
 
 
 @dataclass(frozen=True)
@@ -33,15 +31,8 @@ class LocalizeOptions:
 
     candidates: int = 3
     """Scenes that are tried per image, at most."""
-    attempts: tuple[Attempt, ...] = (
-        Attempt(12, 4),
-        Attempt(12, 2),
-        Attempt(12, 2, unknown_camera=True),
-        Attempt(48, 1),
-        Attempt(48, 1, unknown_camera=True),
-        Attempt(200, 1),
-    )
-    """Until a pose is accepted. From the third on, images must be promising."""
+    attempts: tuple[Attempt, ...] = (Attempt(12, 4), Attempt(12, 2), Attempt(48, 1))
+    """Until a pose is accepted. The third is for promising images."""
     middle_px: int = 160
     """Side of the middle of an image that its quarter turn is judged by, at working size."""
     aligned_inliers: int = 12
@@ -49,19 +40,13 @@ class LocalizeOptions:
     promising_inliers: int = 16
     """Images with fewer PnP inliers after two attempts are rejected."""
     immediate: float = 3.0
-    """A pose of the first attempt is final if its support is this many times the threshold."""
-    guided_below: float = 1.5
-    """Poses with less support are matched again near themselves while their support rises."""
-    guided_gain: float = 1.1
-    """Factor by which guided matching must raise the support to go on."""
+    """Other scenes are not tried after a pose with this many times the threshold of support."""
     rival_px: float = 16.0
     """A second pose is sought among matches that the first one misses by more than this, pixels."""
     climbs: int = 5
     """Poses whose rivals are tried, at most."""
     clear_strength: float = 0.8
     """Relative strength of a rival, see `Localizer`, from which the image is ambiguous."""
-    guided_px: float = 32.0
-    """Search radius of guided matching, pixels at the encoder's working size."""
     keyframes: int = 6
     """Keyframes of a scene that an image is matched and aligned to."""
     retrieval_stride: int = 4
@@ -96,8 +81,6 @@ class Query:
         default_factory=dict
     )
     """Most similar cells of keyframes, see `Matcher`."""
-    tried: set[tuple[int, int, bool, bytes]] = field(default_factory=set)
-    """Candidates that were tried."""
     turns: int = 0
     """Quarter turns clockwise of the image before it was encoded."""
 
@@ -119,24 +102,17 @@ class Query:
         return image_pyramid(self.grey, 2)
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A scene to try with the effort of an `Attempt`."""
+class Candidate(NamedTuple):
+    """A scene to try."""
 
     scene: int
     keyframes: NDArray[np.int64]
     """Its keyframes in the bank, most similar first."""
-    match_stride: int = 1
-    unknown_camera: bool = False
-
-    @property
-    def key(self) -> tuple[int, int, bool, bytes]:
-        """The same for candidates that give the same pose."""
-        return self.scene, self.match_stride, self.unknown_camera, self.keyframes.tobytes()
+    stride: int = 1
+    """Matches every n-th row and column of patches."""
 
 
-@dataclass(frozen=True, eq=False)
-class Matches:
+class Matches(NamedTuple):
     """2D-3D matches of an image in one scene."""
 
     pixels: np.ndarray
@@ -177,9 +153,6 @@ class Hypothesis:
     """Keyframes that it was found with; None where alignment failed."""
     matches: Matches | None = None
     """All matches; None where alignment failed."""
-    templates: np.ndarray | None = None
-    """(n, p) patches of the inliers in their keyframes, at half size."""
-
     @property
     def inliers(self) -> int:
         """Landmarks that agree with the pose."""

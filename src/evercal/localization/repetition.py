@@ -49,10 +49,12 @@ def pattern_steps(points_m: Array, templates: Array, position_m: Array) -> Array
 
 def _shared(moves: Array, tolerance: float, least: float) -> Array:
     """(k, 3) displacements within the tolerance of at least so many of `moves` (n, 3)."""
-    cells, of, counts = np.unique(
-        np.round(moves / tolerance).astype(int), axis=0, return_inverse=True, return_counts=True
+    cells = np.round(moves / tolerance).astype(np.int64)
+    _, where, of, counts = np.unique(
+        cells @ [1, 1 << 20, 1 << 40], return_index=True, return_inverse=True, return_counts=True
     )
-    sums = np.stack([np.bincount(of.ravel(), column) for column in moves.T], 1)
+    cells = cells[where]
+    sums = np.stack([np.bincount(of, column) for column in moves.T], 1)
     found: list[tuple[float, Array]] = []
     for cell in np.argsort(-counts, kind="stable")[:MOST_COMPARED]:
         # A displacement near the border of a cell has neighbours in the next one.

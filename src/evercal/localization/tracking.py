@@ -20,7 +20,6 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import cameras_in_scenes, prior_of
 from evercal.localization.localizer import Localizer
 from evercal.localization.query import Candidate, Hypothesis, Query
-from evercal.localization.repetition import pattern_steps
 from evercal.recordings.images import as_rgb
 
 TrackState = Literal["tracking", "relocalized", "lost"]
@@ -214,9 +213,7 @@ class Tracker:
     def _may_have_slipped(self, found: Hypothesis, predicted: SE3, stamp: float) -> bool:
         """Whether a pose that lies a period of repeated texture away is as near the prediction."""
         assert found.pose is not None, "a trusted pose"
-        if found.points_m is None or found.templates is None:
-            return False
-        steps = pattern_steps(found.points_m, found.templates, found.pose.pose.translation_m)
+        steps = self.localizer.slips(found)
         if not len(steps):
             return False
         elapsed = stamp - self._poses[-1][0]

@@ -75,11 +75,11 @@ def project_surface(
     frame; rotation and translation lead from there to the camera.
     """
     centre = points[0] @ rotation.T + translation_m
-    front = np.flatnonzero(centre[:, 2] > NEAREST_M)
-    pixels = camera.project(centre[front])
+    visible = np.flatnonzero(centre[:, 2] > NEAREST_M)
+    pixels = camera.project(centre[visible])
     high = np.array([camera.width, camera.height]) - BORDER_PX - 1
     inside = ((pixels > BORDER_PX) & (pixels < high)).all(1)
-    visible, pixels = front[inside], pixels[inside]
+    visible, pixels = visible[inside], pixels[inside]
     if most is not None and len(visible) > most:
         spread = np.linspace(0, len(visible) - 1, most).round().astype(int)
         visible, pixels = visible[spread], pixels[spread]

@@ -57,18 +57,17 @@ def from_level(pixels: Array, level: int) -> Array:
 class Patches(NamedTuple):
     """Templates of n patches in one level of a keyframe's pyramid."""
 
-    intensity: Array
-    """(n, p) zero mean, unit deviation."""
-    descent: Array
-    """(n, 2, p) step in keyframe pixels for a difference of intensities, zero mean."""
+    templates: Array
+    """(n, 3, p) zero mean: steps u and v in keyframe pixels for a difference of intensities, and
+    the intensities with unit deviation."""
     inverse_hessian: Array
     """(n, 2, 2) covariance of the aligned position in pixels per unit of intensity noise."""
     rest: Array
-    """(n, 2) `descent` of the template itself, subtracted from every step."""
+    """(n, 2) step of the template itself, subtracted from every step."""
 
     def take(self, index: np.ndarray | slice) -> "Patches":
         """The patches of an index."""
-        return Patches(*(values[index] for values in self))
+        return Patches(self.templates[index], self.inverse_hessian[index], self.rest[index])
 
     @classmethod
     def joined(cls, parts: Sequence["Patches"]) -> "Patches":
@@ -92,10 +91,12 @@ def cut_patches(image: Array, pixels: Array) -> Patches:
     hessian = gradient.transpose(0, 2, 1) @ gradient
     # Beside a flat patch the slopes are so large that the damping needs double precision.
     inverse = np.linalg.inv(hessian + _DAMPING * np.eye(2)).astype(np.float32)
-    descent = np.ascontiguousarray((gradient @ inverse).transpose(0, 2, 1))
-    descent -= descent.mean(2, keepdims=True)
-    intensity = patch / deviation
-    return Patches(intensity, descent, inverse, np.einsum("nkp,np->nk", descent, intensity))
+    templates = np.empty((n, 3, SIDE * SIDE), np.float32)
+    templates[:, :2] = (gradient @ inverse).transpose(0, 2, 1)
+    templates[:, :2] -= templates[:, :2].mean(2, keepdims=True)
+    templates[:, 2] = patch / deviation
+    rest = np.einsum("nkp,np->nk", templates[:, :2], templates[:, 2])
+    return Patches(templates, inverse, rest)
 
 
 def align_patches(
@@ -118,20 +119,18 @@ def align_patches(
     # One array for each coordinate: interleaved ones take three times as long to add.
     right, down = affines[:, 0] @ _OFFSETS.T, affines[:, 1] @ _OFFSETS.T
     centre, (x, y) = centres.astype(np.float32), np.empty((2, *right.shape), np.float32)
-    for last in (*(False,) * iterations, True):
+    for passed in range(iterations + 1):
         values = _sample(
             image, np.add(right, centre[:, :1], out=x), np.add(down, centre[:, 1:], out=y)
         )
         # Templates have zero mean, so that the mean of the values drops out of products with them.
         square = np.einsum("np,np->n", values, values) / values.shape[1]
         deviation = np.sqrt(np.maximum(square - (values @ _MEAN) ** 2, 0)) + _FLAT
-        if last:
-            break
-        step = np.einsum("nkp,np->nk", patches.descent, values) / deviation[:, None] - patches.rest
-        step = step.clip(-_LONGEST_STEP, _LONGEST_STEP)
-        centre = centre - (affines @ step[..., None])[..., 0]
-    product = np.einsum("np,np->n", values, patches.intensity)
-    return centre, product / (deviation * values.shape[1])
+        product = np.einsum("nkp,np->nk", patches.templates, values) / deviation[:, None]
+        if passed < iterations:
+            step = (product[:, :2] - patches.rest).clip(-_LONGEST_STEP, _LONGEST_STEP)
+            centre = centre - (affines @ step[..., None])[..., 0]
+    return centre, product[:, 2] / values.shape[1]
 
 
 def align_down(
