@@ -110,7 +110,7 @@ def cuda() -> torch.device:
     """A CUDA device, for tests marked `gpu`; the test is skipped without one."""
     import torch
 
-    from evercal.features.device import device_of
+    from evercal.continual.networks.device import device_of
 
     if not torch.cuda.is_available():
         pytest.skip("this machine has no CUDA device")

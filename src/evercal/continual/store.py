@@ -17,18 +17,25 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Self
 
-from torch import Tensor, nn
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from evercal.continual.networks.atlas import Cell
-from evercal.continual.networks.descriptor import descriptor_for, load_descriptor
+from evercal.continual.networks.descriptor import (
+    DESCRIBED_ENCODER,
+    descriptor_bytes,
+    descriptor_for,
+    load_descriptor,
+)
 from evercal.continual.networks.head import Head, HeadOptions
 from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
-from evercal.features.weights_file import network_bytes
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.store import KEYFRAMES, write_encoder
+from evercal.mapping.store import KEYFRAMES
 from evercal.recordings.frame import checked_name
 from evercal.storage.atomic import write_bytes, write_json
 from evercal.storage.manifest import Manifest
@@ -58,12 +65,12 @@ class NetworkStore(StageStore):
     ) -> Self:
         """An empty store; nothing is written before the first `commit`.
 
-        By default it has the shipped weights. The sibling `descriptor.safetensors` of another
-        encoder's file is used, if it fits.
+        By default it has the shipped networks. The sibling `descriptor.safetensors` of another
+        encoder's ONNX file is used, if it fits.
         """
         require_free(root)
         if encoder is None:
-            networks = load_encoder(), load_descriptor()
+            networks = load_encoder(DESCRIBED_ENCODER), load_descriptor()
         else:
             local = load_encoder(encoder)
             networks = local, descriptor_for(encoder, local.width)
@@ -75,16 +82,18 @@ class NetworkStore(StageStore):
 
         def read(manifest: Manifest) -> Self:
             payload = manifest.payload
-            # Stores of earlier versions may list centroids in between.
-            first, *_, descriptor = (str(name) for name in payload["networks"])
+            networks = tuple(str(name) for name in payload["networks"])
+            encoder = load_encoder(root / networks[0])
+            for name in networks[1:-1]:
+                encoder.centroids = load_tensors(root / name)["centroids"].astype(np.float32)
             scenes = LearnedScenes(
-                load_encoder(root / first),
-                load_descriptor(root / descriptor),
+                encoder,
+                load_descriptor(root / networks[-1]),
                 str(payload["strategy"]),
                 int(payload["short_side"]),
             )
             stages = [str(name) for name in payload["stages"]]
-            store = cls(root, scenes, stages, (first, descriptor))
+            store = cls(root, scenes, stages, networks)
             for name in stages:
                 store._read_stage(name, manifest)
             return store
@@ -101,7 +110,7 @@ class NetworkStore(StageStore):
         scenes.keyframes.append(
             Keyframes.from_tensors(load_tensors(folder / KEYFRAMES)) if listed(KEYFRAMES) else None
         )
-        scenes.method_states.append(load_tensors(folder / STATE) if listed(STATE) else {})
+        scenes.method_states.append(_tensors(folder / STATE) if listed(STATE) else {})
         if listed(HEAD):
             scenes.heads.append(_read_head(folder, scenes.encoder.width))
 
@@ -114,12 +123,12 @@ class NetworkStore(StageStore):
                 self.networks = self._write_networks(scenes)
             record = scenes.scenes[-1]
             write_json(folder / RECORD, _plain(record))
-            save_tensors(folder / PROTOTYPES, {"prototypes": record.prototypes})
+            save_tensors(folder / PROTOTYPES, _arrays({"prototypes": record.prototypes}))
             _write_head(folder, scenes.heads[-1])
             if keyframes is not None:
                 save_tensors(folder / KEYFRAMES, keyframes.to_tensors())
             if scenes.method_states[-1]:
-                save_tensors(folder / STATE, scenes.method_states[-1])
+                save_tensors(folder / STATE, _arrays(scenes.method_states[-1]))
             write_report(folder, report)
 
         shared = len(scenes.heads) == 1
@@ -128,12 +137,10 @@ class NetworkStore(StageStore):
         self.contents = scenes
 
     def _write_networks(self, scenes: LearnedScenes) -> tuple[str, ...]:
-        names = write_encoder(self.root, scenes.encoder, centroids=False)
-        assert isinstance(scenes.descriptor, nn.Module), "only modules have weights"
-        data = network_bytes(scenes.descriptor, "descriptor")
+        data = descriptor_bytes(scenes.descriptor)
         name = f"descriptor-{hashlib.sha256(data).hexdigest()[:12]}.safetensors"
         write_bytes(self.root / name, data)
-        return (*names, name)
+        return (*scenes.encoder.write(self.root), name)
 
 
 def describe(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]]:
@@ -168,20 +175,28 @@ def _write_head(folder: Path, head: Head) -> None:
         "features": head.features,
         "descriptor": head.descriptor,
     }
-    save_tensors(folder / HEAD, _stored(head), {"head": json.dumps(settings)})
+    save_tensors(folder / HEAD, _arrays(_stored(head)), {"head": json.dumps(settings)})
 
 
 def _read_head(folder: Path, features: int) -> Head:
     from safetensors import safe_open
 
     path = folder / HEAD
-    state = load_tensors(path)
-    with safe_open(path, "pt") as file:
+    state = _tensors(path)
+    with safe_open(path, "np") as file:
         settings = json.loads((file.metadata() or {})["head"])
     if settings["features"] != features:
         raise InputError(f"{path}: trained with another encoder than the store's")
     options = HeadOptions(**settings["options"])
     return Head.from_state(features, settings["descriptor"], options, state).eval()
+
+
+def _arrays(tensors: Mapping[str, Tensor]) -> dict[str, NDArray[Any]]:
+    return {name: value.numpy(force=True) for name, value in tensors.items()}
+
+
+def _tensors(path: Path) -> dict[str, Tensor]:
+    return {name: torch.tensor(value) for name, value in load_tensors(path).items()}
 
 
 def _plain(record: SceneRecord) -> dict[str, Any]:
@@ -199,6 +214,6 @@ def _read_record(folder: Path) -> SceneRecord:
         "camera": Camera.from_dict(content["camera"]),
         "cell": Cell(tuple(cell["centre_m"]), cell["side_m"], tuple(cell["origin_m"])),
         "refined_camera": Camera.from_dict(refined) if refined else None,
-        **load_tensors(folder / PROTOTYPES),
+        **_tensors(folder / PROTOTYPES),
     }
     return SceneRecord(**{**content, **read})

@@ -28,7 +28,7 @@ from evercal.continual.benchmark.strategy_run import (
     Order,
     run_strategy,
 )
-from evercal.continual.networks.descriptor import DESCRIPTOR_FILE
+from evercal.continual.networks.descriptor import DESCRIBED_ENCODER, DESCRIPTOR_FILE
 from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
 from evercal.features.encoder import ENCODER_FILE
@@ -133,9 +133,10 @@ def in_order(scenes: Sequence[Recording], order: Order, seed: int) -> list[Recor
 
 def _settings(scenes: Sequence[Recording], options: BenchOptions) -> dict[str, object]:
     stage = options.stage(0)
+    networks = ENCODER_FILE, DESCRIBED_ENCODER, DESCRIPTOR_FILE
     return {
         **asdict(replace(stage, seed=0, encode=replace(stage.encode, seed=0))),
-        "networks": [sha256_file(file)[:12] for file in (ENCODER_FILE, DESCRIPTOR_FILE)],
+        "networks": [sha256_file(file)[:12] for file in networks],
         "localize": asdict(LocalizeOptions()),
         "localize_networks": asdict(NETWORK_LOCALIZE),
         "acceptance": {k: v for k, v in vars(acceptance).items() if isinstance(v, float)},
