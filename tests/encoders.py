@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from evercal.features.encoder import Encoder, load_encoder
 
-WIDTH = 8
-"""Channels of `tiny_encoder`."""
+STEM = (4, 3, 1), (4, 3, 1), (4, 2, 2), (4, 3, 1), (8, 2, 2)
+TINY = 2, STEM, (3, 1, 3), 1, 8
+"""`training.network.Layout` of a small network with eight channels."""
 
 
 class BlockMean(Encoder):
@@ -33,7 +34,7 @@ def tiny_onnx(seed: int = 0) -> bytes:
 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return onnx_bytes(LocalEncoder(Layout(2, ((4, 2, 2), (8, 2, 2)), (3,), 1, WIDTH)))
+        return onnx_bytes(LocalEncoder(Layout(*TINY)))
 
 
 def tiny_encoder(seed: int = 0) -> Encoder:

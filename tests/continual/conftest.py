@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ..box_world import block_mean, box, shoot
-from ..encoders import WIDTH, tiny_encoder
+from ..encoders import tiny_encoder
 from .box_features import describe, learnable
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def empty_scenes() -> EmptyScenes:
     from evercal.continual.scenes import LearnedScenes
 
     torch.manual_seed(0)
-    encoder, descriptor = tiny_encoder(), GlobalDescriptor(WIDTH, maps=2, hidden=4, width=8).eval()
+    encoder, descriptor = tiny_encoder(), GlobalDescriptor(8, maps=2, hidden=4, width=8).eval()
     for parameter in descriptor.parameters():
         parameter.data = parameter.data.half().float()  # as they are stored
     return lambda strategy: LearnedScenes(encoder, descriptor, strategy, 48)
