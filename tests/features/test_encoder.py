@@ -47,6 +47,19 @@ def test_onnx_file_is_the_module_that_it_was_made_of(size: tuple[int, int]) -> N
     np.testing.assert_allclose(load_encoder(TEACHER_FILE)(grey), expected, atol=1e-5)
 
 
+def test_weights_in_maps_of_before_are_those_of_the_onnx_file(tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    from training.network import TEACHER, from_onnx
+
+    state = from_onnx(TEACHER_FILE, TEACHER).half().state_dict()
+    path = tmp_path / "encoder-283526ac0c3c.safetensors"
+    save_tensors(path, {name: value.numpy() for name, value in state.items()})
+    encoder, shipped = load_encoder(path), load_encoder(TEACHER_FILE)
+    assert encoder.name == shipped.name == "encoder-1.onnx"
+    assert encoder.centroids is not None
+    np.testing.assert_array_equal(encoder(image(48, 64)), shipped(image(48, 64)))
+
+
 @pytest.mark.parametrize("size", [(48, 64), (55, 57), (8, 8), (15, 9)])
 def test_cells_are_unit_vectors_and_pixels_beyond_whole_cells_are_cut_off(
     size: tuple[int, int],
