@@ -15,13 +15,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import torch
 import urllib3
 
 from benchmarks.malformed import heavy, malformed
 from benchmarks.rows import Row, save
 from evercal import InputError, Map, Recording, load_recording
-from evercal.processes import python_command
+from evercal.processes import cores, python_command
 from evercal.recordings.images import decode_image, encode_jpeg
 
 _WARM = 10
@@ -161,10 +160,9 @@ def _mixed(
     opened: Map, service: _Service, images: list[bytes], count: int, clients: int
 ) -> Iterator[Row]:
     """Throughput of located images, beside direct calls in as many threads as the service has."""
-    threads = torch.get_num_threads()
+    threads = cores()
 
     def direct(number: int) -> None:
-        torch.set_num_threads(1)
         opened.localize(_decoded(images[number % len(images)]))
 
     def ask(number: int) -> None:
@@ -188,7 +186,6 @@ def _mixed(
         times, seconds = timed(work, number, workers)
         located = good if work is ask else number
         yield _row(part, times) | {"per_second": located / seconds, "mb": service.resident_mb}
-    torch.set_num_threads(threads)
 
 
 def _bad(service: _Service, count: int) -> Row:

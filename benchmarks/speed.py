@@ -6,13 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from benchmarks.rows import save
 from evercal.localization.parallel import in_parallel
 from evercal.map import Map
 from evercal.mapping.selection import SarsOptions, select_sars
-from evercal.processes import output_of, python_command
+from evercal.processes import cores, output_of, python_command
 from evercal.recordings.samples import sample_rooms
 
 _WARM = 5
@@ -63,7 +62,7 @@ def run(out: Path = Path("runs/speed.csv"), repeat: int = 3) -> None:
                     "batch_images_per_s": 1000 * len(images) / whole,
                 }
             )
-    settings = {"threads": torch.get_num_threads(), "scenes": len(rooms), "repeat": repeat}
+    settings = {"threads": cores(), "scenes": len(rooms), "repeat": repeat}
     save(out, rows, settings)
     _others()
 

@@ -19,7 +19,7 @@ def errors_of(seed: int, images: int, options: CellOptions) -> tuple[float, floa
         root = Path(folder)
         for _ in record_cell(root / "cell", seed, images, options):
             pass
-        learned = Map.open(root / "map", device="cpu")
+        learned = Map.open(root / "map")
         report = learned.learn(root / "cell/wrist").hand_eye
         tripod = learned.calibrate(root / "cell/tripod").parent_from_child
     assert report is not None

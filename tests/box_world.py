@@ -5,12 +5,12 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
-from torch import Tensor
-from torch.nn import functional as F
 
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame, Recording
 from evercal.simulation.box_room import BoxRoom, default_camera
+
+from .encoders import BlockMean
 
 Shoot = Callable[[Camera, SE3], Frame]
 
@@ -61,15 +61,6 @@ def shoot(box: BoxRoom) -> Shoot:
         return Frame("frame", image, camera, pose)
 
     return take
-
-
-class BlockMean:
-    """An encoder of one channel: the mean grey value of each cell."""
-
-    stride, width = 8, 1
-
-    def __call__(self, grey: Tensor) -> Tensor:
-        return F.avg_pool2d(grey, 8)
 
 
 @pytest.fixture(scope="session")

@@ -1,9 +1,9 @@
 """Recordings of small rooms and a map, each made once.
 
 `rooms` are 64x48 pixels, for tests that need no pose. `arcs` are short camera arcs at 160x120.
-`hall` is an arc at 320x240 with fine textures: its map locates images to a millimetre. torch is
-imported inside the fixtures, after its number of threads is set: tests run side by side, and small
-matrix products are slower with more threads.
+`hall` is an arc at 320x240 with fine textures: its map locates images to a millimetre. Libraries
+are imported inside the fixtures, after their number of threads is set: tests run side by side, and
+small matrix products are slower with more threads.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from filelock import FileLock
 from hypothesis import settings
 
 os.environ["OMP_NUM_THREADS"] = "1"
-# The same precision on every machine, so that a bound holds on all of them.
+# The same precision of networks on every machine, so that a bound holds on all of them.
 os.environ["EVERCAL_PRECISION"] = "float32"
 # Empty: the processor's kernels. The command line would choose others for all tests after it, but
 # not for the products of numpy or of child processes.
@@ -110,7 +110,7 @@ def cuda() -> torch.device:
     """A CUDA device, for tests marked `gpu`; the test is skipped without one."""
     import torch
 
-    from evercal.features.device import device_of
+    from evercal.continual.networks.device import device_of
 
     if not torch.cuda.is_available():
         pytest.skip("this machine has no CUDA device")
@@ -126,14 +126,10 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 
 
 @pytest.fixture
-def two_threads() -> Iterator[None]:
-    """torch with two threads, whatever the machine has."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
+def two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two processor cores, whatever the machine has."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,7 @@
 """Folders import only from folders above them; lazy and relative imports count.
 
-So the product reaches nothing of the simulation or the networks, which stand below it.
+So the product reaches nothing of the simulation or the networks, which stand below it. Only the
+networks import torch.
 """
 
 import ast
@@ -86,14 +87,31 @@ def violations(root: Path) -> list[str]:
     return lines
 
 
+def torch_imports(root: Path) -> list[str]:
+    """Modules outside `continual` that import torch, at any depth."""
+    files = {file.relative_to(root).as_posix(): file for file in sorted(root.rglob("*.py"))}
+    found = {name: imported(ast.parse(file.read_text("utf-8")), ()) for name, file in files.items()}
+    using = [name for name, of in found.items() if "torch" in {parts[0] for _, parts in of}]
+    return [name for name in using if not name.startswith("continual/")]
+
+
 def outside_product(module: str) -> bool:
-    """Whether a module belongs to the networks, the simulation or the command line."""
-    return not {*module.split(".")[1:2]} <= {*PRODUCT, *FOR_ALL}
+    """Whether a module belongs to the networks, their torch, the simulation or the command line."""
+    return module.split(".")[0] == "torch" or not {*module.split(".")[1:2]} <= {*PRODUCT, *FOR_ALL}
 
 
 def test_folders_import_only_from_folders_above() -> None:
     lines = violations(Path(evercal.__file__).parent)
     assert not lines, "\n" + "\n".join(lines)
+
+
+def test_only_networks_import_torch(tmp_path: Path) -> None:
+    assert torch_imports(Path(evercal.__file__).parent) == []
+    (tmp_path / "continual").mkdir()
+    for name in ("continual/head.py", "map.py", "plain.py"):
+        (tmp_path / name).write_text("def f():\n    from torch.nn import functional\n")
+    (tmp_path / "plain.py").write_text("from evercal.continual import torch\nimport torchlike")
+    assert torch_imports(tmp_path) == ["map.py"]
 
 
 def printed(code: str, *words: Path) -> list[list[str]]:
@@ -104,21 +122,21 @@ def printed(code: str, *words: Path) -> list[list[str]]:
 
 
 def loaded_modules(code: str, *words: Path) -> list[list[str]]:
-    """Modules of evercal that a program has loaded, each time that it calls `show`."""
+    """Modules of evercal, and torch, that a program has loaded, each time that it calls `show`."""
     return printed(f"{SHOW}\n{code}\nshow()", *words)
 
 
 SHOW = """
 import sys, evercal
 def show():
-    print(*(name for name in sys.modules if name.split(".")[0] == "evercal"))
+    print(*(name for name in sys.modules if name.split(".")[0] in ("evercal", "torch")))
 """
 LEARN = """
-map = evercal.Map.open(sys.argv[1], device="cpu")
+map = evercal.Map.open(sys.argv[1])
 map.learn(sys.argv[2], memory="40%")
 """
 LOCALIZE_AND_CALIBRATE = """
-map = evercal.Map.open(sys.argv[1], device="cpu")
+map = evercal.Map.open(sys.argv[1])
 assert map.localize(evercal.read_image(sys.argv[2])).status == "ok"
 show()
 calibration = map.calibrate(sys.argv[2])

@@ -32,7 +32,7 @@ def learned(
     """A map of the hall, learned from its folder, and of an arc, learned from a `Recording`."""
     root = tmp_path_factory.mktemp("map")
     generic.write(root / "hall", hall)
-    opened = Map.open(root / "new" / "map", device="cpu")
+    opened = Map.open(root / "new" / "map")
     assert opened.scenes == ()
     reports = opened.learn(root / "hall"), opened.learn(arcs[0], name="arc", memory="300kB")
     return opened, reports
@@ -43,7 +43,7 @@ def hall_only(learned: tuple[Map, tuple[LearnReport, LearnReport]], tmp_path_fac
     """A map of the hall."""
     file = tmp_path_factory.mktemp("hall") / "map.zip"
     learned[0].pack(file)
-    opened = Map.unpack(file, file.parent / "map", device="cpu")
+    opened = Map.unpack(file, file.parent / "map")
     opened.remove("arc")
     return opened
 
@@ -92,7 +92,7 @@ def test_images_of_both_scenes_are_located_also_after_opening_again(
     hall: Recording,
     arcs: tuple[Recording, Recording],
 ) -> None:
-    for opened in (learned[0], Map.open(learned[0].path, device="cpu")):
+    for opened in (learned[0], Map.open(learned[0].path)):
         for name, frame in (("hall", hall.test[7]), ("arc", arcs[0].test[11])):
             estimate = opened.localize(frame.read_image())
             assert (estimate.status, estimate.scene) == ("ok", name)
@@ -200,7 +200,7 @@ def test_memory_that_cannot_be_used_is_refused(
     memory: str, rooms: tuple[Recording, ...], tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match=r"memory .*: give a share of the frames"):
-        Map.open(tmp_path / "map", device="cpu").learn(rooms[0], memory=memory)
+        Map.open(tmp_path / "map").learn(rooms[0], memory=memory)
     assert not (tmp_path / "map").exists()
 
 
@@ -212,7 +212,7 @@ def test_memory_in_megabytes_and_auto(arcs: tuple[Recording, Recording], tmp_pat
     auto = opened.learn(arcs[0], name="two", memory="auto", options=quick)
     assert 1 <= auto.frames_kept <= 8
     frame = arcs[0].test[9]
-    estimate = Map.open(tmp_path / "map", device="cpu").localize(frame.read_image())
+    estimate = Map.open(tmp_path / "map").localize(frame.read_image())
     assert estimate.base_from_camera is not None
     assert pose_distance(estimate.base_from_camera, truth_of(frame))[0] < 0.03
 
@@ -229,7 +229,7 @@ def test_interrupted_learning_leaves_the_map_unchanged(
     with pytest.raises(KeyboardInterrupt):
         hall_only.learn(rooms[0], on_progress=interrupt)
     assert tree(hall_only.path) == before
-    assert hall_only.scenes == Map.open(hall_only.path, device="cpu").scenes == ("hall",)
+    assert hall_only.scenes == Map.open(hall_only.path).scenes == ("hall",)
     assert hall_only.localize(hall.test[9].read_image()).status == "ok"
     assert verify(hall_only.path) == []
 
@@ -241,12 +241,12 @@ def test_interrupted_first_learning_leaves_no_map(
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        Map.open(tmp_path / "map", device="cpu").learn(arcs[0], on_progress=interrupt)
-    assert Map.open(tmp_path / "map", device="cpu").scenes == ()
+        Map.open(tmp_path / "map").learn(arcs[0], on_progress=interrupt)
+    assert Map.open(tmp_path / "map").scenes == ()
 
 
 def test_a_map_without_scenes_is_refused(rooms: tuple[Recording, ...], tmp_path: Path) -> None:
-    opened = Map.open(tmp_path / "map", device="cpu")
+    opened = Map.open(tmp_path / "map")
     with pytest.raises(InputError, match=r"map .*: no scene learned yet"):
         opened.localize(rooms[0].train[0].read_image())
     with pytest.raises(InputError, match="no scene learned yet"):
@@ -258,9 +258,9 @@ def test_recordings_with_few_frames_are_refused(
 ) -> None:
     few = replace(rooms[0], train=rooms[0].train[:3])
     with pytest.raises(InputError, match="scene 'alpha': 3 training frames are too few"):
-        Map.open(tmp_path / "map", device="cpu").learn(few)
+        Map.open(tmp_path / "map").learn(few)
     with pytest.raises(InputError, match="missing"):
-        Map.open(tmp_path / "map", device="cpu").learn(tmp_path / "missing")
+        Map.open(tmp_path / "map").learn(tmp_path / "missing")
 
 
 def test_stores_of_networks_and_other_folders_are_refused(hall_only: Map, tmp_path: Path) -> None:
@@ -272,14 +272,14 @@ def test_stores_of_networks_and_other_folders_are_refused(hall_only: Map, tmp_pa
     payload = {**manifest.payload, "kind": "networks", "strategy": "evercal_network", **empty}
     write_manifest(root, payload, [])
     with pytest.raises(InputError, match=rf"{root}: holds networks of strategy 'evercal_network'"):
-        Map.open(root, device="cpu")
+        Map.open(root)
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_bytes(b"")
     with pytest.raises(InputError, match="photos: exists and is not an evercal store"):
-        Map.open(tmp_path / "photos", device="cpu")
+        Map.open(tmp_path / "photos")
     (root / MANIFEST).write_text("{")
     with pytest.raises(InputError, match=MANIFEST):
-        Map.open(root, device="cpu")
+        Map.open(root)
 
 
 def test_a_second_object_of_one_map_does_not_overwrite_its_scenes(
@@ -289,7 +289,7 @@ def test_a_second_object_of_one_map_does_not_overwrite_its_scenes(
     first.learn(rooms[0], options=MapOptions(adjust=False))
     with pytest.raises(InputError, match="another process has changed it"):
         second.learn(rooms[1])
-    assert Map.open(tmp_path / "map", device="cpu").scenes == ("alpha",)
+    assert Map.open(tmp_path / "map").scenes == ("alpha",)
 
 
 def test_a_merged_map_gives_the_answers_of_one_that_learned_in_turn(
@@ -298,11 +298,11 @@ def test_a_merged_map_gives_the_answers_of_one_that_learned_in_turn(
     arcs: tuple[Recording, Recording],
     tmp_path: Path,
 ) -> None:
-    turn = Map.open(learned[0].path, device="cpu")
+    turn = Map.open(learned[0].path)
     turn.pack(tmp_path / "turn.zip")
-    Map.unpack(tmp_path / "turn.zip", tmp_path / "hall", device="cpu").remove("arc")
-    Map.unpack(tmp_path / "turn.zip", tmp_path / "arc", device="cpu").remove("hall")
-    merged = Map.open(tmp_path / "merged", device="cpu")
+    Map.unpack(tmp_path / "turn.zip", tmp_path / "hall").remove("arc")
+    Map.unpack(tmp_path / "turn.zip", tmp_path / "arc").remove("hall")
+    merged = Map.open(tmp_path / "merged")
     joined = merged.merge(tmp_path / "hall", tmp_path / "arc")
     assert joined.added == merged.scenes == turn.scenes == ("hall", "arc")
     images = [scene.test[i].read_image() for scene in (hall, arcs[0]) for i in (3, 12)]
@@ -324,7 +324,7 @@ def test_a_scene_is_renamed_and_removed_while_a_localizer_answers(
     hall_only: Map, hall: Recording, tmp_path: Path
 ) -> None:
     hall_only.pack(tmp_path / "hall.zip")
-    opened = Map.unpack(tmp_path / "hall.zip", tmp_path / "map", device="cpu")
+    opened = Map.unpack(tmp_path / "hall.zip", tmp_path / "map")
     opened.merge(hall_only.path, on_clash="rename")
     opened.rename("hall", "first")
     before, image = opened.localizer, hall.test[9].read_image()

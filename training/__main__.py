@@ -20,7 +20,7 @@ def run(
     """Train the encoder and the descriptor on procedural images (hours).
 
     Args:
-        out: Output folder of encoder.safetensors, descriptor.safetensors and pretrain.log.
+        out: Output folder of encoder.onnx, descriptor.safetensors and pretrain.log.
         options: Training options.
         work: Folder of checkpoints, from which the same command resumes. Default: OUT/work.
     """

@@ -14,13 +14,13 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import DataLoader, IterableDataset
 
+from evercal.continual.networks.precision import autocast
 from evercal.errors import InputError
-from evercal.features.encoder import LocalEncoder
-from evercal.features.precision import autocast
 from evercal.processes import started_safely
 from evercal.storage.atomic import write_bytes
 from rooms.renderer import mitsuba
 from training.furnished import cached_furnished_views
+from training.network import TEACHER, LocalEncoder
 from training.pairs import (
     END_ROOM_SEED,
     FIRST_ROOM_SEED,
@@ -252,7 +252,7 @@ def train_encoder(
     """
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(options.seed)
-        encoder = LocalEncoder(fused=False)
+        encoder = LocalEncoder(TEACHER, fused=False)
     encoder.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     optimiser = torch.optim.AdamW(encoder.parameters(), lr=1e-4, weight_decay=0.02)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
@@ -330,7 +330,7 @@ def _earlier(checkpoint: Path) -> dict[str, Tensor]:
     """
     try:
         weights = torch.load(checkpoint, weights_only=True)["encoder"]
-        LocalEncoder(fused=False).load_state_dict(weights)
+        LocalEncoder(TEACHER, fused=False).load_state_dict(weights)
     except Exception as error:
         reason = (str(error).splitlines() or [repr(error)])[0]
         raise InputError(

@@ -9,14 +9,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from evercal.features.weights_file import network_bytes
+from evercal.continual.networks.descriptor import descriptor_bytes
 from evercal.storage.atomic import write_bytes
 from training.contrastive import PretrainOptions, make_data, train_encoder
+from training.network import onnx_bytes
 from training.places import train_descriptor
 
 
 def pretrain(out: Path, work: Path, options: PretrainOptions) -> None:
-    """Write `encoder.safetensors`, `descriptor.safetensors` and `pretrain.log`.
+    """Write `encoder.onnx`, `descriptor.safetensors` and `pretrain.log`.
 
     Args:
         out: Folder of the three files; existing files are replaced.
@@ -45,8 +46,8 @@ def pretrain(out: Path, work: Path, options: PretrainOptions) -> None:
     )
     trained = train_encoder(data, options, work, log)
     encoder = trained.fuse().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    write_bytes(out / "encoder.safetensors", network_bytes(encoder, "encoder"))
+    write_bytes(out / "encoder.onnx", onnx_bytes(encoder))
     descriptor = train_descriptor(data, options, encoder, log)
-    write_bytes(out / "descriptor.safetensors", network_bytes(descriptor, "descriptor"))
+    write_bytes(out / "descriptor.safetensors", descriptor_bytes(descriptor))
     log(f"done {seconds()}")
     write_bytes(out / "pretrain.log", path.read_bytes())

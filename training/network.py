@@ -28,7 +28,8 @@ class Layout(NamedTuple):
     """Channels of the features."""
 
 
-TEACHER = Layout(2, ((32, 3, 1), (32, 3, 1), (64, 2, 2), (64, 3, 1), (160, 2, 2)), (3, 1, 3), 3, 128)
+_STEM = (32, 3, 1), (32, 3, 1), (64, 2, 2), (64, 3, 1), (160, 2, 2)
+TEACHER = Layout(2, _STEM, (3, 1, 3), 3, 128)
 """Trained by contrast; maps of version 0.2 and before use it."""
 SHIPPED = Layout(4, ((32, 3, 1), (32, 3, 1), (80, 2, 2)), (3, 3), 3, 64)
 """Distilled from the teacher."""
@@ -128,7 +129,7 @@ def onnx_bytes(module: LocalEncoder) -> bytes:
             values = getattr(conv, kind).detach().numpy().astype(np.float16)
             names.append(f"{kind}{len(weights)}")
             weights.append(numpy_helper.from_array(values, names[-1]))
-        pads = [side for side in cast(tuple[int, int], conv.padding)] * 2
+        pads = [*cast(tuple[int, int], conv.padding)] * 2
         x = node("Conv", names, kernel_shape=conv.kernel_size, strides=conv.stride, pads=pads)
         return node("Relu", [x]) if relu else x
 

@@ -8,9 +8,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from evercal.continual.networks.descriptor import GlobalDescriptor
-from evercal.features.encoder import Encoder
-from evercal.features.precision import autocast
+from evercal.continual.networks.precision import autocast
 from training.contrastive import PretrainData, PretrainOptions
+from training.network import LocalEncoder
 from training.pairs import (
     PER_ANCHOR,
     VALIDATION_ROOM_SEED,
@@ -24,7 +24,7 @@ TEMPERATURE = 0.07
 
 
 @torch.inference_mode()
-def _encode(encoder: Encoder, rooms: Sequence[Views], rng: np.random.Generator) -> Tensor:
+def _encode(encoder: LocalEncoder, rooms: Sequence[Views], rng: np.random.Generator) -> Tensor:
     """Encode all views with random photometric changes.
 
     Returns:
@@ -72,7 +72,7 @@ def place_accuracy(descriptor: GlobalDescriptor, maps: Tensor) -> float:
 
 
 def train_descriptor(
-    data: PretrainData, options: PretrainOptions, encoder: Encoder, log: Callable[[str], None]
+    data: PretrainData, options: PretrainOptions, encoder: LocalEncoder, log: Callable[[str], None]
 ) -> GlobalDescriptor:
     """Train the descriptor on features of the frozen encoder."""
     rng = np.random.default_rng([options.seed, 9])

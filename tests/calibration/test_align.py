@@ -223,7 +223,7 @@ def test_verb_aligns_a_scene(
     (tmp_path / "poses.csv").write_text("\n".join(rows))
     words = [tmp_path / "map", "hall", tmp_path / "arm", "--robot-poses", tmp_path / "poses.csv"]
     assert main(["align", *map(str, words)]) == 0
-    estimate = Localizer.open(tmp_path / "map", device="cpu").localize(images[4][1])
+    estimate = Localizer.open(tmp_path / "map").localize(images[4][1])
     assert estimate.base_from_camera is not None
     truth = BASE_FROM_MAP @ map_from_camera[4]
     assert pose_distance(estimate.base_from_camera, truth)[0] < 0.006

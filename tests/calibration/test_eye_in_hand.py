@@ -50,7 +50,7 @@ def learned(
     rough = truth @ SE3.exp([0.05, 0, 0, 0, 0.2, 0])
     arm = without_camera_poses(hand)
     few = replace(arm, train=arm.train[:: len(arm.train) // 14][:14])
-    report = Map.open(folder, device="cpu").learn(few, gripper_from_camera=rough)
+    report = Map.open(folder).learn(few, gripper_from_camera=rough)
     return folder, report
 
 
@@ -75,7 +75,7 @@ def test_the_map_keeps_the_calibration(learned: tuple[Path, LearnReport], tmp_pa
     folder, report = learned
     assert report.hand_eye is not None
     shutil.copytree(folder, tmp_path / "cell")
-    cell = Map.open(tmp_path / "cell", device="cpu")
+    cell = Map.open(tmp_path / "cell")
     calibration = cell.calibration()
     assert (calibration.mount, calibration.parent_frame) == ("eye_in_hand", "gripper")
     assert tier(calibration) in TIERS
@@ -113,13 +113,13 @@ def test_a_map_without_gripper_poses_has_no_calibration(
     with pytest.raises(InputError, match="was not learned from gripper poses"):
         calibration_at(tmp_path / "map")
     with pytest.raises(InputError, match="map:hall: was not learned from gripper poses"):
-        Map.open(tmp_path / "map", device="cpu").calibration("hall")
+        Map.open(tmp_path / "map").calibration("hall")
 
 
 def test_images_are_located_in_the_base_frame(
     learned: tuple[Path, LearnReport], hand: Recording
 ) -> None:
-    contents = Localizer.open(learned[0], device="cpu").contents
+    contents = Localizer.open(learned[0]).contents
     scene, frame = contents.scenes[0], hand.test[3]
     assert scene.frame.base_covariance is not None
     without_error = replace(scene, frame=replace(scene.frame, base_covariance=None))
@@ -149,7 +149,7 @@ def test_rotation_about_one_axis_is_refused(hand: Recording, tmp_path: Path) -> 
         for f, pose in zip(hand.test, poses, strict=True)
     )
     with pytest.raises(InputError, match="arm: parallel axes: the gripper turned"):
-        Map.open(tmp_path / "map", device="cpu").learn(Recording("arm", frames, ()))
+        Map.open(tmp_path / "map").learn(Recording("arm", frames, ()))
     assert not (tmp_path / "map").exists()
 
 
@@ -158,4 +158,4 @@ def test_too_few_images_are_refused(count: int, hand: Recording, tmp_path: Path)
     arm = without_camera_poses(hand)
     few = replace(arm, train=arm.train[:count])
     with pytest.raises(InputError, match=rf"^scene 'arm': {count} training frames are too few"):
-        Map.open(tmp_path / "map", device="cpu").learn(few)
+        Map.open(tmp_path / "map").learn(few)

@@ -43,13 +43,12 @@ def learnable(box: BoxRoom) -> Learnable:
             points, _ = box.intersect(pose.translation_m, rays)
             phase = points @ waves.T
             features = np.concatenate([np.sin(phase), np.cos(phase)], 1)
-            grid = torch.from_numpy(features.T.reshape(1, CHANNELS, 15, 20)).float()
             intrinsics = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy], np.float32)
             grey, valid = np.zeros((120, 160), np.uint8), np.ones(300, bool)
             view = View(grey, pixels.astype(np.float32), valid, intrinsics, pose)
-            descriptor = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(1, 6))))
-            every = torch.ones(1, 300, dtype=torch.bool)
-            buffer.append([view], (grid, descriptor), every)
+            descriptor = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=6)), dim=0)
+            rows = torch.from_numpy(features).float()
+            buffer.append(view, (rows, descriptor), torch.ones(300, dtype=torch.bool))
             everything.append(torch.from_numpy(ATLAS_FROM_BASE.apply(points)).float())
         return buffer, torch.cat(everything)
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ..box_world import block_mean, box, shoot
+from ..encoders import tiny_encoder
 from .box_features import describe, learnable
 
 if TYPE_CHECKING:
@@ -40,12 +41,10 @@ def empty_scenes() -> EmptyScenes:
 
     from evercal.continual.networks.descriptor import GlobalDescriptor
     from evercal.continual.scenes import LearnedScenes
-    from evercal.features.encoder import LocalEncoder
 
     torch.manual_seed(0)
-    encoder = LocalEncoder(stem=(4, 4), inner=8, blocks=1, width=8).eval()
-    descriptor = GlobalDescriptor(8, maps=2, hidden=4, width=8).eval()
-    for parameter in (*encoder.parameters(), *descriptor.parameters()):
+    encoder, descriptor = tiny_encoder(), GlobalDescriptor(8, maps=2, hidden=4, width=8).eval()
+    for parameter in descriptor.parameters():
         parameter.data = parameter.data.half().float()  # as they are stored
     return lambda strategy: LearnedScenes(encoder, descriptor, strategy, 48)
 

@@ -1,112 +1,89 @@
 """VLAD: shipped and fitted centroids, and sums against a slow twin."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
-import torch
-from safetensors import safe_open
-from torch import Tensor
-from torch.nn import functional as F
+from numpy.typing import NDArray
 
 from evercal.errors import InputError
-from evercal.features import vlad as module
-from evercal.features.encoder import LocalEncoder, load_encoder
-from evercal.features.vlad import (
-    CENTROIDS,
-    VLAD_FILE,
-    WIDTH,
-    Vlad,
-    fit_centroids,
-    load_centroids,
-    save_centroids,
-    vlad_for,
-)
+from evercal.features.encoder import load_encoder
+from evercal.features.vlad import CENTROIDS, WIDTH, Array, Vlad, fit_centroids, similar_pairs
+
+from ..encoders import tiny_encoder
 
 
-def tiny(seed: int) -> LocalEncoder:
-    torch.manual_seed(seed)
-    return LocalEncoder(stem=(4, 4), inner=8, blocks=1, width=8).eval()
+def features(count: int, width: int, seed: int) -> Array:
+    drawn = np.random.default_rng(seed).normal(size=(count, width)).astype(np.float32)
+    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
 
 
-def features(count: int, width: int, seed: int) -> Tensor:
-    drawn = torch.randn(count, width, generator=torch.Generator().manual_seed(seed))
-    return F.normalize(drawn, dim=1)
-
-
-def test_shipped_centroids_are_those_of_the_shipped_encoder() -> None:
+def test_shipped_centroids_are_unit_vectors_that_differ() -> None:
     encoder = load_encoder()
-    with safe_open(VLAD_FILE, "pt") as file:
-        assert file.metadata() == {"encoder": module._digest(encoder)}
-        stored = file.get_tensor("centroids")
-    assert stored.shape == (CENTROIDS, encoder.width)
-    vlad = vlad_for(encoder)
-    assert torch.equal(vlad.centroids, stored.float())
-    np.testing.assert_allclose(vlad.centroids.norm(dim=1), 1, atol=1e-3)  # half precision
-    # They are all different.
-    similarity = vlad.centroids @ vlad.centroids.T - 2 * torch.eye(CENTROIDS)
+    vlad = encoder.vlad()
+    assert vlad.centroids.shape == (CENTROIDS, encoder.width)
+    np.testing.assert_allclose(np.linalg.norm(vlad.centroids, axis=1), 1, atol=1e-3)
+    similarity = vlad.centroids @ vlad.centroids.T - 2 * np.eye(CENTROIDS)
     assert similarity.max() < 0.95
-    assert vlad.projection.shape == (CENTROIDS * encoder.width, WIDTH)
-    assert vlad_for(encoder) is vlad
+    assert encoder.vlad() is vlad
 
 
 def test_another_encoder_has_centroids_of_given_features() -> None:
+    encoder, other = tiny_encoder(0), tiny_encoder(1)
     with pytest.raises(InputError, match="no VLAD centroids; learn a recording"):
-        vlad_for(tiny(0))
+        encoder.vlad()
     images = [features(50, 8, seed) for seed in range(4)]
-    encoder, other = tiny(0), tiny(1)
-    one, two = vlad_for(encoder, images), vlad_for(other, [-image for image in images])
+    one, two = encoder.vlad(images), other.vlad([-image for image in images])
     for vlad in (one, two):
         assert vlad.centroids.shape == (CENTROIDS, 8)
-        np.testing.assert_allclose(vlad.centroids.norm(dim=1), 1, atol=1e-5)
-    assert not torch.allclose(one.centroids, two.centroids, atol=1e-2)
-    # They are fitted once.
-    assert vlad_for(encoder) is vlad_for(encoder, images[:1]) is one
-    # The fit is deterministic.
-    again = vlad_for(tiny(0), images)
-    assert torch.equal(again.centroids, one.centroids)
-    assert torch.equal(again.projection, one.projection)
-
-
-def test_changed_weights_make_another_encoder() -> None:
-    changed = load_encoder()
-    assert isinstance(changed, LocalEncoder)
-    with torch.no_grad():
-        next(changed.parameters()).add_(0.5)
-    with pytest.raises(InputError, match="no VLAD centroids"):
-        vlad_for(changed)
+        np.testing.assert_allclose(np.linalg.norm(vlad.centroids, axis=1), 1, atol=1e-5)
+    assert not np.allclose(one.centroids, two.centroids, atol=1e-2)
+    # They are fitted once, and the fit is deterministic.
+    assert encoder.vlad() is encoder.vlad(images[:1]) is one
+    np.testing.assert_array_equal(fit_centroids(images), one.centroids)
 
 
 def test_centroids_of_separate_clusters_are_their_means() -> None:
-    means = torch.eye(CENTROIDS)
-    rows = F.normalize(means.repeat(100, 1) + 0.05 * features(100 * CENTROIDS, CENTROIDS, 3), dim=1)
-    centroids = fit_centroids([rows])
-    similarity = centroids @ means.T
+    means = np.eye(CENTROIDS, dtype=np.float32)
+    rows = np.tile(means, (100, 1)) + 0.05 * features(100 * CENTROIDS, CENTROIDS, 3)
+    similarity = fit_centroids([rows / np.linalg.norm(rows, axis=1, keepdims=True)]) @ means.T
     # k-means from random rows finds most clusters.
-    assert (similarity.max(0).values > 0.98).float().mean() > 0.5
+    assert (similarity.max(0) > 0.98).mean() > 0.5
 
 
-def test_centroids_are_saved_with_their_encoder(tmp_path: Path) -> None:
-    encoder, other = tiny(0), tiny(1)
-    expected = vlad_for(encoder, [features(200, 8, 0)]).centroids
-    save_centroids(encoder, tmp_path / "vlad.safetensors")
-    with safe_open(tmp_path / "vlad.safetensors", "pt") as file:
-        assert (file.metadata() or {})["encoder"] == module._digest(encoder)
-    load_centroids(other, tmp_path / "vlad.safetensors")
-    assert torch.equal(vlad_for(other).centroids, expected)
+def by_hand(rows: Array, centroids: Array) -> NDArray[np.float64]:
+    """Unit sums of the differences from each centroid, one after the other."""
+    sums = np.zeros(centroids.shape)
+    for row in rows.astype(float):
+        nearest = int(np.argmax(centroids @ row))
+        sums[nearest] += row - centroids[nearest]
+    return (sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)).ravel()
 
 
 def test_vector_is_the_sum_of_differences_from_the_nearest_centroids() -> None:
-    centroids, projection = features(5, 6, 0), torch.randn(30, 12)
-    rows = features(40, 6, 1)
-    vector = Vlad(centroids, projection)(rows)
-    sums = np.zeros((5, 6))
-    for row in rows.double().numpy():
-        nearest = int(np.argmax([row @ c for c in centroids.double().numpy()]))
-        sums[nearest] += row - centroids[nearest].double().numpy()
-    lengths = np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
-    expected = (sums / lengths).ravel() @ projection.double().numpy()
+    centroids, rows = features(5, 6, 0), features(40, 6, 1)
+    vector = Vlad(centroids)(rows)
+    np.testing.assert_allclose(vector, by_hand(rows, centroids) / 5**0.5, atol=1e-5)
+    assert float(np.linalg.norm(vector)) == pytest.approx(1, abs=1e-5)
+
+
+def test_long_vectors_are_projected_by_numbers_that_never_change() -> None:
+    """Those of `torch.randn` with seed 1, which maps of before were made with."""
+    torch = pytest.importorskip("torch")
+    centroids, rows = features(CENTROIDS, 64, 0), features(40, 64, 1)
+    size = centroids.size
+    generator = torch.Generator().manual_seed(1)
+    projection = torch.randn(size, WIDTH, generator=generator).numpy() / size**0.5
+    vlad = Vlad(centroids)
+    assert vlad._projection is not None
+    np.testing.assert_allclose(vlad._projection, projection, rtol=1e-4, atol=1e-7)
+    vector, plain = vlad(rows), Vlad(centroids[:16])(rows)
+    assert vector.shape == plain.shape == (WIDTH,)
+    expected = by_hand(rows, centroids) @ projection
     np.testing.assert_allclose(vector, expected / np.linalg.norm(expected), atol=1e-5)
-    assert float(vector.norm()) == pytest.approx(1, abs=1e-5)
+
+
+def test_every_image_is_paired_with_the_most_similar_ones() -> None:
+    images = [features(60, 8, seed) for seed in range(3)]
+    images += [np.asarray(image + 0.01 * features(60, 8, 9), np.float32) for image in images]
+    pairs = similar_pairs(images, Vlad(features(4, 8, 1)), 1)
+    assert pairs == [(0, 3), (1, 4), (2, 5)]
+    assert similar_pairs(images[:2], Vlad(features(4, 8, 1)), 5) == [(0, 1)]

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from evercal.features.weights_file import network_bytes
 
 from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
-from evercal.features.weights_file import network_bytes
 from evercal.learning.many import LearnTask, learn_scenes
 from evercal.map import Map
 from evercal.mapping.build import MapOptions

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-
 from evercal.features.encode import encode_image
+
 from evercal.geometry import SE3, UncertainPose, pose_distance
 from evercal.localization.acceptance import support
 from evercal.localization.intrinsics import OWN

@@ -178,7 +178,7 @@ def test_map_on_disk_gives_the_same_poses(
     MapStore(tmp_path / "map", with_scene(hall_map, hall_map.scenes[0])).commit(
         hall_map.scenes[0], {}
     )
-    opened = Localizer.open(tmp_path / "map", device="cpu")
+    opened = Localizer.open(tmp_path / "map")
     for frame, first in list(zip(views, estimates, strict=True))[::6]:
         # Landmarks are stored in single precision.
         again = opened.localize(frame.read_image(), frame.camera)
@@ -370,11 +370,8 @@ def test_a_wider_attempt_locates_what_the_first_rejects(
         assert error(estimate, view.base_from_camera)[0] < 0.02
 
 
-def test_unusable_paths_and_devices_are_refused(tmp_path: Path, hall_map: MapContents) -> None:
+def test_unusable_paths_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=str(tmp_path)):
         Localizer.open(tmp_path)
     with pytest.raises(InputError, match="missing"):
         Localizer.open(str(tmp_path / "missing"))
-    for device in ("mps", "", "gpu"):
-        with pytest.raises(InputError, match=f"device '{device}'"):
-            Localizer.open(tmp_path, device=device)

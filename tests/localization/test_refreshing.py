@@ -165,7 +165,7 @@ def test_a_refresh_is_refused_or_undone_as_a_whole(
 ) -> None:
     contents = MapContents(hall_map.encoder, hall_map.short_side)
     MapStore(tmp_path / "map", contents).commit(hall_map.scenes[0], {})
-    before, opened = tree(tmp_path / "map"), Map.open(tmp_path / "map", device="cpu")
+    before, opened = tree(tmp_path / "map"), Map.open(tmp_path / "map")
     other, camera = BoxRoom(55, texture_px=256), hall.train[0].camera
     wrong = [other.render(camera, SE3.exp([0.05 * i, 0, 1.2, 0.3, 0.1, 0.2])) for i in range(2)]
     with pytest.raises(InputError, match=r"0 of 2 images are located precisely.*unchanged"):
@@ -176,12 +176,12 @@ def test_a_refresh_is_refused_or_undone_as_a_whole(
     image = hall.test[5].read_image()
     first = opened.localize(image).base_from_camera
     opened.refresh([pixels for _, pixels in images[:6]])
-    again = Map.open(tmp_path / "map", device="cpu").localize(image).base_from_camera
+    again = Map.open(tmp_path / "map").localize(image).base_from_camera
     assert first is not None
     assert again is not None
     assert not np.array_equal(again.matrix(), first.matrix())
     opened.undo_refresh("hall")
-    for cell in (opened, Map.open(tmp_path / "map", device="cpu")):
+    for cell in (opened, Map.open(tmp_path / "map")):
         back = cell.localize(image).base_from_camera
         assert back is not None
         assert np.array_equal(back.matrix(), first.matrix())

@@ -81,7 +81,7 @@ def running(map: Path, **options: Any) -> Iterator[Running]:
     """Serve a map."""
     from evercal.service.server import ServeOptions, bound_socket, make_app, server_of, url_of
 
-    chosen = ServeOptions(map, port=0, device="cpu", **options)
+    chosen = ServeOptions(map, port=0, **options)
     ready = threading.Event()
     with bound_socket(chosen) as listener:
         app = make_app(chosen, lambda _: ready.set())

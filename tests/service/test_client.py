@@ -25,7 +25,7 @@ def client(hall_service: Any) -> Client:
 def test_estimates_are_those_of_the_map(
     client: Client, hall_store: Path, image: Path, hall: Recording
 ) -> None:
-    opened, pixels = Map.open(hall_store, device="cpu"), read_image(image)
+    opened, pixels = Map.open(hall_store), read_image(image)
     assert client.scenes == opened.scenes
     for given, camera in ((image, None), (pixels, None), (str(image), hall.test[7].camera)):
         got, expected = client.localize(given, camera), opened.localize(pixels, camera)
@@ -41,7 +41,7 @@ def test_estimates_are_those_of_the_map(
 def test_calibrations_and_checks(
     client: Client, hall_store: Path, hall: Recording, tmp_path: Path
 ) -> None:
-    rng, opened = np.random.default_rng(0), Map.open(hall_store, device="cpu")
+    rng, opened = np.random.default_rng(0), Map.open(hall_store)
     frame = hall.test[3]
     for i in range(3):
         noisy = frame.read_image() + rng.normal(0, 4, (240, 320, 3))

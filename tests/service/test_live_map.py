@@ -14,7 +14,7 @@ def test_changes_by_other_processes_are_noticed(serve: Any, copy: Path, image: P
     parts = [("image", (image.name, image.read_bytes()))]
     with serve(copy) as service:
         assert service.ask("POST", "/localize", parts).json["scene"] == "hall"
-        Map.open(copy, device="cpu").rename("hall", "lobby")
+        Map.open(copy).rename("hall", "lobby")
         until = time.monotonic() + 10
         while service.ask("GET", "/scenes").json["scenes"] != ["lobby"]:
             assert time.monotonic() < until
@@ -35,7 +35,7 @@ def test_no_answer_mixes_two_states(serve: Any, copy: Path, image: Path, tmp_pat
         def rename() -> None:
             names = ["hall", "lobby"]
             while not stop.is_set():
-                Map.open(copy, device="cpu").rename(*names)
+                Map.open(copy).rename(*names)
                 service.service.live.refresh()
                 names.reverse()
 
@@ -60,6 +60,6 @@ def test_a_service_without_a_map_waits_for_its_first_scene(
         assert got.status == 400
         assert "no scene learned yet" in got.json["error"]
         assert not (tmp_path / "new").exists()
-        Map.open(tmp_path / "new", device="cpu").merge(hall_store)
+        Map.open(tmp_path / "new").merge(hall_store)
         service.service.live.refresh()
         assert service.ask("POST", "/localize", parts).json["scene"] == "hall"

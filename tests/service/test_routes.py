@@ -26,7 +26,7 @@ def part(path: Path) -> tuple[str, bytes]:
 def test_localize_gives_the_row_of_the_command(
     hall_service: Any, hall_store: Path, image: Path, hall: Recording
 ) -> None:
-    opened, camera = Map.open(hall_store, device="cpu"), hall.test[7].camera
+    opened, camera = Map.open(hall_store), hall.test[7].camera
     parts = [("image", part(image))]
     lens = ("camera.json", json.dumps(camera.to_dict()).encode())
     for given, sent in ((None, parts), (camera, [*parts, ("camera", lens)])):

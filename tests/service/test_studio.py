@@ -50,7 +50,7 @@ def cell() -> VirtualCell:
 
 
 def studio_in(root: Path, cell: VirtualCell, **changes: Any) -> Studio:
-    return Studio(replace(devices_of(cell), **changes), root, device="cpu")
+    return Studio(replace(devices_of(cell), **changes), root)
 
 
 def silent(*_: object) -> None:
@@ -170,7 +170,7 @@ def test_devices_that_give_nothing_are_named(cell: VirtualCell, tmp_path: Path) 
     write_image(tmp_path / "images/0.png", cell.wrist_camera.read()[1])
     camera = StreamCamera(str(tmp_path / "images"))
     devices = Devices(camera, cell.intrinsics, PoseFileRobot(tmp_path / "poses.csv"))
-    studio = Studio(devices, tmp_path / "out", tmp_path / "map", "cpu")
+    studio = Studio(devices, tmp_path / "out", tmp_path / "map")
     connection = studio.connection
     connection.look()
     assert "wrist" in connection.images

@@ -37,7 +37,7 @@ def test_from_an_empty_folder_to_both_calibrations(browser: Any, tmp_path: Path)
         arm=lambda: joint_frames(np.array(cell.robot.joints_rad()))[:, :3, 3],
         settle_s=0.0,
     )
-    page = StudioPage(Studio(devices, tmp_path, device="cpu"), "127.0.0.1", 0)
+    page = StudioPage(Studio(devices, tmp_path), "127.0.0.1", 0)
     try:
         with visited(browser, page.server.url) as visit:
             record(visit, tmp_path)

@@ -137,7 +137,7 @@ def test_the_whole_chain_finds_the_truth(tmp_path: Path) -> None:
 
     list(record_cell(tmp_path / "cell", 3))
     truth = VirtualCell(3).truth
-    learned = Map.open(tmp_path / "map", device="cpu")
+    learned = Map.open(tmp_path / "map")
     report = learned.learn(tmp_path / "cell/wrist").hand_eye
     assert report is not None
     fixed = learned.calibrate(tmp_path / "cell/tripod").parent_from_child

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from torch.nn import functional as F
 from torch.utils.data import DataLoader
 
 from evercal.errors import InputError
-from evercal.features.encoder import LocalEncoder
 from training import contrastive
 from training.contrastive import (
     Batch,
@@ -25,11 +23,15 @@ from training.contrastive import (
     sample_features,
     train_encoder,
 )
+from training.network import Layout
 from training.pairs import HEIGHT, WIDTH, RoomViews, cell_pixels, leaf_picture
+
+from ..encoders import TINY
 
 pytestmark = pytest.mark.slow("training", "src/evercal/features")
 
 OPTIONS = PretrainOptions(steps=6, room_pairs=2, furnished_pairs=0, leaf_pairs=1, points=64)
+SMALL = Layout(*TINY)
 FAR = torch.tensor([[0.0, 0.0], [100.0, 0.0]])
 
 
@@ -154,8 +156,7 @@ def test_batches_depend_on_seed_and_step_only(data: PretrainData) -> None:
 def small(monkeypatch: pytest.MonkeyPatch, one_room: RoomViews) -> None:
     """Use a small encoder, checkpoints every two steps, and no worker process."""
     monkeypatch.setattr(contrastive, "CHECKPOINT_STEPS", 2)
-    tiny = partial(LocalEncoder, (4, 4), 8, 1, 8)
-    monkeypatch.setattr(contrastive, "LocalEncoder", tiny)
+    monkeypatch.setattr(contrastive, "TEACHER", SMALL)
     monkeypatch.setattr(contrastive, "DataLoader", lambda stream, **_: stream)
     draw = PairStream.draw
     batches: dict[int, Batch] = {}

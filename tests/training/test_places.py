@@ -11,12 +11,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evercal.continual.networks.descriptor import load_descriptor
-from evercal.features.encoder import LocalEncoder, load_encoder
+from evercal.continual.networks.descriptor import DESCRIBED_ENCODER, described, load_descriptor
+from evercal.features.encoder import load_encoder
 from evercal.simulation.box_room import BoxRoom, default_camera
 from training import make, places
 from training.contrastive import PretrainData, PretrainOptions
 from training.make import pretrain
+from training.network import Layout, LocalEncoder
 from training.pairs import RoomViews, leaf_picture
 from training.places import (
     place_accuracy,
@@ -25,8 +26,12 @@ from training.places import (
     train_descriptor,
 )
 
+from ..encoders import TINY
+
 pytestmark = pytest.mark.slow("training", "src/evercal/features")
 
+SMALL = Layout(*TINY)
+GREY = np.random.default_rng(0).integers(0, 256, (64, 80)).astype(np.uint8)
 T = places.TEMPERATURE
 
 
@@ -81,7 +86,7 @@ def test_crops_are_windows_of_the_map() -> None:
 
 def trained(one_room: RoomViews, steps: int) -> tuple[dict[str, Tensor], list[str]]:
     torch.manual_seed(0)
-    encoder = LocalEncoder((4, 4), 8, 1, 8).eval()
+    encoder = LocalEncoder(SMALL).eval()
     lines: list[str] = []
     options = PretrainOptions(descriptor_steps=steps)
     data = PretrainData([one_room, one_room], [])
@@ -105,20 +110,20 @@ def test_pretrain_writes_loadable_files(
 ) -> None:
     """Without the two slow parts, rendering and training of the encoder."""
     data = PretrainData([one_room], [leaf_picture(np.random.default_rng(0), 64)])
-    unfused = LocalEncoder((4, 4), 8, 1, 8, fused=False)
+    unfused = LocalEncoder(SMALL, fused=False)
     monkeypatch.setattr(make, "make_data", lambda options, folder: data)
     monkeypatch.setattr(make, "train_encoder", lambda *_: unfused)
     monkeypatch.setattr(places, "photometric", lambda image, rng: image)
     options = PretrainOptions(descriptor_steps=2, rooms=1, pictures=1)
     pretrain(tmp_path / "out", tmp_path / "work", options)
-    encoder = load_encoder(tmp_path / "out" / "encoder.safetensors")
+    encoder = load_encoder(tmp_path / "out" / "encoder.onnx")
     descriptor = load_descriptor(tmp_path / "out" / "descriptor.safetensors")
     assert (encoder.width, descriptor.settings["inputs"]) == (8, 8)
-    image = torch.rand(1, 1, 32, 40)
     with torch.no_grad():
-        expected = unfused.eval()(image)
-        torch.testing.assert_close(encoder(image), expected, atol=5e-3, rtol=0)
-        assert torch.isfinite(descriptor(encoder(image))).all()
+        expected = unfused.eval()(torch.from_numpy(GREY[None, None]) / 255)[0]
+    actual, vector = described(encoder(GREY), descriptor)
+    torch.testing.assert_close(actual, expected.flatten(1).T, atol=5e-3, rtol=0)
+    assert torch.isfinite(vector).all()
     log = (tmp_path / "out" / "pretrain.log").read_text()
     assert '"rooms": 1' in log
     assert log.splitlines()[-1].startswith("done")
@@ -131,20 +136,17 @@ def test_small_pretraining_is_complete_and_resumable(tmp_path: Path) -> None:
     out, work = tmp_path / "out", tmp_path / "work"
     pretrain(out, work, options)
     files = {path.name: path.read_bytes() for path in out.iterdir()}
-    assert set(files) == {"encoder.safetensors", "descriptor.safetensors", "pretrain.log"}
-    encoder, descriptor = (
-        load_encoder(out / "encoder.safetensors"),
-        load_descriptor(out / "descriptor.safetensors"),
-    )
-    with torch.no_grad():
-        assert torch.isfinite(descriptor(encoder(torch.rand(1, 1, 64, 64)))).all()
+    assert set(files) == {"encoder.onnx", "descriptor.safetensors", "pretrain.log"}
+    encoder = load_encoder(out / "encoder.onnx")
+    _, vector = described(encoder(GREY), load_descriptor(out / "descriptor.safetensors"))
+    assert torch.isfinite(vector).all()
     pretrain(out, work, options)
     log = (out / "pretrain.log").read_text()
     assert "resumed at step 3" in log
-    for name in ("encoder.safetensors", "descriptor.safetensors"):
+    for name in ("encoder.onnx", "descriptor.safetensors"):
         assert (out / name).read_bytes() == files[name]
     pretrain(tmp_path / "other", tmp_path / "again", replace(options, seed=2))
-    assert (tmp_path / "other" / "encoder.safetensors").read_bytes() != files["encoder.safetensors"]
+    assert (tmp_path / "other" / "encoder.onnx").read_bytes() != files["encoder.onnx"]
 
 
 def ranks(seeds: range, gallery: int, queries: int) -> np.ndarray:
@@ -153,15 +155,16 @@ def ranks(seeds: range, gallery: int, queries: int) -> np.ndarray:
     Both come from the shipped networks: a gallery from one sweep through each room, queries from
     another walk along the same way; a room is as like as its likest gallery image.
     """
-    encoder, descriptor, camera = load_encoder(), load_descriptor(), default_camera(256, 192)
+    encoder, descriptor = load_encoder(DESCRIBED_ENCODER), load_descriptor()
+    camera = default_camera(256, 192)
 
     def describe(room: BoxRoom, frames: int, path: int) -> Tensor:
         images = [
             cv2.cvtColor(room.render(camera, pose), cv2.COLOR_RGB2GRAY)
             for pose in room.path(frames, path)
         ]
-        with torch.inference_mode():
-            return descriptor(encoder(torch.from_numpy(np.stack(images))[:, None].float() / 255))
+        grey = (np.asarray(image, np.uint8) for image in images)
+        return torch.stack([described(encoder(image), descriptor)[1] for image in grey])
 
     rooms = [BoxRoom(seed, texture_px=128) for seed in seeds]
     learned_head = [describe(room, gallery, 1) for room in rooms]

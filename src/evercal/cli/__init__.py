@@ -1,7 +1,7 @@
 """The command line: one verb per file; `main` runs a verb and prints errors as one line.
 
-Only the module of the verb is loaded, and no verb loads torch before it runs, so that help and
-argument errors appear at once.
+Only the module of the verb is loaded, and no verb loads large libraries before it runs, so that
+help and argument errors appear at once.
 """
 
 import contextlib
@@ -44,8 +44,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     as_json = "--json" in words
-    # Spinning threads of torch take up to ten times as long when other programs use the cores, and
-    # save a tenth otherwise. Read once, when torch is loaded.
+    # Spinning threads of networks take up to ten times as long when other programs use the cores,
+    # and save a tenth otherwise. Read once, when torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     if os.environ.get("EVERCAL_PRECISION") == "float32" and platform.machine() in _X86:
         for name, value in _SAME_ARITHMETIC.items():

@@ -56,7 +56,7 @@ class Align(args.Verb):
                 "--points: images, --convention and --board-poses belong to --robot-poses; omit"
                 " them"
             )
-            from evercal.localization.localizer import Localizer
+        from evercal.localization.localizer import Localizer
         from evercal.mapping.store import MapStore
 
         opened = MapStore.open(self.store)

@@ -180,8 +180,10 @@ def strategy_of(store: Path) -> str | None:
 
 
 def open_localizer(store: Path, device: str = "auto") -> "LearnedLocalizer":
-    """The localizer of a map or a store of networks."""
+    """The localizer of a map, or of a store of networks on a device."""
     if strategy_of(store) in (MAP, None):
+        if device != "auto":
+            raise InputError(f"--device {device}: a map needs no device; omit the option")
         return open_map(store)
     from evercal.continual.localizer import open_networks
 

@@ -31,6 +31,7 @@ class NetworkOptions:
     """Cluster centres that a scene adds to the network. Default: those of the preset."""
     seed: int = 0
     """Random seed."""
+    device: args.Device = "auto"
 
     def refuse(self) -> None:
         """Refuse options that a map does not have."""
@@ -65,14 +66,13 @@ class Learn(args.Verb):
     gripper_from_camera: args.File = None
     """A rough gripper_from_camera to compare the estimate with: 4x4 matrix or calibration file."""
     encoder: args.File = None
-    """Encoder weights from 'python -m training', for a new map. Default: the shipped weights."""
+    """An encoder as ONNX file, for a new map. Default: the shipped one."""
     strategy: args.Name = None
     """evercal builds a map; every other strategy trains a network. Default: that of the store."""
     reading: Annotated[args.Reading, arg(name="")] = field(default_factory=args.Reading)
     networks: Annotated[NetworkOptions, arg(name="")] = field(default_factory=NetworkOptions)
     workers: args.Number = 1
     """Recordings to learn in parallel."""
-    device: args.Device = "auto"
 
     def run(self) -> int:
         if not self.recordings:
@@ -204,7 +204,7 @@ def learn_into_networks(
         memory=given.memory or "10%",
         centres=wanted.centres,
         encoder=given.encoder,
-        device=given.device,
+        device=wanted.device,
         seed=wanted.seed,
     )
     return learn_networks(given.store, recording, options, show)

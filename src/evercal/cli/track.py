@@ -42,7 +42,6 @@ class Track(args.Verb):
     """Frames per second of a folder without times in its file names."""
     most: args.Count = None
     """Stop after so many frames."""
-    device: args.Device = "auto"
 
     def run(self) -> int:
         if self.rate <= 0 or self.smooth < 0 or (self.at_most is not None and self.at_most <= 0):
@@ -53,7 +52,7 @@ class Track(args.Verb):
         from evercal.recordings.streams import stream
         from evercal.reports.track_files import TrackFile, track_row
 
-        frames, localizer = stream(self.source, self.rate), args.open_map(self.store, self.device)
+        frames, localizer = stream(self.source, self.rate), args.open_map(self.store)
         options = TrackOptions(
             fallback_s=1 / self.rate, at_most_ms=self.at_most, smooth=self.smooth
         )

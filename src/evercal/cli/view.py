@@ -58,7 +58,6 @@ class View(Page):
     """Intrinsics of the live camera. Default: those of the camera that recorded the scene."""
     urdf: args.File = None
     """Robot description of the arm; its base link is at the robot base."""
-    device: args.Device = "auto"
 
     def run(self) -> int:
         if self.camera is not None and self.live is None:
@@ -67,9 +66,7 @@ class View(Page):
         from evercal.service.viewer.page import Page as ViewerPage
 
         address = (self.host, self.port)
-        page = ViewerPage(
-            args.open_map(self.store, self.device), self.calibrations, self.urdf, address
-        )
+        page = ViewerPage(args.open_map(self.store), self.calibrations, self.urdf, address)
         try:
             if self.live is not None:
                 page.track(self.live, self.camera)

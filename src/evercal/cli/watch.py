@@ -49,7 +49,6 @@ class Watch(args.Verb):
     """Stop with exit code 0 after this time without a new image. Default: never."""
     camera: args.File = None
     """Intrinsics. Default: those of the reference."""
-    device: args.Device = "auto"
 
     def run(self) -> int:
         if not self.folder.is_dir():
@@ -61,7 +60,7 @@ class Watch(args.Verb):
         from evercal.calibration.located import ImagePose, fuse, locate
 
         reference = read_calibration(self.reference)
-        localizer = args.open_map(self.store, self.device)
+        localizer = args.open_map(self.store)
         recent: deque[ImagePose] = deque(maxlen=self.window)
         arrivals = Arrivals(self.folder)
         tests, last = 0, time.monotonic()

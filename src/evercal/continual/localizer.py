@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from evercal.continual.networks.descriptor import described
+from evercal.continual.networks.device import device_of
+from evercal.continual.networks.precision import autocast
 from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.continual.store import NetworkStore
 from evercal.errors import InputError
-from evercal.features.device import device_of
-from evercal.features.encode import encode_image
-from evercal.features.precision import autocast
 from evercal.geometry import Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import cameras_in_scenes
@@ -67,7 +67,7 @@ class NetworkLocalizer:
         began = time.perf_counter()
         image, scenes = as_rgb(image), self.contents
         cameras = _fitting_cameras(camera, image, scenes.scenes)
-        features = encode_image(image, scenes.encoder, scenes.short_side)
+        features = scenes.encoder.encode(image, scenes.short_side)
         query = Query(image, features, self.options.patches_short_side)
         best: Hypothesis | None = None
         for scene in self._candidates(query, cameras):
@@ -82,12 +82,11 @@ class NetworkLocalizer:
         heads = self.contents.heads
         return len(heads) == 1 and heads[0].options.condition == "descriptor"
 
-    @torch.inference_mode()
     def _candidates(self, query: Query, cameras: Sequence[Camera | None]) -> list[int]:
         usable = [i for i, camera in enumerate(cameras) if camera is not None]
         if self._decides_scene:
             return usable[:1]
-        descriptor = self.contents.descriptor(query.features[None])[0]
+        _, descriptor = described(query.features, self.contents.descriptor)
         similarity = {i: float((self._prototypes[i] @ descriptor).max()) for i in usable}
         usable.sort(key=lambda i: -similarity[i])
         floor = similarity[usable[0]] - self.options.margin
@@ -128,8 +127,7 @@ class NetworkLocalizer:
         scenes = self.contents
         patches, pixels = strided_patches(query, camera, scenes.encoder.stride, 1)
         head, local = scenes.head_for(scene)
-        features = query.features.flatten(1).T.to(head.device)
-        descriptor = scenes.descriptor(query.features[None])[0].to(head.device)
+        features, descriptor = described(query.features, scenes.descriptor)
         with autocast(head.device):
             output = head(features, local, descriptor.expand(len(features), -1))
         points = output.points.cpu().double().numpy()

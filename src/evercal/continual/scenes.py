@@ -8,12 +8,12 @@ from typing import Self
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from evercal.continual.networks.atlas import Atlas, Cell
 from evercal.continual.networks.descriptor import Descriptor
+from evercal.continual.networks.device import device_of_network
 from evercal.continual.networks.head import Head
-from evercal.features.device import device_of_network
 from evercal.features.encoder import Encoder
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
@@ -75,14 +75,13 @@ class LearnedScenes:
 
     @property
     def device(self) -> torch.device:
-        """Device of the encoder's weights, on which images are encoded."""
-        return device_of_network(self.encoder)
+        """Device of the networks; images are encoded on the CPU."""
+        return device_of_network(self.descriptor)
 
     def to(self, device: torch.device) -> Self:
-        """Move encoder, descriptor and heads to a device, in place; all else stays on the CPU."""
-        for network in (self.encoder, self.descriptor, *self.heads):
-            if isinstance(network, nn.Module):
-                network.to(device)
+        """Move descriptor and heads to a device, in place; all else stays on the CPU."""
+        for network in (self.descriptor, *self.heads):
+            network.to(device)
         return self
 
     @property

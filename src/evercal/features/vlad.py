@@ -70,7 +70,8 @@ def _random_projection(size: int) -> Array:
     uniform = ((bits & 0xFFFFFF) * np.float32(2**-24)).astype(np.float32).reshape(-1, 2, 8)
     radius = np.sqrt(-2 * np.log1p(-uniform[:, 0])) / np.float32(size) ** 0.5
     angle = np.float32(2 * np.pi) * uniform[:, 1]
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1).reshape(size, WIDTH)
+    normal = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
+    return np.asarray(normal, np.float32).reshape(size, WIDTH)
 
 
 def similar_pairs(features: Sequence[Array], vlad: Vlad, partners: int) -> list[tuple[int, int]]:

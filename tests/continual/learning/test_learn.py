@@ -17,10 +17,10 @@ from evercal.continual.methods.replay import Replay
 from evercal.continual.networks.buffer import Rows
 from evercal.continual.networks.head import HeadOutput
 from evercal.continual.networks.loss import LossOptions, clamp_px
+from evercal.continual.networks.precision import autocast
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.scenes import LearnedScenes
 from evercal.continual.strategies import STRATEGIES, Strategy
-from evercal.features.precision import autocast
 from evercal.geometry import SE3, pose_distance
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.recordings.frame import Frame, Recording, stated_poses

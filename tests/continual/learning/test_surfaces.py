@@ -12,13 +12,14 @@ from evercal.continual.learning import surfaces
 from evercal.continual.learning.surfaces import frame_depths, shared_depths, surface_points
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, encode_frames
 from evercal.continual.networks.descriptor import GlobalDescriptor
-from evercal.features.encoder import LocalEncoder, load_encoder
+from evercal.features.encoder import load_encoder
 from evercal.features.views import ViewOptions, ideal_cell_pixels
 from evercal.geometry import SE3
 from evercal.recordings.frame import Frame
 from evercal.simulation.box_room import BoxRoom
 
 from ...box_world import box_room_scene
+from ...encoders import BlockMean
 
 SIDE, FRAMES = 120, box_room_scene(3, 4, 1).train
 ROOM = BoxRoom(3)
@@ -58,9 +59,8 @@ def test_agreed_depths_are_those_of_the_walls() -> None:
 def buffer() -> FeatureBuffer:
     atlas_from_base = SE3.exp(np.array([5.0, -2.0, 1.0, 0.0, 0.0, 0.3]))
     buffer = FeatureBuffer(0, atlas_from_base)
-    encoder = LocalEncoder(stem=(4, 4), inner=8, blocks=1, width=8).eval()
-    descriptor = GlobalDescriptor(8, maps=2, hidden=4, width=8).eval()
-    for _ in encode_frames(buffer, FRAMES, PLAN, encoder, descriptor):
+    descriptor = GlobalDescriptor(1, maps=2, hidden=4, width=8).eval()
+    for _ in encode_frames(buffer, FRAMES, PLAN, BlockMean(), descriptor):
         pass
     return buffer
 

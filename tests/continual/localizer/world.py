@@ -23,6 +23,8 @@ from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.estimate import PoseEstimate
 from evercal.simulation.box_room import BoxRoom, default_camera
 
+from ...encoders import BlockMean
+
 SHORT_SIDE = 120
 CAMERA = default_camera(160, 120)
 
@@ -31,15 +33,6 @@ CAMERA = default_camera(160, 120)
 def room() -> BoxRoom:
     """The room of all views."""
     return BoxRoom(5, furniture=3, texture_px=16)
-
-
-class LevelEncoder:
-    """The feature of a patch is its mean grey level."""
-
-    stride, width = 8, 1
-
-    def __call__(self, grey: Tensor) -> Tensor:
-        return F.avg_pool2d(grey, 8)
 
 
 class LevelDescriptor(nn.Module):
@@ -164,7 +157,5 @@ def make_world(
         record = SceneRecord(f"scene-{i}", camera, cell, torch.eye(4)[i : i + 1].half(), 100)
         records.append(replace(record, inlier_threshold=threshold))
     descriptor = cast(GlobalDescriptor, LevelDescriptor())
-    scenes = LearnedScenes(
-        LevelEncoder(), descriptor, "evercal_network", SHORT_SIDE, [head], records
-    )
+    scenes = LearnedScenes(BlockMean(), descriptor, "evercal_network", SHORT_SIDE, [head], records)
     return World(scenes, head)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from evercal.continual.networks import buffer as module
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, encode_frames, join
-from evercal.continual.networks.descriptor import GlobalDescriptor, encode
+from evercal.continual.networks.descriptor import GlobalDescriptor, described
 from evercal.continual.networks.loss import reprojection_error
 from evercal.features.encoder import Encoder
 from evercal.features.views import ViewOptions, augmented_view, cell_centres, frame_view
@@ -42,7 +42,7 @@ def frames(box: BoxRoom, shoot) -> list[Frame]:
 def filled(
     frames: list[Frame], block_mean: Encoder, describe: GlobalDescriptor, device: torch.device
 ) -> Filled:
-    """The encoder is on the CPU; rows are drawn on the device of the test."""
+    """Images are encoded on the CPU; rows are drawn on the device of the test."""
 
     def make(plan: EncodePlan = PLAN, some: Sequence[Frame] = frames) -> FeatureBuffer:
         buffer = FeatureBuffer(4, ATLAS_FROM_BASE, device=device)
@@ -123,7 +123,7 @@ def test_rows_have_the_descriptor_of_their_image(
     rows = buffer.rows(torch.arange(len(buffer)))
     for position, frame in enumerate(frames):
         view = frame_view(frame, 8, PLAN.view)
-        _, expected = encode([view], block_mean, describe)
+        _, expected = described(block_mean(view.grey), describe)
         own = rows.descriptor[buffer.tensors["view"] == position]
         assert len(own) == len(view.valid)
         torch.testing.assert_close(own.cpu(), expected.expand_as(own), atol=2e-3, rtol=0)

@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from evercal.continual.networks.descriptor import GlobalDescriptor, load_descriptor
+from evercal.continual.networks.descriptor import (
+    DESCRIBED_ENCODER,
+    GlobalDescriptor,
+    described,
+    descriptor_bytes,
+    load_descriptor,
+)
 from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
-from evercal.features.weights_file import network_bytes
 
 
 def tiny() -> GlobalDescriptor:
@@ -46,7 +51,7 @@ def test_output_matches_a_slow_reference() -> None:
 def test_round_trip_through_a_file(tmp_path: Path) -> None:
     descriptor = tiny()
     path = tmp_path / "descriptor.safetensors"
-    path.write_bytes(network_bytes(descriptor, "descriptor"))
+    path.write_bytes(descriptor_bytes(descriptor))
     actual = load_descriptor(path)
     assert actual.settings == descriptor.settings
     for key, value in descriptor.state_dict().items():
@@ -56,10 +61,10 @@ def test_round_trip_through_a_file(tmp_path: Path) -> None:
 def test_broken_files_are_refused(tmp_path: Path) -> None:
     from safetensors.torch import save
 
-    good = network_bytes(tiny(), "descriptor")
+    good = descriptor_bytes(tiny())
     broken = {
         "cut": good[: len(good) // 2],
-        "other_kind": network_bytes(tiny(), "encoder"),
+        "other_kind": save({"a": torch.zeros(1)}, {"encoder": '{"inputs": 5}'}),
         "strange_settings": save({"a": torch.zeros(1)}, {"descriptor": '{"depth": 3}'}),
         "other_tensors": save({"a": torch.zeros(1)}, {"descriptor": '{"inputs": 5}'}),
     }
@@ -75,8 +80,9 @@ def test_broken_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_shipped_descriptor_fits_the_shipped_encoder() -> None:
-    encoder, descriptor = load_encoder(), load_descriptor()
-    with torch.no_grad():
-        vector = descriptor(encoder(torch.rand(1, 1, 64, 80)))
-    assert vector.shape == (1, descriptor.width)
+    descriptor = load_descriptor()
+    grey = np.random.default_rng(0).integers(0, 256, (64, 80)).astype(np.uint8)
+    rows, vector = described(load_encoder(DESCRIBED_ENCODER)(grey), descriptor)
+    assert rows.shape == (80, descriptor.settings["inputs"])
+    assert vector.shape == (descriptor.width,)
     assert float(vector.norm()) == pytest.approx(1.0, abs=1e-5)

@@ -66,7 +66,7 @@ def test_neighbouring_frames_share_parts(
 def test_gradient_predicts_the_change_of_the_loss(
     captured: tuple[FrameStatistics, Head, FeatureBuffer],
 ) -> None:
-    """A small step against the gradient lowers the loss by the predicted amount."""
+    """A small step along the gradient changes the loss by the predicted amount."""
     candidates, head, buffer = captured
     gradient = candidates.gradients()[0]
     own = torch.nonzero(buffer.tensors["view"] == 0)[:, 0]
@@ -78,13 +78,15 @@ def test_gradient_predicts_the_change_of_the_loss(
             points = head(rows.features.float(), 0, rows.descriptor).points
             return float(reprojection_loss(points, rows.target, 5.0, LossOptions())[0].mean())
 
-    before, selected = loss(), head.logit.data
+    selected = head.logit.data
     part = torch.from_numpy(gradient[: head.logit.numel()]).float().view_as(head.logit)
     step = 2e-2 / float(part.norm())  # much longer than rounding
-    head.logit.data = selected - step * part
-    after = loss()
+    losses = []
+    for share in (0.5, -0.5):
+        head.logit.data = selected + share * step * part
+        losses.append(loss())
     head.logit.data = selected
-    assert before - after == pytest.approx(step * float(part.norm()) ** 2, rel=0.1)
+    assert losses[0] - losses[1] == pytest.approx(step * float(part.norm()) ** 2, rel=0.1)
 
 
 def test_fixed_centres_all_have_gradients(

@@ -17,7 +17,7 @@ def environment() -> dict[str, str]:
     import numpy as np
     import torch
 
-    from evercal.features.precision import BFLOAT16, FLOAT32, fast_bfloat16
+    from evercal.continual.networks.precision import BFLOAT16, FLOAT32, fast_bfloat16
 
     gpu = torch.cuda.is_available()
     return {

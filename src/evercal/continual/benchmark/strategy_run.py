@@ -10,7 +10,6 @@ from typing import Literal
 
 import pandas as pd
 from filelock import FileLock
-from torch import nn
 
 from evercal.continual.benchmark.results import (
     UNALIGNED,
@@ -27,13 +26,13 @@ from evercal.continual.learning.stage_rows import scene_rows
 from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer
 from evercal.continual.networks.atlas import combined_centres
 from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.device import device_of
 from evercal.continual.networks.feature_cache import cache_features
 from evercal.continual.scenes import LearnedScenes
 from evercal.continual.store import NetworkStore, head_bytes
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.continual.threshold import fit_threshold
 from evercal.evaluation.protocol import evaluate
-from evercal.features.device import device_of
 from evercal.learning.scene import learn_scene
 from evercal.localization.learned import LearnedLocalizer
 from evercal.localization.localizer import Localizer
@@ -70,7 +69,7 @@ class BenchOptions:
     settings: dict[str, object] = field(default_factory=dict)
     """Further settings that decide the results, for settings.json."""
     device: str = "auto"
-    """Device of the networks, see `features.device.device_of`."""
+    """Device of the networks, see `networks.device.device_of`."""
 
 
 def run_strategy(
@@ -139,8 +138,7 @@ class _MapRun(_Run):
             self._remove()  # left by an interrupted commit
         for number in range(max(0, len(self._opened().stages) - 1), len(self.scenes)):
             opened = self._opened()
-            contents = opened.contents.to(self.device)
-            assert isinstance(contents.encoder, nn.Module)
+            contents = opened.contents
             cache_features(contents.encoder, self.features)
             if number >= len(opened.stages):
                 memory = self.stage.memory
@@ -203,7 +201,7 @@ class _NetworkRun(_Run):
 
     def _prepared(self, scenes: LearnedScenes) -> LearnedScenes:
         scenes.to(self.device)
-        cache_features(scenes.encoder, self.features)  # pyright: ignore[reportArgumentType]
+        cache_features(scenes.encoder, self.features)
         scenes.cache = self.features
         return scenes
 

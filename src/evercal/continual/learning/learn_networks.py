@@ -5,17 +5,15 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from torch import nn
-
 from evercal.continual.learning.learn import learn
 from evercal.continual.learning.presets import preset, short_side
 from evercal.continual.learning.stage import OnEvent, StageOptions, unobserved
+from evercal.continual.networks.device import device_of
 from evercal.continual.networks.feature_cache import cache_features
 from evercal.continual.store import NetworkStore, head_bytes
 from evercal.continual.strategies import Strategy, strategy_named
 from evercal.continual.threshold import fit_threshold
 from evercal.errors import InputError
-from evercal.features.device import device_of
 from evercal.learning.scene import LearnReport
 from evercal.recordings.frame import Frame, Recording, lacks_camera_poses, posed_recording
 from evercal.recordings.held_out import named_recording, require_frames, split_held_out
@@ -35,7 +33,7 @@ class NetworkLearnOptions:
     centres: int | None = None
     """Cluster centres that a scene adds; those of the preset by default."""
     encoder: Path | None = None
-    """A weights file for a new store."""
+    """An ONNX file for a new store."""
     device: str = "auto"
     """Device of the networks, see `device_of`."""
     seed: int = 0
@@ -90,7 +88,7 @@ def learn_networks(
             )
         recording = posed_recording(recording)
         require_frames(recording)
-        if options.cache is not None and isinstance(contents.encoder, nn.Module):
+        if options.cache is not None:
             cache_features(contents.encoder, options.cache)
             contents.cache = options.cache
         split = split_held_out(recording.train)

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evercal.continual.networks.buffer import FeatureBuffer
-from evercal.continual.networks.feature_cache import read_cached, write_cached
+from evercal.continual.networks.feature_cache import encoder_key, read_cached, write_cached
 from evercal.features.encoder import Encoder
-from evercal.features.vlad import vlad_for
-from evercal.features.weights_file import network_bytes
 from evercal.geometry import SE3
 from evercal.mapping.pose_check import depth_scale, matched_pairs
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
@@ -38,12 +36,12 @@ def frame_depths(
     """
     prepared = PreparedFrames(frames, encoder, WorkingSize(short_side, short_side))
     features = [prepared.features(i) for i in range(len(prepared))]
-    pairs = matched_pairs(prepared, vlad_for(encoder, features))
+    pairs = matched_pairs(prepared, encoder.vlad(features))
     prepared.depth_scale = depth_scale(prepared, pairs)
     swept, sources = [], []
     for i in range(len(prepared)):
         inverse, near = prepared.swept(i, SOURCE_VIEWS)
-        swept.append(1 / inverse.double().numpy())
+        swept.append(1 / inverse.astype(np.float64))
         sources.append(near)
     return [_agreed(prepared, i, swept, sources[i]) for i in range(len(prepared))]
 
@@ -81,15 +79,14 @@ def shared_depths(
     key = hashlib.blake2b(digest_size=16)
     for frame, pose in zip(frames, stated_poses(frames).matrix(), strict=True):
         key.update(f"{frame.name} {frame.camera} {short_side}".encode() + pose.tobytes())
-    assert isinstance(encoder, torch.nn.Module)
-    key.update(network_bytes(encoder, "encoder"))
+    key.update(encoder_key(encoder).encode())
     path = cache / f"depths-{key.hexdigest()}.npy"
     if (cached := read_cached(path)) is not None:
-        return list(cached.numpy())
+        return list(cached)
     depths = frame_depths(frames, encoder, short_side)
     if len({depth.shape for depth in depths}) == 1:
         cache.mkdir(parents=True, exist_ok=True)
-        write_cached(path, torch.from_numpy(np.stack(depths)))
+        write_cached(path, np.stack(depths))
     return depths
 
 

@@ -15,9 +15,9 @@ from evercal.continual.methods.penalties import Penalty, Reprojection
 from evercal.continual.networks.buffer import Rows
 from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
+from evercal.continual.networks.precision import autocast
 from evercal.continual.selection.frame_statistics import FrameStatistics
 from evercal.continual.selection.selectors import SELECTORS
-from evercal.features.precision import autocast
 
 
 @dataclass(frozen=True)

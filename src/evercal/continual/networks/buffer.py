@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import groupby, islice
 from operator import attrgetter
 
 import numpy as np
@@ -10,9 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from evercal.continual.networks.descriptor import Descriptor, encode
+from evercal.continual.networks.descriptor import Descriptor, described
 from evercal.continual.networks.loss import MAX_RADIUS2, Target
-from evercal.features.encode import ENCODE_BATCH
 from evercal.features.encoder import Encoder
 from evercal.features.views import View, ViewOptions, augmented_view, frame_view
 from evercal.geometry.se3 import SE3
@@ -74,23 +72,20 @@ class FeatureBuffer:
         self._parts: list[dict[str, Tensor]] = []
         self._merged: dict[str, Tensor] | None = None
 
-    def append(self, views: Sequence[View], encoded: tuple[Tensor, Tensor], keep: Tensor) -> None:
-        """Append the rows of views that a mask (b, cells) keeps.
+    def append(self, view: View, encoded: tuple[Tensor, Tensor], keep: Tensor) -> None:
+        """Append the rows of a view that a mask (cells,) keeps.
 
-        `encoded` are features (b, channels, h, w) and descriptors (b, width) on any device.
+        `encoded` are features (cells, channels) and a descriptor (width,) on any device.
         """
-        features, descriptors = encoded
-        rows = features.flatten(2).transpose(1, 2)
-        poses = SE3.stack([self.atlas_from_base @ view.base_from_camera for view in views])
-        pixels = torch.from_numpy(np.stack([view.cell_pixels for view in views]))
-        number = torch.arange(self.views, self.views + len(views), dtype=torch.int32, device="cpu")
+        features, descriptor = (values.cpu() for values in encoded)
+        camera_from_atlas = (self.atlas_from_base @ view.base_from_camera).inverse().matrix()[:3]
         part = {
-            "features": rows[keep.to(rows.device)].half().cpu(),
-            "pixels": pixels[keep],
-            "view": number.repeat_interleave(keep.sum(1)),
-            "intrinsics": torch.from_numpy(np.stack([view.intrinsics for view in views])),
-            "camera_from_atlas": torch.from_numpy(poses.inverse().matrix()[:, :3]).float(),
-            "descriptors": descriptors.float().cpu(),
+            "features": features[keep].half(),
+            "pixels": torch.tensor(view.cell_pixels, device="cpu")[keep],
+            "view": torch.full((int(keep.sum()),), self.views, dtype=torch.int32, device="cpu"),
+            "intrinsics": torch.from_numpy(view.intrinsics)[None],
+            "camera_from_atlas": torch.from_numpy(camera_from_atlas)[None].float(),
+            "descriptors": descriptor[None].float(),
         }
         self.extend(part)
 
@@ -193,28 +188,10 @@ def encode_frames(
     Pass 0 shows the frames unchanged, later passes augmented. A view and its cells depend only on
     (seed, pass, frame).
     """
-    for batch in encode_batches(frames, plan):
-        planned = [_view(frames, number, plan, encoder.stride) for number in batch]
-        views, keep = [view for view, _ in planned], torch.stack([mask for _, mask in planned])
-        buffer.append(views, encode(views, encoder, descriptor), keep)
+    for number in range(plan.views_per_frame * len(frames)):
+        view, keep = _view(frames, number, plan, encoder.stride)
+        buffer.append(view, described(encoder(view.grey), descriptor), keep)
         yield buffer.views
-
-
-def encode_batches(frames: Sequence[Frame], plan: EncodePlan) -> list[list[int]]:
-    """Group consecutive views of equal size into batches for the encoder.
-
-    View n shows frame n mod len(frames) in pass n // len(frames).
-    """
-
-    def size(number: int) -> tuple[int, int]:
-        small = frames[number % len(frames)].camera.short_side_resized(plan.view.short_side)
-        return small.width, small.height
-
-    batches = []
-    for _, same in groupby(range(plan.views_per_frame * len(frames)), size):
-        while batch := list(islice(same, ENCODE_BATCH)):
-            batches.append(batch)
-    return batches
 
 
 def _view(

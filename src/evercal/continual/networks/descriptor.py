@@ -1,20 +1,21 @@
 """The global descriptor: one vector per image that identifies the scene."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from evercal.continual.networks.device import device_of_network
 from evercal.errors import InputError
-from evercal.features.encode import encode_features
-from evercal.features.encoder import WEIGHTS, Encoder
-from evercal.features.views import View
-from evercal.features.weights_file import load_strictly
+from evercal.features.encoder import WEIGHTS
 
 DESCRIPTOR_FILE = WEIGHTS / "descriptor.safetensors"
+DESCRIBED_ENCODER = WEIGHTS / "encoder-1.onnx"
+"""The encoder whose features the shipped descriptor was trained with."""
 
 
 class GlobalDescriptor(nn.Module):
@@ -83,8 +84,21 @@ def load_descriptor(path: Path | None = None) -> Descriptor:
         descriptor = PooledDescriptor(**settings) if pooled else GlobalDescriptor(**settings)
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"descriptor {path}: not an evercal descriptor ({error!r})") from error
-    load_strictly(descriptor, state, f"descriptor {path}: not an evercal descriptor")
+    try:
+        descriptor.load_state_dict(state)
+    except RuntimeError as error:
+        first = str(error).splitlines()[1].strip()  # line 0 is the class of the module
+        raise InputError(f"descriptor {path}: not an evercal descriptor: {first}") from error
     return descriptor.eval()
+
+
+def descriptor_bytes(descriptor: Descriptor) -> bytes:
+    """Serialise a descriptor in half precision, with its settings as metadata."""
+    from safetensors.torch import save
+
+    state = {k: v.cpu().half().contiguous() for k, v in descriptor.state_dict().items()}
+    settings = {**descriptor.settings, "layout": type(descriptor).__name__}
+    return save(state, {"descriptor": json.dumps(settings)})
 
 
 def descriptor_for(encoder_file: Path, inputs: int) -> Descriptor:
@@ -98,12 +112,10 @@ def descriptor_for(encoder_file: Path, inputs: int) -> Descriptor:
 
 
 @torch.inference_mode()
-def encode(
-    views: Sequence[View], encoder: Encoder, descriptor: Descriptor
-) -> tuple[Tensor, Tensor]:
-    """Features (b, channels, h, w) and descriptors (b, width) of views of one size.
+def described(features: NDArray[np.float32], descriptor: Descriptor) -> tuple[Tensor, Tensor]:
+    """Convert the features (rows, columns, channels) of an image, and describe it.
 
-    Both are on the encoder's device, which must be that of the descriptor, too.
+    Returns features (rows * columns, channels) and descriptor (width,), on the descriptor's device.
     """
-    features = encode_features([view.grey for view in views], encoder)
-    return features, descriptor(features)
+    grid = torch.from_numpy(features).to(device_of_network(descriptor))
+    return grid.flatten(0, 1), descriptor(grid.permute(2, 0, 1)[None])[0]

@@ -36,11 +36,10 @@ def device_of(name: str | torch.device = "auto") -> torch.device:
     return torch.device("cuda", index)
 
 
-def device_of_network(network: object) -> torch.device:
+def device_of_network(network: nn.Module) -> torch.device:
     """Device of the weights of a network; the CPU for a network without weights."""
-    if isinstance(network, nn.Module):
-        for value in chain(network.parameters(), network.buffers()):
-            return value.device
+    for value in chain(network.parameters(), network.buffers()):
+        return value.device
     return torch.device("cpu")
 
 

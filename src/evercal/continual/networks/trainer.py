@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from evercal.continual.networks.buffer import FeatureBuffer, Rows, diffused, join
+from evercal.continual.networks.device import tf32
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 from evercal.continual.networks.loss import LossOptions, clamp_px, reprojection_loss, surface_loss
+from evercal.continual.networks.precision import autocast
 from evercal.continual.networks.shampoo import OneSidedShampoo
-from evercal.features.device import tf32
-from evercal.features.precision import autocast
 
 INLIER_PX = 5.0
 CORRECTION_FROM_PX = 20.0

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 
+from evercal.continual.networks.precision import VARIABLE, autocast, fast_bfloat16, has_bfloat16
 from evercal.errors import InputError
-from evercal.features.encoder import load_encoder
-from evercal.features.precision import VARIABLE, autocast, fast_bfloat16, has_bfloat16
-from evercal.features.vlad import vlad_for
-from evercal.mapping.pose_check import MatchedPair, matched_pairs
-from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
-from evercal.recordings.frame import Recording
 
 
 def test_autocast_uses_the_reported_precision(device: torch.device) -> None:
@@ -56,26 +50,3 @@ def test_environment_sets_the_precision(
     monkeypatch.setenv(VARIABLE, "half")
     with pytest.raises(InputError, match="'half' is not a precision; set it to auto"):
         fast_bfloat16()
-
-
-def test_float32_gives_the_same_matches_whatever_the_hardware(
-    arcs: tuple[Recording, Recording], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frames = arcs[0].train[:6]
-
-    def matches(precision: str) -> list[MatchedPair]:
-        monkeypatch.setenv(VARIABLE, precision)
-        recording = PreparedFrames(frames, load_encoder(), WorkingSize(120, 120))
-        return matched_pairs(recording, vlad_for(recording.encoder))
-
-    monkeypatch.setattr("evercal.mapping.pose_check.MIN_MATCHES", 5)
-    monkeypatch.setattr("evercal.features.precision.has_bfloat16", lambda kind: False)
-    without = matches("auto")
-    monkeypatch.setattr("evercal.features.precision.has_bfloat16", lambda kind: True)
-    explicit = matches("float32")
-    assert len(without) == len(explicit) > 0
-    for one, two in zip(without, explicit, strict=True):
-        assert (one.first, one.second) == (two.first, two.second)
-        np.testing.assert_array_equal(one.pixels, two.pixels)
-    shared = [len(pair.pixels) for pair in matches("bfloat16")]
-    assert sum(shared) == pytest.approx(sum(len(pair.pixels) for pair in without), rel=0.1)
