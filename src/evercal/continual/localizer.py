@@ -18,7 +18,7 @@ from evercal.geometry import Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.localization.matching import strided_patches
-from evercal.localization.pnp import PnpOptions, PnpResult, solve_pnp
+from evercal.localization.pnp import PnpOptions, PnpResult, solve_pnp, uncertain
 from evercal.localization.query import Hypothesis, Matches, Query
 from evercal.recordings.images import as_rgb
 
@@ -115,7 +115,7 @@ class NetworkLocalizer:
                 scene = other
         return Hypothesis(
             scene,
-            rough.pose,
+            uncertain(*(values[rough.inliers] for values in matches), small, rough.pose),
             pixels=matches.pixels[rough.inliers],
             points_m=matches.points_m[rough.inliers],
             expected=patches,
@@ -137,7 +137,7 @@ class NetworkLocalizer:
 
     def _scene_of(self, rough: PnpResult, scene: int) -> int:
         atlas_from_base = self.contents.scenes[scene].cell.atlas_from_base
-        position = atlas_from_base.apply(rough.pose.pose.translation_m)
+        position = atlas_from_base.apply(rough.pose.translation_m)
         inside = self.contents.atlas().scene_at(position)
         return scene if inside is None else inside
 
