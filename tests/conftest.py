@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -37,7 +36,6 @@ __all__ = ("pytest_addoption", "pytest_collection_modifyitems", "pytest_sessionf
 
 if TYPE_CHECKING:
     import torch
-    from matplotlib.figure import Figure
 
     from evercal.continual.learning.stage import StageOptions
     from evercal.mapping.build import BuiltMap
@@ -109,7 +107,6 @@ def cell(shared: Shared, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def cuda() -> torch.device:
     """A CUDA device, for tests marked `gpu`; the test is skipped without one."""
     import torch
-
     from evercal.features.device import device_of
 
     if not torch.cuda.is_available():
@@ -340,24 +337,6 @@ def everything(
 ) -> Callable[[Path], dict[str, bytes | None]]:
     """As `snapshot`; locks are left out."""
     return lambda root: {n: c for n, c in snapshot(root).items() if not n.endswith(".lock")}
-
-
-@pytest.fixture
-def figures_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[ModuleType], list[Figure]]:
-    """The figures that a module of charts makes with `new_figure`, in order."""
-
-    def watch(module: ModuleType) -> list[Figure]:
-        made: list[Figure] = []
-        original = module.new_figure
-
-        def keep(width: float, height: float) -> Figure:
-            made.append(original(width, height))
-            return made[-1]
-
-        monkeypatch.setattr(module, "new_figure", keep)
-        return made
-
-    return watch
 
 
 @pytest.fixture(scope="module")

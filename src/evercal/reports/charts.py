@@ -24,7 +24,6 @@ INKS = {
 }
 """Colours on light and on dark paper. Blue and orange, of Okabe and Ito, differ for all eyes."""
 _GAP = (np.nan, np.nan)
-_MOST_TICKS = 8
 _FINER = 4  # steps in a pixel of a frame
 
 
@@ -82,14 +81,13 @@ class Panel:
         """The numbers at the axes, and what these show."""
         (width, height), (x, y) = self.size, self.labels
         below = [(words, at, height + 18, 1) for _, at, words in self._ticks(0)]
-        below.append((x, width / 2, height + 40, 1))
         beside = [(words, -8, height - at + 4, 2) for _, at, words in self._ticks(1)]
-        return [(y, -52, -12, 0), *beside, *(below if x else [])]
+        return [(y, -52, -12, 0), (x, width / 2, height + 40, 1), *beside, *(below if x else [])]
 
     def _ticks(self, axis: int) -> list[tuple[float, float, str]]:
         """Round numbers along an axis, their distance from its lower end in pixels, and words."""
         (low, high), size = self.limits[:, axis].tolist(), self.size[axis]
-        coarse = (high - low) / min(max(size // 50, 5), _MOST_TICKS)
+        coarse = (high - low) / min(max(size // 50, 5), 8)
         power = 10.0 ** np.floor(np.log10(coarse))
         step = power * next(factor for factor in (1, 2, 5, 10) if factor * power >= coarse)
         digits = max(0, -int(np.floor(np.log10(step) + 1e-9)))
@@ -116,7 +114,9 @@ def write(image: Image, text: Text, size: int = 13, ink: str = "text") -> None:
 
     words, x, y, align = text
     font = cv2.FontFace("sans")
-    cv2.putText(image, words, (round(x), round(y)), rgb(ink), font, size, 400, align)
+    width = cv2.getTextSize((0, 0), words, (0, 0), font, size, 400)[2]
+    at = round(x - align * width / 2), round(y)
+    cv2.putText(image, words, at, rgb(ink), font, size, 400)
 
 
 def paint(image: Image, panel: Panel, left: int, top: int) -> None:

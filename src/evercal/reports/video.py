@@ -84,13 +84,12 @@ def animate(
 
 def _from_above(scene: Any, around: Surroundings, answers: Sequence[Answer], number: int) -> Panel:
     """A map with the camera of an image and its path up to it."""
-    here = [a.estimate.status == "ok" and a.estimate.scene == scene.name for a in answers]
-    own = list(zip(answers, here, strict=True))
+    own = [(a, a.estimate.status == "ok" and a.estimate.scene == scene.name) for a in answers]
     poses = [a.estimate.base_from_camera if shown else None for a, shown in own]
     eyes = np.array([np.full(3, np.nan) if p is None else p.translation_m for p in poses])
     seen = np.concatenate([np.zeros((1, 3)), eyes[np.isfinite(eyes[:, 0])]])
     view = None if (pose := poses[number]) is None else Frustum.of(pose, scene.adjusted_camera)
-    path = Shape("line", eyes[: number + 1, ABOVE], "orange")
+    path = Shape("line", eyes[: number + 1, ABOVE], "orange", 2)
     unit = "m" if all(a.unit_known for a, shown in own if shown) else "unit unknown"
     return view_panel(_PANEL, ABOVE, around, seen, view, [path], ("base", unit))
 
