@@ -70,9 +70,7 @@ class Demo(args.Verb):
         return 0
 
 
-def run_demo(
-    out: Path, rooms: "Sequence[SampleRoom]", quiet: bool = True
-) -> "DemoResult":
+def run_demo(out: Path, rooms: "Sequence[SampleRoom]", quiet: bool = True) -> "DemoResult":
     """Map the rooms, measure, and write the report.
 
     Args:
