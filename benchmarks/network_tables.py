@@ -16,8 +16,8 @@ from evercal.continual.benchmark.comparison import (
     run_scores,
     seeds_interval,
 )
+from evercal.continual.benchmark.figures import COLOURS, new_figure, tidy
 from evercal.continual.benchmark.results import Table
-from evercal.reports.charts import COLOURS, new_figure, tidy
 
 FOLDER = Path(__file__).resolve().parent.parent / "results"
 

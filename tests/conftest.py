@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -37,7 +36,6 @@ __all__ = ("pytest_addoption", "pytest_collection_modifyitems", "pytest_sessionf
 
 if TYPE_CHECKING:
     import torch
-    from matplotlib.figure import Figure
 
     from evercal.continual.learning.stage import StageOptions
     from evercal.mapping.build import BuiltMap
@@ -336,24 +334,6 @@ def everything(
 ) -> Callable[[Path], dict[str, bytes | None]]:
     """As `snapshot`; locks are left out."""
     return lambda root: {n: c for n, c in snapshot(root).items() if not n.endswith(".lock")}
-
-
-@pytest.fixture
-def figures_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[ModuleType], list[Figure]]:
-    """The figures that a module of charts makes with `new_figure`, in order."""
-
-    def watch(module: ModuleType) -> list[Figure]:
-        made: list[Figure] = []
-        original = module.new_figure
-
-        def keep(width: float, height: float) -> Figure:
-            made.append(original(width, height))
-            return made[-1]
-
-        monkeypatch.setattr(module, "new_figure", keep)
-        return made
-
-    return watch
 
 
 @pytest.fixture(scope="module")

@@ -174,7 +174,8 @@ def test_import_is_fast_and_provides_every_public_name() -> None:
     code = "import sys, time; began = time.perf_counter(); import evercal\n"
     code += "print(time.perf_counter() - began, *sys.modules)"
     ((seconds, *modules),) = printed(code)
-    assert not {"torch", "cv2", "scipy", "matplotlib", "poselib", "tyro", "numpy"} & set(modules)
+    heavy = {"torch", "cv2", "scipy", "matplotlib", "pandas", "poselib", "tyro", "numpy"}
+    assert not heavy & set(modules)
     assert float(seconds) < 1.0
     for name in dir(evercal):
         assert getattr(evercal, name) is not None
@@ -186,6 +187,22 @@ def test_geometry_and_recordings_load_no_torch_and_no_opencv() -> None:
     code = "import sys, evercal.geometry, evercal.storage, evercal.recordings; print(*sys.modules)"
     (modules,) = printed(code)
     assert not {"torch", "cv2"} & set(modules)
+
+
+def test_the_product_does_without_pandas_and_matplotlib() -> None:
+    # A module that cannot be imported stands for one that is not installed.
+    code = """
+import importlib, pathlib, pkgutil, sys
+sys.modules |= dict.fromkeys(("matplotlib", "pandas"))
+import evercal
+for module in pkgutil.walk_packages(evercal.__path__, "evercal."):
+    if module.name.split(".")[1] not in ("continual", "__main__"):
+        importlib.import_module(module.name)
+from evercal.recordings.poses.row_files import table_cells
+from evercal.reports import charts, page
+print(*table_cells(["a,b"])[0], page.environment().get_template("calibration.html").name)
+"""
+    assert printed(code) == [["a", "b", "calibration.html"]]
 
 
 def test_planted_violations_are_found(tmp_path: Path) -> None:

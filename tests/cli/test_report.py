@@ -38,8 +38,9 @@ def test_report_is_one_self_contained_file(run: Any, calibration: Path, tmp_path
     assert "No held-out error" in ran.out
     assert ran.out.splitlines()[-1].startswith("next: evercal export ")
     page = (tmp_path / "r.html").read_text()
-    # The image, the camera with its ellipsoid, and the residuals.
-    assert page.count('src="data:image/') == 3
+    # The image; the camera with its ellipsoid, and the residuals.
+    assert page.count('src="data:image/') == 1
+    assert page.count('<figure class="chart">') == 2
     assert "images used; 1 rejected" in page
     assert not re.search(r"(?:src|href)=\"(?!data:)|https?://", page)
 

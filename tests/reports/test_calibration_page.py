@@ -1,15 +1,10 @@
 """The report shows the contents of the calibration and lists what it lacks."""
 
-import sys
-from collections.abc import Callable
 from dataclasses import replace
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
 from numpy.typing import ArrayLike
 
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
@@ -22,6 +17,7 @@ from evercal.reports.calibration_page import (
     calibration_page,
     camera_views,
     difference,
+    residual_chart,
 )
 from evercal.reports.overlay import LandmarkPicture
 from evercal.reports.scene import Surroundings, ellipse
@@ -164,7 +160,8 @@ def test_checks_ellipsoid_and_source_are_shown() -> None:
     ):
         assert reader.row(name)[1] == value
     assert page.missing == ()
-    assert len(reader.images) == 2  # residuals, and the camera with its ellipsoid
+    assert reader.text("text").count("residual") == 2
+    assert {f"{axis} of panda_link0 (m)" for axis in "xyz"} < {*reader.text("text").splitlines()}
     assert "lens: intrinsics" in page.html
 
 
@@ -180,13 +177,13 @@ def test_missing_contents_are_listed() -> None:
         "No intrinsics",
     }
     assert reader.text("li").splitlines() == list(page.missing)
-    assert len(reader.images) == 1  # the ellipsoid
+    assert reader.tags.count("figure") == 1  # the ellipsoid
     assert "Good for bin picking (within 3 mm" in reader.text("h1")
 
 
 def test_verdict_without_any_measure_has_no_basis() -> None:
     reader, page = read(replace(solved(), covariance=np.zeros((6, 6)), source={}))
-    assert reader.images == []
+    assert "figure" not in reader.tags
     assert "this verdict has no basis" in reader.text("p")
     assert "No uncertainty" in {text.split(":")[0] for text in page.missing}
 
@@ -231,17 +228,34 @@ def test_pictures_show_the_origin_and_the_landmarks() -> None:
 
 @pytest.mark.parametrize("sigma_mm", [0.01, 1.0, 300.0])
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
-def test_the_ellipsoid_fits_its_drawing(
-    sigma_mm: float, mount: Any, figures_of: Callable[[ModuleType], list[Figure]]
-) -> None:
-    figures = figures_of(sys.modules[camera_views.__module__])
+def test_the_ellipsoid_fits_its_drawing(sigma_mm: float, mount: Any) -> None:
     covariance = (sigma_mm / 1000) ** 2 * np.diag([1.0, 4.0, 9.0, 1e-6, 1e-6, 1e-6])
-    camera_views(full(mount=mount, covariance=covariance), Surroundings())
-    for panel in figures[0].axes:
-        [shape] = [p for p in panel.patches if isinstance(p, Polygon)]
-        (x0, y0), (x1, y1) = shape.get_xy().min(0), shape.get_xy().max(0)
-        assert panel.get_xlim()[0] < x0 < x1 < panel.get_xlim()[1]
-        assert panel.get_ylim()[0] < y0 < y1 < panel.get_ylim()[1]
+    panels, _ = camera_views(full(mount=mount, covariance=covariance), Surroundings())
+    for panel in panels:
+        [shape] = [shape for shape in panel.shapes if shape.kind == "area"]
+        (low, high), (first, last) = panel.limits, (shape.points.min(0), shape.points.max(0))
+        assert ((low < first) & (first < last) & (last < high)).all()
+
+
+def test_bars_are_as_high_as_the_residuals_of_their_images() -> None:
+    chart = residual_chart(full())
+    assert chart is not None
+    for panel, residuals, ticks in zip(
+        chart[0], ((0.51, 20.8, 0), (0.012, 0, 0)), (0, 5), strict=True
+    ):
+        used, rejected = panel.shapes
+        assert (used.kind, used.ink, rejected.kind, rejected.ink) == (
+            "line", "blue", "stripes", "orange"
+        )  # fmt: skip
+        np.testing.assert_array_equal(used.points[:2], [(1, residuals[0]), (1, 0)])
+        np.testing.assert_array_equal(
+            rejected.points[[0, 1, 3]], [(2, residuals[1]), (2, 0), (3, 0)]
+        )
+        # The bar of the rejected image is cut: the chart ends at twice the largest used one.
+        assert panel.limits[1, 1] == pytest.approx(min(2 * residuals[0], 1.1 * max(residuals)))
+        numbers = [words for words, *_ in panel.texts if words.isdigit()]
+        assert len(numbers) == ticks
+    assert residual_chart(full(images=())) is None
 
 
 @pytest.mark.parametrize("plane", [(0, 1), (0, 2), (1, 2)])

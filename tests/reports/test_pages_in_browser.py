@@ -13,7 +13,7 @@ from evercal.reports.demo_page import DemoResult, FixedCamera, LearnedRoom, demo
 from evercal.reports.page import Picture, Table
 
 from .test_calibration_page import full, read, solved
-from .test_page import PNG, page
+from .test_page import PHOTO, page
 
 pytestmark = pytest.mark.slow("src/evercal/reports/templates")
 
@@ -50,7 +50,7 @@ def demonstrated() -> str:
         unknown_images=2,
         unknown_refused=2,
     )
-    return demo_page(result, [Picture(PNG)])
+    return demo_page(result, [Picture(PHOTO)])
 
 
 WIDE = Table([f"column {i}" for i in range(14)], [["evercal", *np.arange(13) / 7]])
@@ -59,7 +59,7 @@ PAGES = {
     "bad": lambda: read(full(checks={"repeatability_mm": 100.0}, verdict=""))[1].html,
     "solved": lambda: read(solved(), name="a_long_name_without_a_space" * 4)[1].html,
     "demo": demonstrated,
-    "wide table": lambda: page(WIDE, Picture(PNG)),
+    "wide table": lambda: page(WIDE, Picture(PHOTO)),
 }
 
 

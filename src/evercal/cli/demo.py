@@ -203,7 +203,7 @@ def _pictures(cell: "Map", scene: "Recording") -> "list[Picture]":
         estimate = cell.localize(image, frame.camera)
         drawn = draw_landmarks(image, estimate, cell.localizer)
         caption = f"{estimate.scene or estimate.status}: {drawn.summary}"
-        pictures.append(Picture.photo(drawn.image, caption))
+        pictures.append(Picture(drawn.image, caption))
     return pictures
 
 

@@ -15,7 +15,6 @@ dense normal equations with six rows a frame: 8 (6 n + 12)^2 bytes, and time in 
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -255,22 +254,8 @@ class BundleAdjustment:
         lin = estimate.linearised
         squares = (lin.residual**2).sum(1)
         weight = 1 / (1 + squares / noise**2) / (noise * self.options.correlation) ** 2
-        m, p = len(tracks.frame), len(tracks.host)
-        root = np.repeat(np.sqrt(weight), 2)
-        scaled = sparse.diags_array(root) @ lin.jacobian(tracks, self.n)
-        landmark, slope = tracks.landmark, weight * (lin.by_depth * lin.residual).sum(1)
-        values = (lin.by_depth * np.sqrt(weight)[:, None]).ravel()
-        columns = np.repeat(landmark, 2)
-        depth = sparse.csr_array((values, (np.arange(2 * m), columns)), shape=(2 * m, p))
-        prior, prior_slope = self._prior(estimate.parameters, variances)
-        return NormalEquations(
-            gram=sparse.csr_array(scaled.T @ scaled),
-            mixed=(depth.T @ scaled).tocsr(),
-            depth=np.bincount(landmark, weight * (lin.by_depth**2).sum(1), p) + 1e-6,
-            prior=prior,
-            slope=scaled.T @ (lin.residual.ravel() * root) + prior_slope,
-            depth_slope=np.bincount(landmark, slope, p).astype(np.float64),
-        )
+        prior, slope = self._prior(estimate.parameters, variances)
+        return NormalEquations.of(tracks, lin, weight, prior, slope)
 
     def _moved(
         self, tracks: BundleTracks, parameters: Parameters, solution: Solution

@@ -1,9 +1,9 @@
 """Residuals of bundle adjustment, their derivatives, and the normal equations of one step."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
 
 import numpy as np
-import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 from scipy.spatial.transform import Rotation
@@ -81,24 +81,6 @@ class Linearised:
     """(m, 2, 5)."""
     valid: NDArray[np.bool_]
     """(m,) False where the distortion of the camera has no pixel for the landmark."""
-
-    def jacobian(self, tracks: BundleTracks, frames: int) -> sparse.csr_array:
-        """(2 m, 6 n + 12) derivatives by corrections and shared parameters."""
-        m, six = len(tracks.frame), np.arange(6)
-        intrinsics = 6 * frames + COMMON + SHIFT + np.arange(INTRINSICS)
-        columns = np.concatenate(
-            [
-                6 * tracks.host_frame[:, None] + six,
-                6 * tracks.frame[:, None] + six,
-                np.broadcast_to(intrinsics, (m, INTRINSICS)),
-            ],
-            1,
-        )
-        values = np.concatenate([self.by_host, self.by_frame, self.by_intrinsics], 2)
-        rows = np.repeat(np.arange(2 * m), columns.shape[1])
-        columns = np.repeat(columns[:, None], 2, 1).ravel()
-        shape = (2 * m, 6 * frames + SHARED)
-        return sparse.csr_array((values.ravel(), (rows, columns)), shape=shape)
 
 
 class StatedFrames:
@@ -219,16 +201,27 @@ class Solution:
     """Length of the step in standard deviations."""
 
 
+class HostBlock(NamedTuple):
+    """The landmarks of one host frame; they depend on it, on the frames that see them, and on the
+    intrinsics."""
+
+    landmarks: Index
+    """(a,)."""
+    columns: Index
+    """(b,) parameters."""
+    mixed: Array
+    """(a, b) normal equations between inverse depths and parameters."""
+
+
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
     """Least squares in corrections and shared parameters (6 n + 12) and inverse depths (p)."""
 
-    gram: sparse.csr_array
+    gram: Array
     """(6 n + 12, 6 n + 12) of the observations."""
     prior: Array
     """(6 n + 12, 6 n + 12) of the priors."""
-    mixed: sparse.csr_array
-    """(p, 6 n + 12)."""
+    blocks: list[HostBlock]
     depth: Array
     """(p,) diagonal of the inverse depths."""
     slope: Array
@@ -236,11 +229,47 @@ class NormalEquations:
     depth_slope: Array
     """(p,) the same by inverse depths."""
 
+    @classmethod
+    def of(
+        cls, tracks: BundleTracks, lin: Linearised, weight: Array, prior: Array, slope: Array
+    ) -> Self:
+        """Sum the products of derivatives, weighted (m,), over the observations of each host."""
+        root, p, six = np.sqrt(weight)[:, None], len(tracks.host), np.arange(6)
+        rows = np.concatenate([lin.by_host, lin.by_frame, lin.by_intrinsics], 2) * root[..., None]
+        residual, by_depth = lin.residual * root, lin.by_depth * root
+        depth = np.bincount(tracks.landmark, (by_depth**2).sum(1), p) + 1e-6
+        depth_slope = np.bincount(tracks.landmark, (by_depth * residual).sum(1), p)
+        mixed = np.einsum("mr,mrc->mc", by_depth, rows)
+        gram, slope, blocks = np.zeros(prior.shape), slope.copy(), []
+        for host in np.unique(tracks.host_frame):
+            own = np.flatnonzero(tracks.host_frame == host)
+            landmarks, place = np.unique(tracks.landmark[own], return_inverse=True)
+            frames = np.unique(tracks.frame[own])
+            last = np.arange(len(gram) - INTRINSICS, len(gram))
+            seen = (6 * frames[:, None] + six).ravel()
+            columns = np.concatenate([6 * host + six, seen, last])
+            local = np.zeros((len(columns),) * 2)
+            block = np.zeros((len(landmarks), len(columns)))
+            for number, frame in enumerate(frames):
+                which = tracks.frame[own] == frame
+                part, at = own[which], np.r_[0:6, 6 + 6 * number + six, -INTRINSICS:0]
+                product = rows[part].reshape(-1, len(at))
+                local[at[:, None], at] += product.T @ product
+                slope[columns[at]] += product.T @ residual[part].ravel()
+                # A frame sees a landmark once.
+                block[place[which][:, None], at] += mixed[part]
+            gram[columns[:, None], columns] += local
+            blocks.append(HostBlock(landmarks, columns, block))
+        return cls(gram, prior, blocks, depth, slope, depth_slope.astype(np.float64))
+
     def solve(self, damping: float) -> Solution | None:
         """Solve with diagonal elements raised by a share; None if not positive definite."""
         depth = (1 + damping) * self.depth
-        eliminated = self.mixed.T @ sparse.diags_array(1 / depth) @ self.mixed
-        system = (self.gram - eliminated).toarray() + self.prior
+        system, slope = self.gram + self.prior, self.slope.copy()
+        for landmarks, columns, mixed in self.blocks:
+            scaled = mixed / depth[landmarks, None]
+            system[columns[:, None], columns] -= mixed.T @ scaled
+            slope[columns] -= scaled.T @ self.depth_slope[landmarks]
         diagonal = np.arange(len(system))
         system[diagonal, diagonal] += damping * (self.gram.diagonal() + self.prior.diagonal())
         try:
@@ -248,10 +277,12 @@ class NormalEquations:
         except np.linalg.LinAlgError:
             return None
         root = lapack.dtrtri(lower, lower=1)[0]  # pyright: ignore[reportAttributeAccessIssue]
-        slope = self.slope - self.mixed.T @ (self.depth_slope / depth)
         whitened = root @ slope
         change = -root.T @ whitened
-        depths = (-self.depth_slope - self.mixed @ change) / depth
+        depths = -self.depth_slope
+        for landmarks, columns, mixed in self.blocks:
+            depths[landmarks] -= mixed @ change[columns]
+        depths = depths / depth
         if not (np.isfinite(change).all() and np.isfinite(depths).all()):
             return None
         return Solution(change, depths, root, float(np.linalg.norm(whitened)))

@@ -69,7 +69,7 @@ class AnnotatedImages:
     other_map: bool = False
     """Whether the map in the store differs from the map of the calibration."""
     surroundings: Surroundings = field(default_factory=Surroundings)
-    """The map around a fixed camera; empty without a store."""
+    """The map that a fixed camera was calibrated in; empty without a store."""
 
 
 def select_images(
@@ -135,10 +135,8 @@ def annotate_images(
         drawn = _with_evidence(calibration, camera, image, board or localizer)
         picture = drawn.image
         if older is not None:
-            pose = older.parent_from_child.inverse()
-            picture = draw_axes(picture, camera, pose, pale=True)
-        pose = calibration.parent_from_child.inverse()
-        picture = draw_axes(picture, camera, pose)
+            picture = draw_axes(picture, camera, older.parent_from_child.inverse(), pale=True)
+        picture = draw_axes(picture, camera, calibration.parent_from_child.inverse())
         summary = "; ".join(filter(None, [_use(file.use), drawn.summary]))
         annotated[str(file.path)] = LandmarkPicture(picture, drawn.landmarks, summary)
         on_image()
@@ -148,7 +146,9 @@ def annotate_images(
         return AnnotatedImages(annotated, tuple(missing))
     scene, digest = _scene_of(calibration, localizer), calibration.source.get("map")
     other = digest is not None and (scene is None or scene.digest != digest)
-    return AnnotatedImages(annotated, tuple(missing), other, _surroundings(calibration, scene))
+    shown = calibration.mount == "eye_to_hand" and scene is not None and scene.unit_known
+    around = Surroundings.of(scene if shown else None)
+    return AnnotatedImages(annotated, tuple(missing), other, around)
 
 
 def _fitting(path: Path, camera: Camera) -> Image:
@@ -204,12 +204,6 @@ def _scene_of(calibration: Calibration, localizer: "LearnedLocalizer") -> SceneM
     name = calibration.source.get("scene")
     maps = [scene for scene in localizer.contents.scenes if isinstance(scene, SceneMap)]
     return next((scene for scene in maps if scene.name == name), None)
-
-
-def _surroundings(calibration: Calibration, scene: SceneMap | None) -> Surroundings:
-    """The map that a fixed camera was calibrated in; empty for other cameras and maps."""
-    shown = calibration.mount == "eye_to_hand" and scene is not None and scene.unit_known
-    return Surroundings.of(scene) if scene is not None and shown else Surroundings()
 
 
 def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:

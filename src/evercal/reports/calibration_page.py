@@ -13,7 +13,7 @@ from evercal.calibration.verdict import TIERS, expected_error, tier, verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.reports.calibration_images import AnnotatedImages
-from evercal.reports.charts import COLOURS, new_figure, png_bytes, tidy
+from evercal.reports.charts import Chart, Panel, Shape
 from evercal.reports.overlay import origin_in_view
 from evercal.reports.page import Picture, Table, Tile, render
 from evercal.reports.scene import (
@@ -22,16 +22,14 @@ from evercal.reports.scene import (
     Ellipsoid,
     Frustum,
     Surroundings,
-    draw_view,
     ellipse,
-    frame_lines,
-    frustum_line,
     readable_scale,
+    view_panel,
 )
 
 _SHOWN_ELSEWHERE = ("warnings", "left_open", "camera_sigma")
 _LONGEST_CELL = 160
-USED, REJECTED = COLOURS[0], COLOURS[1]
+_VIEW_PX, _BARS_PX = (420, 400), (850, 120)
 
 
 class NamedCalibration(NamedTuple):
@@ -100,8 +98,7 @@ def calibration_page(
         headline=headline,
         details=details,
         first=_tiles(calibration),
-        tiers=TIERS,
-        best=tier(calibration),
+        suitability=suitability_table(calibration),
         deviations=deviation_table(calibration, point_m) if uncertain else None,
         older=older,
         difference=None if old is None else difference(calibration, old),
@@ -109,7 +106,7 @@ def calibration_page(
         images=images,
         origin=_origin(calibration),
         pictures=[
-            Picture.photo(drawn.image, f"{os.path.basename(name)}: {drawn.summary}")
+            Picture(drawn.image, f"{os.path.basename(name)}: {drawn.summary}")
             for name, drawn in images.images.items()
         ],
         landmarks_drawn=any(drawn.landmarks for drawn in images.images.values()),
@@ -153,6 +150,17 @@ def _tiles(calibration: Calibration) -> list[Tile]:
         words = "repeatability: difference between the positions from two halves of the data"
         tiles.append(Tile(f"{halves:.2f} mm", words))
     return tiles
+
+
+def suitability_table(calibration: Calibration) -> Table:
+    """The uses that a calibration serves."""
+    known, best = _level(calibration), tier(calibration)
+    serves = ["yes" if known and best and t.mm >= best.mm else "no" for t in TIERS]
+    rows = [
+        (t.name, f"{t.mm:g}", f"{t.deg:g}", word) for t, word in zip(TIERS, serves, strict=True)
+    ]
+    header = ("use", "position error below (mm)", "rotation error below (deg)", "suitable")
+    return Table(header, rows, "A use is suitable if both expected errors lie below its bounds.")
 
 
 def _origin(calibration: Calibration) -> str:
@@ -282,26 +290,21 @@ def _fixed(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def camera_views(calibration: Calibration, around: Surroundings) -> Picture:
+def camera_views(calibration: Calibration, around: Surroundings) -> Chart:
     """Draw the camera and the ellipsoid of its position, from above and from the side."""
     pose, parent = calibration.uncertain_pose, calibration.parent_frame
     ends = np.stack([np.zeros(3), pose.pose.translation_m])
     extent = float(np.ptp(around.bounds(ends), axis=0).max())
-    lines = frame_lines(0.1 * extent)
-    if calibration.camera is not None:
-        view = Frustum.of(pose.pose, calibration.camera)
-        lines.append(frustum_line(view, 0.09 * extent, COLOURS[1], 1.6))
     times = readable_scale([Ellipsoid.of(pose)], 0.07 * extent)
     variances, axes = np.linalg.eigh(pose.covariance[:3, :3])
     half = times * np.sqrt(CHI2_95 * np.diag(pose.covariance)[:3].clip(0))
-    points = np.concatenate([ends, [ends[1] - half, ends[1] + half]])
-    bounds = around.bounds(np.concatenate([points, *(line.points_m for line in lines)]))
-    width, depth, _ = np.ptp(bounds, axis=0)
-    side = int(depth > width), 2  # the wider one
-    figure = new_figure(10.8, 4.8)
-    for panel, plane in zip(figure.subplots(1, 2), (ABOVE, side), strict=True):
-        panel.fill(*ellipse(pose, times, plane).T, color=COLOURS[1], alpha=0.3, zorder=2)
-        draw_view(panel, plane, lines, around, bounds, (parent, "m"))
+    seen = np.concatenate([ends, [ends[1] - half, ends[1] + half]])
+    width, depth, _ = np.ptp(around.bounds(seen), axis=0)
+    camera, panels = calibration.camera, []
+    view = None if camera is None else Frustum.of(pose.pose, camera)
+    for plane in (ABOVE, (int(depth > width), 2)):  # from the wider side
+        shape = Shape("area", ellipse(pose, times, plane), "orange", opacity=0.3)
+        panels.append(view_panel(_VIEW_PX, plane, around, seen, view, [shape], (parent, "m")))
     c, b, a = 1000 * np.sqrt(CHI2_95 * variances.clip(0))
     forward = pose.pose.rotation_matrix()[:, 2]
     angle = np.rad2deg(np.arccos(np.clip(abs(axes[:, 2] @ forward), 0.0, 1.0)))
@@ -310,28 +313,28 @@ def camera_views(calibration: Calibration, around: Surroundings) -> Picture:
         f" axes of {a:.2f}, {b:.2f} and {c:.2f} mm and is drawn {times} times as large. The longest"
         f" one lies {angle:.0f} deg from the viewing direction."
     )
-    return Picture(png_bytes(figure), caption)
+    return panels, caption
 
 
-def residual_chart(calibration: Calibration) -> Picture | None:
+def residual_chart(calibration: Calibration) -> Chart | None:
     """Bars of the residuals of all images, cut at twice the largest used one; None without any."""
     images = calibration.images
     rows = np.array([[i.residual_mm, i.residual_deg] for i in images], np.float64).reshape(-1, 2)
     if not np.isfinite(rows).any():
         return None
-    used = np.array([image.used for image in images])
-    numbers = np.arange(1, len(images) + 1)
-    figure = new_figure(9.0, 3.4)
-    panels = figure.subplots(2, 1, sharex=True)
-    for panel, values, unit in zip(panels, np.nan_to_num(rows).T, ("mm", "deg"), strict=True):
-        panel.bar(numbers[used], values[used], 0.8, color=USED)
-        # Hatched, so that the two kinds differ in grey print as well.
-        style = {"facecolor": "white", "edgecolor": REJECTED, "hatch": "////"}
-        panel.bar(numbers[~used], values[~used], 0.8, **style)
+    used, panels = np.array([image.used for image in images]), []
+    numbers, end = np.arange(1.0, len(images) + 1), max(len(images), 5) + 0.6
+    width, below = 0.8 * _BARS_PX[0] / (end - 0.4), "number of the image in the table"
+    for values, unit, label in zip(np.nan_to_num(rows).T, ("mm", "deg"), ("", below), strict=True):
         typical = float(values[used].max(initial=0.0))
-        top = min(1.1 * float(values.max()), 2 * typical or math.inf)
-        panel.set(ylim=(0, max(top, 1e-6)), ylabel=f"residual ({unit})")
-        tidy(panel)
-    panels[1].set(xlabel="number of the image in the table", xlim=(0.4, max(len(images), 5) + 0.6))
-    words = "Residual of each image; those of rejected images are hatched, and cut where larger."
-    return Picture(png_bytes(figure), words)
+        top = max(min(1.1 * float(values.max()), 2 * typical or math.inf), 1e-3)
+        ends = np.column_stack([numbers, values])
+        bars = np.stack([ends, ends * (1, 0), ends * np.nan], axis=1)
+        shapes = [
+            Shape("line", bars[used].reshape(-1, 2), "blue", width),
+            # Striped, so that the two kinds differ in grey print as well.
+            Shape("stripes", bars[~used].reshape(-1, 2), "orange", width),
+        ]
+        limits = np.array([[0.4, 0.0], [end, top]])
+        panels.append(Panel(_BARS_PX, limits, (label, f"residual ({unit})"), shapes))
+    return panels, "Residual of each image; rejected ones are striped, and cut where larger."

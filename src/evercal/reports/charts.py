@@ -1,66 +1,142 @@
-"""The common style of charts, and their PNG bytes.
+"""Charts: panels with two axes, written by a template as SVG, or drawn into frames of a video."""
 
-The Okabe-Ito colours are distinguishable with colour blindness. No pyplot and no global state is
-used.
-"""
-
-import io
-import warnings
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from evercal.reports.overlay import overlay_lines
 
 Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Text = tuple[str, float, float, int]
+"""Words, and the pixel on their base line that they lie right of (0), around (1) or left of (2)."""
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-_MARKERS = "os^Dv<>P"
-_LINES = ("-", "--", "-.", ":")
-
-
-def new_figure(width: float, height: float) -> "Figure":
-    """Create an empty white figure; width and height in inches."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), dpi=150, layout="constrained", facecolor="white")
-
-
-def png_bytes(figure: "Figure") -> bytes:
-    """Encode a figure as PNG. Equal figures give equal bytes."""
-    buffer = io.BytesIO()
-    with warnings.catch_warnings():
-        # Names in scripts that the font lacks are drawn as boxes.
-        warnings.filterwarnings("ignore", "Glyph .* missing from font")
-        figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()
+INKS = {
+    "text": ("#1b1f24", "#e6edf3"),
+    "grid": ("#e4e8ec", "#262c34"),
+    "blue": ("#0072B2", "#56B4E9"),
+    "orange": ("#D55E00", "#E69F00"),
+    "green": ("#1a7f37", "#4ac26b"),
+    "red": ("#cf222e", "#ff7b72"),
+}
+"""Colours on light and on dark paper. Blue and orange, of Okabe and Ito, differ for all eyes."""
+_GAP = (np.nan, np.nan)
+_FINER = 4  # steps in a pixel of a frame
 
 
-def tidy(panel: "Axes") -> None:
-    """Apply the common style: light grid, small ticks, no frame at the top and right."""
-    panel.grid(color="0.9", linewidth=0.6)
-    panel.set_axisbelow(True)
-    panel.tick_params(labelsize=8)
-    panel.xaxis.label.set_fontsize(9)
-    panel.yaxis.label.set_fontsize(9)
-    panel.spines[["top", "right"]].set_visible(False)
+class Shape(NamedTuple):
+    """What is drawn in a panel in one colour."""
+
+    kind: Literal["line", "dots", "area", "stripes"]
+    """An area has an outline, too. Stripes lie across the line, which looks hatched."""
+    points: Array
+    """(n, 2) in the units of the axes; NaN interrupts a line."""
+    ink: str
+    width: float = 1.0
+    """Of a line or dot, pixels."""
+    opacity: float = 1.0
+    """Of dots, and inside of an area."""
 
 
-def line_style(index: int, name: str) -> dict[str, Any]:
-    """Keywords of `plot` that distinguish lines by colour, marker and dashes."""
-    return {
-        "color": COLOURS[index % len(COLOURS)],
-        "marker": _MARKERS[index % len(_MARKERS)],
-        "linestyle": _LINES[index % len(_LINES)],
-        "label": name,
-        "linewidth": 1.5,
-        "markersize": 3.5,
-    }
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """Shapes in a box with axes at the left and bottom; nothing is drawn outside."""
+
+    size: tuple[int, int]
+    """Width and height of the box, pixels."""
+    limits: Array
+    """(2, 2) lower and upper ends of both axes, in their units."""
+    labels: tuple[str, str]
+    """What the axes show, with the unit. An x axis without a label has no numbers."""
+    shapes: Sequence[Shape]
+
+    def pixels(self, points: Array) -> Array:
+        """(n, 2) pixels in the box of points (n, 2); the upper left corner is (0, 0)."""
+        x, y = ((points - self.limits[0]) / np.ptp(self.limits, axis=0) * self.size).T
+        return np.column_stack([x, self.size[1] - y])
+
+    def path(self, shape: Shape) -> str:
+        """The points of a shape as a path of SVG."""
+        places = self.pixels(shape.points).round(1).tolist()
+        words = " ".join(f"{x:g},{y:g}" for x, y in places)
+        if shape.kind == "dots":
+            return "".join(f"M{word}h0" for word in words.split())
+        return "".join(f"M{part}" for part in words.split("nan,nan") if part.strip())
+
+    @property
+    def drawn(self) -> list[Shape]:
+        """The grid, the shapes, and the axes."""
+        (x0, y0), (x1, y1) = self.limits
+        lines = [[(x, y0), (x, y1), _GAP] for x, _, _ in self._ticks(0)]
+        lines += [[(x0, y), (x1, y), _GAP] for y, _, _ in self._ticks(1)]
+        grid = Shape("line", np.array(lines).reshape(-1, 2), "grid")
+        axes = Shape("line", np.array([(x0, y1), (x0, y0), (x1, y0)]), "text", 2.0)
+        return [grid, *self.shapes, axes]
+
+    @property
+    def texts(self) -> list[Text]:
+        """The numbers at the axes, and what these show."""
+        (width, height), (x, y) = self.size, self.labels
+        below = [(words, at, height + 18, 1) for _, at, words in self._ticks(0)]
+        beside = [(words, -8, height - at + 4, 2) for _, at, words in self._ticks(1)]
+        return [(y, -52, -12, 0), (x, width / 2, height + 40, 1), *beside, *(below if x else [])]
+
+    def _ticks(self, axis: int) -> list[tuple[float, float, str]]:
+        """Round numbers along an axis, their distance from its lower end in pixels, and words."""
+        (low, high), size = self.limits[:, axis].tolist(), self.size[axis]
+        coarse = (high - low) / min(max(size // 50, 5), 8)
+        power = 10.0 ** np.floor(np.log10(coarse))
+        step = power * next(factor for factor in (1, 2, 5, 10) if factor * power >= coarse)
+        digits = max(0, -int(np.floor(np.log10(step) + 1e-9)))
+        numbers = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
+        at = ((numbers - low) / (high - low) * size).round(1)
+        # Adding zero makes a positive zero of a negative one. A minus sign is as wide as a digit.
+        words = [f"{n + 0.0:.{digits}f}".replace("-", "\N{MINUS SIGN}") for n in numbers]
+        return list(zip(numbers.tolist(), at.tolist(), words, strict=True))
 
 
-def plain(text: str) -> str:
-    """Escape the dollar signs with which matplotlib marks formulas."""
-    return text.replace("$", r"\$")
+Chart = tuple[list[Panel], str]
+"""Panels side by side, or below each other where they are wide, and a caption."""
+
+
+def rgb(ink: str) -> tuple[int, int, int]:
+    """A colour on light paper."""
+    red, green, blue = bytes.fromhex(INKS[ink][0][1:])
+    return red, green, blue
+
+
+def write(image: Image, text: Text, size: int = 13, ink: str = "text") -> None:
+    """Write into an RGB image (h, w, 3), whose upper left corner is the text's; size in pixels."""
+    import cv2
+
+    words, x, y, align = text
+    font = cv2.FontFace("sans")
+    width = cv2.getTextSize((0, 0), words, (0, 0), font, size, 400)[2]
+    at = round(x - align * width / 2), round(y)
+    cv2.putText(image, words, at, rgb(ink), font, size, 400)
+
+
+def paint(image: Image, panel: Panel, left: int, top: int) -> None:
+    """Draw a panel into an RGB image (h, w, 3), the upper left corner of its box at a pixel.
+
+    Of areas and stripes, lines are drawn.
+    """
+    import cv2
+
+    width, height = panel.size
+    large = np.full((_FINER * height, _FINER * width, 3), 255, np.uint8)
+    for shape in panel.drawn:
+        pixels, thickness = _FINER * panel.pixels(shape.points), round(_FINER * shape.width)
+        if shape.kind == "dots":
+            colour = [255 + shape.opacity * (value - 255) for value in rgb(shape.ink)]
+            for centre in pixels.round().astype(int).tolist():
+                cv2.circle(large, centre, thickness // 2, colour, -1)
+        else:
+            large = overlay_lines(large, [pixels], [rgb(shape.ink)], thickness)
+    box = cv2.resize(large, (width, height), interpolation=cv2.INTER_AREA)
+    image[top : top + height, left : left + width] = box
+    for words, x, y, align in panel.texts:
+        write(image, (words, left + x, top + y, align))

@@ -5,12 +5,14 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evercal.recordings.images import encode_jpeg
+from evercal.recordings.poses.row_files import is_number
+from evercal.reports.charts import INKS
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -18,29 +20,19 @@ if TYPE_CHECKING:
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A chart (PNG) or a photograph (JPEG). Dark mode inverts charts only."""
+class Picture(NamedTuple):
+    """A photograph."""
 
-    data: bytes
-    """Content of the image file."""
+    image: NDArray[np.uint8]
+    """(h, w, 3) RGB."""
     caption: str = ""
     """Text below the picture, also its alternative text."""
 
-    @classmethod
-    def photo(cls, image: NDArray[np.uint8], caption: str = "") -> Self:
-        """An image (h, w, 3) RGB as a JPEG file."""
-        return cls(encode_jpeg(image, quality=88), caption)
-
-    @property
-    def kind(self) -> Literal["png", "jpeg"]:
-        """File type."""
-        return "png" if self.data.startswith(b"\x89PNG") else "jpeg"
-
     @property
     def uri(self) -> str:
-        """The file as a data URI."""
-        return f"data:image/{self.kind};base64,{base64.b64encode(self.data).decode()}"
+        """A JPEG file as a data URI."""
+        data = base64.b64encode(encode_jpeg(self.image, quality=88))
+        return f"data:image/jpeg;base64,{data.decode()}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +75,7 @@ class Tile(NamedTuple):
 
 def render(template: str, **values: object) -> str:
     """Fill in a template, escaping all values; the document refers to no other file."""
-    return environment().get_template(template).render(values)
+    return environment().get_template(template).render(values, inks=INKS)
 
 
 @functools.cache
@@ -113,10 +105,4 @@ def _blank(cell: str | int | float) -> bool:
 
 
 def _number(cell: str | int | float) -> bool:
-    if _blank(cell):
-        return True
-    try:
-        float(str(cell).removesuffix("%").partition("±")[0])
-    except ValueError:
-        return False
-    return True
+    return _blank(cell) or is_number(str(cell).removesuffix("%").partition("±")[0])

@@ -6,18 +6,15 @@ corrections of `mapping.map_frame`, usually about a millimetre.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple, Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.mapping.scene_map import SceneMap
-from evercal.reports.charts import COLOURS, plain, tidy
+from evercal.reports.charts import Panel, Shape
 from evercal.reports.overlay import colour_map
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -36,8 +33,6 @@ ABOVE: Plane = (0, 1)
 CHI2_95 = 7.8147
 """Squared Mahalanobis distance of 95 % of three-dimensional errors."""
 _DRAWN_POINTS = 6000
-_AXES = ("#c0392b", "#1e8449", "#2874a6")
-"""Colours of x, y and z."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,15 +173,6 @@ def _scale(scene: SceneMap) -> float:
     return 1.0 if scene.frame.similarity is None else scene.frame.similarity.scale
 
 
-class Line(NamedTuple):
-    """A line in space."""
-
-    points_m: Array
-    """(n, 3)."""
-    colour: str
-    width: float = 0.8
-
-
 @dataclass(frozen=True, eq=False)
 class Surroundings:
     """Landmarks and keyframes of a map; lengths in its unit."""
@@ -199,8 +185,10 @@ class Surroundings:
     """Views of the map."""
 
     @classmethod
-    def of(cls, scene: SceneMap) -> Self:
-        """The landmarks and keyframes of a map."""
+    def of(cls, scene: object) -> Self:
+        """The landmarks and keyframes of a map; none of other scenes."""
+        if not isinstance(scene, SceneMap):
+            return cls()
         marks = Landmarks3D.of(scene, _DRAWN_POINTS)
         views = tuple(view.frustum for view in keyframe_views(scene))
         return cls(np.asarray(marks.points_m, np.float64), marks.grey, views)
@@ -218,21 +206,6 @@ class Surroundings:
         return np.stack([low - 0.1 * reach, high + 0.1 * reach])
 
 
-def frustum_line(view: Frustum, length_m: float, colour: str, width: float = 0.8) -> Line:
-    """The edges of a view as one line."""
-    a, b, c, d = view.corners(length_m)
-    eye = view.base_from_camera.translation_m
-    return Line(np.array([eye, a, b, eye, c, d, eye, b, c, d, a]), colour, width)
-
-
-def frame_lines(length_m: float) -> list[Line]:
-    """The axes of the frame that is drawn: x red, y green, z blue."""
-    return [
-        Line(np.stack([np.zeros(3), length_m * axis]), colour, 2.0)
-        for axis, colour in zip(np.eye(3), _AXES, strict=True)
-    ]
-
-
 def ellipse(pose: UncertainPose, times: float, plane: Plane) -> Array:
     """(n, 2) outline in a plane of the ellipsoid that holds a position with 95 %, enlarged."""
     values, vectors = np.linalg.eigh(pose.covariance[np.ix_(plane, plane)])
@@ -242,29 +215,41 @@ def ellipse(pose: UncertainPose, times: float, plane: Plane) -> Array:
     return pose.pose.translation_m[list(plane)] + circle * half_axes @ vectors.T
 
 
-def draw_view(
-    panel: "Axes",
+def view_panel(
+    size: tuple[int, int],
     plane: Plane,
-    lines: Sequence[Line],
     around: Surroundings,
-    bounds: Array,
+    seen: Array,
+    view: Frustum | None,
+    shapes: Sequence[Shape] = (),
     names: tuple[str, str] = ("base", "m"),
-) -> None:
-    """Draw lines, landmarks and keyframes within a box; `names` are those of frame and unit."""
-    shades = 0.35 + 0.5 * around.grey / 255  # neither ink nor paper
-    pairs = around.points_m[:, plane]
-    panel.scatter(*pairs.T, s=2.0, c=shades, cmap="gray", vmin=0, vmax=1, linewidths=0, zorder=1)
-    length = 0.04 * float(np.ptp(bounds, axis=0).max())
-    keyframes = [frustum_line(view, length, COLOURS[0]) for view in around.keyframes]
-    for line in (*keyframes, *lines):
-        panel.plot(*line.points_m[:, plane].T, color=line.colour, linewidth=line.width, zorder=3)
-    frame, unit = names
-    (x0, y0), (x1, y1) = bounds[:, plane]
-    x, y = (plain(f"{'xyz'[axis]} of {frame[:24]} ({unit})") for axis in plane)
-    panel.set(xlabel=x, ylabel=y)
-    panel.locator_params(nbins=7)
-    tidy(panel)
-    # Where the box is narrower than the panel, more is shown, and nothing white.
-    panel.set_xlim(x0, x1, auto=True)
-    panel.set_ylim(y0, y1, auto=True)
-    panel.set_aspect("equal", adjustable="datalim")
+) -> Panel:
+    """Show a map, the axes of its frame, the view of a camera, and shapes.
+
+    Points (n, 3) are `seen`. Both axes have one scale: where the points need less than the panel,
+    more is shown. `names` are those of frame and unit.
+    """
+    bounds = around.bounds(seen)
+    extent = float(np.ptp(bounds, axis=0).max())
+    low, high = bounds[:, plane]
+    half = np.array(size) * ((high - low) / size).max() / 2
+    limits = (low + high) / 2 + np.stack([-half, half])
+    flat = around.points_m[:, plane]
+    shade = np.where(((flat > limits[0]) & (flat < limits[1])).all(axis=1), around.grey // 52, -1)
+    # Neither ink nor paper.
+    drawn = [Shape("dots", flat[shade == i], "text", 1.9, 0.65 - 0.12 * i) for i in range(5)]
+    lines = [(_edges(view, 0.04 * extent), ("blue", 1.2)) for view in around.keyframes]
+    axes = 0.08 * extent * np.insert(np.eye(3)[:, None], 0, 0, axis=1)
+    lines += [(axis, (ink, 2.5)) for axis, ink in zip(axes, ("red", "green", "blue"), strict=True)]
+    if view is not None:
+        lines.append((_edges(view, 0.08 * extent), ("orange", 2.2)))
+    drawn += [*shapes, *(Shape("line", points[:, plane], *style) for points, style in lines)]
+    x, y = (f"{'xyz'[axis]} of {names[0][:24]} ({names[1]})" for axis in plane)
+    return Panel(size, limits, (x, y), drawn)
+
+
+def _edges(view: Frustum, length_m: float) -> Array:
+    """(11, 3) one line along all edges of a view."""
+    a, b, c, d = view.corners(length_m)
+    eye = view.base_from_camera.translation_m
+    return np.array([eye, a, b, eye, c, d, eye, b, c, d, a])

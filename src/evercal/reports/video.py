@@ -11,19 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
-from evercal.mapping.scene_map import SceneMap
 from evercal.reports.answers import Answer, finite_pose
-from evercal.reports.charts import COLOURS, plain
+from evercal.reports.charts import Panel, Shape, paint, write
 from evercal.reports.overlay import draw_landmarks
-from evercal.reports.scene import (
-    ABOVE,
-    Frustum,
-    Line,
-    Surroundings,
-    draw_view,
-    frame_lines,
-    frustum_line,
-)
+from evercal.reports.scene import ABOVE, Frustum, Surroundings, view_panel
 
 if TYPE_CHECKING:
     from evercal.localization.learned import LearnedLocalizer
@@ -34,8 +25,9 @@ ENDING = ".mp4"
 FRAMES_A_SECOND = 10
 _CODEC = "vp09"
 """VP9: OpenCV's wheels write it, and browsers play it."""
-_SIZE_IN, _DPI = (12.8, 5.6), 100
-_GOOD, _BAD = "#1a7f37", "#cf222e"
+_SIZE, _PICTURE, _PANEL = (1280, 560), (620, 440), (540, 404)
+"""Width and height of a frame, of its picture at most, and of its chart, pixels."""
+_LEFT, _PANEL_LEFT, _TOP = 15, 726, 84
 
 
 def require_ending(path: Path) -> None:
@@ -70,61 +62,36 @@ def animate(
     answers: Sequence[Answer], localizer: "LearnedLocalizer", read: Callable[[Path], Image]
 ) -> Iterator[Image]:
     """Draw one frame for each answer; `read` reads an image file."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
     scenes = {scene.name: scene for scene in localizer.contents.scenes}
     found = [a.estimate.scene for a in answers if a.estimate.scene is not None]
-    maps = {name: _MapView(scenes[name], answers) for name in set(found)}
+    maps = {name: Surroundings.of(scenes[name]) for name in set(found)}
     shown = found[0] if found else None
     for i, answer in enumerate(answers):
         good = answer.estimate.status == "ok"
         shown = answer.estimate.scene if good else shown
-        drawn = draw_landmarks(read(answer.path), answer.estimate, localizer)
-        figure.clear()
-        panel: Any = figure.add_axes((0.012, 0.1, 0.49, 0.75))
-        panel.imshow(drawn.image)
-        panel.axis("off")
-        panel.set_title(plain(textwrap.shorten(drawn.summary, 90)), fontsize=9, loc="left")
+        frame, image = np.full((*_SIZE[::-1], 3), 255, np.uint8), read(answer.path)
+        width = min(_PICTURE[0], _PICTURE[1] * image.shape[1] // image.shape[0])
+        drawn = draw_landmarks(image, answer.estimate, localizer, width=width)
+        frame[_TOP:, _LEFT:][: len(drawn.image), :width] = drawn.image
+        write(frame, (textwrap.shorten(drawn.summary, 90), _LEFT, _TOP - 12, 0))
         if shown is not None:
-            maps[shown].draw(figure.add_axes((0.57, 0.13, 0.42, 0.72)), i)
-        words, colour = plain(_words(answer)), _GOOD if good else _BAD
-        figure.suptitle(words, color=colour, x=0.015, y=0.97, ha="left", fontsize=13)
-        canvas.draw()
-        yield np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
+            paint(frame, _from_above(scenes[shown], maps[shown], answers, i), _PANEL_LEFT, _TOP)
+            words = f"{shown[:24]} from above: keyframes blue, camera and path orange"
+            write(frame, (words, _PANEL_LEFT - 52, 32, 0))
+        write(frame, (_words(answer), _LEFT, 32, 0), 19, "green" if good else "red")
+        yield frame
 
 
-class _MapView:
-    """A map from above, with the path of the camera."""
-
-    def __init__(self, scene: Any, answers: Sequence[Answer]) -> None:
-        self._name, self._camera = scene.name, scene.adjusted_camera
-        self._around = Surroundings.of(scene) if isinstance(scene, SceneMap) else Surroundings()
-        here = [a.estimate.status == "ok" and a.estimate.scene == scene.name for a in answers]
-        self._poses = [
-            answer.estimate.base_from_camera if own else None
-            for answer, own in zip(answers, here, strict=True)
-        ]
-        self._eyes = np.array(
-            [np.full(3, np.nan) if pose is None else pose.translation_m for pose in self._poses]
-        )
-        known = all(a.unit_known for a, own in zip(answers, here, strict=True) if own)
-        self._names = "base", "m" if known else "unit unknown"
-
-    def draw(self, panel: Any, number: int) -> None:
-        """Draw the camera of an image and the path up to it."""
-        seen = self._eyes[np.isfinite(self._eyes[:, 0])]
-        bounds = self._around.bounds(np.concatenate([np.zeros((1, 3)), seen]))
-        extent, pose = float(np.ptp(bounds, axis=0).max()), self._poses[number]
-        lines = [*frame_lines(0.07 * extent), Line(self._eyes[: number + 1], COLOURS[1])]
-        if pose is not None:
-            view = Frustum.of(pose, self._camera)
-            lines.append(frustum_line(view, 0.08 * extent, COLOURS[1], 1.8))
-        draw_view(panel, ABOVE, lines, self._around, bounds, self._names)
-        words = f"{self._name[:24]} from above: keyframes blue, camera and path orange"
-        panel.set_title(plain(words), fontsize=9, loc="left")
+def _from_above(scene: Any, around: Surroundings, answers: Sequence[Answer], number: int) -> Panel:
+    """A map with the camera of an image and its path up to it."""
+    own = [(a, a.estimate.status == "ok" and a.estimate.scene == scene.name) for a in answers]
+    poses = [a.estimate.base_from_camera if shown else None for a, shown in own]
+    eyes = np.array([np.full(3, np.nan) if p is None else p.translation_m for p in poses])
+    seen = np.concatenate([np.zeros((1, 3)), eyes[np.isfinite(eyes[:, 0])]])
+    view = None if (pose := poses[number]) is None else Frustum.of(pose, scene.adjusted_camera)
+    path = Shape("line", eyes[: number + 1, ABOVE], "orange", 2)
+    unit = "m" if all(a.unit_known for a, shown in own if shown) else "unit unknown"
+    return view_panel(_PANEL, ABOVE, around, seen, view, [path], ("base", unit))
 
 
 def _words(answer: Answer) -> str:

@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 
 import cv2
 import numpy as np
-import pandas as pd
 from PIL import Image
 
 from evercal.bounds import RequestBounds, reading_a_request, request_bounds
@@ -21,7 +20,6 @@ from evercal.recordings.images import decode_image
 from evercal.recordings.poses.camera_file import read_camera
 from evercal.recordings.poses.pairing import poses_of_images
 
-_ = pd  # loading it takes a while, and no request should wait for it
 Image.preinit()
 Content = TypeVar("Content")
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")

@@ -19,10 +19,10 @@ from evercal.continual.benchmark.comparison import (
     run_scores,
     scene_table,
 )
+from evercal.continual.benchmark.figures import line_style, new_figure, tidy
 from evercal.continual.benchmark.paper_tables import ablation_table, latex, paper_table
 from evercal.continual.benchmark.results import Table
 from evercal.errors import InputError
-from evercal.reports.charts import line_style, new_figure, tidy
 from evercal.storage import write_bytes
 from evercal.storage.settings import read_settings
 

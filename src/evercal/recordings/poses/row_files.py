@@ -5,11 +5,12 @@ Labels are columns of a table, or lists of JSON, that hold image names and times
 have any name. In JSON lists beside the poses, names are in the plural: `images`, `stamps_s`.
 """
 
-import io
+import csv
 import math
 import re
 import zipfile
 from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path, PurePath
 from typing import IO, Any, NamedTuple
 
@@ -36,7 +37,7 @@ _UNIT = re.compile(
 _SHORT = {"degrees": "deg", "radians": "rad"}
 _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _EARLIEST_S, _LATEST_S = 1e9, 4e9  # 2001 and 2096 in seconds since 1970
-_DECIMAL_COMMA = r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$"
+_DECIMAL_COMMA = re.compile(r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$")
 
 
 class Rows(NamedTuple):
@@ -70,31 +71,38 @@ def table_cells(lines: Sequence[str]) -> Cells:
     Semicolons, commas, tabs or blanks of the first line separate them. If it is semicolons, the
     comma may be a decimal point.
     """
-    import pandas as pd
-
     first = next((line for line in lines if line.strip()), "")
     separator = next((s for s in (";", ",", "\t") if s in first), " ")
     count = len(first.split()) if separator == " " else first.count(separator) + 1
-    require_at_most(count, "columns", "columns")
-    require_at_most(count * len(lines), "numbers", "cells")
+    _require_few_cells(count, len(lines))
+    if separator == " ":
+        lines = [line.replace("\t", " ") for line in lines]
     # Empty cells at the end of a line are missing cells.
-    text = "\n".join(line.lstrip(" ").rstrip(f" \r\n{separator}") for line in lines)
-    try:
-        table = pd.read_csv(
-            io.StringIO(text),
-            sep=r"\s+" if separator == " " else separator,
-            dtype=str,
-            header=None,
-            keep_default_na=False,
-            skipinitialspace=True,
-        )
-    except pd.errors.EmptyDataError:
+    stripped = (line.lstrip(" ").rstrip(f" \t\r\n{separator}") + "\n" for line in lines)
+    # The bound below on the length of a cell is stricter, and names its place.
+    csv.field_size_limit(max(csv.field_size_limit(), bounds().text_bytes))
+    # A cell whose quote is never closed swallows the line after the last one.
+    rows = csv.reader(chain(stripped, ["end"]), delimiter=separator, skipinitialspace=True)
+    cells: list[list[str]] = []
+    for row in rows:
+        width = len(cells[0]) if cells else len(row)
+        _require_few_cells(width, len(lines))  # lines of one row come together
+        if len(row) > width:
+            raise ValueError(f"no table: line {rows.line_num} has {len(row)} cells, not {width}")
+        if row:
+            cells.append([*row, *[""] * (width - len(row))])
+    if cells.pop()[:1] != ["end"]:
+        raise ValueError("no table: a quotation mark is not closed")
+    if not cells:
         return np.empty((0, 0), dtype=object)
-    except pd.errors.ParserError as error:
-        raise ValueError(f"no table: {str(error).strip().rpartition('error: ')[2]}") from None
     if separator == ";":
-        table = table.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
-    return text_cells([map(str.strip, row) for row in table.itertuples(index=False, name=None)])
+        cells = [[_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in row] for row in cells]
+    return text_cells([map(str.strip, row) for row in cells])
+
+
+def _require_few_cells(columns: int, rows: int) -> None:
+    require_at_most(columns, "columns", "columns")
+    require_at_most(columns * rows, "numbers", "cells")
 
 
 def text_cells(rows: Iterable[Iterable[str]]) -> Cells:
