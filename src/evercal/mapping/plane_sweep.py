@@ -147,22 +147,32 @@ class _SourceView:
         self.translation = other_from_view.translation_m
         self.similarity = (view.features @ other.features.T).reshape(-1, *other.grid)
 
-    def pixels(self, inverse: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Pixels (..., 2) of cells at inverse depths (cells, ...), and whether they are visible."""
-        ray = self.ray.reshape(len(self.ray), *[1] * (inverse.ndim - 1), 3)
-        point = ray + inverse[..., None] * self.translation
-        front = point[..., 2] > 0.05
-        pixels = self.other.camera.project(np.where(front[..., None], point, [0, 0, 1]))
-        return np.nan_to_num(pixels), front & np.isfinite(pixels).all(-1)
+    def pixels(self, inverse: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Columns and rows (cells, ...) at inverse depths (cells, ...), and whether visible."""
+        shape = (-1, *[1] * (inverse.ndim - 1))
+        x, y, z = (
+            self.ray[:, i].reshape(shape).astype(inverse.dtype)
+            + inverse * inverse.dtype.type(self.translation[i])
+            for i in range(3)
+        )
+        front = z > 0.05
+        z = np.where(front, z, 1)
+        camera = self.other.camera
+        if camera.distortion:
+            pixels = camera.project(np.stack([x, y, z], -1))
+            front &= np.isfinite(pixels).all(-1)
+            u, v = np.moveaxis(np.nan_to_num(pixels).astype(inverse.dtype), -1, 0)
+            return u, v, front
+        return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, front
 
     def along(self, planes: Array) -> Array:
         """(cells, planes) similarity at inverse depths, 0 outside this view."""
-        cells = len(self.ray)
-        pixels, front = self.pixels(np.broadcast_to(planes, (cells, len(planes))))
-        size = np.array([self.columns, self.rows]) * self.other.stride
-        inside = front & (pixels > -4).all(-1) & (pixels < size + 4).all(-1)
-        last = np.array([self.columns - 1, self.rows - 1])
-        at = ((pixels + 0.5) / self.other.stride - 0.5).clip(0, last).astype(np.float32)
+        cells, stride = len(self.ray), self.other.stride
+        u, v, inside = self.pixels(np.broadcast_to(planes, (cells, len(planes))))
+        right, down = (u + 0.5) / stride - 0.5, (v + 0.5) / stride - 0.5
+        for at, last in ((right, self.columns - 1), (down, self.rows - 1)):
+            inside &= (at > -1) & (at < last + 1)
+            np.clip(at, 0, last, out=at)
         sampled = np.empty((cells, len(planes)), np.float32)
         # The grids of many cells one below the other are one image.
         block = _MOST_ROWS // self.rows
@@ -170,16 +180,15 @@ class _SourceView:
             part = slice(start, start + block)
             image = self.similarity[part].reshape(-1, self.columns)
             top = np.arange(len(image) // self.rows, dtype=np.float32)[:, None] * self.rows
-            right, down = at[part, :, 0], at[part, :, 1] + top
-            sampled[part] = cv2.remap(image, right, down, cv2.INTER_LINEAR)
+            sampled[part] = cv2.remap(image, right[part], down[part] + top, cv2.INTER_LINEAR)
         return np.maximum(sampled, 0) * inside
 
     def normal_equation(self, inverse: Array) -> tuple[Array, Array]:
         """Gradient and Hessian (cells,) of least squares in the inverse depth of each cell."""
         rho = inverse.astype(np.float64)
-        here, front = self.pixels(rho)
-        delta, stride = 1e-4, self.other.stride
-        slope = (self.pixels(rho + delta)[0] - here) / delta
+        *here, front = self.pixels(rho)
+        here, delta, stride = np.stack(here, 1), 1e-4, self.other.stride
+        slope = (np.stack(self.pixels(rho + delta)[:2], 1) - here) / delta
         cell = np.rint((here - (stride - 1) / 2) / stride).astype(int)
         last = np.array([self.columns - 2, self.rows - 2])
         inside = front & (cell >= 1).all(1) & (cell <= last).all(1)
