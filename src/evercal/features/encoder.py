@@ -149,14 +149,14 @@ class _OnnxNetwork:
 
     def _read(self) -> Any:
         # OpenCV's classic engine takes half the time, and is only used for a file.
-        with tempfile.NamedTemporaryFile(suffix=".onnx") as file:
-            file.write(self.data)
-            file.flush()
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "encoder.onnx"
+            file.write_bytes(self.data)
             level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
             try:
                 for engine in (cv2.dnn.ENGINE_CLASSIC, cv2.dnn.ENGINE_AUTO):
                     try:
-                        return cv2.dnn.readNetFromONNX(file.name, engine=engine)
+                        return cv2.dnn.readNetFromONNX(str(file), engine=engine)
                     except cv2.error as error:
                         reason = " ".join(str(error).split())[:200]
             finally:
@@ -190,22 +190,27 @@ def _of_file(path: Path) -> Encoder:
         raise InputError(f"{path}: the map was made with the function {name!r}; give it as encoder")
     if not path.is_file():
         raise InputError(f"encoder {path}: no such file")
-    if path.suffix == ".safetensors":  # maps of before hold weights of PyTorch
-        if _digest(load_tensors(path)) != _TEACHER:
-            raise InputError(
-                f"encoder {path}: weights of a PyTorch module; export the module to an ONNX file"
-                " or wrap it in a function, and give that as encoder"
-            )
-        path = WEIGHTS / "encoder-1.onnx"
-    data = path.read_bytes()
-    shipped = [file for file in sorted(WEIGHTS.glob("*.onnx")) if file.read_bytes() == data]
+    name = shipped_name(path)
+    if name is None and path.suffix == ".safetensors":  # maps of before hold weights of PyTorch
+        raise InputError(
+            f"encoder {path}: weights of a PyTorch module; export the module to an ONNX file or"
+            " wrap it in a function, and give that as encoder"
+        )
+    data = (path if name is None else WEIGHTS / name).read_bytes()
     digest = hashlib.sha256(data).hexdigest()[:12]
-    name = shipped[0].name if shipped else f"encoder-{digest}.onnx"
-    encoder = Encoder(_OnnxNetwork(data, str(path)), name, data)
-    if shipped:
-        centroids = WEIGHTS / shipped[0].with_suffix(".safetensors").name.replace("encoder", "vlad")
+    encoder = Encoder(_OnnxNetwork(data, str(path)), name or f"encoder-{digest}.onnx", data)
+    if name is not None:
+        centroids = WEIGHTS / f"{Path(name).stem.replace('encoder', 'vlad')}.safetensors"
         encoder.centroids = load_tensors(centroids)["centroids"].astype(np.float32)
     return encoder
+
+
+def shipped_name(path: Path) -> str | None:
+    """Name of the shipped network in the file of a map; None for another one."""
+    if path.suffix == ".safetensors":
+        return "encoder-1.onnx" if _digest(load_tensors(path)) == _TEACHER else None
+    data = path.read_bytes()
+    return next((f.name for f in sorted(WEIGHTS.glob("*.onnx")) if f.read_bytes() == data), None)
 
 
 def _digest(arrays: Mapping[str, NDArray[np.generic]]) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-CENTROIDS = 32
+CENTROIDS = 16
 WIDTH = 1024
 _ROUNDS = 15
 _ROWS = 40_000

@@ -94,7 +94,7 @@ def merge_maps(
     maps = [_incoming(Path(other)) for other in others]
     contents = store.contents
     if is_new:
-        contents = MapStore.open(Path(others[0])).contents.empty().to(contents.device)
+        contents = MapStore.open(Path(others[0])).contents.empty()
     first = maps[0][0] if is_new else Manifest.read(store.root)
     incoming: dict[str, _Incoming] = {}
     kept = {scene.name: i for i, scene in enumerate(store.contents.scenes)}
@@ -211,7 +211,7 @@ def _require_same_networks(first: Manifest, other: Manifest, root: Path, path: P
         a, b = first.payload.get(key), other.payload.get(key)
         if a != b:
             raise InputError(f"map {path}: {what} {b}, map {root} has {a}; learn its scenes again")
-    if _networks(first) != _networks(other):
+    if _networks(root, first) != _networks(path, other):
         names = ", ".join(other.payload["networks"])
         raise InputError(
             f"map {path}: was made with another encoder or other centroids ({names}) than map"
@@ -219,8 +219,10 @@ def _require_same_networks(first: Manifest, other: Manifest, root: Path, path: P
         )
 
 
-def _networks(manifest: Manifest) -> dict[str, object]:
-    return {name: manifest.files[name]["sha256"] for name in manifest.payload["networks"]}
+def _networks(root: Path, manifest: Manifest) -> set[object]:
+    """What identifies the networks of a map: maps of before store the first encoder otherwise."""
+    names = [str(name) for name in manifest.payload["networks"]]
+    return {shipped_name(root / name) or manifest.files[name]["sha256"] for name in names}
 
 
 def _commit(
