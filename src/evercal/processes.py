@@ -43,6 +43,34 @@ def cores() -> int:
     return max(1, min(free, int(most))) if most.isdecimal() and int(most) else free
 
 
+_pools: Any = None
+_limiting, _limits = 0, threading.Lock()
+
+
+@contextmanager
+def one_product_thread() -> Iterator[None]:
+    """Calculate matrix products with one thread meanwhile, in the whole process.
+
+    Those of an image are so small that threads mostly wait for each other: on a busy machine an
+    image takes ten times as long with two.
+    """
+    global _pools, _limiting
+    with _limits:
+        if _limiting == 0:
+            from threadpoolctl import ThreadpoolController
+
+            _pools = _pools or ThreadpoolController()
+            _pools.before = _pools.limit(limits=1, user_api="blas")
+        _limiting += 1
+    try:
+        yield
+    finally:
+        with _limits:
+            _limiting -= 1
+            if _limiting == 0:
+                _pools.before.restore_original_limits()
+
+
 def python_command(*words: str) -> list[str]:
     """The command that runs this Python."""
     return [sys.executable, "-P", *words]

@@ -11,9 +11,11 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import RigidTransform, Rotation
 
 Array = NDArray[np.float64]
+
+_SMALL_RAD = 1e-3
+"""Angle below which series replace quotients that cancel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +81,7 @@ class SE3:
             )
         if not (np.linalg.det(block) > 0).all():
             raise ValueError("a pose matrix got a reflection (determinant -1), which is no pose")
-        rotation = Rotation.from_matrix(block)
-        return cls(rotation.as_quat(canonical=True, scalar_first=True), matrix[..., :3, 3])
+        return cls(_quaternion(block), matrix[..., :3, 3])
 
     @classmethod
     def exp(cls, tangent: ArrayLike) -> Self:
@@ -88,11 +89,20 @@ class SE3:
         tangent = np.asarray(tangent, dtype=np.float64)
         if tangent.shape[-1:] != (6,):
             raise ValueError(f"a tangent is (..., 6) = (v, w), got {tangent.shape}")
-        # scipy wants the rotation first.
-        coordinates = np.concatenate([tangent[..., 3:], tangent[..., :3]], axis=-1)
-        transform = RigidTransform.from_exp_coords(coordinates)
-        quaternion = transform.rotation.as_quat(canonical=True, scalar_first=True)
-        return cls(quaternion, transform.translation)
+        vector = tangent[..., 3:]
+        angle = np.linalg.norm(vector, axis=-1, keepdims=True)
+        quaternion = np.concatenate(
+            [np.cos(angle / 2), np.sinc(angle / 2 / np.pi) / 2 * vector], -1
+        )
+        square = angle * angle
+        # 1 - cos cancels for small angles, and so does angle - sin: then their series are used.
+        small, safe = angle < _SMALL_RAD, np.where(angle < _SMALL_RAD, 1.0, angle)
+        first = 2 * (np.sin(safe / 2) / safe) ** 2
+        first = np.where(small, 0.5 - square / 24, first)
+        second = np.where(small, 1 / 6 - square / 120, (safe - np.sin(safe)) / safe**3)
+        once = np.cross(vector, tangent[..., :3])
+        shift = tangent[..., :3] + first * once + second * np.cross(vector, once)
+        return cls(quaternion, shift)
 
     @classmethod
     def stack(cls, poses: Sequence["SE3"]) -> Self:
@@ -187,12 +197,17 @@ class SE3:
 
     def log(self) -> Array:
         """(..., 6) = (v, w) with |w| <= pi, the inverse of `exp`."""
-        transform = RigidTransform.from_components(self.translation_m, self._rotation())
-        coordinates = transform.as_exp_coords()
-        return np.concatenate([coordinates[..., 3:], coordinates[..., :3]], axis=-1)
-
-    def _rotation(self) -> Rotation:
-        return Rotation.from_quat(self.rotation_wxyz, scalar_first=True)
+        w, v = np.split(self.rotation_wxyz, [1], -1)
+        v = np.where(w < 0, -v, v)
+        sine = np.linalg.norm(v, axis=-1, keepdims=True)
+        angle = 2 * np.arctan2(sine, np.abs(w))
+        vector = np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 2) * v
+        small, safe = angle < _SMALL_RAD, np.where(angle < _SMALL_RAD, 1.0, angle)
+        second = (1 - safe / 2 / np.tan(safe / 2)) / safe**2
+        second = np.where(small, 1 / 12 + angle**2 / 720, second)
+        once = np.cross(vector, self.translation_m)
+        shift = self.translation_m - once / 2 + second * np.cross(vector, once)
+        return np.concatenate([shift, vector], -1)
 
 
 def pose_to_dict(pose: SE3 | None) -> dict[str, object] | None:
@@ -236,11 +251,29 @@ def average_poses(poses: SE3) -> SE3:
         if weight.sum() <= 0:  # poses near in metres and poses near in radians are disjoint
             return mean
         translation = weight @ poses.translation_m / weight.sum()
-        rotation = poses._rotation().mean(weight).as_quat(canonical=True, scalar_first=True)
+        rotation = _dominant(np.einsum("n,ni,nj", weight, *[poses.rotation_wxyz] * 2))
         before, mean = mean, SE3(rotation, translation)
         if max(pose_distance(before, mean)) < 1e-12:
             break
     return mean
+
+
+def _quaternion(matrix: Array) -> Array:
+    """(..., 4) of the rotations nearest to matrices (..., 3, 3) (Bar-Itzhack, JGCD 2000)."""
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(matrix, (-2, -1), (0, 1))
+    rows = [
+        [a + e + i, h - f, c - g, d - b],
+        [h - f, a - e - i, b + d, c + g],
+        [c - g, b + d, e - a - i, f + h],
+        [d - b, c + g, f + h, i - a - e],
+    ]
+    return _dominant(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
+
+
+def _dominant(matrix: Array) -> Array:
+    """(..., 4) eigenvectors of the largest eigenvalues of (..., 4, 4), with w >= 0."""
+    vector = np.linalg.eigh(matrix)[1][..., -1]
+    return np.where(vector[..., :1] < 0, -vector, vector)
 
 
 def _quaternion_product(a: Array, b: Array) -> Array:

@@ -131,12 +131,12 @@ def scatter(errors: np.ndarray, covariances: np.ndarray) -> float:
     they are without it.
     """
     from scipy.optimize import brentq
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     values, axes = np.linalg.eigh(covariances)
     values = np.maximum(values, 1e-18)
     squares = np.einsum("nji,nj->ni", axes, errors) ** 2
-    limit = float(chi2.ppf(0.9, 3))
+    limit = float(chdtri(3, 0.1))
 
     def excess(sigma: float) -> float:
         distances = (squares / (values + sigma**2)).sum(1)

@@ -9,6 +9,7 @@ from evercal.learning.fit_acceptance import fit_acceptance
 from evercal.mapping.build import Adjusted, MapOptions, build_map
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.processes import one_product_thread
 from evercal.progress import OnProgress
 from evercal.recordings import posed_recording
 from evercal.recordings.frame import (
@@ -53,6 +54,7 @@ class LearnReport:
     """Size of the networks; 0 for a map."""
 
 
+@one_product_thread()
 def learn_scene(
     recording: Recording,
     contents: MapContents,

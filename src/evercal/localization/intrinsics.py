@@ -4,13 +4,13 @@ A stated focal length is a prior and not a fact. The landmarks of an image measu
 together with the pose, to a thousandth. Where they contradict the prior, the prior gives way.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit, logit
 
 from evercal.errors import InputError
 from evercal.geometry import Camera, UncertainPose
@@ -117,7 +117,9 @@ class Prior:
             _log_density(change, self.scale * covariance + np.diag(sigma.variances(camera)))
             for sigma in (self.sigma, SAME_MODEL)
         )
-        return float(expit(logit(self.sigma.other_camera) + other - own))
+        before = self.sigma.other_camera
+        odds = before / (1 - before) * math.exp(min(max(other - own, -700.0), 700.0))
+        return odds / (1 + odds)
 
 
     def decided(

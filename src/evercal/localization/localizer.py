@@ -50,6 +50,7 @@ from evercal.localization.query import (
 from evercal.localization.repetition import displaced
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
+from evercal.processes import one_product_thread
 from evercal.recordings.images import as_rgb
 
 _ALONG_FOCAL = np.eye(INTRINSICS)[0]
@@ -104,8 +105,13 @@ class Localizer:
         self, image: np.ndarray, camera: Camera | None = None
     ) -> tuple[PoseEstimate, Hypothesis]:
         """`localize`, and the pose in the map's frame, for tracking."""
-        began = time.perf_counter()
-        image, contents = as_rgb(image), self.contents
+        with one_product_thread():
+            return self._located(as_rgb(image), camera)
+
+    def _located(
+        self, image: np.ndarray, camera: Camera | None
+    ) -> tuple[PoseEstimate, Hypothesis]:
+        began, contents = time.perf_counter(), self.contents
         cameras = cameras_in_scenes(camera, image, contents.scenes)
         query = Query(
             image,
