@@ -13,8 +13,6 @@ chance. The last counts the inliers, as if no more landmarks had been searched t
 unobstructed image. A hand before the lens lowers the first factor alone.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from evercal.geometry import SE3, UncertainPose, pose_distance
@@ -89,15 +87,18 @@ def in_base(
     if hypothesis.refined is None:
         return estimate, ()
 
-    def moved(covariance: np.ndarray, **frame: object) -> np.ndarray:
-        pose = UncertainPose(wide.pose, covariance)
-        return replace(scene.frame, base_covariance=None, **frame).to_base(pose).covariance
+    slope, refined = scene.frame.slope, hypothesis.refined
 
-    scale = np.trace(wide.covariance) / np.trace(hypothesis.refined.pose.covariance)
-    exact, nothing = (0.0, 0.0), np.zeros((6, 6))
-    lens = moved(scale * hypothesis.refined.by_intrinsics, pose_sigma=exact, frame_sigma=exact)
-    view = moved(wide.covariance, pose_sigma=exact, frame_sigma=exact) - lens
-    poses, stated = moved(nothing, frame_sigma=exact), moved(nothing, pose_sigma=exact)
+    def moved(covariance: np.ndarray) -> np.ndarray:
+        return slope @ covariance @ slope.T
+
+    scale = np.trace(wide.covariance) / np.trace(refined.pose.covariance)
+    lens = moved(scale * refined.by_intrinsics)
+    view = moved(wide.covariance) - lens
+    poses, stated = (
+        moved(np.diag(np.repeat(np.square(sigma), 3)))
+        for sigma in (scene.frame.pose_sigma, scene.frame.frame_sigma)
+    )
     frame = estimate.covariance - view - lens - poses - stated
     return estimate, (
         CovarianceTerm("view", view),

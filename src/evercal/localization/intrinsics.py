@@ -121,7 +121,6 @@ class Prior:
         odds = before / (1 - before) * math.exp(min(max(other - own, -700.0), 700.0))
         return odds / (1 + odds)
 
-
     def decided(
         self, camera: Camera, change: Array, covariance: Array
     ) -> tuple[float, Array | None]:

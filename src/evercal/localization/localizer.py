@@ -108,9 +108,7 @@ class Localizer:
         with one_product_thread():
             return self._located(as_rgb(image), camera)
 
-    def _located(
-        self, image: np.ndarray, camera: Camera | None
-    ) -> tuple[PoseEstimate, Hypothesis]:
+    def _located(self, image: np.ndarray, camera: Camera | None) -> tuple[PoseEstimate, Hypothesis]:
         began, contents = time.perf_counter(), self.contents
         cameras = cameras_in_scenes(camera, image, contents.scenes)
         query = Query(
@@ -221,6 +219,7 @@ class Localizer:
         start: SE3,
         change: NDArray[np.floating],
         coarse: bool = True,
+        least: float = 0.0,
     ) -> Hypothesis | None:
         """A pose map_from_camera, refined by landmarks; see `align_pose`."""
         height, width = query.grey.shape
@@ -234,6 +233,7 @@ class Localizer:
             Prior(query.priors[candidate.scene], scene.covariance_scale, scene.shared_px),
             change,
             coarse,
+            least,
         )
         if aligned is None:
             return None
@@ -315,7 +315,8 @@ class Localizer:
                 yield replace(left_over, matches=best.matches)
         for step in self.slips(best):
             start = displaced(pose, step)
-            rival = self.aligned(query, best.candidate, camera, start, change, coarse=False)
+            least = self.options.rival_matched * best.matched / best.expected
+            rival = self.aligned(query, best.candidate, camera, start, change, False, least)
             if rival is not None:
                 yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
 

@@ -100,7 +100,12 @@ def minimise(
     count = 6 if variances is None else 6 + INTRINSICS
     (rotation, position), best = start, None
     change = np.zeros(INTRINSICS) if change is None else change
-    now, moved, prior, white = changed_camera(camera, change), change, np.zeros(0), observed.whitening
+    now, moved, prior, white = (
+        changed_camera(camera, change),
+        change,
+        np.zeros(0),
+        observed.whitening,
+    )
     for _ in range(max(iterations, 1)):
         raw, slope = linearise(
             observed.pixels, observed.points_m, rotation, position, now, count > 6

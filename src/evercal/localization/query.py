@@ -29,7 +29,7 @@ class Attempt(NamedTuple):
 class LocalizeOptions:
     """How an image is located."""
 
-    candidates: int = 3
+    candidates: int = 2
     """Scenes that are tried per image, at most."""
     attempts: tuple[Attempt, ...] = (Attempt(12, 4), Attempt(12, 2), Attempt(48, 1))
     """Until a pose is accepted. The third is for promising images."""
@@ -43,6 +43,8 @@ class LocalizeOptions:
     """Other scenes are not tried after a pose with this many times the threshold of support."""
     rival_px: float = 16.0
     """A second pose is sought among matches that the first one misses by more than this, pixels."""
+    rival_matched: float = 0.5
+    """A displaced pose is given up if a smaller share of landmarks matches, relative to the pose."""
     climbs: int = 5
     """Poses whose rivals are tried, at most."""
     clear_strength: float = 0.8
@@ -51,7 +53,7 @@ class LocalizeOptions:
     """Keyframes of a scene that an image is matched and aligned to."""
     retrieval_stride: int = 4
     """Patches of every n-th row and column vote for the proposed keyframes."""
-    votes: float = 0.2
+    votes: float = 0.5
     """Scenes with a smaller share of the best scene's votes are not tried."""
     pnp: PnpOptions = field(default_factory=PnpOptions)
     """RANSAC settings of the first pose."""
@@ -153,6 +155,7 @@ class Hypothesis:
     """Keyframes that it was found with; None where alignment failed."""
     matches: Matches | None = None
     """All matches; None where alignment failed."""
+
     @property
     def inliers(self) -> int:
         """Landmarks that agree with the pose."""

@@ -203,7 +203,8 @@ class Solution:
 
 class HostBlock(NamedTuple):
     """The landmarks of one host frame; they depend on it, on the frames that see them, and on the
-    intrinsics."""
+    intrinsics.
+    """
 
     landmarks: Index
     """(a,)."""

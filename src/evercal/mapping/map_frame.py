@@ -99,14 +99,21 @@ class MapFrame:
         covariance = map_from_camera.covariance + own
         pose = self._undo(map_from_camera.pose)
         if self.similarity is not None:
-            slope = np.eye(6)
-            slope[:3, :3] *= self.similarity.scale
-            slope[:3, :3] = slope[:3, :3] @ self.similarity.base_from_map.rotation_matrix()
-            pose, covariance = self.similarity.pose(pose), slope @ covariance @ slope.T
+            pose = self.similarity.pose(pose)
+            covariance = self.slope @ covariance @ self.slope.T
         estimate = UncertainPose(pose, covariance)
         if self.base_covariance is None:
             return estimate
         return UncertainPose(SE3.identity(), self.base_covariance) @ estimate
+
+    @property
+    def slope(self) -> Array:
+        """(6, 6) derivative of an answer by a pose among the landmarks."""
+        slope = np.eye(6)
+        if self.similarity is not None:
+            rotation = self.similarity.base_from_map.rotation_matrix()
+            slope[:3, :3] = self.similarity.scale * rotation
+        return slope
 
     def from_base(self, base_from_camera: SE3) -> SE3:
         """Camera pose among the landmarks: the inverse of `to_base`."""

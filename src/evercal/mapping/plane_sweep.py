@@ -200,9 +200,9 @@ class _SourceView:
         return weight * (slope * residual).sum(1), weight * (slope * slope).sum(1)
 
 
-def peak(similarity: Array, row: NDArray[np.integer], column: NDArray[np.integer]) -> tuple[
-    Array, Array
-]:
+def peak(
+    similarity: Array, row: NDArray[np.integer], column: NDArray[np.integer]
+) -> tuple[Array, Array]:
     """The most similar cell of the 3x3 around a cell, to a fraction of a cell.
 
     The similarity (n, h, w) is that of n cells to all cells of another view; rows and columns (n,)
