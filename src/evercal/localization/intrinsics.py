@@ -119,7 +119,6 @@ class Prior:
         )
         return float(expit(logit(self.sigma.other_camera) + other - own))
 
-
     def decided(
         self, camera: Camera, change: Array, covariance: Array
     ) -> tuple[float, Array | None]:

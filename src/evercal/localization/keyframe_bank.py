@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from evercal.features.encoder import Encoder
 from evercal.features.views import ideal_cell_pixels
+from evercal.localization.repetition import pattern_steps
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.patches import Patches, cut_patches, image_pyramid, to_level
-from evercal.localization.repetition import pattern_steps
 from evercal.mapping.scene_map import MapContents
 
 ALIGNED_LEVELS = 2

@@ -81,6 +81,7 @@ class Matcher:
             query.similar[key] = nearest, similarity[np.arange(len(rows)), nearest]
         return query.similar[key]
 
+
 def _grid(query: Query, stride: int) -> NDArray[np.int64]:
     """Indices (n,) of the patches of every `stride`-th row and column."""
     rows, columns = query.features.shape[:2]

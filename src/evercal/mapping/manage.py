@@ -94,7 +94,7 @@ def merge_maps(
     maps = [_incoming(Path(other)) for other in others]
     contents = store.contents
     if is_new:
-        contents = MapStore.open(Path(others[0])).contents.empty().to(contents.device)
+        contents = MapStore.open(Path(others[0])).contents.empty()
     first = maps[0][0] if is_new else Manifest.read(store.root)
     incoming: dict[str, _Incoming] = {}
     kept = {scene.name: i for i, scene in enumerate(store.contents.scenes)}
