@@ -157,12 +157,12 @@ class Localizer:
         side = self.options.middle_px
         top, left = (max(whole - side, 0) // 2 for whole in grey.shape)
         middle = grey[top : top + side, left : left + side]
-        turned = [np.ascontiguousarray(np.rot90(middle, -turns)) for turns in range(4)]
-        similar = [self._matcher.similarity(self.contents.encoder(image)) for image in turned]
+        encoder, views = self.contents.encoder, [turned(middle, turns) for turns in range(4)]
+        similar = [self._matcher.similarity(encoder(view)) for view in views]
         turns = int(np.argmax(similar))
-        if not turns:
+        if similar[turns] <= similar[0] + self.options.clear_turn:
             return query
-        features = self.contents.encoder(np.ascontiguousarray(np.rot90(grey, -turns)))
+        features = encoder(turned(grey, turns))
         return replace(query, features=features, turns=turns, similar={})
 
     def _tried(self, query: Query, attempt: Attempt, cameras: Sequence[Camera]) -> Hypothesis:

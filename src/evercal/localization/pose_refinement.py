@@ -100,12 +100,8 @@ def minimise(
     count = 6 if variances is None else 6 + INTRINSICS
     (rotation, position), best = start, None
     change = np.zeros(INTRINSICS) if change is None else change
-    now, moved, prior, white = (
-        changed_camera(camera, change),
-        change,
-        np.zeros(0),
-        observed.whitening,
-    )
+    now, moved, prior, ahead = changed_camera(camera, change), change, np.zeros(0), {}
+    white = observed.whitening
     for _ in range(max(iterations, 1)):
         raw, slope = linearise(
             observed.pixels, observed.points_m, rotation, position, now, count > 6
@@ -117,6 +113,7 @@ def minimise(
         squares = residual[0] * residual[0] + residual[1] * residual[1]
         variance = robust_variance(squares)
         if best is not None and variance > _DIVERGED * best.variance:
+            ahead = {}
             break
         root = 1 / np.sqrt(1 + squares / variance)
         rows = (slope * root).reshape(count, -1)
@@ -133,13 +130,12 @@ def minimise(
             moved[0] = np.clip(moved[0], -_FOCAL_CHANGE, _FOCAL_CHANGE)
         position = position + rotation @ step[:3]
         rotation = rotation @ cv2.Rodrigues(step[3:6])[0]
+        ahead = {"rotation": rotation, "position": position, "change": moved}
+        ahead["gradient"] = gradient + data @ step
         if step @ data @ step + prior @ step[6:] ** 2 < _CONVERGED * variance:
-            gradient = gradient + data @ step
-            best = replace(
-                best, rotation=rotation, position=position, change=moved, gradient=gradient
-            )
             break
     assert best is not None, "at least one iteration"
+    best = replace(best, **ahead)
     return replace(best, camera=changed_camera(camera, best.change))
 
 
@@ -217,8 +213,8 @@ def linearise(
     return np.stack([u + camera.cx - pixels[:, 0], v + camera.cy - pixels[:, 1]]), slope
 
 
-def in_parent_axes(rotation: Array, covariance: Array) -> Array:
+def in_parent_axes(rotation: Array, covariance: Array) -> NDArray[np.float64]:
     """Covariance (6, 6) with its translation part rotated from camera axes to the parent's."""
     slope = np.eye(6)
     slope[:3, :3] = rotation
-    return slope @ covariance @ slope.T
+    return np.asarray(slope @ covariance @ slope.T, np.float64)

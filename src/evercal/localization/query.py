@@ -35,6 +35,8 @@ class LocalizeOptions:
     """Until a pose is accepted. The third is for promising images."""
     middle_px: int = 160
     """Side of the middle of an image that its quarter turn is judged by, at working size."""
+    clear_turn: float = 0.03
+    """Gain in similarity of a turned image; less may be noise where something covers the middle."""
     aligned_inliers: int = 12
     """Poses with fewer PnP inliers are not aligned."""
     promising_inliers: int = 16

@@ -71,8 +71,9 @@ def project_surface(
     """Predict positions and warps of patches in an image.
 
     A patch is visible if it lies in front of the camera, inside the image by a margin, and its size
-    is similar to that in its keyframe. At most `most` are taken, evenly spread. Points (3, n, 3) are those of `Landmarks.surface`, in any
-    frame; rotation and translation lead from there to the camera.
+    is similar to that in its keyframe. At most `most` are taken, evenly spread. Points (3, n, 3)
+    are those of `Landmarks.surface`, in any frame; rotation and translation lead from there to the
+    camera.
     """
     centre = points[0] @ rotation.T + translation_m
     visible = np.flatnonzero(centre[:, 2] > NEAREST_M)

@@ -122,19 +122,20 @@ def align_patches(
     affines = affines.astype(np.float32)
     # One array for each coordinate: interleaved ones take three times as long to add.
     right, down = affines[:, 0] @ _OFFSETS.T, affines[:, 1] @ _OFFSETS.T
-    centre, (x, y) = centres.astype(np.float32), np.empty((2, *right.shape), np.float32)
+    centre, x, y = centres.astype(np.float32), np.empty_like(right), np.empty_like(down)
+    product, count = np.zeros((len(centre), 3), np.float32), right.shape[1]
     for passed in range(iterations + 1):
         values = _sample(
             image, np.add(right, centre[:, :1], out=x), np.add(down, centre[:, 1:], out=y)
         )
         # Templates have zero mean, so that the mean of the values drops out of products with them.
-        square = np.einsum("np,np->n", values, values) / values.shape[1]
+        square = np.einsum("np,np->n", values, values) / count
         deviation = np.sqrt(np.maximum(square - (values @ _MEAN) ** 2, 0)) + _FLAT
         product = np.einsum("nkp,np->nk", patches.templates, values) / deviation[:, None]
         if passed < iterations:
             step = (product[:, :2] - patches.rest).clip(-_LONGEST_STEP, _LONGEST_STEP)
             centre = centre - (affines @ step[..., None])[..., 0]
-    return centre, product[:, 2] / values.shape[1]
+    return centre, product[:, 2] / count
 
 
 def align_down(

@@ -122,9 +122,8 @@ def inverse_depths(
         similarity = np.partition(similarity, -SEEN_BY, 0)[-SEEN_BY:]
     score = similarity.mean(0)
     # The mean of a cell's neighbours, without those beyond the border.
-    volume, kind = score.reshape(*view.grid, PLANES), {"borderType": cv2.BORDER_CONSTANT}
-    count = cv2.boxFilter(np.ones(view.grid, np.float32), -1, (3, 3), normalize=False, **kind)
-    near = cv2.boxFilter(volume, -1, (3, 3), normalize=False, **kind) / count[..., None]
+    volume = score.reshape(*view.grid, PLANES)
+    near = _sums(volume) / _sums(np.ones(view.grid, np.float32))[..., None]
     score = (volume + SMOOTHING * (near - volume)).reshape(-1, PLANES)
     inverse = planes[score.argmax(1)]
     for _ in range(2):
@@ -135,6 +134,12 @@ def inverse_depths(
         step = (gradient / hessian).clip(-0.1 / scale, 0.1 / scale)
         inverse = (inverse + step).clip(least, most).astype(np.float32)
     return inverse
+
+
+def _sums(values: Array) -> Array:
+    """Sums over the 3x3 around each cell of (h, w, ...)."""
+    kind = cv2.BORDER_CONSTANT
+    return np.asarray(cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=kind), float)
 
 
 class _SourceView:
