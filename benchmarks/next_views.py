@@ -81,9 +81,8 @@ def seen_covariance(base_from_camera: SE3, points_m: NDArray[np.floating]) -> ND
     pixels = camera.project(base_from_camera.inverse().apply(points_m))
     visible = ((pixels >= 0) & (pixels <= (camera.width - 1, camera.height - 1))).all(1)
     at = base_from_camera.rotation_matrix(), base_from_camera.translation_m
-    slopes = linearise(pixels[visible], points_m[visible], *at, camera)[1]
-    slopes = slopes.transpose(2, 0, 1).reshape(-1, 6)
-    return np.linalg.inv(slopes.T @ slopes + 1e-9 * np.eye(6)) * PIXEL_PX**2
+    slopes = linearise(pixels[visible], points_m[visible], *at, camera)[1].reshape(6, -1)
+    return np.linalg.inv(slopes @ slopes.T + 1e-9 * np.eye(6)) * PIXEL_PX**2
 
 
 def random_order(draw: Trial) -> NDArray[np.int64]:

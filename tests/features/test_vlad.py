@@ -87,3 +87,14 @@ def test_every_image_is_paired_with_the_most_similar_ones() -> None:
     pairs = similar_pairs(images, Vlad(features(4, 8, 1)), 1)
     assert pairs == [(0, 3), (1, 4), (2, 5)]
     assert similar_pairs(images[:2], Vlad(features(4, 8, 1)), 5) == [(0, 1)]
+
+
+@pytest.mark.parametrize("partners", [1, 3, 20])
+def test_pairs_are_those_of_a_search_one_by_one(partners: int) -> None:
+    images, vlad = [features(30, 8, seed) for seed in range(12)], Vlad(features(4, 8, 1))
+    vectors, expected = [vlad(image) for image in images], set()
+    for i, one in enumerate(vectors):
+        others = [j for j in range(len(images)) if j != i]
+        others.sort(key=lambda j: -float(one @ vectors[j]))
+        expected |= {tuple(sorted((i, j))) for j in others[:partners]}
+    assert similar_pairs(images, vlad, partners) == sorted(expected)

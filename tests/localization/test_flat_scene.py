@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from evercal.geometry import SE3, Camera
+from evercal.geometry import Camera
 from evercal.learning.fit_acceptance import LEAST_SHARED_PX
 from evercal.localization.intrinsics import (
     NOT_STATED,
@@ -32,12 +32,13 @@ def answer(prior: IntrinsicsPrior, longer: float, tilt: float) -> tuple[float, f
     rays, normal = camera.unproject(pixels), np.array([np.sin(tilt), 0, np.cos(tilt)])
     points = rays * (2 / (rays @ normal))[:, None]
     seen = Observed(
-        pixels + rng.normal(0, 0.05, pixels.shape), points, np.tile(10 * np.eye(2), (400, 1, 1))
+        pixels + rng.normal(0, 0.05, pixels.shape), points, np.repeat(10 * np.eye(2)[..., None], 400, 2)
     )
     own = Prior(prior, 1.6, LEAST_SHARED_PX)
-    refined = self_calibrated(seen, CAMERA, SE3.identity(), np.zeros(5), own)
+    refined = self_calibrated(seen, CAMERA, (np.eye(3), np.zeros(3)), np.zeros(5), own)
     for _ in range(3):
-        refined = self_calibrated(seen, CAMERA, refined.pose.pose, refined.change, own)
+        at = refined.pose.pose.rotation_matrix(), refined.pose.pose.translation_m
+        refined = self_calibrated(seen, CAMERA, at, refined.change, own)
     sigma = float(np.sqrt(np.trace(refined.pose.covariance[:3, :3]) / 3))
     return float(np.linalg.norm(refined.pose.pose.translation_m)), sigma
 

@@ -8,10 +8,9 @@ from threading import Barrier
 
 import numpy as np
 import pytest
-import torch
-from torch import Tensor, nn
+from numpy.typing import NDArray
 
-from evercal.features.vlad import vlad_for
+from evercal.features.encoder import Encoder
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.mapping.scene_map import MapContents
 
@@ -24,10 +23,9 @@ def several(hall_map: MapContents) -> MapContents:
     return MapContents(hall_map.encoder, hall_map.short_side, scenes)
 
 
-def features(seed: int, contents: MapContents) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    drawn = torch.randn(300, contents.encoder.width, generator=generator)
-    return nn.functional.normalize(drawn, dim=1)
+def features(seed: int, contents: MapContents) -> NDArray[np.float32]:
+    drawn = np.random.default_rng(seed).normal(size=(300, contents.encoder.width))
+    return (drawn / np.linalg.norm(drawn, axis=1, keepdims=True)).astype(np.float32)
 
 
 def test_retrieval_ranks_the_keyframes_of_all_scenes(several: MapContents) -> None:
@@ -36,8 +34,8 @@ def test_retrieval_ranks_the_keyframes_of_all_scenes(several: MapContents) -> No
     assert descriptors is not None
     for seed in range(5):
         query = features(seed, several)
-        vlad = vlad_for(several.encoder)(query)
-        similarity = [float(row.float() @ vlad) for row in descriptors] * 3
+        vlad = several.encoder.vlad()(query)
+        similarity = [float(row.astype(np.float32) @ vlad) for row in descriptors] * 3
         ranked = bank.retrieve(query).tolist()
         assert sorted(ranked) == list(range(21))
         values = [similarity[i] for i in ranked]
@@ -67,27 +65,26 @@ def test_landmarks_project_to_their_pixels(hall_map: MapContents) -> None:
         np.testing.assert_array_equal(loaded.position_m, pose.translation_m)
         cells = bank.load(i).cells
         assert len(cells.points_m) == len(cells.features) == 30 * 40
-        assert len(loaded.depth_noise) == len(landmarks) == len(loaded.patches[0].intensity)
+        assert len(loaded.depth_noise) == len(landmarks) == len(loaded.patches[0].templates)
 
 
-class Counted(nn.Module):
+class Counted(Encoder):
     """An encoder that counts its calls and can wait for another thread in them."""
 
-    def __init__(self, encoder: nn.Module, barrier: Barrier | None = None) -> None:
-        super().__init__()
-        self.encoder, self.barrier, self.calls = encoder, barrier, 0
-        self.stride, self.width = encoder.stride, encoder.width
+    def __init__(self, encoder: Encoder) -> None:
+        super().__init__(encoder.function, encoder.name, encoder.data)
+        self.barrier: Barrier | None = None
+        self.calls = 0
 
-    def forward(self, grey: Tensor) -> Tensor:
+    def __call__(self, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
         self.calls += 1
         if self.barrier is not None:
             self.barrier.wait()
-        return self.encoder(grey)
+        return super().__call__(grey)
 
 
-def counted(hall_map: MapContents, barrier: Barrier | None = None) -> tuple[KeyframeBank, Counted]:
-    assert isinstance(hall_map.encoder, nn.Module)
-    encoder = Counted(hall_map.encoder, barrier)
+def counted(hall_map: MapContents) -> tuple[KeyframeBank, Counted]:
+    encoder = Counted(hall_map.encoder)
     return KeyframeBank(replace(hall_map, encoder=encoder), 9), encoder
 
 
@@ -102,7 +99,8 @@ def test_keyframes_are_encoded_once_and_on_demand(hall_map: MapContents) -> None
 
 def test_threads_load_different_keyframes_at_once(hall_map: MapContents) -> None:
     # The barrier breaks if the second thread waits until the first one has finished.
-    bank, _ = counted(hall_map, Barrier(2, timeout=20))
+    bank, encoder = counted(hall_map)
+    encoder.barrier = Barrier(2, timeout=20)
     with ThreadPoolExecutor(2) as pool:
         cells = list(pool.map(lambda i: bank.load(i).cells, (0, 1)))
-    assert not torch.equal(cells[0].features, cells[1].features)
+    assert not np.array_equal(cells[0].features, cells[1].features)

@@ -360,8 +360,7 @@ def test_a_wider_attempt_locates_what_the_first_rejects(
 ) -> None:
     """One wrong keyframe is proposed first; the second attempt proposes all."""
     narrow = LocalizeOptions(
-        quick=(Attempt(1, 8), Attempt(1, 8, unknown_camera=True)),
-        thorough=(Attempt(48, 1),),
+        attempts=(Attempt(1, 8), Attempt(48, 1)),
         keyframes=1,
         promising_inliers=0,
     )

@@ -11,9 +11,8 @@ import pytest
 from evercal.geometry import Camera
 from evercal.learning.fit_acceptance import LEAST_SHARED_PX, shared_px
 from evercal.localization import intrinsics
-from evercal.localization.intrinsics import Prior
+from evercal.localization.intrinsics import MeasuredIntrinsics, Prior
 from evercal.localization.localizer import Localizer
-from evercal.localization.pose_refinement import MeasuredIntrinsics
 from evercal.mapping.scene_map import SHARED_PX
 
 if TYPE_CHECKING:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3, UncertainPose, pose_distance
-from evercal.localization import tracking
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker, TrackOptions
@@ -78,7 +77,7 @@ def test_where_a_period_of_texture_is_in_reach_the_frame_is_located_from_nothing
     hall_map: MapContents, views: list[tuple[np.ndarray, SE3]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     step = np.array([[0.05, 0.0, 0.0]])
-    monkeypatch.setattr(tracking, "pattern_steps", lambda *_: step)
+    monkeypatch.setattr(Localizer, "slips", lambda *_: step)
     tracker, image = Tracker(Localizer(hall_map)), views[0][0]
     # Without a known motion 0.05 m are possible in a fifteenth of a second, with one in 0.2 s.
     stamps = np.cumsum([0, 1 / 15, 1 / 15, 1 / 15, 0.2, 1 / 15])

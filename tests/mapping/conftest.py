@@ -33,8 +33,6 @@ def hall_built(hall: Recording) -> BuiltMap:
 @pytest.fixture(scope="session")
 def scenes(rooms: tuple[Recording, ...]) -> list[SceneMap]:
     """Three scenes with two keyframes each; landmarks, depths and descriptors are random."""
-    import torch
-
     from evercal.geometry import SE3
     from evercal.mapping.keyframes import store_keyframes
     from evercal.mapping.landmarks import Landmarks
@@ -55,9 +53,9 @@ def scenes(rooms: tuple[Recording, ...]) -> list[SceneMap]:
         ]
         keyframes = replace(
             store_keyframes(room.train[:2], 48),
-            inverse_depth=tuple(torch.full((48,), 0.5 + i).half() for _ in marks),
+            inverse_depth=tuple(np.full(48, 0.5 + i, np.float16) for _ in marks),
             landmarks=tuple(marks),
-            descriptors=torch.from_numpy(rng.normal(size=(2, 16))).half(),
+            descriptors=rng.normal(size=(2, 16)).astype(np.float16),
         )
         poses, motion = SE3.exp(rng.normal(size=(5, 6))), SE3.exp(rng.normal(size=6))
         frame = MapFrame(
@@ -86,16 +84,14 @@ def scenes(rooms: tuple[Recording, ...]) -> list[SceneMap]:
 @pytest.fixture
 def make() -> Callable[[Path, Sequence[SceneMap]], MapStore]:
     """Make a store of given scenes with a tiny random encoder and its centroids."""
-    import torch
-
-    from evercal.features.encoder import LocalEncoder
-    from evercal.features.vlad import vlad_for
     from evercal.mapping.store import MapStore
 
+    from ..encoders import tiny_encoder
+
     def store(root: Path, scenes: Sequence[SceneMap]) -> MapStore:
-        torch.manual_seed(0)
-        encoder = LocalEncoder(stem=(4, 4), inner=8, blocks=1, width=8).half().float().eval()
-        vlad_for(encoder, [torch.nn.functional.normalize(torch.randn(200, 8), dim=1)])
+        encoder, rows = tiny_encoder(), np.random.default_rng(0).normal(size=(200, 8))
+        unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+        encoder.vlad([unit.astype(np.float32)])
         store = MapStore.create(root, encoder, 48)
         for scene in scenes:
             store.commit(scene, {"scene": scene.name, "seconds": 1.5})

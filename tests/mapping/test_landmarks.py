@@ -103,6 +103,20 @@ def test_landmarks_behind_outside_or_too_slanted_are_not_visible() -> None:
     assert len(project_surface(mirrored, eye, np.zeros(3), PLAIN)[0]) == 0
 
 
+@pytest.mark.parametrize("most", [1, 20, 400])
+def test_at_most_so_many_patches_are_evenly_spread(most: int) -> None:
+    surface = on_a_plane(DISTORTED, np.array([0.15, -0.1, 0.5]), spots()).surface(DISTORTED)
+    surface[1:, ::5] = surface[0, ::5]  # patches without an area are never visible
+    which, *others = project_surface(surface, ROTATION, TRANSLATION, DISTORTED)
+    some, *fewer = project_surface(surface, ROTATION, TRANSLATION, DISTORTED, most)
+    assert 1 <= len(some) <= most
+    assert set(some) <= set(which)
+    for whole, part in zip(others, fewer, strict=True):
+        np.testing.assert_allclose(part, whole[np.isin(which, some)], atol=1e-12)
+    assert np.diff(some).max(initial=0) <= 3 * max(1, surface.shape[1] / most)
+    assert most < len(which) or len(some) == len(which)
+
+
 def test_slopes_of_a_plane_are_exact_inside() -> None:
     grid, cell = (30, 40), 8.0
     row, column = np.mgrid[0:30, 0:40]

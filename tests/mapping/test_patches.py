@@ -93,11 +93,11 @@ def test_gain_and_offset_have_no_effect() -> None:
     brighter = align_patches(cut_patches(plain, at), 0.4 * other + 90, truth + 0.7, affines, 8)
     for a, b in zip(reference, brighter, strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)
-    patches = cut_patches(3 * plain - 7, at)
-    np.testing.assert_allclose(patches.intensity, cut_patches(plain, at).intensity, atol=1e-3)
-    np.testing.assert_allclose(patches.intensity.mean(1), 0, atol=1e-4)
-    np.testing.assert_allclose(patches.intensity.std(1), 1, atol=1e-3)
-    assert patches.intensity.shape == (len(at), SIDE**2)
+    templates = cut_patches(3 * plain - 7, at).templates
+    np.testing.assert_allclose(templates, cut_patches(plain, at).templates, atol=1e-3)
+    np.testing.assert_allclose(templates.mean(2), 0, atol=1e-4)
+    np.testing.assert_allclose(templates[:, 2].std(1), 1, atol=1e-3)
+    assert templates.shape == (len(at), 3, SIDE**2)
 
 
 def test_patches_of_another_image_do_not_fit() -> None:
@@ -107,10 +107,11 @@ def test_patches_of_another_image_do_not_fit() -> None:
     unrelated = image(picture(77), np.eye(2), np.zeros(2))
     _, correlation = align_patches(patches, unrelated, at, affines, 12)
     assert np.mean(correlation > 0.8) < 0.2
-    blank = np.full((HEIGHT, WIDTH), 90, np.float32)
-    aligned, correlation = align_patches(patches, blank, at, affines, 4)
-    assert np.abs(correlation).max() < 0.1
-    assert np.isfinite(aligned).all()
+    for level in (90, 200, 252, 254.75):
+        blank = np.full((HEIGHT, WIDTH), level, np.float32)
+        aligned, correlation = align_patches(patches, blank, at, affines, 4)
+        assert np.abs(correlation).max() < 0.1
+        assert np.isfinite(aligned).all()
 
 
 def test_step_of_one_patch_is_that_of_least_squares() -> None:
@@ -199,28 +200,32 @@ def test_whitening_makes_errors_independent() -> None:
     root = rng.normal(size=(20, 2, 2)) / 10
     inverse_hessian = root @ root.transpose(0, 2, 1) + 1e-4 * np.eye(2)
     affines = np.eye(2) + 0.3 * rng.normal(size=(20, 2, 2))
-    white = whitening(affines, inverse_hessian, 0.1, 0.8)
+    white = whitening(affines, inverse_hessian, 0.1, 0.8).transpose(2, 0, 1)
     spread = affines @ inverse_hessian @ affines.transpose(0, 2, 1) + 0.01 * np.eye(2)
     unit = white @ (0.64 * spread) @ white.transpose(0, 2, 1)
     np.testing.assert_allclose(unit, np.broadcast_to(np.eye(2), unit.shape), atol=1e-6)
 
 
-def test_error_along_one_line_is_whitened() -> None:
+def test_whitening_is_the_root_of_the_inverse_covariance() -> None:
+    """Without and with an error along one line."""
     rng = np.random.default_rng(0)
     affines = rng.normal(0, 0.2, (7, 2, 2)) + np.eye(2)
     root = rng.normal(0, 0.3, (7, 2, 2))
     hessian = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(2)
     line = rng.normal(0, 0.5, (7, 2))
-    for i, white in enumerate(whitening(affines, hessian, 0.1, 0.8, line)):
-        spread = affines[i] @ hessian[i] @ affines[i].T + 0.01 * np.eye(2)
-        covariance = 0.64 * spread + np.outer(line[i], line[i])
-        np.testing.assert_allclose(white @ covariance @ white.T, np.eye(2), atol=1e-9)
+    for moved in (None, line):
+        white = whitening(affines, hessian, 0.1, 0.8, moved)
+        for i in range(7):
+            spread = affines[i] @ hessian[i] @ affines[i].T + 0.01 * np.eye(2)
+            covariance = 0.64 * spread + (0 if moved is None else np.outer(line[i], line[i]))
+            root = np.linalg.cholesky(np.linalg.inv(covariance)).T
+            np.testing.assert_allclose(white[:, :, i], root, atol=1e-9)
 
 
 def test_no_pixels_give_no_patches() -> None:
     empty = cut_patches(np.zeros((40, 40), np.float32), np.zeros((0, 2)))
-    assert len(empty.intensity) == 0
-    assert Patches.joined([empty, empty]).intensity.shape == empty.intensity.shape
+    assert len(empty.templates) == 0
+    assert Patches.joined([empty, empty]).templates.shape == empty.templates.shape
 
 
 def test_a_flat_patch_beside_a_corner_has_a_hessian() -> None:

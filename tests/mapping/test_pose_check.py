@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 from evercal.features.encoder import load_encoder
-from evercal.features.vlad import vlad_for
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.mapping.pose_check import (
+    STRIDE,
     MatchedPair,
-    _distinct,
+    _matched,
     _segment_distance,
     check_poses,
     depth_scale,
@@ -41,7 +41,7 @@ def moved(recording: PreparedFrames, changes: dict[int, SE3]) -> PreparedFrames:
 
 
 def detected(recording: PreparedFrames) -> list[int]:
-    pairs = matched_pairs(recording, vlad_for(recording.encoder))
+    pairs = matched_pairs(recording, recording.encoder.vlad())
     check = check_poses(recording, pairs)
     assert len(check.untracked) == 0
     return check.wrong.tolist()
@@ -69,7 +69,7 @@ def test_shifted_and_rotated_frames_are_detected(recording: PreparedFrames) -> N
 
 @pytest.mark.parametrize("scale", [0.1, 8.0])
 def test_depth_scale_is_that_of_the_recording(scale: float, recording: PreparedFrames) -> None:
-    vlad = vlad_for(recording.encoder)
+    vlad = recording.encoder.vlad()
     pairs, scaled = matched_pairs(recording, vlad), moved(recording, {})
     assert depth_scale(recording, pairs) == 1  # as a room is
     poses = recording.poses
@@ -109,19 +109,28 @@ def test_distances_from_segments() -> None:
 
 
 def test_cells_with_a_similar_cell_elsewhere_are_not_distinct() -> None:
-    camera = Camera(64, 8, 50, 50, 31.5, 3.5)
-    similar = torch.full((3, 8), 0.2)
+    camera = Camera(96, 8, 50, 50, 47.5, 3.5)
+    similar = np.full((12, 12), 0.2)
     similar[0, 1] = 0.9
-    similar[1, [1, 2]] = torch.tensor([0.9, 0.89])  # the neighbour shows the same place
-    similar[2, [1, 6]] = torch.tensor([0.9, 0.89])
-    assert _distinct(similar, torch.tensor([1, 1, 1]), camera, 8).tolist() == [True, True, False]
+    similar[STRIDE, [3, 4]] = 0.9, 0.89  # the neighbour shows the same place
+    similar[2 * STRIDE, [6, 11]] = 0.9, 0.89
+    similar[3 * STRIDE, 9] = 0.5
+    features = [similar, np.eye(12)]
+    recording = SimpleNamespace(
+        features=features.__getitem__,
+        encoder=SimpleNamespace(stride=8),
+        cell_camera=lambda _: camera,
+    )
+    pair = _matched(recording, 0, 1)  # type: ignore[arg-type]
+    assert pair.pixels.tolist() == [[11.5, 3.5], [27.5, 3.5]]
+    np.testing.assert_allclose(camera.project(pair.ray), [[3.5, 3.5], [27.5, 3.5]])
 
 
 def test_sift_clears_frames_that_the_encoder_suspects(
     recording: PreparedFrames, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def suspicious(frames: PreparedFrames) -> list[MatchedPair]:
-        pairs = matched_pairs(frames, vlad_for(frames.encoder))
+        pairs = matched_pairs(frames, frames.encoder.vlad())
         shift = np.array([60.0, 0.0])  # the encoder mistakes one square for another
         return [
             replace(p, pixels=p.pixels + shift) if 6 in (p.first, p.second) else p for p in pairs

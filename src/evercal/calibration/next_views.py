@@ -318,7 +318,7 @@ class HostedLandmarks:
         """By the camera's pose (v, 2, 6), and by keyframes and depths (v, 2, N)."""
         visible = self.visible(camera, pose)
         at = self.points_m[visible], pose.rotation_matrix(), pose.translation_m
-        by_pose = linearise(np.zeros((len(visible), 2)), *at, camera)[1].transpose(2, 0, 1)
+        by_pose = linearise(np.zeros((len(visible), 2)), *at, camera)[1].transpose(2, 1, 0)
         host, depth = self.host[visible], self.inverse_depth[visible, None]
         local = self.rays[visible] / depth
         # A motion of the camera moves its points the other way.

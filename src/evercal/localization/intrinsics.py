@@ -37,6 +37,8 @@ _REFINE_STEPS = 10
 """Gauss-Newton steps of pose and intrinsics, at most."""
 _BETTER = 0.7
 """Relative variance below which other intrinsics fit so much better that a linear step is rough."""
+_UNSURE = 0.07
+"""Probability of another camera from which a linear step is too rough to decide."""
 _REACHED = 0.05 * 7.815
 """Probability of another camera at which the 95 % ellipsoid (chi-squared) reaches its pose."""
 
@@ -186,7 +188,8 @@ def self_calibrated(
     step, inverse = own.moved(own.variance / prior.free(camera))
     variance, free = own.variance_after(step), own.change + step[6:]
     doubt, variances = prior.decided(camera, free, variance * inverse[6:, 6:])
-    if variances is not None or variance < _BETTER * own.variance:
+    better = variance < _BETTER * own.variance
+    if variances is not None or better or doubt > _UNSURE:
         best = minimise(observed, camera, start, _REFINE_STEPS, prior.free(camera), free)
         variance, inverse, free = best.variance, inverse_of(best.data), best.change
         doubt, variances = prior.decided(camera, free, variance * inverse[6:, 6:])
@@ -203,7 +206,7 @@ def self_calibrated(
         off = (own.moved(own.variance / other)[0] - own.moved(own.variance / limits)[0])[:6]
         wider = _covariances(own, other)[1] - lens + np.outer(off, off) / prior.scale
         more = min(1.0, doubt / _REACHED) * wider
-        covariance, lens = covariance + more, lens + more / shared
+        covariance, lens = covariance + more, lens + more
     lens = shared * lens
     pose = own.pose(covariance + (1 - 1 / shared) * lens)
     by_lens = in_parent_axes(own.rotation, lens)

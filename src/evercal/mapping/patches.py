@@ -20,6 +20,7 @@ RADIUS = 5
 SIDE = 2 * RADIUS + 1
 _MOST_ROWS = 30_000  # cv2.remap takes maps of up to 32,767 rows
 _FLAT = 1e-3
+_ROUNDING = np.float32(1e-6)  # of the square of a blank patch, in single precision
 _DAMPING = 1e-2
 _LONGEST_STEP = 2.0
 
@@ -130,7 +131,8 @@ def align_patches(
         )
         # Templates have zero mean, so that the mean of the values drops out of products with them.
         square = np.einsum("np,np->n", values, values) / count
-        deviation = np.sqrt(np.maximum(square - (values @ _MEAN) ** 2, 0)) + _FLAT
+        variance = np.maximum(square - (values @ _MEAN) ** 2, _ROUNDING * square)
+        deviation = np.sqrt(variance) + _FLAT
         product = np.einsum("nkp,np->nk", patches.templates, values) / deviation[:, None]
         if passed < iterations:
             step = (product[:, :2] - patches.rest).clip(-_LONGEST_STEP, _LONGEST_STEP)

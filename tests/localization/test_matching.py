@@ -1,0 +1,97 @@
+"""Matches of an image to the keyframes of a map, its quarter turn, and poses aligned from them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evercal.geometry import SE3, pose_distance
+from evercal.localization.intrinsics import OWN
+from evercal.localization.localizer import Localizer, turned
+from evercal.localization.query import Attempt, Candidate, Query
+from evercal.mapping.scene_map import MapContents
+from evercal.recordings import Frame, Recording
+
+KEYFRAMES = Candidate(0, np.arange(3), 2)
+
+
+@pytest.fixture(scope="module")
+def localizer(hall_map: MapContents) -> Localizer:
+    return Localizer(hall_map)
+
+
+@pytest.fixture(scope="module")
+def frame(hall: Recording) -> Frame:
+    return hall.test[7]
+
+
+def truth_of(frame: Frame) -> SE3:
+    assert frame.base_from_camera is not None
+    return frame.base_from_camera
+
+
+def query_of(image: np.ndarray, contents: MapContents) -> Query:
+    return Query(image, contents.encoder.encode(image, 240), 480, [OWN])
+
+
+def test_matches_are_the_most_similar_cells_of_all_keyframes(
+    localizer: Localizer, frame: Frame, hall_map: MapContents
+) -> None:
+    query = query_of(frame.read_image(), hall_map)
+    matches = localizer._matcher.matches(query, KEYFRAMES, frame.camera)
+    loaded = [localizer._bank.load(int(k)).cells for k in KEYFRAMES.keyframes]
+    features = np.concatenate([cells.features for cells in loaded])
+    points = np.concatenate([cells.points_m for cells in loaded])
+    rows, columns = query.features.shape[:2]
+    spots = [(i, j) for i in range(0, rows, 2) for j in range(0, columns, 2)]
+    nearest = [int(np.argmax(features @ query.features[i, j])) for i, j in spots]
+    assert np.mean((matches.points_m == points[nearest]).all(1)) > 0.995  # equal to rounding
+    np.testing.assert_allclose(matches.pixels, [(8 * j + 3.5, 8 * i + 3.5) for i, j in spots])
+    projected = frame.camera.project(truth_of(frame).inverse().apply(matches.points_m))
+    off = np.linalg.norm(projected - matches.pixels, axis=1)
+    assert (off < 8).mean() > 0.5
+
+
+def test_similarities_are_calculated_once(
+    localizer: Localizer, frame: Frame, hall_map: MapContents
+) -> None:
+    query, attempt = query_of(frame.read_image(), hall_map), Attempt(7, 4)
+    (candidate,) = localizer._matcher.candidates(query, attempt)
+    assert set(query.similar) == {(4, k) for k in range(7)}
+    known = dict(query.similar)
+    again = query_of(frame.read_image(), hall_map)
+    one, other = (localizer._matcher.matches(q, candidate, frame.camera) for q in (query, again))
+    assert query.similar == known
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_quarter_turns_are_recognised(
+    turns: int, localizer: Localizer, hall: Recording, hall_map: MapContents
+) -> None:
+    for frame in hall.test[1::6]:
+        query = query_of(turned(frame.read_image(), turns), hall_map)
+        upright = localizer._upright(query)
+        assert upright.turns == -turns % 4
+        assert upright is query or not upright.similar
+        expected = hall_map.encoder.encode(frame.read_image(), 240)
+        np.testing.assert_allclose(upright.features, expected, atol=1e-4)
+
+
+def test_noise_is_no_turned_image(localizer: Localizer, frame: Frame, hall_map: MapContents) -> None:
+    image, rng = frame.read_image().copy(), np.random.default_rng(0)
+    image[:, 80:] = rng.integers(0, 256, image[:, 80:].shape)
+    assert localizer._upright(query_of(image, hall_map)).turns == 0
+
+
+def test_a_pose_beside_the_true_one_converges(
+    localizer: Localizer, frame: Frame, hall_map: MapContents
+) -> None:
+    truth, query = truth_of(frame), query_of(frame.read_image(), hall_map)
+    beside = truth @ SE3.exp([0.04, 0.02, 0, 0, 0.01, 0])
+    (candidate,) = localizer._matcher.candidates(query, Attempt(7, 4))
+    found = localizer.aligned(query, candidate, frame.camera, beside, np.zeros(5))
+    assert found is not None
+    assert found.pose is not None
+    assert pose_distance(found.pose.pose, truth)[0] < 0.01 < pose_distance(beside, truth)[0]
