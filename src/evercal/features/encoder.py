@@ -25,7 +25,7 @@ from evercal.storage.atomic import write_bytes
 from evercal.storage.tensors import load_tensors, save_tensors
 
 WEIGHTS = Path(__file__).parent / "weights"
-ENCODER_FILE = WEIGHTS / "encoder-1.onnx"
+ENCODER_FILE = WEIGHTS / "encoder-2.onnx"
 Features = Callable[[NDArray[np.float32]], NDArray[np.floating]]
 """A network: (h, w) grey values with mean 0 and deviation 1 -> (rows, columns, width) features.
 

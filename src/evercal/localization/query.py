@@ -33,9 +33,9 @@ class LocalizeOptions:
     """Scenes that are tried per image, at most."""
     attempts: tuple[Attempt, ...] = (Attempt(12, 4), Attempt(12, 2), Attempt(48, 1))
     """Until a pose is accepted. The third is for promising images."""
-    middle_px: int = 160
+    middle_px: int = 112
     """Side of the middle of an image that its quarter turn is judged by, at working size."""
-    clear_turn: float = 0.03
+    clear_turn: float = 0.015
     """Gain in similarity of a turned image; less may be noise where something covers the middle."""
     aligned_inliers: int = 12
     """Poses with fewer PnP inliers are not aligned."""
