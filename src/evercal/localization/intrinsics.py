@@ -181,17 +181,17 @@ def self_calibrated(
     a linear step away, unless the image contradicts it.
     """
     own = minimise(observed, camera, start, _REFINE_STEPS, prior.tight(camera), change)
-    # Errors that neighbouring landmarks share do not average out.
-    by_shared = float((observed.whitening**2).sum()) / (2 * own.variance)
-    shared = 1 + prior.shared_px**2 * by_shared
-    prior = replace(prior, scale=shared * prior.scale)
     step, inverse = own.moved(own.variance / prior.free(camera))
     variance, free = own.variance_after(step), own.change + step[6:]
+    # Errors that neighbouring landmarks share do not average out.
+    by_shared = float((observed.whitening**2).sum()) / (2 * variance)
+    shared = 1 + prior.shared_px**2 * by_shared
+    prior = replace(prior, scale=shared * prior.scale)
     doubt, variances = prior.decided(camera, free, variance * inverse[6:, 6:])
-    better = variance < _BETTER * own.variance
-    if variances is not None or better or doubt > _UNSURE:
+    if variances is not None or variance < _BETTER * own.variance:
         best = minimise(observed, camera, start, _REFINE_STEPS, prior.free(camera), free)
-        variance, inverse, free = best.variance, inverse_of(best.data), best.change
+        variance, free = best.variance, best.change
+        inverse = best.moved(variance / prior.free(camera))[1]
         doubt, variances = prior.decided(camera, free, variance * inverse[6:, 6:])
         if variances is not None:
             start = best.rotation, best.position

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from evercal.errors import InputError
+from evercal.features.encoder import shipped_name
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.mapping.store import PREVIOUS, SCENE, MapStore, read_scene, require_map
 from evercal.recordings.frame import checked_name
@@ -96,13 +97,14 @@ def merge_maps(
     if is_new:
         contents = MapStore.open(Path(others[0])).contents.empty()
     first = maps[0][0] if is_new else Manifest.read(store.root)
+    networks = Path(others[0]) if is_new else store.root
     incoming: dict[str, _Incoming] = {}
     kept = {scene.name: i for i, scene in enumerate(store.contents.scenes)}
     renamed, skipped, replaced = [], [], []
     for other, (manifest, scenes) in zip(others, maps, strict=True):
         if Path(other).resolve() == store.root.resolve():
             raise InputError(f"map {other}: is the map that scenes are merged into; give others")
-        _require_same_networks(first, manifest, store.root, Path(other))
+        _require_same_networks(first, manifest, networks, Path(other))
         for item in scenes:
             name = item.scene.name
             if name in kept or name in incoming:
