@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.alignment import Alignment, AlignmentOptions, _shift_px, align_pose
@@ -60,17 +61,20 @@ def test_distorted_image_is_located(hall: Recording, hall_map: MapContents) -> N
     assert estimate.uncertain_pose.squared_mahalanobis(frame.base_from_camera) < 22.5
 
 
-def texture() -> np.ndarray:
-    """(240, 320) uint8 with structure of some pixels everywhere."""
-    noise = np.random.default_rng(0).uniform(0, 255, (240, 320))
-    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+def texture(height: int = 240, width: int = 320) -> np.ndarray:
+    """(h, w) uint8 with structure of some pixels everywhere; its copies fit side by side."""
+    noise = np.random.default_rng(0).uniform(0, 255, (height, width))
+    smooth = gaussian_filter(noise, 2.0, mode="wrap")
     return cv2.normalize(smooth, np.empty(0), 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
-def wall(image: np.ndarray, count: int) -> AlignedLandmarks:
+def spots(count: int) -> Array:
+    return np.random.default_rng(1).integers([20, 20], [300, 220], (count, 2)).astype(float)
+
+
+def wall(image: np.ndarray, pixels: Array) -> AlignedLandmarks:
     """Landmarks on a wall two metres ahead of a keyframe at the origin."""
-    rng = np.random.default_rng(1)
-    pixels = rng.integers([20, 20], [300, 220], (count, 2)).astype(float)
+    count = len(pixels)
     flat = Landmarks(pixels, np.full(count, 0.5), np.zeros((count, 2)), np.full(count, 1e-3))
     patches = [
         cut_patches(level, to_level(pixels, i)) for i, level in enumerate(image_pyramid(image, 2))
@@ -85,7 +89,7 @@ def aligned(count: int, options: AlignmentOptions | None = None) -> Alignment | 
     image = texture()
     start = SE3.exp([0.01, -0.01, 0.005, 0.004, -0.003, 0.002])
     pyramid = image_pyramid(image, 2)
-    walls, options = [wall(image, count)], options or AlignmentOptions()
+    walls, options = [wall(image, spots(count))], options or AlignmentOptions()
     return align_pose(pyramid, CAMERA, walls, start, options, Prior())
 
 
@@ -103,7 +107,7 @@ def test_number_of_searched_landmarks_does_not_jump_at_the_limit(count: int) -> 
 
 def test_few_matches_widen_the_next_search() -> None:
     image = texture()
-    keyframe = wall(image, 3000)
+    keyframe = wall(image, spots(3000))
     image[:, 90:] = 0
     start = SE3.exp([0.002, 0, 0, 0, 0, 0])
     pyramid, options = image_pyramid(image, 2), AlignmentOptions()
@@ -116,3 +120,16 @@ def test_few_matches_widen_the_next_search() -> None:
 def test_too_few_landmarks_give_no_pose() -> None:
     assert aligned(11) is None
     assert aligned(300, AlignmentOptions(min_matches=301)) is None
+
+
+def test_pattern_of_a_keyframe_has_the_period_of_its_wall() -> None:
+    across = np.meshgrid(np.arange(20.0, 300, 20), np.arange(20.0, 220, 20))
+    pixels, period = np.stack(across, -1).reshape(-1, 2), 40 * 2 / np.array([290, 280])
+    keyframe = wall(np.tile(texture(40, 40), (6, 8)), pixels)
+    steps = keyframe.pattern
+    assert keyframe.pattern is steps  # it is calculated once
+    for step in (*np.diag(period), *-np.diag(period)):
+        assert np.linalg.norm(steps[:, :2] - step, axis=1).min() < 1e-6
+    times = np.round(steps[:, :2] / period)
+    np.testing.assert_allclose(steps, np.c_[times * period, 0 * times[:, 0]], atol=1e-6)
+    assert wall(texture(), pixels).pattern.shape == (0, 3)

@@ -79,7 +79,9 @@ def test_quarter_turns_are_recognised(
         np.testing.assert_allclose(upright.features, expected, atol=1e-4)
 
 
-def test_noise_is_no_turned_image(localizer: Localizer, frame: Frame, hall_map: MapContents) -> None:
+def test_noise_is_no_turned_image(
+    localizer: Localizer, frame: Frame, hall_map: MapContents
+) -> None:
     image, rng = frame.read_image().copy(), np.random.default_rng(0)
     image[:, 80:] = rng.integers(0, 256, image[:, 80:].shape)
     assert localizer._upright(query_of(image, hall_map)).turns == 0

@@ -7,15 +7,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.special import exp1
 
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
+from evercal.localization.alignment import _moved_px
+from evercal.localization.intrinsics import (
+    OWN,
+    SAME_MODEL,
+    STATED,
+    UNKNOWN,
+    IntrinsicsPrior,
+    Prior,
+    self_calibrated,
+)
 from evercal.localization.pose_refinement import (
+    Minimum,
     Observed,
-    RefinedPose,
     changed_camera,
     linearise,
-    refine_pose,
+    minimise,
 )
 
 Array = NDArray[np.floating]
@@ -29,35 +40,48 @@ def points(count: int, seed: int = 0) -> Array:
     return POSE.apply(rng.uniform([-1, -0.8, 1.5], [1, 0.8, 4.0], (count, 3)))
 
 
-def project(points_m: Array) -> Array:
-    return CAMERA.project(POSE.inverse().apply(points_m))
+def project(points_m: Array, camera: Camera = CAMERA) -> Array:
+    return camera.project(POSE.inverse().apply(points_m))
 
 
-def refined(pixels: Array, points_m: Array, white: Array) -> RefinedPose:
-    return refine_pose(Observed(pixels, points_m, white), CAMERA, NEAR)
+def refined(pixels: Array, points_m: Array, white: Array) -> tuple[UncertainPose, Minimum]:
+    """With fixed intrinsics; whitening (n, 2, 2)."""
+    observed = Observed(pixels, points_m, white.transpose(1, 2, 0))
+    found = minimise(observed, CAMERA, matrix_and_position(NEAR))
+    return found.pose(found.variance * found.moved(np.zeros(0))[1]), found
 
 
 def test_exact_pixels_give_the_exact_pose() -> None:
     points_m = points(30)
-    result = refined(project(points_m), points_m, np.tile(np.eye(2), (30, 1, 1)))
-    metres, radians = pose_distance(result.pose.pose, POSE)
+    # It ends at a tenth of a standard deviation; these are small.
+    result, found = refined(project(points_m), points_m, np.tile(1e4 * np.eye(2), (30, 1, 1)))
+    metres, radians = pose_distance(result.pose, POSE)
     assert metres < 1e-8
     assert radians < 1e-8
-    assert result.residual_px.max() < 1e-6
+    assert found.residual_px.max() < 1e-4
+
+
+def test_every_step_leads_nearer() -> None:
+    points_m = points(30)
+    seen, at = Observed(project(points_m), points_m, precise(30, 1e-4)), matrix_and_position(NEAR)
+    found = [minimise(seen, CAMERA, at, steps) for steps in (1, 2, 3)]
+    away = [np.linalg.norm(a.position - POSE.translation_m) for a in found]
+    assert away[0] < 0.2 * np.linalg.norm(NEAR.translation_m - POSE.translation_m)
+    assert away[2] < 0.2 * away[1] < 0.04 * away[0]
 
 
 def test_a_third_of_outliers_does_not_bias_the_pose() -> None:
     points_m, rng = points(120), np.random.default_rng(1)
     pixels = project(points_m) + rng.normal(0, 0.2, (120, 2))
     white = np.tile(np.eye(2) / 0.2, (120, 1, 1))
-    right = refined(pixels, points_m, white)
+    right, _ = refined(pixels, points_m, white)
     pixels[:40] += rng.uniform(4, 12, (40, 2))  # all to one side
-    result = refined(pixels, points_m, white)
-    metres, radians = pose_distance(result.pose.pose, right.pose.pose)
+    result, found = refined(pixels, points_m, white)
+    metres, radians = pose_distance(result.pose, right.pose)
     assert metres < 0.003
     assert radians < 0.002
-    assert (result.residual_px[:40] > 3).all()
-    assert np.median(result.residual_px[40:]) < 0.4
+    assert (found.residual_px[:40] > 3).all()
+    assert np.median(found.residual_px[40:]) < 0.4
 
 
 def test_covariance_matches_repeated_trials() -> None:
@@ -69,11 +93,11 @@ def test_covariance_matches_repeated_trials() -> None:
     drawn, claimed = [], []
     for _ in range(runs):
         noise = np.einsum("nij,nj->ni", root, rng.normal(size=(count, 2)))
-        result = refined(project(points_m) + noise, points_m, white)
-        moved = (POSE.inverse() @ result.pose.pose).log()[3:]
-        shift = result.pose.pose.translation_m - POSE.translation_m
+        result, _ = refined(project(points_m) + noise, points_m, white)
+        moved = (POSE.inverse() @ result.pose).log()[3:]
+        shift = result.pose.translation_m - POSE.translation_m
         drawn.append(np.concatenate([shift, moved]))
-        claimed.append(result.pose.covariance)
+        claimed.append(result.covariance)
     true = np.cov(np.array(drawn).T)
     ratio = np.linalg.eigvals(np.linalg.solve(true, np.mean(claimed, 0))).real
     # For Gaussian errors of two axes Cauchy's weight w = 1 / (1 + s) has the mean a; the estimate
@@ -91,11 +115,9 @@ def test_covariance_follows_the_residuals() -> None:
     points_m, rng = points(200), np.random.default_rng(3)
     noise = rng.normal(0, 0.3, (200, 2))
     white = np.tile(np.eye(2) / 0.3, (200, 1, 1))
-    right = refined(project(points_m) + noise, points_m, white)
-    overconfident = refined(project(points_m) + noise, points_m, 10 * white)
-    np.testing.assert_allclose(
-        overconfident.pose.covariance, right.pose.covariance, rtol=0.05, atol=1e-12
-    )
+    right, _ = refined(project(points_m) + noise, points_m, white)
+    overconfident, _ = refined(project(points_m) + noise, points_m, 10 * white)
+    np.testing.assert_allclose(overconfident.covariance, right.covariance, rtol=0.05, atol=1e-12)
 
 
 def matrix_and_position(pose: SE3) -> tuple[Array, Array]:
@@ -113,22 +135,89 @@ def test_derivatives_equal_finite_differences(lens: tuple[float, ...]) -> None:
 
     _, slope = linearise(pixels, points_m, *matrix_and_position(NEAR), camera, True)
     by_pose = linearise(pixels, points_m, *matrix_and_position(NEAR), camera)[1]
-    np.testing.assert_allclose(by_pose, slope[:, :6], rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(by_pose, slope[:6], rtol=1e-12, atol=1e-9)
     for column in range(11):
         step = 1e-6 * np.eye(11)[column]
         ahead, behind = (residual(s[:6], s[6:]) for s in (step, -step))
         numeric = (ahead - behind) / 2e-6
-        np.testing.assert_allclose(slope[:, column], numeric, rtol=1e-4, atol=1e-3)
+        np.testing.assert_allclose(slope[column], numeric, rtol=1e-4, atol=1e-3)
 
 
 def test_matches_without_a_common_pose_do_not_diverge() -> None:
     """Ten steps with free intrinsics lead nowhere, and not out of the world."""
     variances = np.array([2e-8, 5e-3, 5e-3, 6e-7, 6e-7])
-    white = np.tile(np.eye(2) / 0.1, (28, 1, 1))
     for seed in range(40):
         rng = np.random.default_rng(seed)
         pixels, points_m = rng.uniform(0, [640, 480], (28, 2)), points(28, seed)
-        result = refine_pose(Observed(pixels, points_m, white), CAMERA, POSE, 10, variances)
-        assert pose_distance(result.pose.pose, POSE)[0] < 100
-        assert np.isfinite(result.pose.covariance).all()
+        seen = Observed(pixels, points_m, precise(28, 0.1))
+        result = minimise(seen, CAMERA, matrix_and_position(POSE), 10, variances)
+        assert np.linalg.norm(result.position - POSE.translation_m) < 100
+        assert np.isfinite(result.moved(result.variance / variances)[1]).all()
         assert 100 < result.camera.fx < 2000
+
+
+def precise(count: int, sigma_px: float) -> Array:
+    """(2, 2, n) whitening of errors of one standard deviation."""
+    return np.repeat(np.eye(2)[..., None] / sigma_px, count, 2)
+
+
+CHANGE = np.array([0.004, 1.5, -1.0, 0.004, -0.003])
+"""Between two cameras of a model."""
+
+
+def seen_with(change: Array, seed: int, sigma_px: float, noise_px: float) -> Observed:
+    """300 points seen with other intrinsics than those of `CAMERA`."""
+    points_m, noise = points(300, seed), np.random.default_rng(seed).normal(size=(300, 2))
+    pixels = project(points_m, changed_camera(CAMERA, change)) + noise_px * noise
+    return Observed(pixels, points_m, precise(300, sigma_px))
+
+
+@pytest.mark.parametrize("other", [STATED, SAME_MODEL, UNKNOWN])
+@pytest.mark.parametrize(
+    ("sigma_px", "noise_px", "share", "off"),
+    [
+        (3.0, 0.01, 0.05, 0.03),  # the errors are small, so that all weights are 1
+        (0.3, 0.3, 0.2, 1.5),
+    ],
+)
+def test_a_minimum_moves_to_that_of_another_prior(
+    sigma_px: float, noise_px: float, share: float, off: float, other: IntrinsicsPrior
+) -> None:
+    tight, wide = OWN.variances(CAMERA), other.variances(CAMERA)
+    for seed in range(4):
+        seen = seen_with(share * CHANGE, seed, sigma_px, noise_px)
+        own, expected = (
+            minimise(seen, CAMERA, matrix_and_position(NEAR), 30, v) for v in (tight, wide)
+        )
+        step, covariance = own.moved(own.variance / wide)
+        again, inverse = expected.moved(expected.variance / wide)
+        turn = Rotation.from_matrix(own.rotation.T @ expected.rotation).as_rotvec()
+        shift = own.rotation.T @ (expected.position - own.position)
+        real = np.concatenate([shift, turn, expected.change - own.change])
+        root = np.linalg.inv(np.linalg.cholesky(expected.variance * inverse))
+        assert np.linalg.norm(root @ (step - real)) < off < 2 * np.linalg.norm(root @ step)
+        assert np.linalg.norm(root @ again) < 0.1  # it is at its own minimum
+        assert own.variance_after(step) == pytest.approx(expected.variance, rel=0.15)
+        ratio = np.linalg.eigvals(np.linalg.solve(inverse, covariance)).real
+        assert np.abs(np.log(ratio)).mean() < 0.2 * off
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_a_far_camera_is_reached_by_repetition(factor: float) -> None:
+    """The errors are linear in the intrinsics; `align_pose` begins again where the last ended."""
+    far = np.array([np.log(factor), 12.0, -9.0, -0.06, 0.03])
+    seen, change, prior = seen_with(far, 0, 0.3, 0.3), np.zeros(5), Prior(UNKNOWN)
+    result = self_calibrated(seen, CAMERA, matrix_and_position(NEAR), change, prior)
+    moved = []
+    for _ in range(8):
+        moved.append(_moved_px(CAMERA, change, result.change))
+        if moved[-1] < 0.2:
+            break
+        at, change = matrix_and_position(result.pose.pose), result.change
+        result = self_calibrated(seen, CAMERA, at, change, prior)
+    assert moved[-1] < 0.2 < moved[-2]
+    truth = changed_camera(CAMERA, far)
+    assert result.camera.fx == pytest.approx(truth.fx, rel=2e-3)
+    np.testing.assert_allclose(result.camera.distortion[:2], truth.distortion[:2], atol=0.01)
+    assert result.pose.squared_mahalanobis(POSE) < 22.5
+    assert pose_distance(result.pose.pose, POSE)[0] < 0.01
