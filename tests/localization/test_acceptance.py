@@ -68,7 +68,7 @@ def occluded(frame: Frame) -> Frame:
     """The frame with noise over most of its image."""
     image = frame.read_image().copy()
     rng = np.random.default_rng(0)
-    image[:, 60:] = rng.integers(0, 256, image[:, 60:].shape)
+    image[:, 48:] = rng.integers(0, 256, image[:, 48:].shape)
     return replace(frame, image=image)
 
 

@@ -20,6 +20,8 @@ from evercal.mapping.bundle_equations import (
     SHARED,
     SHIFT,
     BundleTracks,
+    Linearised,
+    NormalEquations,
     Parameters,
     StatedFrames,
 )

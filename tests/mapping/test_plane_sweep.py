@@ -78,7 +78,7 @@ def similarities(view: PosedCells, other: PosedCells, planes: np.ndarray) -> np.
         points = across.apply(ray / planes[:, None])
         seen = points[:, 2] * planes > 0.05
         pixels = other.camera.project(np.where(seen[:, None], points, [0, 0, 1]))
-        low, high = -STRIDE / 2, STRIDE * (np.array([columns, rows]) + 0.5)
+        low, high = -STRIDE / 2 - 0.5, STRIDE * (np.array([columns, rows]) + 0.5) - 0.5
         seen &= ((pixels > low) & (pixels < high)).all(1)
         at = (np.nan_to_num(pixels) + 0.5) / STRIDE - 0.5
         values = map_coordinates(grid, at.T[::-1], order=1, mode="nearest")

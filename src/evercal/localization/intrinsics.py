@@ -37,8 +37,6 @@ _REFINE_STEPS = 10
 """Gauss-Newton steps of pose and intrinsics, at most."""
 _BETTER = 0.7
 """Relative variance below which other intrinsics fit so much better that a linear step is rough."""
-_UNSURE = 0.07
-"""Probability of another camera from which a linear step is too rough to decide."""
 _REACHED = 0.05 * 7.815
 """Probability of another camera at which the 95 % ellipsoid (chi-squared) reaches its pose."""
 
@@ -188,7 +186,8 @@ def self_calibrated(
     shared = 1 + prior.shared_px**2 * by_shared
     prior = replace(prior, scale=shared * prior.scale)
     doubt, variances = prior.decided(camera, free, variance * inverse[6:, 6:])
-    if variances is not None or variance < _BETTER * own.variance:
+    unsure = doubt > prior.sigma.other_camera or variance < _BETTER * own.variance
+    if variances is not None or unsure:
         best = minimise(observed, camera, start, _REFINE_STEPS, prior.free(camera), free)
         variance, free = best.variance, best.change
         inverse = best.moved(variance / prior.free(camera))[1]
