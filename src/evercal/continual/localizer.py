@@ -113,11 +113,12 @@ class NetworkLocalizer:
                 rough = PnpResult(across @ rough.pose, rough.inliers)
                 matches = Matches(matches.pixels, across.apply(matches.points_m))
                 scene = other
+        pixels, points = (values[rough.inliers] for values in matches)
         return Hypothesis(
             scene,
-            uncertain(*(values[rough.inliers] for values in matches), small, rough.pose),
-            pixels=matches.pixels[rough.inliers],
-            points_m=matches.points_m[rough.inliers],
+            uncertain(pixels, points, small, rough.pose),
+            pixels=pixels,
+            points_m=points,
             expected=patches,
         )
 

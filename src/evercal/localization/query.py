@@ -46,7 +46,7 @@ class LocalizeOptions:
     rival_px: float = 16.0
     """A second pose is sought among matches that the first one misses by more than this, pixels."""
     rival_matched: float = 0.5
-    """A displaced pose is given up if a smaller share of landmarks matches, relative to the pose."""
+    """Share of matched landmarks, relative to the pose, below which a displaced one is given up."""
     climbs: int = 5
     """Poses whose rivals are tried, at most."""
     clear_strength: float = 0.8

@@ -202,9 +202,7 @@ class Solution:
 
 
 class HostBlock(NamedTuple):
-    """The landmarks of one host frame; they depend on it, on the frames that see them, and on the
-    intrinsics.
-    """
+    """The landmarks of one host frame, and the parameters that their observations depend on."""
 
     landmarks: Index
     """(a,)."""
