@@ -1,95 +1,139 @@
-"""Time of learning, of localization, of SARS and of import."""
+"""Time and memory of learning, localization and a cold start, beside another version."""
 
+import json
+import os
+import subprocess
+import sys
 import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.rows import save
-from evercal.localization.parallel import in_parallel
+from evercal.errors import InputError
+from evercal.processes import python_command
+
+_ROOT = Path(__file__).resolve().parents[1]
+_AVX2 = {
+    "OPENCV_CPU_DISABLE": "AVX512_SKX,AVX512_CLX,AVX512F",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
+    "OPENBLAS_CORETYPE": "Haswell",
+    "ATEN_CPU_CAPABILITY": "avx2",
+    "ONEDNN_MAX_CPU_ISA": "AVX2",
+    "EVERCAL_PRECISION": "float32",
+}
+"""Variables that limit OpenCV, NumPy, OpenBLAS and PyTorch to the instructions of AVX2."""
+
+_MEASURE = """
+import json, resource, sys, tempfile, time
+from pathlib import Path
+import numpy as np
 from evercal.map import Map
-from evercal.mapping.selection import SarsOptions, select_sars
-from evercal.processes import cores, output_of, python_command
+from evercal.recordings import load_recording
 from evercal.recordings.samples import sample_rooms
 
-_WARM = 5
-"""Images located before the first one that counts."""
+def timed(work):
+    wall, busy = time.perf_counter(), time.process_time()
+    work()
+    return time.perf_counter() - wall, time.process_time() - busy
+
+folder, scene = Path(sys.argv[1]), sys.argv[2]
+quiet = {"on_progress": lambda *_: None}
+rooms, out = [room.scene for room in sample_rooms()], {}
+whole, rest = Map.open(folder / "whole"), Map.open(folder / "rest")
+out["learn a room, s"], out["learn a room, processor s"] = np.median(
+    [timed(lambda r=room: whole.learn(r, **quiet)) for room in rooms], 0
+).tolist()
+for room in rooms[1:]:
+    rest.learn(room, **quiet)
+images = [frame.read_image() for room in rooms for frame in room.test]
+strange = [frame.read_image() for frame in rooms[0].test[::2]]
+for name, cell, shown in (("image", whole, images), ("unknown room", rest, strange)):
+    for image in shown[::8]:
+        cell.localize(image)
+    times = 1000 * np.array([timed(lambda i=image: cell.localize(i)) for image in shown])
+    out[f"{name}, ms"], out[f"{name}, processor ms"] = np.median(times, 0).tolist()
+    out[f"{name}, 90 %, ms"] = float(np.quantile(times[:, 0], 0.9))
+frames, began = [images[i] for i in range(0, len(images), 10) for _ in range(8)], []
+for tracked in whole.track(iter(frames)):
+    began.append((time.perf_counter(), tracked.state))
+steps = [1000 * (b[0] - a[0]) for a, b in zip(began, began[1:]) if b[1] == "tracking"]
+out["tracked frame, ms"] = float(np.median(steps))
+if scene:
+    recording = load_recording(Path(scene))
+    new = Map.open(folder / "long")
+    out["learn SCENE, s"], out["learn SCENE, processor s"] = timed(
+        lambda: new.learn(recording, memory="10%", **quiet)
+    )
+print(json.dumps(out))
+"""
 
 
-def run(out: Path = Path("runs/speed.csv"), repeat: int = 3) -> None:
-    """Time learning of the packaged rooms and localization of their test images.
+def run(
+    out: Path = Path("runs/speed.csv"),
+    beside: Path | None = None,
+    repeat: int = 3,
+    scene: Path | None = None,
+    avx2: bool = False,
+    demo: bool = False,
+) -> None:
+    """Time this version, and alternately another one, each in processes of its own.
 
-    Images are decoded before. Also timed: SARS on 10,000 poses, and import.
+    Images are decoded before. A room that is missing in a map stands for an unknown one. A tracked
+    frame shows the image before once more.
 
     Args:
         out: File of rows to write.
-        repeat: Times that a room is learned; the median counts.
+        beside: Folder of another checkout, such as one of `git worktree add`.
+        repeat: Times that each version is measured; medians count.
+        scene: Recording to learn beside the packaged rooms.
+        avx2: Use no instructions that processors with AVX2 lack.
+        demo: Time `evercal demo`, too.
     """
-    rooms = [room.scene for room in sample_rooms()]
-    learned: dict[str, float] = {}
+    trees = [_ROOT] if beside is None else [beside.resolve(), _ROOT]
+    for tree in trees:
+        if not (tree / "src" / "evercal").is_dir():
+            raise InputError(f"--beside {tree}: no checkout of evercal")
+    found: list[list[dict[str, float]]] = [[] for _ in trees]
+    for number in range(repeat):
+        for tree, measured in zip(trees, found, strict=True):
+            measured.append(_measured(tree, scene, avx2, demo))
+            print(f"{number + 1} of {repeat}: {tree}", file=sys.stderr, flush=True)
+    rows: list[dict[str, str | float]] = []
+    for name in found[-1][0]:
+        values = [float(np.median([m[name] for m in measured])) for measured in found]
+        row: dict[str, str | float] = {"what": name, "now": values[-1]}
+        rows.append(
+            row if beside is None else {**row, "beside": values[0], "ratio": values[-1] / values[0]}
+        )
+    save(out, rows, {"repeat": repeat, "avx2": avx2, "scene": scene and scene.name})
+
+
+def _measured(tree: Path, scene: Path | None, avx2: bool, demo: bool) -> dict[str, float]:
+    environment = {**os.environ, "PYTHONPATH": str(tree / "src"), **(_AVX2 if avx2 else {})}
+
+    def called(*words: str) -> tuple[str, float, float, float]:
+        """Output, seconds, processor seconds and peak MB of a process."""
+        command = ["/usr/bin/env", *python_command(*words)]
+        with tempfile.TemporaryFile() as printed:
+            process = subprocess.Popen(
+                command, stdout=printed, stderr=subprocess.DEVNULL, env=environment, cwd=tree
+            )
+            began = os.times().elapsed
+            _, status, used = os.wait4(process.pid, 0)
+            if status:
+                raise InputError(f"{tree}: {' '.join(words)[:40]!r} ended with {status}")
+            printed.seek(0)
+            busy = used.ru_utime + used.ru_stime
+            return printed.read().decode(), os.times().elapsed - began, busy, used.ru_maxrss / 1024
+
     with tempfile.TemporaryDirectory() as scratch:
-        for room in rooms:
-            seconds = []
-            for attempt in range(repeat):
-                fresh = Map.open(Path(scratch) / f"{room.name}-{attempt}")
-                seconds.append(_milliseconds(lambda r=room, m=fresh: m.learn(r), 1)[0] / 1000)
-            learned[room.name] = float(np.median(seconds))
-        cell = Map.open(Path(scratch) / "all")
-        for room in rooms:
-            cell.learn(room)
-        rows = []
-        for room in rooms:
-            images = [frame.read_image() for frame in room.test]
-            for image in images[:_WARM]:
-                cell.localizer.localize(image)
-            began = time.process_time()
-            times = [
-                _milliseconds(lambda i=image: cell.localizer.localize(i), 1) for image in images
-            ]
-            busy = 1000 * (time.process_time() - began) / len(images)
-            (whole,) = _milliseconds(
-                lambda many=images: list(in_parallel(cell.localizer.localize, many)), 1
-            )
-            rows.append(
-                {
-                    "room": room.name,
-                    "learn_s": learned[room.name],
-                    "locate_ms": float(np.median(times)),
-                    "locate_90_%_ms": float(np.percentile(times, 90)),
-                    "processor_ms": busy,
-                    "batch_images_per_s": 1000 * len(images) / whole,
-                }
-            )
-    settings = {"threads": cores(), "scenes": len(rooms), "repeat": repeat}
-    save(out, rows, settings)
-    _others()
-
-
-def _others() -> None:
-    """Print the time of SARS and of import."""
-    rng = np.random.default_rng(0)
-    positions = np.cumsum(rng.normal(0, 0.01, (10_000, 3)), 0)
-    quaternions = rng.normal(size=(10_000, 4))
-    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    (sars,) = _milliseconds(
-        lambda: select_sars(positions, quaternions, 1000, SarsOptions(radius=0.0)), 1
-    )
-    print(f"SARS, 10,000 poses, N_b 1,000, r 0: {sars / 1000:.2f} s")
-    for name, arguments in (
-        ("import evercal", ["-c", "import evercal"]),
-        ("evercal --help", ["-m", "evercal", "--help"]),
-    ):
-        command = python_command(*arguments)
-        times = _milliseconds(lambda c=command: output_of(*c), 5)
-        print(f"{name}: median {np.median(times) / 1000:.2f} s")
-
-
-def _milliseconds(work: Callable[[], object], repeat: int) -> list[float]:
-    times = []
-    for _ in range(repeat):
-        began = time.perf_counter()
-        work()
-        times.append(1000 * (time.perf_counter() - began))
-    return times
+        found = json.loads(called("-c", _MEASURE, scratch, str(scene or ""))[0].splitlines()[-1])
+        rooms = _ROOT / "src" / "evercal" / "recordings" / "sample_rooms"
+        images = [str(image) for image in sorted(rooms.glob("*/images/*"))[::4]]
+        locate = ["-m", "evercal", "localize", f"{scratch}/whole", "--json"]
+        _, _, found["cold start, processor s"], _ = called(*locate, images[0])
+        _, _, _, found["peak of locating, MB"] = called(*locate, *images)
+        if demo:
+            _, found["demo, s"], _, _ = called("-m", "evercal", "demo", "--out", f"{scratch}/demo")
+    return found
