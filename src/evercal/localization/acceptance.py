@@ -13,10 +13,12 @@ chance. The last counts the inliers, as if no more landmarks had been searched t
 unobstructed image. A hand before the lens lowers the first factor alone.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
-from evercal.geometry import SE3, UncertainPose, pose_distance
-from evercal.localization.estimate import CovarianceTerm
+from evercal.geometry import SE3, UncertainPose, pose_distance, pose_distance_mm_deg
+from evercal.localization.estimate import CovarianceTerm, PoseEstimate
 from evercal.localization.query import Hypothesis
 from evercal.mapping.scene_map import SceneMap
 
@@ -107,3 +109,62 @@ def in_base(
         CovarianceTerm("stated poses", stated),
         CovarianceTerm("base frame", frame),
     )
+
+
+def answer(
+    best: Hypothesis,
+    scene: SceneMap,
+    size: tuple[int, ...],
+    milliseconds: float,
+    rival: Hypothesis | None = None,
+) -> PoseEstimate:
+    """The answer for a pose in the map's frame, with another one that fits as well.
+
+    `size` are height and width of the image.
+    """
+    rejected = PoseEstimate(
+        status="unknown_scene",
+        reason="",
+        scene=None,
+        base_from_camera=None,
+        covariance=None,
+        inliers=best.inliers,
+        inlier_ratio=best.inlier_ratio,
+        milliseconds=milliseconds,
+        support=support(best),
+    )
+    if best.pose is None and not best.pnp_inliers:
+        return replace(rejected, status="failed", reason="fewer than 6 inliers")
+    if not accepted(best, scene):
+        return replace(rejected, reason=rejection(best, scene))
+    estimate, terms = in_base(best, scene)
+    if rival is not None and rival.pose is not None:
+        other = scene.frame.to_base(rival.pose).pose
+        mm, deg = pose_distance_mm_deg(estimate.pose, other)
+        return replace(
+            rejected,
+            status="ambiguous",
+            reason=_rival_reason(mm, deg, scene.unit_known),
+            scene=scene.name,
+            alternatives=(estimate.pose, other),
+        )
+    if scene.unit_known and estimate.sigma_mm > 1000 * USELESS_M:
+        wide = f"its position is uncertain by {estimate.sigma_mm:.0f} mm per axis"
+        return replace(rejected, reason=wide)
+    assert best.points_m is not None, "accepted poses have inliers"
+    return replace(
+        rejected,
+        status="ok",
+        scene=scene.name,
+        base_from_camera=estimate.pose,
+        covariance=estimate.covariance,
+        terms=terms,
+        pixels=best.pixels,
+        points_m=scene.frame.points_to_base(best.points_m),
+        camera=best.refined and best.refined.camera.resized(size[1], size[0]),
+    )
+
+
+def _rival_reason(mm: float, deg: float, unit_known: bool) -> str:
+    away = f"{mm:.0f} mm, {deg:.1f} deg away" if unit_known else f"{deg:.1f} deg away"
+    return f"ambiguous: a second pose {away} fits equally well"

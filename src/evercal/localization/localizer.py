@@ -5,7 +5,7 @@ The way of an image: prepare, encode, retrieve keyframes, match, PnP, align land
 
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
@@ -16,15 +16,11 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.features.encoder import Features
 from evercal.features.views import working_image
-from evercal.geometry import SE3, Camera, pose_distance_mm_deg, resize_pixels
+from evercal.geometry import SE3, Camera, resize_pixels
 from evercal.localization.acceptance import (
-    USELESS_M,
     accepted,
-    differ,
-    in_base,
+    answer,
     order,
-    rejection,
-    support,
 )
 from evercal.localization.alignment import align_pose
 from evercal.localization.estimate import PoseEstimate
@@ -47,7 +43,7 @@ from evercal.localization.query import (
     Matches,
     Query,
 )
-from evercal.localization.repetition import displaced
+from evercal.localization.rivals import settled
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
 from evercal.processes import one_product_thread
@@ -119,8 +115,10 @@ class Localizer:
         )
         best, rival = self._best_hypothesis(query, cameras), None
         if self.accepts(best):
-            best, rival = self._settled(query, best, cameras)
-        return self.answer(query, best, 1000 * (time.perf_counter() - began), rival), best
+            best, rival = settled(self, query, best, cameras[best.scene])
+        milliseconds = 1000 * (time.perf_counter() - began)
+        scene, size = contents.scenes[best.scene], query.image.shape[:2]
+        return answer(best, scene, size, milliseconds, rival), best
 
     def slips(self, hypothesis: Hypothesis) -> NDArray[np.floating]:
         """(k, 3) displacements, by which an aligned pose may have slipped, the shortest first."""
@@ -169,13 +167,13 @@ class Localizer:
         """The pose with the most support of one attempt."""
         best = Hypothesis(0)
         for candidate in self._matcher.candidates(query, attempt):
-            trial = self._hypothesis(query, candidate, cameras[candidate.scene])
+            trial = self.hypothesis(query, candidate, cameras[candidate.scene])
             best = max(best, trial, key=order)
             if self.accepts(best, self.options.immediate):
                 break
         return best
 
-    def _hypothesis(
+    def hypothesis(
         self,
         query: Query,
         candidate: Candidate,
@@ -249,125 +247,3 @@ class Localizer:
             aligned.planned,
             candidate=candidate,
         )
-
-    def _settled(
-        self, query: Query, best: Hypothesis, cameras: Sequence[Camera]
-    ) -> tuple[Hypothesis, Hypothesis | None]:
-        """The strongest pose among an accepted one and its rivals, and the runner-up.
-
-        Without a runner-up that explains the image nearly as well, the second value is None.
-        """
-        seen, front, scene = [best], best, self.contents.scenes[best.scene]
-        for _ in range(self.options.climbs):
-            rivals = [
-                rival
-                for rival in self._rivals(query, front, cameras[best.scene])
-                if rival.refined and rival.pose and self.accepts(rival)
-            ]
-            seen += rivals
-            higher = max(rivals, key=support, default=front)
-            if support(higher) <= support(front):
-                break
-            front = higher  # several periods away, the way leads over poses of rising support
-        if len(seen) == 1:
-            return best, None
-        strongest = max(seen, key=lambda rival: self._strength(rival, best))
-        if self._strength(strongest, best) * self.options.clear_strength > 1:
-            best = strongest
-        others = [x for x in seen if x.pose and x is not best and differ(best, x.pose.pose, scene)]
-        runner_up = max(others, key=lambda rival: self._strength(rival, best), default=None)
-        if runner_up is None or self._strength(runner_up, best) <= self.options.clear_strength:
-            return best, None
-        return best, runner_up
-
-    def _strength(self, rival: Hypothesis, best: Hypothesis) -> float:
-        """How well a rival explains the image, relative to another pose; both are aligned.
-
-        The ratio of their support times that of the matches within one cell. Landmarks distinguish
-        a square of a board from the next one; racks of one kind differ only in their surroundings.
-        """
-        ratio = support(rival) / max(support(best), 1e-9)
-        if best.matches is None:
-            return ratio
-        agreeing = []
-        for pose in (rival.refined, best.refined):
-            if pose is None:  # without alignment there are no rivals
-                return ratio
-            small = pose.camera.short_side_resized(self.contents.short_side)
-            rest = best.matches.beside(small, pose.pose.pose, self.contents.encoder.stride)
-            agreeing.append(len(best.matches.pixels) - len(rest.pixels))
-        return ratio * agreeing[0] / max(agreeing[1], 1)
-
-    def _rivals(self, query: Query, best: Hypothesis, camera: Camera) -> Iterator[Hypothesis]:
-        """Other poses in the same scene.
-
-        Repeated texture matches in several places. So the matches that a pose leaves over may agree
-        on another one, and the pose may have slipped by a step of the pattern.
-        """
-        if best.pose is None or best.refined is None or best.candidate is None:
-            return
-        pose, change = best.pose.pose, best.refined.change
-        if best.matches is not None:
-            small = best.refined.camera.short_side_resized(self.contents.short_side)
-            rest = best.matches.beside(small, pose, self.options.rival_px)
-            if len(rest.pixels) >= self.options.aligned_inliers:
-                left_over = self._hypothesis(query, best.candidate, camera, rest)
-                yield replace(left_over, matches=best.matches)
-        for step in self.slips(best):
-            start = displaced(pose, step)
-            least = self.options.rival_matched * best.matched / best.expected
-            rival = self.aligned(query, best.candidate, camera, start, change, False, least)
-            if rival is not None:
-                yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
-
-    def answer(
-        self, query: Query, best: Hypothesis, milliseconds: float, rival: Hypothesis | None = None
-    ) -> PoseEstimate:
-        """The answer for a pose in the map's frame, with another one that fits as well."""
-        scene, (height, width) = self.contents.scenes[best.scene], query.image.shape[:2]
-        rejected = PoseEstimate(
-            status="unknown_scene",
-            reason="",
-            scene=None,
-            base_from_camera=None,
-            covariance=None,
-            inliers=best.inliers,
-            inlier_ratio=best.inlier_ratio,
-            milliseconds=milliseconds,
-            support=support(best),
-        )
-        if best.pose is None and not best.pnp_inliers:
-            return replace(rejected, status="failed", reason="fewer than 6 inliers")
-        if not self.accepts(best):
-            return replace(rejected, reason=rejection(best, scene))
-        estimate, terms = in_base(best, scene)
-        if rival is not None and rival.pose is not None:
-            other = scene.frame.to_base(rival.pose).pose
-            mm, deg = pose_distance_mm_deg(estimate.pose, other)
-            return replace(
-                rejected,
-                status="ambiguous",
-                reason=_rival_reason(mm, deg, scene.unit_known),
-                scene=scene.name,
-                alternatives=(estimate.pose, other),
-            )
-        if scene.unit_known and estimate.sigma_mm > 1000 * USELESS_M:
-            wide = f"its position is uncertain by {estimate.sigma_mm:.0f} mm per axis"
-            return replace(rejected, reason=wide)
-        assert best.points_m is not None, "accepted poses have inliers"
-        return replace(
-            rejected,
-            status="ok",
-            scene=scene.name,
-            base_from_camera=estimate.pose,
-            covariance=estimate.covariance,
-            terms=terms,
-            pixels=best.pixels,
-            points_m=scene.frame.points_to_base(best.points_m),
-            camera=best.refined and best.refined.camera.resized(width, height),
-        )
-
-
-def _rival_reason(mm: float, deg: float, unit_known: bool) -> str:
-    away = f"{mm:.0f} mm, {deg:.1f} deg away" if unit_known else f"{deg:.1f} deg away"
-    return f"ambiguous: a second pose {away} fits equally well"

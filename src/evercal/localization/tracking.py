@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, pose_distance
+from evercal.localization.acceptance import answer
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import cameras_in_scenes, prior_of
 from evercal.localization.localizer import Localizer
@@ -203,11 +204,14 @@ class Tracker:
             if found is not None and self._trusted(found, predicted, settled):
                 if self._may_have_slipped(found, predicted, stamp):
                     return None
-                answer = localizer.answer(query, found, 1000 * (time.perf_counter() - began))
-                if answer.status != "ok":  # too uncertain to be useful
+                milliseconds = 1000 * (time.perf_counter() - began)
+                estimate = answer(
+                    found, contents.scenes[found.scene], image.shape[:2], milliseconds
+                )
+                if estimate.status != "ok":  # too uncertain to be useful
                     return None
                 self._remember(found, stamp)
-                return answer
+                return estimate
         return None
 
     def _may_have_slipped(self, found: Hypothesis, predicted: SE3, stamp: float) -> bool:

@@ -1,0 +1,90 @@
+"""Rivals of a pose: other poses of the same scene that explain the image as well."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from evercal.geometry import Camera
+from evercal.localization.acceptance import differ, support
+from evercal.localization.query import Hypothesis, Query
+from evercal.localization.repetition import displaced
+
+if TYPE_CHECKING:
+    from evercal.localization.localizer import Localizer
+
+
+def settled(
+    localizer: "Localizer", query: Query, best: Hypothesis, camera: Camera
+) -> tuple[Hypothesis, Hypothesis | None]:
+    """The strongest pose among an accepted one and its rivals, and the runner-up.
+
+    Without a runner-up that explains the image nearly as well, the second value is None.
+    """
+    options, scene = localizer.options, localizer.contents.scenes[best.scene]
+    seen, front = [best], best
+    for _ in range(options.climbs):
+        rivals = [
+            rival
+            for rival in _rivals(localizer, query, front, camera)
+            if rival.refined and rival.pose and localizer.accepts(rival)
+        ]
+        seen += rivals
+        higher = max(rivals, key=support, default=front)
+        if support(higher) <= support(front):
+            break
+        front = higher  # several periods away, the way leads over poses of rising support
+    if len(seen) == 1:
+        return best, None
+    strongest = max(seen, key=lambda rival: _strength(localizer, rival, best))
+    if _strength(localizer, strongest, best) * options.clear_strength > 1:
+        best = strongest
+    others = [x for x in seen if x.pose and x is not best and differ(best, x.pose.pose, scene)]
+    runner_up = max(others, key=lambda rival: _strength(localizer, rival, best), default=None)
+    if runner_up is None or _strength(localizer, runner_up, best) <= options.clear_strength:
+        return best, None
+    return best, runner_up
+
+
+def _strength(localizer: "Localizer", rival: Hypothesis, best: Hypothesis) -> float:
+    """How well a rival explains the image, relative to another pose; both are aligned.
+
+    The ratio of their support times that of the matches within one cell. Landmarks distinguish
+    a square of a board from the next one; racks of one kind differ only in their surroundings.
+    """
+    contents = localizer.contents
+    ratio = support(rival) / max(support(best), 1e-9)
+    if best.matches is None:
+        return ratio
+    agreeing = []
+    for pose in (rival.refined, best.refined):
+        if pose is None:  # without alignment there are no rivals
+            return ratio
+        small = pose.camera.short_side_resized(contents.short_side)
+        rest = best.matches.beside(small, pose.pose.pose, contents.encoder.stride)
+        agreeing.append(len(best.matches.pixels) - len(rest.pixels))
+    return ratio * agreeing[0] / max(agreeing[1], 1)
+
+
+def _rivals(
+    localizer: "Localizer", query: Query, best: Hypothesis, camera: Camera
+) -> Iterator[Hypothesis]:
+    """Other poses in the same scene.
+
+    Repeated texture matches in several places. So the matches that a pose leaves over may agree
+    on another one, and the pose may have slipped by a step of the pattern.
+    """
+    if best.pose is None or best.refined is None or best.candidate is None:
+        return
+    pose, change = best.pose.pose, best.refined.change
+    if best.matches is not None:
+        small = best.refined.camera.short_side_resized(localizer.contents.short_side)
+        rest = best.matches.beside(small, pose, localizer.options.rival_px)
+        if len(rest.pixels) >= localizer.options.aligned_inliers:
+            left_over = localizer.hypothesis(query, best.candidate, camera, rest)
+            yield replace(left_over, matches=best.matches)
+    for step in localizer.slips(best):
+        start = displaced(pose, step)
+        least = localizer.options.rival_matched * best.matched / best.expected
+        rival = localizer.aligned(query, best.candidate, camera, start, change, False, least)
+        if rival is not None:
+            yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
