@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3, UncertainPose, pose_distance
+from evercal.localization import tracking
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker, TrackOptions
