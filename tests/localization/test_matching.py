@@ -8,7 +8,7 @@ import pytest
 from evercal.geometry import SE3, pose_distance
 from evercal.localization.intrinsics import OWN
 from evercal.localization.localizer import Localizer, turned
-from evercal.localization.query import Attempt, Candidate, Query
+from evercal.localization.query import Attempt, Candidate, LocalizeOptions, Query
 from evercal.mapping.scene_map import MapContents
 from evercal.recordings import Frame, Recording
 
@@ -97,3 +97,20 @@ def test_a_pose_beside_the_true_one_converges(
     assert found is not None
     assert found.pose is not None
     assert pose_distance(found.pose.pose, truth)[0] < 0.01 < pose_distance(beside, truth)[0]
+
+
+def test_guided_matches_lie_near_the_projections_of_their_points(
+    localizer: Localizer, frame: Frame, hall_map: MapContents
+) -> None:
+    query, beside = query_of(frame.read_image(), hall_map), SE3.exp([0.04, 0.02, 0, 0, 0.01, 0])
+    pose = truth_of(frame) @ beside
+    anywhere = localizer._matcher.matches(query, KEYFRAMES, frame.camera)
+    near = localizer._matcher.near(query, KEYFRAMES, frame.camera, pose)
+    off = [
+        np.linalg.norm(frame.camera.project(pose.inverse().apply(m.points_m)) - m.pixels, axis=1)
+        for m in (near, anywhere)
+    ]
+    assert off[0].max() < LocalizeOptions().guided_px < np.nanmax(off[1])
+    # Most of the matches that lie near are the same.
+    known = {tuple(row) for row in anywhere.pixels[off[1] < LocalizeOptions().guided_px]}
+    assert len(known - {tuple(row) for row in near.pixels}) == 0

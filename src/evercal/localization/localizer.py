@@ -21,6 +21,7 @@ from evercal.localization.acceptance import (
     accepted,
     answer,
     order,
+    support,
 )
 from evercal.localization.alignment import align_pose
 from evercal.localization.estimate import PoseEstimate
@@ -207,7 +208,26 @@ class Localizer:
             aligned = self.aligned(query, candidate, camera, pnp.pose, change)
         if aligned is None:
             return Hypothesis(candidate.scene, pnp_inliers=inliers)
-        return replace(aligned, pnp_inliers=inliers, matches=matches)
+        return self._guided(
+            query, candidate, camera, replace(aligned, pnp_inliers=inliers, matches=matches)
+        )
+
+    def _guided(
+        self, query: Query, candidate: Candidate, camera: Camera, best: Hypothesis
+    ) -> Hypothesis:
+        """The pose after matching near itself, as long as that raises little support."""
+        while best.refined and 0 < support(best) < self.options.guided_below:
+            pose, change = best.refined.pose.pose, best.refined.change
+            small = best.refined.camera.short_side_resized(self.contents.short_side)
+            pnp = solve_pnp(
+                *self._matcher.near(query, candidate, small, pose), small, self.options.pnp
+            )
+            again = pnp and self.aligned(query, candidate, camera, pnp.pose, change)
+            if not again or support(again) < self.options.guided_gain * support(best):
+                break
+            # Rivals are sought among all matches, and not only near this pose.
+            best = replace(again, pnp_inliers=best.pnp_inliers, matches=best.matches)
+        return best
 
     def aligned(
         self,

@@ -39,10 +39,18 @@ class LocalizeOptions:
     """Gain in similarity of a turned image; less may be noise where something covers the middle."""
     aligned_inliers: int = 12
     """Poses with fewer PnP inliers are not aligned."""
-    promising_inliers: int = 16
+    promising_inliers: int = 9
     """Images with fewer PnP inliers after two attempts are rejected."""
     immediate: float = 3.0
     """Other scenes are not tried after a pose with this many times the threshold of support."""
+    guided_below: float = 1.5
+    """Poses with less support are matched again near themselves while their support rises."""
+    guided_gain: float = 1.1
+    """Factor by which guided matching must raise the support to go on."""
+    guided_stride: int = 2
+    """Rows and columns of patches of guided matching, see `Attempt`."""
+    guided_px: float = 32.0
+    """Search radius of guided matching, pixels at the encoder's working size."""
     rival_px: float = 16.0
     """A second pose is sought among matches that the first one misses by more than this, pixels."""
     rival_matched: float = 0.5
