@@ -7,7 +7,8 @@ import pytest
 
 from evercal.geometry import SE3, pose_distance
 from evercal.localization.intrinsics import OWN
-from evercal.localization.localizer import Localizer, turned
+from evercal.localization.localizer import Localizer
+from evercal.localization.matching import turned
 from evercal.localization.query import Attempt, Candidate, LocalizeOptions, Query
 from evercal.mapping.scene_map import MapContents
 from evercal.recordings import Frame, Recording
@@ -72,7 +73,7 @@ def test_quarter_turns_are_recognised(
 ) -> None:
     for frame in hall.test[1::6]:
         query = query_of(turned(frame.read_image(), turns), hall_map)
-        upright = localizer._upright(query)
+        upright = localizer._matcher.upright(query)
         assert upright.turns == -turns % 4
         assert upright is query or not upright.similar
         expected = hall_map.encoder.encode(frame.read_image(), 240)
@@ -84,7 +85,7 @@ def test_noise_is_no_turned_image(
 ) -> None:
     image, rng = frame.read_image().copy(), np.random.default_rng(0)
     image[:, 80:] = rng.integers(0, 256, image[:, 80:].shape)
-    assert localizer._upright(query_of(image, hall_map)).turns == 0
+    assert localizer._matcher.upright(query_of(image, hall_map)).turns == 0
 
 
 def test_a_pose_beside_the_true_one_converges(

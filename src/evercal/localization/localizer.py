@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.features.encoder import Features
-from evercal.features.views import working_image
 from evercal.geometry import SE3, Camera, resize_pixels
 from evercal.localization.acceptance import (
     accepted,
@@ -53,18 +52,13 @@ from evercal.recordings.images import as_rgb
 _ALONG_FOCAL = np.eye(INTRINSICS)[0]
 
 
-def turned(image: np.ndarray, turns: int) -> np.ndarray:
-    """An image after quarter turns clockwise."""
-    return np.ascontiguousarray(np.rot90(image, -turns))
-
-
 class Localizer:
     """Locates images in the scenes of a map."""
 
     def __init__(self, contents: MapContents, options: LocalizeOptions | None = None):
         self.contents, self.options = contents, options or LocalizeOptions()
         self._bank = KeyframeBank(contents, self.options.loaded_keyframes)
-        self._matcher = Matcher(self._bank, self.options)
+        self._matcher = Matcher(self._bank, self.options, contents.short_side)
 
     @classmethod
     def open(
@@ -147,22 +141,8 @@ class Localizer:
             if self.accepts(best) or (number and best.pnp_inliers < self.options.promising_inliers):
                 break
             if not number and best.pnp_inliers < self.options.aligned_inliers:
-                query = self._upright(query)  # turned, or of another room
+                query = self._matcher.upright(query)  # turned, or of another room
         return best
-
-    def _upright(self, query: Query) -> Query:
-        """The image in the quarter turn whose middle is most similar to keyframes."""
-        grey = working_image(query.image, query.plain, self.contents.short_side)[0]
-        side = self.options.middle_px
-        top, left = (max(whole - side, 0) // 2 for whole in grey.shape)
-        middle = grey[top : top + side, left : left + side]
-        encoder, views = self.contents.encoder, [turned(middle, turns) for turns in range(4)]
-        similar = [self._matcher.similarity(encoder(view)) for view in views]
-        turns = int(np.argmax(similar))
-        if similar[turns] <= similar[0] + self.options.clear_turn:
-            return query
-        features = encoder(turned(grey, turns))
-        return replace(query, features=features, turns=turns, similar={})
 
     def _tried(self, query: Query, attempt: Attempt, cameras: Sequence[Camera]) -> Hypothesis:
         """The pose with the most support of one attempt."""

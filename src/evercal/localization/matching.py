@@ -1,9 +1,11 @@
 """Candidate scenes and keyframes of an image, and the 2D-3D matches of its patches."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.features.views import cell_centres, ideal_cell_pixels
+from evercal.features.views import cell_centres, ideal_cell_pixels, working_image
 from evercal.geometry import SE3, Camera
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.query import Attempt, Candidate, LocalizeOptions, Matches, Query
@@ -12,8 +14,8 @@ from evercal.localization.query import Attempt, Candidate, LocalizeOptions, Matc
 class Matcher:
     """Retrieval and matching."""
 
-    def __init__(self, bank: KeyframeBank, options: LocalizeOptions):
-        self._bank, self._options = bank, options
+    def __init__(self, bank: KeyframeBank, options: LocalizeOptions, short_side: int):
+        self._bank, self._options, self._short_side = bank, options, short_side
 
     def candidates(self, query: Query, attempt: Attempt) -> list[Candidate]:
         """Scenes to try, most likely first.
@@ -42,7 +44,21 @@ class Matcher:
             candidates.append(Candidate(s, keyframes, attempt.stride))
         return candidates
 
-    def similarity(self, features: NDArray[np.float32]) -> float:
+    def upright(self, query: Query) -> Query:
+        """The image in the quarter turn whose middle is most similar to keyframes."""
+        grey = working_image(query.image, query.plain, self._short_side)[0]
+        side = self._options.middle_px
+        top, left = (max(whole - side, 0) // 2 for whole in grey.shape)
+        middle = grey[top : top + side, left : left + side]
+        encoder, views = self._bank.encoder, [turned(middle, turns) for turns in range(4)]
+        similar = [self._similarity(encoder(view)) for view in views]
+        turns = int(np.argmax(similar))
+        if similar[turns] <= similar[0] + self._options.clear_turn:
+            return query
+        features = encoder(turned(grey, turns))
+        return replace(query, features=features, turns=turns, similar={})
+
+    def _similarity(self, features: NDArray[np.float32]) -> float:
         """Mean similarity of every second row and column of features (rows, columns, channels).
 
         Each is compared to its most similar cell in the keyframes that match best.
@@ -104,6 +120,11 @@ def _grid(query: Query, stride: int) -> NDArray[np.int64]:
     """Indices (n,) of the patches of every `stride`-th row and column."""
     rows, columns = query.features.shape[:2]
     return np.arange(rows * columns).reshape(rows, columns)[::stride, ::stride].ravel()
+
+
+def turned(image: np.ndarray, turns: int) -> np.ndarray:
+    """An image after quarter turns clockwise."""
+    return np.ascontiguousarray(np.rot90(image, -turns))
 
 
 def strided_patches(
