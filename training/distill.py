@@ -157,7 +157,7 @@ def distil(data: Pictures, steps: int, folder: Path) -> LocalEncoder:
 
 
 def run(
-    out: Path, steps: int = 14_000, rooms: int = 14, boxes: int = 100, leaves: int = 200
+    out: Path, steps: int = 11_000, rooms: int = 14, boxes: int = 100, leaves: int = 200
 ) -> None:
     """Distil the shipped encoder (hours); the same command resumes.
 

@@ -31,7 +31,7 @@ class Layout(NamedTuple):
 _STEM = (32, 3, 1), (32, 3, 1), (64, 2, 2), (64, 3, 1), (160, 2, 2)
 TEACHER = Layout(2, _STEM, (3, 1, 3), 3, 128)
 """Trained by contrast; maps of version 0.2 and before use it."""
-SHIPPED = Layout(4, ((32, 3, 1), (32, 3, 1), (80, 2, 2)), (3, 3), 3, 64)
+SHIPPED = Layout(4, ((32, 3, 1), (48, 3, 1), (112, 2, 2)), (3, 3), 3, 64)
 """Distilled from the teacher."""
 
 

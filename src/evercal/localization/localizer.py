@@ -138,7 +138,9 @@ class Localizer:
         best = Hypothesis(0)
         for number, attempt in enumerate(self.options.attempts):
             best = max(best, self._tried(query, attempt, cameras), key=order)
-            if self.accepts(best) or (number and best.pnp_inliers < self.options.promising_inliers):
+            promising = not number or best.pnp_inliers >= self.options.promising_inliers
+            # A pose that is barely accepted may be beaten in the next attempt.
+            if self.accepts(best, self.options.immediate) or not promising:
                 break
             if not number and best.pnp_inliers < self.options.aligned_inliers:
                 query = self._matcher.upright(query)  # turned, or of another room

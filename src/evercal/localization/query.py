@@ -33,7 +33,7 @@ class LocalizeOptions:
     """Scenes that are tried per image, at most."""
     attempts: tuple[Attempt, ...] = (Attempt(12, 4), Attempt(12, 2), Attempt(48, 1))
     """Until a pose is accepted. The third is for promising images."""
-    middle_px: int = 112
+    middle_px: int = 144
     """Side of the middle of an image that its quarter turn is judged by, at working size."""
     clear_turn: float = 0.015
     """Gain in similarity of a turned image; less may be noise where something covers the middle."""
@@ -42,7 +42,7 @@ class LocalizeOptions:
     promising_inliers: int = 9
     """Images with fewer PnP inliers after two attempts are rejected."""
     immediate: float = 3.0
-    """Other scenes are not tried after a pose with this many times the threshold of support."""
+    """A pose with this many times the threshold of support is final."""
     guided_below: float = 1.5
     """Poses with less support are matched again near themselves while their support rises."""
     guided_gain: float = 1.1
