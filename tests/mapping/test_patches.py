@@ -97,7 +97,7 @@ def test_gain_and_offset_have_no_effect() -> None:
     np.testing.assert_allclose(templates, cut_patches(plain, at).templates, atol=1e-3)
     np.testing.assert_allclose(templates.mean(2), 0, atol=1e-4)
     np.testing.assert_allclose(templates[:, 2].std(1), 1, atol=1e-3)
-    assert templates.shape == (len(at), 3, (SIDE**2 + 1) // 2)
+    assert templates.shape == (len(at), 3, SIDE**2)
 
 
 def test_patches_of_another_image_do_not_fit() -> None:

@@ -64,7 +64,7 @@ class AlignmentOptions:
     """Share of matched landmarks below which the next round searches proportionally more."""
     most_more: float = 3.0
     """Largest factor on the number of landmarks."""
-    min_correlation: float = 0.75
+    min_correlation: float = 0.7
     """Smallest normalised cross-correlation of a match."""
     min_matches: int = 12
     """Fewer landmarks give no pose."""

@@ -30,11 +30,8 @@ def _grid(radius: int) -> Array:
     return np.stack(np.meshgrid(steps, steps), -1).reshape(-1, 2)
 
 
-_WIDE = _grid(RADIUS + 1)
-# Every second pixel, like the dark squares of a chessboard: neighbours show nearly the same.
-_USED = np.arange(0, SIDE * SIDE, 2)
-_OFFSETS = _grid(RADIUS)[_USED]
-_MEAN = np.full(len(_USED), 1 / len(_USED), np.float32)
+_OFFSETS, _WIDE = _grid(RADIUS), _grid(RADIUS + 1)
+_MEAN = np.full(SIDE * SIDE, 1 / SIDE**2, np.float32)
 
 
 def image_pyramid(grey: np.ndarray, levels: int) -> list[Array]:
@@ -87,16 +84,15 @@ def cut_patches(image: Array, pixels: Array) -> Patches:
     wide = wide.reshape(n, SIDE + 2, SIDE + 2)
     slope_u = (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2
     slope_v = (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2
-    patch = wide[:, 1:-1, 1:-1].reshape(n, SIDE * SIDE)[:, _USED]
+    patch = wide[:, 1:-1, 1:-1].reshape(n, SIDE * SIDE)
     patch = patch - patch.mean(1, keepdims=True)
     deviation = np.sqrt((patch * patch).mean(1, keepdims=True)) + _FLAT
-    slopes = (slope.reshape(n, SIDE * SIDE)[:, _USED] for slope in (slope_u, slope_v))
-    gradient = np.stack(list(slopes), -1)
+    gradient = np.stack([slope_u.reshape(patch.shape), slope_v.reshape(patch.shape)], -1)
     gradient /= deviation[..., None]
     hessian = gradient.transpose(0, 2, 1) @ gradient
     # Beside a flat patch the slopes are so large that the damping needs double precision.
     inverse = np.linalg.inv(hessian + _DAMPING * np.eye(2)).astype(np.float32)
-    templates = np.empty((n, 3, len(_USED)), np.float32)
+    templates = np.empty((n, 3, SIDE * SIDE), np.float32)
     templates[:, :2] = (gradient @ inverse).transpose(0, 2, 1)
     templates[:, :2] -= templates[:, :2].mean(2, keepdims=True)
     templates[:, 2] = patch / deviation
