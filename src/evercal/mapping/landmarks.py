@@ -81,14 +81,13 @@ def project_surface(
     high = np.array([camera.width, camera.height]) - BORDER_PX - 1
     inside = ((pixels > BORDER_PX) & (pixels < high)).all(1)
     visible, pixels = visible[inside], pixels[inside]
-    if most is not None and len(visible) > most:
-        spread = np.linspace(0, len(visible) - 1, most).round().astype(int)
-        visible, pixels = visible[spread], pixels[spread]
     beside = points[1:, visible] @ rotation.T + translation_m
     tangents = camera.project(np.maximum(beside, [-np.inf, -np.inf, NEAREST_M])) - pixels
     affines = tangents.transpose(1, 2, 0) / _TANGENT_PX
     area = affines[:, 0, 0] * affines[:, 1, 1] - affines[:, 0, 1] * affines[:, 1, 0]
-    similar = (area > _MIN_AREA) & (area < _MAX_AREA)
+    similar = np.flatnonzero((area > _MIN_AREA) & (area < _MAX_AREA))
+    if most is not None and len(similar) > most:
+        similar = similar[np.linspace(0, len(similar) - 1, most).round().astype(int)]
     return ProjectedPatches(visible[similar], pixels[similar], affines[similar])
 
 
