@@ -108,7 +108,7 @@ def arc_scenes(
     arcs: tuple[Recording, Recording], arc_stage: StageOptions, shared: Shared
 ) -> tuple[LearnedScenes, LearnedScenes]:
     """Networks after the first arc, and after both."""
-    from evercal.continual.networks.descriptor import load_descriptor
+    from evercal.continual.networks.descriptor import DESCRIBED_ENCODER, load_descriptor
     from evercal.continual.scenes import LearnedScenes
     from evercal.continual.strategies import STRATEGIES
     from evercal.features.encoder import load_encoder
@@ -118,7 +118,8 @@ def arc_scenes(
     def train() -> tuple[LearnedScenes, LearnedScenes]:
         strategy = STRATEGIES["evercal_network"]
         options = replace(arc_stage, fit=replace(arc_stage.fit, iterations=450))
-        empty = LearnedScenes(load_encoder(), load_descriptor(), strategy.name, 120)
+        encoder = load_encoder(DESCRIBED_ENCODER)
+        empty = LearnedScenes(encoder, load_descriptor(), strategy.name, 120)
         one = learn(empty, strategy, arcs[0], options).scenes
         return one, learn(one, strategy, arcs[1], options).scenes
 
