@@ -359,11 +359,7 @@ def test_a_wider_attempt_locates_what_the_first_rejects(
     hall_map: MapContents, views: tuple[Frame, ...]
 ) -> None:
     """One wrong keyframe is proposed first; the second attempt proposes all."""
-    narrow = LocalizeOptions(
-        attempts=(Attempt(1, 8), Attempt(48, 1)),
-        keyframes=1,
-        promising_inliers=0,
-    )
+    narrow = LocalizeOptions(attempts=(Attempt(1, 8), Attempt(48, 1)), keyframes=1)
     for view in views[::5]:
         estimate = Localizer(hall_map, narrow).localize(view.read_image(), view.camera)
         assert error(estimate, view.base_from_camera)[0] < 0.02

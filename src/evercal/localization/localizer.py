@@ -138,12 +138,12 @@ class Localizer:
         best = Hypothesis(0)
         for number, attempt in enumerate(self.options.attempts):
             best = max(best, self._tried(query, attempt, cameras), key=order)
-            promising = not number or best.pnp_inliers >= self.options.promising_inliers
+            few = best.pnp_inliers < self.options.aligned_inliers
             # A pose that is barely accepted may be beaten in the next attempt.
-            if self.accepts(best, self.options.immediate) or not promising:
+            if self.accepts(best, self.options.immediate) or (number and few):
                 break
-            if not number and best.pnp_inliers < self.options.aligned_inliers:
-                query = self._matcher.upright(query)  # turned, or of another room
+            if few:  # turned, or of another room
+                query = self._matcher.upright(query)
         return best
 
     def _tried(self, query: Query, attempt: Attempt, cameras: Sequence[Camera]) -> Hypothesis:

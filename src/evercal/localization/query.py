@@ -32,15 +32,13 @@ class LocalizeOptions:
     candidates: int = 2
     """Scenes that are tried per image, at most."""
     attempts: tuple[Attempt, ...] = (Attempt(12, 4), Attempt(12, 2), Attempt(48, 1))
-    """Until a pose is accepted. The third is for promising images."""
+    """Until a pose is final. The third is for images with enough inliers after the second."""
     middle_px: int = 144
     """Side of the middle of an image that its quarter turn is judged by, at working size."""
     clear_turn: float = 0.015
     """Gain in similarity of a turned image; less may be noise where something covers the middle."""
     aligned_inliers: int = 12
     """Poses with fewer PnP inliers are not aligned."""
-    promising_inliers: int = 9
-    """Images with fewer PnP inliers after two attempts are rejected."""
     immediate: float = 3.0
     """A pose with this many times the threshold of support is final."""
     guided_below: float = 1.5
