@@ -228,7 +228,8 @@ TABLES: dict[str, Callable[[], Table]] = {
     "results: another camera of the model": _rows(
         "answer,camera,stated,answers,located,median_mm,95_%_mm,inside_95_%,wrong", "same-model"
     ),
-    "results: speed": _rows("room,learn_s,locate_ms,locate_90_%_ms,batch_images_per_s", "speed"),
+    "results: speed": _rows("what,beside,now,ratio", "speed"),
+    "speed: AVX2": _rows("what,beside,now,ratio", "speed-avx2"),
     "boards: solvers": _rows(
         "condition,median_mm,p95_mm,inside_95,size_flagged,ms,Park_mm,Daniilidis_mm,"
         "reprojection_mm",

@@ -166,10 +166,8 @@ class _Told:
         return self.localizer.scenes
 
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
-        return self.localizer.localize(image, camera)
-
-    def camera_for(self, stated: Camera) -> Camera | None:
-        return self.case.camera(stated)
+        assert camera is not None, "frames have the true intrinsics of their view"
+        return self.localizer.localize(image, self.case.camera(camera))
 
 
 def _located(
