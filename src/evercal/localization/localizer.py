@@ -26,6 +26,7 @@ from evercal.localization.alignment import align_pose
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import (
     FOCAL_FACTORS,
+    NOT_STATED,
     UNKNOWN,
     Prior,
     cameras_in_scenes,
@@ -167,12 +168,15 @@ class Localizer:
         height, width = query.grey.shape
         small = camera.resized(width, height).short_side_resized(self.contents.short_side)
         matches = matches or self._matcher.matches(query, candidate, small)
-        unknown = query.priors[candidate.scene] is UNKNOWN
-        poses = [
-            (pose, factor)
-            for factor in (FOCAL_FACTORS if unknown else (1.0,))
-            if (pose := solve_pnp(*matches, small.zoomed(factor), self.options.pnp))
-        ]
+        prior, poses = query.priors[candidate.scene], []
+        # No camera is stated, and the image was not located at once.
+        hard = prior is NOT_STATED and candidate.stride < self.options.attempts[0].stride
+        for factor in (1.0, *FOCAL_FACTORS):
+            pnp = solve_pnp(*matches, small.zoomed(factor), self.options.pnp)
+            poses += [(pnp, factor)] if pnp else []
+            few = not pnp or pnp.inliers.sum() < self.options.aligned_inliers
+            if factor == 1 and prior is not UNKNOWN and (few or not hard):
+                break
         if not poses:
             return Hypothesis(candidate.scene)
         pnp, factor = max(poses, key=lambda pose: pose[0].inliers.sum())
