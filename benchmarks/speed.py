@@ -25,7 +25,7 @@ _AVX2 = {
 """Variables that limit OpenCV, NumPy, OpenBLAS and PyTorch to the instructions of AVX2."""
 
 _MEASURE = """
-import json, resource, sys, tempfile, time
+import json, sys, time
 from pathlib import Path
 import numpy as np
 from evercal.map import Map
@@ -114,7 +114,7 @@ def _measured(tree: Path, scene: Path | None, avx2: bool, demo: bool) -> dict[st
 
     def called(*words: str) -> tuple[str, float, float, float]:
         """Output, seconds, processor seconds and peak MB of a process."""
-        command = ["/usr/bin/env", *python_command(*words)]
+        command = python_command(*words)
         with tempfile.TemporaryFile() as printed:
             process = subprocess.Popen(
                 command, stdout=printed, stderr=subprocess.DEVNULL, env=environment, cwd=tree

@@ -15,6 +15,7 @@ from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.continual.store import NetworkStore
 from evercal.errors import InputError
 from evercal.geometry import Camera
+from evercal.localization.acceptance import without_pose
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.localization.matching import strided_patches
@@ -145,17 +146,8 @@ class NetworkLocalizer:
     def _answer(self, best: Hypothesis, milliseconds: float) -> PoseEstimate:
         record = self.contents.scenes[best.scene]
         status, reason = self._status(best, record)
-        rejected = PoseEstimate(
-            status=status,
-            reason=reason,
-            scene=None,
-            base_from_camera=None,
-            covariance=None,
-            inliers=best.inliers,
-            inlier_ratio=best.inlier_ratio,
-            milliseconds=milliseconds,
-            support=_support(best),
-        )
+        rejected = without_pose(best, _support(best), milliseconds)
+        rejected = replace(rejected, status=status, reason=reason)
         if status != "ok" or best.pose is None:
             return rejected
         return replace(

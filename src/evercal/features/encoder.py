@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
-from evercal.features.views import working_image
-from evercal.features.vlad import Vlad, fit_centroids
-from evercal.geometry import Camera
+from evercal.features.views import working_grey
+from evercal.features.vlad import Vlad, fit_centroids, unit
 from evercal.storage.atomic import write_bytes
 from evercal.storage.tensors import load_tensors, save_tensors
 
@@ -52,20 +51,18 @@ class Encoder:
                 " make (rows, columns, channels) with a stride of 1, 2, 4, 8 or 16 pixels"
             )
         self.stride, self.width = _PROBE[0] // len(features), features.shape[2]
-        self.fingerprint = _unit(features).mean((0, 1))[:8].round(4).tolist()
+        self.fingerprint = unit(features).mean((0, 1))[:8].round(4).tolist()
         self._centroids: NDArray[np.float32] | None = None
         self._vlad: Vlad | None = None
 
     def __call__(self, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(h, w) -> (h // stride, w // stride, width) unit vectors."""
         height, width = (side // self.stride * self.stride for side in grey.shape)
-        return _unit(np.asarray(self.function(_standardised(grey[:height, :width])), np.float32))
+        return unit(self.function(_standardised(grey[:height, :width])))
 
     def encode(self, image: np.ndarray, short_side: int) -> NDArray[np.float32]:
         """(rows, columns, width) features of an image (h, w) or (h, w, 3) at working size."""
-        height, width = image.shape[:2]
-        plain = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
-        return self(working_image(image, plain, short_side)[0])
+        return self(working_grey(image, short_side))
 
     @property
     def centroids(self) -> NDArray[np.float32] | None:
@@ -98,15 +95,13 @@ class Encoder:
             write_bytes(root / first, self.data)
         else:
             first = "encoder.json"
-            write_bytes(root / first, json.dumps(self._record(), indent=1).encode())
+            record = {"function": self.name, "fingerprint": self.fingerprint}
+            write_bytes(root / first, json.dumps(record, indent=1).encode())
         if self._centroids is None or (self.data and (WEIGHTS / self.name).exists()):
             return (first,)
         vlad = f"{stem.replace('encoder', 'vlad', 1) if self.data else 'vlad'}.safetensors"
         save_tensors(root / vlad, {"centroids": self._centroids})
         return first, vlad
-
-    def _record(self) -> dict[str, Any]:
-        return {"function": self.name, "fingerprint": self.fingerprint}
 
     def require_same(self, record: Any, path: Path) -> None:
         """Compare with a record of `write`; another function is an `InputError`."""
@@ -231,8 +226,3 @@ def _standardised(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
     deviation *= (grey.size / max(grey.size - 1, 1)) ** 0.5
     scale = 1 / (deviation + 0.255)
     return np.asarray(grey * np.float32(scale) - np.float32(mean * scale), np.float32)
-
-
-def _unit(features: NDArray[np.floating]) -> NDArray[np.float32]:
-    length = np.sqrt(np.einsum("ijc,ijc->ij", features, features))[..., None]
-    return np.asarray(features / np.maximum(length, 1e-12), np.float32)

@@ -128,5 +128,11 @@ def working_image(image: np.ndarray, camera: Camera, short_side: int) -> tuple[n
     return grey, small
 
 
+def working_grey(image: np.ndarray, short_side: int) -> np.ndarray:
+    """Grey (h, w) uint8 image with the given shorter side, see `working_image`."""
+    height, width = image.shape[:2]
+    return working_image(image, Camera(width, height, 1, 1, 0, 0), short_side)[0]
+
+
 def _four(camera: Camera) -> np.ndarray:
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)

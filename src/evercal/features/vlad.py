@@ -33,8 +33,8 @@ class Vlad:
     def __call__(self, features: Array) -> Array:
         """(cells, channels) unit vectors of an image -> unit vector of at most `WIDTH` numbers."""
         sums = _sums(features, self.centroids, self.centroids)
-        vector = _unit(sums).ravel()
-        return _unit(vector if self._projection is None else vector @ self._projection)
+        vector = unit(sums).ravel()
+        return unit(vector if self._projection is None else vector @ self._projection)
 
 
 def fit_centroids(features: Sequence[Array]) -> Array:
@@ -45,7 +45,7 @@ def fit_centroids(features: Sequence[Array]) -> Array:
     for _ in range(_ROUNDS):
         sums = _sums(rows, centroids)
         # A centroid without members stays where it is.
-        centroids = np.where(np.abs(sums).sum(1, keepdims=True) > 0, _unit(sums), centroids)
+        centroids = np.where(np.abs(sums).sum(1, keepdims=True) > 0, unit(sums), centroids)
     return centroids
 
 
@@ -58,8 +58,10 @@ def _sums(rows: Array, centroids: Array, origin: Array | None = None) -> Array:
     return sums if origin is None else sums - member.sum(1, keepdims=True) * origin
 
 
-def _unit(vectors: Array) -> Array:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+def unit(vectors: NDArray[np.floating]) -> Array:
+    """Vectors (..., n) of unit length."""
+    length = np.sqrt(np.einsum("...c,...c->...", vectors, vectors))[..., None]
+    return np.asarray(vectors / np.maximum(length, 1e-12), np.float32)
 
 
 def _random_projection(size: int) -> Array:

@@ -111,6 +111,21 @@ def in_base(
     )
 
 
+def without_pose(best: Hypothesis, evidence: float, milliseconds: float) -> PoseEstimate:
+    """A rejection of a pose whose support is `evidence`, without its reason."""
+    return PoseEstimate(
+        status="unknown_scene",
+        reason="",
+        scene=None,
+        base_from_camera=None,
+        covariance=None,
+        inliers=best.inliers,
+        inlier_ratio=best.inlier_ratio,
+        milliseconds=milliseconds,
+        support=evidence,
+    )
+
+
 def answer(
     best: Hypothesis,
     scene: SceneMap,
@@ -122,17 +137,7 @@ def answer(
 
     `size` are height and width of the image.
     """
-    rejected = PoseEstimate(
-        status="unknown_scene",
-        reason="",
-        scene=None,
-        base_from_camera=None,
-        covariance=None,
-        inliers=best.inliers,
-        inlier_ratio=best.inlier_ratio,
-        milliseconds=milliseconds,
-        support=support(best),
-    )
+    rejected = without_pose(best, support(best), milliseconds)
     if best.pose is None and not best.pnp_inliers:
         return replace(rejected, status="failed", reason="fewer than 6 inliers")
     if not accepted(best, scene):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.features.views import cell_centres, ideal_cell_pixels, working_image
+from evercal.features.views import cell_centres, ideal_cell_pixels, working_grey
 from evercal.geometry import SE3, Camera
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.query import Attempt, Candidate, LocalizeOptions, Matches, Query
@@ -46,7 +46,7 @@ class Matcher:
 
     def upright(self, query: Query) -> Query:
         """The image in the quarter turn whose middle is most similar to keyframes."""
-        grey = working_image(query.image, query.plain, self._short_side)[0]
+        grey = working_grey(query.image, self._short_side)
         side = self._options.middle_px
         top, left = (max(whole - side, 0) // 2 for whole in grey.shape)
         middle = grey[top : top + side, left : left + side]

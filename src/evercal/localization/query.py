@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.features.views import working_image
+from evercal.features.views import working_grey
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.localization.alignment import AlignmentOptions
 from evercal.localization.intrinsics import IntrinsicsPrior, RefinedPose
@@ -94,17 +94,10 @@ class Query:
     turns: int = 0
     """Quarter turns clockwise of the image before it was encoded."""
 
-    @property
-    def plain(self) -> Camera:
-        """A camera of the size of the image."""
-        height, width = self.image.shape[:2]
-        return Camera(width, height, 1, 1, 0, 0)
-
     @cached_property
     def grey(self) -> np.ndarray:
         """The image that landmarks are aligned in."""
-        least = min(self.short_side, *self.image.shape[:2])
-        return working_image(self.image, self.plain, least)[0]
+        return working_grey(self.image, min(self.short_side, *self.image.shape[:2]))
 
     @cached_property
     def pyramid(self) -> list[np.ndarray]:
