@@ -80,7 +80,6 @@ def _map(store: Path) -> tuple[Sequence[dict[str, Any]], int, int, dict[str, int
             "keyframes": len(scene.keyframes),
             "camera": scene.camera.to_dict(),
             "landmarks": scene.landmarks,
-            "min_support": scene.min_support,
             "adjusted": report.get("adjusted"),
             "hand_eye": report.get("hand_eye"),
         }
@@ -98,7 +97,7 @@ def _content(scene: dict[str, Any]) -> dict[str, object]:
         "keyframes": scene["keyframes"],
         **({"landmarks": scene["landmarks"]} if is_map else {}),
         "memory": size(scene["memory_bytes"]),
-        "rejected below": f"support {scene['min_support']:.2f}" if is_map else share,
+        **({} if is_map else {"rejected below": share}),
         "camera": f"{scene['camera']['width']}x{scene['camera']['height']}",
     }
 

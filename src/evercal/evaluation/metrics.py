@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from evercal.geometry import SE3
 from evercal.geometry.near import COARSE
 
-Status = Literal["ok", "ambiguous", "unknown_scene", "failed"]
+Status = Literal["ok", "uncertain", "ambiguous", "unknown_scene", "failed"]
 
 MIDDLE = (0.02, math.radians(2.0))
 FINE = (0.01, math.radians(1.0))
@@ -73,7 +73,7 @@ class SceneScores:
     wrong_scene: float
     """Frames with a pose in another scene."""
     unknown: float
-    """Frames with status `unknown_scene` or `ambiguous`."""
+    """Frames with status `unknown_scene`, `uncertain` or `ambiguous`."""
     near_training_frame: float
     """Frames with a training frame within 5 cm and 5 deg."""
     inside_95: float = math.nan
@@ -214,7 +214,9 @@ def _scene_scores(rows: list[FrameResult]) -> SceneScores:
         median_translation_cm=100.0 * sorted(row.translation_error_m for row in rows)[middle],
         median_rotation_deg=math.degrees(sorted(row.rotation_error_rad for row in rows)[middle]),
         wrong_scene=_percent([row.wrong_scene for row in rows]),
-        unknown=_percent([row.status in ("unknown_scene", "ambiguous") for row in rows]),
+        unknown=_percent(
+            [row.status in ("uncertain", "unknown_scene", "ambiguous") for row in rows]
+        ),
         near_training_frame=_percent([row.near_training_frame for row in rows]),
         inside_95=share_inside([row.squared_mahalanobis for row in rows]),
     )

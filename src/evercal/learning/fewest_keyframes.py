@@ -1,13 +1,11 @@
 """`--memory auto`: the fewest keyframes that locate a recording's other frames well."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, pose_distance
-from evercal.localization.acceptance import MAX_SUPPORT
 from evercal.localization.localizer import Localizer
 from evercal.mapping.build import BuiltMap
 from evercal.mapping.scene_map import MapContents
@@ -64,7 +62,7 @@ def _located(
     selected: NDArray[np.int64],
     frames: Sequence[Frame],
 ) -> list[SE3 | None]:
-    scene = replace(built.take(selected).scene, min_support=MAX_SUPPORT)
+    scene = built.take(selected).scene
     localizer = Localizer(MapContents(contents.encoder, contents.short_side, [scene]))
     return [localizer.localize(f.read_image(), f.camera).base_from_camera for f in frames]
 

@@ -1,11 +1,11 @@
-"""A scene of a map from a recording: keyframes, landmarks, adjusted poses, fitted acceptance."""
+"""A scene of a map from a recording: keyframes, landmarks, poses and their scatter."""
 
 import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from evercal.geometry import SE3
-from evercal.learning.fit_acceptance import fit_acceptance
+from evercal.learning.stated_scatter import with_scatter
 from evercal.mapping.build import Adjusted, MapOptions, build_map
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -39,9 +39,7 @@ class LearnReport:
     train_frames: int
     """Frames that were learned."""
     held_out_frames: int
-    """Frames that acceptance was fitted to."""
-    min_support: float = 0.0
-    """Support below which poses in this scene are rejected."""
+    """Frames that the scatter of the stated poses was fitted to."""
     landmarks: int = 0
     """Landmarks of this scene."""
     adjusted: Adjusted | None = None
@@ -63,7 +61,7 @@ def learn_scene(
     options: MapOptions | None = None,
     on_progress: OnProgress = lambda *_: None,
 ) -> tuple[SceneMap, LearnReport]:
-    """Build the map of one scene and fit its acceptance; nothing is written.
+    """Build the map of one scene and fit the scatter of its stated poses; nothing is written.
 
     Args:
         recording: Its training frames are learned; test frames are not read.
@@ -93,8 +91,8 @@ def learn_scene(
         from evercal.learning.fewest_keyframes import fewest_keyframes
 
         built = built.take(fewest_keyframes(contents, built, split.train, on_progress))
-    scene = fit_acceptance(
-        # Alone in a map, so that the threshold does not depend on the other scenes.
+    scene = with_scatter(
+        # Alone in a map, so that it does not depend on the other scenes.
         contents.empty().with_scene(built.scene),
         built.corrected(split.held_out),
         left_out=built.left_out(split.train),
@@ -107,7 +105,6 @@ def learn_scene(
         frames_kept=len(scene.keyframes),
         train_frames=len(split.train),
         held_out_frames=len(split.held_out),
-        min_support=scene.min_support,
         landmarks=scene.landmarks,
         adjusted=built.adjusted,
     )

@@ -1,18 +1,12 @@
-"""Acceptance: which poses are answers, and how wide their covariance is.
+"""Acceptance: which poses are answers.
 
-This file holds the formula of the support, its constants and the decision;
-`learning.fit_acceptance` fits the threshold of a scene. `LocalizeOptions` says at which support
-further attempts are made.
-
-The support of a pose is
-
-    inlier_ratio * (inliers / matched)^2 * sqrt(inlier_ratio * planned)
-
-The first factor falls where another room is in view. The second falls where patches matched by
-chance. The last counts the inliers, as if no more landmarks had been searched than for an
-unobstructed image. A hand before the lens lowers the first factor alone.
+One law and one rate decide. At a wrong pose some landmarks match by chance, and how many differs
+from place to place: the inliers among n searched landmarks have a beta-binomial distribution. The
+support of a pose is -log10 of the probability that a wrong one has as many inliers. A pose is
+accepted where that is below the rate of false accepts.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -22,25 +16,33 @@ from evercal.localization.estimate import CovarianceTerm, PoseEstimate
 from evercal.localization.query import Hypothesis
 from evercal.mapping.scene_map import SceneMap
 
-MAX_SUPPORT = 0.5
-"""Largest threshold. Of the wrong poses measured one had more support (research/map.md)."""
-MIN_SUPPORT = 0.14
-"""Smallest threshold, for recordings whose stated poses fit the images badly."""
-COVARIANCE_SCALE = 1.6
-"""Alignment errors of neighbouring patches are correlated, so they exceed residuals."""
+CHANCE = 13.6, 232.0
+"""Beta distribution of the inlier ratio of wrong poses: 0.055 +- 0.015 (research/trust.md)."""
+FALSE_ACCEPTS = 1e-5
+"""Probability that a wrong pose is accepted."""
 USELESS_M = 0.05
-"""Answers with a larger standard deviation of the position per axis are rejected."""
+"""Answers with a larger standard deviation of the position per axis are `uncertain`."""
 APART_SIGMAS, APART_M, APART_RAD = 5.0, 0.01, np.deg2rad(1.0)
 """Poses that differ by less are the same answer."""
-FULL_SUPPORT = 4.0
-"""Poses with less support get a wider covariance: errors on few surfaces are correlated."""
 
 
 def support(hypothesis: Hypothesis) -> float:
-    """Support of a pose, see the top of this file."""
-    ratio = hypothesis.inlier_ratio
-    exact = hypothesis.inliers / max(1, hypothesis.matched)
-    return ratio * exact**2 * (ratio * hypothesis.planned) ** 0.5
+    """Support of a pose, see the top of this file; 0 without inliers."""
+    k, n, (a, b) = hypothesis.inliers, hypothesis.expected, CHANCE
+    if not k:
+        return 0.0
+    more = np.arange(k, n)
+    # Logarithms of the probabilities of k, k + 1, ... n inliers, relative to that of k.
+    steps = np.log((n - more) / (more + 1) * (more + a) / (n - more - 1 + b))
+    relative = np.r_[0.0, np.cumsum(steps)]
+    tail = relative.max() + math.log(np.exp(relative - relative.max()).sum())
+    choose = math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
+    first = choose + _log_beta(k + a, n - k + b) - _log_beta(a, b)
+    return max(0.0, -(first + tail) / math.log(10))
+
+
+def _log_beta(a: float, b: float) -> float:
+    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
 
 
 def order(hypothesis: Hypothesis) -> tuple[float, int]:
@@ -48,44 +50,35 @@ def order(hypothesis: Hypothesis) -> tuple[float, int]:
     return support(hypothesis), hypothesis.pnp_inliers
 
 
-def accepted(hypothesis: Hypothesis, scene: SceneMap, times: float = 1.0) -> bool:
-    """Whether a pose has enough support in its scene."""
-    return hypothesis.inliers > 0 and support(hypothesis) >= times * scene.min_support
+def accepted(hypothesis: Hypothesis, times: float = 1.0) -> bool:
+    """Whether a pose has `times` the support that is required."""
+    return support(hypothesis) >= -times * math.log10(FALSE_ACCEPTS)
 
 
 def rejection(hypothesis: Hypothesis, scene: SceneMap) -> str:
     """Why a pose is not accepted."""
     share = f"{100 * hypothesis.inlier_ratio:.0f} %"
     return (
-        f"{hypothesis.inliers} inliers, {share} of the landmarks that should be visible:"
-        f" support {support(hypothesis):.2f}, {scene.name} requires {scene.min_support:.2f}"
+        f"{hypothesis.inliers} inliers, {share} of the landmarks of {scene.name} that should be"
+        f" visible: support {support(hypothesis):.1f}, {-math.log10(FALSE_ACCEPTS):.1f} is required"
     )
 
 
-def widened(hypothesis: Hypothesis, scene: SceneMap) -> UncertainPose:
-    """The pose of a hypothesis with the covariance that its support and its scene ask for."""
-    assert hypothesis.pose is not None, "a hypothesis without a pose is never accepted"
-    few = FULL_SUPPORT / max(support(hypothesis), 1e-9) if hypothesis.inliers else 1.0
-    scale = scene.covariance_scale * max(1.0, few)
-    return UncertainPose(hypothesis.pose.pose, scale * hypothesis.pose.covariance)
-
-
-def differ(hypothesis: Hypothesis, other: SE3, scene: SceneMap) -> bool:
+def differ(hypothesis: Hypothesis, other: SE3) -> bool:
     """Whether another pose, map_from_camera, is outside the uncertainty of an accepted one."""
-    own = widened(hypothesis, scene)
-    metres, radians = pose_distance(own.pose, other)
-    if scene.frame.similarity is not None:
-        metres = metres * scene.frame.similarity.scale
-    far = not scene.unit_known or metres > APART_M or radians > APART_RAD
-    return bool(far and own.squared_mahalanobis(other) > APART_SIGMAS**2)
+    assert hypothesis.pose is not None, "a hypothesis without a pose is never accepted"
+    metres, radians = pose_distance(hypothesis.pose.pose, other)
+    far = metres > APART_M or radians > APART_RAD
+    return bool(far and hypothesis.pose.squared_mahalanobis(other) > APART_SIGMAS**2)
 
 
 def in_base(
     hypothesis: Hypothesis, scene: SceneMap
 ) -> tuple[UncertainPose, tuple[CovarianceTerm, ...]]:
     """The answer in the base frame, and the shares of its covariance."""
-    wide = widened(hypothesis, scene)
-    estimate = scene.frame.to_base(wide)
+    pose = hypothesis.pose
+    assert pose is not None, "a hypothesis without a pose is never accepted"
+    estimate = scene.frame.to_base(pose)
     if hypothesis.refined is None:
         return estimate, ()
 
@@ -94,9 +87,8 @@ def in_base(
     def moved(covariance: np.ndarray) -> np.ndarray:
         return slope @ covariance @ slope.T
 
-    scale = np.trace(wide.covariance) / np.trace(refined.pose.covariance)
-    lens = moved(scale * refined.by_intrinsics)
-    view = moved(wide.covariance) - lens
+    lens = moved(refined.by_intrinsics)
+    view = moved(pose.covariance) - lens
     poses, stated = (
         moved(np.diag(np.repeat(np.square(sigma), 3)))
         for sigma in (scene.frame.pose_sigma, scene.frame.frame_sigma)
@@ -140,7 +132,7 @@ def answer(
     rejected = without_pose(best, support(best), milliseconds)
     if best.pose is None and not best.pnp_inliers:
         return replace(rejected, status="failed", reason="fewer than 6 inliers")
-    if not accepted(best, scene):
+    if not accepted(best):
         return replace(rejected, reason=rejection(best, scene))
     estimate, terms = in_base(best, scene)
     if rival is not None and rival.pose is not None:
@@ -155,7 +147,7 @@ def answer(
         )
     if scene.unit_known and estimate.sigma_mm > 1000 * USELESS_M:
         wide = f"its position is uncertain by {estimate.sigma_mm:.0f} mm per axis"
-        return replace(rejected, reason=wide)
+        return replace(rejected, status="uncertain", reason=wide, scene=scene.name)
     assert best.points_m is not None, "accepted poses have inliers"
     return replace(
         rejected,

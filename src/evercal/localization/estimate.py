@@ -26,10 +26,10 @@ class CovarianceTerm:
 class PoseEstimate:
     """The answer for one image; failure is a value, not an exception."""
 
-    status: Literal["ok", "ambiguous", "unknown_scene", "failed"]
-    """`ambiguous`: two poses explain the image, see `alternatives`. `unknown_scene`: a pose without
-    enough support, or too uncertain to be useful. `failed`: no pose, or a network's pose outside
-    the cell of its scene."""
+    status: Literal["ok", "uncertain", "ambiguous", "unknown_scene", "failed"]
+    """`uncertain`: the scene is known, the pose is too uncertain to be useful. `ambiguous`: two
+    poses explain the image, see `alternatives`. `unknown_scene`: no pose has enough support.
+    `failed`: no pose, or a network's pose outside the cell of its scene."""
     reason: str
     """Why the status is not `ok`; empty otherwise."""
     scene: str | None
@@ -56,7 +56,7 @@ class PoseEstimate:
     omitted: tuple[str, ...] = ()
     """Steps that a time for the frame left out, see `TrackOptions.at_most_ms`."""
     support: float = 0.0
-    """Support of the pose, see `localization.acceptance`."""
+    """-log10 of the probability of as many inliers at a wrong pose; 0 for networks."""
 
     @property
     def uncertain_pose(self) -> UncertainPose | None:

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.geometry import Camera, UncertainPose
 from evercal.localization.pose_refinement import (
+    INTRINSICS,
     Minimum,
     Observed,
+    cells_of,
     in_parent_axes,
-    inverse_of,
     minimise,
 )
-from evercal.mapping.scene_map import SHARED_PX
 
 if TYPE_CHECKING:
     from evercal.localization.learned import LearnedScene
@@ -61,6 +61,45 @@ class IntrinsicsPrior:
         centre = self.centre * max(camera.width, camera.height)
         return np.square([self.focal, centre, centre, self.k1, self.k2])
 
+    def tested(self, camera: Camera, change: Array, measured: Array) -> Array:
+        """(5,) variances: those of the prior, wider where an estimate contradicts it.
+
+        The change (5,) and its covariance (5, 5) were estimated without a prior. Before a flat
+        scene no parameter contradicts the prior alone, but all together may.
+        """
+        tight = self.variances(camera)
+        excess = change**2 - DOUBT * (np.diag(measured) + tight)
+        variances = tight + np.maximum(excess, 0)
+        squares = change @ np.linalg.solve(measured + np.diag(variances), change)
+        return FREE.variances(camera) if squares > CONTRADICTED else variances
+
+    def doubt(self, camera: Camera, change: Array, measured: Array) -> float:
+        """Probability that an image is of another camera of the model, by estimated intrinsics.
+
+        See `tested`. Each hypothesis is a Gaussian about the intrinsics of the recording.
+        """
+        own, other = (
+            _log_density(change, measured + np.diag(sigma.variances(camera)))
+            for sigma in (self, SAME_MODEL)
+        )
+        before = self.other_camera
+        odds = before / (1 - before) * math.exp(min(max(other - own, -700.0), 700.0))
+        return odds / (1 + odds)
+
+    def decided(self, camera: Camera, change: Array, measured: Array) -> tuple[float, Array | None]:
+        """Probability of another camera, and variances (5,) that an estimate asks for.
+
+        The variances are None where the prior holds; the estimate is as for `tested`.
+        """
+        if not self.other_camera:
+            variances = self.tested(camera, change, measured)
+            holds = np.allclose(variances, self.variances(camera))
+            return 0.0, None if holds else variances
+        doubt = self.doubt(camera, change, measured)
+        if doubt <= 0.5:
+            return doubt, None
+        return doubt, UNKNOWN.tested(camera, change, measured)
+
 
 OWN = IntrinsicsPrior(focal=2e-4, centre=3e-4, k1=1e-3, k2=1e-3, other_camera=0.01)
 """The camera that recorded the scene: its error is in the landmarks, too, and cancels."""
@@ -78,79 +117,14 @@ FOCAL_FACTORS = (0.7, 0.84, 1.2, 1.44)
 """Focal lengths that are tried where nothing is known, relative to a guess, beside it."""
 
 
-@dataclass(frozen=True)
-class Prior:
-    """The prior of one image."""
-
-    sigma: IntrinsicsPrior = NOT_STATED
-    scale: float = 1.0
-    """Factor on the covariance of landmarks."""
-    shared_px: float = SHARED_PX
-    """See `SceneMap.shared_px`."""
-
-    def free(self, camera: Camera) -> Array:
-        """(5,) variances that hardly bind."""
-        return FREE.variances(camera) / self.scale
-
-    def tight(self, camera: Camera) -> Array:
-        """(5,) variances of the prior itself."""
-        return self.sigma.variances(camera) / self.scale
-
-    def tested(self, camera: Camera, change: Array, covariance: Array) -> Array:
-        """(5,) variances: those of the prior, wider where an estimate contradicts it.
-
-        The change (5,) and its covariance (5, 5) were estimated without a prior. Before a flat
-        scene no parameter contradicts the prior alone, but all together may.
-        """
-        tight, measured = self.sigma.variances(camera), self.scale * covariance
-        excess = change**2 - DOUBT * (np.diag(measured) + tight)
-        variances = tight + np.maximum(excess, 0)
-        squares = change @ np.linalg.solve(measured + np.diag(variances), change)
-        return self.free(camera) if squares > CONTRADICTED else variances / self.scale
-
-    def other_camera(self, camera: Camera, change: Array, covariance: Array) -> float:
-        """Probability that an image is of another camera of the model, by estimated intrinsics.
-
-        See `tested`. Each hypothesis is a Gaussian about the intrinsics of the recording.
-        """
-        own, other = (
-            _log_density(change, self.scale * covariance + np.diag(sigma.variances(camera)))
-            for sigma in (self.sigma, SAME_MODEL)
-        )
-        before = self.sigma.other_camera
-        odds = before / (1 - before) * math.exp(min(max(other - own, -700.0), 700.0))
-        return odds / (1 + odds)
-
-    def decided(
-        self, camera: Camera, change: Array, covariance: Array
-    ) -> tuple[float, Array | None]:
-        """Probability of another camera, and variances (5,) that an estimate asks for.
-
-        The variances are None where the prior holds; the estimate is as for `tested`.
-        """
-        if not self.sigma.other_camera:
-            variances = self.tested(camera, change, covariance)
-            holds = np.allclose(variances, self.tight(camera))
-            return 0.0, None if holds else variances
-        doubt = self.other_camera(camera, change, covariance)
-        if doubt <= 0.5:
-            return doubt, None
-        return doubt, replace(self, sigma=UNKNOWN).tested(camera, change, covariance)
+def zoomed(factor: float) -> Array:
+    """(5,) change of the intrinsics to `factor` times the focal length."""
+    return np.log(factor) * np.eye(INTRINSICS)[0]
 
 
 def _log_density(change: Array, covariance: Array) -> float:
     squares = change @ np.linalg.solve(covariance, change)
     return float(-(squares + np.linalg.slogdet(covariance)[1]) / 2)
-
-
-@dataclass(frozen=True, eq=False)
-class MeasuredIntrinsics:
-    """Intrinsics that landmarks measure without a prior."""
-
-    squares: float
-    """Squared change from the stated intrinsics in standard deviations of landmarks' errors."""
-    by_shared: float
-    """Factor on the variance is 1 + `by_shared` s^2, if landmarks share errors of s pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,56 +141,52 @@ class RefinedPose:
     """(5,) change of the intrinsics."""
     by_intrinsics: Array
     """(6, 6) share of the pose's covariance that is due to the intrinsics."""
-    measured: MeasuredIntrinsics
 
 
 def self_calibrated(
-    observed: Observed, camera: Camera, start: tuple[Array, Array], change: Array, prior: Prior
+    observed: Observed,
+    camera: Camera,
+    start: tuple[Array, Array],
+    change: Array,
+    prior: IntrinsicsPrior,
 ) -> RefinedPose:
     """Pose and intrinsics; the prior gives way where the image contradicts it.
 
     The start is rotation and position of points_from_camera. Other priors than the stated one are
     a linear step away, unless the image contradicts it.
     """
-    own = minimise(observed, camera, start, _REFINE_STEPS, prior.tight(camera), change)
-    step, inverse = own.moved(own.variance / prior.free(camera))
-    variance, free = own.variance_after(step), own.change + step[6:]
-    # Errors that neighbouring landmarks share do not average out.
-    by_shared = float((observed.whitening**2).sum()) / (2 * variance)
-    shared = 1 + prior.shared_px**2 * by_shared
-    prior = replace(prior, scale=shared * prior.scale)
-    doubt, variances = prior.decided(camera, free, variance * inverse[6:, 6:])
-    unsure = doubt > prior.sigma.other_camera or variance < _BETTER * own.variance
-    if variances is not None or unsure:
-        best = minimise(observed, camera, start, _REFINE_STEPS, prior.free(camera), free)
-        variance, free = best.variance, best.change
-        inverse = best.moved(variance / prior.free(camera))[1]
-        doubt, variances = prior.decided(camera, free, variance * inverse[6:, 6:])
+    tight, free = prior.variances(camera), FREE.variances(camera)
+    own = minimise(observed, camera, start, _REFINE_STEPS, tight, change)
+    cells = cells_of(observed.pixels, camera)
+    step, _ = own.moved(own.variance / free)
+    measured = own.covariance(own.variance / free, cells)[6:, 6:]
+    doubt, variances = prior.decided(camera, own.change + step[6:], measured)
+    better = own.variance_after(step) < _BETTER * own.variance
+    if variances is not None or doubt > prior.other_camera or better:
+        best = minimise(observed, camera, start, _REFINE_STEPS, free, own.change + step[6:])
+        measured = best.covariance(best.variance / free, cells)[6:, 6:]
+        doubt, variances = prior.decided(camera, best.change, measured)
         if variances is not None:
             start = best.rotation, best.position
-            own = minimise(observed, camera, start, _REFINE_STEPS, variances, free)
-    squares = free @ np.linalg.solve(variance * inverse[6:, 6:], free)
-    limits = prior.tight(camera) if variances is None else variances
-    covariance, lens = _covariances(own, limits)
+            own = minimise(observed, camera, start, _REFINE_STEPS, variances, best.change)
+    limits = tight if variances is None else variances
+    covariance, lens = _covariances(own, limits, cells)
     if variances is None and doubt:
         # A covariance whose deviation reaches to the pose of another camera of the model.
-        # Covariances are scaled by the caller, distances are not.
-        other = replace(prior, sigma=SAME_MODEL).tight(camera)
+        other = SAME_MODEL.variances(camera)
         off = (own.moved(own.variance / other)[0] - own.moved(own.variance / limits)[0])[:6]
-        wider = _covariances(own, other)[1] - lens + np.outer(off, off) / prior.scale
+        wider = _covariances(own, other, cells)[1] - lens + np.outer(off, off)
         more = min(1.0, doubt / _REACHED) * wider
         covariance, lens = covariance + more, lens + more
-    lens = shared * lens
-    pose = own.pose(covariance + (1 - 1 / shared) * lens)
     by_lens = in_parent_axes(own.rotation, lens)
-    measured = MeasuredIntrinsics(float(squares), by_shared)
-    return RefinedPose(pose, own.residual_px, own.camera, own.change, by_lens, measured)
+    pose = own.pose(covariance)
+    return RefinedPose(pose, own.residual_px, own.camera, own.change, by_lens)
 
 
-def _covariances(minimum: Minimum, variances: Array) -> tuple[Array, Array]:
+def _covariances(minimum: Minimum, variances: Array, cells: Array) -> tuple[Array, Array]:
     """(6, 6) covariance of a pose in camera axes, and the share of the intrinsics in it."""
-    whole = minimum.variance * minimum.moved(minimum.variance / variances)[1][:6, :6]
-    return whole, whole - minimum.variance * inverse_of(minimum.data[:6, :6])
+    whole = minimum.covariance(minimum.variance / variances, cells)[:6, :6]
+    return whole, whole - minimum.covariance(np.zeros(0), cells)
 
 
 def cameras_in_scenes(

@@ -28,14 +28,13 @@ from evercal.localization.intrinsics import (
     FOCAL_FACTORS,
     NOT_STATED,
     UNKNOWN,
-    Prior,
     cameras_in_scenes,
     prior_of,
+    zoomed,
 )
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.matching import Matcher
 from evercal.localization.pnp import solve_pnp, uncertain
-from evercal.localization.pose_refinement import INTRINSICS
 from evercal.localization.query import (
     Attempt,
     Candidate,
@@ -49,8 +48,6 @@ from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
 from evercal.processes import one_product_thread
 from evercal.recordings.images import as_rgb
-
-_ALONG_FOCAL = np.eye(INTRINSICS)[0]
 
 
 class Localizer:
@@ -122,8 +119,8 @@ class Localizer:
         return np.zeros((0, 3)) if found is None else self._bank.pattern(found.keyframes)
 
     def accepts(self, hypothesis: Hypothesis, times: float = 1.0) -> bool:
-        """Whether a pose has `times` the support that its scene requires."""
-        return accepted(hypothesis, self.contents.scenes[hypothesis.scene], times)
+        """Whether a pose has `times` the required support."""
+        return accepted(hypothesis, times)
 
     def localize_batch(
         self, images: Sequence[np.ndarray], cameras: Sequence[Camera | None]
@@ -185,12 +182,10 @@ class Localizer:
             pixels, points = (values[pnp.inliers] for values in matches)
             pose = uncertain(pixels, points, small.zoomed(factor), pnp.pose)
             count = len(pnp.inliers)
-            return Hypothesis(
-                candidate.scene, pose, None, pixels, points, count, inliers, count, inliers
-            )
+            return Hypothesis(candidate.scene, pose, None, pixels, points, count, inliers, inliers)
         aligned = None
         if inliers >= self.options.aligned_inliers:
-            change = np.log(factor) * _ALONG_FOCAL
+            change = zoomed(factor)
             aligned = self.aligned(query, candidate, camera, pnp.pose, change)
         if aligned is None:
             return Hypothesis(candidate.scene, pnp_inliers=inliers)
@@ -202,7 +197,7 @@ class Localizer:
         self, query: Query, candidate: Candidate, camera: Camera, best: Hypothesis
     ) -> Hypothesis:
         """The pose after matching near itself, as long as that raises little support."""
-        while best.refined and 0 < support(best) < self.options.guided_below:
+        while best.refined and not self.accepts(best, self.options.immediate):
             pose, change = best.refined.pose.pose, best.refined.change
             small = best.refined.camera.short_side_resized(self.contents.short_side)
             pnp = solve_pnp(
@@ -227,14 +222,13 @@ class Localizer:
     ) -> Hypothesis | None:
         """A pose map_from_camera, refined by landmarks; see `align_pose`."""
         height, width = query.grey.shape
-        scene = self.contents.scenes[candidate.scene]
         aligned = align_pose(
             query.pyramid,
             camera.resized(width, height),
             [self._bank.load(int(index)).landmarks for index in candidate.keyframes],
             start,
             self.options.alignment,
-            Prior(query.priors[candidate.scene], scene.covariance_scale, scene.shared_px),
+            query.priors[candidate.scene],
             change,
             coarse,
             least,
@@ -250,6 +244,5 @@ class Localizer:
             aligned.points_m,
             aligned.expected,
             aligned.matched,
-            aligned.planned,
             candidate=candidate,
         )

@@ -18,6 +18,11 @@ _DIVERGED = 10.0
 """Growth of the variance of residuals at which the step before is kept."""
 _FOCAL_CHANGE = 1.0
 """Largest change of the logarithm of the focal lengths."""
+SHARED = 0.07
+"""Variance of the error that all observations of a cell share, over the square of their variance:
+errors that are larger than the noise of patches are shared more (research/trust.md)."""
+SHARED_CELLS = 4
+"""Such cells along the shorter side of an image."""
 _OPEN = 1e-12
 """Damping of the scaled information: an open direction gets a huge variance."""
 
@@ -71,6 +76,26 @@ class Minimum:
         gradient[6:] += prior * self.change[:count]
         inverse = inverse_of(data)
         return -inverse @ gradient, inverse
+
+    def covariance(self, prior: Array, cells: Array) -> Array:
+        """Covariance (k, k) at the minimum with a prior, see `moved`.
+
+        That of an M-estimator with Cauchy weights (Huber, Robust Statistics, 1981). Observations of
+        a cell, see `cells_of`, share a part of their errors, which does not average out.
+        """
+        count = 6 + len(prior)
+        squares = (self.residual**2).sum(0)
+        weight = 1 / (1 + squares / self.variance)
+        slope = self.slope[:count] * weight
+        rows, sums = slope.reshape(count, -1), (slope @ cells).reshape(count, -1)
+        hessian = rows @ rows.T
+        noise = float((weight**2 @ squares) / (2 * (weight**2).sum()))
+        scores = noise * hessian + SHARED * self.variance**2 * sums @ sums.T
+        diagonal = slice(6 * count + 6, None, count + 1)
+        hessian.flat[diagonal] += prior
+        scores.flat[diagonal] += prior * self.variance
+        inverse = inverse_of(hessian)
+        return inverse @ scores @ inverse
 
     def variance_after(self, step: Array) -> float:
         """Robust variance of the errors after a step (k,)."""
@@ -145,6 +170,13 @@ def robust_variance(squares: Array) -> float:
     half = len(squares) // 2
     # np.median takes three times as long for some hundred values.
     return max(float(np.partition(squares, half)[half]) / 1.386, 0.05)
+
+
+def cells_of(pixels: Array, camera: Camera) -> Array:
+    """(n, cells) 1 where a pixel (n, 2) lies in a cell of the image."""
+    side = min(camera.width, camera.height) / SHARED_CELLS
+    cell = (pixels // side).astype(np.int64) @ [1, 1000]
+    return (cell[:, None] == np.unique(cell)).astype(np.float64)
 
 
 def changed_camera(camera: Camera, change: Array) -> Camera:

@@ -40,9 +40,8 @@ class LocalizeOptions:
     aligned_inliers: int = 12
     """Poses with fewer PnP inliers are not aligned."""
     immediate: float = 3.0
-    """A pose with this many times the threshold of support is final."""
-    guided_below: float = 1.5
-    """Poses with less support are matched again near themselves while their support rises."""
+    """A pose with this many times the required support is final. Others are matched again near
+    themselves while their support rises."""
     guided_gain: float = 1.1
     """Factor by which guided matching must raise the support to go on."""
     guided_stride: int = 2
@@ -148,8 +147,6 @@ class Hypothesis:
     """Landmarks that should be visible and were searched."""
     matched: int = 0
     """Landmarks whose patch was found near the expected position."""
-    planned: int = 0
-    """Landmarks that an unobstructed image would have been searched for."""
     pnp_inliers: int = 0
     """Matches that agree with the pose before alignment."""
     candidate: Candidate | None = None

@@ -6,8 +6,13 @@ from typing import TYPE_CHECKING
 
 from evercal.geometry import Camera
 from evercal.localization.acceptance import differ, support
+from evercal.localization.intrinsics import FOCAL_FACTORS, UNKNOWN, zoomed
+from evercal.localization.pnp import solve_pnp
 from evercal.localization.query import Hypothesis, Query
 from evercal.localization.repetition import displaced
+
+_NEXT_FOCAL = 0.09
+"""Half of the step between `FOCAL_FACTORS`, logarithm."""
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
@@ -20,7 +25,7 @@ def settled(
 
     Without a runner-up that explains the image nearly as well, the second value is None.
     """
-    options, scene = localizer.options, localizer.contents.scenes[best.scene]
+    options = localizer.options
     seen, front = [best], best
     for _ in range(options.climbs):
         rivals = [
@@ -38,7 +43,7 @@ def settled(
     strongest = max(seen, key=lambda rival: _strength(localizer, rival, best))
     if _strength(localizer, strongest, best) * options.clear_strength > 1:
         best = strongest
-    others = [x for x in seen if x.pose and x is not best and differ(best, x.pose.pose, scene)]
+    others = [x for x in seen if x.pose and x is not best and differ(best, x.pose.pose)]
     runner_up = max(others, key=lambda rival: _strength(localizer, rival, best), default=None)
     if runner_up is None or _strength(localizer, runner_up, best) <= options.clear_strength:
         return best, None
@@ -82,9 +87,32 @@ def _rivals(
         if len(rest.pixels) >= localizer.options.aligned_inliers:
             left_over = localizer.hypothesis(query, best.candidate, camera, rest)
             yield replace(left_over, matches=best.matches)
+    if query.priors[best.scene] is UNKNOWN or abs(change[0]) > _NEXT_FOCAL:
+        yield from _other_focal_lengths(localizer, query, best, camera)
     for step in localizer.slips(best):
         start = displaced(pose, step)
         least = localizer.options.rival_matched * best.matched / best.expected
         rival = localizer.aligned(query, best.candidate, camera, start, change, False, least)
         if rival is not None:
             yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
+
+
+def _other_focal_lengths(
+    localizer: "Localizer", query: Query, best: Hypothesis, camera: Camera
+) -> Iterator[Hypothesis]:
+    """Poses that start at other focal lengths.
+
+    Before a flat surface a longer focal length looks like a smaller distance.
+    """
+    if best.matches is None or best.refined is None or best.candidate is None:
+        return
+    small = camera.short_side_resized(localizer.contents.short_side)
+    for factor in (1.0, *FOCAL_FACTORS):
+        change = zoomed(factor)
+        if abs(change[0] - best.refined.change[0]) < _NEXT_FOCAL:
+            continue
+        pnp = solve_pnp(*best.matches, small.zoomed(factor), localizer.options.pnp)
+        if pnp and pnp.inliers.sum() >= localizer.options.aligned_inliers:
+            rival = localizer.aligned(query, best.candidate, camera, pnp.pose, change)
+            if rival is not None:
+                yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)

@@ -16,9 +16,6 @@ from evercal.mapping.map_frame import MapFrame
 if TYPE_CHECKING:
     from evercal.recordings.frame import Frame
 
-SHARED_PX = 0.02
-"""`SceneMap.shared_px` of a map that is not tested with frames of its recording."""
-
 
 @dataclass(frozen=True, eq=False)
 class SceneMap:
@@ -36,14 +33,6 @@ class SceneMap:
     """Relation of the landmarks' frame to the base frame."""
     train_frames: int
     """Frames that the map was built from."""
-    min_support: float = 0.0
-    """Poses with less support are rejected (`localization.acceptance`)."""
-    shared_px: float = SHARED_PX
-    """Errors that landmarks share, pixels: they bound how well many landmarks measure the
-    intrinsics of an image. A flat wall seen from the front would otherwise seem to measure the
-    focal length."""
-    covariance_scale: float = 1.0
-    """Factor on covariances (`localization.acceptance.COVARIANCE_SCALE`)."""
     metric: bool = True
     """Whether the recording was in metres; False where its unit of length is unknown."""
 

@@ -44,10 +44,7 @@ REFRESHES = "refreshes.json"
 _STATE, PREVIOUS = (SCENE, KEYFRAMES, CORRECTION), "previous-"
 """Files that a refresh replaces, and the prefix of their state before."""
 
-_FIELDS = (
-    "name", "camera", "adjusted_camera", "train_frames", "min_support", "shared_px",
-    "covariance_scale", "metric",
-)  # fmt: skip
+_FIELDS = "name", "camera", "adjusted_camera", "train_frames", "metric"
 """Fields of `SceneMap` in scene.json, beside `frame`."""
 
 

@@ -103,7 +103,6 @@ def learn_networks(
             frames_kept=done.frames_kept,
             train_frames=len(split.train),
             held_out_frames=len(split.held_out),
-            min_support=record.inlier_threshold,
             iterations=done.iterations,
             head_bytes=sum(head_bytes(head) for head in done.scenes.heads),
         )
