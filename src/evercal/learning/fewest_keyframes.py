@@ -43,12 +43,13 @@ def fewest_keyframes(
     located = _located(contents, built, everything, [others[i] for i in spread])
     probes = [others[i] for i, pose in zip(spread, located, strict=True) if pose is not None]
     reference = [pose for pose in located if pose is not None]
+    unit = built.scene.frame.unit
     sizes = sorted({max(1, int(share * built.scene.train_frames)) for share in SHARES})
     for step, size in enumerate(size for size in sizes if size < len(poses)):
         on_progress("selecting keyframes", step + 1, len(sizes))
         selected = spread_poses(poses, size)
         poses_of_few = _located(contents, built, selected, probes)
-        good = [_close(*pair) for pair in zip(poses_of_few, reference, strict=True)]
+        good = [_close(*pair, unit) for pair in zip(poses_of_few, reference, strict=True)]
         if good and sum(good) >= LEAST_LOCATED * len(probes):
             everything = selected
             break
@@ -67,8 +68,8 @@ def _located(
     return [localizer.localize(f.read_image(), f.camera).base_from_camera for f in frames]
 
 
-def _close(pose: SE3 | None, reference: SE3) -> bool:
+def _close(pose: SE3 | None, reference: SE3, unit: float) -> bool:
     if pose is None:
         return False
     metres, radians = pose_distance(pose, reference)
-    return bool(metres < MOST_M and radians < np.deg2rad(MOST_DEG))
+    return bool(metres < MOST_M * unit and radians < np.deg2rad(MOST_DEG))

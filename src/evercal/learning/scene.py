@@ -85,8 +85,8 @@ def learn_scene(
     require_frames(recording, least)
     split = split_held_out(recording.train)
     options = _sized(options, budget, contents.short_side)
+    options = replace(options, metric=recording.metric)
     built = build_map(recording.name, split.train, contents.encoder, options, on_progress)
-    built = replace(built, scene=replace(built.scene, metric=recording.metric))
     if budget.auto:
         from evercal.learning.fewest_keyframes import fewest_keyframes
 

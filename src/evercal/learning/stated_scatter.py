@@ -33,11 +33,13 @@ def with_scatter(
             from frame to frame. It averages out in the map and is no error of an answer.
     """
     *others, scene = contents.scenes
+    # Scatter and its bounds are in the unit of the map.
+    unit = scene.frame.unit
     bare = replace(scene, frame=replace(scene.frame, frame_sigma=(0.0, 0.0)))
-    answers = _located(replace(contents, scenes=[*others, bare]), held_out, scene.name)
+    answers = _located(replace(contents, scenes=[*others, bare]), held_out, scene.name, unit)
     for part in left_out:
         few = replace(bare, keyframes=scene.keyframes.take(part.keyframes))
-        answers += _located(replace(contents, scenes=[*others, few]), part.frames, scene.name)
+        answers += _located(replace(contents, scenes=[*others, few]), part.frames, scene.name, unit)
     answers = [answer for answer in answers if np.linalg.norm(answer.off[:3]) < WRONG_PLACE_M]
     if len(answers) < LEAST_ANSWERS:
         return scene
@@ -55,13 +57,16 @@ class _Answer(NamedTuple):
     """A located frame beside its stated pose."""
 
     off: np.ndarray
-    """(6,) translation in the base frame, metres, and rotation about camera axes, radians."""
+    """(6,) translation in the base frame, unit of the map, and rotation about camera axes,
+    radians."""
     covariance: np.ndarray
     """(6, 6)."""
 
 
-def _located(contents: MapContents, frames: Sequence[Frame], scene: str) -> list[_Answer]:
-    localizer, answers = Localizer(contents), []
+def _located(
+    contents: MapContents, frames: Sequence[Frame], scene: str, unit: float
+) -> list[_Answer]:
+    localizer, answers, size = Localizer(contents), [], np.repeat([unit, 1.0], 3)
     for frame in frames:
         estimate = localizer.localize(frame.read_image(), frame.camera)
         pose, stated = estimate.uncertain_pose, frame.base_from_camera
@@ -70,7 +75,7 @@ def _located(contents: MapContents, frames: Sequence[Frame], scene: str) -> list
         if np.isfinite(pose.covariance).all():
             turn = (pose.pose.inverse() @ stated).log()[3:]
             off = np.r_[stated.translation_m - pose.pose.translation_m, turn]
-            answers.append(_Answer(off, pose.covariance))
+            answers.append(_Answer(off / size, pose.covariance / np.outer(size, size)))
     return answers
 
 

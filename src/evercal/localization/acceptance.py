@@ -145,8 +145,10 @@ def answer(
             scene=scene.name,
             alternatives=(estimate.pose, other),
         )
-    if scene.unit_known and estimate.sigma_mm > 1000 * USELESS_M:
-        wide = f"its position is uncertain by {estimate.sigma_mm:.0f} mm per axis"
+    metres = estimate.sigma_mm / 1000 / scene.frame.unit * scene.metres_per_unit
+    if metres > USELESS_M:
+        off = f"{1000 * metres:.0f} mm" if scene.unit_known else f"{estimate.sigma_mm / 1000:.3g}"
+        wide = f"its position is uncertain by {off} per axis"
         return replace(rejected, status="uncertain", reason=wide, scene=scene.name)
     assert best.points_m is not None, "accepted poses have inliers"
     return replace(

@@ -156,7 +156,8 @@ def _precise(estimate: PoseEstimate, scene: SceneMap) -> bool:
     """Whether the image determines its own pose well, apart from errors that all answers share."""
     own = sum(term.covariance for term in estimate.terms if term.name in ("view", "lens"))
     sigma = np.sqrt(np.diag(np.asarray(own)).reshape(2, 3).mean(1))
-    return bool(sigma[1] < PRECISE_RAD and (sigma[0] < PRECISE_M or not scene.unit_known))
+    metres = sigma[0] / scene.frame.unit * scene.metres_per_unit
+    return bool(sigma[1] < PRECISE_RAD and metres < PRECISE_M)
 
 
 def _verified(

@@ -230,8 +230,7 @@ class Tracker:
 
     @property
     def _metres_per_unit(self) -> float:
-        similarity = self.localizer.contents.scenes[self._scene].frame.similarity
-        return 1.0 if similarity is None else similarity.scale
+        return self.localizer.contents.scenes[self._scene].metres_per_unit
 
     def _predicted(self, stamp: float) -> SE3 | None:
         if not self._poses:

@@ -18,7 +18,7 @@ from evercal.geometry import SE3, Camera
 from evercal.geometry.uncertain_pose import frame_covariance
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment, BundleOptions
 from evercal.mapping.keyframes import Keyframes, jpeg
-from evercal.mapping.map_frame import MapFrame, fit_correction, shared_sigma
+from evercal.mapping.map_frame import MapFrame, Similarity, fit_correction, shared_sigma
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.pose_check import (
     check_poses,
@@ -63,6 +63,8 @@ class MapOptions:
     support_frames: int = 250
     """Frames that are adjusted beside the keyframes, spread by pose. The dense normal equations
     have six rows for each; more frames add time and no precision."""
+    metric: bool = True
+    """Whether stated poses are in metres. Otherwise the map's unit follows from its depths."""
     adjust: bool = True
     """Adjust poses and intrinsics. False keeps them as stated."""
     rounds: int = 2
@@ -203,7 +205,8 @@ def build_map(
     adjustment = None
     if options.adjust:
         order = {frame.name: i for i, frame in enumerate(frames)}
-        velocity = _velocity(frames)[[order[frame.name] for frame in prepared.frames.frames]]
+        velocity = _velocity(frames) / np.repeat([prepared.unit, 1.0], 3)
+        velocity = velocity[[order[frame.name] for frame in prepared.frames.frames]]
         adjustment = _adjust(prepared.frames, keyframes, velocity, options, on_progress)
     built = _finish(name, prepared, keyframes, adjustment, options)
     built = replace(built, scene=replace(built.scene, train_frames=len(frames)))
@@ -221,6 +224,8 @@ class _Prepared:
     """Names of frames whose stated pose contradicts the images."""
     untracked: tuple[str, ...]
     """Names of frames that could not be tracked."""
+    unit: float
+    """Units of the recording per unit of the map."""
 
 
 def _prepare(
@@ -235,7 +240,11 @@ def _prepare(
         features.append(prepared.features(i))
         on_progress("encoding", i + 1, len(prepared))
     pairs = matched_pairs(prepared, encoder.vlad(features))
-    prepared.depth_scale = depth_scale(prepared, pairs)
+    unit, scale = 1.0, depth_scale(prepared, pairs, options.metric)
+    if options.metric:
+        prepared.depth_scale = scale
+    else:
+        unit, prepared = scale, prepared.in_unit(scale)
     check = check_poses(prepared, pairs)
     wrong, untracked = (
         tuple(prepared.frames[i].name for i in part) for part in (check.wrong, check.untracked)
@@ -247,7 +256,7 @@ def _prepare(
     # Other frames replace excluded keyframes.
     positions, rotations = prepared.stated.translation_m, prepared.stated.rotation_wxyz
     keyframes = select_farthest(positions, rotations, len(wanted), start=start)
-    return _Prepared(prepared, keyframes.tolist(), wrong, untracked)
+    return _Prepared(prepared, keyframes.tolist(), wrong, untracked, unit)
 
 
 def spread_frames(frames: Sequence[Frame], capacity: int) -> NDArray[np.int64]:
@@ -345,6 +354,7 @@ def _finish(
     first = frames.frames[0].camera
     camera = frames.cameras[0].resized(first.width, first.height)
     frame, hand_eye = MapFrame(), None
+    own = None if options.metric else Similarity(SE3.identity(), prepared.unit, known=False)
     if adjustment is not None:
         block = np.einsum("nii->ni", adjustment.covariance[numbers])
         common = adjustment.common
@@ -374,7 +384,8 @@ def _finish(
             camera=first,
             adjusted_camera=camera,
             keyframes=_keyframes(frames, tracks),
-            frame=frame,
+            frame=replace(frame, similarity=own),
+            metric=options.metric,
             train_frames=len(frames),
         ),
         _adjusted(prepared, adjustment, camera),

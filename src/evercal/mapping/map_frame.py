@@ -6,7 +6,7 @@ the map's frame and not of single frames, so localization undoes them:
 - a transform common to all cameras: an error of `gripper_from_camera` or of the sensor that stated
   the poses;
 - corrections that vary slowly over the recording: a drifting depth fusion, an arm that sags;
-- the similarity of a map whose own frame is not the base frame.
+- the similarity of a map whose own frame or unit is not that of the base.
 
 Slow corrections are predicted from neighbouring frames. Noise cannot be predicted and remains.
 """
@@ -52,7 +52,9 @@ class Similarity:
     base_from_map: SE3
     """Applied after scaling."""
     scale: float = 1.0
-    """Metres per unit of length of the map."""
+    """Units of length of the base frame per unit of the map."""
+    known: bool = True
+    """Whether the base frame is in metres. Otherwise this leads to the recording's own unit."""
 
     def pose(self, map_from_camera: SE3) -> SE3:
         """Camera pose in the base frame."""
@@ -105,6 +107,11 @@ class MapFrame:
         if self.base_covariance is None:
             return estimate
         return UncertainPose(SE3.identity(), self.base_covariance) @ estimate
+
+    @property
+    def unit(self) -> float:
+        """Units of length of an answer per unit of the map."""
+        return 1.0 if self.similarity is None else self.similarity.scale
 
     @property
     def slope(self) -> Array:

@@ -138,22 +138,23 @@ class _SiftCheck:
         return self._features[frame]
 
 
-def depth_scale(recording: PreparedFrames, pairs: list[MatchedPair]) -> float:
+def depth_scale(recording: PreparedFrames, pairs: list[MatchedPair], metric: bool = True) -> float:
     """Estimate the usual depth relative to that in a room; 1 if the range of a room fits.
 
-    Recordings have other scales if their unit of length is unknown, on a wrist, or in a hall.
+    Recordings have other scales if their unit of length is unknown (not `metric`: any range), on a
+    wrist, or in a hall.
     Matches with clear parallax are triangulated.
     """
     depths = [_triangulated(recording, pair) for pair in pairs]
-    return scale_of_depths(np.concatenate([np.zeros(0), *depths]))
+    return scale_of_depths(np.concatenate([np.zeros(0), *depths]), metric)
 
 
-def scale_of_depths(depth: np.ndarray) -> float:
+def scale_of_depths(depth: np.ndarray, metric: bool = True) -> float:
     """Return the factor of `depth_scale` for depths (n,) of a recording."""
     if len(depth) < MIN_DEPTHS:
         return 1.0
     near, middle, far = np.quantile(depth, [0.1, 0.5, 0.9])
-    usual = near > NEAR_M and far < FAR_M / 2
+    usual = metric and near > NEAR_M and far < FAR_M / 2
     return 1.0 if usual else float(middle / USUAL_M)
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -65,6 +65,17 @@ class PreparedFrames:
         features = self._features
         rest._features = {new: features[old] for new, old in enumerate(index) if old in features}
         rest._cache_pyramids()
+        return rest
+
+    def in_unit(self, unit: float) -> "PreparedFrames":
+        """A copy whose positions are divided by `unit`."""
+        rest, poses = copy(self), self.stated
+        scaled = SE3(poses.rotation_wxyz, poses.translation_m / unit)
+        rest.frames = tuple(
+            replace(frame, base_from_camera=pose)
+            for frame, pose in zip(self.frames, scaled, strict=True)
+        )
+        rest._move(scaled)
         return rest
 
     def __len__(self) -> int:

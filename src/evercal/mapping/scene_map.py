@@ -39,7 +39,13 @@ class SceneMap:
     @property
     def unit_known(self) -> bool:
         """Whether answers are in metres: of the recording, or by alignment with the base frame."""
-        return self.metric or self.frame.similarity is not None
+        similarity = self.frame.similarity
+        return self.metric or (similarity is not None and similarity.known)
+
+    @property
+    def metres_per_unit(self) -> float:
+        """Metres per unit of the map; 1 where it is unknown: depths are then those of rooms."""
+        return self.frame.unit if self.unit_known else 1.0
 
     @property
     def landmarks(self) -> int:

@@ -267,6 +267,7 @@ def frame_to_dict(frame: MapFrame) -> dict[str, object]:
         "frame_sigma": list(frame.frame_sigma),
         "base_from_map": None if similarity is None else similarity.base_from_map.matrix().tolist(),
         "scale": 1.0 if similarity is None else similarity.scale,
+        "unit_known": similarity is None or similarity.known,
         "base_covariance": None if covariance is None else covariance.tolist(),
     }
 
@@ -277,7 +278,8 @@ def frame_of(content: Mapping[str, object], correction: FrameCorrection | None) 
     pose, shared = (np.asarray(content[key], np.float64) for key in ("pose_sigma", "frame_sigma"))
     similarity = None
     if base is not None:
-        similarity = Similarity(SE3.from_matrix(np.asarray(base)), float(str(content["scale"])))
+        known, scale = bool(content.get("unit_known", True)), float(str(content["scale"]))
+        similarity = Similarity(SE3.from_matrix(np.asarray(base)), scale, known)
     return MapFrame(
         common=SE3.from_matrix(np.asarray(content["stated_camera_from_camera"])),
         correction=correction,
