@@ -13,7 +13,7 @@ from benchmarks.rows import save
 from evercal.evaluation.metrics import share_inside
 from evercal.features.encoder import Encoder, load_encoder
 from evercal.geometry import pose_distance
-from evercal.learning.fit_acceptance import fit_acceptance
+from evercal.learning.stated_scatter import with_scatter
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.localization.refreshing import refresh_scene
@@ -171,7 +171,7 @@ def _learned(recording: Recording, encoder: Encoder, keyframes: int) -> SceneMap
     budget = MemoryBudget(share=0.0, least=keyframes)
     options = replace(options, memory=budget, size=replace(options.size, cells=240))
     built = build_map(recording.name, split.train, encoder, options)
-    return fit_acceptance(
+    return with_scatter(
         MapContents(encoder, 240, [built.scene]),
         built.corrected(split.held_out),
         left_out=built.left_out(split.train),

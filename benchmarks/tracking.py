@@ -10,7 +10,7 @@ from tqdm import tqdm
 from benchmarks.rows import save
 from evercal.features.encoder import load_encoder
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.learning.fit_acceptance import fit_acceptance
+from evercal.learning.stated_scatter import with_scatter
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import TrackedFrame, Tracker, TrackOptions
@@ -128,7 +128,7 @@ def _learned(room: BoxRoom, lens: Camera) -> MapContents:
     split, encoder = split_held_out(frames), load_encoder()
     built = build_map("room", split.train, encoder, MapOptions(memory=MemoryBudget()))
     contents = MapContents(encoder, 240, [built.scene])
-    scene = fit_acceptance(
+    scene = with_scatter(
         contents, split.held_out, left_out=built.left_out(split.train), noise=(0.0, 0.0)
     )
     return MapContents(encoder, 240, [scene])

@@ -166,9 +166,10 @@ def hall_room() -> BoxRoom:
 
 @pytest.fixture(scope="session")
 def hall_built(hall: Recording, shared: Shared) -> BuiltMap:
-    """The map of `hall` with 7 keyframes; its acceptance is fitted to three test frames."""
+    """The map of `hall` with 7 keyframes; its scatter is fitted to three test frames."""
+    from evercal.learning.stated_scatter import with_scatter
+
     from evercal.features.encoder import load_encoder
-    from evercal.learning.fit_acceptance import fit_acceptance
     from evercal.mapping.build import MapOptions, build_map
     from evercal.mapping.memory_budget import MemoryBudget
     from evercal.mapping.scene_map import MapContents
@@ -177,7 +178,7 @@ def hall_built(hall: Recording, shared: Shared) -> BuiltMap:
         encoder, options = load_encoder(), MapOptions(memory=MemoryBudget(share=0.25))
         built = build_map("hall", hall.train, encoder, options)
         contents = MapContents(encoder, options.size.cells, [built.scene])
-        return replace(built, scene=fit_acceptance(contents, hall.test[::10]))
+        return replace(built, scene=with_scatter(contents, hall.test[::10]))
 
     return shared("hall", build)
 

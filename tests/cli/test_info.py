@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 MAP_KEYS = {"name", "train_frames", "memory_bytes", "keyframes", "camera", "landmarks"}
-MAP_KEYS |= {"min_support", "adjusted", "hand_eye"}
+MAP_KEYS |= {"adjusted", "hand_eye"}
 
 
 def test_info_of_a_map(run: Any, store: Path) -> None:

@@ -19,7 +19,7 @@ from evercal.mapping.store import MapStore
 from evercal.recordings.samples import CELL
 
 KEYS = {"scene", "seconds", "iterations", "memory_bytes", "head_bytes", "frames_kept"}
-KEYS |= {"landmarks", "train_frames", "held_out_frames", "min_support", "adjusted", "hand_eye"}
+KEYS |= {"landmarks", "train_frames", "held_out_frames", "adjusted", "hand_eye"}
 ADJUSTED = {"common_translation_mm", "common_rotation_deg", "focal_percent", "residual_px"}
 
 

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 
 from evercal.geometry import Camera
-from evercal.learning.fit_acceptance import LEAST_SHARED_PX
 from evercal.localization.intrinsics import (
     NOT_STATED,
     STATED,
     IntrinsicsPrior,
-    Prior,
     self_calibrated,
 )
 from evercal.localization.pose_refinement import Observed
@@ -35,11 +33,10 @@ def answer(
     points = rays * (2 / (rays @ normal))[:, None]
     white = np.repeat(10 * np.eye(2)[..., None], 400, 2)
     seen = Observed(pixels + rng.normal(0, 0.05, pixels.shape), points, white)
-    own = Prior(prior, 1.6, LEAST_SHARED_PX)
-    refined = self_calibrated(seen, CAMERA, (np.eye(3), np.zeros(3)), np.zeros(5), own)
+    refined = self_calibrated(seen, CAMERA, (np.eye(3), np.zeros(3)), np.zeros(5), prior)
     for _ in range(3):
         at = refined.pose.pose.rotation_matrix(), refined.pose.pose.translation_m
-        refined = self_calibrated(seen, CAMERA, at, refined.change, own)
+        refined = self_calibrated(seen, CAMERA, at, refined.change, prior)
     sigma = float(np.sqrt(np.trace(refined.pose.covariance[:3, :3]) / 3))
     return float(np.linalg.norm(refined.pose.pose.translation_m)), sigma
 

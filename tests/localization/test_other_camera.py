@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 
 from evercal.geometry import Camera
-from evercal.learning.fit_acceptance import LEAST_SHARED_PX, shared_px
 from evercal.localization import intrinsics
-from evercal.localization.intrinsics import MeasuredIntrinsics, Prior
+from evercal.localization.intrinsics import NOT_STATED
 from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_map import SHARED_PX
 
 if TYPE_CHECKING:
     from evercal.mapping.scene_map import MapContents
@@ -58,23 +56,13 @@ def test_another_camera_of_the_model_is_recognised(
 
 
 def test_probability_of_another_camera() -> None:
-    camera, prior = Camera(640, 480, 520.0, 520.0, 319.5, 239.5), Prior()
+    camera = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
     precise = np.diag(np.square([5e-4, 0.3, 0.3, 2e-3, 2e-3]))
 
     def probability(change: list[float], covariance: np.ndarray) -> float:
-        return prior.other_camera(camera, np.array(change), covariance)
+        return NOT_STATED.doubt(camera, np.array(change), covariance)
 
     assert probability([0, 0, 0, 0, 0], precise) < 0.01
     assert probability([0.005, 2, 1, 0, 0], precise) > 0.99
     # Nothing was measured.
     assert probability([0.5, 9, 9, 0, 0], 1e6 * precise) == pytest.approx(0.3, abs=0.02)
-
-
-def test_shared_errors_explain_the_intrinsics_of_own_frames() -> None:
-    def of(squares: float) -> MeasuredIntrinsics:
-        return MeasuredIntrinsics(squares, 5000.0)
-
-    scale = 1.6 * 7.29
-    assert shared_px([of(scale * (1 + 5000 * 0.1**2))] * 8) == pytest.approx(0.1)
-    assert shared_px([of(3.0)] * 8) == LEAST_SHARED_PX
-    assert shared_px([of(1000.0)] * 7) == SHARED_PX

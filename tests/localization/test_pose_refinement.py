@@ -18,7 +18,6 @@ from evercal.localization.intrinsics import (
     STATED,
     UNKNOWN,
     IntrinsicsPrior,
-    Prior,
     self_calibrated,
 )
 from evercal.localization.pose_refinement import (
@@ -197,7 +196,7 @@ def test_a_minimum_moves_to_that_of_another_prior(
         root = np.linalg.inv(np.linalg.cholesky(expected.variance * inverse))
         assert np.linalg.norm(root @ (step - real)) < off < 2 * np.linalg.norm(root @ step)
         assert np.linalg.norm(root @ again) < 0.1  # it is at its own minimum
-        assert own.variance_after(step) == pytest.approx(expected.variance, rel=0.15)
+        assert own.after(step).variance == pytest.approx(expected.variance, rel=0.15)
         ratio = np.linalg.eigvals(np.linalg.solve(inverse, covariance)).real
         assert np.abs(np.log(ratio)).mean() < 0.2 * off
 
@@ -206,7 +205,7 @@ def test_a_minimum_moves_to_that_of_another_prior(
 def test_a_far_camera_is_reached_by_repetition(factor: float) -> None:
     """The errors are linear in the intrinsics; `align_pose` begins again where the last ended."""
     far = np.array([np.log(factor), 12.0, -9.0, -0.06, 0.03])
-    seen, change, prior = seen_with(far, 0, 0.3, 0.3), np.zeros(5), Prior(UNKNOWN)
+    seen, change, prior = seen_with(far, 0, 0.3, 0.3), np.zeros(5), UNKNOWN
     result = self_calibrated(seen, CAMERA, matrix_and_position(NEAR), change, prior)
     moved = []
     for _ in range(8):

@@ -73,8 +73,6 @@ def scenes(rooms: tuple[Recording, ...]) -> list[SceneMap]:
                 keyframes=keyframes,
                 frame=frame if i == 0 else MapFrame(),
                 train_frames=30 + i,
-                min_support=0.1 * i,
-                covariance_scale=1.0 + i,
                 metric=i > 0,
             )
         )
@@ -109,7 +107,7 @@ def content() -> Contents:
         listed: list[object] = []
         for scene in contents.scenes:
             listed.append((scene.name, scene.camera, scene.adjusted_camera, scene.train_frames))
-            listed.append((scene.min_support, scene.covariance_scale, scene.metric))
+            listed.append((scene.metric, scene.unit_known))
             listed.append(_rounded(frame_to_dict(scene.frame)))
             tensors = scene.keyframes.to_tensors()
             if scene.frame.correction is not None:

@@ -44,8 +44,8 @@ def root(scenes: list[SceneMap], tmp_path: Path, make: Make) -> Path:
 
 @pytest.fixture
 def other(scenes: list[SceneMap], tmp_path: Path, make: Make) -> Path:
-    """A map of beta, with a threshold of its own, and delta."""
-    beta, delta = replace(scenes[1], min_support=0.7), replace(scenes[2], name="delta")
+    """A map of beta, with a number of frames of its own, and delta."""
+    beta, delta = replace(scenes[1], train_frames=7), replace(scenes[2], name="delta")
     return make(tmp_path / "other", [beta, delta]).root
 
 
@@ -53,8 +53,8 @@ def names(root: Path) -> list[str]:
     return [scene.name for scene in MapStore.open(root).contents.scenes]
 
 
-def supports(root: Path) -> dict[str, float]:
-    return {scene.name: scene.min_support for scene in MapStore.open(root).contents.scenes}
+def frames_of(root: Path) -> dict[str, int]:
+    return {scene.name: scene.train_frames for scene in MapStore.open(root).contents.scenes}
 
 
 @pytest.mark.parametrize("gone", [["alpha"], ["beta"], ["gamma", "alpha"], ["beta", "alpha"]])
@@ -84,7 +84,7 @@ def test_no_folder_name_is_used_again(root: Path, scenes: list[SceneMap]) -> Non
     """A process that opened the map before would take the new scene for the old one."""
     late, store = MapStore.open(root), MapStore.open(root)
     remove_scenes(store, ["gamma"])
-    store.commit(replace(scenes[2], min_support=0.9), {"scene": "gamma"})
+    store.commit(replace(scenes[2], train_frames=9), {"scene": "gamma"})
     assert store.stages == ["0001-alpha", "0002-beta", "0004-gamma"]
     rename_scene(store, "gamma", "hall")
     with pytest.raises(InputError, match="another process has changed it"):
@@ -143,21 +143,21 @@ def test_misuse_is_refused_by_name_and_changes_nothing(root: Path, tree: Tree) -
 @pytest.mark.parametrize(
     ("on_clash", "expected"),
     [
-        ("rename", {"alpha": 0.0, "beta": 0.1, "gamma": 0.2, "beta-2": 0.7, "delta": 0.2}),
-        ("skip", {"alpha": 0.0, "beta": 0.1, "gamma": 0.2, "delta": 0.2}),
-        ("replace", {"alpha": 0.0, "gamma": 0.2, "beta": 0.7, "delta": 0.2}),
+        ("rename", {"alpha": 30, "beta": 31, "gamma": 32, "beta-2": 7, "delta": 32}),
+        ("skip", {"alpha": 30, "beta": 31, "gamma": 32, "delta": 32}),
+        ("replace", {"alpha": 30, "gamma": 32, "beta": 7, "delta": 32}),
     ],
 )
 def test_names_that_are_taken(
-    on_clash: OnClash, expected: dict[str, float], root: Path, other: Path, tree: Tree
+    on_clash: OnClash, expected: dict[str, int], root: Path, other: Path, tree: Tree
 ) -> None:
     before, source, store = tree(root), tree(other), MapStore.open(root)
     with pytest.raises(InputError, match=r"scene 'beta' of map .*other: the name is taken"):
         merge_maps(store, [other])
     assert tree(root) == before
     merged = merge_maps(store, [other], on_clash)
-    assert supports(root) == pytest.approx(expected)
-    assert list(supports(root)) == list(expected)
+    assert frames_of(root) == expected
+    assert list(frames_of(root)) == list(expected)
     assert [scene.name for scene in store.contents.scenes] == list(expected)
     assert merged.renamed == ((("beta", "beta-2"),) if on_clash == "rename" else ())
     assert (merged.skipped, merged.replaced) == (

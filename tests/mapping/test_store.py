@@ -165,7 +165,7 @@ def test_update_replaces_one_scene(
     root = tmp_path / "store"
     make(root, scenes)
     similarity = Similarity(SE3.exp([1.0, 2, 3, 0.1, 0.2, 0.3]), 2.5)
-    moved = replace(scenes[index], frame=MapFrame(similarity=similarity), min_support=0.7)
+    moved = replace(scenes[index], frame=MapFrame(similarity=similarity), train_frames=7)
     for _ in range(2):
         MapStore.open(root).update(moved)
     assert verify(root) == []
@@ -173,7 +173,7 @@ def test_update_replaces_one_scene(
     opened = MapStore.open(root)
     assert content(opened.contents)[:2] == content(MapContents(load_encoder(), 48, expected))[:2]
     assert opened.contents.scenes[index].frame.similarity is not None
-    assert opened.contents.scenes[index].min_support == 0.7
+    assert opened.contents.scenes[index].train_frames == 7
     assert len(list((root / "stages").iterdir())) == 3
 
 

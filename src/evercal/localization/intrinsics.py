@@ -35,8 +35,8 @@ DOUBT = 3.0
 
 _REFINE_STEPS = 10
 """Gauss-Newton steps of pose and intrinsics, at most."""
-_BETTER = 0.7
-"""Relative variance below which other intrinsics fit so much better that a linear step is rough."""
+_ROUGH = 0.7
+"""Ratio of variances, to either side, at which a linear step to other intrinsics is rough."""
 _REACHED = 0.05 * 7.815
 """Probability of another camera at which the 95 % ellipsoid (chi-squared) reaches its pose."""
 
@@ -159,11 +159,13 @@ def self_calibrated(
     own = minimise(observed, camera, start, _REFINE_STEPS, tight, change)
     cells = cells_of(observed.pixels, camera)
     step, _ = own.moved(own.variance / free)
-    measured = own.covariance(own.variance / free, cells)[6:, 6:]
+    moved = own.after(step)
+    measured = moved.covariance(moved.variance / free, cells)[6:, 6:]
     doubt, variances = prior.decided(camera, own.change + step[6:], measured)
-    better = own.variance_after(step) < _BETTER * own.variance
-    if variances is not None or doubt > prior.other_camera or better:
-        best = minimise(observed, camera, start, _REFINE_STEPS, free, own.change + step[6:])
+    rough = not _ROUGH < moved.variance / own.variance < 1 / _ROUGH
+    if variances is not None or doubt > prior.other_camera or rough:
+        start = own.rotation, own.position
+        best = minimise(observed, camera, start, _REFINE_STEPS, free, own.change)
         measured = best.covariance(best.variance / free, cells)[6:, 6:]
         doubt, variances = prior.decided(camera, best.change, measured)
         if variances is not None:

@@ -20,7 +20,7 @@ _FOCAL_CHANGE = 1.0
 """Largest change of the logarithm of the focal lengths."""
 SHARED = 0.07
 """Variance of the error that all observations of a cell share, over the square of their variance:
-errors that are larger than the noise of patches are shared more (research/trust.md)."""
+errors beyond the noise of patches, whose variance is 1, are shared more (research/trust.md)."""
 SHARED_CELLS = 4
 """Such cells along the shorter side of an image."""
 _OPEN = 1e-12
@@ -90,16 +90,17 @@ class Minimum:
         rows, sums = slope.reshape(count, -1), (slope @ cells).reshape(count, -1)
         hessian = rows @ rows.T
         noise = float((weight**2 @ squares) / (2 * (weight**2).sum()))
-        scores = noise * hessian + SHARED * self.variance**2 * sums @ sums.T
+        scores = noise * hessian + SHARED * max(self.variance, 1.0) ** 2 * sums @ sums.T
         diagonal = slice(6 * count + 6, None, count + 1)
         hessian.flat[diagonal] += prior
         scores.flat[diagonal] += prior * self.variance
         inverse = inverse_of(hessian)
         return inverse @ scores @ inverse
 
-    def variance_after(self, step: Array) -> float:
-        """Robust variance of the errors after a step (k,)."""
-        return robust_variance(((self.residual + np.tensordot(step, self.slope, 1)) ** 2).sum(0))
+    def after(self, step: Array) -> "Minimum":
+        """The same with the residuals after a step (k,), to first order."""
+        residual = self.residual + np.tensordot(step, self.slope, 1)
+        return replace(self, residual=residual, variance=robust_variance((residual**2).sum(0)))
 
     def pose(self, covariance: Array) -> UncertainPose:
         """points_from_camera with a covariance (6, 6) in camera axes."""

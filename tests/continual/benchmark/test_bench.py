@@ -132,7 +132,7 @@ def test_options_that_decide_a_result_are_recorded(complete: tuple[Path, list[St
     assert settings["fit"]["iterations"] == 6
     assert settings["localize"]["align"] is True
     assert settings["localize"]["pnp"]["threshold_px"] > 0
-    assert 0 < settings["acceptance"]["MIN_SUPPORT"] < 1
+    assert 0 < settings["acceptance"]["FALSE_ACCEPTS"] < 1
 
 
 @pytest.mark.parametrize("stages", [0, 1, 2])

@@ -66,7 +66,6 @@ def test_reports_describe_the_store(learned: Learned) -> None:
         assert report.train_frames == record.train_frames
         assert report.train_frames + report.held_out_frames == 30
         assert report.iterations == 8
-        assert report.min_support == record.inlier_threshold
         assert 0 < report.seconds < 600
         assert (report.landmarks, report.adjusted) == (0, None)
     first, last = learned.reports
