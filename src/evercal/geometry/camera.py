@@ -148,7 +148,7 @@ class Camera:
         if points.shape[-1:] != (3,):
             raise ValueError(f"points are (..., 3), got {points.shape}")
         # One array for each coordinate: sums along pairs take several times as long.
-        x, y, depth = np.moveaxis(points, -1, 0)
+        x, y, depth = points[..., 0], points[..., 1], points[..., 2]
         if not (depth > 0).all():
             depth = np.where(depth > 0, depth, np.nan)
         x, y = x / depth, y / depth
