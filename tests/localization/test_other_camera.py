@@ -11,7 +11,7 @@ import pytest
 from evercal.geometry import Camera
 from evercal.learning.fit_acceptance import LEAST_SHARED_PX, shared_px
 from evercal.localization import intrinsics
-from evercal.localization.intrinsics import MeasuredIntrinsics, Prior
+from evercal.localization.intrinsics import Prior
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_map import SHARED_PX
 
@@ -71,10 +71,7 @@ def test_probability_of_another_camera() -> None:
 
 
 def test_shared_errors_explain_the_intrinsics_of_own_frames() -> None:
-    def of(squares: float) -> MeasuredIntrinsics:
-        return MeasuredIntrinsics(squares, 5000.0)
-
     scale = 1.6 * 7.29
-    assert shared_px([of(scale * (1 + 5000 * 0.1**2))] * 8) == pytest.approx(0.1)
-    assert shared_px([of(3.0)] * 8) == LEAST_SHARED_PX
-    assert shared_px([of(1000.0)] * 7) == SHARED_PX
+    assert shared_px([(scale * (1 + 5000 * 0.1**2), 5000.0)] * 8) == pytest.approx(0.1)
+    assert shared_px([(3.0, 5000.0)] * 8) == LEAST_SHARED_PX
+    assert shared_px([(1000.0, 5000.0)] * 7) == SHARED_PX

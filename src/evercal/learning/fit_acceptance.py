@@ -8,7 +8,6 @@ import numpy as np
 
 from evercal.geometry.near import COARSE
 from evercal.localization.acceptance import COVARIANCE_SCALE, MAX_SUPPORT, MIN_SUPPORT
-from evercal.localization.intrinsics import MeasuredIntrinsics
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_map import SHARED_PX, LeftOut, MapContents, SceneMap
 from evercal.recordings.frame import Frame
@@ -86,8 +85,8 @@ class _Answer(NamedTuple):
     """(6,) translation in the base frame, metres, and rotation about camera axes, radians."""
     covariance: np.ndarray
     """(6, 6)."""
-    measured: MeasuredIntrinsics | None
-    """Its intrinsics without a prior."""
+    measured: tuple[float, float] | None
+    """`squares` and `by_shared` of `RefinedPose`."""
 
     def near(self, metric: bool) -> bool:
         """Whether the frame is well located; by its rotation where the unit is unknown."""
@@ -105,12 +104,13 @@ def _located(contents: MapContents, frames: Sequence[Frame], scene: str) -> list
         if np.isfinite(pose.covariance).all():
             turn = (pose.pose.inverse() @ stated).log()[3:]
             off = np.r_[stated.translation_m - pose.pose.translation_m, turn]
-            measured = None if found.refined is None else found.refined.measured
+            refined = found.refined
+            measured = None if refined is None else (refined.squares, refined.by_shared)
             answers.append(_Answer(estimate.support, off, pose.covariance, measured))
     return answers
 
 
-def shared_px(measured: Sequence[MeasuredIntrinsics]) -> float:
+def shared_px(measured: Sequence[tuple[float, float]]) -> float:
     """Errors that landmarks share, from frames of the recording's own camera.
 
     With them, the intrinsics of 80 % of the frames agree with those of the recording as well as
@@ -118,7 +118,7 @@ def shared_px(measured: Sequence[MeasuredIntrinsics]) -> float:
     """
     if len(measured) < LEAST_ANSWERS:
         return SHARED_PX
-    squares, by_shared = np.array([(m.squares, m.by_shared) for m in measured]).T
+    squares, by_shared = np.array(measured).T
     needed = (squares / (COVARIANCE_SCALE * AGREE_SQUARES) - 1) / by_shared
     return float(np.sqrt(max(np.quantile(needed, 0.8), LEAST_SHARED_PX**2)))
 

@@ -144,21 +144,13 @@ def _log_density(change: Array, covariance: Array) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredIntrinsics:
-    """Intrinsics that landmarks measure without a prior."""
-
-    squares: float
-    """Squared change from the stated intrinsics in standard deviations of landmarks' errors."""
-    by_shared: float
-    """Factor on the variance is 1 + `by_shared` s^2, if landmarks share errors of s pixels."""
-
-
-@dataclass(frozen=True, eq=False)
 class RefinedPose:
     """A pose, intrinsics and the residuals of the observations."""
 
     pose: UncertainPose
     """points_from_camera; the uncertainty of the intrinsics is part of its covariance."""
+    observed: Observed
+    """What the pose was refined by."""
     residual_px: Array
     """(n,) reprojection errors, pixels of the image."""
     camera: Camera
@@ -167,7 +159,11 @@ class RefinedPose:
     """(5,) change of the intrinsics."""
     by_intrinsics: Array
     """(6, 6) share of the pose's covariance that is due to the intrinsics."""
-    measured: MeasuredIntrinsics
+    squares: float
+    """Squared change from the stated intrinsics, as landmarks measure it without a prior, in
+    standard deviations of their errors."""
+    by_shared: float
+    """Factor on the variance is 1 + `by_shared` s^2, if landmarks share errors of s pixels."""
 
 
 def self_calibrated(
@@ -209,8 +205,16 @@ def self_calibrated(
     lens = shared * lens
     pose = own.pose(covariance + (1 - 1 / shared) * lens)
     by_lens = in_parent_axes(own.rotation, lens)
-    measured = MeasuredIntrinsics(float(squares), by_shared)
-    return RefinedPose(pose, own.residual_px, own.camera, own.change, by_lens, measured)
+    return RefinedPose(
+        pose,
+        observed,
+        own.residual_px,
+        own.camera,
+        own.change,
+        by_lens,
+        float(squares),
+        by_shared,
+    )
 
 
 def _covariances(minimum: Minimum, variances: Array) -> tuple[Array, Array]:

@@ -16,12 +16,7 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.features.encoder import Features
 from evercal.geometry import SE3, Camera, resize_pixels
-from evercal.localization.acceptance import (
-    accepted,
-    answer,
-    order,
-    support,
-)
+from evercal.localization.acceptance import accepted, answer, order, support
 from evercal.localization.alignment import align_pose
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import (
@@ -227,29 +222,29 @@ class Localizer:
     ) -> Hypothesis | None:
         """A pose map_from_camera, refined by landmarks; see `align_pose`."""
         height, width = query.grey.shape
-        scene = self.contents.scenes[candidate.scene]
-        aligned = align_pose(
+        scene, options = self.contents.scenes[candidate.scene], self.options.alignment
+        refined = align_pose(
             query.pyramid,
             camera.resized(width, height),
             [self._bank.load(int(index)).landmarks for index in candidate.keyframes],
             start,
-            self.options.alignment,
+            options,
             Prior(query.priors[candidate.scene], scene.covariance_scale, scene.shared_px),
             change,
             coarse,
             least,
         )
-        if aligned is None:
+        if refined is None:
             return None
-        scale = self.contents.short_side / min(height, width)
+        observed, inliers = refined.observed, refined.residual_px < options.inlier_px
         return Hypothesis(
             candidate.scene,
-            aligned.refined.pose,
-            aligned.refined,
-            resize_pixels(aligned.pixels, scale),
-            aligned.points_m,
-            aligned.expected,
-            aligned.matched,
-            aligned.planned,
+            refined.pose,
+            refined,
+            resize_pixels(observed.pixels[inliers], self.contents.short_side / min(height, width)),
+            observed.points_m[inliers],
+            observed.expected,
+            len(inliers),
+            min(observed.expected, options.rounds[-1].landmarks),
             candidate=candidate,
         )

@@ -23,7 +23,7 @@ class PnpOptions:
     min_iterations: int = 100
     """Iterations that always run."""
     wanted: int = 12
-    """Inliers that are missed in one of a thousand images, see `LocalizeOptions.aligned_inliers`."""
+    """So many inliers are missed in one of a thousand images."""
 
 
 class PnpResult(NamedTuple):

@@ -32,6 +32,8 @@ class Observed:
     """(n, 3) in the map's frame."""
     whitening: Array
     """(2, 2, n) that gives errors in the image unit variance."""
+    expected: int = 0
+    """Landmarks that should be visible and were searched."""
 
 
 @dataclass(frozen=True, eq=False)
