@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.alignment import AlignmentOptions, _shift_px, align_pose
-from evercal.localization.intrinsics import Prior, RefinedPose
+from evercal.localization.intrinsics import NOT_STATED, RefinedPose
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.localizer import Localizer
 from evercal.mapping.landmarks import Landmarks
@@ -90,7 +90,7 @@ def aligned(count: int, options: AlignmentOptions | None = None) -> RefinedPose 
     start = SE3.exp([0.01, -0.01, 0.005, 0.004, -0.003, 0.002])
     pyramid = image_pyramid(image, 2)
     walls, options = [wall(image, spots(count))], options or AlignmentOptions()
-    return align_pose(pyramid, CAMERA, walls, start, options, Prior())
+    return align_pose(pyramid, CAMERA, walls, start, options, NOT_STATED)
 
 
 @pytest.mark.parametrize("count", [300, 900, 901, 1000, 1799, 3000])
@@ -111,7 +111,7 @@ def test_few_matches_widen_the_next_search() -> None:
     image[:, 90:] = 0
     start = SE3.exp([0.002, 0, 0, 0, 0, 0])
     pyramid, options = image_pyramid(image, 2), AlignmentOptions()
-    occluded = align_pose(pyramid, CAMERA, [keyframe], start, options, Prior())
+    occluded = align_pose(pyramid, CAMERA, [keyframe], start, options, NOT_STATED)
     assert occluded is not None
     assert 900 < occluded.observed.expected <= 2700
 

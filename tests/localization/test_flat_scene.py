@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -13,7 +14,6 @@ from evercal.localization.intrinsics import (
     NOT_STATED,
     STATED,
     IntrinsicsPrior,
-    Prior,
     self_calibrated,
 )
 from evercal.localization.pose_refinement import Observed
@@ -35,7 +35,7 @@ def answer(
     points = rays * (2 / (rays @ normal))[:, None]
     white = np.repeat(10 * np.eye(2)[..., None], 400, 2)
     seen = Observed(pixels + rng.normal(0, 0.05, pixels.shape), points, white)
-    own = Prior(prior, 1.6, LEAST_SHARED_PX)
+    own = replace(prior, scale=1.6, shared_px=LEAST_SHARED_PX)
     refined = self_calibrated(seen, CAMERA, (np.eye(3), np.zeros(3)), np.zeros(5), own)
     for _ in range(3):
         at = refined.pose.pose.rotation_matrix(), refined.pose.pose.translation_m

@@ -11,7 +11,7 @@ import pytest
 from evercal.geometry import Camera
 from evercal.learning.fit_acceptance import LEAST_SHARED_PX, shared_px
 from evercal.localization import intrinsics
-from evercal.localization.intrinsics import Prior
+from evercal.localization.intrinsics import NOT_STATED
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_map import SHARED_PX
 
@@ -58,11 +58,11 @@ def test_another_camera_of_the_model_is_recognised(
 
 
 def test_probability_of_another_camera() -> None:
-    camera, prior = Camera(640, 480, 520.0, 520.0, 319.5, 239.5), Prior()
+    camera, prior = Camera(640, 480, 520.0, 520.0, 319.5, 239.5), NOT_STATED
     precise = np.diag(np.square([5e-4, 0.3, 0.3, 2e-3, 2e-3]))
 
     def probability(change: list[float], covariance: np.ndarray) -> float:
-        return prior.other_camera(camera, np.array(change), covariance)
+        return prior.doubt(camera, np.array(change), covariance)
 
     assert probability([0, 0, 0, 0, 0], precise) < 0.01
     assert probability([0.005, 2, 1, 0, 0], precise) > 0.99

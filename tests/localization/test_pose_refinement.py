@@ -18,7 +18,6 @@ from evercal.localization.intrinsics import (
     STATED,
     UNKNOWN,
     IntrinsicsPrior,
-    Prior,
     self_calibrated,
 )
 from evercal.localization.pose_refinement import (
@@ -206,7 +205,7 @@ def test_a_minimum_moves_to_that_of_another_prior(
 def test_a_far_camera_is_reached_by_repetition(factor: float) -> None:
     """The errors are linear in the intrinsics; `align_pose` begins again where the last ended."""
     far = np.array([np.log(factor), 12.0, -9.0, -0.06, 0.03])
-    seen, change, prior = seen_with(far, 0, 0.3, 0.3), np.zeros(5), Prior(UNKNOWN)
+    seen, change, prior = seen_with(far, 0, 0.3, 0.3), np.zeros(5), UNKNOWN
     result = self_calibrated(seen, CAMERA, matrix_and_position(NEAR), change, prior)
     moved = []
     for _ in range(8):

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera
-from evercal.localization.intrinsics import Prior, RefinedPose, self_calibrated
+from evercal.localization.intrinsics import IntrinsicsPrior, RefinedPose, self_calibrated
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import (
@@ -81,7 +81,7 @@ def align_pose(
     keyframes: Sequence[AlignedLandmarks],
     start: SE3,
     options: AlignmentOptions,
-    prior: Prior,
+    prior: IntrinsicsPrior,
     change: Array | None = None,
     coarse: bool = True,
     least: float = 0.0,
@@ -110,7 +110,7 @@ def align_pose(
         if (refined.residual_px < options.inlier_px).sum() < _HOPELESS * observed.expected:
             break  # other intrinsics do not make it the right place
         if again == _MOST_AGAIN:
-            if prior.sigma.other_camera:
+            if prior.other_camera:
                 break  # both are good, and it is undecided between them
             return None  # the intrinsics do not converge
         at = refined.pose.pose

@@ -55,11 +55,64 @@ class IntrinsicsPrior:
     """Of the second one."""
     other_camera: float = 0.0
     """Probability that the image is of another camera of the same model, see `SAME_MODEL`."""
+    scale: float = 1.0
+    """Factor on the covariance of landmarks."""
+    shared_px: float = SHARED_PX
+    """See `SceneMap.shared_px`."""
 
     def variances(self, camera: Camera) -> Array:
         """(5,) variances of a change of intrinsics, see `pose_refinement.changed_camera`."""
         centre = self.centre * max(camera.width, camera.height)
         return np.square([self.focal, centre, centre, self.k1, self.k2])
+
+    def free(self, camera: Camera) -> Array:
+        """(5,) variances that hardly bind."""
+        return FREE.variances(camera) / self.scale
+
+    def tight(self, camera: Camera) -> Array:
+        """(5,) variances of the prior itself."""
+        return self.variances(camera) / self.scale
+
+    def tested(self, camera: Camera, change: Array, covariance: Array) -> Array:
+        """(5,) variances: those of the prior, wider where an estimate contradicts it.
+
+        The change (5,) and its covariance (5, 5) were estimated without a prior. Before a flat
+        scene no parameter contradicts the prior alone, but all together may.
+        """
+        tight, measured = self.variances(camera), self.scale * covariance
+        excess = change**2 - DOUBT * (np.diag(measured) + tight)
+        variances = tight + np.maximum(excess, 0)
+        squares = change @ np.linalg.solve(measured + np.diag(variances), change)
+        return self.free(camera) if squares > CONTRADICTED else variances / self.scale
+
+    def doubt(self, camera: Camera, change: Array, covariance: Array) -> float:
+        """Probability that an image is of another camera of the model, by estimated intrinsics.
+
+        See `tested`. Each hypothesis is a Gaussian about the intrinsics of the recording.
+        """
+        own, other = (
+            _log_density(change, self.scale * covariance + np.diag(prior.variances(camera)))
+            for prior in (self, SAME_MODEL)
+        )
+        before = self.other_camera
+        odds = before / (1 - before) * math.exp(min(max(other - own, -700.0), 700.0))
+        return odds / (1 + odds)
+
+    def decided(
+        self, camera: Camera, change: Array, covariance: Array
+    ) -> tuple[float, Array | None]:
+        """Probability of another camera, and variances (5,) that an estimate asks for.
+
+        The variances are None where the prior holds; the estimate is as for `tested`.
+        """
+        if not self.other_camera:
+            variances = self.tested(camera, change, covariance)
+            holds = np.allclose(variances, self.tight(camera))
+            return 0.0, None if holds else variances
+        doubt = self.doubt(camera, change, covariance)
+        if doubt <= 0.5:
+            return doubt, None
+        return doubt, replace(UNKNOWN, scale=self.scale).tested(camera, change, covariance)
 
 
 OWN = IntrinsicsPrior(focal=2e-4, centre=3e-4, k1=1e-3, k2=1e-3, other_camera=0.01)
@@ -76,66 +129,6 @@ FREE = IntrinsicsPrior(focal=1.0, centre=0.3, k1=0.3, k2=0.3)
 """Wide enough to test the other priors."""
 FOCAL_FACTORS = (0.7, 0.84, 1.2, 1.44)
 """Focal lengths that are tried where nothing is known, relative to a guess, beside it."""
-
-
-@dataclass(frozen=True)
-class Prior:
-    """The prior of one image."""
-
-    sigma: IntrinsicsPrior = NOT_STATED
-    scale: float = 1.0
-    """Factor on the covariance of landmarks."""
-    shared_px: float = SHARED_PX
-    """See `SceneMap.shared_px`."""
-
-    def free(self, camera: Camera) -> Array:
-        """(5,) variances that hardly bind."""
-        return FREE.variances(camera) / self.scale
-
-    def tight(self, camera: Camera) -> Array:
-        """(5,) variances of the prior itself."""
-        return self.sigma.variances(camera) / self.scale
-
-    def tested(self, camera: Camera, change: Array, covariance: Array) -> Array:
-        """(5,) variances: those of the prior, wider where an estimate contradicts it.
-
-        The change (5,) and its covariance (5, 5) were estimated without a prior. Before a flat
-        scene no parameter contradicts the prior alone, but all together may.
-        """
-        tight, measured = self.sigma.variances(camera), self.scale * covariance
-        excess = change**2 - DOUBT * (np.diag(measured) + tight)
-        variances = tight + np.maximum(excess, 0)
-        squares = change @ np.linalg.solve(measured + np.diag(variances), change)
-        return self.free(camera) if squares > CONTRADICTED else variances / self.scale
-
-    def other_camera(self, camera: Camera, change: Array, covariance: Array) -> float:
-        """Probability that an image is of another camera of the model, by estimated intrinsics.
-
-        See `tested`. Each hypothesis is a Gaussian about the intrinsics of the recording.
-        """
-        own, other = (
-            _log_density(change, self.scale * covariance + np.diag(sigma.variances(camera)))
-            for sigma in (self.sigma, SAME_MODEL)
-        )
-        before = self.sigma.other_camera
-        odds = before / (1 - before) * math.exp(min(max(other - own, -700.0), 700.0))
-        return odds / (1 + odds)
-
-    def decided(
-        self, camera: Camera, change: Array, covariance: Array
-    ) -> tuple[float, Array | None]:
-        """Probability of another camera, and variances (5,) that an estimate asks for.
-
-        The variances are None where the prior holds; the estimate is as for `tested`.
-        """
-        if not self.sigma.other_camera:
-            variances = self.tested(camera, change, covariance)
-            holds = np.allclose(variances, self.tight(camera))
-            return 0.0, None if holds else variances
-        doubt = self.other_camera(camera, change, covariance)
-        if doubt <= 0.5:
-            return doubt, None
-        return doubt, replace(self, sigma=UNKNOWN).tested(camera, change, covariance)
 
 
 def _log_density(change: Array, covariance: Array) -> float:
@@ -167,7 +160,11 @@ class RefinedPose:
 
 
 def self_calibrated(
-    observed: Observed, camera: Camera, start: tuple[Array, Array], change: Array, prior: Prior
+    observed: Observed,
+    camera: Camera,
+    start: tuple[Array, Array],
+    change: Array,
+    prior: IntrinsicsPrior,
 ) -> RefinedPose:
     """Pose and intrinsics; the prior gives way where the image contradicts it.
 
@@ -182,7 +179,7 @@ def self_calibrated(
     shared = 1 + prior.shared_px**2 * by_shared
     prior = replace(prior, scale=shared * prior.scale)
     doubt, variances = prior.decided(camera, free, variance * inverse[6:, 6:])
-    unsure = doubt > prior.sigma.other_camera or variance < _BETTER * own.variance
+    unsure = doubt > prior.other_camera or variance < _BETTER * own.variance
     if variances is not None or unsure:
         best = minimise(observed, camera, start, _REFINE_STEPS, prior.free(camera), free)
         variance, free = best.variance, best.change
@@ -197,7 +194,7 @@ def self_calibrated(
     if variances is None and doubt:
         # A covariance whose deviation reaches to the pose of another camera of the model.
         # Covariances are scaled by the caller, distances are not.
-        other = replace(prior, sigma=SAME_MODEL).tight(camera)
+        other = SAME_MODEL.variances(camera) / prior.scale
         off = (own.moved(own.variance / other)[0] - own.moved(own.variance / limits)[0])[:6]
         wider = _covariances(own, other)[1] - lens + np.outer(off, off) / prior.scale
         more = min(1.0, doubt / _REACHED) * wider

@@ -23,7 +23,6 @@ from evercal.localization.intrinsics import (
     FOCAL_FACTORS,
     NOT_STATED,
     UNKNOWN,
-    Prior,
     cameras_in_scenes,
     prior_of,
 )
@@ -221,15 +220,16 @@ class Localizer:
         least: float = 0.0,
     ) -> Hypothesis | None:
         """A pose map_from_camera, refined by landmarks; see `align_pose`."""
-        height, width = query.grey.shape
         scene, options = self.contents.scenes[candidate.scene], self.options.alignment
+        scale, shared_px, size = scene.covariance_scale, scene.shared_px, query.grey.shape
+        prior = replace(query.priors[candidate.scene], scale=scale, shared_px=shared_px)
         refined = align_pose(
             query.pyramid,
-            camera.resized(width, height),
+            camera.resized(*size[::-1]),
             [self._bank.load(int(index)).landmarks for index in candidate.keyframes],
             start,
             options,
-            Prior(query.priors[candidate.scene], scene.covariance_scale, scene.shared_px),
+            prior,
             change,
             coarse,
             least,
@@ -241,7 +241,7 @@ class Localizer:
             candidate.scene,
             refined.pose,
             refined,
-            resize_pixels(observed.pixels[inliers], self.contents.short_side / min(height, width)),
+            resize_pixels(observed.pixels[inliers], self.contents.short_side / min(size)),
             observed.points_m[inliers],
             observed.expected,
             len(inliers),
