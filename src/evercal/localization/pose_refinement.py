@@ -107,7 +107,7 @@ def minimise(
         raw, slope = linearise(
             observed.pixels, observed.points_m, rotation, position, now, free > 0
         )
-        raw += np.tensordot((moved - change)[:free], slope[6:], 1)
+        raw += (moved - change)[:free] @ slope[6:].transpose(1, 0, 2)
         residual = white[:, 0] * raw[0] + white[:, 1] * raw[1]
         slope = white[None, :, 0] * slope[:, 0, None] + white[None, :, 1] * slope[:, 1, None]
         squares = residual[0] * residual[0] + residual[1] * residual[1]
