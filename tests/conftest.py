@@ -167,9 +167,8 @@ def hall_room() -> BoxRoom:
 @pytest.fixture(scope="session")
 def hall_built(hall: Recording, shared: Shared) -> BuiltMap:
     """The map of `hall` with 7 keyframes; its scatter is fitted to three test frames."""
-    from evercal.learning.stated_scatter import with_scatter
-
     from evercal.features.encoder import load_encoder
+    from evercal.learning.stated_scatter import with_scatter
     from evercal.mapping.build import MapOptions, build_map
     from evercal.mapping.memory_budget import MemoryBudget
     from evercal.mapping.scene_map import MapContents

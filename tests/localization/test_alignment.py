@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.localization.alignment import Alignment, AlignmentOptions, _shift_px, align_pose
-from evercal.localization.intrinsics import NOT_STATED
+from evercal.localization.alignment import AlignmentOptions, _shift_px, align_pose
+from evercal.localization.intrinsics import NOT_STATED, RefinedPose
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.localizer import Localizer
 from evercal.mapping.landmarks import Landmarks
@@ -84,7 +84,7 @@ def wall(image: np.ndarray, pixels: Array) -> AlignedLandmarks:
     )
 
 
-def aligned(count: int, options: AlignmentOptions | None = None) -> Alignment | None:
+def aligned(count: int, options: AlignmentOptions | None = None) -> RefinedPose | None:
     """Align the keyframe's own image from a pose some pixels away."""
     image = texture()
     start = SE3.exp([0.01, -0.01, 0.005, 0.004, -0.003, 0.002])
@@ -97,10 +97,10 @@ def aligned(count: int, options: AlignmentOptions | None = None) -> Alignment | 
 def test_number_of_searched_landmarks_does_not_jump_at_the_limit(count: int) -> None:
     alignment = aligned(count)
     assert alignment is not None
-    assert alignment.expected == min(count, 900)
-    assert alignment.matched > 0.95 * alignment.expected
-    assert len(alignment.pixels) == len(alignment.points_m) > 0.95 * alignment.matched
-    metres, radians = pose_distance(alignment.refined.pose.pose, SE3.identity())
+    assert alignment.observed.expected == min(count, 900)
+    assert len(alignment.residual_px) > 0.95 * alignment.observed.expected
+    assert (alignment.residual_px < 1).mean() > 0.95
+    metres, radians = pose_distance(alignment.pose.pose, SE3.identity())
     assert metres < 5e-4
     assert radians < 3e-4
 
@@ -113,7 +113,7 @@ def test_few_matches_widen_the_next_search() -> None:
     pyramid, options = image_pyramid(image, 2), AlignmentOptions()
     occluded = align_pose(pyramid, CAMERA, [keyframe], start, options, NOT_STATED)
     assert occluded is not None
-    assert 900 < occluded.expected <= 2700
+    assert 900 < occluded.observed.expected <= 2700
 
 
 def test_too_few_landmarks_give_no_pose() -> None:

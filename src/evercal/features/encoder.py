@@ -185,27 +185,30 @@ def _of_file(path: Path) -> Encoder:
         raise InputError(f"{path}: the map was made with the function {name!r}; give it as encoder")
     if not path.is_file():
         raise InputError(f"encoder {path}: no such file")
-    name = shipped_name(path)
+    name, data = read_network(path)
     if name is None and path.suffix == ".safetensors":  # maps of before hold weights of PyTorch
         raise InputError(
             f"encoder {path}: weights of a PyTorch module; export the module to an ONNX file or"
             " wrap it in a function, and give that as encoder"
         )
-    data = (path if name is None else WEIGHTS / name).read_bytes()
-    digest = hashlib.sha256(data).hexdigest()[:12]
-    encoder = Encoder(_OnnxNetwork(data, str(path)), name or f"encoder-{digest}.onnx", data)
-    if name is not None:
-        centroids = WEIGHTS / f"{Path(name).stem.replace('encoder', 'vlad')}.safetensors"
-        encoder.centroids = load_tensors(centroids)["centroids"].astype(np.float32)
+    network = _OnnxNetwork(data, str(path))
+    if name is None:
+        return Encoder(network, f"encoder-{hashlib.sha256(data).hexdigest()[:12]}.onnx", data)
+    encoder = Encoder(network, name, data)
+    centroids = WEIGHTS / f"{Path(name).stem.replace('encoder', 'vlad')}.safetensors"
+    encoder.centroids = load_tensors(centroids)["centroids"].astype(np.float32)
     return encoder
 
 
-def shipped_name(path: Path) -> str | None:
-    """Name of the shipped network in the file of a map; None for another one."""
+def read_network(path: Path) -> tuple[str | None, bytes]:
+    """Name of the shipped network in the file of a map, None for another one, and its data."""
     if path.suffix == ".safetensors":
-        return "encoder-1.onnx" if _digest(load_tensors(path)) == _TEACHER else None
+        if _digest(load_tensors(path)) != _TEACHER:
+            return None, b""
+        path = WEIGHTS / "encoder-1.onnx"
     data = path.read_bytes()
-    return next((f.name for f in sorted(WEIGHTS.glob("*.onnx")) if f.read_bytes() == data), None)
+    shipped = (f.name for f in sorted(WEIGHTS.glob("*.onnx")) if f.read_bytes() == data)
+    return next(shipped, None), data
 
 
 def _digest(arrays: Mapping[str, NDArray[np.generic]]) -> str:

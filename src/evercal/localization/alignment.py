@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,19 +75,6 @@ class AlignmentOptions:
     """Noise of aligned patches, in standard deviations of a patch's intensities."""
 
 
-@dataclass(frozen=True, eq=False)
-class Alignment:
-    """A pose refined by landmarks, and its inliers."""
-
-    refined: RefinedPose
-    """map_from_camera and intrinsics."""
-    pixels: Array
-    """(n, 2) inliers, pixels of the image; the other fields are those of `Hypothesis`."""
-    points_m: Array
-    expected: int
-    matched: int
-
-
 def align_pose(
     pyramid: Sequence[Array],
     camera: Camera,
@@ -99,7 +85,7 @@ def align_pose(
     change: Array | None = None,
     coarse: bool = True,
     least: float = 0.0,
-) -> Alignment | None:
+) -> RefinedPose | None:
     """Refine a rough pose by the landmarks of keyframes.
 
     The camera is that of the first level of the pyramid and the mean of the prior. The start is
@@ -111,17 +97,17 @@ def align_pose(
     pose = start.rotation_matrix(), start.translation_m
     rounds = options.rounds if coarse else options.rounds[1:]
     change = np.zeros(INTRINSICS) if change is None else change
-    found, again = None, 0
+    observed, again = None, 0
     while True:
-        passed = search.rounds(rounds, changed_camera(camera, change), pose, found, least)
+        passed = search.rounds(rounds, changed_camera(camera, change), pose, observed, least)
         if passed is None:
             return None
-        pose, found = passed
-        refined = self_calibrated(found.observed, camera, pose, change, prior)
+        pose, observed = passed
+        refined = self_calibrated(observed, camera, pose, change, prior)
         moved = _moved_px(camera, change, refined.change)
         if moved < _NOTICEABLE_PX:
             break
-        if (refined.residual_px < options.inlier_px).sum() < _HOPELESS * found.expected:
+        if (refined.residual_px < options.inlier_px).sum() < _HOPELESS * observed.expected:
             break  # other intrinsics do not make it the right place
         if again == _MOST_AGAIN:
             if prior.other_camera:
@@ -131,16 +117,8 @@ def align_pose(
         pose, change = (at.rotation_matrix(), at.translation_m), refined.change
         again += 1
         rounds = options.rounds if moved > _FAR_PX else options.rounds[-1:]
-    inliers = refined.residual_px < options.inlier_px
-    if inliers.sum() < options.min_matches:
-        return None
-    return Alignment(
-        refined,
-        found.observed.pixels[inliers],
-        found.observed.points_m[inliers],
-        found.expected,
-        len(found.landmark),
-    )
+    enough = (refined.residual_px < options.inlier_px).sum() >= options.min_matches
+    return refined if enough else None
 
 
 def _moved_px(camera: Camera, before: Array, after: Array) -> float:
@@ -161,16 +139,6 @@ def _consistent(observed: Observed, camera: Camera) -> Pose | None:
     if rough is None:
         return None
     return rough.pose.rotation_matrix(), rough.pose.translation_m
-
-
-class _Found(NamedTuple):
-    """Landmarks matched in one round."""
-
-    expected: int
-    """Landmarks that were searched."""
-    observed: Observed
-    landmark: NDArray[np.int64]
-    """(n,) their numbers."""
 
 
 class _Search:
@@ -204,32 +172,32 @@ class _Search:
         rounds: Sequence[AlignmentRound],
         camera: Camera,
         pose: Pose,
-        found: _Found | None,
+        found: Observed | None,
         least: float,
-    ) -> tuple[Pose, _Found] | None:
+    ) -> tuple[Pose, Observed] | None:
         """Search coarse to fine; return the matches of the last round and where it began."""
         for step in rounds:
             found = self.run(step, camera, pose, found)
-            if found is None or len(found.landmark) < least * found.expected:
+            if found is None or len(found.pixels) < least * found.expected:
                 return None
             if step is rounds[-1]:
                 return pose, found
             rough = pose
             if step.level:
                 # Many matches of the first round are wrong; RANSAC selects a consistent set.
-                rough = _consistent(found.observed, camera)
+                rough = _consistent(found, camera)
             if rough is None:
                 return None
-            at = minimise(found.observed, camera, rough, step.steps)
+            at = minimise(found, camera, rough, step.steps)
             pose = at.rotation, at.position
         raise AssertionError("at least one round")
 
     def run(
-        self, step: AlignmentRound, camera: Camera, pose: Pose, before: _Found | None
-    ) -> _Found | None:
+        self, step: AlignmentRound, camera: Camera, pose: Pose, before: Observed | None
+    ) -> Observed | None:
         """Match landmarks near their expected positions; None for too few matches."""
         options = self.options
-        share = 1.0 if before is None else len(before.landmark) / before.expected
+        share = 1.0 if before is None else len(before.pixels) / before.expected
         more = max(1.0, options.enough_matched / max(share, 1e-3))
         most = int(min(more, options.most_more) * step.landmarks)
         rotation = pose[0].T
@@ -250,7 +218,7 @@ class _Search:
         error = _shift_px(points, self.depth_error_m[which], rotation, shift, camera)
         hessian = patches.inverse_hessian[good]
         white = whitening(affines[good], hessian, options.floor_px, noise, error)
-        return _Found(len(good), Observed(at[good], points, white), which)
+        return Observed(at[good], points, white, len(good))
 
 
 def _shift_px(points: Array, moves: Array, rotation: Array, shift: Array, camera: Camera) -> Array:

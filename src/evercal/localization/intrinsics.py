@@ -133,6 +133,8 @@ class RefinedPose:
 
     pose: UncertainPose
     """points_from_camera; the uncertainty of the intrinsics is part of its covariance."""
+    observed: Observed
+    """What the pose was refined by."""
     residual_px: Array
     """(n,) reprojection errors, pixels of the image."""
     camera: Camera
@@ -182,7 +184,7 @@ def self_calibrated(
         covariance, lens = covariance + more, lens + more
     by_lens = in_parent_axes(own.rotation, lens)
     pose = own.pose(covariance)
-    return RefinedPose(pose, own.residual_px, own.camera, own.change, by_lens)
+    return RefinedPose(pose, observed, own.residual_px, own.camera, own.change, by_lens)
 
 
 def _covariances(minimum: Minimum, variances: Array, cells: Array) -> tuple[Array, Array]:

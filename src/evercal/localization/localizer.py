@@ -16,12 +16,7 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.features.encoder import Features
 from evercal.geometry import SE3, Camera, resize_pixels
-from evercal.localization.acceptance import (
-    accepted,
-    answer,
-    order,
-    support,
-)
+from evercal.localization.acceptance import accepted, answer, order, support
 from evercal.localization.alignment import align_pose
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import (
@@ -221,28 +216,28 @@ class Localizer:
         least: float = 0.0,
     ) -> Hypothesis | None:
         """A pose map_from_camera, refined by landmarks; see `align_pose`."""
-        height, width = query.grey.shape
-        aligned = align_pose(
+        options, size = self.options.alignment, query.grey.shape
+        refined = align_pose(
             query.pyramid,
-            camera.resized(width, height),
+            camera.resized(*size[::-1]),
             [self._bank.load(int(index)).landmarks for index in candidate.keyframes],
             start,
-            self.options.alignment,
+            options,
             query.priors[candidate.scene],
             change,
             coarse,
             least,
         )
-        if aligned is None:
+        if refined is None:
             return None
-        scale = self.contents.short_side / min(height, width)
+        observed, inliers = refined.observed, refined.residual_px < options.inlier_px
         return Hypothesis(
             candidate.scene,
-            aligned.refined.pose,
-            aligned.refined,
-            resize_pixels(aligned.pixels, scale),
-            aligned.points_m,
-            aligned.expected,
-            aligned.matched,
+            refined.pose,
+            refined,
+            resize_pixels(observed.pixels[inliers], self.contents.short_side / min(size)),
+            observed.points_m[inliers],
+            observed.expected,
+            len(inliers),
             candidate=candidate,
         )

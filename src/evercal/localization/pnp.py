@@ -1,5 +1,6 @@
 """Pose from 2D-3D matches: PoseLib's LO-RANSAC with a cap, and the covariance of the pose."""
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ class PnpOptions:
     """Cap on the iterations, for images without any consistent sample."""
     min_iterations: int = 100
     """Iterations that always run."""
+    wanted: int = 12
+    """So many inliers are missed in one of a thousand images."""
 
 
 class PnpResult(NamedTuple):
@@ -44,9 +47,12 @@ def solve_pnp(
     # PoseLib does not use the image size of a PINHOLE camera.
     parameters = [camera.fx, camera.fy, camera.cx, camera.cy]
     pinhole = {"model": "PINHOLE", "width": 0, "height": 0, "params": parameters}
+    # Samples of three until one is of so many inliers: few matches need few.
+    share = min(options.wanted / max(len(pixels), 1), 0.9)
+    needed = max(math.log(1e-3) / math.log1p(-(share**3)), options.min_iterations)
     ransac = {
         "max_reproj_error": options.threshold_px,
-        "max_iterations": options.max_iterations,
+        "max_iterations": int(min(needed, options.max_iterations)),
         "min_iterations": options.min_iterations,
         # The default multiplies the number of iterations that the inlier ratio asks for by three.
         "dyn_num_trials_mult": 1.0,

@@ -23,6 +23,7 @@ SHARED = 0.07
 errors beyond the noise of patches, whose variance is 1, are shared more (research/trust.md)."""
 SHARED_CELLS = 4
 """Such cells along the shorter side of an image."""
+_FIXED, _UNCHANGED = np.zeros(0), np.zeros(INTRINSICS)
 _OPEN = 1e-12
 """Damping of the scaled information: an open direction gets a huge variance."""
 
@@ -37,6 +38,8 @@ class Observed:
     """(n, 3) in the map's frame."""
     whitening: Array
     """(2, 2, n) that gives errors in the image unit variance."""
+    expected: int = 0
+    """Landmarks that should be visible and were searched."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,26 +117,23 @@ def minimise(
     camera: Camera,
     start: tuple[Array, Array],
     iterations: int = 10,
-    variances: Array | None = None,
-    change: Array | None = None,
+    variances: Array = _FIXED,
+    change: Array = _UNCHANGED,
 ) -> Minimum:
     """Minimise whitened reprojection errors with Cauchy weights.
 
     The start is rotation and position of points_from_camera, roughly, with a change (5,) of the
-    intrinsics. These have variances (5,) about those of `camera`; None holds them fixed. Errors are
+    intrinsics. These have variances (5,) about those of `camera`; none hold them fixed. Errors are
     linear in them: the caller repeats it after a large change.
     """
-    count = 6 if variances is None else 6 + INTRINSICS
-    (rotation, position), best = start, None
-    change = np.zeros(INTRINSICS) if change is None else change
-    now, moved, prior, ahead = changed_camera(camera, change), change, np.zeros(0), {}
-    white = observed.whitening
+    (rotation, position), best, ahead = start, None, {}
+    now, moved, white = changed_camera(camera, change), change.copy(), observed.whitening
+    free = len(variances)
     for _ in range(max(iterations, 1)):
         raw, slope = linearise(
-            observed.pixels, observed.points_m, rotation, position, now, count > 6
+            observed.pixels, observed.points_m, rotation, position, now, free > 0
         )
-        if variances is not None:
-            raw += np.tensordot(moved - change, slope[6:], 1)
+        raw += (moved - change)[:free] @ slope[6:].transpose(1, 0, 2)
         residual = white[:, 0] * raw[0] + white[:, 1] * raw[1]
         slope = white[None, :, 0] * slope[:, 0, None] + white[None, :, 1] * slope[:, 1, None]
         squares = residual[0] * residual[0] + residual[1] * residual[1]
@@ -142,18 +142,17 @@ def minimise(
             ahead = {}
             break
         root = 1 / np.sqrt(1 + squares / variance)
-        rows = (slope * root).reshape(count, -1)
+        rows = (slope * root).reshape(len(slope), -1)
         data, gradient = rows @ rows.T, rows @ (residual * root).ravel()
         best = Minimum(
             rotation, position, camera, moved, variance, data, gradient, residual, slope,
             np.hypot(*raw),
         )  # fmt: skip
-        if variances is not None:
-            prior = variance / variances
+        prior = variance / variances
         step, _ = best.moved(prior)
-        if variances is not None:
-            moved = moved + step[6:]
-            moved[0] = np.clip(moved[0], -_FOCAL_CHANGE, _FOCAL_CHANGE)
+        moved = moved.copy()
+        moved[:free] += step[6:]
+        moved[0] = np.clip(moved[0], -_FOCAL_CHANGE, _FOCAL_CHANGE)
         position = position + rotation @ step[:3]
         rotation = rotation @ cv2.Rodrigues(step[3:6])[0]
         ahead = {"rotation": rotation, "position": position, "change": moved}

@@ -75,14 +75,15 @@ def project_surface(
     are those of `Landmarks.surface`, in any frame; rotation and translation lead from there to the
     camera.
     """
-    centre = points[0] @ rotation.T + translation_m
-    visible = np.flatnonzero(centre[:, 2] > NEAREST_M)
-    pixels = camera.project(centre[visible])
-    high = np.array([camera.width, camera.height]) - BORDER_PX - 1
-    inside = ((pixels > BORDER_PX) & (pixels < high)).all(1)
-    visible, pixels = visible[inside], pixels[inside]
-    beside = points[1:, visible] @ rotation.T + translation_m
-    tangents = camera.project(np.maximum(beside, [-np.inf, -np.inf, NEAREST_M])) - pixels
+    centre = rotation @ points[0].T + translation_m[:, None]
+    u, v = camera.project(centre.T).T
+    inside = (u > BORDER_PX) & (u < camera.width - BORDER_PX - 1) & (centre[2] > NEAREST_M)
+    inside &= (v > BORDER_PX) & (v < camera.height - BORDER_PX - 1)
+    visible = np.flatnonzero(inside)
+    pixels = np.stack([u[visible], v[visible]], 1)
+    beside = rotation @ points[1:, visible].transpose(0, 2, 1) + translation_m[:, None]
+    np.maximum(beside[:, 2], NEAREST_M, out=beside[:, 2])
+    tangents = camera.project(beside.transpose(0, 2, 1)) - pixels
     affines = tangents.transpose(1, 2, 0) / _TANGENT_PX
     area = affines[:, 0, 0] * affines[:, 1, 1] - affines[:, 0, 1] * affines[:, 1, 0]
     similar = np.flatnonzero((area > _MIN_AREA) & (area < _MAX_AREA))

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from evercal.errors import InputError
-from evercal.features.encoder import shipped_name
+from evercal.features.encoder import read_network
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.mapping.store import PREVIOUS, SCENE, MapStore, read_scene, require_map
 from evercal.recordings.frame import checked_name
@@ -224,7 +224,7 @@ def _require_same_networks(first: Manifest, other: Manifest, root: Path, path: P
 def _networks(root: Path, manifest: Manifest) -> set[object]:
     """What identifies the networks of a map: maps of before store the first encoder otherwise."""
     names = [str(name) for name in manifest.payload["networks"]]
-    return {shipped_name(root / name) or manifest.files[name]["sha256"] for name in names}
+    return {read_network(root / name)[0] or manifest.files[name]["sha256"] for name in names}
 
 
 def _commit(

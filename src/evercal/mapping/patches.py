@@ -132,7 +132,7 @@ def align_patches(
         product = np.einsum("nkp,np->nk", patches.templates, values) / deviation[:, None]
         if passed < iterations:
             step = (product[:, :2] - patches.rest).clip(-_LONGEST_STEP, _LONGEST_STEP)
-            centre = centre - (affines @ step[..., None])[..., 0]
+            centre -= affines[..., 0] * step[:, :1] + affines[..., 1] * step[:, 1:]
     return centre, product[:, 2] / count
 
 
