@@ -37,6 +37,9 @@ _REFINE_STEPS = 10
 """Gauss-Newton steps of pose and intrinsics, at most."""
 _ROUGH = 0.7
 """Ratio of variances, to either side, at which a linear step to other intrinsics is rough."""
+_BENT_PX = 0.01
+"""Errors of a map that all landmarks may share, pixels. They bound how well many landmarks measure
+intrinsics: a flat wall seen from the front would otherwise seem to measure the focal length."""
 _REACHED = 0.05 * 7.815
 """Probability of another camera at which the 95 % ellipsoid (chi-squared) reaches its pose."""
 
@@ -160,16 +163,18 @@ def self_calibrated(
     tight, free = prior.variances(camera), FREE.variances(camera)
     own = minimise(observed, camera, start, _REFINE_STEPS, tight, change)
     cells = cells_of(observed.pixels, camera)
+    bent = _BENT_PX**2 * float((observed.whitening**2).sum()) / 2
     step, _ = own.moved(own.variance / free)
     moved = own.after(step)
-    measured = moved.covariance(moved.variance / free, cells)[6:, 6:]
+    measured = _measured(moved, free, cells, bent)
     doubt, variances = prior.decided(camera, own.change + step[6:], measured)
     rough = not _ROUGH < moved.variance / own.variance < 1 / _ROUGH
     if variances is not None or doubt > prior.other_camera or rough:
         start = own.rotation, own.position
         best = minimise(observed, camera, start, _REFINE_STEPS, free, own.change)
-        measured = best.covariance(best.variance / free, cells)[6:, 6:]
-        doubt, variances = prior.decided(camera, best.change, measured)
+        if best.variance < moved.variance:
+            measured = _measured(best, free, cells, bent)
+            doubt, variances = prior.decided(camera, best.change, measured)
         if variances is not None:
             start = best.rotation, best.position
             own = minimise(observed, camera, start, _REFINE_STEPS, variances, best.change)
@@ -182,15 +187,22 @@ def self_calibrated(
         wider = _covariances(own, other, cells)[1] - lens + np.outer(off, off)
         more = min(1.0, doubt / _REACHED) * wider
         covariance, lens = covariance + more, lens + more
-    by_lens = in_parent_axes(own.rotation, lens)
-    pose = own.pose(covariance)
+    more = bent / own.variance * lens
+    by_lens, pose = in_parent_axes(own.rotation, lens + more), own.pose(covariance + more)
     return RefinedPose(pose, observed, own.residual_px, own.camera, own.change, by_lens)
+
+
+def _measured(minimum: Minimum, free: Array, cells: Array, bent: float) -> Array:
+    """(5, 5) covariance of intrinsics without a prior."""
+    formal = minimum.covariance(minimum.variance / free, cells)[6:, 6:]
+    return (1 + bent / minimum.variance) * formal
 
 
 def _covariances(minimum: Minimum, variances: Array, cells: Array) -> tuple[Array, Array]:
     """(6, 6) covariance of a pose in camera axes, and the share of the intrinsics in it."""
     whole = minimum.covariance(minimum.variance / variances, cells)[:6, :6]
-    return whole, whole - minimum.covariance(np.zeros(0), cells)
+    values, axes = np.linalg.eigh(whole - minimum.covariance(np.zeros(0), cells))
+    return whole, (axes * np.maximum(values, 0)) @ axes.T
 
 
 def cameras_in_scenes(

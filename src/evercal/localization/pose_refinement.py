@@ -93,7 +93,7 @@ class Minimum:
         rows, sums = slope.reshape(count, -1), (slope @ cells).reshape(count, -1)
         hessian = rows @ rows.T
         noise = float((weight**2 @ squares) / (2 * (weight**2).sum()))
-        scores = noise * hessian + SHARED * max(self.variance, 1.0) ** 2 * sums @ sums.T
+        scores = noise * hessian + SHARED * self.variance**2 * sums @ sums.T
         diagonal = slice(6 * count + 6, None, count + 1)
         hessian.flat[diagonal] += prior
         scores.flat[diagonal] += prior * self.variance
