@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3, pose_distance
+from evercal.localization.acceptance import support
 from evercal.localization.intrinsics import OWN
 from evercal.localization.localizer import Localizer
 from evercal.localization.matching import turned
@@ -100,18 +101,19 @@ def test_a_pose_beside_the_true_one_converges(
     assert pose_distance(found.pose.pose, truth)[0] < 0.01 < pose_distance(beside, truth)[0]
 
 
-def test_guided_matches_lie_near_the_projections_of_their_points(
-    localizer: Localizer, frame: Frame, hall_map: MapContents
+def test_a_pose_of_little_support_is_aligned_to_the_keyframes_that_see_its_view(
+    hall_map: MapContents, frame: Frame
 ) -> None:
-    query, beside = query_of(frame.read_image(), hall_map), SE3.exp([0.04, 0.02, 0, 0, 0.01, 0])
-    pose = truth_of(frame) @ beside
-    anywhere = localizer._matcher.matches(query, KEYFRAMES, frame.camera)
-    near = localizer._matcher.near(query, KEYFRAMES, frame.camera, pose)
-    off = [
-        np.linalg.norm(frame.camera.project(pose.inverse().apply(m.points_m)) - m.pixels, axis=1)
-        for m in (near, anywhere)
-    ]
-    assert off[0].max() < LocalizeOptions().guided_px < np.nanmax(off[1])
-    # Most of the matches that lie near are the same.
-    known = {tuple(row) for row in anywhere.pixels[off[1] < LocalizeOptions().guided_px]}
-    assert len(known - {tuple(row) for row in near.pixels}) == 0
+    localizer = Localizer(hall_map, LocalizeOptions(keyframes=2, reselect_below=99))
+    truth, query = truth_of(frame), query_of(frame.read_image(), hall_map)
+    ranked = localizer._bank.seen(0, truth, frame.camera)
+    supports = []
+    for chosen in (ranked[-2:], ranked[:2]):
+        candidate = Candidate(0, chosen)
+        found = localizer.aligned(query, candidate, frame.camera, truth, np.zeros(5))
+        assert found is not None
+        supports.append(support(found))
+        best = localizer._reselected(query, candidate, frame.camera, found)
+        assert best.candidate is not None
+        assert set(best.candidate.keyframes) == set(ranked[:2])
+    assert supports[0] < supports[1]

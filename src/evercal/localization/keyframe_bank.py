@@ -10,12 +10,16 @@ from numpy.typing import NDArray
 
 from evercal.features.encoder import Encoder
 from evercal.features.views import ideal_cell_pixels
+from evercal.geometry import SE3, Camera
 from evercal.localization.repetition import pattern_steps
 from evercal.mapping.keyframes import Keyframes
+from evercal.mapping.landmarks import project_surface
 from evercal.mapping.patches import Patches, cut_patches, image_pyramid, to_level
 from evercal.mapping.scene_map import MapContents
 
 ALIGNED_LEVELS = 2
+_SAMPLED = 6
+"""Every n-th landmark decides which keyframes see a view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +111,7 @@ class KeyframeBank:
     def __init__(self, contents: MapContents, most_loaded: int):
         self._contents, self._most, self._lock = contents, most_loaded, Lock()
         self._loaded: OrderedDict[int, LoadedKeyframe] = OrderedDict()
+        self._sampled: dict[int, tuple[np.ndarray, NDArray[np.int64]]] = {}
         keyframes = [scene.keyframes for scene in contents.scenes]
         counts = [len(k) for k in keyframes]
         self.scene = np.repeat(np.arange(len(counts)), counts)
@@ -126,6 +131,25 @@ class KeyframeBank:
         """
         similarity = self._descriptors @ self._contents.encoder.vlad()(features)
         return np.argsort(-similarity, kind="stable")
+
+    def seen(self, scene: int, pose: SE3, camera: Camera) -> NDArray[np.int64]:
+        """Rank the keyframes of a scene by their landmarks that a pose map_from_camera shows."""
+        if scene not in self._sampled:
+            frames = self._contents.scenes[scene].keyframes
+            parts = [
+                pose.apply(marks.take(np.arange(0, len(marks), _SAMPLED)).surface(camera))
+                for pose, marks, camera in zip(
+                    frames.base_from_camera, frames.landmarks, frames.cameras, strict=True
+                )
+            ]
+            counts = [part.shape[1] for part in parts]
+            self._sampled[scene] = np.concatenate(parts, 1), np.repeat(range(len(parts)), counts)
+        surface_m, owner = self._sampled[scene]
+        inverse = pose.inverse()
+        rotation, shift = inverse.rotation_matrix(), inverse.translation_m
+        shown = project_surface(surface_m, rotation, shift, camera).landmark
+        own = np.flatnonzero(self.scene == scene)
+        return own[np.argsort(-np.bincount(owner[shown], minlength=len(own)), kind="stable")]
 
     def pattern(self, keyframes: NDArray[np.int64]) -> np.ndarray:
         """(k, 3) displacements by which a pose before the best keyframes may have slipped."""

@@ -184,24 +184,21 @@ class Localizer:
             aligned = self.aligned(query, candidate, camera, pnp.pose, change)
         if aligned is None:
             return Hypothesis(candidate.scene, pnp_inliers=inliers)
-        return self._guided(
+        return self._reselected(
             query, candidate, camera, replace(aligned, pnp_inliers=inliers, matches=matches)
         )
 
-    def _guided(
+    def _reselected(
         self, query: Query, candidate: Candidate, camera: Camera, best: Hypothesis
     ) -> Hypothesis:
-        """The pose after matching near itself, as long as that raises little support."""
+        """The pose by the keyframes that see most of its view, while that raises little support."""
         while best.refined and not self.accepts(best, self.options.immediate):
             pose, change = best.refined.pose.pose, best.refined.change
-            small = best.refined.camera.short_side_resized(self.contents.short_side)
-            pnp = solve_pnp(
-                *self._matcher.near(query, candidate, small, pose), small, self.options.pnp
-            )
-            again = pnp and self.aligned(query, candidate, camera, pnp.pose, change)
-            if not again or support(again) < self.options.guided_gain * support(best):
+            seen = self._bank.seen(candidate.scene, pose, best.refined.camera)
+            candidate = candidate._replace(keyframes=seen[: self.options.keyframes])
+            again = self.aligned(query, candidate, camera, pose, change)
+            if not again or support(again) < self.options.reselect_gain * support(best):
                 break
-            # Rivals are sought among all matches, and not only near this pose.
             best = replace(again, pnp_inliers=best.pnp_inliers, matches=best.matches)
         return best
 

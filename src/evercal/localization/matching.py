@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.features.views import cell_centres, ideal_cell_pixels, working_grey
-from evercal.geometry import SE3, Camera
+from evercal.geometry import Camera
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.query import Attempt, Candidate, LocalizeOptions, Matches, Query
 
@@ -84,24 +84,6 @@ class Matcher:
             chosen = best == number
             points[chosen] = self._bank.load(int(keyframe)).cells.points_m[nearest[number, chosen]]
         return Matches(pixels, points)
-
-    def near(self, query: Query, candidate: Candidate, camera: Camera, pose: SE3) -> Matches:
-        """The same among the points that a pose map_from_camera projects near each patch."""
-        stride = self._options.guided_stride
-        patches, pixels = strided_patches(query, camera, self._bank.encoder.stride, stride)
-        rows, found = _rows(query.features)[patches], []
-        for keyframe in candidate.keyframes:
-            cells = self._bank.load(int(keyframe)).cells
-            projected = camera.pinhole.project(pose.inverse().apply(cells.points_m))
-            off = [pixels[:, None, i] - projected[:, i] for i in (0, 1)]
-            within = off[0] ** 2 + off[1] ** 2 < self._options.guided_px**2
-            similarity = (rows @ cells.features.T) * within
-            nearest = similarity.argmax(1)
-            found.append((similarity[np.arange(len(rows)), nearest], cells.points_m[nearest]))
-        height, points = (np.array(values) for values in zip(*found, strict=True))
-        best, each = height.argmax(0), np.arange(len(rows))
-        valid = height.max(0) > 0
-        return Matches(pixels[valid], points[best, each][valid])
 
     def _most_similar(
         self, query: Query, stride: int, keyframe: int

@@ -40,14 +40,10 @@ class LocalizeOptions:
     aligned_inliers: int = 12
     """Poses with fewer PnP inliers are not aligned."""
     immediate: float = 3.0
-    """A pose with this many times the required support is final. Others are matched again near
-    themselves while their support rises."""
-    guided_gain: float = 1.1
-    """Factor by which guided matching must raise the support to go on."""
-    guided_stride: int = 2
-    """Rows and columns of patches of guided matching, see `Attempt`."""
-    guided_px: float = 32.0
-    """Search radius of guided matching, pixels at the encoder's working size."""
+    """A pose with this many times the required support is final. Others are aligned again to the
+    keyframes that see most of their view."""
+    reselect_gain: float = 1.1
+    """Factor by which that must raise the support to be repeated."""
     rival_px: float = 16.0
     """A second pose is sought among matches that the first one misses by more than this, pixels."""
     rival_matched: float = 0.5
