@@ -291,7 +291,7 @@ def test_portrait_image_of_a_given_camera(localizer: Localizer, hall_room: BoxRo
     assert error(estimate, truth)[0] < 0.02
     # Before a flat wall the focal length trades against the distance.
     unknown = localizer.localize(hall_room.render(camera, truth))
-    assert unknown.status == "unknown_scene"
+    assert unknown.status == "uncertain"
     assert "its position is uncertain by" in unknown.reason
 
 
@@ -308,7 +308,7 @@ def test_terms_sum_to_the_covariance(localizer: Localizer, views: tuple[Frame, .
         for term in estimate.terms:
             assert np.linalg.eigvalsh(term.covariance).min() > -1e-12
     lens = [float(np.trace(e.terms[1].covariance[:3, :3])) for e in (own, stated)]
-    assert lens[1] > 2 * lens[0]
+    assert lens[1] > 1.5 * lens[0]
 
 
 def hall_view(room: BoxRoom) -> SE3:

@@ -104,7 +104,7 @@ def test_a_pose_beside_the_true_one_converges(
 def test_a_pose_of_little_support_is_aligned_to_the_keyframes_that_see_its_view(
     hall_map: MapContents, frame: Frame
 ) -> None:
-    localizer = Localizer(hall_map, LocalizeOptions(keyframes=2, reselect_below=99))
+    localizer = Localizer(hall_map, LocalizeOptions(keyframes=2, immediate=99))
     truth, query = truth_of(frame), query_of(frame.read_image(), hall_map)
     ranked = localizer._bank.seen(0, truth, frame.camera)
     supports = []

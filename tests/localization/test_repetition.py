@@ -68,7 +68,7 @@ class _WithRival(Localizer):
 
 
 @pytest.mark.parametrize(
-    ("weaker", "status"), [(2.0, "ok"), (1.05, "ambiguous"), (0.95, "ambiguous")]
+    ("weaker", "status"), [(2.0, "ok"), (1.05, "ambiguous"), (1.0, "ambiguous")]
 )
 def test_a_clearly_stronger_pose_wins(
     weaker: float,
