@@ -171,6 +171,7 @@ class Localizer:
         prior, poses = query.priors[candidate.scene], []
         # No camera is stated, and the image was not located at once.
         hard = prior is NOT_STATED and candidate.stride < self.options.attempts[0].stride
+        hard &= not len(self._bank.pattern(candidate.keyframes))
         for factor in (1.0, *FOCAL_FACTORS):
             pnp = solve_pnp(*matches, small.zoomed(factor), self.options.pnp)
             poses += [(pnp, factor)] if pnp else []
