@@ -99,14 +99,12 @@ def align_pose(
     prior: Prior,
     change: Array | None = None,
     coarse: bool = True,
-    least: float = 0.0,
 ) -> Alignment | None:
     """Refine a rough pose by the landmarks of keyframes.
 
     The camera is that of the first level of the pyramid and the mean of the prior. The start is
     map_from_camera, roughly, with a change (5,) of the intrinsics; one that is known to some pixels
-    needs no `coarse` search. Returns None if too few landmarks match: in the first round less than
-    a share `least`.
+    needs no `coarse` search. Returns None if too few landmarks match.
     """
     search = _Search(pyramid, keyframes, options)
     pose = start.rotation_matrix(), start.translation_m
@@ -114,7 +112,7 @@ def align_pose(
     change = np.zeros(INTRINSICS) if change is None else change
     found, again = None, 0
     while True:
-        passed = search.rounds(rounds, changed_camera(camera, change), pose, found, least)
+        passed = search.rounds(rounds, changed_camera(camera, change), pose, found)
         if passed is None:
             return None
         pose, found = passed
@@ -207,12 +205,11 @@ class _Search:
         camera: Camera,
         pose: Pose,
         found: _Found | None,
-        least: float,
     ) -> tuple[Pose, _Found] | None:
         """Search coarse to fine; return the matches of the last round and where it began."""
         for step in rounds:
             found = self.run(step, camera, pose, found)
-            if found is None or len(found.landmark) < least * found.expected:
+            if found is None:
                 return None
             if step is rounds[-1]:
                 return pose, found

@@ -224,7 +224,6 @@ class Localizer:
         start: SE3,
         change: NDArray[np.floating],
         coarse: bool = True,
-        least: float = 0.0,
     ) -> Hypothesis | None:
         """A pose map_from_camera, refined by landmarks; see `align_pose`."""
         height, width = query.grey.shape
@@ -238,7 +237,6 @@ class Localizer:
             Prior(query.priors[candidate.scene], scene.covariance_scale, scene.shared_px),
             change,
             coarse,
-            least,
         )
         if aligned is None:
             return None
