@@ -149,12 +149,12 @@ def _bad_poses() -> Table:
 def _trials() -> Table:
     """`calibration wrist` and `fixed`: cameras from images alone."""
     wrist, fixed = rows_of("wrist"), rows_of("fixed-sim7").query("images == 25")
-    mount = "on the arm, gripper_from_camera from nothing, packaged rooms, gripper poses to"
+    mount = "`gripper_from_camera`, without an initial value, packaged rooms, gripper poses to"
     table = []
     for title, rows, prefix in (
-        (f"{mount} 0.2 mm/0.02 deg", wrist, ""),
-        ("then a fixed camera in that map", wrist, "fixed_"),
-        ("fixed, 25 images, sim-7", fixed, ""),
+        (f"{mount} 0.2 mm and 0.02 deg", wrist, ""),
+        ("then `base_from_camera` of a fixed camera in that map", wrist, "fixed_"),
+        ("fixed, 25 images, sim-7, version 0.1.0", fixed, ""),
     ):
         mm, deg = rows[f"{prefix}mm"], rows[f"{prefix}deg"]
         inside = (rows[f"{prefix}squared_mahalanobis"] < CHI2_6).sum()
@@ -237,7 +237,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     ),
     "boards: mistakes": _rows("mistake,mount,refused,named,warned", "mistakes"),
     "boards: detection": _rows("board,tilt_deg,finder,found,any_of_opencv,rms_px,ms", "boards"),
-    "handeye: cameras from images": _trials,
+    "results: cameras from images": _trials,
     "handeye: bumps": _bump,
     "intrinsics: another camera of the model": _rows(
         "answer,camera,stated,answers,located,median_mm,95_%_mm,sigma_mm,inside_95_%,wrong",

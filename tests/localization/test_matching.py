@@ -68,6 +68,15 @@ def test_similarities_are_calculated_once(
         np.testing.assert_array_equal(a, b)
 
 
+def test_every_patch_is_matched_before_a_repeated_pattern(
+    localizer: Localizer, frame: Frame, hall_map: MapContents, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(localizer._bank, "pattern", lambda _: np.eye(3))
+    query = query_of(frame.read_image(), hall_map)
+    (candidate,) = localizer._matcher.candidates(query, Attempt(7, 4))
+    assert candidate.stride == 1
+
+
 @pytest.mark.parametrize("turns", range(4))
 def test_quarter_turns_are_recognised(
     turns: int, localizer: Localizer, hall: Recording, hall_map: MapContents

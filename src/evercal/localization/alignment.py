@@ -84,14 +84,12 @@ def align_pose(
     prior: IntrinsicsPrior,
     change: Array | None = None,
     coarse: bool = True,
-    least: float = 0.0,
 ) -> RefinedPose | None:
     """Refine a rough pose by the landmarks of keyframes.
 
     The camera is that of the first level of the pyramid and the mean of the prior. The start is
     map_from_camera, roughly, with a change (5,) of the intrinsics; one that is known to some pixels
-    needs no `coarse` search. Returns None if too few landmarks match: in the first round less than
-    a share `least`.
+    needs no `coarse` search. Returns None if too few landmarks match.
     """
     search = _Search(pyramid, keyframes, options)
     pose = start.rotation_matrix(), start.translation_m
@@ -99,7 +97,7 @@ def align_pose(
     change = np.zeros(INTRINSICS) if change is None else change
     observed, again = None, 0
     while True:
-        passed = search.rounds(rounds, changed_camera(camera, change), pose, observed, least)
+        passed = search.rounds(rounds, changed_camera(camera, change), pose, observed)
         if passed is None:
             return None
         pose, observed = passed
@@ -173,12 +171,11 @@ class _Search:
         camera: Camera,
         pose: Pose,
         found: Observed | None,
-        least: float,
     ) -> tuple[Pose, Observed] | None:
         """Search coarse to fine; return the matches of the last round and where it began."""
         for step in rounds:
             found = self.run(step, camera, pose, found)
-            if found is None or len(found.pixels) < least * found.expected:
+            if found is None:
                 return None
             if step is rounds[-1]:
                 return pose, found

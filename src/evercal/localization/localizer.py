@@ -163,6 +163,7 @@ class Localizer:
         prior, poses = query.priors[candidate.scene], []
         # No camera is stated, and the image was not located at once.
         hard = prior is NOT_STATED and candidate.stride < self.options.attempts[0].stride
+        hard &= not len(self._bank.pattern(candidate.keyframes))
         for factor in (1.0, *FOCAL_FACTORS):
             pnp = solve_pnp(*matches, small.zoomed(factor), self.options.pnp)
             poses += [(pnp, factor)] if pnp else []
@@ -210,7 +211,6 @@ class Localizer:
         start: SE3,
         change: NDArray[np.floating],
         coarse: bool = True,
-        least: float = 0.0,
     ) -> Hypothesis | None:
         """A pose map_from_camera, refined by landmarks; see `align_pose`."""
         options, size = self.options.alignment, query.grey.shape
@@ -223,7 +223,6 @@ class Localizer:
             query.priors[candidate.scene],
             change,
             coarse,
-            least,
         )
         if refined is None:
             return None

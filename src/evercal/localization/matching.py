@@ -41,7 +41,8 @@ class Matcher:
             voted = proposed[order[scene[order] == s]]
             others = rest[self._bank.scene[rest] == s]
             keyframes = np.concatenate([voted, others])[: self._options.keyframes]
-            candidates.append(Candidate(s, keyframes, attempt.stride))
+            repeated = len(self._bank.pattern(keyframes)) > 0
+            candidates.append(Candidate(s, keyframes, 1 if repeated else attempt.stride))
         return candidates
 
     def upright(self, query: Query) -> Query:

@@ -46,8 +46,6 @@ class LocalizeOptions:
     """Factor by which that must raise the support to be repeated."""
     rival_px: float = 16.0
     """A second pose is sought among matches that the first one misses by more than this, pixels."""
-    rival_matched: float = 0.5
-    """Share of matched landmarks, relative to the pose, below which a displaced one is given up."""
     climbs: int = 5
     """Poses whose rivals are tried, at most."""
     clear_strength: float = 0.8

@@ -91,8 +91,7 @@ def _rivals(
         yield from _other_focal_lengths(localizer, query, best, camera)
     for step in localizer.slips(best):
         start = displaced(pose, step)
-        least = localizer.options.rival_matched * best.matched / best.expected
-        rival = localizer.aligned(query, best.candidate, camera, start, change, False, least)
+        rival = localizer.aligned(query, best.candidate, camera, start, change, False)
         if rival is not None:
             yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
 
