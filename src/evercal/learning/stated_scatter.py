@@ -36,10 +36,11 @@ def with_scatter(
     # Scatter and its bounds are in the unit of the map.
     unit = scene.frame.unit
     bare = replace(scene, frame=replace(scene.frame, frame_sigma=(0.0, 0.0)))
-    answers = _located(replace(contents, scenes=[*others, bare]), held_out, scene.name, unit)
+    localizer = Localizer(replace(contents, scenes=[*others, bare]))
+    answers = _located(localizer, held_out, scene.name, unit)
     for part in left_out:
-        few = replace(bare, keyframes=scene.keyframes.take(part.keyframes))
-        answers += _located(replace(contents, scenes=[*others, few]), part.frames, scene.name, unit)
+        few = localizer.only(len(others), part.keyframes)
+        answers += _located(few, part.frames, scene.name, unit)
     answers = [answer for answer in answers if np.linalg.norm(answer.off[:3]) < WRONG_PLACE_M]
     if len(answers) < LEAST_ANSWERS:
         return scene
@@ -64,9 +65,9 @@ class _Answer(NamedTuple):
 
 
 def _located(
-    contents: MapContents, frames: Sequence[Frame], scene: str, unit: float
+    localizer: Localizer, frames: Sequence[Frame], scene: str, unit: float
 ) -> list[_Answer]:
-    localizer, answers, size = Localizer(contents), [], np.repeat([unit, 1.0], 3)
+    answers, size = [], np.repeat([unit, 1.0], 3)
     for frame in frames:
         estimate = localizer.localize(frame.read_image(), frame.camera)
         pose, stated = estimate.uncertain_pose, frame.base_from_camera

@@ -1,9 +1,11 @@
 """All keyframes of a map: retrieved by a global descriptor, decoded and encoded on demand."""
 
 from collections import OrderedDict
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,6 +120,13 @@ class KeyframeBank:
         self._number = np.concatenate([np.arange(count) for count in counts])
         descriptors = [k.descriptors for k in keyframes if k.descriptors is not None]
         self._descriptors = np.concatenate(descriptors).astype(np.float32)
+        self._used = np.ones(len(self.scene), bool)
+
+    def only(self, keyframes: NDArray[np.int64]) -> Self:
+        """The same bank with these keyframes in use; they are loaded once for both."""
+        part = copy(self)
+        part._used = np.isin(np.arange(len(self.scene)), keyframes)
+        return part
 
     @property
     def encoder(self) -> Encoder:
@@ -130,7 +139,8 @@ class KeyframeBank:
         One matrix-vector product takes 3 ms for 10,000 keyframes, so no index is needed.
         """
         similarity = self._descriptors @ self._contents.encoder.vlad()(features)
-        return np.argsort(-similarity, kind="stable")
+        order = np.argsort(-similarity, kind="stable")
+        return order[self._used[order]]
 
     def seen(self, scene: int, pose: SE3, camera: Camera) -> NDArray[np.int64]:
         """Rank the keyframes of a scene by their landmarks that a pose map_from_camera shows."""
@@ -149,7 +159,8 @@ class KeyframeBank:
         rotation, shift = inverse.rotation_matrix(), inverse.translation_m
         shown = project_surface(surface_m, rotation, shift, camera).landmark
         own = np.flatnonzero(self.scene == scene)
-        return own[np.argsort(-np.bincount(owner[shown], minlength=len(own)), kind="stable")]
+        order = own[np.argsort(-np.bincount(owner[shown], minlength=len(own)), kind="stable")]
+        return order[self._used[order]]
 
     def pattern(self, keyframes: NDArray[np.int64]) -> np.ndarray:
         """(k, 3) displacements by which a pose before the best keyframes may have slipped."""

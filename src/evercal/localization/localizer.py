@@ -6,6 +6,7 @@ The way of an image: prepare, encode, retrieve keyframes, match, PnP, align land
 import os
 import time
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
@@ -68,6 +69,13 @@ class Localizer:
         if not contents.scenes:
             raise InputError(f"store {store}: no scene learned yet; run 'evercal learn' first")
         return cls(contents, options)
+
+    def only(self, scene: int, keyframes: NDArray[np.int64]) -> Self:
+        """The same localizer with some keyframes of one scene."""
+        part = copy(self)
+        part._bank = self._bank.only(np.flatnonzero(self._bank.scene == scene)[keyframes])
+        part._matcher = Matcher(part._bank, self.options, self.contents.short_side)
+        return part
 
     @property
     def scenes(self) -> tuple[str, ...]:
