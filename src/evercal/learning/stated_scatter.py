@@ -9,6 +9,7 @@ import numpy as np
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_map import LeftOut, MapContents, SceneMap
 from evercal.recordings.frame import Frame
+from evercal.recordings.images import as_rgb
 
 LEAST_ANSWERS, WRONG_PLACE_M = 8, 0.5
 """Least number of answers that the scatter is fitted to. Answers farther than this from the stated
@@ -23,7 +24,8 @@ def with_scatter(
 ) -> SceneMap:
     """The newest scene of a map, with the scatter of its stated frame.
 
-    The scatter is as large as the errors of located frames ask for that the map was not built from.
+    The scatter is as large as the errors of frames ask for that the map was not built from, aligned
+    from their stated poses.
 
     Args:
         contents: The map.
@@ -34,13 +36,12 @@ def with_scatter(
     """
     *others, scene = contents.scenes
     # Scatter and its bounds are in the unit of the map.
-    unit = scene.frame.unit
     bare = replace(scene, frame=replace(scene.frame, frame_sigma=(0.0, 0.0)))
     localizer = Localizer(replace(contents, scenes=[*others, bare]))
-    answers = _located(localizer, held_out, scene.name, unit)
+    answers = _located(localizer, held_out, scene)
     for part in left_out:
         few = localizer.only(len(others), part.keyframes)
-        answers += _located(few, part.frames, scene.name, unit)
+        answers += _located(few, part.frames, scene)
     answers = [answer for answer in answers if np.linalg.norm(answer.off[:3]) < WRONG_PLACE_M]
     if len(answers) < LEAST_ANSWERS:
         return scene
@@ -64,16 +65,16 @@ class _Answer(NamedTuple):
     """(6, 6)."""
 
 
-def _located(
-    localizer: Localizer, frames: Sequence[Frame], scene: str, unit: float
-) -> list[_Answer]:
-    answers, size = [], np.repeat([unit, 1.0], 3)
+def _located(localizer: Localizer, frames: Sequence[Frame], scene: SceneMap) -> list[_Answer]:
+    answers, size = [], np.repeat([scene.frame.unit, 1.0], 3)
+    index = localizer.scenes.index(scene.name)
     for frame in frames:
-        estimate = localizer.localize(frame.read_image(), frame.camera)
-        pose, stated = estimate.uncertain_pose, frame.base_from_camera
-        if pose is None or stated is None or estimate.scene != scene:
+        if (stated := frame.base_from_camera) is None:
             continue
-        if np.isfinite(pose.covariance).all():
+        start, image = scene.frame.from_base(stated), as_rgb(frame.read_image())
+        estimate = localizer.from_pose(image, frame.camera, index, start)
+        pose = estimate and estimate.uncertain_pose
+        if pose is not None and np.isfinite(pose.covariance).all():
             turn = (pose.pose.inverse() @ stated).log()[3:]
             off = np.r_[stated.translation_m - pose.pose.translation_m, turn]
             answers.append(_Answer(off / size, pose.covariance / np.outer(size, size)))

@@ -31,6 +31,7 @@ from evercal.localization.intrinsics import (
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.matching import Matcher
 from evercal.localization.pnp import solve_pnp, uncertain
+from evercal.localization.pose_refinement import INTRINSICS
 from evercal.localization.query import (
     Attempt,
     Candidate,
@@ -115,6 +116,19 @@ class Localizer:
         milliseconds = 1000 * (time.perf_counter() - began)
         scene, size = contents.scenes[best.scene], query.image.shape[:2]
         return answer(best, scene, size, milliseconds, rival), best
+
+    def from_pose(
+        self, image: np.ndarray, camera: Camera, scene: int, start: SE3
+    ) -> PoseEstimate | None:
+        """The answer of an alignment that begins at a pose map_from_camera in one scene."""
+        [at] = cameras_in_scenes(camera, image, self.contents.scenes[scene : scene + 1])
+        priors = tuple(prior_of(camera, image, scene) for scene in self.contents.scenes)
+        query = Query(
+            image, np.zeros((0, 0, 0), np.float32), self.options.patches_short_side, priors
+        )
+        seen = self._bank.seen(scene, start, at)[: self.options.keyframes]
+        found = self.aligned(query, Candidate(scene, seen), at, start, np.zeros(INTRINSICS))
+        return found and answer(found, self.contents.scenes[scene], image.shape[:2], 0.0)
 
     def slips(self, hypothesis: Hypothesis) -> NDArray[np.floating]:
         """(k, 3) displacements, by which an aligned pose may have slipped, the shortest first."""
