@@ -52,8 +52,7 @@ def test_another_camera_of_the_model_is_recognised(
     assert max(wide) < 16
     surely = replace(intrinsics.OWN, other_camera=1e-12)
     monkeypatch.setattr(intrinsics, "NOT_STATED", surely)
-    narrow = deviations(hall, hall_room, hall_map, change)
-    assert np.median(narrow) > 10 * np.median(wide)
+    assert max(deviations(hall, hall_room, hall_map, change)) > 16
 
 
 def test_probability_of_another_camera() -> None:

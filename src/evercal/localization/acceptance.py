@@ -20,6 +20,9 @@ CHANCE = 13.6, 232.0
 """Beta distribution of the inlier ratio of wrong poses: 0.055 +- 0.015 (research/trust.md)."""
 FALSE_ACCEPTS = 1e-5
 """Probability that a wrong pose is accepted."""
+FULL_SUPPORT = 40.0
+"""Poses with less support get a wider covariance: their landmarks are on few surfaces, whose errors
+are correlated (research/trust.md)."""
 USELESS_M = 0.05
 """Answers with a larger standard deviation of the position per axis are `uncertain`."""
 APART_SIGMAS, APART_M, APART_RAD = 5.0, 0.01, np.deg2rad(1.0)
@@ -64,12 +67,18 @@ def rejection(hypothesis: Hypothesis, scene: SceneMap) -> str:
     )
 
 
+def widening(hypothesis: Hypothesis) -> float:
+    """Factor on the covariance of an accepted pose."""
+    return max(1.0, FULL_SUPPORT / support(hypothesis))
+
+
 def differ(hypothesis: Hypothesis, other: SE3) -> bool:
     """Whether another pose, map_from_camera, is outside the uncertainty of an accepted one."""
     assert hypothesis.pose is not None, "a hypothesis without a pose is never accepted"
     metres, radians = pose_distance(hypothesis.pose.pose, other)
     far = metres > APART_M or radians > APART_RAD
-    return bool(far and hypothesis.pose.squared_mahalanobis(other) > APART_SIGMAS**2)
+    squares = hypothesis.pose.squared_mahalanobis(other) / widening(hypothesis)
+    return bool(far and squares > APART_SIGMAS**2)
 
 
 def in_base(
@@ -78,7 +87,8 @@ def in_base(
     """The answer in the base frame, and the shares of its covariance."""
     pose = hypothesis.pose
     assert pose is not None, "a hypothesis without a pose is never accepted"
-    estimate = scene.frame.to_base(pose)
+    wide = UncertainPose(pose.pose, widening(hypothesis) * pose.covariance)
+    estimate = scene.frame.to_base(wide)
     if hypothesis.refined is None:
         return estimate, ()
 
@@ -87,8 +97,8 @@ def in_base(
     def moved(covariance: np.ndarray) -> np.ndarray:
         return slope @ covariance @ slope.T
 
-    lens = moved(refined.by_intrinsics)
-    view = moved(pose.covariance) - lens
+    lens = moved(widening(hypothesis) * refined.by_intrinsics)
+    view = moved(wide.covariance) - lens
     poses, stated = (
         moved(np.diag(np.repeat(np.square(sigma), 3)))
         for sigma in (scene.frame.pose_sigma, scene.frame.frame_sigma)

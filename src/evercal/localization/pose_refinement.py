@@ -18,7 +18,7 @@ _DIVERGED = 10.0
 """Growth of the variance of residuals at which the step before is kept."""
 _FOCAL_CHANGE = 1.0
 """Largest change of the logarithm of the focal lengths."""
-SHARED = 0.07
+SHARED = 0.05
 """Variance of the error that all observations of a cell share, over the square of their variance:
 errors beyond the noise of patches, whose variance is 1, are shared more (research/trust.md)."""
 SHARED_CELLS = 4
