@@ -26,7 +26,7 @@ def scaled(frames: tuple[Frame, ...], factor: float) -> tuple[Frame, ...]:
 
 
 def answers(arc: Recording, factor: float) -> tuple[np.ndarray, list[str]]:
-    """Errors in units of the unscaled recording, squared Mahalanobis distances; states of a stream."""
+    """Errors in units of the recording, squared Mahalanobis distances; states of a stream."""
     recording = replace(arc, train=scaled(arc.train, factor), metric=False)
     empty = MapContents(load_encoder(), 120)
     scene, _ = learn_scene(recording, empty, memory="50%")

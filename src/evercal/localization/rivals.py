@@ -5,8 +5,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from evercal.geometry import Camera
-from evercal.localization.acceptance import differ, support
-from evercal.localization.intrinsics import FOCAL_FACTORS, UNKNOWN, zoomed
+from evercal.localization.acceptance import FULL_SUPPORT, differ, support
+from evercal.localization.intrinsics import FOCAL_FACTORS, NOT_STATED, UNKNOWN, zoomed
 from evercal.localization.pnp import solve_pnp
 from evercal.localization.query import Hypothesis, Query
 from evercal.localization.repetition import displaced
@@ -87,7 +87,8 @@ def _rivals(
         if len(rest.pixels) >= localizer.options.aligned_inliers:
             left_over = localizer.hypothesis(query, best.candidate, camera, rest)
             yield replace(left_over, matches=best.matches)
-    if query.priors[best.scene] is UNKNOWN or abs(change[0]) > _NEXT_FOCAL:
+    stated = query.priors[best.scene] not in (UNKNOWN, NOT_STATED)
+    if not stated and support(best) < FULL_SUPPORT:
         yield from _other_focal_lengths(localizer, query, best, camera)
     for step in localizer.slips(best):
         start = displaced(pose, step)
@@ -111,7 +112,7 @@ def _other_focal_lengths(
         if abs(change[0] - best.refined.change[0]) < _NEXT_FOCAL:
             continue
         pnp = solve_pnp(*best.matches, small.zoomed(factor), localizer.options.pnp)
-        if pnp and pnp.inliers.sum() >= localizer.options.aligned_inliers:
+        if pnp and pnp.inliers.sum() >= best.pnp_inliers:
             rival = localizer.aligned(query, best.candidate, camera, pnp.pose, change)
             if rival is not None:
                 yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
