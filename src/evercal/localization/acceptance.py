@@ -17,12 +17,12 @@ from evercal.localization.query import Hypothesis
 from evercal.mapping.scene_map import SceneMap
 
 CHANCE = 13.6, 232.0
-"""Beta distribution of the inlier ratio of wrong poses: 0.055 +- 0.015 (research/trust.md)."""
+"""Beta distribution of the inlier ratio of wrong poses: 0.055 +- 0.015 (research/map.md)."""
 FALSE_ACCEPTS = 1e-5
 """Probability that a wrong pose is accepted."""
 FULL_SUPPORT = 40.0
 """Poses with less support get a wider covariance: their landmarks are on few surfaces, whose errors
-are correlated (research/trust.md)."""
+are correlated (research/map.md)."""
 USELESS_M = 0.05
 """Answers with a larger standard deviation of the position per axis are `uncertain`."""
 APART_SIGMAS, APART_M, APART_RAD = 5.0, 0.01, np.deg2rad(1.0)

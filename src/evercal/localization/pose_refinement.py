@@ -20,7 +20,7 @@ _FOCAL_CHANGE = 1.0
 """Largest change of the logarithm of the focal lengths."""
 SHARED = 0.05
 """Variance of the error that all observations of a cell share, over the square of their variance:
-errors beyond the noise of patches, whose variance is 1, are shared more (research/trust.md)."""
+errors beyond the noise of patches, whose variance is 1, are shared more (research/map.md)."""
 SHARED_CELLS = 4
 """Such cells along the shorter side of an image."""
 _FIXED, _UNCHANGED = np.zeros(0), np.zeros(INTRINSICS)
