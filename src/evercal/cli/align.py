@@ -64,7 +64,7 @@ class Align(args.Verb):
             localizer = Localizer(opened.contents)
             alignment = self._by_points(localizer) if by_points else self._by_gripper(localizer)
             opened.update(alignment.applied_to(localizer.contents.scene(self.scene)))
-        self._show(alignment)
+        self._show(alignment, localizer.contents.scene(self.scene).unit)
         return 0
 
     def _by_gripper(self, localizer: "Localizer") -> "MapAlignment":
@@ -105,14 +105,15 @@ class Align(args.Verb):
         metric = self._metric(localizer)
         return align_by_points(localizer, self.scene, points, picks, metric)
 
-    def _show(self, alignment: "MapAlignment") -> None:
+    def _show(self, alignment: "MapAlignment", unit: float) -> None:
         similarity, (mm, deg) = alignment.similarity, alignment.sigma
+        scale = similarity.scale / unit  # metres per unit of the recording
         gripper = alignment.gripper_from_camera
         self.answer(
             {
                 "scene": self.scene,
                 "base_from_map": similarity.base_from_map.matrix().tolist(),
-                "scale": similarity.scale,
+                "scale": scale,
                 "sigma_mm": mm,
                 "sigma_deg": deg,
                 "used": alignment.used,
@@ -121,7 +122,7 @@ class Align(args.Verb):
                 "warnings": alignment.warnings,
             },
             f"aligned {self.scene}: standard deviation {mm:.2f} mm and {deg:.3f} deg per axis in"
-            f" the middle of the scene; scale {similarity.scale:.5f}; {alignment.used} of"
+            f" the middle of the scene; scale {scale:.5f}; {alignment.used} of"
             f" {alignment.given} are inliers, residual {alignment.residual}",
             *(f"warning: {warning}" for warning in alignment.warnings),
             then=("calibrate", self.store, "IMAGE..."),

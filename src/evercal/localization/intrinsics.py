@@ -37,9 +37,6 @@ _REFINE_STEPS = 10
 """Gauss-Newton steps of pose and intrinsics, at most."""
 _ROUGH = 0.7
 """Ratio of variances, to either side, at which a linear step to other intrinsics is rough."""
-_BENT_PX = 0.01
-"""Errors of a map that all landmarks may share, pixels. They bound how well many landmarks measure
-intrinsics: a flat wall seen from the front would otherwise seem to measure the focal length."""
 _REACHED = 0.05 * 7.815
 """Probability of another camera at which the 95 % ellipsoid (chi-squared) reaches its pose."""
 
@@ -163,17 +160,16 @@ def self_calibrated(
     tight, free = prior.variances(camera), FREE.variances(camera)
     own = minimise(observed, camera, start, _REFINE_STEPS, tight, change)
     cells = cells_of(observed.pixels, camera)
-    bent = _BENT_PX**2 * float((observed.whitening**2).sum()) / 2
-    step, _ = own.moved(own.variance / free)
+    step, _ = own.moved(own.against(free))
     moved = own.after(step)
-    measured = _measured(moved, free, cells, bent)
+    measured = _measured(moved, free, cells)
     doubt, variances = prior.decided(camera, own.change + step[6:], measured)
     rough = not _ROUGH < moved.variance / own.variance < 1 / _ROUGH
     if variances is not None or doubt > prior.other_camera or rough:
         start = own.rotation, own.position
         best = minimise(observed, camera, start, _REFINE_STEPS, free, own.change)
         if best.variance < moved.variance:
-            measured = _measured(best, free, cells, bent)
+            measured = _measured(best, free, cells)
             doubt, variances = prior.decided(camera, best.change, measured)
         if variances is not None:
             start = best.rotation, best.position
@@ -183,24 +179,24 @@ def self_calibrated(
     if variances is None and doubt:
         # A covariance whose deviation reaches to the pose of another camera of the model.
         other = SAME_MODEL.variances(camera)
-        off = (own.moved(own.variance / other)[0] - own.moved(own.variance / limits)[0])[:6]
+        off = (own.moved(own.against(other))[0] - own.moved(own.against(limits))[0])[:6]
         wider = _covariances(own, other, cells)[1] - lens + np.outer(off, off)
         more = min(1.0, doubt / _REACHED) * wider
         covariance, lens = covariance + more, lens + more
-    more = bent / own.variance * lens
+    more = own.bent / own.variance * lens
     by_lens, pose = in_parent_axes(own.rotation, lens + more), own.pose(covariance + more)
     return RefinedPose(pose, observed, own.residual_px, own.camera, own.change, by_lens)
 
 
-def _measured(minimum: Minimum, free: Array, cells: Array, bent: float) -> Array:
+def _measured(minimum: Minimum, free: Array, cells: Array) -> Array:
     """(5, 5) covariance of intrinsics without a prior."""
-    formal = minimum.covariance(minimum.variance / free, cells)[6:, 6:]
-    return (1 + bent / minimum.variance) * formal
+    formal = minimum.covariance(minimum.against(free), cells)[6:, 6:]
+    return (1 + minimum.bent / minimum.variance) * formal
 
 
 def _covariances(minimum: Minimum, variances: Array, cells: Array) -> tuple[Array, Array]:
     """(6, 6) covariance of a pose in camera axes, and the share of the intrinsics in it."""
-    whole = minimum.covariance(minimum.variance / variances, cells)[:6, :6]
+    whole = minimum.covariance(minimum.against(variances), cells)[:6, :6]
     values, axes = np.linalg.eigh(whole - minimum.covariance(np.zeros(0), cells))
     return whole, (axes * np.maximum(values, 0)) @ axes.T
 

@@ -24,6 +24,9 @@ errors beyond the noise of patches, whose variance is 1, are shared more (resear
 SHARED_CELLS = 4
 """Such cells along the shorter side of an image."""
 _FIXED, _UNCHANGED = np.zeros(0), np.zeros(INTRINSICS)
+_BENT_PX = 0.01
+"""Errors of a map that all landmarks may share, pixels. They bound how well many landmarks measure
+intrinsics: a flat wall seen from the front would otherwise seem to measure the focal length."""
 _OPEN = 1e-12
 """Damping of the scaled information: an open direction gets a huge variance."""
 
@@ -55,6 +58,8 @@ class Minimum:
     """(5,) of the intrinsics."""
     variance: float
     """Robust variance of the whitened errors."""
+    bent: float
+    """Variance that the share of all landmarks adds where they measure intrinsics."""
     data: Array
     """(6, 6) or (11, 11) information of the observations: of translation and rotation in camera
     axes, and of the intrinsics. Divided by `variance` it is that of the errors."""
@@ -67,10 +72,14 @@ class Minimum:
     residual_px: Array
     """(n,) errors, pixels of the image."""
 
+    def against(self, variances: Array) -> Array:
+        """Information (5,) of a prior with variances (5,), as `moved` weighs it."""
+        return (self.variance + self.bent) / variances
+
     def moved(self, prior: Array) -> tuple[Array, Array]:
         """Step (k,) to the minimum with another prior, and its covariance (k, k).
 
-        The prior is the information (5,) about unchanged intrinsics, times `variance`; empty where
+        The prior is the information (5,) about unchanged intrinsics, see `against`; empty where
         they are fixed. The errors are linear in steps of this size.
         """
         count = len(prior)
@@ -96,7 +105,7 @@ class Minimum:
         scores = noise * hessian + SHARED * self.variance**2 * sums @ sums.T
         diagonal = slice(6 * count + 6, None, count + 1)
         hessian.flat[diagonal] += prior
-        scores.flat[diagonal] += prior * self.variance
+        scores.flat[diagonal] += prior * (self.variance + self.bent)
         inverse = inverse_of(hessian)
         return inverse @ scores @ inverse
 
@@ -128,7 +137,7 @@ def minimise(
     """
     (rotation, position), best, ahead = start, None, {}
     now, moved, white = changed_camera(camera, change), change.copy(), observed.whitening
-    free = len(variances)
+    free, bent = len(variances), _BENT_PX**2 * float((white**2).sum()) / 2
     for _ in range(max(iterations, 1)):
         raw, slope = linearise(
             observed.pixels, observed.points_m, rotation, position, now, free > 0
@@ -145,10 +154,10 @@ def minimise(
         rows = (slope * root).reshape(len(slope), -1)
         data, gradient = rows @ rows.T, rows @ (residual * root).ravel()
         best = Minimum(
-            rotation, position, camera, moved, variance, data, gradient, residual, slope,
+            rotation, position, camera, moved, variance, bent, data, gradient, residual, slope,
             np.hypot(*raw),
         )  # fmt: skip
-        prior = variance / variances
+        prior = best.against(variances)
         step, _ = best.moved(prior)
         moved = moved.copy()
         moved[:free] += step[6:]

@@ -386,6 +386,7 @@ def _finish(
             keyframes=_keyframes(frames, tracks),
             frame=replace(frame, similarity=own),
             metric=options.metric,
+            unit=prepared.unit,
             train_frames=len(frames),
         ),
         _adjusted(prepared, adjustment, camera),

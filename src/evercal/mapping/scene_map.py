@@ -35,6 +35,8 @@ class SceneMap:
     """Frames that the map was built from."""
     metric: bool = True
     """Whether the recording was in metres; False where its unit of length is unknown."""
+    unit: float = 1.0
+    """Units of length of the recording per unit of the map; 1 where the recording is in metres."""
 
     @property
     def unit_known(self) -> bool:

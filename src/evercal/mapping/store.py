@@ -44,7 +44,7 @@ REFRESHES = "refreshes.json"
 _STATE, PREVIOUS = (SCENE, KEYFRAMES, CORRECTION), "previous-"
 """Files that a refresh replaces, and the prefix of their state before."""
 
-_FIELDS = "name", "camera", "adjusted_camera", "train_frames", "metric"
+_FIELDS = "name", "camera", "adjusted_camera", "train_frames", "metric", "unit"
 """Fields of `SceneMap` in scene.json, beside `frame`."""
 
 
@@ -243,7 +243,7 @@ def read_scene(folder: Path) -> SceneMap:
 
 
 def _read_scene(folder: Path) -> SceneMap:
-    content = {"metric": True, **json.loads((folder / SCENE).read_text())}
+    content = {"metric": True, "unit": 1.0, **json.loads((folder / SCENE).read_text())}
     correction = None
     if (folder / CORRECTION).exists():
         correction = correction_of(load_tensors(folder / CORRECTION))
