@@ -28,7 +28,7 @@ _MOST_AGAIN = 8
 _NOTICEABLE_PX = 0.2
 """Shift of projections by the intrinsics above which landmarks are searched again, pixels."""
 _HOPELESS = 0.08
-"""Inlier ratio below which landmarks are not searched again."""
+"""Share of the searched landmarks that must agree; with fewer the search ends."""
 _FAR_PX = 1.0
 """Shift above which the coarse round is repeated, pixels."""
 
@@ -134,7 +134,7 @@ def _consistent(observed: Observed, camera: Camera) -> Pose | None:
     ideal = camera.pinhole.project(camera.unproject(observed.pixels))
     valid = np.isfinite(ideal).all(1)
     rough = solve_pnp(ideal[valid], observed.points_m[valid], camera, loose)
-    if rough is None:
+    if rough is None or rough.inliers.sum() < _HOPELESS * observed.expected:
         return None
     return rough.pose.rotation_matrix(), rough.pose.translation_m
 

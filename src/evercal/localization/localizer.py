@@ -201,10 +201,8 @@ class Localizer:
             pose = uncertain(pixels, points, small.zoomed(factor), pnp.pose)
             count = len(pnp.inliers)
             return Hypothesis(candidate.scene, pose, None, pixels, points, count, inliers, inliers)
-        aligned = None
-        if inliers >= self.options.aligned_inliers:
-            change = zoomed(factor)
-            aligned = self.aligned(query, candidate, camera, pnp.pose, change)
+        change = zoomed(factor)
+        aligned = self.aligned(query, candidate, camera, pnp.pose, change)
         if aligned is None:
             return Hypothesis(candidate.scene, pnp_inliers=inliers)
         return self._reselected(
