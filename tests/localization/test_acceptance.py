@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3, UncertainPose
-from evercal.localization.acceptance import CHANCE, FALSE_ACCEPTS, accepted, support
+from evercal.localization.acceptance import CHANCE, FALSE_ACCEPTS, SAME_SURFACE, accepted, support
 from evercal.localization.query import Hypothesis
 
 
@@ -15,13 +15,13 @@ def hypothesis(inliers: int, expected: int) -> Hypothesis:
     return Hypothesis(0, pose, None, points[:, :2], points, expected, inliers)
 
 
-@pytest.mark.parametrize("expected", [40, 900])
+@pytest.mark.parametrize("expected", [42, 900])
 def test_support_is_the_tail_of_the_beta_binomial_distribution(expected: int) -> None:
     rng = np.random.default_rng(0)
-    drawn = rng.binomial(expected, rng.beta(*CHANCE, 400_000))
+    drawn = rng.binomial(expected // SAME_SURFACE, rng.beta(*CHANCE, 400_000))
     for inliers in np.quantile(drawn, [0.5, 0.9, 0.99]).astype(int):
         share = float((drawn >= inliers).mean())
-        assert support(hypothesis(inliers, expected)) == pytest.approx(-np.log10(share), abs=0.02)
+        assert support(hypothesis(SAME_SURFACE * inliers, expected)) == pytest.approx(-np.log10(share), abs=0.02)
 
 
 def test_more_inliers_have_more_support() -> None:

@@ -16,11 +16,13 @@ from evercal.localization.estimate import CovarianceTerm, PoseEstimate
 from evercal.localization.query import Hypothesis
 from evercal.mapping.scene_map import SceneMap
 
-CHANCE = 13.6, 232.0
-"""Beta distribution of the inlier ratio of wrong poses: 0.055 +- 0.015 (research/map.md)."""
-FALSE_ACCEPTS = 1e-5
+CHANCE = 17.2, 306.0
+"""Beta distribution of the inlier ratio of wrong poses: 0.053 +- 0.012 (research/map.md)."""
+SAME_SURFACE = 3
+"""Landmarks that show the same piece of a surface from several keyframes and match together."""
+FALSE_ACCEPTS = 1e-4
 """Probability that a wrong pose is accepted."""
-FULL_SUPPORT = 40.0
+FULL_SUPPORT = 36.0
 """Poses with less support get a wider covariance: their landmarks are on few surfaces, whose errors
 are correlated (research/map.md)."""
 USELESS_M = 0.05
@@ -31,10 +33,11 @@ APART_SIGMAS, APART_M, APART_RAD = 5.0, 0.01, np.deg2rad(1.0)
 
 def support(hypothesis: Hypothesis) -> float:
     """Support of a pose, see the top of this file; 0 without inliers."""
-    k, n, (a, b) = hypothesis.inliers, hypothesis.expected, CHANCE
-    if not k:
+    if not hypothesis.inliers:
         return 0.0
-    more = np.arange(k, n)
+    k, n = hypothesis.inliers / SAME_SURFACE, hypothesis.expected / SAME_SURFACE
+    a, b = CHANCE
+    more = np.arange(k, n - 1e-6)
     # Logarithms of the probabilities of k, k + 1, ... n inliers, relative to that of k.
     steps = np.log((n - more) / (more + 1) * (more + a) / (n - more - 1 + b))
     relative = np.r_[0.0, np.cumsum(steps)]
