@@ -48,18 +48,19 @@ class Track(args.Verb):
             raise InputError("--rate and --at-most are above 0, --smooth is 0 or more")
         for path in self.out:
             require_writable(path, "--out")
+        from evercal.live.camera import StreamCamera
         from evercal.localization.tracking import Tracker, TrackOptions
-        from evercal.recordings.streams import stream
         from evercal.reports.track_files import TrackFile, track_row
 
-        frames, localizer = stream(self.source, self.rate), args.open_map(self.store)
+        source = StreamCamera(self.source, self.rate, timeout_s=None)
         options = TrackOptions(
             fallback_s=1 / self.rate, at_most_ms=self.at_most, smooth=self.smooth
         )
         tracker: Tracker | None = None
         states: Counter[str] = Counter()
         times: list[float] = []
-        with ExitStack() as stack:
+        with source as frames, ExitStack() as stack:
+            localizer = args.open_map(self.store)
             files = [stack.enter_context(TrackFile(path)) for path in self.out]
             try:
                 for name, stamp, image, _ in frames:
