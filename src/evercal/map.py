@@ -230,7 +230,8 @@ class Map:
         Args:
             images: A folder, image files or arrays (H, W, 3) of one camera, or a recording, whose
                 training frames are used.
-            camera: Intrinsics. Default: those of the camera that recorded the scene.
+            camera: Intrinsics. Default: those of the recording, or of the camera that recorded
+                the scene.
             options: Thresholds.
             on_progress: Called with the current step, how much of it is done, and its total.
                 Default: bars on stderr.
@@ -244,11 +245,13 @@ class Map:
         from evercal.progress import shown
 
         if isinstance(images, Recording):
-            given = [(frame.name, frame.read_image()) for frame in images.train]
+            given = [(frame.name, frame.image) for frame in images.train]
+            cameras = [camera or frame.camera for frame in images.train]
         else:
-            given = Images.of(images, camera).images
+            given = Images.of(images).images
+            cameras = [camera] * len(given)
         with self._store.writing(), shown(on_progress) as step:
-            scene, report = refresh_scene(self.localizer, given, camera, options, step)
+            scene, report = refresh_scene(self.localizer, given, cameras, options, step)
             self._store.refresh(scene, asdict(report))
         self._localizer = None
         return report

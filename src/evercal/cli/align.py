@@ -76,7 +76,7 @@ class Align(args.Verb):
         files = image_files(self.images)
         assert self.robot_poses is not None
         poses = poses_of_images(self.robot_poses, files, self.convention)
-        images, boards = args.read_images(files), None
+        images, boards = [(str(path), path) for path in files], None
         if self.board_poses is not None:
             detected = read_board_poses(self.board_poses).detected
             by_name = {Path(image.name).name: image.camera_from_board for image in detected}

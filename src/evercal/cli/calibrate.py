@@ -83,10 +83,10 @@ class Calibrate(args.Verb):
         from evercal.calibration.from_images import Images
         from evercal.recordings.poses.pairing import poses_of_images
 
-        poses = None
+        camera, poses = args.camera_for(self.camera, files), None
         if self.robot_poses is not None:
             poses = poses_of_images(self.robot_poses, files, self.convention)
-        return Images(args.read_images(files), args.camera_for(self.camera, files), poses)
+        return Images([(str(path), path) for path in files], camera, poses)
 
     def _calibrated(self, localizer: "Localizer", given: "Images") -> "Calibration":
         from evercal.calibration.from_images import calibrate

@@ -70,14 +70,11 @@ class Refresh(args.Verb):
 
 def _recording(paths: tuple[Path, ...]) -> "Recording | None":
     """The recording at a single path; None for images."""
-    from evercal.recordings import load_recording
+    from evercal.recordings.load import load_recording, recognised
 
-    if len(paths) != 1 or paths[0].is_file():
+    if len(paths) != 1 or paths[0].is_file() or recognised(paths[0]) is None:
         return None
-    try:
-        return load_recording(paths[0])
-    except InputError:
-        return None
+    return load_recording(paths[0])
 
 
 def _lines(report: "RefreshReport") -> Iterator[str]:
