@@ -153,6 +153,7 @@ class Map:
         self,
         recordings: Iterable[PathLike | Recording],
         *,
+        read: Callable[[Path], Recording] | None = None,
         workers: int = 2,
         memory: str | int | None = None,
         options: MapOptions | None = None,
@@ -166,6 +167,7 @@ class Map:
 
         Args:
             recordings: Recordings or their paths.
+            read: Reads the recording at a path. Default: `load_recording`.
             workers: Processes; they share the threads of this machine.
             memory: Keyframes of each scene, as for `learn`.
             options: Sizes and priors of the map.
@@ -185,20 +187,28 @@ class Map:
 
         MemoryBudget.parse(memory)
         loaded: list[Recording] = []
+        failed: list[str] = []
         for item in recordings:
-            recording = item if isinstance(item, Recording) else load_recording(item)
+            try:
+                known = isinstance(item, Recording)
+                recording = item if known else (read or load_recording)(Path(item))
+            except InputError as error:
+                failed.append(str(error))
+                continue
             taken = {*self.scenes, *(other.name for other in loaded)}
             loaded.append(named_recording(recording, None, taken))
         reports: list[LearnReport] = []
-        failed: list[str] = []
+        given = len(loaded) + len(failed)
         with self._store.writing(), shown(on_progress) as step:
             task = LearnTask(self._store.contents.empty(), memory, options)
             ready: dict[int, Learned] = {}
+            following = 0
             step("learning", 0, len(loaded))
             for done, outcome in enumerate(learn_scenes(task, loaded, workers), 1):
                 step("learning", done, len(loaded))
                 ready[outcome.number] = outcome
-                while (learned := ready.pop(len(reports) + len(failed), None)) is not None:
+                while (learned := ready.pop(following, None)) is not None:
+                    following += 1
                     if learned.scene is None or learned.report is None:
                         failed.append(f"{loaded[learned.number].name} ({learned.error})")
                         continue
@@ -210,7 +220,7 @@ class Map:
                     on_scene(report)
         if failed:
             raise InputError(
-                f"{len(failed)} of {len(loaded)} recordings were not learned: {'; '.join(failed)}"
+                f"{len(failed)} of {given} recordings were not learned: {'; '.join(failed)}"
             )
         return tuple(reports)
 

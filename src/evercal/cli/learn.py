@@ -107,11 +107,11 @@ class Learn(args.Verb):
             raise InputError("several recordings: a network learns one at a time; give one")
         from evercal.map import Map
 
-        loaded = [self.reading.recording(path) for path in self.recordings]
         cell = Map.open(self.store, encoder=self.encoder)
-        with self._bars(f"{len(loaded)} recordings, {self.workers} at once") as bars:
+        with self._bars(f"{len(self.recordings)} recordings, {self.workers} at once") as bars:
             reports = cell.learn_many(
-                loaded,
+                self.recordings,
+                read=self.reading.recording,
                 workers=self.workers,
                 memory=self.memory,
                 on_scene=lambda report: bars.write("\n".join(summary(report))),
