@@ -236,6 +236,9 @@ def test_motion_is_detected_and_rest_is_not(
         shift = check(localizer, now, replace(fixed, parent_from_child=pose))
         assert shift.moved
         assert shift.translation_mm == pytest.approx(1000 * np.linalg.norm(tangent[:3]), abs=0.5)
+    [hall_scene] = localizer.contents.scenes
+    renamed = replace(localizer.contents, scenes=[replace(hall_scene, name="lobby")])
+    assert check(Localizer(renamed), now, fixed).same_map
     # A reference of another map adds its uncertainty.
     other = check(localizer, now, replace(fixed, source={"command": "solve"}))
     assert not other.same_map
