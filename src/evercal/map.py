@@ -20,6 +20,7 @@ from evercal.recordings.frame import Recording
 if TYPE_CHECKING:
     import numpy as np
 
+    from evercal.calibration.align import MapAlignment
     from evercal.calibration.calibration import Calibration, Mount
     from evercal.calibration.drift import Shift
     from evercal.calibration.from_images import ImageSource
@@ -410,6 +411,53 @@ class Map:
         from evercal.calibration.learned import learned_calibration
 
         return learned_calibration(self.path, scene)
+
+    def align(
+        self,
+        scene: str,
+        images: ImageSource = (),
+        *,
+        robot_poses: PathLike | SE3 | None = None,
+        convention: str | None = None,
+        boards: Mapping[str, SE3] | None = None,
+        points: Mapping[str, np.ndarray] | None = None,
+        picks: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]] = (),
+        unknown_scale: bool = False,
+    ) -> MapAlignment:
+        """Transform a scene in a frame of its own to the base frame, from images or points.
+
+        Args:
+            scene: Name of the scene; its previous alignment is ignored.
+            images: Of a camera on the gripper, from five or more places that turn about two axes.
+            robot_poses: base_from_gripper of every image, as a file or (n,) poses.
+            convention: Format of the file, if it does not state it.
+            boards: camera_from_board by image name, for a fixed camera and a board in the gripper.
+            points: Instead of images: (3,) touched points by name in the base frame, metres.
+            picks: Name, image (H, W, 3) and pixels (2,) by name of the point, of each image.
+            unknown_scale: Estimate the scale also where the recording was in metres.
+
+        Raises:
+            InputError: No such scene, too few images or points, or another process writes into the
+                map. The map is unchanged.
+        """
+        from evercal.calibration.align import align_by_gripper, align_by_points
+        from evercal.calibration.from_images import Images
+
+        with self._store.writing():
+            own = self.localizer.contents.scene(scene)
+            scale_known = own.metric and not unknown_scale
+            if points is not None:
+                found = align_by_points(self.localizer, scene, points, picks, scale_known)
+            else:
+                given = Images.of(images, None, robot_poses, convention)
+                if (poses := given.base_from_gripper) is None:
+                    raise InputError("give images with robot_poses, or points with picks")
+                found = align_by_gripper(
+                    self.localizer, scene, given.images, poses, scale_known, boards
+                )
+            self._store.update(found.applied_to(own))
+        self._localizer = None
+        return found
 
     def check(
         self,
