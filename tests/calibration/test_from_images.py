@@ -204,6 +204,8 @@ def test_eye_in_hand_needs_a_pose_for_every_image(localizer: Localizer, hall: Re
         calibrate(localizer, Images(images), "eye_in_hand")
     with pytest.raises(InputError, match="1 images and 2 robot poses"):
         calibrate(localizer, Images(images, base_from_gripper=SE3.identity((2,))))
+    with pytest.raises(InputError, match="state it with --mount"):
+        calibrate(localizer, Images(images, base_from_gripper=SE3.identity((1,))))
 
 
 def test_images_from_files_and_arrays(hall: Recording, tmp_path: Path) -> None:

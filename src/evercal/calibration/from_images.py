@@ -171,10 +171,13 @@ def estimated_camera(used: Sequence[ImagePose], stated: Camera) -> Camera:
 
 
 def _stands_still(located: Sequence[ImagePose]) -> bool:
-    items = [item for item in located if item.is_located]
+    fused, items = fuse(located), [item for item in located if item.is_located]
     if len(items) < 2:
-        return True
-    off = deviations(SE3.stack([item.pose for item in items]), fuse(items).pose)
+        raise InputError(
+            "one located image does not show whether the camera moves with the gripper: state it"
+            " with --mount, or give images of more gripper poses"
+        )
+    off = deviations(SE3.stack([item.pose for item in items]), fused.pose)
     metres, radians = np.median(np.linalg.norm(off.reshape(-1, 2, 3), axis=2), axis=0)
     return bool(metres < 0.01 and radians < np.deg2rad(1.0))
 
