@@ -108,7 +108,7 @@ class Adjusted:
     wrong_poses: tuple[str, ...]
     """Frames whose stated pose contradicts the images; they are excluded."""
     untracked: tuple[str, ...]
-    """Frames that could not be tracked in other images; they are excluded."""
+    """Frames that could not be tracked in other images, or not enough; they are excluded."""
     doubtful_poses: tuple[str, ...]
     """Frames whose stated pose has an unusually large error; they were given less weight."""
 
@@ -160,6 +160,13 @@ class BuiltMap:
             for frame in frames
             if frame.base_from_camera is not None
         ]
+
+    def cleared(self, names: Sequence[str]) -> "BuiltMap":
+        """The same map, in which the poses of some frames no longer count as wrong."""
+        adjusted = self.adjusted
+        wrong = tuple(name for name in adjusted.wrong_poses if name not in names)
+        adjusted = replace(adjusted, wrong_poses=wrong, untracked=(*adjusted.untracked, *names))
+        return replace(self, adjusted=adjusted)
 
     def left_out(self, frames: Sequence[Frame]) -> list[LeftOut]:
         """Parts of the recording, each with the keyframes that were recorded before and after it.
