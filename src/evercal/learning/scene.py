@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.learning.stated_scatter import with_scatter
 from evercal.localization.acceptance import differ
@@ -23,6 +24,7 @@ from evercal.recordings.frame import (
     lacks_camera_poses,
 )
 from evercal.recordings.held_out import require_frames, split_held_out
+from evercal.recordings.pictures import look_at
 
 if TYPE_CHECKING:
     from evercal.calibration.eye_in_hand import HandEyeReport
@@ -79,6 +81,8 @@ def learn_scene(
     began = time.perf_counter()
     budget, options = MemoryBudget.parse(memory), options or MapOptions()
     start, least = None, MIN_TRAIN_FRAMES
+    if not (shown := look_at(recording.train)).usable:
+        raise InputError(f"scene {recording.name!r}: {'; '.join(shown.warnings)}")
     if lacks_camera_poses(recording):
         from evercal.calibration.eye_in_hand import posed_by_gripper
 

@@ -12,6 +12,7 @@ import numpy as np
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.geometry.near import near_training
 from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording, posed_frames
+from evercal.recordings.pictures import look_at
 from evercal.recordings.poses.pose_evidence import rotation_warnings
 
 SAME_M, SAME_DEG = 0.001, 0.1
@@ -64,7 +65,8 @@ def inspect_recording(recording: Recording) -> Inspection:
     poses, tested = (SE3.stack([*map(pose_of, part)]) for part in (train, test))
     extent = np.ptp(poses.translation_m, axis=0) if len(train) else np.zeros(3)
     untracked = recording.untracked + len(both) - len(train) - len(test)
-    warnings = [*_frame_warnings(len(train), len(test), untracked, owner)]
+    shown = look_at(recording.train)
+    warnings = [*_frame_warnings(len(train), len(test), untracked, owner), *shown.warnings]
     warnings += [warning for camera in cameras for warning in _camera_warnings(camera)]
     step_m = step_deg = largest_m = near = None
     if len(train) > 1:
@@ -72,7 +74,8 @@ def inspect_recording(recording: Recording) -> Inspection:
         step_m, step_deg = float(np.median(metres)), float(np.rad2deg(np.median(radians)))
         largest_m, of_camera = float(metres.max()), owner == "camera"
         warnings += _motion_warnings(poses, float(extent.max()), step_m, of_camera)
-        warnings += rotation_warnings(train, poses, of_camera)
+        if shown.usable:
+            warnings += rotation_warnings(train, poses, of_camera)
     if train and test:
         warnings += _copy_warnings(train, test, poses, tested)
         near = 100 * float(near_training(poses, tested).mean())
