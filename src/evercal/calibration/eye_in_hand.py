@@ -152,7 +152,7 @@ def _warnings(adjusted: Adjusted) -> tuple[str, ...]:
             f"the images suggest a focal length {adjusted.focal_percent:+.1f} % from the stated"
             " one: calibrate the intrinsics first ('evercal detect' on images of a board)"
         )
-    if adjusted.pose_sigma_mm > MOST_POSE_SIGMA_MM:
+    if (adjusted.pose_sigma_mm or 0) > MOST_POSE_SIGMA_MM:
         warnings.append(
             f"the gripper poses fit the images to {adjusted.pose_sigma_mm:.0f} mm only: let the arm"
             " stand still at every image, and check the clocks"

@@ -85,11 +85,12 @@ def _lines(found: "Inspection") -> Iterator[str]:
     yield f"{found.name}: {found.train} training and {found.test} test frames{whose}"
     yield f"  without a pose  {found.untracked}"
     yield from (f"  camera          {lens}" for lens in found.cameras)
-    extent = " x ".join(f"{side:.2f}" for side in found.extent_m)
-    yield f"  {'gripper' if gripper else 'camera'} moved in {extent} m (training frames)"
+    extent = " x ".join(f"{side:.3g}" for side in found.extent_m)
+    unit = "m" if found.metric else "units"
+    yield f"  {'gripper' if gripper else 'camera'} moved in {extent} {unit} (training frames)"
     if found.step_median_m is not None and found.step_largest_m is not None:
-        middle = f"{100 * found.step_median_m:.1f} cm and {found.step_median_deg:.1f} deg"
-        yield f"  frame to frame  {middle} (median), {found.step_largest_m:.2f} m at most"
+        middle = f"{found.step_median_m:.3g} {unit} and {found.step_median_deg:.1f} deg"
+        yield f"  frame to frame  {middle} (median), {found.step_largest_m:.3g} {unit} at most"
     if found.near_training is not None:
         near = f"{found.near_training:.1f} % of the test frames"
         yield f"  near training   {near} lie within 5 cm and 5 deg of a training frame"

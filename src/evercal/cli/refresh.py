@@ -85,11 +85,15 @@ def _lines(report: "RefreshReport") -> Iterator[str]:
     yield f"  landmarks    {gone:,} of {seen:,} in view are gone ({share})"
     keyframes = f"{report.keyframes_left} replaced, {report.keyframes_added} new"
     yield f"  keyframes    {keyframes}; {size(report.memory_bytes)}"
-    yield (
-        f"  base frame   moved by {report.shift_mm:.2f} mm and {report.shift_deg:.3f} deg"
-        f" (standard deviation {report.shift_sigma_mm:.2f} mm, {report.shift_sigma_deg:.3f} deg;"
-        f" {report.verified} images outside the map)"
+    shift, sigma = (
+        deg if mm is None else f"{mm:.2f} mm, {deg}"
+        for mm, deg in (
+            (report.shift_mm, f"{report.shift_deg:.3f} deg"),
+            (report.shift_sigma_mm, f"{report.shift_sigma_deg:.3f} deg"),
+        )
     )
+    outside = f"{report.verified} images outside the map"
+    yield f"  base frame   moved by {shift} (standard deviation {sigma}; {outside})"
     left_out = list(report.left_out.items())
     yield from (f"  left out     {name}: {reason}" for name, reason in left_out[:_LISTED])
     if len(left_out) > _LISTED:

@@ -116,7 +116,9 @@ def learn_scene(
         train_frames=len(split.train),
         held_out_frames=len(split.held_out),
         landmarks=scene.landmarks,
-        adjusted=built.adjusted,
+        adjusted=built.adjusted
+        if recording.metric
+        else replace(built.adjusted, common_translation_mm=None, pose_sigma_mm=None),
     )
     if start is not None:
         from evercal.calibration.eye_in_hand import hand_eye_report

@@ -52,10 +52,11 @@ class RefreshReport:
     """Size of the keyframes of this scene."""
     verified: int
     """Images outside the map that were located before and after."""
-    shift_mm: float
-    """Their mean motion by the refresh: the shift of the base frame."""
+    shift_mm: float | None
+    """Their mean motion by the refresh: the shift of the base frame. None where the unit of length
+    is unknown, as `shift_sigma_mm`."""
     shift_deg: float
-    shift_sigma_mm: float
+    shift_sigma_mm: float | None
     """Standard deviation of that shift, which is part of every later covariance."""
     shift_sigma_deg: float
 
@@ -122,9 +123,9 @@ def refresh_scene(
         keyframes_added=result.added,
         memory_bytes=updated.keyframes.bytes,
         verified=verified,
-        shift_mm=1000 * float(np.linalg.norm(tangent[:3])),
+        shift_mm=1000 * float(np.linalg.norm(tangent[:3])) if scene.unit_known else None,
         shift_deg=float(np.rad2deg(np.linalg.norm(tangent[3:]))),
-        shift_sigma_mm=1000 * float(sigma[0]),
+        shift_sigma_mm=1000 * float(sigma[0]) if scene.unit_known else None,
         shift_sigma_deg=float(np.rad2deg(sigma[1])),
     )
     return updated, report

@@ -91,15 +91,16 @@ class MapOptions:
 class Adjusted:
     """What bundle adjustment changed about a recording, as JSON values."""
 
-    common_translation_mm: tuple[float, float, float]
-    """Correction common to all stated poses, in the camera frame."""
+    common_translation_mm: tuple[float, float, float] | None
+    """Correction common to all stated poses, in the camera frame; None where their unit of length
+    is unknown, as `pose_sigma_mm`."""
     common_rotation_deg: tuple[float, float, float]
     """Its rotation vector."""
     focal_percent: float
     """Change of the focal length."""
     residual_px: float | None
     """Median reprojection error after the adjustment; None without adjustment."""
-    pose_sigma_mm: float
+    pose_sigma_mm: float | None
     """Estimated error of the stated positions, standard deviation per axis."""
     pose_sigma_deg: float
     """The same for the stated rotations, degrees."""
@@ -143,7 +144,7 @@ class BuiltMap:
     @property
     def independent_noise(self) -> tuple[float, float]:
         """Standard deviation of stated poses per axis that neighbouring frames do not share."""
-        stated = self.adjusted.pose_sigma_mm / 1000, np.deg2rad(self.adjusted.pose_sigma_deg)
+        stated = (self.adjusted.pose_sigma_mm or 0) / 1000, np.deg2rad(self.adjusted.pose_sigma_deg)
         metres, radians = (
             0.0 if shared else float(sigma)
             for sigma, shared in zip(stated, self.scene.frame.frame_sigma, strict=True)
