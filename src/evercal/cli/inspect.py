@@ -44,6 +44,14 @@ class Inspect(args.Verb):
         recording = self.reading.recording(self.scene)
         found = inspect_recording(recording)
         record, lines = asdict(found), [*_lines(found)]
+        if found.poses == "gripper":
+            from evercal.calibration.next_views import open_position
+            from evercal.recordings.frame import stated_grippers
+
+            rough = args.transform_of(self.gripper_from_camera)
+            left = open_position(stated_grippers(recording.train), rough)
+            record["open_position"] = left and asdict(left)
+            lines += [f"warning: {left.sentence()}"] if left else []
         if self.coverage or self.next is not None:
             self._advise(recording, record, lines)
         self.answer(record, *lines, then=("learn", "MAP", self.scene, *self.reading.words()))
@@ -51,11 +59,10 @@ class Inspect(args.Verb):
 
     def _advise(self, recording: "Recording", record: dict[str, object], lines: list[str]) -> None:
         """Add coverage and next poses, as far as asked for."""
-        from evercal.geometry import SE3
         from evercal.live.coverage import Sample, coverage
+        from evercal.recordings.frame import stated_grippers
 
         frames = [frame for frame in recording.train if frame.base_from_gripper is not None]
-        poses = [f.base_from_gripper for f in frames if f.base_from_gripper is not None]
         if not frames:
             raise InputError(
                 f"{self.scene}: states no gripper poses; --coverage and --next need them"
@@ -66,7 +73,7 @@ class Inspect(args.Verb):
             record["coverage"] = asdict(covered)
             lines += _coverage_lines(covered)
         if self.next is not None:
-            views = self._next_views(self.next, SE3.stack(poses), rough)
+            views = self._next_views(self.next, stated_grippers(frames), rough)
             record["next"] = _next_records(views)
             lines += _next_lines(views)
 

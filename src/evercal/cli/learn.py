@@ -250,7 +250,8 @@ def summary(report: "LearnReport") -> Iterator[str]:
             f" standard deviation {pose.sigma_mm:.2f} mm and {pose.sigma_deg:.3f} deg per axis;"
             f" {found.pairs} of {found.of_pairs} image pairs are inliers"
         )
-        yield from (f"warning: {warning}" for warning in found.warnings)
+        notes = (*found.warnings, *([found.advice] if found.advice else ()))
+        yield from (f"warning: {note}" for note in notes)
         if found.given_mm is not None:
             far = f"{found.given_mm:.1f} mm and {found.given_deg:.1f} deg"
             yield f"distance from the given one: {far}"

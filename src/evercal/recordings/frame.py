@@ -57,6 +57,11 @@ def stated_poses(frames: Iterable[Frame]) -> SE3:
     return SE3.stack([f.base_from_camera for f in frames if f.base_from_camera is not None])
 
 
+def stated_grippers(frames: Iterable[Frame]) -> SE3:
+    """(n,) base_from_gripper of the frames that have one."""
+    return SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper is not None])
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """Frames of one place in recorded order, with all poses in one base frame."""

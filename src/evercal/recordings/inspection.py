@@ -11,7 +11,13 @@ import numpy as np
 
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.geometry.near import near_training
-from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording, posed_frames
+from evercal.recordings.frame import (
+    MIN_GRIPPER_FRAMES,
+    MIN_TRAIN_FRAMES,
+    Frame,
+    Recording,
+    posed_frames,
+)
 from evercal.recordings.pictures import look_at
 from evercal.recordings.poses.pose_evidence import rotation_warnings
 
@@ -124,8 +130,9 @@ def _camera_lines(cameras: Counter[Camera]) -> Iterator[str]:
 
 
 def _frame_warnings(train: int, test: int, untracked: int, owner: str) -> Iterator[str]:
-    if train < MIN_TRAIN_FRAMES:
-        yield f"{train} training frames with a pose; learning takes {MIN_TRAIN_FRAMES} or more"
+    least = MIN_GRIPPER_FRAMES if owner == "gripper" else MIN_TRAIN_FRAMES
+    if train < least:
+        yield f"{train} training frames with a pose; learning takes {least} or more"
     if not test and owner != "gripper":
         yield "no test frame with a pose; 'evercal evaluate' has nothing to measure on"
     total = train + test + untracked
