@@ -62,7 +62,7 @@ _ANY_SCALE = 1.0
 _OPEN = 1.5
 """A direction is open if a few images would divide its standard deviation by this: by 7 and 2 for a
 KUKA and a Panda that orbit a board, by 1.04 for the packaged cell."""
-ADDED, _STEP, _STEPS_M, _TURN_DEG = 4, 0.25, (0.03, 0.2), 15.0
+_ADDED, _STEP, _STEPS_M, _TURN_DEG = 4, 0.25, (0.03, 0.2), 15.0
 """Images of a motion that may close it; its size, in distances of the scene, with bounds."""
 _AT_M, _AHEAD_M = 0.3, 0.5
 """Distance of the point whose variance counts; distance of the scene before parallel cameras."""
@@ -126,24 +126,26 @@ class OpenPosition:
     """Further images that reduce it most."""
     then_mm: float
     """Largest expected standard deviation with them."""
+    scale_percent: float
+    """Expected standard deviation of the scale of the scene."""
 
     def sentence(self, stated_mm: float | None = None) -> str:
         """What to do; by default with the expected standard deviation, or with a stated one."""
-        now = self.sigma_mm if stated_mm is None else stated_mm
-        x, y, z = self.direction
+        times = 1.0 if stated_mm is None else stated_mm / self.sigma_mm
+        along = ", ".join(f"{value:+.2f}" for value in self.direction)
+        now, across, then = (times * s for s in (self.sigma_mm, self.across_mm, self.then_mm))
         return (
-            f"the motions leave the position along ({x:+.2f}, {y:+.2f}, {z:+.2f}) of the gripper"
-            f" open: standard deviation {now:.1f} mm, {now / self.sigma_mm * self.across_mm:.1f} mm"
-            f" across; {ADDED} more images {self.motion} would give about"
-            f" {now / self.sigma_mm * self.then_mm:.1f} mm"
+            f"the motions leave the position along ({along}) of the gripper open: standard"
+            f" deviation {now:.1f} mm, {across:.1f} mm across; {_ADDED} more images {self.motion}"
+            f" would give about {then:.1f} mm"
         )
 
 
 def open_position(recorded: SE3, gripper_from_camera: SE3 | None = None) -> OpenPosition | None:
     """The direction that (m,) recorded base_from_gripper leave open, and how to close it.
 
-    None if a few images would improve it little. Without a rough
-    `gripper_from_camera`, distances of the scene are from the gripper.
+    None if a few images would improve it little. Without a rough `gripper_from_camera`, distances
+    of the scene are from the gripper.
     """
     if len(recorded) < MIN_GRIPPER_FRAMES:
         return None
@@ -156,24 +158,24 @@ def open_position(recorded: SE3, gripper_from_camera: SE3 | None = None) -> Open
     # An error of the scale moves X as far as the scene is away.
     away_m = np.linalg.norm(covariance[:3, 12]) / covariance[12, 12]
     step_m = float(np.clip(_STEP * away_m, *_STEPS_M))
-    across = np.stack([axes[:, 0], -axes[:, 0], axes[:, 1], -axes[:, 1]])
-    turn = np.deg2rad(_TURN_DEG) * np.concatenate([np.zeros((4, 3)), across], 1)
+    shift = step_m * np.pad(np.stack([along, axes[:, 0], axes[:, 1]]), ((0, 0), (0, 3)))
+    turn = np.deg2rad(_TURN_DEG) * np.pad(axes[:, :2].T, ((0, 0), (3, 0)))
     motions = {
-        f"{100 * step_m:.0f} cm nearer and farther": step_m * np.outer([1, -1, 1, -1], along),
-        f"{100 * step_m:.0f} cm aside without turning": step_m * across,
+        f"{100 * step_m:.0f} cm nearer and farther": shift[[0, 0]],
+        f"{100 * step_m:.0f} cm aside without turning": shift[1:],
         f"turned by {_TURN_DEG:.0f} deg in place": turn,
     }
-    some = recorded[np.linspace(0, len(recorded) - 1, ADDED).round().astype(int)]
+    some = recorded[np.linspace(0, len(recorded) - 1, _ADDED).round().astype(int)]
     then = {}
     for words, steps in motions.items():
-        moved = some @ SE3.exp(np.pad(steps, ((0, 0), (0, 6 - steps.shape[1]))))
+        moved = some @ SE3.exp(np.concatenate([steps, -steps]))
         more = _of_six(known + wrist_information(moved, mount, scene_m).sum(0))
         then[words] = 1000 * float(np.sqrt(np.linalg.eigvalsh(more[:3, :3])[-1]))
     best = min(then, key=then.__getitem__)
     if sigmas[2] < _OPEN * then[best]:
         return None
-    x, y, z = along.tolist()
-    return OpenPosition((x, y, z), float(sigmas[2]), float(sigmas[1]), best, then[best])
+    (x, y, z), percent = along.tolist(), 100 * float(np.sqrt(covariance[12, 12]))
+    return OpenPosition((x, y, z), float(sigmas[2]), float(sigmas[1]), best, then[best], percent)
 
 
 def _known(recorded: SE3, gripper_from_camera: SE3 | None, scene_m: Array) -> Array:

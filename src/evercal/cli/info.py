@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from evercal.cli import args
-from evercal.cli.console import size, table
+from evercal.cli.console import length, size, table
 
 MEMORY_FILES = ("keyframes.safetensors", "state.safetensors")
 
@@ -112,13 +112,9 @@ def adjusted_row(scene: str, adjusted: dict[str, Any]) -> dict[str, object]:
     return {
         "bundle adjustment": scene,
         "median residual": "-" if residual is None else f"{residual:.2f} px",
-        "error of stated poses": f"{_length(sigma)}{adjusted['pose_sigma_deg']:.3f} deg",
-        "common transform": f"{_length(shift)}{rotation:.3f} deg",
+        "error of stated poses": f"{length(sigma)}{adjusted['pose_sigma_deg']:.3f} deg",
+        "common transform": f"{length(shift)}{rotation:.3f} deg",
         "focal length": f"{adjusted['focal_percent']:+.2f} %",
         "wrong poses": len(adjusted["wrong_poses"]),
         "untracked": len(adjusted.get("untracked", ())),
     }
-
-
-def _length(mm: float | None) -> str:
-    return "" if mm is None else f"{mm:.2f} mm, "

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional
 
 from evercal.cli import args
-from evercal.cli.console import size
+from evercal.cli.console import length, size
 from evercal.errors import InputError
 from evercal.progress import Bars
 
@@ -85,13 +85,8 @@ def _lines(report: "RefreshReport") -> Iterator[str]:
     yield f"  landmarks    {gone:,} of {seen:,} in view are gone ({share})"
     keyframes = f"{report.keyframes_left} replaced, {report.keyframes_added} new"
     yield f"  keyframes    {keyframes}; {size(report.memory_bytes)}"
-    shift, sigma = (
-        deg if mm is None else f"{mm:.2f} mm, {deg}"
-        for mm, deg in (
-            (report.shift_mm, f"{report.shift_deg:.3f} deg"),
-            (report.shift_sigma_mm, f"{report.shift_sigma_deg:.3f} deg"),
-        )
-    )
+    shift = f"{length(report.shift_mm)}{report.shift_deg:.3f} deg"
+    sigma = f"{length(report.shift_sigma_mm)}{report.shift_sigma_deg:.3f} deg"
     outside = f"{report.verified} images outside the map"
     yield f"  base frame   moved by {shift} (standard deviation {sigma}; {outside})"
     left_out = list(report.left_out.items())

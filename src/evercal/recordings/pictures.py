@@ -42,8 +42,8 @@ def look_at(frames: Sequence[Frame]) -> Pictures:
         level = float(np.median([np.median(image) for image in blank]))
         what = "almost black" if level < 48 else "almost white" if level > 207 else "of one colour"
         hint = "; if 12-bit values are stored in 16 bits, multiply them by 16" * (level < 48)
-        count = f"{len(blank)} of {len(images)} images that were looked at"
-        return Pictures((f"{count} are {what}{hint}",), 2 * len(blank) <= len(images))
+        words = f"{len(blank)} of {len(images)} images that were looked at are {what}{hint}"
+        return Pictures((words,), 2 * len(blank) <= len(images))
     tiny = [cv2.resize(image, (40, 30), interpolation=cv2.INTER_AREA) for image in images]
     change = np.abs(np.diff(np.stack(tiny).astype(np.float64), axis=0)).mean((1, 2, 3))
     if len(images) > 1 and np.median(change) < _SAME:
