@@ -148,7 +148,7 @@ def _rounds(root: Path, keyframes: int) -> list[dict[str, object]]:
             for variant, given in zip(VARIANTS[1:3], (images, mixed), strict=True):
                 localizer = Localizer(MapContents(encoder, 240, [scenes[variant]]))
                 scenes[variant], report = refresh_scene(localizer, given)
-                bounds[variant] = float(np.hypot(bounds[variant], report.shift_sigma_mm))
+                bounds[variant] = float(np.hypot(bounds[variant], report.shift_sigma_mm or 0))
                 seconds[variant] = report.seconds
             scenes[VARIANTS[3]] = _learned(recording, encoder, keyframes)
         answers = {v: _answers(scene, recording, encoder) for v, scene in scenes.items()}

@@ -242,7 +242,7 @@ def _mount(recording: Recording, truth: SE3, store: Path) -> Row:
         "status": "ok",
         **row,
         "warnings": "; ".join(report.hand_eye.warnings),
-        "pose_sigma_mm": report.adjusted.pose_sigma_mm,
+        "pose_sigma_mm": report.adjusted.pose_sigma_mm or 0.0,
         "pose_sigma_deg": report.adjusted.pose_sigma_deg,
         "seconds": report.seconds,
     }

@@ -20,6 +20,7 @@ from evercal.recordings.frame import Recording
 if TYPE_CHECKING:
     import numpy as np
 
+    from evercal.calibration.align import MapAlignment
     from evercal.calibration.calibration import Calibration, Mount
     from evercal.calibration.drift import Shift
     from evercal.calibration.from_images import ImageSource
@@ -153,6 +154,7 @@ class Map:
         self,
         recordings: Iterable[PathLike | Recording],
         *,
+        read: Callable[[Path], Recording] | None = None,
         workers: int = 2,
         memory: str | int | None = None,
         options: MapOptions | None = None,
@@ -166,6 +168,7 @@ class Map:
 
         Args:
             recordings: Recordings or their paths.
+            read: Reads the recording at a path. Default: `load_recording`.
             workers: Processes; they share the threads of this machine.
             memory: Keyframes of each scene, as for `learn`.
             options: Sizes and priors of the map.
@@ -185,20 +188,28 @@ class Map:
 
         MemoryBudget.parse(memory)
         loaded: list[Recording] = []
+        failed: list[str] = []
         for item in recordings:
-            recording = item if isinstance(item, Recording) else load_recording(item)
+            try:
+                known = isinstance(item, Recording)
+                recording = item if known else (read or load_recording)(Path(item))
+            except InputError as error:
+                failed.append(str(error))
+                continue
             taken = {*self.scenes, *(other.name for other in loaded)}
             loaded.append(named_recording(recording, None, taken))
         reports: list[LearnReport] = []
-        failed: list[str] = []
+        given = len(loaded) + len(failed)
         with self._store.writing(), shown(on_progress) as step:
             task = LearnTask(self._store.contents.empty(), memory, options)
             ready: dict[int, Learned] = {}
+            following = 0
             step("learning", 0, len(loaded))
             for done, outcome in enumerate(learn_scenes(task, loaded, workers), 1):
                 step("learning", done, len(loaded))
                 ready[outcome.number] = outcome
-                while (learned := ready.pop(len(reports) + len(failed), None)) is not None:
+                while (learned := ready.pop(following, None)) is not None:
+                    following += 1
                     if learned.scene is None or learned.report is None:
                         failed.append(f"{loaded[learned.number].name} ({learned.error})")
                         continue
@@ -210,7 +221,7 @@ class Map:
                     on_scene(report)
         if failed:
             raise InputError(
-                f"{len(failed)} of {len(loaded)} recordings were not learned: {'; '.join(failed)}"
+                f"{len(failed)} of {given} recordings were not learned: {'; '.join(failed)}"
             )
         return tuple(reports)
 
@@ -230,7 +241,8 @@ class Map:
         Args:
             images: A folder, image files or arrays (H, W, 3) of one camera, or a recording, whose
                 training frames are used.
-            camera: Intrinsics. Default: those of the camera that recorded the scene.
+            camera: Intrinsics. Default: those of the recording, or of the camera that recorded
+                the scene.
             options: Thresholds.
             on_progress: Called with the current step, how much of it is done, and its total.
                 Default: bars on stderr.
@@ -244,11 +256,13 @@ class Map:
         from evercal.progress import shown
 
         if isinstance(images, Recording):
-            given = [(frame.name, frame.read_image()) for frame in images.train]
+            given = [(frame.name, frame.image) for frame in images.train]
+            cameras = [camera or frame.camera for frame in images.train]
         else:
-            given = Images.of(images, camera).images
+            given = Images.of(images).images
+            cameras = [camera] * len(given)
         with self._store.writing(), shown(on_progress) as step:
-            scene, report = refresh_scene(self.localizer, given, camera, options, step)
+            scene, report = refresh_scene(self.localizer, given, cameras, options, step)
             self._store.refresh(scene, asdict(report))
         self._localizer = None
         return report
@@ -397,6 +411,53 @@ class Map:
         from evercal.calibration.learned import learned_calibration
 
         return learned_calibration(self.path, scene)
+
+    def align(
+        self,
+        scene: str,
+        images: ImageSource = (),
+        *,
+        robot_poses: PathLike | SE3 | None = None,
+        convention: str | None = None,
+        boards: Mapping[str, SE3] | None = None,
+        points: Mapping[str, np.ndarray] | None = None,
+        picks: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]] = (),
+        unknown_scale: bool = False,
+    ) -> MapAlignment:
+        """Transform a scene in a frame of its own to the base frame, from images or points.
+
+        Args:
+            scene: Name of the scene; its previous alignment is ignored.
+            images: Of a camera on the gripper, from five or more places that turn about two axes.
+            robot_poses: base_from_gripper of every image, as a file or (n,) poses.
+            convention: Format of the file, if it does not state it.
+            boards: camera_from_board by image name, for a fixed camera and a board in the gripper.
+            points: Instead of images: (3,) touched points by name in the base frame, metres.
+            picks: Name, image (H, W, 3) and pixels (2,) by name of the point, of each image.
+            unknown_scale: Estimate the scale also where the recording was in metres.
+
+        Raises:
+            InputError: No such scene, too few images or points, or another process writes into the
+                map. The map is unchanged.
+        """
+        from evercal.calibration.align import align_by_gripper, align_by_points
+        from evercal.calibration.from_images import Images
+
+        with self._store.writing():
+            own = self.localizer.contents.scene(scene)
+            scale_known = own.metric and not unknown_scale
+            if points is not None:
+                found = align_by_points(self.localizer, scene, points, picks, scale_known)
+            else:
+                given = Images.of(images, None, robot_poses, convention)
+                if (poses := given.base_from_gripper) is None:
+                    raise InputError("give images with robot_poses, or points with picks")
+                found = align_by_gripper(
+                    self.localizer, scene, given.images, poses, scale_known, boards
+                )
+            self._store.update(found.applied_to(own))
+        self._localizer = None
+        return found
 
     def check(
         self,

@@ -21,6 +21,7 @@ from evercal.calibration.from_images import Images, calibrate
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
 from evercal.localization.localizer import Localizer
+from evercal.map import Map
 from evercal.mapping.map_frame import Similarity
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
@@ -207,8 +208,9 @@ def test_calibration_before_a_second_alignment_is_of_another_map(
         assert not shift.moved
 
 
-def test_verb_aligns_a_scene(
-    arm_views: tuple[NamedImages, SE3], hall_map: MapContents, tmp_path: Path
+@pytest.mark.parametrize("form", ["verb", "method"])
+def test_a_map_on_disk_is_aligned(
+    form: str, arm_views: tuple[NamedImages, SE3], hall_map: MapContents, tmp_path: Path
 ) -> None:
     from evercal.cli import main
 
@@ -222,7 +224,11 @@ def test_verb_aligns_a_scene(
         rows.append(",".join(map(str, [name, *pose.translation_m, *pose.rotation_wxyz])))
     (tmp_path / "poses.csv").write_text("\n".join(rows))
     words = [tmp_path / "map", "hall", tmp_path / "arm", "--robot-poses", tmp_path / "poses.csv"]
-    assert main(["align", *map(str, words)]) == 0
+    if form == "verb":
+        assert main(["align", *map(str, words)]) == 0
+    else:
+        poses = gripper_poses(map_from_camera)
+        Map.open(tmp_path / "map").align("hall", [i for _, i in images], robot_poses=poses)
     estimate = Localizer.open(tmp_path / "map").localize(images[4][1])
     assert estimate.base_from_camera is not None
     truth = BASE_FROM_MAP @ map_from_camera[4]

@@ -100,9 +100,9 @@ def test_the_map_keeps_the_calibration(learned: tuple[Path, LearnReport], tmp_pa
     assert all(0 < (image.residual_mm or 0) < 5 for image in calibration.images if image.used)
     parts = [term.translation_mm for term in calibration.error_terms]
     assert np.linalg.norm(parts) == pytest.approx(calibration.sigma_mm)
-    doubtful = replace(report.hand_eye, warnings=("the clocks differ",))
+    doubtful = replace(report.hand_eye, warnings=("the clocks differ",), advice="turn more")
     verdict = doubtful.calibration(cell.localizer.contents.scenes[0].camera, "arm", 60).verdict
-    assert verdict == "Do not rely on it: the clocks differ."
+    assert verdict == "Do not rely on it: the clocks differ. Turn more."
 
 
 def test_a_map_without_gripper_poses_has_no_calibration(

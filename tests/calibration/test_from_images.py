@@ -204,6 +204,8 @@ def test_eye_in_hand_needs_a_pose_for_every_image(localizer: Localizer, hall: Re
         calibrate(localizer, Images(images), "eye_in_hand")
     with pytest.raises(InputError, match="1 images and 2 robot poses"):
         calibrate(localizer, Images(images, base_from_gripper=SE3.identity((2,))))
+    with pytest.raises(InputError, match="state it with --mount"):
+        calibrate(localizer, Images(images, base_from_gripper=SE3.identity((1,))))
 
 
 def test_images_from_files_and_arrays(hall: Recording, tmp_path: Path) -> None:
@@ -211,11 +213,10 @@ def test_images_from_files_and_arrays(hall: Recording, tmp_path: Path) -> None:
     for number, frame in zip((2, 10, 1), frames, strict=True):
         write_image(tmp_path / f"{number}.png", frame.read_image())
     in_order = [f.read_image() for f in (frames[2], frames[0], frames[1])]
-    folder = Images.of(tmp_path)
-    assert [Path(name).name for name, _ in folder.images] == ["1.png", "2.png", "10.png"]
-    for source in (in_order, np.stack(in_order), [tmp_path / f"{i}.png" for i in (1, 2, 10)]):
-        for (_, image), expected in zip(Images.of(source).images, in_order, strict=True):
-            np.testing.assert_array_equal(image, expected)
+    files = [tmp_path / f"{i}.png" for i in (1, 2, 10)]
+    assert Images.of(tmp_path).images == [(str(file), file) for file in files]
+    for (_, image), expected in zip(Images.of(np.stack(in_order)).images, in_order, strict=True):
+        np.testing.assert_array_equal(image, expected)
     [(_, image)] = Images.of(in_order[0]).images
     np.testing.assert_array_equal(image, in_order[0])
     with pytest.raises(InputError, match=r"poses\.csv: .*give poses \(n,\)"):
@@ -237,6 +238,9 @@ def test_motion_is_detected_and_rest_is_not(
         shift = check(localizer, now, replace(fixed, parent_from_child=pose))
         assert shift.moved
         assert shift.translation_mm == pytest.approx(1000 * np.linalg.norm(tangent[:3]), abs=0.5)
+    [hall_scene] = localizer.contents.scenes
+    renamed = replace(localizer.contents, scenes=[replace(hall_scene, name="lobby")])
+    assert check(Localizer(renamed), now, fixed).same_map
     # A reference of another map adds its uncertainty.
     other = check(localizer, now, replace(fixed, source={"command": "solve"}))
     assert not other.same_map
@@ -282,6 +286,9 @@ def test_episodes_with_wrong_poses_are_reported(
     write_image(tmp_path / "bare" / "0.png", frame.read_image())
     with pytest.raises(InputError, match=r"bare: states no camera pose.*--calibration"):
         audit(localizer, tmp_path)
+    (tmp_path / "bare" / "scene.json").write_text("{")
+    with pytest.raises(InputError, match=r"scene\.json"):
+        audit(localizer, tmp_path, stated=truth_of(frame))
 
 
 GRIPPER_FROM_CAMERA = SE3.exp([0.05, 0.02, 0.1, 0.1, 0.2, -0.3])

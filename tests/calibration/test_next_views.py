@@ -21,6 +21,7 @@ from evercal.calibration.next_views import (
     looked_at,
     next_views,
     next_views_of_fixed_camera,
+    open_position,
     wrist_information,
     wrist_jacobian,
 )
@@ -66,11 +67,12 @@ def test_information_is_that_of_the_residuals_under_noise_on_both_poses() -> Non
         camera = scene.inverse() @ gripper @ MOUNT
 
         def residual(x: np.ndarray, gripper: SE3 = gripper, camera: SE3 = camera) -> np.ndarray:
-            moved = (gripper @ SE3.exp(x[12:18]) @ changed(MOUNT, x[:6])).inverse()
-            return (moved @ scene @ SE3.exp(x[6:12]) @ camera @ SE3.exp(x[18:])).log()
+            moved = (gripper @ SE3.exp(x[13:19]) @ changed(MOUNT, x[:6])).inverse()
+            scaled = SE3(camera.rotation_wxyz, (1 + x[12]) * camera.translation_m)
+            return (moved @ scene @ SE3.exp(x[6:12]) @ scaled @ SE3.exp(x[19:])).log()
 
-        slopes = numerical(residual, 24)
-        by_unknowns, by_noise = slopes[:, :12], slopes[:, 12:]
+        slopes = numerical(residual, 25)
+        by_unknowns, by_noise = slopes[:, :13], slopes[:, 13:]
         np.testing.assert_allclose(wrist_jacobian(poses, MOUNT, SCENE)[i], by_unknowns, atol=1e-8)
         expected = by_unknowns.T @ np.linalg.inv(by_noise @ noise @ by_noise.T) @ by_unknowns
         information = wrist_information(poses, MOUNT, SCENE)[i]
@@ -87,7 +89,7 @@ def test_rotations_about_two_axes_are_needed(
     """The position of X stays open by as many directions as Tsai and Lenz state."""
     added = wrist_information(grippers(8, turn), MOUNT, SCENE).sum(0)
     # What no view decides has a standard deviation of about 30 m.
-    position = np.linalg.inv(added + 1e-3 * np.eye(12))[:3, :3]
+    position = np.linalg.inv(added + 1e-3 * np.eye(13))[:3, :3]
     assert int((np.linalg.eigvalsh(position) > 1.0).sum()) == open_directions
 
 
@@ -103,7 +105,7 @@ def test_the_point_looked_at_is_where_the_axes_meet() -> None:
 
 def test_one_view_is_the_best_one_and_two_are_nearly_the_best_two() -> None:
     used, reachable = grippers(2), grippers(12, seed=2)
-    known = 1e-2 * np.eye(12) + wrist_information(used, MOUNT, SCENE).sum(0)
+    known = 1e-2 * np.eye(13) + wrist_information(used, MOUNT, SCENE).sum(0)
     added = wrist_information(reachable, MOUNT, SCENE)
 
     def cost(index: tuple[int, ...]) -> float:
@@ -128,6 +130,28 @@ def test_recorded_and_excluded_poses_and_their_twins_are_not_proposed() -> None:
     assert found.index.tolist() == [9]
     with pytest.raises(InputError, match="no reachable poses"):
         next_views(used, SE3.identity((0,)))
+
+
+@pytest.mark.parametrize("mount", [MOUNT, None])
+def test_an_orbit_leaves_the_distance_open_and_other_distances_close_it(mount: SE3 | None) -> None:
+    """The images show neither the scale of the scene nor, therefore, how far the camera is."""
+    turns = SE3.exp(np.pad(0.3 * np.random.default_rng(0).normal(size=(20, 3)), ((0, 0), (3, 0))))
+    near, far = (
+        SE3.from_translation(SCENE) @ turns @ SE3.from_translation((0, 0, -z)) @ MOUNT.inverse()
+        for z in (0.5, 0.8)
+    )
+    found = open_position(near, mount)
+    assert found is not None
+    # Without a mount, the distance is that of the gripper.
+    ahead = MOUNT.apply([0, 0, 0.5]) - (0 if mount is None else MOUNT.translation_m)
+    assert abs(ahead @ found.direction) > 0.99 * np.linalg.norm(ahead)
+    assert found.sigma_mm > 5 * found.across_mm
+    assert found.scale_percent > 5
+    assert found.then_mm < 0.5 * found.sigma_mm
+    assert found.motion in found.sentence()
+    assert f"{2 * found.then_mm:.1f} mm" in found.sentence(2 * found.sigma_mm)
+    assert open_position(SE3.stack([*near, *far]), mount) is None
+    assert open_position(near[:4], mount) is None
 
 
 def wrist_views(count: int, seed: int) -> SE3:

@@ -35,6 +35,8 @@ def test_coverage_and_next_poses_of_a_wrist_recording(run: Any, tmp_path: Path) 
     words += ["--count", "3", "--gripper-from-camera", cell / "rough.txt"]
     record = json.loads(run(*words, "--json").out)
     assert len(record["coverage"]["samples"]) == 9
+    assert record["warnings"] == []
+    assert record["open_position"] is None
     assert record["coverage"]["ready"]
     sigmas = [view["sigma_mm"] for view in record["next"]]
     assert len(sigmas) == 3

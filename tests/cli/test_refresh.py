@@ -41,3 +41,5 @@ def test_the_stated_camera_is_used(
     assert given[0].fx == 250
     assert (given[0].width, given[0].height) == (320, 240)
     assert given[1] is None
+    (tmp_path / "now" / "scene.json").write_text("{")
+    assert "scene.json" in run("refresh", hall_store, tmp_path / "now").err[0]

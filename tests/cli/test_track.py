@@ -1,7 +1,14 @@
-"""`evercal track` and `evercal refresh` on the command line."""
+"""`evercal track` on the command line."""
 
 import json
+import time
+from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
+
+from evercal.live import camera
+from evercal.recordings import Recording, streams
 
 from .conftest import Run
 
@@ -19,3 +26,20 @@ def test_a_folder_is_tracked_into_files(
     assert len(lines.read_text().splitlines()) == 6
     located = report["tracking"] + report["relocalized"]
     assert len(tum.read_text().splitlines()) == 1 + located
+
+
+def test_a_live_camera_is_tracked_in_its_newest_frames(
+    run: Run, hall_store: Path, hall: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = hall.test[3].read_image()
+
+    def frames(source: str, rate: float) -> Iterator[streams.StreamFrame]:
+        for i in range(30):
+            time.sleep(0.005)
+            yield streams.StreamFrame(str(i), time.time(), image, time.monotonic())
+
+    for module in (streams, camera):
+        monkeypatch.setattr(module, "stream", frames)
+    ran = run("track", hall_store, "0", "--out", tmp_path / "t.jsonl", "--json")
+    assert 1 <= json.loads(ran.out)["frames"] < 30
+    assert ran.code == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,6 +55,7 @@ def phone_store(phone: Path) -> Path:
     words = ("learn", store, phone, "--name", "hall", "--memory", "25%")
     with contextlib.redirect_stdout(io.StringIO()) as shown:
         assert main([str(word) for word in words]) == 0
+    assert " mm" not in shown.getvalue()
     next_line = shown.getvalue().splitlines()[-1]
     assert next_line == f"next: evercal align {store} hall IMAGE... --robot-poses FILE"
     return store
@@ -102,6 +104,28 @@ def test_poses_have_no_millimetres(
     assert " mm" not in text
     assert " m " not in text
     assert " deg" in text
+
+
+def test_no_command_prints_a_length_in_metres(
+    run: Any, phone: Path, phone_store: Path, four_images: Path, tmp_path: Path
+) -> None:
+    wide = json.loads((phone / "transforms.json").read_text())
+    for frame in wide["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= 1000
+    shutil.copytree(phone, tmp_path / "wide")
+    (tmp_path / "wide" / "transforms.json").write_text(json.dumps(wide))
+    copy = shutil.copytree(phone_store, tmp_path / "copy")
+    for words in (
+        ("inspect", tmp_path / "wide"),
+        ("info", phone_store),
+        ("track", phone_store, four_images),
+        ("refresh", copy, phone / "images"),
+    ):
+        ran = run(*words)
+        assert ran.code == 0, ran.err
+        assert not re.search(r"\d (mm|cm|m)\b", ran.out), ran.out
+    assert "no millimetres to measure" in run("evaluate", phone_store, f"hall={phone}").err[0]
 
 
 def test_alignment_gives_metres(

@@ -93,12 +93,16 @@ def test_broken_file_does_not_end_the_watch_nor_prolong_it(
     assert [Path(line.split(": ")[1]).name for line in warnings] == ["0-broken.png", "1-folder.png"]
 
 
-def test_image_of_another_place_is_reported(
-    run: Any, words: tuple[object, ...], tmp_path: Path
+def test_neither_one_moved_image_nor_one_of_another_shape_ends_the_watch(
+    run: Any, words: tuple[object, ...], hall: Recording, tmp_path: Path
 ) -> None:
-    write_image(tmp_path / "arriving" / "black.png", np.zeros((240, 320, 3), np.uint8))
-    ran = run(*words, "--idle", "0.2", "--json")
+    black, moved = np.zeros((240, 320, 3), np.uint8), hall.test[6].read_image()
+    for i, image in enumerate((black, black[:200, :200], black, moved)):
+        write_image(tmp_path / "arriving" / f"{i}.png", image)
+    ran = run(*words, "--idle", "0.5", "--json")
     assert ran.code == 0
-    record = json.loads(ran.out)
-    assert record["moved"] is None
-    assert record["reason"]
+    first, second, third = map(json.loads, ran.out.splitlines())
+    assert first["moved"] is second["moved"] is None
+    assert first["reason"]
+    assert third["moved"]
+    assert "1.png: camera 320x240 does not fit the image 200x200" in "".join(ran.err)

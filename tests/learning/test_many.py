@@ -98,8 +98,10 @@ def test_unusable_recordings_and_killed_workers_do_not_stop_the_others(
     once = deadly(small[0], tmp_path / "once", 1)
     always = deadly(small[2], tmp_path / "always", 99)
     opened = small_map(tmp_path / "map")
-    with pytest.raises(InputError, match=r"2 of 4 recordings were not learned") as error:
-        opened.learn_many((once, few, always, small[1]), workers=2, options=QUICK)
+    items = (tmp_path / "missing", once, few, always, small[1])
+    with pytest.raises(InputError, match=r"3 of 5 recordings were not learned") as error:
+        opened.learn_many(items, workers=2, options=QUICK)
+    assert f"{items[0]}: no such folder" in str(error.value)
     assert re.search(r"few \(.*3 training", str(error.value))
     assert re.search(r"gamma \(.*killed 3 times", str(error.value))
     assert opened.scenes == Map.open(tmp_path / "map").scenes == ("alpha", "beta")

@@ -21,7 +21,9 @@ def test_support_is_the_tail_of_the_beta_binomial_distribution(expected: int) ->
     drawn = rng.binomial(expected // SAME_SURFACE, rng.beta(*CHANCE, 400_000))
     for inliers in np.quantile(drawn, [0.5, 0.9, 0.99]).astype(int):
         share = float((drawn >= inliers).mean())
-        assert support(hypothesis(SAME_SURFACE * inliers, expected)) == pytest.approx(-np.log10(share), abs=0.02)
+        assert support(hypothesis(SAME_SURFACE * inliers, expected)) == pytest.approx(
+            -np.log10(share), abs=0.02
+        )
 
 
 def test_more_inliers_have_more_support() -> None:

@@ -16,6 +16,7 @@ from evercal.localization import acceptance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import NOT_STATED, OWN, STATED, cameras_in_scenes, prior_of
 from evercal.localization.localizer import Localizer
+from evercal.localization.parallel import in_parallel
 from evercal.localization.pnp import PnpOptions
 from evercal.localization.query import Attempt, LocalizeOptions
 from evercal.mapping.build import MapOptions, build_map
@@ -164,13 +165,12 @@ def test_estimates_do_not_depend_on_earlier_images(
 @pytest.mark.usefixtures("two_threads")
 def test_batch_equals_single_images(hall: Recording, hall_map: MapContents) -> None:
     frames = hall.test[1:13:4]
-    images, cameras = [f.read_image() for f in frames], [f.camera for f in frames]
-    localizer = Localizer(hall_map)
-    single = [everything(localizer.localize(*pair)) for pair in zip(images, cameras, strict=True)]
+    single, fresh = Localizer(hall_map), Localizer(hall_map)
     # A localizer without decoded keyframes loads them in both threads at once.
-    batch = Localizer(hall_map).localize_batch(images, cameras)
-    assert [everything(e) for e in batch] == single
-    assert localizer.localize_batch([], []) == []
+    batch = in_parallel(lambda f: fresh.localize(f.read_image(), f.camera), frames)
+    for frame, estimate in zip(frames, batch, strict=True):
+        expected = single.localize(frame.read_image(), frame.camera)
+        assert everything(estimate) == everything(expected)
 
 
 def test_map_on_disk_gives_the_same_poses(
@@ -331,8 +331,6 @@ def test_camera_of_another_aspect_ratio_is_refused(localizer: Localizer) -> None
         localizer.localize(image, CAMERA)
     with pytest.raises(InputError, match="image"):
         localizer.localize(image[..., :2])
-    with pytest.raises(InputError, match="160x90"):
-        localizer.localize_batch([np.zeros((240, 320, 3), np.uint8), image], [None, CAMERA])
 
 
 @pytest.fixture(scope="module")

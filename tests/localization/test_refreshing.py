@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from evercal import InputError, Map, Recording
-from evercal.geometry import SE3, pose_distance
+from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.localization.refreshing import RefreshReport, refresh_scene
@@ -120,6 +120,8 @@ def test_memory_stays_and_images_are_located_as_well_as_before(
         errors.append(pose_distance(estimate.base_from_camera, truth(frame))[0])
     assert np.median(errors) < 0.004
     # The stated bound of the shift contains the mean error.
+    assert report.shift_mm is not None
+    assert report.shift_sigma_mm is not None
     assert report.shift_mm < 3 * max(report.shift_sigma_mm, 0.3)
 
 
@@ -154,6 +156,24 @@ def test_a_refresh_that_loses_its_only_image_outside_is_refused(
     monkeypatch.setattr(Localizer, "localize", blind)
     with pytest.raises(InputError, match=r"locates 0 of 1 images .*unchanged"):
         refresh_scene(Localizer(hall_map), few)
+
+
+def test_images_of_a_recording_have_their_own_cameras(
+    hall: Recording, hall_map: MapContents, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    MapStore(tmp_path, MapContents(hall_map.encoder, 240)).commit(hall_map.scenes[0], {})
+    cameras = [Camera(320, 240, f, f, 160, 120) for f in (200, 210)]
+    train = tuple(replace(f, camera=c) for f, c in zip(hall.test, cameras, strict=False))
+    given = []
+
+    def localize(self: Localizer, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
+        given.append(camera)
+        return PoseEstimate("failed", "", None, None, None, 0, 0, 0)
+
+    monkeypatch.setattr(Localizer, "localize", localize)
+    with pytest.raises(InputError, match="0 of 2 images"):
+        Map.open(tmp_path).refresh(replace(hall, train=train))
+    assert given == cameras
 
 
 def test_a_refresh_is_refused_or_undone_as_a_whole(

@@ -9,13 +9,13 @@ from evercal.recordings.inspection import inspect_recording
 from evercal.simulation.box_room import BoxRoom, look_at
 
 LENS = Camera(32, 24, 26, 26, 15.5, 11.5)
-PICTURE = np.zeros((24, 32, 3), np.uint8)
+PICTURES = np.random.default_rng(0).integers(0, 255, (7, 24, 32, 3), np.uint8)
 
 
 def recording_of(train: SE3, test: SE3, camera: Camera = LENS, untracked: int = 0) -> Recording:
     def frames(poses: SE3, split: str) -> tuple[Frame, ...]:
         count = len(poses)
-        return tuple(Frame(f"{split}{i}", PICTURE, camera, poses[i]) for i in range(count))
+        return tuple(Frame(f"{split}{i}", PICTURES[i % 7], camera, poses[i]) for i in range(count))
 
     return Recording("planted", frames(train, "a"), frames(test, "b"), untracked)
 

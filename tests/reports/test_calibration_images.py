@@ -50,7 +50,9 @@ class FixedLocalizer:
     scenes = ("room",)
 
     def __init__(self, pose: SE3 | None) -> None:
-        keyframes: Any = SimpleNamespace(landmarks=(), cameras=(), base_from_camera=SE3.identity())
+        keyframes: Any = SimpleNamespace(
+            images=(), landmarks=(), cameras=(), base_from_camera=SE3.identity()
+        )
         scene = SceneMap("room", CAMERA, CAMERA, keyframes, MapFrame(), 10)
         self.contents = SimpleNamespace(scenes=[scene], short_side=60)
         self.pose = pose

@@ -25,6 +25,7 @@ from evercal.geometry import SE3, Camera, axis_deviation, cross_matrix
 from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.mapping.map_frame import MapFrame, Similarity
 from evercal.mapping.scene_map import SceneMap
+from evercal.recordings.images import Picture
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
@@ -74,7 +75,7 @@ def _in_own_frame(localizer: "Localizer", name: str) -> "Localizer":
 def align_by_gripper(
     localizer: "Localizer",
     scene: str,
-    images: Sequence[tuple[str, NDArray[np.uint8]]],
+    images: Sequence[tuple[str, Picture]],
     base_from_gripper: SE3,
     scale_known: bool = True,
     camera_from_board: Mapping[str, SE3] | None = None,

@@ -2,25 +2,23 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.calibration import read_transform
 from evercal.calibration.located import ImagePose, fuse, locate
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg
-from evercal.recordings import load_recording, read_image
-from evercal.recordings.images import IMAGE_ENDINGS
+from evercal.recordings.images import IMAGE_ENDINGS, Picture
+from evercal.recordings.load import load_recording, recognised
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
 
-_Shot = tuple[str, Callable[[], NDArray[np.uint8]], Camera | None, SE3]
-"""Name, reader, intrinsics and stated base_from_camera of an image."""
+_Shot = tuple[str, Picture, Camera | None, SE3]
+"""Name, picture, intrinsics and stated base_from_camera of an image."""
 POSE_FILES = ("calibration.json", "base_from_camera.txt")
 """Files of an episode's folder that state the pose of its camera."""
 
@@ -77,8 +75,8 @@ def _audited(
     localizer: "Localizer", episode: Path, shots: Sequence[_Shot], agreement: tuple[float, float]
 ) -> Episode:
     differences, reason = [], ""
-    for name, read, camera, base_from_camera in shots:
-        [item] = locate(localizer, [(name, read())], camera)
+    for name, image, camera, base_from_camera in shots:
+        [item] = locate(localizer, [(name, image)], camera)
         if item.is_located:
             in_stated = base_from_camera.inverse() @ item.pose
             differences.append(ImagePose(name, item.estimate, in_stated, item.covariance))
@@ -97,21 +95,21 @@ def _audited(
 def _shots(episode: Path, stated: SE3 | None, count: int) -> list[_Shot]:
     pose_file = next((episode / name for name in POSE_FILES if (episode / name).is_file()), None)
     pose = stated if pose_file is None else read_transform(pose_file)
-    try:
+    if recognised(episode) is not None:
         scene = load_recording(episode)
         every = [
-            (frame.name, frame.read_image, frame.camera, frame.base_from_camera)
+            (frame.name, frame.image, frame.camera, frame.base_from_camera or pose)
             for frame in (*scene.train, *scene.test)
         ]
-    except InputError:
+    else:
         files = sorted(p for p in episode.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS)
         if files and pose is None:
             raise InputError(
                 f"{episode}: states no camera pose; put a {' or '.join(POSE_FILES)} there, or give"
                 " the pose of all episodes with --calibration"
-            ) from None
-        every = [(file.name, partial(read_image, file), None, pose) for file in files]
-    shots = [(name, read, camera, at) for name, read, camera, at in every if at is not None]
+            )
+        every = [(file.name, file, None, pose) for file in files]
+    shots = [(name, image, camera, at) for name, image, camera, at in every if at is not None]
     if not shots:
         raise InputError(f"{episode}: no images with a stated camera pose in it")
     chosen = np.unique(np.linspace(0, len(shots) - 1, count).round().astype(int))

@@ -16,6 +16,7 @@ from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.calibration.located import Fused, ImagePose, deviations, fuse, length_mm_deg, locate
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, axis_deviation
+from evercal.recordings.images import Picture
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
@@ -54,7 +55,7 @@ class Shift:
 
 def check(
     localizer: "Localizer",
-    images: Sequence[tuple[str, NDArray[np.uint8]]],
+    images: Sequence[tuple[str, Picture]],
     reference: Calibration,
     camera: Camera | None = None,
     on_image: Callable[[], object] = lambda: None,

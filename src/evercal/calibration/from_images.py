@@ -30,9 +30,8 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, cross_matrix, pose_distance
 from evercal.localization.estimate import Cause
 from evercal.localization.intrinsics import STATED, cameras_in_scenes
-from evercal.recordings import read_image
 from evercal.recordings.image_files import image_files
-from evercal.recordings.images import as_rgb
+from evercal.recordings.images import Picture, as_rgb, pixels_of
 from evercal.recordings.poses.pairing import poses_of_images
 
 if TYPE_CHECKING:
@@ -55,8 +54,8 @@ ImageSource = (
 class Images:
     """Images of one camera, with intrinsics and gripper poses if known."""
 
-    images: Sequence[tuple[str, NDArray[np.uint8]]]
-    """(name, (h, w, 3) uint8 RGB)."""
+    images: Sequence[tuple[str, Picture]]
+    """Names and pictures, which are read one at a time."""
     camera: Camera | None = None
     """Intrinsics. None: those of the camera that recorded the scene, or of another of its model."""
     base_from_gripper: SE3 | None = None
@@ -70,7 +69,7 @@ class Images:
         robot_poses: str | os.PathLike[str] | SE3 | None = None,
         convention: str | None = None,
     ) -> Self:
-        """Read images from files or take them from arrays, see `Map.calibrate`."""
+        """Take images from files or arrays, see `Map.calibrate`."""
         single = isinstance(source, str | os.PathLike) or (
             isinstance(source, np.ndarray) and source.ndim < 4
         )
@@ -80,7 +79,7 @@ class Images:
             poses = robot_poses
             if isinstance(poses, str | os.PathLike):
                 poses = poses_of_images(Path(poses), files, convention)
-            return cls([(str(path), read_image(path)) for path in files], camera, poses)
+            return cls([(str(path), path) for path in files], camera, poses)
         if isinstance(robot_poses, str | os.PathLike):
             raise InputError(
                 f"{robot_poses}: a file of robot poses is paired with image files by name, time or"
@@ -116,7 +115,7 @@ def calibrate(
         moved = in_gripper_frame(located, grippers)
     fused = fuse(moved)
     scene = localizer.contents.metric_scene(fused.scene)
-    first = given.images[0][1]  # once: it may be decoded on request
+    first = pixels_of(given.images[0][1])
     stated = cameras_in_scenes(given.camera, first, [scene])[0]
     camera = estimated_camera(fused.select(located), stated)
     if mount == "eye_to_hand":
@@ -172,10 +171,13 @@ def estimated_camera(used: Sequence[ImagePose], stated: Camera) -> Camera:
 
 
 def _stands_still(located: Sequence[ImagePose]) -> bool:
-    items = [item for item in located if item.is_located]
+    fused, items = fuse(located), [item for item in located if item.is_located]
     if len(items) < 2:
-        return True
-    off = deviations(SE3.stack([item.pose for item in items]), fuse(items).pose)
+        raise InputError(
+            "one located image does not show whether the camera moves with the gripper: state it"
+            " with --mount, or give images of more gripper poses"
+        )
+    off = deviations(SE3.stack([item.pose for item in items]), fused.pose)
     metres, radians = np.median(np.linalg.norm(off.reshape(-1, 2, 3), axis=2), axis=0)
     return bool(metres < 0.01 and radians < np.deg2rad(1.0))
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from evercal.calibration.calibration import ImageUse
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, average_poses, pose_distance_mm_deg
+from evercal.recordings.images import Picture, pixels_of
 
 if TYPE_CHECKING:
     from evercal.localization.estimate import PoseEstimate
@@ -61,14 +62,14 @@ class Fused:
 
 def locate(
     localizer: "Localizer",
-    images: Sequence[tuple[str, NDArray[np.uint8]]],
+    images: Sequence[tuple[str, Picture]],
     camera: Camera | None = None,
     on_image: Callable[[], object] = lambda: None,
 ) -> list[ImagePose]:
-    """Locate every image (name, (h, w, 3) uint8 RGB); `on_image` is called after each."""
+    """Read and locate the named images one by one; `on_image` is called after each."""
     located = []
     for name, image in images:
-        estimate = localizer.localize(image, camera)
+        estimate = localizer.localize(pixels_of(image), camera)
         uncertain = estimate.uncertain_pose or UncertainPose(SE3.identity(), np.eye(6))
         located.append(ImagePose(name, estimate, uncertain.pose, uncertain.covariance))
         on_image()

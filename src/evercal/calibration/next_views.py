@@ -7,11 +7,13 @@ of a point in front of the camera most is proposed, then the next one (A-optimal
 scene. With X = gripper_from_camera and Z = base_from_scene, G X = Z C. The residual
 log((G X)^-1 Z C) is a tangent of the camera frame, and to first order
 
-    r = - (R_X^T dt, dr) + Ad(C^-1) dz - Ad(X^-1) g + c.
+    r = - (R_X^T dt, dr) + Ad(C^-1) dz - (m, 0) ds - Ad(X^-1) g + c.
 
 (dt, dr) is the error of X in the convention of `UncertainPose`, dz that of Z on its right, g and c
 the noise of the gripper and the camera pose, each on the right of its pose. Z is unknown, so X is
-seen only in differences between views: rotations about two axes are needed.
+seen only in differences between views: rotations about two axes are needed. ds is the relative
+error of the scene's scale, which images do not show, and m the position of the scene in the camera
+frame: where the arm orbits one place, m hardly changes, and X is open in its direction.
 
 **Fixed camera.** It is located by landmarks of a map that wrist images made. A further wrist image
 shows some of them again. The unknowns are, in this order, errors of the fixed camera's pose, of X,
@@ -36,6 +38,7 @@ from evercal.geometry import (
 )
 from evercal.localization.pose_refinement import linearise
 from evercal.mapping.scene_map import SceneMap
+from evercal.recordings.frame import MIN_GRIPPER_FRAMES
 
 Array = NDArray[np.floating]
 
@@ -54,6 +57,13 @@ _ROUGH, _UNKNOWN = _covariance(0.05, np.deg2rad(15.0)), _covariance(0.2, np.pi)
 """Of a `gripper_from_camera` that is roughly known, and of one that is not."""
 _ANYWHERE = _covariance(1.0, np.pi)
 """Of the pose of the scene, or of a fixed camera, before any image."""
+_ANY_SCALE = 1.0
+"""Relative standard deviation of the scale of the scene before any image."""
+_OPEN = 1.5
+"""A direction is open if a few images would divide its standard deviation by this: by 7 and 2 for a
+KUKA and a Panda that orbit a board, by 1.04 for the packaged cell."""
+_ADDED, _STEP, _STEPS_M, _TURN_DEG = 4, 0.25, (0.03, 0.2), 15.0
+"""Images of a motion that may close it; its size, in distances of the scene, with bounds."""
 _AT_M, _AHEAD_M = 0.3, 0.5
 """Distance of the point whose variance counts; distance of the scene before parallel cameras."""
 _APART_M, _APART_DEG = 0.02, 4.0
@@ -95,14 +105,86 @@ def next_views(
         gripper_from_camera: A rough one. Default: unknown.
         excluded: Poses that are not proposed. Default: those recorded.
     """
-    mount = SE3.identity() if gripper_from_camera is None else gripper_from_camera
-    prior = np.zeros((12, 12))
-    prior[:6, :6] = np.linalg.inv(_UNKNOWN if gripper_from_camera is None else _ROUGH)
-    prior[6:, 6:] = np.linalg.inv(_ANYWHERE)
+    mount = gripper_from_camera or SE3.identity()
     scene_m = looked_at(recorded @ mount)
-    known = prior + wrist_information(recorded, mount, scene_m).sum(0)
+    known = _known(recorded, gripper_from_camera, scene_m)
     added = wrist_information(reachable, mount, scene_m)
     return _chosen(known, added, reachable, count, recorded if excluded is None else excluded)
+
+
+@dataclass(frozen=True)
+class OpenPosition:
+    """The direction in which the motions of a recording leave `gripper_from_camera` open."""
+
+    direction: tuple[float, float, float]
+    """Unit vector in the gripper frame."""
+    sigma_mm: float
+    """Expected standard deviation along it."""
+    across_mm: float
+    """The largest one across it."""
+    motion: str
+    """Further images that reduce it most."""
+    then_mm: float
+    """Largest expected standard deviation with them."""
+    scale_percent: float
+    """Expected standard deviation of the scale of the scene."""
+
+    def sentence(self, stated_mm: float | None = None) -> str:
+        """What to do; by default with the expected standard deviation, or with a stated one."""
+        times = 1.0 if stated_mm is None else stated_mm / self.sigma_mm
+        along = ", ".join(f"{value:+.2f}" for value in self.direction)
+        now, across, then = (times * s for s in (self.sigma_mm, self.across_mm, self.then_mm))
+        return (
+            f"the motions leave the position along ({along}) of the gripper open: standard"
+            f" deviation {now:.1f} mm, {across:.1f} mm across; {_ADDED} more images {self.motion}"
+            f" would give about {then:.1f} mm"
+        )
+
+
+def open_position(recorded: SE3, gripper_from_camera: SE3 | None = None) -> OpenPosition | None:
+    """The direction that (m,) recorded base_from_gripper leave open, and how to close it.
+
+    None if a few images would improve it little. Without a rough `gripper_from_camera`, distances
+    of the scene are from the gripper.
+    """
+    if len(recorded) < MIN_GRIPPER_FRAMES:
+        return None
+    mount = gripper_from_camera or SE3.identity()
+    scene_m = looked_at(recorded @ mount)
+    known = _known(recorded, gripper_from_camera, scene_m)
+    covariance = np.linalg.inv(known)
+    variances, axes = np.linalg.eigh(covariance[:3, :3])
+    along, sigmas = axes[:, 2], 1000 * np.sqrt(variances)
+    # An error of the scale moves X as far as the scene is away.
+    away_m = np.linalg.norm(covariance[:3, 12]) / covariance[12, 12]
+    step_m = float(np.clip(_STEP * away_m, *_STEPS_M))
+    shift = step_m * np.pad(np.stack([along, axes[:, 0], axes[:, 1]]), ((0, 0), (0, 3)))
+    turn = np.deg2rad(_TURN_DEG) * np.pad(axes[:, :2].T, ((0, 0), (3, 0)))
+    motions = {
+        f"{100 * step_m:.0f} cm nearer and farther": shift[[0, 0]],
+        f"{100 * step_m:.0f} cm aside without turning": shift[1:],
+        f"turned by {_TURN_DEG:.0f} deg in place": turn,
+    }
+    some = recorded[np.linspace(0, len(recorded) - 1, _ADDED).round().astype(int)]
+    then = {}
+    for words, steps in motions.items():
+        moved = some @ SE3.exp(np.concatenate([steps, -steps]))
+        more = _of_six(known + wrist_information(moved, mount, scene_m).sum(0))
+        then[words] = 1000 * float(np.sqrt(np.linalg.eigvalsh(more[:3, :3])[-1]))
+    best = min(then, key=then.__getitem__)
+    if sigmas[2] < _OPEN * then[best]:
+        return None
+    (x, y, z), percent = along.tolist(), 100 * float(np.sqrt(covariance[12, 12]))
+    return OpenPosition((x, y, z), float(sigmas[2]), float(sigmas[1]), best, then[best], percent)
+
+
+def _known(recorded: SE3, gripper_from_camera: SE3 | None, scene_m: Array) -> Array:
+    """(13, 13) information about X, Z and the scale of the scene."""
+    mount, known = gripper_from_camera or SE3.identity(), np.zeros((13, 13))
+    known[:6, :6] = np.linalg.inv(_UNKNOWN if gripper_from_camera is None else _ROUGH)
+    known[6:12, 6:12] = np.linalg.inv(_ANYWHERE)
+    known[12, 12] = _ANY_SCALE**-2
+    return known + wrist_information(recorded, mount, scene_m).sum(0)
 
 
 def next_views_of_fixed_camera(
@@ -192,7 +274,7 @@ def looked_at(base_from_camera: SE3) -> Array:
 
 
 def wrist_information(base_from_gripper: SE3, mount: SE3, scene_m: Array) -> Array:
-    """(n, 12, 12) information about X and Z that an image at each of (n,) gripper poses adds."""
+    """(n, 13, 13) information about X, Z and scale that an image at (n,) gripper poses adds."""
     jacobian = wrist_jacobian(base_from_gripper, mount, scene_m)
     to_camera = mount.inverse().adjoint()
     weight = np.linalg.inv(to_camera @ GRIPPER_NOISE @ to_camera.T + CAMERA_NOISE)
@@ -200,11 +282,12 @@ def wrist_information(base_from_gripper: SE3, mount: SE3, scene_m: Array) -> Arr
 
 
 def wrist_jacobian(base_from_gripper: SE3, mount: SE3, scene_m: Array) -> Array:
-    """(n, 6, 12) derivatives of the residuals by the errors of X and of Z about `scene_m` (3,)."""
+    """(n, 6, 13) derivatives of residuals by errors of X, of Z and scale about `scene_m` (3,)."""
     camera_from_scene = (base_from_gripper @ mount).inverse() @ SE3.from_translation(scene_m)
-    jacobian = np.zeros((len(base_from_gripper), 6, 12))
+    jacobian = np.zeros((len(base_from_gripper), 6, 13))
     jacobian[:, :, :6] = -_of_mount(mount)
-    jacobian[:, :, 6:] = camera_from_scene.adjoint()
+    jacobian[:, :, 6:12] = camera_from_scene.adjoint()
+    jacobian[:, :3, 12] = -camera_from_scene.translation_m
     return jacobian
 
 

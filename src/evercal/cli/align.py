@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from evercal.calibration.align import MapAlignment
-    from evercal.localization.localizer import Localizer
+    from evercal.map import Map
 
 
 @dataclass(frozen=True)
@@ -56,40 +56,27 @@ class Align(args.Verb):
                 "--points: images, --convention and --board-poses belong to --robot-poses; omit"
                 " them"
             )
-        from evercal.localization.localizer import Localizer
+        from evercal.map import Map
         from evercal.mapping.store import MapStore
 
-        opened = MapStore.open(self.store)
-        with opened.writing():
-            localizer = Localizer(opened.contents)
-            alignment = self._by_points(localizer) if by_points else self._by_gripper(localizer)
-            opened.update(alignment.applied_to(localizer.contents.scene(self.scene)))
-        self._show(alignment, localizer.contents.scene(self.scene).unit)
+        cell = Map(MapStore.open(self.store))
+        unit = cell.localizer.contents.scene(self.scene).unit
+        self._show(self._by_points(cell) if by_points else self._by_gripper(cell), unit)
         return 0
 
-    def _by_gripper(self, localizer: "Localizer") -> "MapAlignment":
-        from evercal.calibration.align import align_by_gripper
+    def _by_gripper(self, cell: "Map") -> "MapAlignment":
         from evercal.calibration.boards.board_poses import read_board_poses
         from evercal.recordings.image_files import image_files
-        from evercal.recordings.poses.pairing import poses_of_images
 
-        files = image_files(self.images)
-        assert self.robot_poses is not None
-        poses = poses_of_images(self.robot_poses, files, self.convention)
-        images, boards = args.read_images(files), None
+        files, boards = image_files(self.images), None
         if self.board_poses is not None:
             detected = read_board_poses(self.board_poses).detected
             by_name = {Path(image.name).name: image.camera_from_board for image in detected}
             boards = {str(f): pose for f in files if (pose := by_name.get(f.name)) is not None}
-        metric = self._metric(localizer)
-        return align_by_gripper(localizer, self.scene, images, poses, metric, boards)
+        given = {"robot_poses": self.robot_poses, "convention": self.convention, "boards": boards}
+        return cell.align(self.scene, files, unknown_scale=self.unknown_scale, **given)
 
-    def _metric(self, localizer: "Localizer") -> bool:
-        """Whether the scale is known."""
-        return localizer.contents.scene(self.scene).metric and not self.unknown_scale
-
-    def _by_points(self, localizer: "Localizer") -> "MapAlignment":
-        from evercal.calibration.align import align_by_points
+    def _by_points(self, cell: "Map") -> "MapAlignment":
         from evercal.recordings import read_image
 
         if self.points is None or self.picks is None:
@@ -102,10 +89,11 @@ class Align(args.Verb):
             by_image.setdefault(image, {})[name] = pixel
         folder = self.picks.parent
         picks = [(name, read_image(folder / name), pixels) for name, pixels in by_image.items()]
-        metric = self._metric(localizer)
-        return align_by_points(localizer, self.scene, points, picks, metric)
+        how = self.unknown_scale
+        return cell.align(self.scene, points=points, picks=picks, unknown_scale=how)
 
     def _show(self, alignment: "MapAlignment", unit: float) -> None:
+        """Print it; `unit` is that of the recording, per unit of the map."""
         similarity, (mm, deg) = alignment.similarity, alignment.sigma
         scale = similarity.scale / unit  # metres per unit of the recording
         gripper = alignment.gripper_from_camera

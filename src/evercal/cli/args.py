@@ -14,8 +14,6 @@ from evercal.cli.console import print_json, print_next, say
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from evercal.geometry import SE3, Camera, UncertainPose
     from evercal.localization.learned import LearnedLocalizer
     from evercal.localization.localizer import Localizer
@@ -139,13 +137,6 @@ class Reading:
 def option(field: str) -> str:
     """The option of a field."""
     return "--" + field.replace("_", "-")
-
-
-def read_images(files: Sequence[Path]) -> "list[tuple[str, np.ndarray]]":
-    """Read image files: (path, pixels)."""
-    from evercal.recordings import read_image
-
-    return [(str(path), read_image(path)) for path in files]
 
 
 def camera_for(file: Path | None, images: Sequence[Path]) -> "Camera | None":

@@ -81,12 +81,9 @@ class Calibrate(args.Verb):
 
     def _given(self, files: list[Path]) -> "Images":
         from evercal.calibration.from_images import Images
-        from evercal.recordings.poses.pairing import poses_of_images
 
-        poses = None
-        if self.robot_poses is not None:
-            poses = poses_of_images(self.robot_poses, files, self.convention)
-        return Images(args.read_images(files), args.camera_for(self.camera, files), poses)
+        camera = args.camera_for(self.camera, files)
+        return Images.of(files, camera, self.robot_poses, self.convention)
 
     def _calibrated(self, localizer: "Localizer", given: "Images") -> "Calibration":
         from evercal.calibration.from_images import calibrate

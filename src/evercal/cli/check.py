@@ -40,7 +40,7 @@ class Check(args.Verb):
         files = image_files(self.images)
         reference = read_calibration(self.reference)
         camera = args.camera_for(self.camera, files)
-        images = args.read_images(files)
+        images = [(str(path), path) for path in files]
         localizer = args.open_map(self.store)
         with progress_bar("localizing", len(images), "image") as bar:
             shift = check(localizer, images, reference, camera, on_image=bar.update)

@@ -35,6 +35,11 @@ def table(rows: Sequence[Mapping[str, object]]) -> list[str]:
     return [tabulate(list(rows), headers="keys", colalign=align, disable_numparse=True)]
 
 
+def length(mm: float | None) -> str:
+    """A length before an angle; nothing where its unit is unknown."""
+    return "" if mm is None else f"{mm:.2f} mm, "
+
+
 def size(count: float) -> str:
     """Format bytes: 1.2 MB."""
     for unit in ("B", "kB", "MB"):

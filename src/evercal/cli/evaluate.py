@@ -58,6 +58,11 @@ def load_named(words: tuple[str, ...]) -> "dict[str, Recording]":
         if not sign or not name or Path(word).is_dir():
             name, path = "", word
         scene = load_recording(path, name=name or None)
+        if not scene.metric:
+            raise InputError(
+                f"{path}: the unit of length of its poses is unknown, so there are no millimetres"
+                " to measure; if it is the metre, convert it with 'evercal convert --metres'"
+            )
         if scene.name in scenes:
             raise InputError(
                 f"scene {scene.name!r} was given twice; pass NAME={path} with the name of the"

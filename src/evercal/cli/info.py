@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from evercal.cli import args
-from evercal.cli.console import size, table
+from evercal.cli.console import length, size, table
 
 MEMORY_FILES = ("keyframes.safetensors", "state.safetensors")
 
@@ -105,16 +105,15 @@ def _content(scene: dict[str, Any]) -> dict[str, object]:
 def adjusted_row(scene: str, adjusted: dict[str, Any]) -> dict[str, object]:
     """Changes by bundle adjustment."""
     shift, rotation = (
-        sum(x * x for x in adjusted[key]) ** 0.5
+        adjusted[key] and sum(x * x for x in adjusted[key]) ** 0.5
         for key in ("common_translation_mm", "common_rotation_deg")
     )
-    residual = adjusted["residual_px"]
-    sigma = f"{adjusted['pose_sigma_mm']:.2f} mm, {adjusted['pose_sigma_deg']:.3f} deg"
+    sigma, residual = adjusted["pose_sigma_mm"], adjusted["residual_px"]
     return {
         "bundle adjustment": scene,
         "median residual": "-" if residual is None else f"{residual:.2f} px",
-        "error of stated poses": sigma,
-        "common transform": f"{shift:.2f} mm, {rotation:.3f} deg",
+        "error of stated poses": f"{length(sigma)}{adjusted['pose_sigma_deg']:.3f} deg",
+        "common transform": f"{length(shift)}{rotation:.3f} deg",
         "focal length": f"{adjusted['focal_percent']:+.2f} %",
         "wrong poses": len(adjusted["wrong_poses"]),
         "untracked": len(adjusted.get("untracked", ())),

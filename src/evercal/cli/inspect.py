@@ -44,6 +44,14 @@ class Inspect(args.Verb):
         recording = self.reading.recording(self.scene)
         found = inspect_recording(recording)
         record, lines = asdict(found), [*_lines(found)]
+        if found.poses == "gripper":
+            from evercal.calibration.next_views import open_position
+            from evercal.recordings.frame import stated_grippers
+
+            rough = args.transform_of(self.gripper_from_camera)
+            left = open_position(stated_grippers(recording.train), rough)
+            record["open_position"] = left and asdict(left)
+            lines += [f"warning: {left.sentence()}"] if left else []
         if self.coverage or self.next is not None:
             self._advise(recording, record, lines)
         self.answer(record, *lines, then=("learn", "MAP", self.scene, *self.reading.words()))
@@ -51,11 +59,10 @@ class Inspect(args.Verb):
 
     def _advise(self, recording: "Recording", record: dict[str, object], lines: list[str]) -> None:
         """Add coverage and next poses, as far as asked for."""
-        from evercal.geometry import SE3
         from evercal.live.coverage import Sample, coverage
+        from evercal.recordings.frame import stated_grippers
 
         frames = [frame for frame in recording.train if frame.base_from_gripper is not None]
-        poses = [f.base_from_gripper for f in frames if f.base_from_gripper is not None]
         if not frames:
             raise InputError(
                 f"{self.scene}: states no gripper poses; --coverage and --next need them"
@@ -66,7 +73,7 @@ class Inspect(args.Verb):
             record["coverage"] = asdict(covered)
             lines += _coverage_lines(covered)
         if self.next is not None:
-            views = self._next_views(self.next, SE3.stack(poses), rough)
+            views = self._next_views(self.next, stated_grippers(frames), rough)
             record["next"] = _next_records(views)
             lines += _next_lines(views)
 
@@ -85,11 +92,12 @@ def _lines(found: "Inspection") -> Iterator[str]:
     yield f"{found.name}: {found.train} training and {found.test} test frames{whose}"
     yield f"  without a pose  {found.untracked}"
     yield from (f"  camera          {lens}" for lens in found.cameras)
-    extent = " x ".join(f"{side:.2f}" for side in found.extent_m)
-    yield f"  {'gripper' if gripper else 'camera'} moved in {extent} m (training frames)"
+    extent = " x ".join(f"{side:.3g}" for side in found.extent_m)
+    unit = "m" if found.metric else "units"
+    yield f"  {'gripper' if gripper else 'camera'} moved in {extent} {unit} (training frames)"
     if found.step_median_m is not None and found.step_largest_m is not None:
-        middle = f"{100 * found.step_median_m:.1f} cm and {found.step_median_deg:.1f} deg"
-        yield f"  frame to frame  {middle} (median), {found.step_largest_m:.2f} m at most"
+        middle = f"{found.step_median_m:.3g} {unit} and {found.step_median_deg:.1f} deg"
+        yield f"  frame to frame  {middle} (median), {found.step_largest_m:.3g} {unit} at most"
     if found.near_training is not None:
         near = f"{found.near_training:.1f} % of the test frames"
         yield f"  near training   {near} lie within 5 cm and 5 deg of a training frame"

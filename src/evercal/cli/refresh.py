@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional
 
 from evercal.cli import args
-from evercal.cli.console import size
+from evercal.cli.console import length, size
 from evercal.errors import InputError
 from evercal.progress import Bars
 
@@ -70,14 +70,11 @@ class Refresh(args.Verb):
 
 def _recording(paths: tuple[Path, ...]) -> "Recording | None":
     """The recording at a single path; None for images."""
-    from evercal.recordings import load_recording
+    from evercal.recordings.load import load_recording, recognised
 
-    if len(paths) != 1 or paths[0].is_file():
+    if len(paths) != 1 or paths[0].is_file() or recognised(paths[0]) is None:
         return None
-    try:
-        return load_recording(paths[0])
-    except InputError:
-        return None
+    return load_recording(paths[0])
 
 
 def _lines(report: "RefreshReport") -> Iterator[str]:
@@ -88,11 +85,10 @@ def _lines(report: "RefreshReport") -> Iterator[str]:
     yield f"  landmarks    {gone:,} of {seen:,} in view are gone ({share})"
     keyframes = f"{report.keyframes_left} replaced, {report.keyframes_added} new"
     yield f"  keyframes    {keyframes}; {size(report.memory_bytes)}"
-    yield (
-        f"  base frame   moved by {report.shift_mm:.2f} mm and {report.shift_deg:.3f} deg"
-        f" (standard deviation {report.shift_sigma_mm:.2f} mm, {report.shift_sigma_deg:.3f} deg;"
-        f" {report.verified} images outside the map)"
-    )
+    shift = f"{length(report.shift_mm)}{report.shift_deg:.3f} deg"
+    sigma = f"{length(report.shift_sigma_mm)}{report.shift_sigma_deg:.3f} deg"
+    outside = f"{report.verified} images outside the map"
+    yield f"  base frame   moved by {shift} (standard deviation {sigma}; {outside})"
     left_out = list(report.left_out.items())
     yield from (f"  left out     {name}: {reason}" for name, reason in left_out[:_LISTED])
     if len(left_out) > _LISTED:

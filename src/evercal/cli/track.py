@@ -48,18 +48,19 @@ class Track(args.Verb):
             raise InputError("--rate and --at-most are above 0, --smooth is 0 or more")
         for path in self.out:
             require_writable(path, "--out")
+        from evercal.live.camera import StreamCamera
         from evercal.localization.tracking import Tracker, TrackOptions
-        from evercal.recordings.streams import stream
         from evercal.reports.track_files import TrackFile, track_row
 
-        frames, localizer = stream(self.source, self.rate), args.open_map(self.store)
+        source = StreamCamera(self.source, self.rate, timeout_s=None)
         options = TrackOptions(
             fallback_s=1 / self.rate, at_most_ms=self.at_most, smooth=self.smooth
         )
         tracker: Tracker | None = None
         states: Counter[str] = Counter()
         times: list[float] = []
-        with ExitStack() as stack:
+        with source as frames, ExitStack() as stack:
+            localizer = args.open_map(self.store)
             files = [stack.enter_context(TrackFile(path)) for path in self.out]
             try:
                 for name, stamp, image, _ in frames:
@@ -73,7 +74,7 @@ class Track(args.Verb):
                     for file in files:
                         file.write(frame, track_row(frame, name, known))
                     if not self.json:
-                        say(_line(name, frame))
+                        say(_line(name, frame, known))
                     if self.most is not None and len(times) >= self.most:
                         break
             except KeyboardInterrupt:
@@ -97,15 +98,13 @@ class Track(args.Verb):
         )
 
 
-def _line(name: str, frame: "TrackedFrame") -> str:
+def _line(name: str, frame: "TrackedFrame", unit_known: bool) -> str:
     estimate = frame.estimate
     if frame.state == "lost" or estimate.base_from_camera is None:
         return f"{name}: lost ({estimate.reason or estimate.status})"
-    x, y, z = 1000 * estimate.base_from_camera.translation_m
-    pose = estimate.uncertain_pose
-    sigma = f" +- {pose.sigma_mm:.1f}" if pose is not None else ""
+    x, y, z = estimate.base_from_camera.translation_m
+    at = f"{x:+.4g} {y:+.4g} {z:+.4g} in an unknown unit"
+    if unit_known and (pose := estimate.uncertain_pose) is not None:
+        at = f"{1e3 * x:+.1f} {1e3 * y:+.1f} {1e3 * z:+.1f} +- {pose.sigma_mm:.1f} mm"
     left = f", without {', '.join(estimate.omitted)}" if estimate.omitted else ""
-    return (
-        f"{name}: {frame.state}, {estimate.scene}, {x:+.1f} {y:+.1f} {z:+.1f}{sigma} mm,"
-        f" {estimate.milliseconds:.0f} ms{left}"
-    )
+    return f"{name}: {frame.state}, {estimate.scene}, {at}, {estimate.milliseconds:.0f} ms{left}"

@@ -68,7 +68,11 @@ class Watch(args.Verb):
             for path, pixels in arrivals.scan():
                 height, width = pixels.shape[:2]
                 camera = args.stated_camera(self.camera, (width, height)) or reference.camera
-                recent.extend(locate(localizer, [(path.name, pixels)], camera))
+                try:
+                    recent.extend(locate(localizer, [(path.name, pixels)], camera))
+                except InputError as error:
+                    say(f"warning: {path}: {error}; skipped", sys.stderr)
+                    continue
                 last = time.monotonic()
                 if not any(item.is_located for item in recent):
                     self._print(path, {"moved": None, "reason": recent[-1].estimate.reason})
@@ -77,7 +81,7 @@ class Watch(args.Verb):
                 confidence = 1 - false_alarm_share(tests)
                 shift = shift_between(reference, fuse(recent), list(recent), localizer, confidence)
                 self._print(path, shift_dict(shift), shift_line(shift))
-                if shift.moved and len(recent) >= min(3, self.window):
+                if shift.moved and sum(use.used for use in shift.images) >= min(3, self.window):
                     return 1
             time.sleep(self.interval)
         return 0

@@ -1,11 +1,15 @@
 """A scene of a map from a recording: keyframes, landmarks, poses and their scatter."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.learning.stated_scatter import with_scatter
+from evercal.localization.acceptance import differ
+from evercal.localization.localizer import Localizer
 from evercal.mapping.build import Adjusted, MapOptions, build_map
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -15,10 +19,12 @@ from evercal.recordings import posed_recording
 from evercal.recordings.frame import (
     MIN_GRIPPER_FRAMES,
     MIN_TRAIN_FRAMES,
+    Frame,
     Recording,
     lacks_camera_poses,
 )
 from evercal.recordings.held_out import require_frames, split_held_out
+from evercal.recordings.pictures import look_at
 
 if TYPE_CHECKING:
     from evercal.calibration.eye_in_hand import HandEyeReport
@@ -75,6 +81,8 @@ def learn_scene(
     began = time.perf_counter()
     budget, options = MemoryBudget.parse(memory), options or MapOptions()
     start, least = None, MIN_TRAIN_FRAMES
+    if not (shown := look_at(recording.train)).usable:
+        raise InputError(f"scene {recording.name!r}: {'; '.join(shown.warnings)}")
     if lacks_camera_poses(recording):
         from evercal.calibration.eye_in_hand import posed_by_gripper
 
@@ -98,6 +106,8 @@ def learn_scene(
         left_out=built.left_out(split.train),
         noise=built.independent_noise,
     )
+    accused = [frame for frame in split.train if frame.name in built.adjusted.wrong_poses]
+    built = built.cleared(located_as_stated(contents, scene, built.corrected(accused)))
     report = LearnReport(
         scene=scene.name,
         seconds=time.perf_counter() - began,
@@ -106,7 +116,9 @@ def learn_scene(
         train_frames=len(split.train),
         held_out_frames=len(split.held_out),
         landmarks=scene.landmarks,
-        adjusted=built.adjusted,
+        adjusted=built.adjusted
+        if recording.metric
+        else replace(built.adjusted, common_translation_mm=None, pose_sigma_mm=None),
     )
     if start is not None:
         from evercal.calibration.eye_in_hand import hand_eye_report
@@ -114,6 +126,20 @@ def learn_scene(
         hand_eye = hand_eye_report(start, built, split.train, gripper_from_camera)
         report = replace(report, hand_eye=hand_eye)
     return scene, report
+
+
+def located_as_stated(
+    contents: MapContents, scene: SceneMap, frames: Sequence[Frame]
+) -> tuple[str, ...]:
+    """Names of the frames that a map locates where their poses say."""
+    localizer, right = Localizer(contents.empty().with_scene(scene)), []
+    for frame in frames:
+        estimate, found = localizer.located(frame.read_image(), frame.camera)
+        assert frame.base_from_camera is not None, "a posed frame"
+        stated = scene.frame.from_base(frame.base_from_camera)
+        if estimate.status == "ok" and not differ(found, stated):
+            right.append(frame.name)
+    return tuple(right)
 
 
 def _sized(options: MapOptions, budget: MemoryBudget, short_side: int) -> MapOptions:

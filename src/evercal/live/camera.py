@@ -5,6 +5,7 @@ A live camera is any object with `read()`. `StreamCamera` reads every source of 
 
 import threading
 import time
+from collections.abc import Iterator
 from typing import Protocol, Self
 
 import numpy as np
@@ -30,10 +31,11 @@ class StreamCamera:
     A live image arrived after the call that asks for it; it was taken earlier by the delay of the
     source. A thread empties the buffer of a live source. A video or a folder gives its next frame.
 
-    `rate` is that of a folder whose file names hold no times, per second.
+    `rate` is that of a folder whose file names hold no times, per second. A live source that gives
+    no image for `timeout_s` has ended; None waits as long as it is open.
     """
 
-    def __init__(self, source: str, rate: float = 15.0, timeout_s: float = 5.0):
+    def __init__(self, source: str, rate: float = 15.0, timeout_s: float | None = 5.0):
         self._source, self._timeout_s = source, timeout_s
         self._frames = stream(source, rate)
         self._frame: StreamFrame | None = None
@@ -45,10 +47,14 @@ class StreamCamera:
 
     def read(self) -> tuple[float, Image]:
         """Take the next image; an error of a live source is raised here."""
-        frame = next(self._frames, None) if self._thread is None else self._after(time.monotonic())
-        if frame is None:
-            raise InputError(f"{self._source}: no more frames; check the camera or give another")
-        return frame.stamp_s, frame.image
+        for frame in self:
+            return frame.stamp_s, frame.image
+        raise InputError(f"{self._source}: no more frames; check the camera or give another")
+
+    def __iter__(self) -> Iterator[StreamFrame]:
+        """The images that `read` takes, with their names, until the source ends."""
+        while (frame := self._next()) is not None:
+            yield frame
 
     def close(self) -> None:
         """Release the source, a live one after its next frame."""
@@ -68,8 +74,11 @@ class StreamCamera:
         """Release the source."""
         self.close()
 
-    def _after(self, asked_s: float) -> StreamFrame | None:
-        """The first frame that arrives after a time; None if the stream ends or none arrives."""
+    def _next(self) -> StreamFrame | None:
+        """The next frame, of a live source the first to arrive from now on; None at the end."""
+        if self._thread is None:
+            return next(self._frames, None)
+        asked_s = time.monotonic()
 
         def arrived() -> bool:
             return self._frame is not None and self._frame.arrived_s >= asked_s

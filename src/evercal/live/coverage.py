@@ -6,7 +6,7 @@ blurred, over- or underexposed, or show what another one shows.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame
+from evercal.recordings.pictures import sharpness
 
 Array = NDArray[np.float64]
-
-_FLAT = 1.0
-"""Squared slope below which an image shows no structure, grey values."""
-
 
 IMAGES = 25
 """Images of a complete recording."""
@@ -119,30 +116,6 @@ def coverage(samples: Sequence[Sample], gripper_from_camera: SE3 | None = None) 
     elif len(good) == len(rows):
         verdict += " It is complete."
     return Coverage(rows, rotations, positions, rank, missing, ready, verdict)
-
-
-def sharpness(image: NDArray[np.uint8]) -> float:
-    """Contrast of fine structure relative to coarser one, in the direction of motion blur.
-
-    It is the smallest generalised eigenvalue of the structure tensors of two octaves, which hardly
-    depends on what is shown. An image without structure has 0.
-    """
-    import cv2
-    from scipy.linalg import eigh
-
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    fine, middle, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1.0, 2.0, 4.0))
-    above, below = _structure(fine - middle), _structure(middle - coarse)
-    if np.linalg.eigvalsh(below)[0] < _FLAT:
-        return 0.0
-    return float(np.sqrt(max(eigh(above, below, eigvals_only=True)[0], 0.0)))
-
-
-def _structure(band: Any) -> Array:
-    import cv2
-
-    slopes = [cv2.Sobel(band, cv2.CV_32F, *order).ravel() for order in ((1, 0), (0, 1))]
-    return np.cov(slopes, bias=True)
 
 
 def clipped_share(image: NDArray[np.uint8]) -> float:

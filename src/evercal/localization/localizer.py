@@ -139,15 +139,6 @@ class Localizer:
         """Whether a pose has `times` the required support."""
         return accepted(hypothesis, times)
 
-    def localize_batch(
-        self, images: Sequence[np.ndarray], cameras: Sequence[Camera | None]
-    ) -> list[PoseEstimate]:
-        """`localize` for many images in parallel; the answers are the same to the last bit."""
-        from evercal.localization.parallel import in_parallel
-
-        pairs = list(zip(images, cameras, strict=True))
-        return list(in_parallel(lambda pair: self.localize(*pair), pairs))
-
     def _best_hypothesis(self, query: Query, cameras: Sequence[Camera]) -> Hypothesis:
         """The pose with the most support, from as few attempts as it takes."""
         best = Hypothesis(0)

@@ -17,6 +17,7 @@ from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import spread_poses
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame
+from evercal.recordings.images import Picture, pixels_of
 
 LEAST_IMAGES = 5
 """Located images that a refresh takes, at least."""
@@ -51,41 +52,42 @@ class RefreshReport:
     """Size of the keyframes of this scene."""
     verified: int
     """Images outside the map that were located before and after."""
-    shift_mm: float
-    """Their mean motion by the refresh: the shift of the base frame."""
+    shift_mm: float | None
+    """Their mean motion by the refresh: the shift of the base frame. None where the unit of length
+    is unknown, as `shift_sigma_mm`."""
     shift_deg: float
-    shift_sigma_mm: float
+    shift_sigma_mm: float | None
     """Standard deviation of that shift, which is part of every later covariance."""
     shift_sigma_deg: float
 
 
-_NewImage = tuple[Frame, SE3]
-"""A frame posed in the frame of the keyframes, and its base_from_camera."""
+_NewImage = tuple[Frame, SE3, Camera | None]
+"""A frame posed in the frame of the keyframes, its base_from_camera, and its stated intrinsics."""
 
 
 def refresh_scene(
     localizer: Localizer,
-    images: Sequence[tuple[str, NDArray[np.uint8]]],
-    camera: Camera | None = None,
+    images: Sequence[tuple[str, Picture]],
+    cameras: Sequence[Camera | None] | None = None,
     options: RefreshOptions | None = None,
     on_progress: OnProgress = lambda *_: None,
 ) -> tuple[SceneMap, RefreshReport]:
     """Refresh the scene that most of the images, with their names, show.
 
-    The intrinsics are by default those of the camera that recorded the scene. Too few located
-    images, or a refreshed map that would locate fewer of them, raise `InputError`.
+    The intrinsics of each image are by default those of the camera that recorded the scene. Too few
+    located images, or a refreshed map that would locate fewer of them, raise `InputError`.
     """
     began, options = time.perf_counter(), options or RefreshOptions()
-    estimates = []
-    for number, (_, image) in enumerate(images):
-        estimates.append(localizer.localize(image, camera))
+    cameras, estimates = cameras or [None] * len(images), []
+    for number, ((_, image), camera) in enumerate(zip(images, cameras, strict=True)):
+        estimates.append(localizer.localize(pixels_of(image), camera))
         on_progress("locating", number + 1, len(images))
     names = [e.scene for e in estimates if e.status == "ok" and e.scene is not None]
     shown = max(sorted(set(names)), key=names.count) if names else None
     contents = localizer.contents
     index = localizer.scenes.index(shown) if shown else -1
     scene = contents.scenes[index]
-    located, left_out = _usable(images, estimates, scene)
+    located, left_out = _usable(images, cameras, estimates, scene)
     if len(located) < LEAST_IMAGES:
         reason = next(iter(left_out.values()), "")
         raise InputError(
@@ -94,14 +96,14 @@ def refresh_scene(
         )
     check = located[VERIFIED - 1 :: VERIFIED]
     used = [item for i, item in enumerate(located) if i % VERIFIED != VERIFIED - 1]
-    poses = SE3.stack([pose for frame, _ in used if (pose := frame.base_from_camera) is not None])
+    poses = SE3.stack([pose for frame, *_ in used if (pose := frame.base_from_camera) is not None])
     frames = [used[i][0] for i in spread_poses(poses, options.most_frames)]
     size = WorkingSize(cells=contents.short_side, patches=localizer.options.patches_short_side)
     result = refreshed(scene, frames, contents.encoder, size, options, on_progress)
     scenes = [*contents.scenes]
     scenes[index] = result.scene
     after = Localizer(replace(contents, scenes=scenes), localizer.options)
-    shift, sigma, verified = _verified(after, check, camera, result.scene.name)
+    shift, sigma, verified = _verified(after, check, result.scene.name)
     covariance = np.diag(np.repeat(sigma**2, 3))
     known = scene.frame.base_covariance
     frame = replace(
@@ -121,22 +123,23 @@ def refresh_scene(
         keyframes_added=result.added,
         memory_bytes=updated.keyframes.bytes,
         verified=verified,
-        shift_mm=1000 * float(np.linalg.norm(tangent[:3])),
+        shift_mm=1000 * float(np.linalg.norm(tangent[:3])) if scene.unit_known else None,
         shift_deg=float(np.rad2deg(np.linalg.norm(tangent[3:]))),
-        shift_sigma_mm=1000 * float(sigma[0]),
+        shift_sigma_mm=1000 * float(sigma[0]) if scene.unit_known else None,
         shift_sigma_deg=float(np.rad2deg(sigma[1])),
     )
     return updated, report
 
 
 def _usable(
-    images: Sequence[tuple[str, NDArray[np.uint8]]],
+    images: Sequence[tuple[str, Picture]],
+    cameras: Sequence[Camera | None],
     estimates: Sequence[PoseEstimate],
     scene: SceneMap,
 ) -> tuple[list[_NewImage], dict[str, str]]:
     """Return the precisely located images of a scene, and why others are left out."""
     located, left_out = [], {}
-    for (name, image), estimate in zip(images, estimates, strict=True):
+    for (name, image), stated, estimate in zip(images, cameras, estimates, strict=True):
         answer = estimate.uncertain_pose
         if estimate.status != "ok" or answer is None:
             left_out[name] = estimate.reason or estimate.status.replace("_", " ")
@@ -146,9 +149,8 @@ def _usable(
             left_out[name] = "located too roughly"
         else:
             pose = scene.frame.from_base(answer.pose)
-            camera = estimate.camera or scene.adjusted_camera
-            camera = camera.resized(image.shape[1], image.shape[0])
-            located.append((Frame(name, image, camera, pose), answer.pose))
+            assert estimate.camera is not None, "an answer from a map"
+            located.append((Frame(name, image, estimate.camera, pose), answer.pose, stated))
     return located, left_out
 
 
@@ -161,11 +163,11 @@ def _precise(estimate: PoseEstimate, scene: SceneMap) -> bool:
 
 
 def _verified(
-    after: Localizer, check: Sequence[_NewImage], camera: Camera | None, scene: str
+    after: Localizer, check: Sequence[_NewImage], scene: str
 ) -> tuple[SE3, NDArray[np.float64], int]:
     """Locate images outside the refreshed map; return shift, its standard deviation, and count."""
     moves = []
-    for frame, before in check:
+    for frame, before, camera in check:
         estimate = after.localize(frame.read_image(), camera)
         if estimate.status == "ok" and estimate.scene == scene and estimate.base_from_camera:
             moves.append(estimate.base_from_camera @ before.inverse())

@@ -91,15 +91,16 @@ class MapOptions:
 class Adjusted:
     """What bundle adjustment changed about a recording, as JSON values."""
 
-    common_translation_mm: tuple[float, float, float]
-    """Correction common to all stated poses, in the camera frame."""
+    common_translation_mm: tuple[float, float, float] | None
+    """Correction common to all stated poses, in the camera frame; None where their unit of length
+    is unknown, as `pose_sigma_mm`."""
     common_rotation_deg: tuple[float, float, float]
     """Its rotation vector."""
     focal_percent: float
     """Change of the focal length."""
     residual_px: float | None
     """Median reprojection error after the adjustment; None without adjustment."""
-    pose_sigma_mm: float
+    pose_sigma_mm: float | None
     """Estimated error of the stated positions, standard deviation per axis."""
     pose_sigma_deg: float
     """The same for the stated rotations, degrees."""
@@ -108,7 +109,7 @@ class Adjusted:
     wrong_poses: tuple[str, ...]
     """Frames whose stated pose contradicts the images; they are excluded."""
     untracked: tuple[str, ...]
-    """Frames that could not be tracked in other images; they are excluded."""
+    """Frames that could not be tracked in other images, or not enough; they are excluded."""
     doubtful_poses: tuple[str, ...]
     """Frames whose stated pose has an unusually large error; they were given less weight."""
 
@@ -143,7 +144,7 @@ class BuiltMap:
     @property
     def independent_noise(self) -> tuple[float, float]:
         """Standard deviation of stated poses per axis that neighbouring frames do not share."""
-        stated = self.adjusted.pose_sigma_mm / 1000, np.deg2rad(self.adjusted.pose_sigma_deg)
+        stated = (self.adjusted.pose_sigma_mm or 0) / 1000, np.deg2rad(self.adjusted.pose_sigma_deg)
         metres, radians = (
             0.0 if shared else float(sigma)
             for sigma, shared in zip(stated, self.scene.frame.frame_sigma, strict=True)
@@ -160,6 +161,13 @@ class BuiltMap:
             for frame in frames
             if frame.base_from_camera is not None
         ]
+
+    def cleared(self, names: Sequence[str]) -> "BuiltMap":
+        """The same map, in which the poses of some frames no longer count as wrong."""
+        adjusted = self.adjusted
+        wrong = tuple(name for name in adjusted.wrong_poses if name not in names)
+        adjusted = replace(adjusted, wrong_poses=wrong, untracked=(*adjusted.untracked, *names))
+        return replace(self, adjusted=adjusted)
 
     def left_out(self, frames: Sequence[Frame]) -> list[LeftOut]:
         """Parts of the recording, each with the keyframes that were recorded before and after it.

@@ -57,7 +57,7 @@ class SceneMap:
     @property
     def digest(self) -> str:
         """Identifies the map and its base frame: poses with the same digest share their errors."""
-        digest = hashlib.sha256(self.name.encode())
+        digest = hashlib.sha256(b"".join(self.keyframes.images))
         digest.update(self.keyframes.base_from_camera.matrix().tobytes())
         similarity = self.frame.similarity
         if similarity is not None:

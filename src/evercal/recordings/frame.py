@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from evercal.bounds import bounds
 from evercal.errors import InputError, is_plain
 from evercal.geometry import SE3, Camera
-from evercal.recordings.images import StoredImage, as_rgb, read_image
+from evercal.recordings.images import Picture, pixels_of
 
 MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
 MIN_GRIPPER_FRAMES = 8  # the same for a camera on the gripper: a few views around one place
@@ -23,8 +23,7 @@ class Frame:
 
     name: str
     """Unique within its recording."""
-    image: Path | NDArray[np.uint8] | StoredImage
-    """A file, an array that `as_rgb` accepts, or an image inside a bag or video."""
+    image: Picture
     camera: Camera
     """Intrinsics at the size of `image`."""
     base_from_camera: SE3 | None
@@ -38,12 +37,7 @@ class Frame:
 
     def read_image(self) -> NDArray[np.uint8]:
         """Read the pixels, (H, W, 3) uint8 RGB; a size that is not the camera's is refused."""
-        if isinstance(self.image, Path):
-            image = read_image(self.image)
-        elif isinstance(self.image, StoredImage):
-            image = self.image.read()
-        else:
-            image = as_rgb(self.image)
+        image = pixels_of(self.image)
         if image.shape[:2] != (self.camera.height, self.camera.width):
             where = self.image if isinstance(self.image, Path) else self.name
             raise InputError(
@@ -61,6 +55,11 @@ def posed_frames(frames: Iterable[Frame]) -> tuple[Frame, ...]:
 def stated_poses(frames: Iterable[Frame]) -> SE3:
     """(n,) base_from_camera of the frames that have one."""
     return SE3.stack([f.base_from_camera for f in frames if f.base_from_camera is not None])
+
+
+def stated_grippers(frames: Iterable[Frame]) -> SE3:
+    """(n,) base_from_gripper of the frames that have one."""
+    return SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper is not None])
 
 
 @dataclass(frozen=True, eq=False)

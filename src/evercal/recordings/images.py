@@ -29,6 +29,17 @@ class StoredImage(ABC):
         return None
 
 
+Picture = Path | NDArray[np.uint8] | StoredImage
+"""A file, an array that `as_rgb` accepts, or an image inside a bag or video."""
+
+
+def pixels_of(image: Picture) -> NDArray[np.uint8]:
+    """Read a picture: (H, W, 3) uint8 RGB."""
+    if isinstance(image, Path):
+        return read_image(image)
+    return image.read() if isinstance(image, StoredImage) else as_rgb(image)
+
+
 def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
     """Convert an image in memory to (H, W, 3) uint8 RGB.
 

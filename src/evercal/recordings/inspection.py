@@ -11,7 +11,14 @@ import numpy as np
 
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.geometry.near import near_training
-from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording, posed_frames
+from evercal.recordings.frame import (
+    MIN_GRIPPER_FRAMES,
+    MIN_TRAIN_FRAMES,
+    Frame,
+    Recording,
+    posed_frames,
+)
+from evercal.recordings.pictures import look_at
 from evercal.recordings.poses.pose_evidence import rotation_warnings
 
 SAME_M, SAME_DEG = 0.001, 0.1
@@ -37,6 +44,8 @@ class Inspection:
     """Frames without a usable pose."""
     cameras: tuple[str, ...]
     """One line for each set of intrinsics."""
+    metric: bool
+    """Whether lengths are in metres; else their unit is unknown."""
     extent_m: tuple[float, float, float]
     """Sides of the box around the training positions, metres."""
     step_median_m: float | None
@@ -46,7 +55,8 @@ class Inspection:
     step_largest_m: float | None
     """Largest distance between consecutive training frames, metres; None for fewer than two."""
     near_training: float | None
-    """Per cent of test frames with a training frame within 5 cm and 5 deg; None without frames."""
+    """Per cent of test frames with a training frame within 5 cm and 5 deg; None without frames, or
+    where the unit is unknown."""
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
 
@@ -64,18 +74,24 @@ def inspect_recording(recording: Recording) -> Inspection:
     poses, tested = (SE3.stack([*map(pose_of, part)]) for part in (train, test))
     extent = np.ptp(poses.translation_m, axis=0) if len(train) else np.zeros(3)
     untracked = recording.untracked + len(both) - len(train) - len(test)
-    warnings = [*_frame_warnings(len(train), len(test), untracked, owner)]
+    shown = look_at(recording.train)
+    warnings = [*_frame_warnings(len(train), len(test), untracked, owner), *shown.warnings]
     warnings += [warning for camera in cameras for warning in _camera_warnings(camera)]
     step_m = step_deg = largest_m = near = None
     if len(train) > 1:
         metres, radians = pose_distance(poses[:-1], poses[1:])
         step_m, step_deg = float(np.median(metres)), float(np.rad2deg(np.median(radians)))
         largest_m, of_camera = float(metres.max()), owner == "camera"
-        warnings += _motion_warnings(poses, float(extent.max()), step_m, of_camera)
-        warnings += rotation_warnings(train, poses, of_camera)
+        if recording.metric:
+            warnings += _motion_warnings(poses, float(extent.max()), step_m, of_camera)
+        if np.rad2deg(pose_distance(poses[0], poses)[1].max()) < SAME_DEG:
+            warnings.append("all training frames look the same way; are the rotations missing?")
+        if shown.usable:
+            warnings += rotation_warnings(train, poses, of_camera)
     if train and test:
-        warnings += _copy_warnings(train, test, poses, tested)
-        near = 100 * float(near_training(poses, tested).mean())
+        same_m = SAME_M if recording.metric else SAME_M * float(extent.max())
+        warnings += _copy_warnings(train, test, poses, tested, same_m)
+        near = 100 * float(near_training(poses, tested).mean()) if recording.metric else None
     x, y, z = extent.tolist()
     return Inspection(
         name=recording.name,
@@ -84,6 +100,7 @@ def inspect_recording(recording: Recording) -> Inspection:
         test=len(test),
         untracked=untracked,
         cameras=tuple(_camera_lines(cameras)),
+        metric=recording.metric,
         extent_m=(x, y, z),
         step_median_m=step_m,
         step_median_deg=step_deg,
@@ -113,8 +130,9 @@ def _camera_lines(cameras: Counter[Camera]) -> Iterator[str]:
 
 
 def _frame_warnings(train: int, test: int, untracked: int, owner: str) -> Iterator[str]:
-    if train < MIN_TRAIN_FRAMES:
-        yield f"{train} training frames with a pose; learning takes {MIN_TRAIN_FRAMES} or more"
+    least = MIN_GRIPPER_FRAMES if owner == "gripper" else MIN_TRAIN_FRAMES
+    if train < least:
+        yield f"{train} training frames with a pose; learning takes {least} or more"
     if not test and owner != "gripper":
         yield "no test frame with a pose; 'evercal evaluate' has nothing to measure on"
     total = train + test + untracked
@@ -154,8 +172,6 @@ def _motion_warnings(poses: SE3, extent: float, step: float, of_camera: bool) ->
             f"the training camera moves by {100 * extent:.1f} cm only; points may get no depth. Are"
             f" the translations in metres?"
         )
-    if rotation_deg < SAME_DEG:
-        yield "all training frames look the same way; are the rotations missing?"
     if extent > LARGEST_EXTENT_M:
         yield f"the camera moves over {extent:.0f} m; are the poses in millimetres?"
     elif step > LARGEST_STEP_M and of_camera:
@@ -163,12 +179,12 @@ def _motion_warnings(poses: SE3, extent: float, step: float, of_camera: bool) ->
 
 
 def _copy_warnings(
-    train: Sequence[Frame], test: Sequence[Frame], poses: SE3, tested: SE3
+    train: Sequence[Frame], test: Sequence[Frame], poses: SE3, tested: SE3, same_m: float
 ) -> Iterator[str]:
     from scipy.spatial import KDTree
 
     files = {f.image for f in train if isinstance(f.image, Path)}
-    close = KDTree(poses.translation_m).query_ball_point(tested.translation_m, SAME_M)
+    close = KDTree(poses.translation_m).query_ball_point(tested.translation_m, same_m)
     copies = 0
     for i, frame in enumerate(test):
         copied = isinstance(frame.image, Path) and frame.image in files

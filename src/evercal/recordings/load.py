@@ -45,6 +45,11 @@ FORMATS = {
 """All formats by name, in the order in which they are tried."""
 
 
+def recognised(root: Path) -> str | None:
+    """The format that the files of a folder or a bag are of; None if they are of none."""
+    return next((key for key, entry in FORMATS.items() if entry.reader.detect(root)), None)
+
+
 def load_recording(
     path: str | os.PathLike[str],
     format: str | None = None,
@@ -69,7 +74,7 @@ def load_recording(
     if not root.exists():
         raise InputError(f"{root}: no such folder; give the folder of a recorded scene")
     if format is None:
-        format = next((key for key, entry in FORMATS.items() if entry.reader.detect(root)), None)
+        format = recognised(root)
     if format is None:
         what = "no known scene format" if root.is_dir() else "a file, not a folder, and no bag"
         known = ", ".join(f"{entry.contents} ({key})" for key, entry in FORMATS.items())

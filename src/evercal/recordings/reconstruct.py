@@ -128,9 +128,13 @@ def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFram
     """Yield the sharpest frame of each step of a moving camera."""
     import cv2
 
+    from evercal.recordings.pictures import is_blank
+
     last: NDArray[np.uint8] | None = None
     best: tuple[float, StreamFrame, NDArray[np.uint8]] | None = None
     for frame in frames:
+        if is_blank(frame.image):  # such as black ones before the picture comes
+            continue
         grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         scale = _SMALL_PX / grey.shape[1]
         resized = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

@@ -201,9 +201,10 @@ def _use(use: ImageUse | None) -> str:
 
 
 def _scene_of(calibration: Calibration, localizer: "LearnedLocalizer") -> SceneMap | None:
-    name = calibration.source.get("scene")
+    name, digest = (calibration.source.get(key) for key in ("scene", "map"))
     maps = [scene for scene in localizer.contents.scenes if isinstance(scene, SceneMap)]
-    return next((scene for scene in maps if scene.name == name), None)
+    own = [scene for scene in maps if scene.digest == digest]  # also after a rename
+    return next((scene for scene in (*own, *maps) if own or scene.name == name), None)
 
 
 def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:

@@ -26,7 +26,7 @@ PLANAR = """<robot name="planar">
   <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
     <origin xyz="0.5 0 0"/><axis xyz="0 0 1"/></joint>
   <joint name="reach" type="prismatic"><parent link="lower"/><child link="slide"/>
-    <origin xyz="0.3 0 0"/><axis xyz="1 0 0"/><limit lower="0" upper="1" effort="1" velocity="1"/>
+    <origin xyz="0.3 0 0"/><axis xyz="2 0 0"/><limit lower="0" upper="1" effort="1" velocity="1"/>
   </joint>
   <joint name="fixed" type="fixed"><parent link="slide"/><child link="tip"/>
     <origin xyz="0 0 -0.1" rpy="0 0 0"/></joint>

@@ -49,6 +49,9 @@ class RobotModel:
                 build_collision_scene_graph=False,
             )
             self.base_link = str(self._urdf.base_link)
+            for joint in self._urdf.robot.joints:
+                if joint.type == "prismatic":  # yourdfpy scales the motion by the axis
+                    joint.axis = joint.axis / np.linalg.norm(joint.axis)
         except Exception as error:  # lxml, yourdfpy and numpy raise many types for broken files
             text = " ".join(str(error).split())[:200]
             raise InputError(f"{path}: no usable URDF ({type(error).__name__}: {text})") from None

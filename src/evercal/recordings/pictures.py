@@ -1,0 +1,86 @@
+"""What the images of a recording show, before anything is computed from them."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.recordings.frame import Frame
+
+_LOOKED_AT, _SIDE_PX = 12, 240
+"""Number of images that are looked at, spread over a recording, and their shorter side."""
+_BLANK = 20.0
+"""Grey values between the 1 % darkest and brightest pixels below which an image is blank. Of a room
+at 1/8, 1/16, 1/32 of its brightness (27, 14, 7), maps located all, half and none of the images."""
+_BLURRED = 0.65
+"""Median sharpness below which a recording is blurred: recordings have 0.8 to 1.3. With 0.6
+(Gaussian blur of 2 px) the median error of a room rises from 0.8 to 2.9 mm, with 0.4 to 6.9 mm."""
+_SAME = 0.7
+"""Median change from one image to the next, grey values, of one that is repeated: 0.4 with noise of
+4 grey values. Recordings have 8 or more."""
+_FLAT = 1.0
+"""Squared slope below which an image shows no structure, grey values."""
+
+
+class Pictures(NamedTuple):
+    """What images show."""
+
+    warnings: tuple[str, ...]
+    usable: bool
+    """Whether a map can be learned from them."""
+
+
+def look_at(frames: Sequence[Frame]) -> Pictures:
+    """Look at some images of a recording, in recorded order."""
+    if not frames:
+        return Pictures((), usable=True)
+    chosen = np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).round().astype(int))
+    images = [_small(frames[i].read_image()) for i in chosen]
+    if blank := [image for image in images if is_blank(image)]:
+        level = float(np.median([np.median(image) for image in blank]))
+        what = "almost black" if level < 48 else "almost white" if level > 207 else "of one colour"
+        hint = "; if 12-bit values are stored in 16 bits, multiply them by 16" * (level < 48)
+        words = f"{len(blank)} of {len(images)} images that were looked at are {what}{hint}"
+        return Pictures((words,), 2 * len(blank) <= len(images))
+    tiny = [cv2.resize(image, (40, 30), interpolation=cv2.INTER_AREA) for image in images]
+    change = np.abs(np.diff(np.stack(tiny).astype(np.float64), axis=0)).mean((1, 2, 3))
+    if len(images) > 1 and np.median(change) < _SAME:
+        return Pictures(("all images are the same; is each pose that of its image?",), False)
+    if np.median([sharpness(image) for image in images]) < _BLURRED:
+        return Pictures(("all images are blurred; check focus and exposure time",), usable=True)
+    return Pictures((), usable=True)
+
+
+def is_blank(image: NDArray[np.uint8]) -> bool:
+    """Whether an image (h, w, 3) is black, white or of one colour."""
+    darkest, brightest = np.quantile(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), [0.01, 0.99])
+    return bool(brightest - darkest < _BLANK)
+
+
+def sharpness(image: NDArray[np.uint8]) -> float:
+    """Contrast of fine structure relative to coarser one, in the direction of motion blur.
+
+    It is the smallest generalised eigenvalue of the structure tensors of two octaves, which hardly
+    depends on what is shown. An image without structure has 0.
+    """
+    from scipy.linalg import eigh
+
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    fine, middle, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1.0, 2.0, 4.0))
+    above, below = _structure(fine - middle), _structure(middle - coarse)
+    if np.linalg.eigvalsh(below)[0] < _FLAT:
+        return 0.0
+    return float(np.sqrt(max(eigh(above, below, eigvals_only=True)[0], 0.0)))
+
+
+def _structure(band: Any) -> NDArray[np.float64]:
+    slopes = [cv2.Sobel(band, cv2.CV_32F, *order).ravel() for order in ((1, 0), (0, 1))]
+    return np.cov(slopes, bias=True)
+
+
+def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    scale = min(1.0, _SIDE_PX / min(image.shape[:2]))
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)
