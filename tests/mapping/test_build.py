@@ -97,6 +97,7 @@ def test_exact_poses_and_intrinsics_hardly_change(hall_built: BuiltMap, hall: Re
     assert scene.adjusted_camera.fx == pytest.approx(hall.train[0].camera.fx, rel=2e-3)
     assert adjusted.residual_px is not None
     assert adjusted.residual_px < 0.2
+    assert adjusted.pose_sigma_mm is not None
     assert adjusted.pose_sigma_mm < 1
     assert adjusted.pose_sigma_deg < 0.05
     assert abs(adjusted.time_shift_frames) < 0.02
