@@ -11,6 +11,7 @@ from evercal.calibration.pose_pairs.checks import (
     SIZE_SIGMA,
     require_observable,
     require_rotations,
+    require_two_lists,
     widened,
     with_tested_size,
 )
@@ -72,10 +73,13 @@ def solve_pairs(
     of_board: bool = True,
 ) -> PairSolution:
     """Like `solve`, but return the fit. Poses in a map, not `of_board`, may have any direction."""
+    if of_board:
+        require_two_lists(pairs)
     require_observable(pairs, scale_known)
     rows, first = pairs.distinct(scale_known)
     start, scale = quick_fit(pairs[rows], mount, scale_known)
-    require_agreement(pairs[np.sort(rows)], mount, scale_known, start, of_board)
+    own_camera = corners is not None or not of_board
+    require_agreement(pairs[np.sort(rows)], mount, scale_known, start, own_camera)
     lens = None
     if corners is not None:
         lens = measured(corners, corners.camera, pairs.camera_from_board)
