@@ -1,6 +1,7 @@
 """`solve`: accuracy, covariance, outliers, scale, board corners and real recordings."""
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -115,6 +116,23 @@ def test_checks_and_error_terms_match_the_noise() -> None:
     assert pose_distance(board, truth.fixed_from_board)[0] < 0.003
     squared = sum(term.translation_mm**2 for term in calibration.error_terms)
     assert np.sqrt(squared) == pytest.approx(calibration.sigma_mm, rel=0.02)
+
+
+@pytest.mark.parametrize(("what", "row"), [("camera", 4), ("board", 12), ("camera", 23)])
+def test_a_slip_is_named_and_widens_the_covariance(what: str, row: int) -> None:
+    mount: Mount = "eye_in_hand" if row == 4 else "eye_to_hand"
+    truth = recording(Setting(mount, path="table", noise_mm=0.3, noise_deg=0.03), 8)
+    step, pairs = SE3.exp([0.002, 0.003, -0.004, 0.004, 0.0, 0.006]), truth.pairs
+    camera = list(pairs.camera_from_board)
+    moved = [step.inverse() @ p if what == "camera" else p @ step for p in camera[row:]]
+    slipped = replace(pairs, camera_from_board=SE3.stack([*camera[:row], *moved]))
+    calibration = solve(slipped, mount)
+    [warning] = calibration.checks["warnings"]
+    assert re.search(rf"the {what} looks moved by \d\.\d mm .* before row {row + 1},", warning)
+    after = truth.parent_from_camera @ step if what == "camera" else truth.parent_from_camera
+    for pose in (truth.parent_from_camera, after):
+        assert calibration.uncertain_pose.squared_mahalanobis(pose) < 16.8
+    assert solve(pairs, mount).checks["warnings"] == []
 
 
 class Photographed(NamedTuple):

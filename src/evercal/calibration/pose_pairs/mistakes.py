@@ -34,9 +34,9 @@ _FAILS_M, _FAILS_RAD, _FEW = 0.01, np.deg2rad(1.0), 0.8
 """A reading fails with larger residuals, or with a smaller share of inliers."""
 _HOPELESS_M, _HOPELESS_RAD = 0.05, np.deg2rad(3.0)
 """Residuals above which the pairs are refused."""
-_BETTER, _MORE = 3.0, 0.2
-"""A better reading reduces residuals of translation or rotation by this factor, or explains this
-share of poses more."""
+_BETTER, _SPOILT, _MORE = 3.0, 1.2, 0.2
+"""A better reading reduces residuals of translation or rotation by the first factor, or explains
+this share of poses more, and enlarges neither by more than the second factor."""
 _FITTED = 30
 """Number of conventions that are fitted, those whose angles agree best."""
 _NEAR_M, _FAR_M, _SPREAD = 0.1, 0.7, 0.8
@@ -142,8 +142,9 @@ def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> No
 
 
 def _better(other: Agreement, fit: Agreement) -> bool:
-    less = min(other.metres / fit.metres, other.radians / fit.radians) * _BETTER < 1
-    return bool(less or other.inliers.mean() - fit.inliers.mean() > _MORE)
+    ratios = other.metres / fit.metres, other.radians / fit.radians
+    more = other.inliers.mean() - fit.inliers.mean() > _MORE
+    return bool((min(ratios) * _BETTER < 1 or more) and max(ratios) < _SPOILT)
 
 
 def _plausibility(reading: _Reading, fit: Agreement) -> float:

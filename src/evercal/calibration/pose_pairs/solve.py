@@ -20,6 +20,7 @@ from evercal.calibration.pose_pairs.mistakes import quick_fit, require_agreement
 from evercal.calibration.pose_pairs.pairs import BoardCorners as BoardCorners
 from evercal.calibration.pose_pairs.pairs import Measured, PosePairs, measured, middle_of
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation, Unknowns
+from evercal.calibration.pose_pairs.slips import find_slip
 from evercal.calibration.pose_pairs.solution import PairSolution
 from evercal.errors import InputError
 from evercal.geometry import SE3, cross_matrix, pose_distance
@@ -99,6 +100,15 @@ def solve_pairs(
         equation, fit, warnings = with_tested_size(equation, fit, corners, of_board)
     else:
         fit = widened(equation, fit)
+    slip = find_slip(equation, fit, rows)
+    if slip is not None:
+        what = "camera" if slip.of_camera else "board" if of_board else "map"
+        fit = replace(fit, covariance=fit.covariance + slip.spread)
+        warnings.append(
+            f"the {what} looks moved by {1000 * slip.metres:.1f} mm and"
+            f" {np.rad2deg(slip.radians):.2f} deg before {pairs.names[slip.row]}, or the arm"
+            " drifts: calibrate from the poses before or after it, or fasten it and record again"
+        )
     warnings += _lens_warnings(fit, equation, corners, lens)
     _require_determined(pairs[rows[fit.inliers]], fit, equation, scale_known)
     return PairSolution(
