@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from evercal.calibration.boards.corners import (
+    BEND,
     LENS,
+    Bend,
     BoardPose,
     BoardView,
     LensPrior,
@@ -188,9 +190,10 @@ class BoardCorners:
 
 
 class Measured(NamedTuple):
-    """Board poses by corners at one estimate of the intrinsics."""
+    """Board poses by corners at one estimate of the intrinsics and of the bend of the board."""
 
     camera: Camera
+    bend: Bend
     poses: list[BoardPose]
     sigma_px: float
     """Standard deviation of a corner coordinate."""
@@ -205,17 +208,22 @@ class Measured(NamedTuple):
         )
 
     def extras(self, prior: LensPrior) -> Extras:
-        """Return the intrinsics as unknowns; the corners are part of their prior."""
-        change, information = lens_estimate(self.poses, self.sigma_px, self.camera, prior)
+        """Return intrinsics and bend as unknowns; the corners are part of their prior."""
+        change, information = lens_estimate(
+            self.poses, self.sigma_px, self.camera, self.bend, prior
+        )
         slopes = np.stack([pose.lens_slope for pose in self.poses])
-        names = LENS[: len(change)]
+        names = (*LENS[: len(change) - 3], *BEND)
         return Extras(names, ("intrinsics",) * len(names), slopes, information, change)
 
 
-def measured(corners: BoardCorners, camera: Camera, starts: SE3) -> Measured:
+def measured(
+    corners: BoardCorners, camera: Camera, starts: SE3, bend: Bend | None = None
+) -> Measured:
     """Fit the pose of the board in every image from (n,) starts."""
-    poses = [board_pose(v, camera, s) for v, s in zip(corners.views, starts, strict=True)]
-    return Measured(camera, poses, pixel_sigma(poses))
+    bend = bend or Bend.none(corners.views)
+    poses = [board_pose(v, camera, s, bend) for v, s in zip(corners.views, starts, strict=True)]
+    return Measured(camera, bend, poses, pixel_sigma(poses))
 
 
 def middle_of(corners: BoardCorners | None) -> NDArray[np.float64]:

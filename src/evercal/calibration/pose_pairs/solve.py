@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.boards.corners import BoardView, board_pose, lens_vector, moved_camera
+from evercal.calibration.boards.corners import BoardView, board_pose, lens_vector, moved_lens
 from evercal.calibration.calibration import Calibration, Mount
 from evercal.calibration.pose_pairs.checks import (
     SIZE_SIGMA,
@@ -148,11 +148,11 @@ class _Problem:
             if change @ information @ change < least:
                 return equation, fit, lens
             try:
-                camera = moved_camera(lens.camera, change)
+                camera, bend = moved_lens(lens.camera, lens.bend, change)
             except ValueError:
                 break
             poses = SE3.stack([pose.camera_from_board for pose in lens.poses])
-            lens = measured(self.corners, camera, poses)
+            lens = measured(self.corners, camera, poses, bend)
         raise InputError(
             "the corners and the robot's motions leave the intrinsics open; tilt the board by 20 to"
             " 45 deg in several directions, or give --camera to evercal detect"
