@@ -122,12 +122,9 @@ def test_pixel_noise_is_estimated_from_all_images() -> None:
 
 
 def test_the_best_candidate_of_a_tag_is_returned_even_if_it_faces_the_camera() -> None:
-    half, rng = TAG.size_m / 2, np.random.default_rng(0)
-    points = half * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
-    poses = [view_of(TAG, 2)]
-    for _ in range(40):
-        facing = SE3.exp([0, 0, 0, 0, 0, rng.uniform(-3, 3)]) @ SE3.exp([0, 0, 0, np.pi, 0, 0])
-        poses.append(SE3.from_translation(rng.uniform((-0.1, -0.1, 0.3), (0.1, 0.1, 0.8))) @ facing)
+    points = TAG.size_m / 2 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    facing = SE3.exp([0, 0, 0, 0, 0, -0.9]) @ SE3.exp([0, 0, 0, np.pi, 0, 0])
+    poses = [view_of(TAG, 2), SE3.from_translation(np.array([-0.09, 0.07, 0.32])) @ facing]
     for pose in poses:
         view = BoardView(points, CAMERA.project(pose.apply(points)))
         metres, radians = pose_distance(board_pose(view, CAMERA).camera_from_board, pose)
