@@ -117,7 +117,7 @@ def test_pixel_noise_is_estimated_from_all_images() -> None:
     views, poses = simulated(10, 0.25)
     fitted = [board_pose(view, CAMERA, pose) for view, pose in zip(views, poses, strict=True)]
     assert pixel_sigma(fitted) == pytest.approx(0.25, rel=0.1)
-    outlier = replace(fitted[0], squared_px=1e4)
+    outlier = replace(fitted[0], residual_px=fitted[0].residual_px + 10)
     assert pixel_sigma([outlier, *fitted[1:]]) == pytest.approx(0.25, rel=0.1)
 
 

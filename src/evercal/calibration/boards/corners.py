@@ -12,7 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, cross_matrix
@@ -21,6 +23,9 @@ Array = NDArray[np.floating]
 
 _LEAST_PX = 0.02
 """Minimum standard deviation of a corner, due to errors of lens model and board."""
+_STRAY, _NEIGHBOURS, _FEW_STRAYS = 6.0, 8, 0.2
+"""Distance of a stray corner from its neighbours, standard deviations; number of neighbours; a view
+with a larger share of strays is no view of the board."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +48,9 @@ class BoardView:
         object.__setattr__(self, "points_m", points)
         object.__setattr__(self, "pixels", pixels)
 
+    def __getitem__(self, use: NDArray[np.bool_]) -> "BoardView":
+        return BoardView(self.points_m[use], self.pixels[use])
+
 
 @dataclass(frozen=True, eq=False)
 class BoardPose:
@@ -52,15 +60,24 @@ class BoardPose:
     unit_covariance: Array
     """(6, 6) covariance for a corner noise of one pixel: (translation in the camera frame, metres;
     rotation about the board's axes, radians)."""
-    squared_px: float
-    """Sum of squared residuals of all coordinates."""
-    corners: int
+    residual_px: Array
+    """(k, 2) residuals of the corners."""
     lens_slope: Array
     """(6, q) derivative of the pose by fx, fy, cx, cy, the distortion coefficients and the bend."""
     lens_normal: Array
     """(q, q) information on the intrinsics for a corner noise of one pixel, the pose unknown."""
     lens_gradient: Array
     """(q,) `lens_normal` times the change of the intrinsics that fits the corners best."""
+
+    @property
+    def corners(self) -> int:
+        """Number of corners."""
+        return len(self.residual_px)
+
+    @property
+    def squared_px(self) -> float:
+        """Sum of squared residuals of all coordinates."""
+        return float((self.residual_px**2).sum())
 
     @property
     def rms_px(self) -> float:
@@ -133,8 +150,7 @@ def board_pose(
     return BoardPose(
         camera_from_board=SE3(quaternion, np.asarray(translation, dtype=np.float64).ravel()),
         unit_covariance=(covariance + covariance.T) / 2,
-        squared_px=float((error**2).sum()),
-        corners=len(view.points_m),
+        residual_px=error.reshape(-1, 2),
         lens_slope=lens_slope,
         lens_normal=unexplained.T @ unexplained,
         lens_gradient=unexplained.T @ error,
@@ -166,6 +182,25 @@ def pixel_sigma(poses: Sequence[BoardPose]) -> float:
     freedom = np.array([max(2 * pose.corners - 6, 1) for pose in poses])
     inliers = squared / freedom <= 4 * np.median(squared / freedom) + 1e-12
     return max(float(np.sqrt(squared[inliers].sum() / freedom[inliers].sum())), _LEAST_PX)
+
+
+BEND = ("bend xx", "bend xy", "bend yy")
+
+
+def strays(views: Sequence[BoardView], poses: Sequence[BoardPose]) -> list[NDArray[np.bool_]]:
+    """Return (k,) of every view: whether a corner leaves its neighbours by many sigma.
+
+    Residuals of lens and board are smooth, so they are no reason.
+    """
+    apart = []
+    for view, pose in zip(views, poses, strict=True):
+        count = min(_NEIGHBOURS + 1, pose.corners)
+        near = np.asarray(KDTree(view.points_m).query(view.points_m, count)[1])
+        apart.append(pose.residual_px - np.median(pose.residual_px[near[:, 1:]], 1))
+    typical = [max(float(np.median(np.abs(a))), _LEAST_PX) for a in apart]
+    limits = _STRAY * np.maximum(typical, np.median(typical)) / norm.ppf(0.75)
+    stray = [np.linalg.norm(a, axis=1) > m for a, m in zip(apart, limits, strict=True)]
+    return [s & (s.mean() < _FEW_STRAYS and (~s).sum() > _NEIGHBOURS) for s in stray]
 
 
 BEND = ("bend xx", "bend xy", "bend yy")
@@ -288,6 +323,10 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
             poses = [board_pose(v, camera, s, bend) for v, s in zip(views, starts, strict=True)]
             if change @ information @ change < 1e-4:
                 break
+        stray = strays(views, poses)
+        if np.concatenate(stray).any():
+            used = [view[~mask] for view, mask in zip(views, stray, strict=True)]
+            return calibrate_camera(used, width, height)
     except ValueError:
         raise InputError(open_focal.format("")) from None
     unit = 1 / np.sqrt(np.diag(information))
