@@ -37,8 +37,8 @@ _HOPELESS_M, _HOPELESS_RAD = 0.05, np.deg2rad(3.0)
 _BETTER, _SPOILT, _MORE = 3.0, 1.2, 0.2
 """A better reading reduces residuals of translation or rotation by the first factor, or explains
 this share of poses more, and enlarges neither by more than the second factor."""
-_FITTED = 30
-"""Number of conventions that are fitted, those whose angles agree best."""
+_DOUBT_RAD = np.deg2rad(0.1)
+"""Residual above which other conventions of tables are tested, even if the given one is usable."""
 _NEAR_M, _FAR_M, _SPREAD = 0.1, 0.7, 0.8
 """Usual distances of a camera or board from gripper and base; deviation of their logarithms."""
 _FIELD_RAD, _ANYWHERE, _IMAGES = np.deg2rad(22.0), 0.03, 4.0
@@ -79,14 +79,13 @@ def require_agreement(
 
     What agrees is not accused, and neither are camera poses of our own, from corners or a map.
     """
-    if not _fails(fit):
-        if not own_camera:
-            _require_plausible(_Reading("", pairs, mount), fit, scale_known)
-        return
-    readings = _readings(pairs, mount, _OTHER_ROBOT) + _shifted(pairs, mount)
-    if not own_camera:
-        readings += _readings(pairs, mount, _OTHER_CAMERA)
-    readings += _other_conventions(pairs, mount)
+    outliers = (~fit.inliers).sum() > 1
+    readings = _shifted(pairs, mount) if outliers or _fails(fit) else []
+    if _fails(fit):
+        readings += _readings(pairs, mount, _OTHER_ROBOT)
+        readings += _readings(pairs, mount, {} if own_camera else _OTHER_CAMERA)
+    if _fails(fit) or fit.radians > _DOUBT_RAD:
+        readings += _other_conventions(pairs, mount)
     fits = [(quick_fit(r.pairs, r.mount, scale_known)[0], r) for r in readings]
     better = [(other, r) for other, r in fits if not _fails(other) and _better(other, fit)]
     if better:
@@ -98,10 +97,12 @@ def require_agreement(
             f"{likely.message}; corrected, the poses agree to {_size(corrected)}, as given to"
             f" {_size(fit)}"
         )
-    if scale_known:
-        _require_unit(pairs, mount, fit)
+    if not (_fails(fit) or own_camera):
+        _require_plausible(_Reading("", pairs, mount), fit, scale_known)
     enough = fit.inliers.mean() >= 0.5
     if not (fit.metres < _HOPELESS_M and fit.radians < _HOPELESS_RAD and enough):
+        if scale_known:
+            _require_unit(pairs, mount, fit)
         raise InputError(
             f"{_mismatch(pairs)}; they agree only to {_size(fit)}, and no other reading fits: no"
             f" order of angles or quaternions, inverse, mount or shift of rows; {_CAUSES}"
@@ -144,6 +145,9 @@ def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> No
 def _better(other: Agreement, fit: Agreement) -> bool:
     ratios = other.metres / fit.metres, other.radians / fit.radians
     more = other.inliers.mean() - fit.inliers.mean() > _MORE
+    # A pair less cannot explain two outliers, unless the rows after it are shifted.
+    if len(other.inliers) < len(fit.inliers):
+        more = (~fit.inliers).sum() - (~other.inliers).sum() > 1
     return bool((min(ratios) * _BETTER < 1 or more) and max(ratios) < _SPOILT)
 
 
@@ -231,9 +235,9 @@ def _shifted(pairs: PosePairs, mount: Mount) -> list[_Reading]:
 
 
 def _other_conventions(pairs: PosePairs, mount: Mount) -> list[_Reading]:
-    """Return the pairs with the numbers of one file in another convention, the best first."""
+    """Return the pairs with the numbers of one file in a convention whose angles agree better."""
     robot, camera = pairs.base_from_gripper, pairs.camera_from_board
-    readings: list[tuple[float, _Reading]] = []
+    readings = list[_Reading]()
     for name, part, other, given in (
         ("robot", "base_from_gripper", camera, pairs.robot_numbers),
         ("camera", "camera_from_board", robot, pairs.camera_numbers),
@@ -241,16 +245,14 @@ def _other_conventions(pairs: PosePairs, mount: Mount) -> list[_Reading]:
         if given is None:  # its file leaves no choice
             continue
         for meant, corrected in _reread(given):
-            message = (
-                f"the {name} poses look written as {' or '.join(meant)} and read as"
-                f" {given.convention.name}; give --{name}-convention {meant[0]}"
-                f" ({CONVENTIONS[pose_convention(meant[0]).base].meaning})"
-            )
-            changed = replace(pairs, **{part: corrected})
-            mismatch = round(np.rad2deg(_mismatch_rad(corrected, other)), 1)
-            readings.append((mismatch, _Reading(message, changed, mount)))
-    readings.sort(key=lambda entry: entry[0])
-    return [reading for _, reading in readings[:_FITTED]]
+            if _mismatch_rad(corrected, other) < _mismatch_rad(robot, camera):
+                message = (
+                    f"the {name} poses look written as {' or '.join(meant)} and read as"
+                    f" {given.convention.name}; give --{name}-convention {meant[0]}"
+                    f" ({CONVENTIONS[pose_convention(meant[0]).base].meaning})"
+                )
+                readings.append(_Reading(message, replace(pairs, **{part: corrected}), mount))
+    return readings
 
 
 def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:
