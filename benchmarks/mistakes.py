@@ -103,6 +103,11 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     "xyzw read as wxyz": (misread("robot", "xyzw", "wxyz"), _named("robot", "xyzw")),
     "wxyz read as xyzw": (misread("robot", "wxyz", "xyzw"), _named("robot", "wxyz")),
     "camera: xyzw read as wxyz": (misread("camera", "xyzw", "wxyz"), _named("camera", "xyzw")),
+    "moving ZYZ read as KUKA": (misread("robot", "kawasaki", "kuka"), _named("robot", "kawasaki")),
+    "moving YXZ read as Yaskawa": (
+        misread("robot", "moving_yxz:mm:deg", "yaskawa"),
+        _named("robot", "moving_yxz:mm:deg"),
+    ),
     "degrees read as radians": (misread("robot", "rpy:deg", "rpy:rad"), "rpy:deg"),
 }
 """A change of correct pairs, and a pattern of the message that names its correction."""

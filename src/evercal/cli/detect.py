@@ -154,6 +154,9 @@ def _lines(poses: "BoardPoses") -> Iterator[str]:
             continue
         x, y, z = 1000 * image.camera_from_board.translation_m
         yield f"{image.name}: board at {x:+.1f} {y:+.1f} {z:+.1f} mm, {image.rms_px:.2f} px"
+        if image.left_out:
+            where = ", ".join(f"{x:.0f} {y:.0f}" for x, y in image.left_out)
+            yield f"{image.name}: left out what leaves its neighbours, corners at x y {where}"
     camera = poses.camera
     numbers = ", ".join(f"{key} {getattr(camera, key):.2f}" for key in ("fx", "fy", "cx", "cy"))
     yield (

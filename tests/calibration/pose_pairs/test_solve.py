@@ -1,6 +1,7 @@
 """`solve`: accuracy, covariance, outliers, scale, board corners and real recordings."""
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -12,11 +13,17 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from benchmarks.hand_eye import Setting, error, recording, trials
-from benchmarks.hand_eye_boards import BoardSetting, corner_pairs, record
+from benchmarks.hand_eye_boards import (
+    BoardRecording,
+    BoardSetting,
+    corner_pairs,
+    project,
+    record,
+)
 from evercal.calibration.boards.board_poses import board_poses
 from evercal.calibration.boards.corners import BoardView, board_pose, calibrate_camera
 from evercal.calibration.boards.detection import Board, find_board
-from evercal.calibration.calibration import Mount
+from evercal.calibration.calibration import Calibration, Mount
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import BoardCorners, solve
 from evercal.evaluation import share_inside
@@ -117,6 +124,23 @@ def test_checks_and_error_terms_match_the_noise() -> None:
     assert np.sqrt(squared) == pytest.approx(calibration.sigma_mm, rel=0.02)
 
 
+@pytest.mark.parametrize(("what", "row"), [("camera", 4), ("board", 12), ("camera", 23)])
+def test_a_slip_is_named_and_widens_the_covariance(what: str, row: int) -> None:
+    mount: Mount = "eye_in_hand" if row == 4 else "eye_to_hand"
+    truth = recording(Setting(mount, path="table", noise_mm=0.3, noise_deg=0.03), 8)
+    step, pairs = SE3.exp([0.002, 0.003, -0.004, 0.004, 0.0, 0.006]), truth.pairs
+    camera = list(pairs.camera_from_board)
+    moved = [step.inverse() @ p if what == "camera" else p @ step for p in camera[row:]]
+    slipped = replace(pairs, camera_from_board=SE3.stack([*camera[:row], *moved]))
+    calibration = solve(slipped, mount)
+    [warning] = calibration.checks["warnings"]
+    assert re.search(rf"the {what} looks moved by \d\.\d mm .* before row {row + 1},", warning)
+    after = truth.parent_from_camera @ step if what == "camera" else truth.parent_from_camera
+    for pose in (truth.parent_from_camera, after):
+        assert calibration.uncertain_pose.squared_mahalanobis(pose) < 16.8
+    assert solve(pairs, mount).checks["warnings"] == []
+
+
 class Photographed(NamedTuple):
     """A simulated recording of a chessboard."""
 
@@ -171,6 +195,52 @@ def test_corners_improve_the_calibration(mount: Mount, noise_px: float, robot_de
         without.append(np.linalg.norm(error(plain, truth.parent_from_camera)[:3]))
     assert np.median(distances) < 11
     assert np.median(with_corners) < 0.5 * np.median(without)
+
+
+def test_a_stray_corner_is_named_and_moves_nothing() -> None:
+    drawn = record(BoardSetting(noise_px=0.02), 3)
+    clean, [*views] = solve_with_corners(drawn), drawn.views
+    for i in (2, 7):
+        pixels = views[i].pixels.copy()
+        pixels[53] += (0.9, 1.2)
+        views[i] = replace(views[i], pixels=pixels)
+    spoiled = replace(drawn, views=tuple(views))
+    assert (
+        clean.uncertain_pose.squared_mahalanobis(solve_with_corners(spoiled).parent_from_child)
+        < 0.2
+    )
+    found = board_poses(
+        Board("chessboard", 0.025, 9, 6), drawn.camera, dict(zip("abcdefghij", views, strict=False))
+    )
+    left_out = {image.name: image.left_out for image in found.images if image.left_out}
+    assert left_out == {name: (tuple(views[i].pixels[53]),) for name, i in (("c", 2), ("h", 7))}
+
+
+def solve_with_corners(drawn: BoardRecording) -> Calibration:
+    pairs, corners = corner_pairs(drawn)
+    return solve(pairs, "eye_in_hand", corners=corners)
+
+
+@pytest.mark.parametrize("bend_m", [0.0, 0.002])
+def test_a_bent_board_is_no_worse_than_a_flat_one(bend_m: float) -> None:
+    distances = []
+    for seed in range(6):
+        drawn = record(BoardSetting(square_m=0.04), seed)
+        x, y = ((drawn.views[0].points_m - drawn.views[0].points_m.mean(0)) / 0.16).T[:2]
+        bent = drawn.views[0].points_m + np.outer(bend_m * (x**2 - 0.4 * x * y), [0, 0, 1])
+        rng = np.random.default_rng(seed)
+        views = tuple(
+            BoardView(
+                view.points_m, project(bent, pose, drawn.camera) + rng.normal(0, 0.1, (54, 2))
+            )
+            for view, pose in zip(drawn.views, drawn.camera_from_board, strict=True)
+        )
+        found = solve_with_corners(replace(drawn, views=views))
+        distances.append(found.uncertain_pose.squared_mahalanobis(drawn.parent_from_camera))
+        assert found.camera is not None
+        sigma = found.checks["camera_sigma"]["fx"]
+        assert abs(found.camera.fx - drawn.camera.fx) < 4 * sigma
+    assert np.mean(distances) < 10
 
 
 @pytest.mark.parametrize("size", [(8, 6), (7, 7), (8, 8)])

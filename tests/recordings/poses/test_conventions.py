@@ -31,10 +31,19 @@ def of_quaternion(w: float, x: float, y: float, z: float) -> Array:
     return of_vector(*(2 * np.arccos(w) / math.sqrt(1 - w * w) * np.array([x, y, z])))
 
 
-def fixed_xyz(unit: float) -> Callable[..., Array]:
-    return lambda a, b, c: (
-        of_vector(0, 0, c * unit) @ of_vector(0, b * unit, 0) @ of_vector(a * unit, 0, 0)
-    )
+def fixed(axes: str, unit: float = 1.0) -> Callable[..., Array]:
+    def rotation(*angles: float) -> Array:
+        vectors = [
+            unit * a * np.eye(3)["xyz".index(axis)] for axis, a in zip(axes, angles, strict=True)
+        ]
+        first, second, third = (of_vector(*vector) for vector in vectors)
+        return third @ second @ first
+
+    return rotation
+
+
+def moving(axes: str, unit: float = 1.0) -> Callable[..., Array]:
+    return lambda a, b, c: fixed(axes[::-1], unit)(c, b, a)
 
 
 DEGREE = math.pi / 180
@@ -44,13 +53,16 @@ ROTATIONS: dict[str, Callable[..., Array]] = {
     "tum": lambda x, y, z, w: of_quaternion(w, x, y, z),
     "abb": of_quaternion,
     "ur": of_vector,
-    "rpy": fixed_xyz(1.0),
-    "kuka": lambda a, b, c: fixed_xyz(DEGREE)(c, b, a),
-    "fanuc": fixed_xyz(DEGREE),
-    "yaskawa": fixed_xyz(DEGREE),
-    "staubli": lambda a, b, c: fixed_xyz(DEGREE)(-a, -b, -c).T,
+    "rpy": fixed("xyz"),
+    "kuka": moving("zyx", DEGREE),
+    "fanuc": fixed("xyz", DEGREE),
+    "yaskawa": fixed("xyz", DEGREE),
+    "staubli": moving("xyz", DEGREE),
+    "kawasaki": moving("zyz", DEGREE),
+    **{n: fixed(n[6:]) for n in CONVENTIONS if n.startswith("fixed_")},
+    **{n: moving(n[7:]) for n in CONVENTIONS if n.startswith("moving_")},
 }
-MILLIMETRES = {"abb", "kuka", "fanuc", "yaskawa", "staubli"}
+MILLIMETRES = {"abb", "kuka", "fanuc", "yaskawa", "staubli", "kawasaki"}
 
 
 def twin(name: str, numbers: Array) -> Array:

@@ -4,21 +4,30 @@
      "camera": {...}, "camera_from": "board", "corner_sigma_px": x,
      "images": [{"name": "image-1.png", "reason": "", "rms_px": x,
                  "camera_from_board": {"translation_m": [3], "quaternion_wxyz": [4]},
-                 "covariance": [6][6], "points_m": [k][3], "pixels": [k][2]}, ...]}
+                 "covariance": [6][6], "points_m": [k][3], "pixels": [k][2],
+                 "left_out": [m][2]}, ...]}
 
 Image names are paths relative to the file. An image without a board has a reason, and null for all
-other fields. Covariances are those of `BoardPose`.
+other fields. Covariances are those of `BoardPose`. Pixels `left_out` are corners that leave their
+neighbours.
 """
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma
+from evercal.calibration.boards.corners import (
+    BoardPose,
+    BoardView,
+    board_pose,
+    pixel_sigma,
+    strays,
+)
 from evercal.calibration.boards.detection import Board
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.storage import write_json
@@ -42,6 +51,8 @@ class BoardImage:
     """Root mean square reprojection error of the corners."""
     reason: str = ""
     """Reason for a missing pose, otherwise empty."""
+    left_out: tuple[tuple[float, float], ...] = ()
+    """Pixels x, y of corners that leave their neighbours by many sigma."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,20 +118,31 @@ def board_poses(
 ) -> BoardPoses:
     """Fit the pose of the board in every image; a view may be the reason for a missing board."""
     fits: dict[str, BoardPose] = {}
+    seen: dict[str, BoardView] = {}
     images: dict[str, BoardImage] = {}
     for name, view in views.items():
-        if isinstance(view, str):
-            images[name] = BoardImage(name, reason=view)
-            continue
-        try:
-            fits[name] = fit = board_pose(view, camera)
-            images[name] = BoardImage(name, view, fit.camera_from_board, rms_px=fit.rms_px)
-        except ValueError:
-            reason = "the detected corners fit no pose of the board"
-            images[name] = BoardImage(name, reason=reason)
+        reason = view if isinstance(view, str) else "the detected corners fit no pose of the board"
+        images[name] = BoardImage(name, reason=reason)
+        with suppress(ValueError):
+            if isinstance(view, BoardView):
+                fits[name], seen[name] = board_pose(view, camera), view
+    stray = dict(zip(seen, strays([*seen.values()], [*fits.values()]), strict=True))
+    for name, mask in stray.items():
+        if mask.any():
+            left_out = tuple((float(x), float(y)) for x, y in seen[name].pixels[mask])
+            images[name] = replace(images[name], left_out=left_out)
+            seen[name] = seen[name][~mask]
+            fits[name] = board_pose(seen[name], camera, fits[name].camera_from_board)
     sigma = pixel_sigma([*fits.values()]) if fits else 0.0
     for name, fit in fits.items():
-        images[name] = replace(images[name], covariance=sigma**2 * fit.unit_covariance)
+        images[name] = replace(
+            images[name],
+            view=seen[name],
+            camera_from_board=fit.camera_from_board,
+            covariance=sigma**2 * fit.unit_covariance,
+            rms_px=fit.rms_px,
+            reason="",
+        )
     return BoardPoses(board, camera, tuple(images.values()), sigma, camera_from)
 
 
@@ -134,6 +156,7 @@ def _image_to_dict(image: BoardImage) -> dict[str, Any]:
         "covariance": None if image.covariance is None else image.covariance.tolist(),
         "points_m": None if view is None else view.points_m.tolist(),
         "pixels": None if view is None else view.pixels.tolist(),
+        "left_out": image.left_out,
     }
 
 
@@ -150,4 +173,5 @@ def _image_from_dict(data: Mapping[str, Any]) -> BoardImage:
         SE3(pose["quaternion_wxyz"], pose["translation_m"]),
         covariance,
         float(data["rms_px"]),
+        left_out=tuple((float(x), float(y)) for x, y in data.get("left_out", ())),
     )

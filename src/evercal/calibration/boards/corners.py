@@ -12,7 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, cross_matrix
@@ -21,6 +23,9 @@ Array = NDArray[np.floating]
 
 _LEAST_PX = 0.02
 """Minimum standard deviation of a corner, due to errors of lens model and board."""
+_STRAY, _NEIGHBOURS, _FEW_STRAYS = 6.0, 8, 0.2
+"""Distance of a stray corner from its neighbours, standard deviations; number of neighbours; a view
+with a larger share of strays is no view of the board."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +48,9 @@ class BoardView:
         object.__setattr__(self, "points_m", points)
         object.__setattr__(self, "pixels", pixels)
 
+    def __getitem__(self, use: NDArray[np.bool_]) -> "BoardView":
+        return BoardView(self.points_m[use], self.pixels[use])
+
 
 @dataclass(frozen=True, eq=False)
 class BoardPose:
@@ -52,15 +60,24 @@ class BoardPose:
     unit_covariance: Array
     """(6, 6) covariance for a corner noise of one pixel: (translation in the camera frame, metres;
     rotation about the board's axes, radians)."""
-    squared_px: float
-    """Sum of squared residuals of all coordinates."""
-    corners: int
+    residual_px: Array
+    """(k, 2) residuals of the corners."""
     lens_slope: Array
-    """(6, q) derivative of the pose by fx, fy, cx, cy and the distortion coefficients."""
+    """(6, q) derivative of the pose by fx, fy, cx, cy, the distortion coefficients and the bend."""
     lens_normal: Array
     """(q, q) information on the intrinsics for a corner noise of one pixel, the pose unknown."""
     lens_gradient: Array
     """(q,) `lens_normal` times the change of the intrinsics that fits the corners best."""
+
+    @property
+    def corners(self) -> int:
+        """Number of corners."""
+        return len(self.residual_px)
+
+    @property
+    def squared_px(self) -> float:
+        """Sum of squared residuals of all coordinates."""
+        return float((self.residual_px**2).sum())
 
     @property
     def rms_px(self) -> float:
@@ -68,40 +85,72 @@ class BoardPose:
         return float(np.sqrt(self.squared_px / self.corners))
 
 
-def board_pose(view: BoardView, camera: Camera, start: SE3 | None = None) -> BoardPose:
+class Bend(NamedTuple):
+    """How a board departs from a plane: z = a x^2 / 2 + b x y + c y^2 / 2 about its middle."""
+
+    middle: Array
+    """(3,) metres."""
+    curvature: Array
+    """(3,) a, b, c, 1 / metres."""
+
+    @classmethod
+    def none(cls, views: Sequence[BoardView]) -> "Bend":
+        """Return the plane of a board that views show."""
+        points = np.concatenate([view.points_m for view in views])
+        return cls((points.min(0) + points.max(0)) / 2, np.zeros(3))
+
+    def slopes(self, points: Array) -> Array:
+        """Return the (k, 3) derivative of z of points (k, 3) by the curvature."""
+        x, y, _ = (points - self.middle).T
+        return np.stack([x * x / 2, x * y, y * y / 2], 1)
+
+
+def board_pose(
+    view: BoardView, camera: Camera, start: SE3 | None = None, bend: Bend | None = None
+) -> BoardPose:
     """Fit the pose of a board to its corners, from a start or from the better of its candidates."""
     import cv2
 
     if start is None:
         starts = board_pose_candidates(view, camera)
-        return min((board_pose(view, camera, s) for s in starts), key=lambda pose: pose.squared_px)
+        fits = (board_pose(view, camera, s, bend) for s in starts)
+        return min(fits, key=lambda pose: pose.squared_px)
+    bend = bend or Bend.none([view])
+    by_bend = bend.slopes(view.points_m)
+    points = view.points_m + np.outer(by_bend @ bend.curvature, [0, 0, 1])
     coefficients = np.zeros(max(len(camera.distortion), 5))
     coefficients[: len(camera.distortion)] = camera.distortion
     lens = camera.matrix(), coefficients
     rotvec = Rotation.from_quat(start.rotation_wxyz, scalar_first=True).as_rotvec()
     translation = start.translation_m.reshape(3, 1).copy()
     rotvec, translation = cv2.solvePnPRefineLM(
-        view.points_m, view.pixels, *lens, rotvec.reshape(3, 1).copy(), translation
+        points, view.pixels, *lens, rotvec.reshape(3, 1).copy(), translation
     )
-    projected, slopes, *_ = cv2.projectPoints(view.points_m, rotvec, translation, *lens)
+    projected, slopes, *_ = cv2.projectPoints(points, rotvec, translation, *lens)
     slopes = np.asarray(slopes, dtype=np.float64)
     rotation = Rotation.from_rotvec(np.ravel(rotvec))
     by_point = slopes[:, 3:6].reshape(-1, 2, 3)
-    by_rotation = by_point @ (-rotation.as_matrix() @ cross_matrix(view.points_m))
+    by_rotation = by_point @ (-rotation.as_matrix() @ cross_matrix(points))
     jacobian = np.concatenate([by_point, by_rotation], 2).reshape(-1, 6)
     error = (view.pixels - projected.reshape(-1, 2)).ravel()
     normal = jacobian.T @ jacobian
     unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     covariance = np.outer(unit, unit) * np.linalg.pinv(normal * np.outer(unit, unit), 1e-12)
-    by_lens = slopes[:, 6 : 10 + max(len(camera.distortion), 5)]
+    by_z = by_point @ rotation.as_matrix()[:, 2:]
+    by_lens = np.concatenate(
+        [
+            slopes[:, 6 : 10 + max(len(camera.distortion), 5)],
+            (by_z * by_bend[:, None]).reshape(-1, 3),
+        ],
+        1,
+    )
     lens_slope = -covariance @ (jacobian.T @ by_lens)
     unexplained = by_lens + jacobian @ lens_slope
     quaternion = rotation.as_quat(canonical=True, scalar_first=True)
     return BoardPose(
         camera_from_board=SE3(quaternion, np.asarray(translation, dtype=np.float64).ravel()),
         unit_covariance=(covariance + covariance.T) / 2,
-        squared_px=float((error**2).sum()),
-        corners=len(view.points_m),
+        residual_px=error.reshape(-1, 2),
         lens_slope=lens_slope,
         lens_normal=unexplained.T @ unexplained,
         lens_gradient=unexplained.T @ error,
@@ -109,19 +158,21 @@ def board_pose(view: BoardView, camera: Camera, start: SE3 | None = None) -> Boa
 
 
 def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
-    """Return the possible poses of the board: up to two for a flat board, mostly one otherwise."""
+    """Return the possible poses of the board: up to three for a flat board, else mostly one."""
     import cv2
 
     thickness = np.linalg.svd(view.points_m - view.points_m.mean(0), compute_uv=False)
     flat = thickness[2] < 1e-6 * thickness[0]
-    flags = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
+    # Both poses of IPPE are wrong for a small board that faces the camera.
+    solvers = (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_SQPNP) if flat else (cv2.SOLVEPNP_SQPNP,)
     lens = camera.matrix(), np.array(camera.distortion)
-    found = cv2.solvePnPGeneric(view.points_m, view.pixels, *lens, flags=flags)
     poses = []
-    for rotvec, translation in zip(*found[1:3], strict=True):
-        if np.isfinite(rotvec).all() and np.isfinite(translation).all() and translation[2] > 0:
-            quaternion = Rotation.from_rotvec(np.ravel(rotvec)).as_quat(scalar_first=True)
-            poses.append(SE3(quaternion, np.asarray(translation, dtype=np.float64).ravel()))
+    for solver in solvers:
+        found = cv2.solvePnPGeneric(view.points_m, view.pixels, *lens, flags=solver)
+        for rotvec, translation in zip(*found[1:3], strict=True):
+            if np.isfinite(rotvec).all() and np.isfinite(translation).all() and translation[2] > 0:
+                quaternion = Rotation.from_rotvec(np.ravel(rotvec)).as_quat(scalar_first=True)
+                poses.append(SE3(quaternion, np.asarray(translation, dtype=np.float64).ravel()))
     return poses
 
 
@@ -133,6 +184,26 @@ def pixel_sigma(poses: Sequence[BoardPose]) -> float:
     return max(float(np.sqrt(squared[inliers].sum() / freedom[inliers].sum())), _LEAST_PX)
 
 
+BEND = ("bend xx", "bend xy", "bend yy")
+
+
+def strays(views: Sequence[BoardView], poses: Sequence[BoardPose]) -> list[NDArray[np.bool_]]:
+    """Return (k,) of every view: whether a corner leaves its neighbours by many sigma.
+
+    Residuals of lens and board are smooth, so they are no reason.
+    """
+    apart = []
+    for view, pose in zip(views, poses, strict=True):
+        count = min(_NEIGHBOURS + 1, pose.corners)
+        near = np.asarray(KDTree(view.points_m).query(view.points_m, count)[1])
+        apart.append(pose.residual_px - np.median(pose.residual_px[near[:, 1:]], 1))
+    typical = [max(float(np.median(np.abs(a))), _LEAST_PX) for a in apart]
+    limits = _STRAY * np.maximum(typical, np.median(typical)) / norm.ppf(0.75)
+    stray = [np.linalg.norm(a, axis=1) > m for a, m in zip(apart, limits, strict=True)]
+    return [s & (s.mean() < _FEW_STRAYS and (~s).sum() > _NEIGHBOURS) for s in stray]
+
+
+BEND = ("bend xx", "bend xy", "bend yy")
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 MIN_VIEWS = 5
 """Minimum number of views of a flat board."""
@@ -143,6 +214,8 @@ _USUAL_DISTORTION = (0.3, 0.5, 2e-3, 2e-3, 0.5, 0.1, 0.1, 0.1)
 _STATED = 0.005
 """Standard deviation of a stated focal length and principal point, relative to the focal length."""
 _STATED_DISTORTION = (0.02, 0.05, 5e-4, 5e-4, 0.1, 0.02, 0.02, 0.02)
+_USUAL_BEND = 0.15
+"""Standard deviation of the curvatures of a board, 1 / metres: 1.7 mm over 300 mm."""
 _FOCAL_SIGMA = 0.1
 """Maximum relative standard deviation of the focal length."""
 _FALSE = 10.0
@@ -151,7 +224,7 @@ _ROUNDS = 25
 
 
 class LensPrior(NamedTuple):
-    """A Gaussian over the (q,) intrinsics in the order of `LENS`."""
+    """A Gaussian over the (q,) intrinsics in the order of `LENS`, and the bend of the board."""
 
     mean: Array
     information: Array
@@ -162,7 +235,7 @@ class LensPrior(NamedTuple):
         """Prior of intrinsics from the maker or from another calibration."""
         mean = lens_vector(camera)
         sigma = np.r_[np.full(4, _STATED * camera.fx), _STATED_DISTORTION][: len(mean)]
-        return cls(mean, np.diag(sigma**-2.0))
+        return cls(np.r_[mean, np.zeros(3)], np.diag(np.r_[sigma, [_USUAL_BEND] * 3] ** -2.0))
 
     @classmethod
     def usual(cls, camera: Camera) -> "LensPrior":
@@ -171,10 +244,10 @@ class LensPrior(NamedTuple):
         mean[:2] = camera.fx
         mean[2:4] = (camera.width - 1) / 2, (camera.height - 1) / 2
         sigma = np.r_[np.full(4, _USUAL_CENTRE * camera.width), _USUAL_DISTORTION][: len(mean)]
-        information = np.diag(sigma**-2.0)
+        information = np.diag(np.r_[sigma, [_USUAL_BEND] * 3] ** -2.0)
         aspect = np.array([[1.0, -1.0], [-1.0, 1.0]]) / (_USUAL_ASPECT * camera.fx) ** 2
         information[:2, :2] = aspect + np.eye(2) / (_ROUGH_FOCAL * camera.fx) ** 2
-        return cls(mean, information)
+        return cls(np.r_[mean, np.zeros(3)], information)
 
 
 class Intrinsics(NamedTuple):
@@ -186,30 +259,36 @@ class Intrinsics(NamedTuple):
 
 
 def lens_estimate(
-    poses: Sequence[BoardPose], sigma_px: float, camera: Camera, prior: LensPrior
+    poses: Sequence[BoardPose], sigma_px: float, camera: Camera, bend: Bend, prior: LensPrior
 ) -> tuple[Array, Array]:
-    """Estimate the change (q,) of the intrinsics that board poses were fitted with.
+    """Estimate the change (q,) of the intrinsics and the bend that board poses were fitted with.
 
     Also return the information (q, q) of the corners and the prior.
     """
     variance = sigma_px**2
     information = np.sum([pose.lens_normal for pose in poses], 0) / variance + prior.information
     right = np.sum([pose.lens_gradient for pose in poses], 0) / variance
-    right = right + prior.information @ (prior.mean - lens_vector(camera))
+    right = right + prior.information @ (prior.mean - np.r_[lens_vector(camera), bend.curvature])
     unit = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information * np.outer(unit, unit)
     return unit * np.linalg.lstsq(scaled, unit * right, rcond=1e-13)[0], information
 
 
 def lens_vector(camera: Camera) -> Array:
-    """Return the (q,) intrinsics in the order of `LENS`, q = 9 or 12."""
+    """Return the 9 or 12 intrinsics in the order of `LENS`."""
     distortion = np.zeros(max(5, len(camera.distortion)))
     distortion[: len(camera.distortion)] = camera.distortion
     return np.r_[camera.fx, camera.fy, camera.cx, camera.cy, distortion]
 
 
+def moved_lens(camera: Camera, bend: Bend, change: Array) -> tuple[Camera, Bend]:
+    """Return camera and bend after a (q,) change; ValueError without a positive focal length."""
+    curvature = bend.curvature + change[-3:]
+    return moved_camera(camera, change[:-3]), bend._replace(curvature=curvature)
+
+
 def moved_camera(camera: Camera, change: Array) -> Camera:
-    """Return the camera after a (q,) change; raises ValueError without a positive focal length."""
+    """Return the camera after a change of its intrinsics."""
     fx, fy, cx, cy, *distortion = (float(value) for value in lens_vector(camera) + change)
     return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion))
 
@@ -228,7 +307,7 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
             f" least {MIN_VIEWS}; check --size, or give --camera"
         )
     camera = _rough(views, width, height)
-    prior = LensPrior.usual(camera)
+    prior, bend = LensPrior.usual(camera), Bend.none(views)
     open_focal = (
         "the images leave the focal length open{}; tilt the board by 20 to 45 deg in several"
         " directions, or give --camera"
@@ -237,13 +316,17 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
     try:
         poses = [board_pose(view, camera) for view in views]
         for _ in range(_ROUNDS):
-            change, information = lens_estimate(poses, pixel_sigma(poses), camera, prior)
+            change, information = lens_estimate(poses, pixel_sigma(poses), camera, bend, prior)
             change = change * min(1.0, 0.2 * camera.fx / np.abs(change[:2]).max())
-            camera = moved_camera(camera, change)
+            camera, bend = moved_lens(camera, bend, change)
             starts = [pose.camera_from_board for pose in poses]
-            poses = [board_pose(v, camera, s) for v, s in zip(views, starts, strict=True)]
+            poses = [board_pose(v, camera, s, bend) for v, s in zip(views, starts, strict=True)]
             if change @ information @ change < 1e-4:
                 break
+        stray = strays(views, poses)
+        if np.concatenate(stray).any():
+            used = [view[~mask] for view, mask in zip(views, stray, strict=True)]
+            return calibrate_camera(used, width, height)
     except ValueError:
         raise InputError(open_focal.format("")) from None
     unit = 1 / np.sqrt(np.diag(information))

@@ -27,6 +27,8 @@ Array = NDArray[np.floating]
 _FAR_M = 20.0
 _MIN_ROTATION_DEG, _MIN_SECOND_DEG = 2.0, 1.0
 _MIN_TRANSLATION_M = 0.01
+_SAME_LIST = 0.1
+"""Differences of robot and camera poses that make them one list, parts of the robot's motion."""
 _STILL_M, _STILL_RAD = 1e-3, np.deg2rad(0.1)
 _RECORD = "record 15 to 25 poses that differ by 20 to 60 deg about two axes and by 10 cm or more"
 
@@ -53,12 +55,33 @@ def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
     grippers = pairs.base_from_gripper[different]
     require_rotations(grippers)
     spread = float(np.sqrt(grippers.translation_m.var(0).sum()))
-    if spread < _MIN_TRANSLATION_M:
+    if not scale_known and spread < _MIN_TRANSLATION_M:
         raise InputError(
             f"pure rotation: the gripper only turned on the spot (its positions vary by"
-            f" {1000 * spread:.1f} mm), so a wrong board size or unit cannot be detected;"
-            f" also move the gripper by 10 cm or more between poses"
+            f" {1000 * spread:.1f} mm), so the scale of the camera poses is open; also move the"
+            f" gripper by 10 cm or more between poses"
         )
+
+
+def require_two_lists(pairs: PosePairs) -> None:
+    """Refuse one list of poses in both files, apart from noise, unit, inversion and axes."""
+    camera, about_x = pairs.camera_from_board, SE3.exp([0, 0, 0, np.pi, 0, 0])
+    for robot in (pairs.base_from_gripper, pairs.base_from_gripper.inverse()):
+        length, motion = _median_length(robot), np.median(pose_distance(robot[0], robot), 1)
+        for read in (camera, about_x @ camera, camera @ about_x):
+            unit = length / max(_median_length(read), 1e-300)
+            same_unit = SE3(read.rotation_wxyz, unit * read.translation_m)
+            apart = np.median(pose_distance(robot, same_unit), 1)
+            if (apart < _SAME_LIST * motion).all():
+                raise InputError(
+                    f"robot and camera poses are one list, up to {1000 * apart[0]:.2f} mm and"
+                    f" {np.rad2deg(apart[1]):.2f} deg, so they measure nothing: give"
+                    f" base_from_gripper of the robot and camera_from_board of the images"
+                )
+
+
+def _median_length(poses: SE3) -> float:
+    return float(np.median(np.linalg.norm(poses.translation_m, axis=1)))
 
 
 def require_rotations(
@@ -238,6 +261,9 @@ def with_tested_size(
     sigma *= float(np.sqrt(1 + _alike(freed)))
     if abs(off) < max(_SIZE_SIGMAS * sigma, SIZE_SIGMA):
         return equation, fit, []
+    if off < -0.5:  # a camera in the point of rotation that sees a board of size zero fits, too
+        warning = "the gripper turned about one point, so a wrong size of the board stays hidden"
+        return equation, fit, [warning]
     what, larger = "board" if of_board else "map", "larger" if off > 0 else "smaller"
     if abs(off) > _LARGE_SIZE and _misfit(fit) < _MUCH_BETTER * _misfit(freed):
         warning = (

@@ -24,22 +24,21 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.conventions import (
     CONVENTIONS,
-    numbers_from_poses,
     pose_convention,
     poses_from_numbers,
 )
 
 Array = NDArray[np.floating]
 
-_SUSPECT_M, _SUSPECT_RAD, _FEW = 0.01, np.deg2rad(1.0), 0.8
-"""Residuals above which other readings are tested, and share of inliers below which they are."""
+_FAILS_M, _FAILS_RAD, _FEW = 0.01, np.deg2rad(1.0), 0.8
+"""A reading fails with larger residuals, or with a smaller share of inliers."""
 _HOPELESS_M, _HOPELESS_RAD = 0.05, np.deg2rad(3.0)
 """Residuals above which the pairs are refused."""
 _BETTER, _SPOILT, _MORE = 3.0, 1.2, 0.2
 """A better reading reduces residuals of translation or rotation by the first factor, or explains
 this share of poses more, and enlarges neither by more than the second factor."""
-_SCREENED, _FITTED = 1.5, 30
-"""Least reduction of the differences of angles by conventions that are fitted; their number."""
+_DOUBT_RAD = np.deg2rad(0.1)
+"""Residual above which other conventions of tables are tested, even if the given one is usable."""
 _NEAR_M, _FAR_M, _SPREAD = 0.1, 0.7, 0.8
 """Usual distances of a camera or board from gripper and base; deviation of their logarithms."""
 _FIELD_RAD, _ANYWHERE, _IMAGES = np.deg2rad(22.0), 0.03, 4.0
@@ -74,15 +73,21 @@ def quick_fit(pairs: PosePairs, mount: Mount, scale_known: bool) -> tuple[Agreem
 
 
 def require_agreement(
-    pairs: PosePairs, mount: Mount, scale_known: bool, fit: Agreement, of_board: bool = True
+    pairs: PosePairs, mount: Mount, scale_known: bool, fit: Agreement, own_camera: bool
 ) -> None:
-    """Check that pose pairs agree, or name the mistake; poses `of_board` must see the board."""
-    suspect = fit.metres > _SUSPECT_M or fit.radians > _SUSPECT_RAD or fit.inliers.mean() < _FEW
-    readings = [_Reading(*other, mount) for other in _other_conventions(pairs, suspect)]
-    if suspect:
-        readings = [*_readings(pairs, mount, _OTHER_EQUATION), *readings]
+    """Check that pose pairs agree, or name the mistake.
+
+    What agrees is not accused, and neither are camera poses of our own, from corners or a map.
+    """
+    outliers = (~fit.inliers).sum() > 1
+    readings = _shifted(pairs, mount) if outliers or _fails(fit) else []
+    if _fails(fit):
+        readings += _readings(pairs, mount, _OTHER_ROBOT)
+        readings += _readings(pairs, mount, {} if own_camera else _OTHER_CAMERA)
+    if _fails(fit) or fit.radians > _DOUBT_RAD:
+        readings += _other_conventions(pairs, mount)
     fits = [(quick_fit(r.pairs, r.mount, scale_known)[0], r) for r in readings]
-    better = [(other, r) for other, r in fits if _clearly_better(other, fit)]
+    better = [(other, r) for other, r in fits if not _fails(other) and _better(other, fit)]
     if better:
         # Inverted robot poses, inverted camera poses and the other mount obey the same equation.
         least = min(_cost(other) for other, _ in better)
@@ -92,15 +97,21 @@ def require_agreement(
             f"{likely.message}; corrected, the poses agree to {_size(corrected)}, as given to"
             f" {_size(fit)}"
         )
-    if not suspect:
-        if of_board:
-            _require_plausible(_Reading("", pairs, mount), fit, scale_known)
-        return
-    if scale_known:
-        _require_unit(pairs, mount, fit)
+    if not (_fails(fit) or own_camera):
+        _require_plausible(_Reading("", pairs, mount), fit, scale_known)
     enough = fit.inliers.mean() >= 0.5
     if not (fit.metres < _HOPELESS_M and fit.radians < _HOPELESS_RAD and enough):
-        raise InputError(f"{_mismatch(pairs)}; they agree only to {_size(fit)}; {_CAUSES}")
+        if scale_known:
+            _require_unit(pairs, mount, fit)
+        raise InputError(
+            f"{_mismatch(pairs)}; they agree only to {_size(fit)}, and no other reading fits: no"
+            f" order of angles or quaternions, inverse, mount or shift of rows; {_CAUSES}"
+        )
+
+
+def _fails(fit: Agreement) -> bool:
+    few = fit.inliers.mean() < _FEW
+    return bool(fit.metres > _FAILS_M or fit.radians > _FAILS_RAD or few)
 
 
 def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> None:
@@ -131,12 +142,13 @@ def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> No
         )
 
 
-def _clearly_better(other: Agreement, fit: Agreement) -> bool:
-    # Residuals below 0.01 mm and 0.01 mrad are not improved.
-    metres, radians = max(other.metres, 1e-5), max(other.radians, 1e-5)
-    ratios = metres / max(fit.metres, 1e-5), radians / max(fit.radians, 1e-5)
+def _better(other: Agreement, fit: Agreement) -> bool:
+    ratios = other.metres / fit.metres, other.radians / fit.radians
     more = other.inliers.mean() - fit.inliers.mean() > _MORE
-    return bool(min(ratios) * _BETTER < 1 or more) and max(ratios) < _SPOILT
+    # A pair less cannot explain two outliers, unless the rows after it are shifted.
+    if len(other.inliers) < len(fit.inliers):
+        more = (~fit.inliers).sum() - (~other.inliers).sum() > 1
+    return bool((min(ratios) * _BETTER < 1 or more) and max(ratios) < _SPOILT)
 
 
 def _plausibility(reading: _Reading, fit: Agreement) -> float:
@@ -161,7 +173,7 @@ _TRANSPOSED = (
     " columns of the matrices, or the sign of the quaternions' x y z"
 )
 _SHIFTED = (
-    "rows and images are shifted by one: the {} poses have an extra pose at the beginning; pair"
+    "rows and images are shifted by one from {} on: the {} poses have an extra pose there; pair"
     " each row with its own image"
 )
 _WRONG_MOUNT = (
@@ -178,18 +190,18 @@ _SAME_EQUATION: dict[str, _Change] = {
     " forward)": lambda robot, camera: (robot, _FLIP @ camera),
 }
 """Readings that agree as well as the given one."""
-_OTHER_EQUATION: dict[str, _Change] = {
+_OTHER_ROBOT: dict[str, _Change] = {
     "the robot poses look inverted (gripper_from_base): invert them (--invert robot), or, if they"
     " are base_from_gripper, use --mount {other}": lambda robot, camera: (robot.inverse(), camera),
-    "the camera poses look inverted (board_from_camera): invert them (--invert camera), or, if they"
-    " are camera_from_board, use --mount {other}": lambda robot, camera: (robot, camera.inverse()),
     _WRONG_MOUNT: lambda robot, camera: (robot, camera),
     _TRANSPOSED.format("robot"): lambda robot, camera: (_transposed(robot), camera),
-    _TRANSPOSED.format("camera"): lambda robot, camera: (robot, _transposed(camera)),
-    _SHIFTED.format("robot"): lambda robot, camera: (robot[1:], camera[:-1]),
-    _SHIFTED.format("camera"): lambda robot, camera: (robot[:-1], camera[1:]),
 }
-"""Readings in other frames, with the other mount, or with rows shifted by one."""
+_OTHER_CAMERA: dict[str, _Change] = {
+    "the camera poses look inverted (board_from_camera): invert them (--invert camera), or, if they"
+    " are camera_from_board, use --mount {other}": lambda robot, camera: (robot, camera.inverse()),
+    _TRANSPOSED.format("camera"): lambda robot, camera: (robot, _transposed(camera)),
+}
+"""Readings in other frames, or with the other mount."""
 
 
 def _readings(pairs: PosePairs, mount: Mount, changes: Mapping[str, _Change]) -> list[_Reading]:
@@ -197,45 +209,50 @@ def _readings(pairs: PosePairs, mount: Mount, changes: Mapping[str, _Change]) ->
     readings = []
     for message, change in changes.items():
         robot, camera = change(pairs.base_from_gripper, pairs.camera_from_board)
-        if len(robot) >= MIN_POSES:
-            read = PosePairs(pairs.names[: len(robot)], robot, camera)
-            to = other if message == _WRONG_MOUNT else mount
-            readings.append(_Reading(message.format(other=other, mount=mount), read, to))
+        to = other if message == _WRONG_MOUNT else mount
+        read = PosePairs(pairs.names, robot, camera)
+        readings.append(_Reading(message.format(other=other, mount=mount), read, to))
     return readings
 
 
-def _other_conventions(pairs: PosePairs, every: bool) -> list[tuple[str, PosePairs]]:
-    """Return the pairs with the numbers of one file in another convention, the best first.
+def _shifted(pairs: PosePairs, mount: Mount) -> list[_Reading]:
+    """Return the pairs without one extra row of either file, where successive angles fit best."""
+    if len(pairs) <= MIN_POSES:
+        return []
+    whole, readings = np.arange(len(pairs)), []
+    sides = {"robot": pairs.base_from_gripper, "camera": pairs.camera_from_board}
+    for extra, other in (("robot", "camera"), ("camera", "robot")):
+        turned, same = (pose_distance(p[:-1], p[1:])[1] for p in (sides[extra], sides[other]))
+        before, after = np.abs(turned - same), np.abs(turned[1:] - same[:-1])
+        mean = [np.mean([*before[: max(k - 1, 0)], *after[k:]]) for k in range(len(pairs) - 2)]
+        k = int(np.argmin(mean))
+        rows = {extra: np.delete(whole, k), other: whole[:-1]}
+        read = PosePairs(
+            pairs.names[:-1], sides["robot"][rows["robot"]], sides["camera"][rows["camera"]]
+        )
+        readings.append(_Reading(_SHIFTED.format(pairs.names[k], extra), read, mount))
+    return readings
 
-    Unless `every` is set, the angles of robot and camera must agree far better.
-    """
+
+def _other_conventions(pairs: PosePairs, mount: Mount) -> list[_Reading]:
+    """Return the pairs with the numbers of one file in a convention whose angles agree better."""
     robot, camera = pairs.base_from_gripper, pairs.camera_from_board
-    limit = np.inf if every else _mismatch_rad(robot, camera) / _SCREENED
-    readings: list[tuple[float, str, PosePairs]] = []
-    for name, part, poses, other, numbers in (
-        ("robot", "base_from_gripper", robot, camera, pairs.robot_numbers),
-        ("camera", "camera_from_board", camera, robot, pairs.camera_numbers),
+    readings = list[_Reading]()
+    for name, part, other, given in (
+        ("robot", "base_from_gripper", camera, pairs.robot_numbers),
+        ("camera", "camera_from_board", robot, pairs.camera_numbers),
     ):
-        for given in _numbers(poses, numbers):
-            for meant, corrected in _reread(given):
-                if (mismatch := _mismatch_rad(corrected, other)) > limit:
-                    continue
+        if given is None:  # its file leaves no choice
+            continue
+        for meant, corrected in _reread(given):
+            if _mismatch_rad(corrected, other) < _mismatch_rad(robot, camera):
                 message = (
                     f"the {name} poses look written as {' or '.join(meant)} and read as"
                     f" {given.convention.name}; give --{name}-convention {meant[0]}"
                     f" ({CONVENTIONS[pose_convention(meant[0]).base].meaning})"
                 )
-                changed = replace(pairs, **{part: corrected})
-                readings.append((round(np.rad2deg(mismatch), 1), message, changed))
-    readings.sort(key=lambda entry: entry[0])
-    return [(message, changed) for _, message, changed in readings[:_FITTED]]
-
-
-def _numbers(poses: SE3, given: PoseNumbers | None) -> list[PoseNumbers]:
-    if given is not None:
-        return [given]
-    likely = [pose_convention(n) for n in ("wxyz", "xyzw", "rpy", "ur", "staubli:m", "kuka:m")]
-    return [PoseNumbers(numbers_from_poses(poses, used), used) for used in likely]
+                readings.append(_Reading(message, replace(pairs, **{part: corrected}), mount))
+    return readings
 
 
 def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:

@@ -4,7 +4,6 @@ With the intrinsics as extras, the hand-eye equation is the full reprojection pr
 corners say about them, and the derivative of each pose by them, come from `boards.corners`.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
@@ -12,15 +11,19 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.corners import (
+    BEND,
     LENS,
+    Bend,
     BoardPose,
     BoardView,
     LensPrior,
     board_pose,
     lens_estimate,
     pixel_sigma,
+    strays,
 )
 from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
@@ -173,13 +176,20 @@ class BoardCorners:
     size_m: float | None = None
     """Stated side of a square, or of a tag, for messages."""
 
-    def orders(self, count: int) -> list[NDArray[np.int64]]:
-        """Other orders in which the corners of a view may be, as indices of them."""
-        if self.quarter_turn:
-            side = math.isqrt(count)
-            grid = np.arange(side * side).reshape(side, side)
-            return [np.rot90(grid, turns).ravel() for turns in (1, 2, 3)]
-        return [np.arange(count)[::-1]] if self.half_turn else []
+    def turned(self, view: BoardView) -> list[BoardView]:
+        """Return a view with the other corners that may have been taken for its corners."""
+        angles = (90, 180, 270) if self.quarter_turn else (180,) if self.half_turn else ()
+        middle = Bend.none(self.views).middle
+        turns = [Rotation.from_euler("z", angle, degrees=True) for angle in angles]
+        return [
+            replace(view, points_m=turn.apply(view.points_m - middle) + middle) for turn in turns
+        ]
+
+    def without_strays(self, poses: Sequence[BoardPose]) -> Self:
+        """Leave out corners that leave their neighbours by many sigma."""
+        stray = strays(self.views, poses)
+        views = (view[~mask] for view, mask in zip(self.views, stray, strict=True))
+        return replace(self, views=tuple(views))
 
     @property
     def prior(self) -> LensPrior:
@@ -188,9 +198,10 @@ class BoardCorners:
 
 
 class Measured(NamedTuple):
-    """Board poses by corners at one estimate of the intrinsics."""
+    """Board poses by corners at one estimate of the intrinsics and of the bend of the board."""
 
     camera: Camera
+    bend: Bend
     poses: list[BoardPose]
     sigma_px: float
     """Standard deviation of a corner coordinate."""
@@ -204,18 +215,22 @@ class Measured(NamedTuple):
             camera_covariance=np.stack([variance * pose.unit_covariance for pose in self.poses]),
         )
 
-    def extras(self, prior: LensPrior) -> Extras:
-        """Return the intrinsics as unknowns; the corners are part of their prior."""
-        change, information = lens_estimate(self.poses, self.sigma_px, self.camera, prior)
+    def extras(self, prior: LensPrior, accepted: Mask) -> Extras:
+        """Return intrinsics and bend as unknowns; corners of `accepted` (n,) are in their prior."""
+        poses = [pose for pose, use in zip(self.poses, accepted, strict=True) if use]
+        change, information = lens_estimate(poses, self.sigma_px, self.camera, self.bend, prior)
         slopes = np.stack([pose.lens_slope for pose in self.poses])
-        names = LENS[: len(change)]
+        names = (*LENS[: len(change) - 3], *BEND)
         return Extras(names, ("intrinsics",) * len(names), slopes, information, change)
 
 
-def measured(corners: BoardCorners, camera: Camera, starts: SE3) -> Measured:
+def measured(
+    corners: BoardCorners, camera: Camera, starts: SE3, bend: Bend | None = None
+) -> Measured:
     """Fit the pose of the board in every image from (n,) starts."""
-    poses = [board_pose(v, camera, s) for v, s in zip(corners.views, starts, strict=True)]
-    return Measured(camera, poses, pixel_sigma(poses))
+    bend = bend or Bend.none(corners.views)
+    poses = [board_pose(v, camera, s, bend) for v, s in zip(corners.views, starts, strict=True)]
+    return Measured(camera, bend, poses, pixel_sigma(poses))
 
 
 def middle_of(corners: BoardCorners | None) -> NDArray[np.float64]:

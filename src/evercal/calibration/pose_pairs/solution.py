@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.boards.corners import LENS, moved_camera
+from evercal.calibration.boards.corners import LENS, moved_lens
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, Mount
 from evercal.calibration.located import length_mm_deg
 from evercal.calibration.pose_pairs.checks import held_out_error, left_open, repeatability
@@ -60,7 +60,7 @@ class PairSolution:
         if self.lens is None:
             return None
         change = self.fit.at.extras[self.equation.extras.indices("intrinsics")]
-        return moved_camera(self.lens.camera, change)
+        return moved_lens(self.lens.camera, self.lens.bend, change)[0]
 
     @property
     def fixed_from_board(self) -> SE3:

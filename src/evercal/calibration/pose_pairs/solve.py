@@ -5,20 +5,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.boards.corners import BoardView, board_pose, lens_vector, moved_camera
+from evercal.calibration.boards.corners import board_pose, lens_vector, moved_lens
 from evercal.calibration.calibration import Calibration, Mount
 from evercal.calibration.pose_pairs.checks import (
     SIZE_SIGMA,
     require_observable,
     require_rotations,
+    require_two_lists,
     widened,
     with_tested_size,
 )
-from evercal.calibration.pose_pairs.fit import HandEyeFit, agreement, least_sigma, robust_fit
+from evercal.calibration.pose_pairs.fit import HandEyeFit, Mask, agreement, least_sigma, robust_fit
 from evercal.calibration.pose_pairs.mistakes import quick_fit, require_agreement
 from evercal.calibration.pose_pairs.pairs import BoardCorners as BoardCorners
 from evercal.calibration.pose_pairs.pairs import Measured, PosePairs, measured, middle_of
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation, Unknowns
+from evercal.calibration.pose_pairs.slips import find_slip
 from evercal.calibration.pose_pairs.solution import PairSolution
 from evercal.errors import InputError
 from evercal.geometry import SE3, cross_matrix, pose_distance
@@ -72,12 +74,17 @@ def solve_pairs(
     of_board: bool = True,
 ) -> PairSolution:
     """Like `solve`, but return the fit. Poses in a map, not `of_board`, may have any direction."""
+    if of_board:
+        require_two_lists(pairs)
     require_observable(pairs, scale_known)
     rows, first = pairs.distinct(scale_known)
     start, scale = quick_fit(pairs[rows], mount, scale_known)
-    require_agreement(pairs[np.sort(rows)], mount, scale_known, start, of_board)
+    own_camera = corners is not None or not of_board
+    require_agreement(pairs[np.sort(rows)], mount, scale_known, start, own_camera)
     lens = None
     if corners is not None:
+        lens = measured(corners, corners.camera, pairs.camera_from_board)
+        corners = corners.without_strays(lens.poses)
         lens = measured(corners, corners.camera, pairs.camera_from_board)
         pairs = lens.applied_to(pairs)
         start, scale = quick_fit(pairs[rows], mount, scale_known)
@@ -95,6 +102,15 @@ def solve_pairs(
         equation, fit, warnings = with_tested_size(equation, fit, corners, of_board)
     else:
         fit = widened(equation, fit)
+    slip = find_slip(equation, fit, rows)
+    if slip is not None:
+        what = "camera" if slip.of_camera else "board" if of_board else "map"
+        fit = replace(fit, covariance=fit.covariance + slip.spread)
+        warnings.append(
+            f"the {what} looks moved by {1000 * slip.metres:.1f} mm and"
+            f" {np.rad2deg(slip.radians):.2f} deg before {pairs.names[slip.row]}, or the arm"
+            " drifts: calibrate from the poses before or after it, or fasten it and record again"
+        )
     warnings += _lens_warnings(fit, equation, corners, lens)
     _require_determined(pairs[rows[fit.inliers]], fit, equation, scale_known)
     return PairSolution(
@@ -119,36 +135,41 @@ class _Problem:
         """Fit all unknowns; with corners, until the intrinsics no longer change."""
         at, shifts = start, start.translations.copy()
         shifts[1] += at.rotations[1] @ middle_of(self.corners)
-        at = replace(at, translations=shifts)
+        at, accepted = replace(at, translations=shifts), np.ones(len(pairs), dtype=bool)
         for turn in range(_MOST_LENSES):
-            equation = self.equation(pairs, lens)[rows]
+            equation = self.equation(pairs, lens, accepted)[rows]
             at = replace(at, extras=np.zeros(len(equation.extras.names)))
             fit = robust_fit(equation, agreement(equation, at))
             if self.corners is None or lens is None:
                 return equation, fit, None
+            before, accepted = accepted, np.isin(np.arange(len(pairs)), rows[fit.inliers])
             group, at = equation.extras.indices("intrinsics"), fit.at
             change = at.extras[group]
             information = equation.extras.information[np.ix_(group, group)]
             # A pose at the threshold of rejection may alternate for ever, and the lens with it.
             least = len(change) if turn == _MOST_LENSES - 1 else _SAME_LENS
-            if change @ information @ change < least:
+            same = (accepted == before).all() or turn == _MOST_LENSES - 1
+            if same and change @ information @ change < least:
                 return equation, fit, lens
             try:
-                camera = moved_camera(lens.camera, change)
+                camera, bend = moved_lens(lens.camera, lens.bend, change)
             except ValueError:
                 break
             poses = SE3.stack([pose.camera_from_board for pose in lens.poses])
-            lens = measured(self.corners, camera, poses)
+            lens = measured(self.corners, camera, poses, bend)
         raise InputError(
             "the corners and the robot's motions leave the intrinsics open; tilt the board by 20 to"
             " 45 deg in several directions, or give --camera to evercal detect"
         )
 
-    def equation(self, pairs: PosePairs, lens: Measured | None) -> PoseEquation:
-        """Return the equation with all extras, about the middle of the board."""
+    def equation(self, pairs: PosePairs, lens: Measured | None, accepted: Mask) -> PoseEquation:
+        """Return the equation with all extras, about the middle of the board.
+
+        The corners of `accepted` (n,) images estimate the intrinsics.
+        """
         extras = Extras.nothing(len(pairs))
         if self.corners is not None and lens is not None:
-            pairs, extras = lens.applied_to(pairs), lens.extras(self.corners.prior)
+            pairs, extras = lens.applied_to(pairs), lens.extras(self.corners.prior, accepted)
         # The board's origin is a convention; noise about its middle is the same in any other.
         middle = middle_of(self.corners)
         lever = np.broadcast_to(np.eye(6), (len(pairs), 6, 6)).copy()
@@ -203,8 +224,7 @@ def _other_board_poses(
     for row in np.flatnonzero(outliers):
         i, nearest = int(rows[row]), np.inf
         view, old = corners.views[i], lens.poses[i]
-        orders = corners.orders(len(view.pixels))
-        for candidate in (view, *(BoardView(view.points_m, view.pixels[k]) for k in orders)):
+        for candidate in (view, *corners.turned(view)):
             pose = board_pose(candidate, lens.camera, predicted[row])
             # All orders of a symmetric board fit; the other poses decide between them.
             _, turn = pose_distance(pose.camera_from_board, predicted[row])

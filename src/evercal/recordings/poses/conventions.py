@@ -5,10 +5,11 @@ A name may be followed by modifiers: `kuka:m` (KUKA's angles, but metres), `matr
 final; units that a convention only implies are checked against the numbers.
 
 Sources: Roboception's documentation of pose formats (ABB, FANUC, KUKA, Yaskawa), Universal Robots'
-script manual, RoboDK's converters (Staubli) and libfranka's reference.
+script manual, RoboDK's converters (Staubli, Kawasaki) and libfranka's reference.
 """
 
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -88,14 +89,26 @@ CONVENTIONS = {
         PoseConvention("fanuc", "xyz", "X Y Z W P R, mm, degrees, W about x", 0.001, True),
         PoseConvention("yaskawa", "xyz", "X Y Z Rx Ry Rz, mm, degrees, fixed axes", 0.001, True),
         PoseConvention("staubli", "XYZ", "X Y Z RX RY RZ, mm, degrees, moving axes", 0.001, True),
+        PoseConvention("kawasaki", "ZYZ", "X Y Z O A T, mm, degrees, about z y z", 0.001, True),
         PoseConvention("matrix", "rows", "4x4 or 3x4 matrix row after row, metres"),
         PoseConvention("franka", "columns", "matrix column after column, metres (O_T_EE)"),
     )
 }
 """All conventions by name, without modifiers."""
 KNOWN_CONVENTIONS = (
-    f"{', '.join(CONVENTIONS)}, followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
+    f"{', '.join(CONVENTIONS)}, fixed_xyz or moving_zyx with any order of axes, followed by :m,"
+    f" :mm, :rad, :deg, :inverse or :opengl where needed"
 )
+CONVENTIONS |= {
+    f"{sense}_{axes}": PoseConvention(
+        f"{sense}_{axes}",
+        axes if sense == "fixed" else axes.upper(),
+        f"x y z and angles about {' '.join(axes)}, {sense} axes",
+    )
+    for axes in map("".join, product("xyz", repeat=3))
+    for sense in ("fixed", "moving")
+    if axes[0] != axes[1] != axes[2]
+}
 UNITS: dict[str, dict[str, Any]] = {
     "m": {"metres_per_unit": 1.0}, "mm": {"metres_per_unit": 0.001},
     "rad": {"degrees": False}, "deg": {"degrees": True},
