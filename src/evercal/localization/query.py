@@ -39,7 +39,7 @@ class LocalizeOptions:
     """Gain in similarity of a turned image; less may be noise where something covers the middle."""
     aligned_inliers: int = 12
     """Poses with fewer PnP inliers are not aligned."""
-    immediate: float = 3.0
+    immediate: float = 4.0
     """A pose with this many times the required support is final. Others are aligned again to the
     keyframes that see most of their view."""
     reselect_gain: float = 1.1
