@@ -272,7 +272,7 @@ def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:
                 corrected = poses_from_numbers(given.numbers, convention, given.camera_from)
             except ValueError:  # no rotations in that convention
                 continue
-            key = np.abs(corrected.rotation_wxyz).round(6).tobytes()
+            key = (corrected.rotation_matrix().round(6) + 0.0).tobytes()  # no -0.0
             readings.setdefault(key, ([], corrected))[0].append(meant)
     for names, _ in readings.values():
         fewest = min(name.count(":") for name in names)
