@@ -85,7 +85,7 @@ def require_agreement(
         readings += _readings(pairs, mount, _OTHER_ROBOT)
         readings += _readings(pairs, mount, {} if own_camera else _OTHER_CAMERA)
     if _fails(fit) or fit.radians > _DOUBT_RAD:
-        readings += _other_conventions(pairs, mount)
+        readings += _other_conventions(pairs, mount, every=_fails(fit))
     fits = [(quick_fit(r.pairs, r.mount, scale_known)[0], r) for r in readings]
     better = [(other, r) for other, r in fits if not _fails(other) and _better(other, fit)]
     if better:
@@ -234,8 +234,8 @@ def _shifted(pairs: PosePairs, mount: Mount) -> list[_Reading]:
     return readings
 
 
-def _other_conventions(pairs: PosePairs, mount: Mount) -> list[_Reading]:
-    """Return the pairs with the numbers of one file in a convention whose angles agree better."""
+def _other_conventions(pairs: PosePairs, mount: Mount, every: bool) -> list[_Reading]:
+    """Return the pairs in other conventions of one file: `every`, or those that agree better."""
     robot, camera = pairs.base_from_gripper, pairs.camera_from_board
     readings = list[_Reading]()
     for name, part, other, given in (
@@ -245,7 +245,7 @@ def _other_conventions(pairs: PosePairs, mount: Mount) -> list[_Reading]:
         if given is None:  # its file leaves no choice
             continue
         for meant, corrected in _reread(given):
-            if _mismatch_rad(corrected, other) < _mismatch_rad(robot, camera):
+            if every or _mismatch_rad(corrected, other) < _mismatch_rad(robot, camera):
                 message = (
                     f"the {name} poses look written as {' or '.join(meant)} and read as"
                     f" {given.convention.name}; give --{name}-convention {meant[0]}"
@@ -272,7 +272,7 @@ def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:
                 corrected = poses_from_numbers(given.numbers, convention, given.camera_from)
             except ValueError:  # no rotations in that convention
                 continue
-            key = np.abs(corrected.rotation_wxyz).round(6).tobytes()
+            key = (corrected.rotation_matrix().round(6) + 0.0).tobytes()  # no -0.0
             readings.setdefault(key, ([], corrected))[0].append(meant)
     for names, _ in readings.values():
         fewest = min(name.count(":") for name in names)
