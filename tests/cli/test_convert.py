@@ -60,7 +60,7 @@ def test_next_command_repeats_the_reading_options(run: Any, wave: Path) -> None:
     camera = wave.parent / "camera.txt"
     ran = run("inspect", wave, "--every", 2, "--camera", camera)
     assert "2 training and 0 test frames with the gripper's pose" in ran.out
-    assert "gripper moved in 0.20 x 0.00 x 0.00 m" in ran.out
+    assert "gripper moved in 0.2 x 0 x 0 m" in ran.out
     assert "note: images and poses were paired in order" in ran.out
     last = ran.out.splitlines()[-1]
     assert last == f"next: evercal learn MAP {wave} --camera {camera} --every 2"
