@@ -108,6 +108,9 @@ def _check_lines(calibration: "Calibration") -> Iterator[str]:
     yield f"  residuals    {residual} (root mean square)"
     if "corner_sigma_px" in checks:
         yield f"  corners      {checks['corner_sigma_px']:.2f} px (standard deviation)"
+    if checks.get("corners_left_out"):
+        where = ", ".join(checks["corners_left_out"])
+        yield f"  left out     corners that leave their neighbours (image x y): {where}"
     if "scale" in checks:
         scale = f"{checks['scale']:.6g} +- {checks['scale_sigma']:.2g}"
         yield f"  scale        {scale} (size of the board, or metres per unit)"

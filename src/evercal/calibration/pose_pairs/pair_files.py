@@ -64,6 +64,11 @@ class _Poses:
             quarter_turn=printed.quarter_turn,
             stated=self.board.camera_from == "file",
             size_m=printed.size_m,
+            left_out=tuple(
+                f"{images[row].name} {x:.0f} {y:.0f}"
+                for row in rows
+                for x, y in images[row].left_out
+            ),
         )
 
 

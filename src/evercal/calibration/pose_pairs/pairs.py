@@ -175,6 +175,8 @@ class BoardCorners:
     """Whether the intrinsics are stated by the maker; else they come from these corners."""
     size_m: float | None = None
     """Stated side of a square, or of a tag, for messages."""
+    left_out: tuple[str, ...] = ()
+    """Images and pixels of corners that leave their neighbours."""
 
     def turned(self, view: BoardView) -> list[BoardView]:
         """Return a view with the other corners that may have been taken for its corners."""
@@ -185,11 +187,13 @@ class BoardCorners:
             replace(view, points_m=turn.apply(view.points_m - middle) + middle) for turn in turns
         ]
 
-    def without_strays(self, poses: Sequence[BoardPose]) -> Self:
+    def without_strays(self, names: Sequence[str], poses: Sequence[BoardPose]) -> Self:
         """Leave out corners that leave their neighbours by many sigma."""
-        stray = strays(self.views, poses)
-        views = (view[~mask] for view, mask in zip(self.views, stray, strict=True))
-        return replace(self, views=tuple(views))
+        views, left_out = list(self.views), [*self.left_out]
+        for i, stray in enumerate(strays(self.views, poses)):
+            left_out += [f"{names[i]} {x:.0f} {y:.0f}" for x, y in views[i].pixels[stray]]
+            views[i] = views[i][~stray]
+        return replace(self, views=tuple(views), left_out=tuple(left_out))
 
     @property
     def prior(self) -> LensPrior:

@@ -130,6 +130,7 @@ class PairSolution:
         checks |= {"scale": self.board_scale, "scale_sigma": sigma["size"]}
         if self.lens is not None:
             checks["corner_sigma_px"] = self.lens.sigma_px
+            checks["corners_left_out"] = list(self.corners.left_out) if self.corners else []
             checks["camera_sigma"] = {name: sigma[name] for name in LENS if name in sigma}
         return checks
 

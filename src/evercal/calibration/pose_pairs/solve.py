@@ -84,7 +84,7 @@ def solve_pairs(
     lens = None
     if corners is not None:
         lens = measured(corners, corners.camera, pairs.camera_from_board)
-        corners = corners.without_strays(lens.poses)
+        corners = corners.without_strays(pairs.names, lens.poses)
         lens = measured(corners, corners.camera, pairs.camera_from_board)
         pairs = lens.applied_to(pairs)
         start, scale = quick_fit(pairs[rows], mount, scale_known)
