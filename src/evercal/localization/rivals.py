@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from evercal.geometry import Camera
+from evercal.geometry import SE3, Camera
 from evercal.localization.acceptance import FULL_SUPPORT, differ, support
 from evercal.localization.intrinsics import FOCAL_FACTORS, NOT_STATED, UNKNOWN, zoomed
 from evercal.localization.pnp import solve_pnp
@@ -100,19 +100,22 @@ def _rivals(
 def _other_focal_lengths(
     localizer: "Localizer", query: Query, best: Hypothesis, camera: Camera
 ) -> Iterator[Hypothesis]:
-    """Poses that start at other focal lengths.
+    """The pose that starts at the best of other focal lengths.
 
     Before a flat surface a longer focal length looks like a smaller distance.
     """
     if best.matches is None or best.refined is None or best.candidate is None:
         return
     small = camera.short_side_resized(localizer.contents.short_side)
+    # As many inliers are wanted as at the focal length of the pose.
+    options, poses = replace(localizer.options.pnp, wanted=best.pnp_inliers), []
     for factor in (1.0, *FOCAL_FACTORS):
         change = zoomed(factor)
-        if abs(change[0] - best.refined.change[0]) < _NEXT_FOCAL:
-            continue
-        pnp = solve_pnp(*best.matches, small.zoomed(factor), localizer.options.pnp)
-        if pnp and pnp.inliers.sum() >= best.pnp_inliers:
-            rival = localizer.aligned(query, best.candidate, camera, pnp.pose, change)
-            if rival is not None:
-                yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
+        if abs(change[0] - best.refined.change[0]) > _NEXT_FOCAL:
+            pnp = solve_pnp(*best.matches, small.zoomed(factor), options)
+            poses += [(int(pnp.inliers.sum()), factor, pnp.pose)] if pnp else []
+    inliers, factor, pose = max(poses, default=(0, 1.0, SE3.identity()), key=lambda found: found[0])
+    if inliers >= best.pnp_inliers:
+        rival = localizer.aligned(query, best.candidate, camera, pose, zoomed(factor))
+        if rival is not None:
+            yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
