@@ -40,7 +40,8 @@ def fewest_keyframes(
     poses = built.scene.keyframes.base_from_camera
     everything = np.arange(len(poses))
     spread = np.linspace(0, len(others) - 1, min(PROBE_FRAMES, len(others))).round().astype(int)
-    located = _located(contents, built, everything, [others[i] for i in spread])
+    localizer = Localizer(contents.empty().with_scene(built.scene))
+    located = _located(localizer, [others[i] for i in spread])
     probes = [others[i] for i, pose in zip(spread, located, strict=True) if pose is not None]
     reference = [pose for pose in located if pose is not None]
     unit = built.scene.frame.unit
@@ -48,7 +49,7 @@ def fewest_keyframes(
     for step, size in enumerate(size for size in sizes if size < len(poses)):
         on_progress("selecting keyframes", step + 1, len(sizes))
         selected = spread_poses(poses, size)
-        poses_of_few = _located(contents, built, selected, probes)
+        poses_of_few = _located(localizer.only(0, selected), probes)
         good = [_close(*pair, unit) for pair in zip(poses_of_few, reference, strict=True)]
         if good and sum(good) >= LEAST_LOCATED * len(probes):
             everything = selected
@@ -57,14 +58,7 @@ def fewest_keyframes(
     return everything
 
 
-def _located(
-    contents: MapContents,
-    built: BuiltMap,
-    selected: NDArray[np.int64],
-    frames: Sequence[Frame],
-) -> list[SE3 | None]:
-    scene = built.take(selected).scene
-    localizer = Localizer(MapContents(contents.encoder, contents.short_side, [scene]))
+def _located(localizer: Localizer, frames: Sequence[Frame]) -> list[SE3 | None]:
     return [localizer.localize(f.read_image(), f.camera).base_from_camera for f in frames]
 
 

@@ -8,6 +8,7 @@ accepted where that is below the rate of false accepts.
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -33,10 +34,14 @@ APART_SIGMAS, APART_M, APART_RAD = 5.0, 0.01, np.deg2rad(1.0)
 
 def support(hypothesis: Hypothesis) -> float:
     """Support of a pose, see the top of this file; 0 without inliers."""
-    if not hypothesis.inliers:
+    return _improbability(hypothesis.inliers, hypothesis.expected)
+
+
+@lru_cache(maxsize=64)  # one image asks for that of its poses again and again
+def _improbability(inliers: int, expected: int) -> float:
+    if not inliers:
         return 0.0
-    k, n = hypothesis.inliers / SAME_SURFACE, hypothesis.expected / SAME_SURFACE
-    a, b = CHANCE
+    k, n, (a, b) = inliers / SAME_SURFACE, expected / SAME_SURFACE, CHANCE
     more = np.arange(k, n - 1e-6)
     # Logarithms of the probabilities of k, k + 1, ... n inliers, relative to that of k.
     steps = np.log((n - more) / (more + 1) * (more + a) / (n - more - 1 + b))

@@ -46,6 +46,8 @@ from evercal.mapping.store import MapStore
 from evercal.processes import one_product_thread
 from evercal.recordings.images import as_rgb
 
+_NONE = np.zeros((0, 0, 0), np.float32)
+
 
 class Localizer:
     """Locates images in the scenes of a map."""
@@ -104,28 +106,27 @@ class Localizer:
     def _located(self, image: np.ndarray, camera: Camera | None) -> tuple[PoseEstimate, Hypothesis]:
         began, contents = time.perf_counter(), self.contents
         cameras = cameras_in_scenes(camera, image, contents.scenes)
-        query = Query(
-            image,
-            contents.encoder.encode(image, contents.short_side),
-            self.options.patches_short_side,
-            tuple(prior_of(camera, image, scene) for scene in contents.scenes),
-        )
+        query = self.query(image, camera, contents.encoder.encode(image, contents.short_side))
         best, rival = self._best_hypothesis(query, cameras), None
-        if self.accepts(best):
+        if accepted(best):
             best, rival = settled(self, query, best, cameras[best.scene])
         milliseconds = 1000 * (time.perf_counter() - began)
         scene, size = contents.scenes[best.scene], query.image.shape[:2]
         return answer(best, scene, size, milliseconds, rival), best
+
+    def query(
+        self, image: np.ndarray, camera: Camera | None, features: NDArray[np.float32] = _NONE
+    ) -> Query:
+        """An image to be located, of the stated camera; alignment alone needs no features."""
+        priors = tuple(prior_of(camera, image, scene) for scene in self.contents.scenes)
+        return Query(image, features, self.options.patches_short_side, priors)
 
     def from_pose(
         self, image: np.ndarray, camera: Camera, scene: int, start: SE3
     ) -> PoseEstimate | None:
         """The answer of an alignment that begins at a pose map_from_camera in one scene."""
         [at] = cameras_in_scenes(camera, image, self.contents.scenes[scene : scene + 1])
-        priors = tuple(prior_of(camera, image, scene) for scene in self.contents.scenes)
-        query = Query(
-            image, np.zeros((0, 0, 0), np.float32), self.options.patches_short_side, priors
-        )
+        query = self.query(image, camera)
         seen = self._bank.seen(scene, start, at)[: self.options.keyframes]
         found = self.aligned(query, Candidate(scene, seen), at, start, np.zeros(INTRINSICS))
         return found and answer(found, self.contents.scenes[scene], image.shape[:2], 0.0)
@@ -135,10 +136,6 @@ class Localizer:
         found = hypothesis.candidate
         return np.zeros((0, 3)) if found is None else self._bank.pattern(found.keyframes)
 
-    def accepts(self, hypothesis: Hypothesis, times: float = 1.0) -> bool:
-        """Whether a pose has `times` the required support."""
-        return accepted(hypothesis, times)
-
     def _best_hypothesis(self, query: Query, cameras: Sequence[Camera]) -> Hypothesis:
         """The pose with the most support, from as few attempts as it takes."""
         best = Hypothesis(0)
@@ -146,7 +143,7 @@ class Localizer:
             best = max(best, self._tried(query, attempt, cameras), key=order)
             few = best.pnp_inliers < self.options.aligned_inliers
             # A pose that is barely accepted may be beaten in the next attempt.
-            if self.accepts(best, self.options.immediate) or (number and few):
+            if accepted(best, self.options.immediate) or (number and few):
                 break
             if few:  # turned, or of another room
                 query = self._matcher.upright(query)
@@ -158,7 +155,7 @@ class Localizer:
         for candidate in self._matcher.candidates(query, attempt):
             trial = self.hypothesis(query, candidate, cameras[candidate.scene])
             best = max(best, trial, key=order)
-            if self.accepts(best, self.options.immediate):
+            if accepted(best, self.options.immediate):
                 break
         return best
 
@@ -204,7 +201,7 @@ class Localizer:
         self, query: Query, candidate: Candidate, camera: Camera, best: Hypothesis
     ) -> Hypothesis:
         """The pose by the keyframes that see most of its view, while that raises little support."""
-        while best.refined and not self.accepts(best, self.options.immediate):
+        while best.refined and not accepted(best, self.options.immediate):
             pose, change = best.refined.pose.pose, best.refined.change
             seen = self._bank.seen(candidate.scene, pose, best.refined.camera)
             candidate = candidate._replace(keyframes=seen[: self.options.keyframes])

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from evercal.geometry import SE3, Camera
-from evercal.localization.acceptance import FULL_SUPPORT, differ, support
+from evercal.localization.acceptance import FULL_SUPPORT, accepted, differ, support
 from evercal.localization.intrinsics import FOCAL_FACTORS, NOT_STATED, UNKNOWN, zoomed
 from evercal.localization.pnp import solve_pnp
 from evercal.localization.query import Hypothesis, Query
@@ -31,7 +31,7 @@ def settled(
         rivals = [
             rival
             for rival in _rivals(localizer, query, front, camera)
-            if rival.refined and rival.pose and localizer.accepts(rival)
+            if rival.refined and rival.pose and accepted(rival)
         ]
         seen += rivals
         higher = max(rivals, key=support, default=front)

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.localization.acceptance import answer
+from evercal.localization.acceptance import accepted, answer
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.intrinsics import cameras_in_scenes, prior_of
+from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.localization.localizer import Localizer
-from evercal.localization.query import Candidate, Hypothesis, Query
+from evercal.localization.query import Candidate, Hypothesis
 from evercal.recordings.images import as_rgb
 
 TrackState = Literal["tracking", "relocalized", "lost"]
@@ -188,9 +188,7 @@ class Tracker:
         settled = self.options.settled if adopted else 1.0
         localizer, contents = self.localizer, self.localizer.contents
         cameras = cameras_in_scenes(self.camera, image, contents.scenes)
-        priors = tuple(prior_of(self.camera, image, scene) for scene in contents.scenes)
-        nothing = np.zeros((0, 0, 0), np.float32)
-        query = Query(image, nothing, localizer.options.patches_short_side, priors)
+        query = localizer.query(image, self.camera)
         candidate = Candidate(self._scene, self._next_keyframes(predicted))
         change = np.zeros(5) if self._change is None else self._change
         for coarse in (True,) if adopted else (False, True):
@@ -252,7 +250,7 @@ class Tracker:
         return first + order[: self.options.keyframes]
 
     def _trusted(self, found: Hypothesis, predicted: SE3, times: float) -> bool:
-        if found.pose is None or not self.localizer.accepts(found, times):
+        if found.pose is None or not accepted(found, times):
             return False
         metres, radians = pose_distance(found.pose.pose, predicted)
         near = float(metres) * self._metres_per_unit < self.options.reach_m
@@ -264,7 +262,7 @@ class Tracker:
         self._scene = found.scene
         self._change = None if found.refined is None else found.refined.change
         settled = settled or bool(self._poses)
-        settled = settled or self.localizer.accepts(found, self.options.settled)
+        settled = settled or accepted(found, self.options.settled)
         self._poses = [*self._poses[-1:], (stamp, found.pose.pose)] if settled else []
 
     def _smooth(self, estimate: PoseEstimate, stamp: float) -> tuple[SE3 | None, bool]:
