@@ -73,7 +73,10 @@ class Matcher:
         return float(np.max(best, 0).mean())
 
     def matches(self, query: Query, candidate: Candidate, camera: Camera) -> Matches:
-        """Match patches to the points of a scene's keyframes; camera at the working size."""
+        """Match patches to the points of a scene's keyframes, the most similar first.
+
+        The camera is that at the working size.
+        """
         stride = candidate.stride if self._options.align else 1
         patches, pixels = strided_patches(query, camera, self._bank.encoder.stride, stride)
         found = [self._most_similar(query, stride, int(k)) for k in candidate.keyframes]
@@ -84,7 +87,8 @@ class Matcher:
         for number, keyframe in enumerate(candidate.keyframes):
             chosen = best == number
             points[chosen] = self._bank.load(int(keyframe)).cells.points_m[nearest[number, chosen]]
-        return Matches(pixels, points)
+        order = np.argsort(-height[:, with_ray].max(0), kind="stable")
+        return Matches(pixels[order], points[order])
 
     def _most_similar(
         self, query: Query, stride: int, keyframe: int

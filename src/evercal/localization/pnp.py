@@ -24,6 +24,9 @@ class PnpOptions:
     """Iterations that always run."""
     wanted: int = 12
     """So many inliers are missed in one of a thousand images."""
+    ranked: bool = False
+    """The most reliable matches come first, and samples are drawn among them first (PROSAC; Chum
+    and Matas, 2005)."""
 
 
 class PnpResult(NamedTuple):
@@ -56,6 +59,7 @@ def solve_pnp(
         "min_iterations": options.min_iterations,
         # The default multiplies the number of iterations that the inlier ratio asks for by three.
         "dyn_num_trials_mult": 1.0,
+        "progressive_sampling": options.ranked,
     }
     pose, info = poselib.estimate_absolute_pose(pixels, points_m, pinhole, ransac, {})
     inliers = np.asarray(info["inliers"], bool)

@@ -56,7 +56,7 @@ class LocalizeOptions:
     """Patches of every n-th row and column vote for the proposed keyframes."""
     votes: float = 0.5
     """Scenes with a smaller share of the best scene's votes are not tried."""
-    pnp: PnpOptions = field(default_factory=PnpOptions)
+    pnp: PnpOptions = PnpOptions(ranked=True)
     """RANSAC settings of the first pose."""
     align: bool = True
     """Refine the first pose by alignment of landmarks. False returns the PnP pose."""
