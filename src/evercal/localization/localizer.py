@@ -138,14 +138,17 @@ class Localizer:
 
     def _best_hypothesis(self, query: Query, cameras: Sequence[Camera]) -> Hypothesis:
         """The pose with the most support, from as few attempts as it takes."""
-        best = Hypothesis(0)
+        best, few = Hypothesis(0), False
         for number, attempt in enumerate(self.options.attempts):
+            if number == 2 and few:
+                attempt = self.options.magnified
+                query = self._matcher.magnified(query, attempt.scale)
             best = max(best, self._tried(query, attempt, cameras), key=order)
             few = best.pnp_inliers < self.options.aligned_inliers
             # A pose that is barely accepted may be beaten in the next attempt.
-            if accepted(best, self.options.immediate) or (number and few):
+            if accepted(best, self.options.immediate):
                 break
-            if few:  # turned, or of another room
+            if few and not number:  # turned, or of another room
                 query = self._matcher.upright(query)
         return best
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.features.views import cell_centres, ideal_cell_pixels, working_grey
-from evercal.geometry import Camera
+from evercal.geometry import Camera, resize_pixels
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.query import Attempt, Candidate, LocalizeOptions, Matches, Query
 
@@ -62,6 +62,11 @@ class Matcher:
         features = encoder(turned(grey, turns))
         return replace(query, features=features, turns=turns, similar={})
 
+    def magnified(self, query: Query, scale: float) -> Query:
+        """The image encoded at another size."""
+        grey = turned(working_grey(query.image, round(scale * self._short_side)), query.turns)
+        return replace(query, features=self._bank.encoder(grey), scale=scale, similar={})
+
     def _similarity(self, features: NDArray[np.float32]) -> float:
         """Mean similarity of every second row and column of features (rows, columns, channels).
 
@@ -78,7 +83,9 @@ class Matcher:
         The camera is that at the working size.
         """
         stride = candidate.stride if self._options.align else 1
-        patches, pixels = strided_patches(query, camera, self._bank.encoder.stride, stride)
+        larger = camera.short_side_resized(round(query.scale * self._short_side))
+        patches, pixels = strided_patches(query, larger, self._bank.encoder.stride, stride)
+        pixels = resize_pixels(pixels, 1 / query.scale)
         found = [self._most_similar(query, stride, int(k)) for k in candidate.keyframes]
         nearest, height = (np.array(values) for values in zip(*found, strict=True))
         with_ray = np.isin(_grid(query, stride), patches)

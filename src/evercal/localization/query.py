@@ -23,6 +23,8 @@ class Attempt(NamedTuple):
     """Keyframes that the global descriptor proposes."""
     stride: int
     """Matches every n-th row and column of patches."""
+    scale: float = 1.0
+    """Of the encoded image, relative to the encoder's working size."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,8 @@ class LocalizeOptions:
     """Scenes that are tried per image, at most."""
     attempts: tuple[Attempt, ...] = (Attempt(12, 4), Attempt(12, 2), Attempt(48, 1))
     """Until a pose is final. The third is for images with enough inliers after the second."""
+    magnified: Attempt = Attempt(12, 3, 1.6)
+    """The third attempt of other images: the scene may be farther away than in the keyframes."""
     middle_px: int = 144
     """Side of the middle of an image that its quarter turn is judged by, at working size."""
     clear_turn: float = 0.015
@@ -84,6 +88,8 @@ class Query:
         default_factory=dict
     )
     """Most similar cells of keyframes, see `Matcher`."""
+    scale: float = 1.0
+    """Of the encoded image, relative to the encoder's working size."""
     turns: int = 0
     """Quarter turns clockwise of the image before it was encoded."""
 
