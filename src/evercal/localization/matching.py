@@ -64,8 +64,8 @@ class Matcher:
 
     def magnified(self, query: Query, scale: float) -> Query:
         """The image encoded at another size."""
-        grey = turned(working_grey(query.image, round(scale * self._short_side)), query.turns)
-        return replace(query, features=self._bank.encoder(grey), scale=scale, similar={})
+        features = self._bank.encoder.encode(query.image, round(scale * self._short_side))
+        return replace(query, features=features, scale=scale, turns=0, similar={})
 
     def _similarity(self, features: NDArray[np.float32]) -> float:
         """Mean similarity of every second row and column of features (rows, columns, channels).
