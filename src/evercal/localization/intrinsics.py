@@ -113,7 +113,7 @@ UNKNOWN = IntrinsicsPrior(focal=0.3, centre=0.05, k1=0.1, k2=0.05)
 """Any camera; the image may be cropped."""
 FREE = IntrinsicsPrior(focal=1.0, centre=0.3, k1=0.3, k2=0.3)
 """Wide enough to test the other priors."""
-FOCAL_FACTORS = (0.7, 0.84, 1.2, 1.44)
+FOCAL_FACTORS = (0.58, 0.7, 0.84, 1.2, 1.44)
 """Focal lengths that are tried where nothing is known, relative to a guess, beside it."""
 
 
