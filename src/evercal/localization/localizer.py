@@ -177,12 +177,14 @@ class Localizer:
         # No camera is stated, and the image was not located at once.
         hard = prior is NOT_STATED and candidate.stride < self.options.attempts[0].stride
         hard &= not len(self._bank.pattern(candidate.keyframes))
+        ransac = self.options.pnp
         for factor in (1.0, *FOCAL_FACTORS):
-            pnp = solve_pnp(*matches, small.zoomed(factor), self.options.pnp)
+            pnp = solve_pnp(*matches, small.zoomed(factor), ransac)
             poses += [(pnp, factor)] if pnp else []
             few = not pnp or pnp.inliers.sum() < self.options.aligned_inliers
             if factor == 1 and prior is not UNKNOWN and (few or not hard):
                 break
+            ransac = replace(ransac, max_iterations=self.options.pnp.max_iterations // 2)
         if not poses:
             return Hypothesis(candidate.scene)
         pnp, factor = max(poses, key=lambda pose: pose[0].inliers.sum())
