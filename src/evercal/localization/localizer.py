@@ -140,8 +140,9 @@ class Localizer:
         """The pose with the most support, from as few attempts as it takes."""
         best, few = Hypothesis(0), False
         for number, attempt in enumerate(self.options.attempts):
-            if number == 2 and few:
-                attempt = self.options.magnified
+            if number > 1 and few == (attempt.scale == 1):
+                continue
+            if attempt.scale != 1:
                 query = self._matcher.magnified(query, attempt.scale)
             best = max(best, self._tried(query, attempt, cameras), key=order)
             few = best.pnp_inliers < self.options.aligned_inliers

@@ -33,10 +33,14 @@ class LocalizeOptions:
 
     candidates: int = 2
     """Scenes that are tried per image, at most."""
-    attempts: tuple[Attempt, ...] = (Attempt(12, 4), Attempt(12, 2), Attempt(48, 1))
-    """Until a pose is final. The third is for images with enough inliers after the second."""
-    magnified: Attempt = Attempt(12, 3, 1.6)
-    """The third attempt of other images: the scene may be farther away than in the keyframes."""
+    attempts: tuple[Attempt, ...] = (
+        Attempt(12, 4),
+        Attempt(12, 2),
+        Attempt(48, 1),
+        Attempt(12, 3, 1.6),
+    )
+    """Until a pose is final. The third is for images with enough inliers after the second, the
+    magnified one for the others: the scene may be farther away than in the keyframes."""
     middle_px: int = 144
     """Side of the middle of an image that its quarter turn is judged by, at working size."""
     clear_turn: float = 0.015
@@ -60,7 +64,7 @@ class LocalizeOptions:
     """Patches of every n-th row and column vote for the proposed keyframes."""
     votes: float = 0.5
     """Scenes with a smaller share of the best scene's votes are not tried."""
-    pnp: PnpOptions = PnpOptions(ranked=True)
+    pnp: PnpOptions = field(default_factory=lambda: PnpOptions(ranked=True))
     """RANSAC settings of the first pose."""
     align: bool = True
     """Refine the first pose by alignment of landmarks. False returns the PnP pose."""
