@@ -54,6 +54,20 @@ def test_half_of_the_points_are_outliers(seed: int) -> None:
     assert result.inliers[~wrong].all()
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_few_right_matches_among_the_first_are_sampled(seed: int) -> None:
+    truth, pixels, points = case(seed, 1200)
+    rng = np.random.default_rng(seed)
+    right = rng.choice(60, 18, replace=False)
+    wrong = np.setdiff1d(np.arange(1200), right)
+    points[wrong] = rng.normal(0, 2, (len(wrong), 3))
+    far = []
+    for ranked in (True, False):
+        result = solve_pnp(pixels, points, CAMERA, PnpOptions(ranked=ranked))
+        far.append(np.inf if result is None else pose_distance(result.pose, truth)[0])
+    assert far[0] < 0.1 < far[1]
+
+
 @pytest.mark.parametrize("count", [0, 3, 5])
 def test_too_few_points_give_none(count: int) -> None:
     _, pixels, points = case(0, count)
