@@ -58,7 +58,7 @@ def test_half_of_the_points_are_outliers(seed: int) -> None:
 def test_few_right_matches_among_the_first_are_sampled(seed: int) -> None:
     truth, pixels, points = case(seed, 1200)
     rng = np.random.default_rng(seed)
-    right = rng.choice(60, 18, replace=False)
+    right = rng.choice(60, 30, replace=False)
     wrong = np.setdiff1d(np.arange(1200), right)
     points[wrong] = rng.normal(0, 2, (len(wrong), 3))
     far = []
