@@ -135,7 +135,6 @@ def test_an_orbit_leaves_the_distance_open_and_other_distances_close_it(mount: S
     ahead = MOUNT.apply([0, 0, 0.5]) - (0 if mount is None else MOUNT.translation_m)
     assert abs(ahead @ found.direction) > 0.99 * np.linalg.norm(ahead)
     assert found.sigma_mm > 5 * found.across_mm
-    assert found.scale_percent > 5
     assert found.then_mm < 0.5 * found.sigma_mm
     assert found.motion in found.sentence()
     assert f"{2 * found.then_mm:.1f} mm" in found.sentence(2 * found.sigma_mm)

@@ -107,8 +107,6 @@ class OpenPosition:
     """Further images that reduce it most."""
     then_mm: float
     """Largest expected standard deviation with them."""
-    scale_percent: float
-    """Expected standard deviation of the scale of the scene."""
 
     def sentence(self, stated_mm: float | None = None) -> str:
         """What to do; by default with the expected standard deviation, or with a stated one."""
@@ -155,8 +153,8 @@ def open_position(recorded: SE3, gripper_from_camera: SE3 | None = None) -> Open
     best = min(then, key=then.__getitem__)
     if sigmas[2] < _OPEN * then[best]:
         return None
-    (x, y, z), percent = along.tolist(), 100 * float(np.sqrt(covariance[12, 12]))
-    return OpenPosition((x, y, z), float(sigmas[2]), float(sigmas[1]), best, then[best], percent)
+    x, y, z = along.tolist()
+    return OpenPosition((x, y, z), float(sigmas[2]), float(sigmas[1]), best, then[best])
 
 
 def _known(recorded: SE3, gripper_from_camera: SE3 | None, scene_m: Array) -> Array:
