@@ -146,7 +146,7 @@ def _robust_translation(
 ) -> tuple[Array, Array]:
     """The translation (3,) and the angles (n,) between observed and predicted directions."""
     rotation = moved.rotation_matrix() - np.eye(3)
-    translation = np.zeros(3)
+    translation, angle = np.zeros(3), np.zeros(len(towards))
     for _ in range(30):
         predicted = rotation @ translation + moved.translation_m
         length = np.maximum(np.linalg.norm(predicted, axis=1), 1e-6)[:, None]
