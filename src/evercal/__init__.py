@@ -11,9 +11,6 @@ if TYPE_CHECKING:
     from evercal.calibration.calibration import read_calibration as read_calibration
     from evercal.calibration.drift import Shift as Shift
     from evercal.calibration.next_views import next_views as next_views
-    from evercal.calibration.next_views import (
-        next_views_of_fixed_camera as next_views_of_fixed_camera,
-    )
     from evercal.calibration.pose_pairs.pairs import PosePairs as PosePairs
     from evercal.calibration.pose_pairs.solve import solve as solve
     from evercal.errors import InputError as InputError
@@ -55,7 +52,6 @@ _PUBLIC = {
     "UncertainPose": "evercal.geometry",
     "load_recording": "evercal.recordings",
     "next_views": "evercal.calibration.next_views",
-    "next_views_of_fixed_camera": "evercal.calibration.next_views",
     "read_calibration": "evercal.calibration.calibration",
     "read_image": "evercal.recordings",
     "solve": "evercal.calibration.pose_pairs.solve",

@@ -60,6 +60,17 @@ def test_wrong_pairs_are_rejected(seed: int) -> None:
     assert start.pairs <= start.of_pairs - 15
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_camera_that_orbits_one_place_does_not_end_there(seed: int) -> None:
+    """In that place the camera would stand still, and errors of all directions would vanish."""
+    rng = np.random.default_rng(seed)
+    turns = SE3.exp(np.pad(rng.normal(0, 0.25, (25, 3)), ((0, 0), (3, 0))))
+    poses = turns @ SE3.from_translation((0.0, 0.0, -0.6)) @ TRUTH.inverse()
+    noisy = poses @ SE3.exp(rng.normal(0, np.repeat([3e-4, 3e-4], 3), (25, 6)))
+    start = solve_motions(noisy, motions(poses, TRUTH, 0.01))
+    assert pose_distance(start.gripper_from_camera, TRUTH)[0] < 0.2
+
+
 def test_inverted_poses_and_too_few_pairs_are_refused() -> None:
     poses = grippers(20, 0)
     with pytest.raises(InputError, match=r"agree in only .*not the inverse"):

@@ -14,7 +14,7 @@ import numpy as np
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
 from evercal.calibration.eye_in_hand_start import HandEyeStart, hand_eye_start
 from evercal.calibration.located import length_mm_deg
-from evercal.calibration.next_views import OpenPosition, open_position
+from evercal.calibration.next_views import open_position
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
@@ -26,9 +26,6 @@ from evercal.recordings.held_out import require_frames
 
 MOST_FOCAL_PERCENT, MOST_POSE_SIGMA_MM = 1.0, 5.0
 """Larger corrections indicate systematic errors, which the covariance does not contain."""
-MOST_SCALE_PERCENT = 5.0
-"""Expected standard deviation of the scene's scale, by the motions alone, above which the estimate
-may be anywhere: an exact orbit (15 %) ended 586 mm off at 10 mm stated; a KUKA has 1 %."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +131,7 @@ def hand_eye_report(
         start_deg=start_deg,
         given_mm=from_given[0],
         given_deg=from_given[1],
-        warnings=_warnings(built.adjusted, open_position(stated_grippers(frames))),
+        warnings=_warnings(built.adjusted),
         advice=left.sentence(widest_mm) if left else "",
         error_terms=(
             ErrorTerm.of("noise of images and gripper poses", correction.by_noise),
@@ -156,13 +153,8 @@ def _use(frame: Frame, built: BuiltMap) -> ImageUse | None:
     return None if residual is None else ImageUse(name, True, "", *length_mm_deg(residual))
 
 
-def _warnings(adjusted: Adjusted, left: OpenPosition | None) -> tuple[str, ...]:
+def _warnings(adjusted: Adjusted) -> tuple[str, ...]:
     warnings = []
-    if left is not None and left.scale_percent > MOST_SCALE_PERCENT:
-        warnings.append(
-            "the arm orbits one place so exactly that the distance of the scene is only known to"
-            f" {left.scale_percent:.0f} %: add images {left.motion}"
-        )
     if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
         warnings.append(
             f"the images suggest a focal length {adjusted.focal_percent:+.1f} % from the stated"

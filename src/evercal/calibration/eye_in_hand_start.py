@@ -3,11 +3,13 @@
 Features of similar frames are matched. An essential matrix gives the rotation of every pair and the
 direction of its translation. Let A be the motion of the gripper, (R, d) that of the camera, and
 X = gripper_from_camera. A X = X B gives the rotation of X from the axes of rotation (Park and
-Martin, IEEE T-RA 1994). The length l of B's translation is unknown, so its translation follows from
+Martin, IEEE T-RA 1994). The length of B's translation is unknown, so t_X follows from directions:
 
-    (R_A - I) t_X + t_A = l R_X d,   so   [R_X d]x ((R_A - I) t_X + t_A) = 0,
+    p / |p| = R_X d,   p = (R_A - I) t_X + t_A.
 
-which is linear in t_X. It can be off by centimetres; bundle adjustment converges from there.
+Cross products p x R_X d are linear in t_X, but vanish where t_X lets the camera stand still: before
+one place, they end there. The estimate can be off by centimetres; bundle adjustment converges from
+there.
 """
 
 from collections.abc import Sequence
@@ -40,6 +42,8 @@ ANGLE_DEG, ROTATION_DEG, DIRECTION_DEG = 3.0, 5.0, 10.0
 """Largest difference of the rotation angles, the rotations and the directions of a pair."""
 LEAST_ROTATION_DEG, LEAST_PAIRS = 5.7, 6
 """Root mean square angle between frames about each of two axes, and pairs that must agree."""
+PRIOR_M = 0.2
+"""Standard deviation of the position of the camera before any image."""
 ENCODED_SIDE = 240
 """Short side of the images that are encoded, pixels."""
 LEAST_SHARE = 0.1
@@ -141,22 +145,21 @@ def _robust_translation(
     moved: SE3, towards: Array, agree: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
     """The translation (3,) and the angles (n,) between observed and predicted directions."""
-    across = np.cross(towards[:, None], np.eye(3)).transpose(0, 2, 1)
     rotation = moved.rotation_matrix() - np.eye(3)
-    rows, right = across @ rotation, -np.einsum("nij,nj->ni", across, moved.translation_m)
-    weight = agree.astype(float)
-    translation, angle = np.zeros(3), weight
-    for _ in range(50):
-        information = np.einsum("n,nji,njk->ik", weight, rows, rows)
-        translation = np.linalg.solve(information, np.einsum("n,nji,nj->i", weight, rows, right))
+    translation, angle = np.zeros(3), np.zeros(len(towards))
+    for _ in range(30):
         predicted = rotation @ translation + moved.translation_m
-        length = np.linalg.norm(predicted, axis=1)
-        angle = np.arctan2(
-            np.linalg.norm(np.cross(towards, predicted), axis=1), (towards * predicted).sum(1)
-        )
+        length = np.maximum(np.linalg.norm(predicted, axis=1), 1e-6)[:, None]
+        ahead = predicted / length
+        off = ahead - towards
+        angle = np.linalg.norm(off, axis=1)
         spread = max(1.48 * float(np.median(angle[agree])), 1e-4)
-        # Rows are sines times the length of the motion; dividing by it weights all pairs equally.
-        weight = agree / (1 + (angle / spread) ** 2) ** 2 / np.maximum(length, 0.01) ** 2
+        weight = agree / (1 + (angle / spread) ** 2) ** 2 / spread**2
+        along = np.einsum("ni,nij->nj", ahead, rotation)
+        rows = (rotation - ahead[:, :, None] * along[:, None]) / length[..., None]
+        information = np.einsum("n,nji,njk->ik", weight, rows, rows) + np.eye(3) / PRIOR_M**2
+        slope = np.einsum("n,nji,nj->i", weight, rows, off) + translation / PRIOR_M**2
+        translation -= np.linalg.solve(information, slope)
     return translation, angle
 
 
