@@ -41,7 +41,7 @@ _REACHED = 0.05 * 7.815
 """Probability of another camera at which the 95 % ellipsoid (chi-squared) reaches its pose."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class IntrinsicsPrior:
     """Standard deviations of a camera's intrinsics about their stated values."""
 
@@ -101,9 +101,10 @@ class IntrinsicsPrior:
         return doubt, UNKNOWN.tested(camera, change, measured)
 
 
-OWN = IntrinsicsPrior(focal=2e-4, centre=3e-4, k1=1e-3, k2=1e-3, other_camera=0.01)
-"""The camera that recorded the scene: its error is in the landmarks, too, and cancels."""
-NOT_STATED = replace(OWN, other_camera=0.3)
+OWN = IntrinsicsPrior(focal=2e-4, centre=3e-4, k1=1e-3, k2=1e-3, other_camera=0.5)
+"""The camera that recorded the scene: its error is in the landmarks, too, and cancels. Whether it
+is that camera or another one of the model is even, also where it is stated: people state it."""
+NOT_STATED = replace(OWN)
 """No camera is stated, and the image has the size of the recording."""
 SAME_MODEL = IntrinsicsPrior(focal=0.007, centre=0.007, k1=0.01, k2=0.01)
 """Another camera of the same model and image size."""
