@@ -231,7 +231,7 @@ def _slipped(what: str, squares_m: tuple[float, ...], seed: int) -> Case:
     )
     pairs, corners = _pairs(made, seed)
     x = made.parent_from_camera
-    pattern = rf"the {what} looks moved .* before {pairs.names[row]},"
+    pattern = rf"the ({what}|camera or board) looks moved .* before {pairs.names[row]},"
     alone = [0] if row == 1 else [row] if row == len(late) - 1 else []
     if alone:  # an outlier
         pattern += f"|left out: {pairs.names[alone[0]]};"

@@ -23,6 +23,8 @@ _GROSS = 30.0
 _FALSE_ALARM = 1e-4
 """Probability of a step in a recording with independent errors. Slow errors of an arm look alike
 and mean the same: the poses of another hour would give another answer."""
+_CLEARLY = 9.2
+"""Twice the logarithm of the likelihood ratio, 100, at which the camera moved or the board."""
 
 
 class Slip(NamedTuple):
@@ -30,8 +32,8 @@ class Slip(NamedTuple):
 
     row: int
     """First row after the step, an index of the pose pairs."""
-    of_camera: bool
-    """Whether `parent_from_camera` changed, else `fixed_from_board`."""
+    what: str
+    """`camera` if `parent_from_camera` changed, `board` if `fixed_from_board` did, or either."""
     metres: float
     radians: float
     spread: Array
@@ -50,19 +52,23 @@ def find_slip(equation: PoseEquation, fit: HandEyeFit, rows: NDArray[np.int64]) 
     every = np.ones(len(order), dtype=bool)
     found = [s for use in (every, fit.inliers[order]) for s in _steps(equation, fit, order, use)]
     before = min(cost for cost, k, *_ in found if k == 0)
-    after, k, first, change, covariance = min(found, key=lambda step: step[0])
+    kinds = [min((s for s in found if s[2] == first), key=lambda s: s[0]) for first in (0, 6)]
+    after, k, first, change, covariance = min(kinds, key=lambda s: s[0])
     # All other unknowns have priors.
     freedom = 6 * len(order) - 18
     ratio = (before / after - 1) * freedom / 6
     if freedom < 6 or 2 * len(order) * f.sf(ratio, 6, freedom) > _FALSE_ALARM:
         return None
+    what = "camera or board"
+    if abs(freedom * np.log(kinds[0][0] / kinds[1][0])) > _CLEARLY:
+        what = "board" if first else "camera"
     metres, radians = np.linalg.norm(change[-6:].reshape(2, 3), axis=1)
     second = np.outer(change, change) + covariance
     before_it = np.eye(equation.unknowns, len(change))
     after_it = before_it.copy()
     after_it[first : first + 6, -6:] = np.eye(6)
     spread = (before_it @ second @ before_it.T + after_it @ second @ after_it.T) / 2
-    return Slip(int(rows[order[k]]), first == 0, float(metres), float(radians), spread)
+    return Slip(int(rows[order[k]]), what, float(metres), float(radians), spread)
 
 
 def _steps(
