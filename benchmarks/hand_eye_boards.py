@@ -7,6 +7,7 @@ calibrated from them first, as most people do.
 
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 from tyro.conf import arg
 
-from benchmarks.hand_eye import pose, rotations
-from benchmarks.rows import save
+from benchmarks.hand_eye import error, pose, rotations
+from benchmarks.rows import Row, once, save
 from evercal.calibration.boards.corners import (
     BoardView,
     board_pose,
@@ -28,7 +29,7 @@ from evercal.calibration.boards.corners import (
 )
 from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
-from evercal.calibration.pose_pairs.solve import solve
+from evercal.calibration.pose_pairs.solve import solve, solve_pairs
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3, Camera, pose_distance
@@ -67,6 +68,15 @@ class BoardSetting:
     columns: int = 9
     rows: int = 6
     square_m: float = 0.025
+    bend_mm: float = 0.0
+    """Departure of the board from a plane at 150 mm from its middle, where it bends most."""
+    dents_mm: float = 0.0
+    """Height of two corners of the board, which are bent over 60 mm."""
+
+    @property
+    def size(self) -> float:
+        """Size in that of a board of 9x6 corners and 25 mm; distances grow with it."""
+        return self.square_m * max((self.columns - 1) / 0.2, (self.rows - 1) / 0.125)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,11 +110,17 @@ def project(points: Array, camera_from_board: SE3, camera: Camera) -> Array:
     return cv2.projectPoints(points, *args)[0].reshape(-1, 2)
 
 
-def record(setting: BoardSetting, seed: int) -> BoardRecording:
-    """Draw one recording."""
+def record(setting: BoardSetting, seed: int, session: int = 0) -> BoardRecording:
+    """Draw one recording; other sessions share the camera, its place and the board."""
     rng = np.random.default_rng(seed)
     camera = _camera(rng)
-    parent_from_camera, fixed_from_board = _places(setting.mount, rng)
+    parent_from_camera, fixed_from_board = _places(setting, rng)
+    true, stated = board_points(setting, stated=False), board_points(setting)
+    if setting.bend_mm or setting.dents_mm:
+        true = _bent(true, setting, rng)
+    if session:
+        rng = np.random.default_rng([seed, session])
+        fixed_from_board = _places(setting, rng)[1]
     camera_from_board = _board_poses(setting, camera, rng)
     fixed_from_parent = (
         fixed_from_board @ camera_from_board.inverse() @ parent_from_camera.inverse()
@@ -116,7 +132,6 @@ def record(setting: BoardSetting, seed: int) -> BoardRecording:
             return rng.standard_t(setting.tails, shape)
         return rng.normal(size=shape)
 
-    true, stated = board_points(setting, stated=False), board_points(setting)
     views = tuple(
         BoardView(stated, project(true, p, camera) + setting.noise_px * noise(len(true), 2))
         for p in camera_from_board
@@ -150,12 +165,25 @@ def _camera(rng: np.random.Generator) -> Camera:
     return Camera(640, 480, focal, focal * ratio, 319.5 + dx, 239.5 + dy, lens)
 
 
-def _places(mount: Mount, rng: np.random.Generator) -> tuple[SE3, SE3]:
+def _bent(points: Array, setting: BoardSetting, rng: np.random.Generator) -> Array:
+    """Bend a board in any direction, and across it by up to half as much; dent two corners."""
+    turn, angle = points.max(0) / 2, rng.uniform(0, np.pi)
+    axes = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    curved = (((points - turn)[:, :2] @ axes) / 0.15) ** 2 @ [1, rng.uniform(-0.5, 0.5)]
+    height = setting.bend_mm * rng.choice([-1, 1]) * curved
+    for corner in rng.choice(4, 2, replace=False):
+        place = points.max(0) * (corner % 2, corner // 2, 0)
+        near = np.clip(1 - np.linalg.norm(points - place, axis=1) / 0.06, 0, None)
+        height += setting.dents_mm * rng.choice([-1, 1]) * near
+    return points + 1e-3 * np.outer(height, [0, 0, 1])
+
+
+def _places(setting: BoardSetting, rng: np.random.Generator) -> tuple[SE3, SE3]:
     near = pose(Rotation.random(rng=rng), rng.uniform(-0.12, 0.12, 3))
-    if mount == "eye_in_hand":
+    if setting.mount == "eye_in_hand":
         return near, pose(Rotation.from_rotvec(rng.normal(0, 0.3, 3)), np.array([0.5, 0.1, 0.02]))
     look = Rotation.from_euler("x", np.pi / 2 + 0.6) * Rotation.from_rotvec(rng.normal(0, 0.2, 3))
-    return pose(look, np.array([1.1, 0.2, 0.7])), near
+    return pose(look, max(1.0, setting.size / 3) * np.array([1.1, 0.2, 0.7])), near
 
 
 def _board_poses(setting: BoardSetting, camera: Camera, rng: np.random.Generator) -> SE3:
@@ -165,7 +193,7 @@ def _board_poses(setting: BoardSetting, camera: Camera, rng: np.random.Generator
         axis = rng.normal(size=3)
         angle = rng.uniform(0, 1.5) * np.deg2rad(setting.tilt_deg)
         turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * angle)
-        distance = rng.uniform(0.3, 0.55)
+        distance = setting.size * rng.uniform(0.3, 0.55)
         aim = np.array([*rng.uniform(-0.28, 0.28, 2) * distance, distance])
         trial = pose(turn, aim - turn.apply(points.mean(0)))
         pixels = project(points, trial, camera)
@@ -264,9 +292,43 @@ CONDITIONS: dict[str, tuple[BoardSetting, bool]] = {
     "poses, arm 0.5 mm 0.3 deg": (replace(POSES, arm_mm=0.5, arm_deg=0.3), False),
 }
 """Setting and whether corners are given."""
+BENT = BoardSetting(columns=11, rows=8, square_m=0.03, arm_mm=0.1, arm_deg=0.02)
+SESSIONS = {
+    f"two sessions, bend {bend:g} mm, dents {dents:g} mm": replace(
+        BENT, bend_mm=bend, dents_mm=dents
+    )
+    for bend, dents in ((0, 0), (0.5, 0), (1, 0), (3, 0), (0, 0.5), (0, 1), (1, 1), (3, 3))
+}
+"""Settings of two sessions of one camera before one board."""
 
 
-def measure(name: str, count: int, references: int) -> dict[str, object]:
+def measure_sessions(name: str, count: int) -> Row:
+    """Solve two sessions of one camera; compare their answers, and their intrinsics."""
+    answers, lenses, squared, mm, refused = [], [], [], [], 0
+    for seed in range(count):
+        setting = replace(SESSIONS[name], mount=("eye_in_hand", "eye_to_hand")[seed % 2])
+        drawn = [record(setting, seed, session) for session in range(2)]
+        try:
+            fits = [solve_pairs(p, setting.mount, corners=c) for p, c in map(corner_pairs, drawn)]
+        except InputError:
+            refused += 1
+            continue
+        both, truth = [fit.calibration() for fit in fits], drawn[0].parent_from_camera
+        squared += [b.uncertain_pose.squared_mahalanobis(truth) for b in both]
+        mm += [1000 * float(pose_distance(b.parent_from_child, truth)[0]) for b in both]
+        step = error(both[0].parent_from_child, both[1].parent_from_child)
+        answers.append(step @ np.linalg.solve(both[0].covariance + both[1].covariance, step))
+        change = np.diff([lens_vector(fit.camera) for fit in fits if fit.camera], axis=0)[0]
+        own = slice(12, 12 + len(change))
+        spread = sum(f.fit.factor * f.fit.covariance[own, own] for f in fits)
+        lenses.append(change @ np.linalg.solve(spread, change))
+    row: Row = {"condition": name, "trials": count, "refused": refused}
+    row |= {"median_mm": float(np.median(mm)), "p95_mm": float(np.quantile(mm, 0.95))}
+    row |= {"inside_95": share_inside(squared), "truth_d2": float(np.mean(squared))}
+    return row | {"answers_d2": float(np.mean(answers)), "lens_d2": float(np.mean(lenses))}
+
+
+def measure(name: str, count: int, references: int) -> Row:
     """Solve many recordings of one condition; the first `references` also by other solvers."""
     setting, with_corners = CONDITIONS[name]
     squared, flagged, ms, refused = [], [], [], 0
@@ -293,7 +355,7 @@ def measure(name: str, count: int, references: int) -> dict[str, object]:
                 estimates["reprojection"] = reprojection(drawn, pairs, corners, start)
         for solver, estimate in estimates.items():
             mm.setdefault(solver, []).append(1000 * float(pose_distance(estimate, truth)[0]))
-    row: dict[str, object] = {"condition": name, "trials": count, "refused": refused}
+    row: Row = {"condition": name, "trials": count, "refused": refused}
     row |= {
         "median_mm": float(np.median(mm["evercal"])),
         "p95_mm": float(np.quantile(mm["evercal"], 0.95)),
@@ -311,13 +373,18 @@ def run(
 ) -> None:
     """Simulated boards through a distorted lens that is found from the same images.
 
+    Rows of two sessions have squared Mahalanobis distances in the mean: of the truth and of the
+    other answer (6 expected), and of the other session's intrinsics (9 expected).
+
     Args:
         count: Trials of each condition.
         references: Trials that are also solved by OpenCV's solvers (OpenCV 4) and by a full
             reprojection fit; their medians are over these trials.
         out: File of the rows.
     """
-    rows: list[dict[str, object]] = []
-    for name in tqdm(CONDITIONS, unit="condition"):
-        rows.append(measure(name, count, references))
+    rows: list[Row] = []
+    for name in tqdm([*CONDITIONS, *SESSIONS], unit="condition"):
+        again = partial(measure_sessions, name, count)
+        draw = again if name in SESSIONS else partial(measure, name, count, references)
+        rows.append(once(out.with_suffix("") / f"{name}.json", draw))
     save(out, rows, {"trials": count})

@@ -47,6 +47,7 @@ def mean_row(name: str, rows: Sequence[Row]) -> Row:
 
 def once(path: Path, measure: Callable[[], Rows]) -> Rows:
     """Measure one or more rows and write them to a file, or read the file if it exists."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     if not path.exists():
         write_bytes(path, json.dumps(measure(), indent=1).encode())
     return json.loads(path.read_text())

@@ -126,7 +126,7 @@ def board_poses(
         with suppress(ValueError):
             if isinstance(view, BoardView):
                 fits[name], seen[name] = board_pose(view, camera), view
-    stray = dict(zip(seen, strays([*seen.values()], [*fits.values()]), strict=True))
+    stray = dict(zip(seen, strays([*seen.values()], [*fits.values()], camera), strict=True))
     for name, mask in stray.items():
         if mask.any():
             left_out = tuple((float(x), float(y)) for x, y in seen[name].pixels[mask])

@@ -8,6 +8,7 @@ information on the intrinsics (the Schur complement of bundle adjustment); a pri
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from math import factorial
 from typing import NamedTuple
 
 import numpy as np
@@ -85,24 +86,35 @@ class BoardPose:
         return float(np.sqrt(self.squared_px / self.corners))
 
 
+_POWERS = [(i, order - i) for order in (2, 3, 4) for i in range(order + 1)]
+BEND = tuple(f"bend {'x' * i}{'y' * j}" for i, j in _POWERS)
+
+
 class Bend(NamedTuple):
-    """How a board departs from a plane: z = a x^2 / 2 + b x y + c y^2 / 2 about its middle."""
+    """How a board departs from a plane: z = size^2 times the sum of curvature x^i y^j / (i! j!).
+
+    x and y are measured from the middle, in units of `size`.
+    """
 
     middle: Array
     """(3,) metres."""
+    size: float
+    """Half of the longer side, metres."""
     curvature: Array
-    """(3,) a, b, c, 1 / metres."""
+    """(b,) 1 / metres, in the order of `BEND`."""
 
     @classmethod
     def none(cls, views: Sequence[BoardView]) -> "Bend":
         """Return the plane of a board that views show."""
         points = np.concatenate([view.points_m for view in views])
-        return cls((points.min(0) + points.max(0)) / 2, np.zeros(3))
+        half = np.ptp(points, axis=0) / 2
+        return cls(points.min(0) + half, float(half.max()), np.zeros(len(BEND)))
 
     def slopes(self, points: Array) -> Array:
-        """Return the (k, 3) derivative of z of points (k, 3) by the curvature."""
-        x, y, _ = (points - self.middle).T
-        return np.stack([x * x / 2, x * y, y * y / 2], 1)
+        """Return the (k, b) derivative of z of points (k, 3) by the curvature."""
+        x, y, _ = (points - self.middle).T / self.size
+        terms = [x**i * y**j / (factorial(i) * factorial(j)) for i, j in _POWERS]
+        return self.size**2 * np.stack(terms, 1)
 
 
 def board_pose(
@@ -140,7 +152,7 @@ def board_pose(
     by_lens = np.concatenate(
         [
             slopes[:, 6 : 10 + max(len(camera.distortion), 5)],
-            (by_z * by_bend[:, None]).reshape(-1, 3),
+            (by_z * by_bend[:, None]).reshape(-1, len(BEND)),
         ],
         1,
     )
@@ -184,26 +196,42 @@ def pixel_sigma(poses: Sequence[BoardPose]) -> float:
     return max(float(np.sqrt(squared[inliers].sum() / freedom[inliers].sum())), _LEAST_PX)
 
 
-BEND = ("bend xx", "bend xy", "bend yy")
-
-
-def strays(views: Sequence[BoardView], poses: Sequence[BoardPose]) -> list[NDArray[np.bool_]]:
+def strays(
+    views: Sequence[BoardView],
+    poses: Sequence[BoardPose],
+    camera: Camera,
+    bend: Bend | None = None,
+) -> list[NDArray[np.bool_]]:
     """Return (k,) of every view: whether a corner leaves its neighbours by many sigma.
 
-    Residuals of lens and board are smooth, so they are no reason.
+    Residuals of lens and board are smooth, so they are no reason. Each is left out before the next
+    is looked for, because it moves the pose and with it the residuals around it.
     """
-    apart = []
-    for view, pose in zip(views, poses, strict=True):
-        count = min(_NEIGHBOURS + 1, pose.corners)
-        near = np.asarray(KDTree(view.points_m).query(view.points_m, count)[1])
-        apart.append(pose.residual_px - np.median(pose.residual_px[near[:, 1:]], 1))
-    typical = [max(float(np.median(np.abs(a))), _LEAST_PX) for a in apart]
-    limits = _STRAY * np.maximum(typical, np.median(typical)) / norm.ppf(0.75)
-    stray = [np.linalg.norm(a, axis=1) > m for a, m in zip(apart, limits, strict=True)]
-    return [s & (s.mean() < _FEW_STRAYS and (~s).sum() > _NEIGHBOURS) for s in stray]
+    usual = np.median([_apart(*both)[1] for both in zip(views, poses, strict=True)])
+    stray = []
+    for view, fit in zip(views, poses, strict=True):
+        pose, keep = fit, np.ones(fit.corners, dtype=bool)
+        apart, typical = _apart(view, pose)
+        while apart.max() > _STRAY * max(typical, usual):
+            keep[np.flatnonzero(keep)[apart.argmax()]] = False
+            if keep.mean() <= 1 - _FEW_STRAYS or keep.sum() <= _NEIGHBOURS:
+                keep[:] = True
+                break
+            pose = board_pose(view[keep], camera, pose.camera_from_board, bend)
+            apart, typical = _apart(view[keep], pose)
+        stray.append(~keep)
+    return stray
 
 
-BEND = ("bend xx", "bend xy", "bend yy")
+def _apart(view: BoardView, pose: BoardPose) -> tuple[Array, float]:
+    """Return distances (k,) of the residuals from the median of their neighbours, and sigma."""
+    count = min(_NEIGHBOURS + 1, pose.corners)
+    near = np.asarray(KDTree(view.points_m).query(view.points_m, count)[1])
+    apart = pose.residual_px - np.median(pose.residual_px[near[:, 1:]], 1)
+    sigma = float(np.median(np.abs(apart)) / norm.ppf(0.75))
+    return np.linalg.norm(apart, axis=1), max(sigma, _LEAST_PX)
+
+
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 MIN_VIEWS = 5
 """Minimum number of views of a flat board."""
@@ -215,7 +243,8 @@ _STATED = 0.005
 """Standard deviation of a stated focal length and principal point, relative to the focal length."""
 _STATED_DISTORTION = (0.02, 0.05, 5e-4, 5e-4, 0.1, 0.02, 0.02, 0.02)
 _USUAL_BEND = 0.15
-"""Standard deviation of the curvatures of a board, 1 / metres: 1.7 mm over 300 mm."""
+"""Standard deviation of the curvatures of a board, 1 / metres: over 300 mm, 1.7 mm at the edges by
+those of second order, 0.6 mm by the third and 0.1 mm by the fourth."""
 _FOCAL_SIGMA = 0.1
 """Maximum relative standard deviation of the focal length."""
 _FALSE = 10.0
@@ -235,7 +264,10 @@ class LensPrior(NamedTuple):
         """Prior of intrinsics from the maker or from another calibration."""
         mean = lens_vector(camera)
         sigma = np.r_[np.full(4, _STATED * camera.fx), _STATED_DISTORTION][: len(mean)]
-        return cls(np.r_[mean, np.zeros(3)], np.diag(np.r_[sigma, [_USUAL_BEND] * 3] ** -2.0))
+        return cls(
+            np.r_[mean, np.zeros(len(BEND))],
+            np.diag(np.r_[sigma, [_USUAL_BEND] * len(BEND)] ** -2.0),
+        )
 
     @classmethod
     def usual(cls, camera: Camera) -> "LensPrior":
@@ -244,10 +276,10 @@ class LensPrior(NamedTuple):
         mean[:2] = camera.fx
         mean[2:4] = (camera.width - 1) / 2, (camera.height - 1) / 2
         sigma = np.r_[np.full(4, _USUAL_CENTRE * camera.width), _USUAL_DISTORTION][: len(mean)]
-        information = np.diag(np.r_[sigma, [_USUAL_BEND] * 3] ** -2.0)
+        information = np.diag(np.r_[sigma, [_USUAL_BEND] * len(BEND)] ** -2.0)
         aspect = np.array([[1.0, -1.0], [-1.0, 1.0]]) / (_USUAL_ASPECT * camera.fx) ** 2
         information[:2, :2] = aspect + np.eye(2) / (_ROUGH_FOCAL * camera.fx) ** 2
-        return cls(np.r_[mean, np.zeros(3)], information)
+        return cls(np.r_[mean, np.zeros(len(BEND))], information)
 
 
 class Intrinsics(NamedTuple):
@@ -283,8 +315,8 @@ def lens_vector(camera: Camera) -> Array:
 
 def moved_lens(camera: Camera, bend: Bend, change: Array) -> tuple[Camera, Bend]:
     """Return camera and bend after a (q,) change; ValueError without a positive focal length."""
-    curvature = bend.curvature + change[-3:]
-    return moved_camera(camera, change[:-3]), bend._replace(curvature=curvature)
+    curvature = bend.curvature + change[-len(BEND) :]
+    return moved_camera(camera, change[: -len(BEND)]), bend._replace(curvature=curvature)
 
 
 def moved_camera(camera: Camera, change: Array) -> Camera:
@@ -323,7 +355,7 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
             poses = [board_pose(v, camera, s, bend) for v, s in zip(views, starts, strict=True)]
             if change @ information @ change < 1e-4:
                 break
-        stray = strays(views, poses)
+        stray = strays(views, poses, camera, bend)
         if np.concatenate(stray).any():
             used = [view[~mask] for view, mask in zip(views, stray, strict=True)]
             return calibrate_camera(used, width, height)

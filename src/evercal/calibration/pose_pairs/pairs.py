@@ -190,7 +190,7 @@ class BoardCorners:
     def without_strays(self, names: Sequence[str], poses: Sequence[BoardPose]) -> Self:
         """Leave out corners that leave their neighbours by many sigma."""
         views, left_out = list(self.views), [*self.left_out]
-        for i, stray in enumerate(strays(self.views, poses)):
+        for i, stray in enumerate(strays(self.views, poses, self.camera)):
             left_out += [f"{names[i]} {x:.0f} {y:.0f}" for x, y in views[i].pixels[stray]]
             views[i] = views[i][~stray]
         return replace(self, views=tuple(views), left_out=tuple(left_out))
@@ -224,7 +224,7 @@ class Measured(NamedTuple):
         poses = [pose for pose, use in zip(self.poses, accepted, strict=True) if use]
         change, information = lens_estimate(poses, self.sigma_px, self.camera, self.bend, prior)
         slopes = np.stack([pose.lens_slope for pose in self.poses])
-        names = (*LENS[: len(change) - 3], *BEND)
+        names = (*LENS[: len(change) - len(BEND)], *BEND)
         return Extras(names, ("intrinsics",) * len(names), slopes, information, change)
 
 

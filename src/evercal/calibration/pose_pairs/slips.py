@@ -5,10 +5,12 @@ the residuals fall if one of them changes there? Interleaved halves of such a re
 no other check notices it.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.stats import f
 
 from evercal.calibration.pose_pairs.fit import Array, HandEyeFit, Mask, normal_inverse
@@ -21,6 +23,8 @@ _GROSS = 30.0
 _FALSE_ALARM = 1e-4
 """Probability of a step in a recording with independent errors. Slow errors of an arm look alike
 and mean the same: the poses of another hour would give another answer."""
+_CLEARLY = 9.2
+"""Twice the logarithm of the likelihood ratio, 100, at which the camera moved or the board."""
 
 
 class Slip(NamedTuple):
@@ -28,8 +32,8 @@ class Slip(NamedTuple):
 
     row: int
     """First row after the step, an index of the pose pairs."""
-    of_camera: bool
-    """Whether `parent_from_camera` changed, else `fixed_from_board`."""
+    what: str
+    """`camera` if `parent_from_camera` changed, `board` if `fixed_from_board` did, or either."""
     metres: float
     radians: float
     spread: Array
@@ -46,41 +50,50 @@ def find_slip(equation: PoseEquation, fit: HandEyeFit, rows: NDArray[np.int64]) 
     """
     order = np.argsort(rows)
     every = np.ones(len(order), dtype=bool)
-    steps = [_best_step(equation, fit, order, use) for use in (every, fit.inliers[order])]
-    explained, k, first, change, covariance = max(steps, key=lambda found: found[0])
-    freedom = 6 * len(order) - equation.unknowns - 6
-    if freedom < 6:
+    found = [s for use in (every, fit.inliers[order]) for s in _steps(equation, fit, order, use)]
+    before = min(cost for cost, k, *_ in found if k == 0)
+    kinds = [min((s for s in found if s[2] == first), key=lambda s: s[0]) for first in (0, 6)]
+    after, k, first, change, covariance = min(kinds, key=lambda s: s[0])
+    # All other unknowns have priors.
+    freedom = 6 * len(order) - 18
+    ratio = (before / after - 1) * freedom / 6
+    if freedom < 6 or 2 * len(order) * f.sf(ratio, 6, freedom) > _FALSE_ALARM:
         return None
-    ratio = explained / (1 - explained) * freedom / 6
-    if 2 * len(order) * f.sf(ratio, 6, freedom) > _FALSE_ALARM:
-        return None
+    what = "camera or board"
+    if abs(freedom * np.log(kinds[0][0] / kinds[1][0])) > _CLEARLY:
+        what = "board" if first else "camera"
     metres, radians = np.linalg.norm(change[-6:].reshape(2, 3), axis=1)
     second = np.outer(change, change) + covariance
-    before = np.eye(equation.unknowns, len(change))
-    after = before.copy()
-    after[first : first + 6, -6:] = np.eye(6)
-    spread = (before @ second @ before.T + after @ second @ after.T) / 2
-    return Slip(int(rows[order[k]]), first == 0, float(metres), float(radians), spread)
+    before_it = np.eye(equation.unknowns, len(change))
+    after_it = before_it.copy()
+    after_it[first : first + 6, -6:] = np.eye(6)
+    spread = (before_it @ second @ before_it.T + after_it @ second @ after_it.T) / 2
+    return Slip(int(rows[order[k]]), what, float(metres), float(radians), spread)
 
 
-def _best_step(
+def _steps(
     equation: PoseEquation, fit: HandEyeFit, order: NDArray[np.int64], use: Mask
-) -> tuple[float, int, int, Array, Array]:
-    """Return the share of squared residuals that the best step explains, its place and kind.
+) -> Iterator[tuple[float, int, int, Array, Array]]:
+    """Fit each step: squared residuals, row and kind, change of the unknowns and its covariance.
 
-    Also return the change (p + 6,) of the unknowns and the step itself, with its covariance.
-
-    Only the poses `use` estimate the step, but all of them judge it.
+    The last six unknowns are the step; row 0 stands for none. The poses `use` estimate it, but all
+    judge it. Errors of an arm that grow with its position are no step: they are unknowns as large
+    as the noise, over the root mean square of the positions.
     """
     system = equation[order].system(fit.at)
     whiten = np.linalg.inv(np.linalg.cholesky(fit.weights[order]))
     residual = (whiten @ system.residual[..., None])[..., 0]
-    jacobian = whiten @ system.jacobian
+    place = equation.robot_translation[order] - equation.robot_translation.mean(0)
+    place /= max(float(np.sqrt((place**2).sum(1).mean())), 1e-9)
+    by_place = whiten @ np.linalg.cholesky(fit.weights.mean(0))
+    by_place = [by_place * place[:, k, None, None] for k in range(3)]
+    jacobian = np.concatenate([whiten @ system.jacobian, *by_place], 2)
     used = jacobian.transpose(0, 2, 1) * use[:, None, None]
-    normal = (used @ jacobian).sum(0) + system.prior
-    gradient = (used @ residual[..., None]).sum((0, 2)) + system.prior @ system.change
-    before = np.minimum((residual**2).sum(1), _GROSS).sum()
-    best = 0.0, 0, 0, np.zeros(0), np.zeros((0, 0))
+    normal = (used @ jacobian).sum(0) + block_diag(system.prior, np.eye(18))
+    pull = np.r_[system.prior @ system.change, np.zeros(18)]
+    gradient = (used @ residual[..., None]).sum((0, 2)) + pull
+    for moved in (residual, residual - jacobian @ (normal_inverse(normal) @ gradient)):
+        yield _cost(moved), 0, 0, gradient, normal
     for first in (0, 6):
         own = slice(first, first + 6)
         # Sums over the poses from each on.
@@ -92,7 +105,8 @@ def _best_step(
             change = -covariance @ np.r_[gradient, pull[k]]
             moved = residual + jacobian @ change[:-6]
             moved[k:] += jacobian[k:, :, own] @ change[-6:]
-            after = np.minimum((moved**2).sum(1), _GROSS).sum()
-            if after < (1 - best[0]) * before:
-                best = 1 - after / before, k, first, change, covariance
-    return best
+            yield _cost(moved), k, first, change, covariance
+
+
+def _cost(residual: Array) -> float:
+    return float(np.minimum((residual**2).sum(1), _GROSS).sum())

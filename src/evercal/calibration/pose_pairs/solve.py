@@ -104,7 +104,7 @@ def solve_pairs(
         fit = widened(equation, fit)
     slip = find_slip(equation, fit, rows)
     if slip is not None:
-        what = "camera" if slip.of_camera else "board" if of_board else "map"
+        what = slip.what if of_board else slip.what.replace("board", "map")
         fit = replace(fit, covariance=fit.covariance + slip.spread)
         warnings.append(
             f"the {what} looks moved by {1000 * slip.metres:.1f} mm and"
