@@ -178,7 +178,7 @@ class Localizer:
         # No camera is stated, and the image was not located at once.
         hard = prior is NOT_STATED and candidate.stride < self.options.attempts[0].stride
         hard &= not len(self._bank.pattern(candidate.keyframes))
-        ransac = self.options.pnp
+        ransac = replace(self.options.pnp, ranked=prior is not UNKNOWN)
         for factor in (1.0, *FOCAL_FACTORS):
             pnp = solve_pnp(*matches, small.zoomed(factor), ransac)
             poses += [(pnp, factor)] if pnp else []
