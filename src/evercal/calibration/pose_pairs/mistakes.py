@@ -30,23 +30,24 @@ from evercal.recordings.poses.conventions import (
 
 Array = NDArray[np.floating]
 
-_FAILS_M, _FAILS_RAD, _FEW = 0.01, np.deg2rad(1.0), 0.5
+_FAILS_M, _FAILS_RAD, _FEW = 0.01, np.deg2rad(1.0), 0.8
 """A reading fails with larger residuals, or with a smaller share of inliers."""
 _HOPELESS_M, _HOPELESS_RAD = 0.05, np.deg2rad(3.0)
 """Residuals above which the pairs are refused."""
-_BETTER, _AS_GOOD = 3.0, 1.2
-"""A better reading reduces the product of residuals of translation and rotation by the first
-factor. Within the second, readings fit as well."""
+_BETTER, _SPOILT, _MORE = 3.0, 1.2, 0.2
+"""A better reading reduces residuals of translation or rotation by the first factor, or explains
+this share of poses more, and enlarges neither by more than the second factor."""
 _DOUBT_RAD = np.deg2rad(0.1)
 """Residual above which other conventions of tables are tested, even if the given one is usable."""
 _NEAR_M, _FAR_M, _SPREAD = 0.1, 0.7, 0.8
 """Usual distances of a camera or board from gripper and base; deviation of their logarithms."""
-_FIELD_RAD, _IMAGES = np.deg2rad(22.0), 4.0
-"""Usual angle between board and optical axis; number of independent images."""
+_FIELD_RAD, _ANYWHERE, _IMAGES = np.deg2rad(22.0), 0.03, 4.0
+"""Usual angle between board and optical axis; share of any angle; number of independent images."""
 _CLEARLY = 4.0
 """Logarithm of the likelihood ratio at which another reading is more plausible."""
-_MOST = 0.9
-"""Share of boards that are behind the camera, or ahead of it."""
+_MOST, _COHERENT, _OBLIQUE, _LONG_M = 0.9, 0.8, np.cos(np.deg2rad(45.0)), 0.4
+"""Suspect: this share of boards behind the camera, boards of similar directions (length of their
+mean) far from the optical axis, or a gripper that reaches so far."""
 _LENGTHS = {1.0: "m", 0.001: "mm"}
 _FLIP = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
 _CAUSES = (
@@ -90,7 +91,7 @@ def require_agreement(
     if better:
         # Inverted robot poses, inverted camera poses and the other mount obey the same equation.
         least = min(_cost(other) for other, _ in better)
-        equal = [(other, r) for other, r in better if _cost(other) < _AS_GOOD * least]
+        equal = [(other, r) for other, r in better if _cost(other) < 3 * least]
         corrected, likely = max(equal, key=lambda pair: _plausibility(pair[1], pair[0]))
         raise InputError(
             f"{likely.message}; corrected, the poses agree to {_size(corrected)}, as given to"
@@ -98,7 +99,7 @@ def require_agreement(
         )
     if not (_fails(fit) or own_camera):
         _require_plausible(_Reading("", pairs, mount), fit, scale_known)
-    enough = fit.inliers.mean() >= _FEW
+    enough = fit.inliers.mean() >= 0.5
     if not (fit.metres < _HOPELESS_M and fit.radians < _HOPELESS_RAD and enough):
         if scale_known:
             _require_unit(pairs, mount, fit)
@@ -115,6 +116,15 @@ def _fails(fit: Agreement) -> bool:
 
 def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> None:
     """Refuse pairs that agree, but whose geometry fits another reading far better."""
+    camera = given.pairs.camera_from_board
+    rays = camera.translation_m / np.linalg.norm(camera.translation_m, axis=1)[:, None].clip(1e-9)
+    behind = (rays[:, 2] < 0).mean() > _MOST
+    mean, coherent = rays.mean(0), float(np.linalg.norm(rays.mean(0)))
+    beside = coherent > _COHERENT and mean[2] < _OBLIQUE * coherent
+    x, z = fit.at.parent_from_camera, fit.at.fixed_from_board
+    carried = x if given.mount == "eye_in_hand" else z
+    if not (behind or beside or np.linalg.norm(carried.translation_m) > _LONG_M):
+        return
     others = [
         (_plausibility(r, quick_fit(r.pairs, r.mount, scale_known)[0]), r)
         for r in _readings(given.pairs, given.mount, _SAME_EQUATION)
@@ -125,7 +135,7 @@ def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> No
     ahead = (board[:, 2] > 0.5 * np.linalg.norm(board, axis=1)).mean()
     if plausibility > _plausibility(given, fit) + _CLEARLY and ahead > _MOST:
         raise InputError(best.message)
-    if (given.pairs.camera_from_board.translation_m[:, 2] < 0).mean() > _MOST:
+    if behind:
         raise InputError(
             "the board is behind the camera: camera poses are camera_from_board, with OpenCV's axes"
             " (z forward); see --camera-convention and --invert"
@@ -133,11 +143,12 @@ def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> No
 
 
 def _better(other: Agreement, fit: Agreement) -> bool:
-    ratio = _cost(other) / _cost(fit)
+    ratios = other.metres / fit.metres, other.radians / fit.radians
+    more = other.inliers.mean() - fit.inliers.mean() > _MORE
     # A pair less cannot explain two outliers, unless the rows after it are shifted.
-    explained = (~fit.inliers).sum() - (~other.inliers).sum()
-    shifted = len(other.inliers) < len(fit.inliers) and explained > 1
-    return bool(ratio * _BETTER < 1 or (shifted and ratio < _AS_GOOD))
+    if len(other.inliers) < len(fit.inliers):
+        more = (~fit.inliers).sum() - (~other.inliers).sum() > 1
+    return bool((min(ratios) * _BETTER < 1 or more) and max(ratios) < _SPOILT)
 
 
 def _plausibility(reading: _Reading, fit: Agreement) -> float:
@@ -147,7 +158,8 @@ def _plausibility(reading: _Reading, fit: Agreement) -> float:
     ratio = np.log(np.maximum(lengths, 0.03) / usual) / _SPREAD
     board = reading.pairs.camera_from_board.translation_m
     angle = np.arccos(np.clip(board[:, 2] / np.linalg.norm(board, axis=1).clip(1e-9), -1, 1))
-    seen = -0.5 * (angle / _FIELD_RAD) ** 2
+    bell = np.exp(-0.5 * (angle / _FIELD_RAD) ** 2) / (_FIELD_RAD * np.sqrt(np.pi / 2))
+    seen = np.log((1 - _ANYWHERE) * bell + _ANYWHERE / np.pi)
     return float(_IMAGES * seen.mean() - 0.5 * (ratio**2).sum())
 
 
