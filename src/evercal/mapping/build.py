@@ -74,16 +74,13 @@ class MapOptions:
         """The same options for poses from a rough `gripper_from_camera`.
 
         The common transform has no prior. The poses of arms have errors of some tenths of a
-        millimetre, which bounds the estimated errors of stated poses. Adjustment starts with not
-        much larger ones: wide ones keep a position that the motions hardly show where it began.
+        millimetre, which bounds the estimated errors of stated poses.
         """
         bundle = replace(
             self.bundle,
             common_stated=False,
             common_sigma_m=0.2,
             common_sigma_deg=10.0,
-            start_sigma_m=2e-3,
-            start_sigma_deg=0.1,
             least_sigma_m=2e-4,
             least_sigma_deg=0.015,
         )
