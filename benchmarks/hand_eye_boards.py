@@ -71,7 +71,7 @@ class BoardSetting:
     bend_mm: float = 0.0
     """Departure of the board from a plane at 150 mm from its middle, where it bends most."""
     dents_mm: float = 0.0
-    """Height of two corners of the board, which are bent over 60 mm."""
+    """Height of two dented corners of the board; a dent is 60 mm long."""
 
     @property
     def size(self) -> float:

@@ -60,9 +60,8 @@ def misread(side: str, written: str, read: str) -> tuple[Mistake, str]:
 def order_of(convention: str) -> str:
     """Return what two conventions share that differ in units only; fixed axes as moving ones."""
     layout = pose_convention(convention).layout
-    return (
-        layout if layout in ("wxyz", "xyzw", "vector") or layout.isupper() else layout[::-1].upper()
-    )
+    fixed_axes = layout.islower() and layout not in ("wxyz", "xyzw", "vector")
+    return layout[::-1].upper() if fixed_axes else layout
 
 
 def _later(poses: SE3) -> SE3:
@@ -126,7 +125,7 @@ class Case(NamedTuple):
     pairs: PosePairs
     mount: Mount
     right: tuple[SE3, ...]
-    """Right answers: the pose of the camera, before and after it slipped; none for equal lists."""
+    """Right answers: the pose of the camera, before and after it slipped; () for equal lists."""
     pattern: str
     """Of what names the mistake."""
     corners: BoardCorners | None = None
@@ -274,7 +273,7 @@ def _pairs(
 
 
 NOTHING = "^left out: .*; corners: ; $"
-"""What is told of a clean recording."""
+"""Messages about a clean recording."""
 LIMIT = float(chi2.ppf(0.99, 6))
 SMALL, ANY = (0.02, 0.025, 0.05), (0.02, 0.025, 0.05, 0.1, 0.2, 0.25)
 ORDERS = [name for name in CONVENTIONS if name.startswith(("fixed_", "moving_"))]
@@ -311,9 +310,9 @@ def measure(name: str, draws: int) -> Row:
         else:
             checks = answer.checks
             left_out = [i.name for i in answer.images if not i.used]
-            told = [*checks["warnings"], f"left out: {', '.join(left_out)}"]
-            told += [f"corners: {', '.join(checks.get('corners_left_out', ()))}"]
-            text = "; ".join([*told, ""])
+            notes = [*checks["warnings"], f"left out: {', '.join(left_out)}"]
+            notes += [f"corners: {', '.join(checks.get('corners_left_out', ()))}"]
+            text = "; ".join([*notes, ""])
             counts["warned"] += bool(checks["warnings"] or checks.get("corners_left_out"))
             distances = [answer.uncertain_pose.squared_mahalanobis(x) for x in case.right]
             safe = min(distances, default=np.inf) < LIMIT

@@ -140,9 +140,10 @@ class Localizer:
         """The pose with the most support, from as few attempts as it takes."""
         best, few = Hypothesis(0), False
         for number, attempt in enumerate(self.options.attempts):
-            if number > 1 and few == (attempt.scale == 1):
+            magnified = attempt.scale != 1
+            if number > 1 and magnified != few:
                 continue
-            if attempt.scale != 1:
+            if magnified:
                 query = self._matcher.magnified(query, attempt.scale)
             best = max(best, self._tried(query, attempt, cameras), key=order)
             few = best.pnp_inliers < self.options.aligned_inliers
@@ -178,14 +179,14 @@ class Localizer:
         # No camera is stated, and the image was not located at once.
         hard = prior is NOT_STATED and candidate.stride < self.options.attempts[0].stride
         hard &= not len(self._bank.pattern(candidate.keyframes))
-        ransac = replace(self.options.pnp, ranked=prior is not UNKNOWN)
+        own = replace(self.options.pnp, ranked=prior is not UNKNOWN)
+        other = replace(own, max_iterations=own.max_iterations // 2)
         for factor in (1.0, *FOCAL_FACTORS):
-            pnp = solve_pnp(*matches, small.zoomed(factor), ransac)
+            pnp = solve_pnp(*matches, small.zoomed(factor), own if factor == 1 else other)
             poses += [(pnp, factor)] if pnp else []
             few = not pnp or pnp.inliers.sum() < self.options.aligned_inliers
             if factor == 1 and prior is not UNKNOWN and (few or not hard):
                 break
-            ransac = replace(ransac, max_iterations=self.options.pnp.max_iterations // 2)
         if not poses:
             return Hypothesis(candidate.scene)
         pnp, factor = max(poses, key=lambda pose: pose[0].inliers.sum())

@@ -243,8 +243,8 @@ _STATED = 0.005
 """Standard deviation of a stated focal length and principal point, relative to the focal length."""
 _STATED_DISTORTION = (0.02, 0.05, 5e-4, 5e-4, 0.1, 0.02, 0.02, 0.02)
 _USUAL_BEND = 0.15
-"""Standard deviation of the curvatures of a board, 1 / metres: over 300 mm, 1.7 mm at the edges by
-those of second order, 0.6 mm by the third and 0.1 mm by the fourth."""
+"""Standard deviation of the curvatures of a board, 1 / metres: over 300 mm, the second
+order moves the edges by 1.7 mm, the third by 0.6 mm and the fourth by 0.1 mm."""
 _FOCAL_SIGMA = 0.1
 """Maximum relative standard deviation of the focal length."""
 _FALSE = 10.0

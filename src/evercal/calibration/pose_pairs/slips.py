@@ -76,7 +76,7 @@ def _steps(
 ) -> Iterator[tuple[float, int, int, Array, Array]]:
     """Fit each step: squared residuals, row and kind, change of the unknowns and its covariance.
 
-    The last six unknowns are the step; row 0 stands for none. The poses `use` estimate it, but all
+    The last six unknowns are the step; row 0 means no step. The poses `use` estimate it, but all
     judge it. Errors of an arm that grow with its position are no step: they are unknowns as large
     as the noise, over the root mean square of the positions.
     """
