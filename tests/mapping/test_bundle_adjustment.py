@@ -139,8 +139,8 @@ def test_exact_poses_do_not_change() -> None:
     assert radians.max() < 1e-5
     np.testing.assert_allclose(result.inverse_depth, made.inverse_depth, rtol=1e-4)
     assert np.abs(result.common.log()).max() < 1e-6
-    assert result.camera is not None
-    assert result.camera.fx == pytest.approx(CAMERA.fx, rel=1e-6)
+    assert result.cameras is not None
+    assert result.cameras[0].fx == pytest.approx(CAMERA.fx, rel=1e-6)
     assert result.residual_px < 1e-3
 
 
@@ -234,32 +234,32 @@ def test_focal_length_is_estimated(factor: float) -> None:
     made = world()
     wrong = replace(CAMERA, fx=factor * CAMERA.fx, fy=factor * CAMERA.fy)
     result = adjusted(made, made.truth, wrong)
-    assert result.camera is not None
-    assert result.camera.fx == pytest.approx(CAMERA.fx, rel=1e-3)
-    assert result.camera.fy == pytest.approx(CAMERA.fy, rel=1e-3)
+    assert result.cameras is not None
+    assert result.cameras[0].fx == pytest.approx(CAMERA.fx, rel=1e-3)
+    assert result.cameras[0].fy == pytest.approx(CAMERA.fy, rel=1e-3)
     metres, _ = errors(result.poses, made.truth)
     assert np.median(metres) < 2e-3
     # It is not adjusted without `intrinsics`, or if frames have different cameras.
     fixed = adjusted(made, made.truth, wrong, options=BundleOptions(intrinsics=False))
-    assert fixed.camera is None
+    assert fixed.cameras is None
     several = [wrong, *[CAMERA] * (FRAMES - 1)]
     mixed = BundleAdjustment(made.truth, several, np.zeros((FRAMES, 6)), BundleOptions())
-    assert mixed.solve(made.tracks).camera is None
+    assert mixed.solve(made.tracks).cameras is None
 
 
 def test_missing_distortion_is_estimated() -> None:
     distorted = replace(CAMERA, distortion=(-0.08, 0.03, 0.0, 0.0))
     made = world(distorted)
     result = adjusted(made, made.truth, CAMERA)
-    assert result.camera is not None
+    assert result.cameras is not None
     corners = np.array([[30.0, 30], [610, 30], [320, 440], [100, 240], [320, 240]])
-    rays, truth = result.camera.unproject(corners), distorted.unproject(corners)
+    rays, truth = result.cameras[0].unproject(corners), distorted.unproject(corners)
     assert np.abs(CAMERA.unproject(corners) - truth).max() > 0.015
     assert np.abs(rays - truth).max() < 2e-3
     # A stated distortion does not change.
     same = adjusted(made, made.truth, distorted)
-    assert same.camera is not None
-    np.testing.assert_allclose(same.camera.distortion, distorted.distortion, atol=1e-3)
+    assert same.cameras is not None
+    np.testing.assert_allclose(same.cameras[0].distortion, distorted.distortion, atol=1e-3)
 
 
 def velocities(stated: SE3) -> Array:

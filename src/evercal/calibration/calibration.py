@@ -16,19 +16,19 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self, get_args
+from typing import Any, NamedTuple, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_distance
+from evercal.recordings.frame import Mount
 from evercal.recordings.text_files import read_text
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
 
 FORMAT, VERSION = "evercal-calibration", 1
-Mount = Literal["eye_to_hand", "eye_in_hand"]
 
 
 @dataclass(frozen=True)

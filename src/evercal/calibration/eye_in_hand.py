@@ -1,6 +1,6 @@
 """A camera on the gripper, from nothing: images and gripper poses give `gripper_from_camera`.
 
-`eye_in_hand_start` estimates a first transform from pairs of images, which the map's bundle
+`hand_eye_start` estimates a first transform from pairs of images, which the map's bundle
 adjustment refines together with all poses and landmarks.
 """
 
@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
-from evercal.calibration.eye_in_hand_start import HandEyeStart, hand_eye_start
+from evercal.calibration.hand_eye_start import HandEyeStart, hand_eye_start, scene_from_parent
+from evercal.calibration.held_thing import cropped, moving_parts, windows
 from evercal.calibration.located import length_mm_deg
 from evercal.calibration.next_views import open_position
 from evercal.calibration.verdict import verdict
@@ -21,7 +22,7 @@ from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
 from evercal.mapping.build import Adjusted, BuiltMap
 from evercal.progress import OnProgress
-from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame, Recording, stated_grippers
+from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame, Mount, Recording, stated_grippers
 from evercal.recordings.held_out import require_frames
 
 MOST_FOCAL_PERCENT, MOST_POSE_SIGMA_MM = 1.0, 5.0
@@ -82,22 +83,30 @@ class HandEyeReport:
 
 
 def posed_by_gripper(
-    recording: Recording, encoder: Encoder, on_progress: OnProgress = lambda *_: None
+    recording: Recording,
+    mount: Mount,
+    encoder: Encoder,
+    on_progress: OnProgress = lambda *_: None,
 ) -> tuple[Recording, HandEyeStart]:
     """Return the recording with rough camera poses, and the first estimate that they are from.
 
-    Frames without a gripper pose count as untracked.
+    Frames without a gripper pose count as untracked. Those of a fixed camera get poses in the frame
+    of the gripper, and windows around what it holds.
     """
     frames = tuple(frame for frame in recording.train if frame.base_from_gripper is not None)
     require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
+    still = 0.0
+    if mount == "eye_to_hand":
+        frames, still = moving_parts(frames)
     try:
-        start = hand_eye_start(frames, encoder, on_progress=on_progress)
+        start = hand_eye_start(frames, mount, encoder, on_progress)
     except InputError as error:
         raise InputError(f"{recording.name}: {error}") from None
+    poses = scene_from_parent(frames, mount) @ start.parent_from_camera
+    if mount == "eye_to_hand" and (around := windows(frames, start)) is not None:
+        frames = tuple(cropped(*both) for both in zip(frames, around, strict=True))
     train = tuple(
-        replace(frame, base_from_camera=frame.base_from_gripper @ start.gripper_from_camera)
-        for frame in frames
-        if frame.base_from_gripper is not None
+        replace(frame, base_from_camera=pose) for frame, pose in zip(frames, poses, strict=True)
     )
     lost = len(recording.train) - len(frames)
     posed = replace(recording, train=train, untracked=recording.untracked + lost)
@@ -116,8 +125,8 @@ def hand_eye_report(
     # The covariance of the correction is about camera axes, as that of a pose after an exact one.
     covariance = correction.by_noise + correction.by_drift
     start_from_camera = UncertainPose(correction.start_camera_from_camera, covariance)
-    estimate = start.gripper_from_camera @ start_from_camera
-    start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.gripper_from_camera)
+    estimate = start.parent_from_camera @ start_from_camera
+    start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.parent_from_camera)
     left = open_position(stated_grippers(frames), estimate.pose)
     widest_mm = 1000 * float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1]))
     from_given = (None, None) if given is None else pose_distance_mm_deg(estimate.pose, given)

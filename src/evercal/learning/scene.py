@@ -20,10 +20,11 @@ from evercal.recordings.frame import (
     MIN_GRIPPER_FRAMES,
     MIN_TRAIN_FRAMES,
     Frame,
+    Mount,
     Recording,
     lacks_camera_poses,
 )
-from evercal.recordings.held_out import require_frames, split_held_out
+from evercal.recordings.held_out import HeldOutSplit, require_frames, split_held_out
 from evercal.recordings.pictures import look_at
 
 if TYPE_CHECKING:
@@ -66,6 +67,7 @@ def learn_scene(
     gripper_from_camera: SE3 | None = None,
     options: MapOptions | None = None,
     on_progress: OnProgress = lambda *_: None,
+    mount: Mount = "eye_in_hand",
 ) -> tuple[SceneMap, LearnReport]:
     """Build the map of one scene and fit the scatter of its stated poses; nothing is written.
 
@@ -86,12 +88,14 @@ def learn_scene(
     if lacks_camera_poses(recording):
         from evercal.calibration.eye_in_hand import posed_by_gripper
 
-        recording, start = posed_by_gripper(recording, contents.encoder, on_progress)
-        options = options.for_hand_eye()
+        recording, start = posed_by_gripper(recording, mount, contents.encoder, on_progress)
+        options = options.for_hand_eye(mount)
         least, budget = MIN_GRIPPER_FRAMES, replace(budget, least=MIN_GRIPPER_FRAMES)
     recording = posed_recording(recording)
     require_frames(recording, least)
     split = split_held_out(recording.train)
+    if options.mount == "eye_to_hand":  # a calibration, in which no image is to be located
+        split = HeldOutSplit(recording.train, ())
     options = _sized(options, budget, contents.short_side)
     options = replace(options, metric=recording.metric)
     built = build_map(recording.name, split.train, contents.encoder, options, on_progress)

@@ -36,9 +36,9 @@ from evercal.mapping.tracks import (
 )
 from evercal.processes import cores
 from evercal.progress import OnProgress
-from evercal.recordings.frame import Frame, stated_poses
+from evercal.recordings.frame import Frame, Mount, stated_grippers, stated_poses
 
-HAND_EYE_COVARIANCE_SCALE = 2.5
+HAND_EYE_COVARIANCE_SCALE = 1.0
 """Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
 over many frames, which residuals do not show: the squared error in 30 trials was 1.8 times the
 formal one (research/handeye.md)."""
@@ -70,7 +70,10 @@ class MapOptions:
     rounds: int = 2
     """Rounds of tracking and adjusting; the second runs only if the first moved something."""
 
-    def for_hand_eye(self) -> "MapOptions":
+    mount: Mount | None = None
+    """Mount of a camera whose poses follow from those of a gripper; see `for_hand_eye`."""
+
+    def for_hand_eye(self, mount: Mount) -> "MapOptions":
         """The same options for poses from a rough `gripper_from_camera`.
 
         The common transform has no prior. The poses of arms have errors of some tenths of a
@@ -79,12 +82,13 @@ class MapOptions:
         bundle = replace(
             self.bundle,
             common_stated=False,
+            correlation=2.7,
             common_sigma_m=0.2,
             common_sigma_deg=10.0,
             least_sigma_m=2e-4,
             least_sigma_deg=0.015,
         )
-        return replace(self, bundle=bundle)
+        return replace(self, bundle=bundle, mount=mount)
 
 
 @dataclass(frozen=True)
@@ -325,9 +329,15 @@ def _adjust(
     for number in range(options.rounds):
         on_progress("adjusting", number, options.rounds)
         tracks = bundle_tracks(prepared, keyframes)
-        problem = BundleAdjustment(prepared.stated, stated_cameras, velocity, options.bundle)
+        problem = BundleAdjustment(
+            prepared.stated,
+            stated_cameras,
+            velocity,
+            options.bundle,
+            _gripper_from_camera(prepared, options.mount),
+        )
         adjustment = problem.solve(tracks)
-        prepared.adjust(adjustment.poses, adjustment.camera)
+        prepared.adjust(adjustment.poses, adjustment.cameras)
         if not _moved(prepared.stated, stated_cameras[0], adjustment):
             break
         again = partial(refine_depths, prepared, again=True)
@@ -338,14 +348,23 @@ def _adjust(
     return adjustment
 
 
+def _gripper_from_camera(prepared: PreparedFrames, mount: Mount | None) -> SE3 | None:
+    """(n,) stated poses of the cameras in the gripper; None where camera poses were stated."""
+    if mount is None:
+        return None
+    if mount == "eye_to_hand":
+        return prepared.stated
+    return stated_grippers(prepared.frames).inverse() @ prepared.stated
+
+
 def _moved(stated: SE3, camera: Camera, adjustment: Adjustment) -> bool:
     change = np.linalg.norm((stated.inverse() @ adjustment.poses).log().reshape(-1, 2, 3), axis=2)
     metres, radians = np.median(change, 0)
     by_camera = 0.0
-    if adjustment.camera is not None:
+    if adjustment.cameras is not None:
         across = [np.linspace(0, side - 1, 9) for side in (camera.width, camera.height)]
         grid = np.stack(np.meshgrid(*across), -1)
-        shift = adjustment.camera.project(camera.unproject(grid)) - grid
+        shift = adjustment.cameras[0].project(camera.unproject(grid)) - grid
         by_camera = float(np.nanmedian(np.linalg.norm(shift, axis=-1))) / camera.fx
     return max(metres * np.median(adjustment.inverse_depth), radians, by_camera) > NOTICEABLE_RAD
 
@@ -382,7 +401,7 @@ def _finish(
             by_noise = HAND_EYE_COVARIANCE_SCALE * by_noise
             by_drift = np.asarray(adjustment.common_systematic, np.float64)
             names = (frame.name for frame in frames.frames)
-            residuals = dict(zip(names, adjustment.correction, strict=True))
+            residuals = dict(zip(names, adjustment.errors, strict=True))
             hand_eye = HandEyeCorrection(common, by_noise, by_drift, residuals)
             base = frame_covariance(frames.stated @ common, by_noise + by_drift)
             frame = replace(frame, common=SE3.identity(), base_covariance=base)

@@ -45,6 +45,9 @@ FIRST_DAMPING, MAX_RAISES = 1e-4, 8
 """Levenberg-Marquardt damping after the first rejected step, and rejections in a row at most."""
 ROUNDING = 1e-9
 """Share by which rounding may raise the cost of an accepted step."""
+SYSTEMATIC = 1.0, 1.0
+"""Prior of the variance of systematic errors: its weight in observed directions, and its size in
+variances of the noise."""
 CONVERGED = 1e-9
 """Adjustment ends when a step is this small, in standard deviations, and variances change by less
 than this share."""
@@ -97,8 +100,8 @@ class Adjustment:
 
     poses: SE3
     """(n,) base_from_camera of the frames."""
-    camera: Camera | None
-    """Adjusted intrinsics; None where frames have different cameras or nothing was adjusted."""
+    cameras: list[Camera] | None
+    """(n,) adjusted intrinsics; None where frames have different cameras or nothing was adjusted."""
     common: SE3
     """stated_camera_from_camera: stated poses are corrected by this on the right."""
     shift_frames: float
@@ -116,6 +119,8 @@ class Adjustment:
     correction: Array
     """(n, 6) of each pose beside common transform and time shift, camera frame, metres and
     radians."""
+    errors: Array
+    """(n, 6) the same where the errors of stated poses arise, see `BundleAdjustment`."""
     weight: Array
     """(n,) below 1 for stated poses with larger errors than most."""
     covariance: Array
@@ -160,13 +165,24 @@ class Estimate:
 class BundleAdjustment:
     """The problem of one recording.
 
-    Cameras are those of the image size that patches are cut from, and adjusted if all are the same.
+    Cameras are those of the image size that patches are cut from, and adjusted if all are the same
+    but for the principal point.
     The velocity (n, 6) is the motion from frame to frame, camera frame, metres and radians; 0 if
-    unknown.
+    unknown. With `gripper_from_camera` (n,), the errors of stated poses are those of an arm: they
+    arise at the gripper, and its rotation moves the camera on a lever.
     """
 
-    def __init__(self, stated: SE3, cameras: list[Camera], velocity: Array, options: BundleOptions):
+    def __init__(
+        self,
+        stated: SE3,
+        cameras: list[Camera],
+        velocity: Array,
+        options: BundleOptions,
+        gripper_from_camera: SE3 | None = None,
+    ):
         self.options, self.n, self.velocity = options, len(stated), velocity
+        at = SE3.identity((len(stated),)) if gripper_from_camera is None else gripper_from_camera
+        self.gripper_from_camera, self.lever = at, at.adjoint()
         self.frames = StatedFrames(stated, cameras)
         self.distorted = any(cameras[0].distortion)
 
@@ -206,7 +222,7 @@ class BundleAdjustment:
     @property
     def adjusts_camera(self) -> bool:
         """Whether intrinsics are adjusted."""
-        return self.options.intrinsics and self.frames.same_camera
+        return self.options.intrinsics and self.frames.same_lens
 
     def step(self, tracks: BundleTracks, estimate: Estimate, variances: Variances) -> Estimate:
         """One Levenberg-Marquardt step at fixed variances.
@@ -245,7 +261,7 @@ class BundleAdjustment:
         squares = (linearised.residual**2).sum(1)
         squares[~linearised.valid] = INVALID_SQUARES
         data = np.log1p(squares / noise**2).sum() / self.options.correlation**2
-        own = variances.weight[:, None] * (self._deviation(parameters) / variances.sigma) ** 2
+        own = variances.weight[:, None] * (self._errors(parameters) / variances.sigma) ** 2
         return float(data + own.sum() + (parameters.shared**2 / variances.shared).sum())
 
     def _normal_equations(
@@ -273,24 +289,32 @@ class BundleAdjustment:
         shifted = parameters.shared[COMMON] * self.velocity
         return parameters.correction - parameters.shared[:COMMON] - shifted
 
+    def _errors(self, parameters: Parameters) -> Array:
+        """(n, 6) the same where the errors arise: at the gripper, or at the camera."""
+        return np.einsum("nij,nj->ni", self.lever, self._deviation(parameters))
+
+    def _precision(self, variances: Variances) -> Array:
+        """(n, 6, 6) information on each deviation."""
+        scaled = self.lever * variances.weight[:, None, None] / variances.sigma[:, None] ** 2
+        return self.lever.transpose(0, 2, 1) @ scaled
+
     def _prior(self, parameters: Parameters, variances: Variances) -> tuple[Array, Array]:
         """Normal matrix (6 n + 12, 6 n + 12) of the priors, and their slope."""
         n = self.n
         system, slope = np.zeros((6 * n + SHARED,) * 2), np.zeros(6 * n + SHARED)
-        precision = variances.weight[:, None] / variances.sigma**2
-        off = self._deviation(parameters)
-        own, common = np.arange(6 * n), 6 * n + np.tile(np.arange(6), n)
-        shift, six = 6 * n + COMMON, 6 * n + np.arange(6)
-        drift = precision * self.velocity
-        system[own, own] = precision.ravel()
-        system[own, common] = system[common, own] = -precision.ravel()
-        system[own, shift] = system[shift, own] = -drift.ravel()
-        system[six, six] = precision.sum(0)
+        precision, shift, six = self._precision(variances), 6 * n + COMMON, 6 * n + np.arange(6)
+        pull = np.einsum("nij,nj->ni", precision, self._deviation(parameters))
+        drift = np.einsum("nij,nj->ni", precision, self.velocity)
+        for i, own in enumerate(np.arange(6 * n).reshape(n, 6)):
+            system[np.ix_(own, own)] = precision[i]
+            system[np.ix_(own, six)] = system[np.ix_(six, own)] = -precision[i]
+            system[own, shift] = system[shift, own] = -drift[i]
+        system[np.ix_(six, six)] = precision.sum(0)
         system[six, shift] = system[shift, six] = drift.sum(0)
         system[shift, shift] = (drift * self.velocity).sum()
-        slope[own] = (precision * off).ravel()
-        slope[six] = -(precision * off).sum(0)
-        slope[shift] = -(drift * off).sum()
+        slope[: 6 * n] = pull.ravel()
+        slope[six] = -pull.sum(0)
+        slope[shift] = -(pull * self.velocity).sum()
         last = 6 * n + np.arange(SHARED)
         system[last, last] += 1 / variances.shared
         slope[last] += parameters.shared / variances.shared
@@ -304,9 +328,11 @@ class BundleAdjustment:
         A correction d is a share K of what the images say, y = d / K, and y has the variance
         s^2 + v / K with the posterior variance v. So s^2 is the mean of d^2 - v K over that of K^2.
         """
-        n, variance = self.n, np.einsum("ij,ij->j", estimate.root, estimate.root)
-        own = variance[: 6 * n].reshape(n, 6)
-        off, weight = self._deviation(estimate.parameters), variances.weight[:, None]
+        root, n = estimate.root, self.n
+        own = root[:, : 6 * n].reshape(-1, n, 6)
+        own = own if self.options.common_stated else self._error_root(root)
+        own = np.einsum("knj,knj->nj", own, own)
+        off, weight = self._errors(estimate.parameters), variances.weight[:, None]
         share = 1 - np.minimum(own * weight / variances.sigma**2, 1)
         sigma = variances.sigma.copy()
         for part in (slice(0, 3), slice(3, 6)):
@@ -320,7 +346,7 @@ class BundleAdjustment:
         sigma, tail = sigma.clip(least, 0.1), self.options.tail
         shared = variances.shared
         if widest is not None:
-            after = variance[6 * n :]
+            after = np.einsum("ij,ij->j", root[:, 6 * n :], root[:, 6 * n :])
             shared = self._relevant(estimate.parameters.shared, shared, after, widest.shared)
         return Variances(sigma, (tail + 6) / (tail + ((off / sigma) ** 2).sum(1)), shared)
 
@@ -343,7 +369,7 @@ class BundleAdjustment:
         root = [estimate.root[:, 6 * i : 6 * i + 6] for i in range(n + 1)]
         return Adjustment(
             poses=self.frames.poses(parameters),
-            camera=self.frames.camera(parameters) if self.adjusts_camera else None,
+            cameras=self.frames.cameras(parameters) if self.adjusts_camera else None,
             common=_small_motion(parameters.shared[:COMMON]),
             shift_frames=float(parameters.shared[COMMON]),
             sigma_m=float(variances.sigma[0]),
@@ -352,6 +378,7 @@ class BundleAdjustment:
             common_covariance=root[n].T @ root[n],
             common_systematic=self._systematic(estimate, variances),
             correction=self._deviation(parameters),
+            errors=self._errors(parameters),
             weight=np.minimum(variances.weight, 1.0),
             covariance=np.stack([columns.T @ columns for columns in root[:n]]),
             inverse_depth=parameters.inverse_depth,
@@ -361,23 +388,42 @@ class BundleAdjustment:
         """Covariance (6, 6) of the common transform due to systematic errors of stated poses.
 
         The errors of a robot's joints vary slowly with the pose. They are modelled by errors that
-        are linear in the rotation and position of a frame, together as large as the estimated
-        noise. Residuals hardly show them, because the common transform and the depths follow.
+        are linear in the rotation and position of a frame. Their variance is estimated from the
+        residuals, as that of independent errors is: an error in a unit direction that the images
+        see to a share K leaves a residual with the variance K^2 t^2 + K s^2.
         """
         n, stated = self.n, self.frames.stated
         rotations = Rotation.from_quat(stated.rotation_wxyz, scalar_first=True)
         turns = (rotations.mean().inv() * rotations).as_rotvec()
-        linear = np.concatenate([turns, stated.translation_m], axis=1)
-        linear = linear - linear.mean(0)
-        linear = linear / np.maximum(linear.std(0), 1e-9) / np.sqrt(linear.shape[1])
+        # Of a fixed camera the frame of the map is the gripper: the arm's position is inverse.
+        arm = self.gripper_from_camera.inverse().translation_m
+        linear = np.concatenate([turns, stated.translation_m, arm], axis=1)
+        basis, size, _ = np.linalg.svd(linear - linear.mean(0), full_matrices=False)
+        basis = basis[:, size > 1e-6 * size[0]]
+        weight = np.sqrt(variances.weight)[:, None, None]
+        posterior = np.einsum("nr,kni->kri", basis, weight[:, 0] * self._error_root(estimate.root))
+        residual = basis.T @ (weight[:, 0] * self._errors(estimate.parameters)) / variances.sigma
+        share = (1 - ((posterior / variances.sigma) ** 2).sum(0)).clip(0)
+        ratio = np.zeros(6)
+        for part in (slice(0, 3), slice(3, 6)):
+            k = share[:, part]
+            excess = (residual[:, part] ** 2 - k).sum() + SYSTEMATIC[0] * SYSTEMATIC[1]
+            ratio[part] = max(excess, 0.0) / ((k**2).sum() + SYSTEMATIC[0])
         common = estimate.root[:, 6 * n : 6 * n + 6].T @ estimate.root
-        precision = variances.weight[:, None] / variances.sigma**2
         # Response of the common transform to an error of each stated pose: (6, n, 6).
         own = common[:, : 6 * n].reshape(6, n, 6) - common[:, None, 6 * n : 6 * n + 6]
         drift = common[:, 6 * n + COMMON, None, None] * self.velocity
-        response = np.einsum("knj,nj,na->kaj", own - drift, precision, linear) * variances.sigma
+        scaled = weight * self.lever / variances.sigma[:, None]
+        response = np.einsum("knj,nij,nr->kri", own - drift, scaled, basis) * np.sqrt(ratio)
         rows = response.reshape(6, -1)
         return rows @ rows.T
+
+    def _error_root(self, root: Array) -> Array:
+        """(k, n, 6) factor of the covariance of the errors, from that of all parameters."""
+        n = self.n
+        moved = root[:, None, 6 * n : 6 * n + 6] + root[:, None, [6 * n + COMMON]] * self.velocity
+        own = root[:, : 6 * n].reshape(-1, n, 6) - moved
+        return np.einsum("nij,knj->kni", self.lever, own)
 
 
 def noise_of(linearised: Linearised) -> float:

@@ -93,7 +93,8 @@ class StatedFrames:
         self.stated = stated
         self._rotation, self._position = stated.rotation_matrix(), stated.translation_m
         self._cameras = cameras
-        self.same_camera = all(camera == cameras[0] for camera in cameras)
+        lenses = {replace(camera, cx=0.0, cy=0.0) for camera in cameras}
+        self.same_lens = len(lenses) == 1
 
     def __len__(self) -> int:
         return len(self._cameras)
@@ -105,11 +106,16 @@ class StatedFrames:
         matrix[:, :3, :3], matrix[:, :3, 3] = rotation, position
         return SE3.from_matrix(matrix)
 
-    def camera(self, parameters: Parameters) -> Camera:
-        """The corrected camera, where all frames share one."""
-        camera, change = self._cameras[0], parameters.shared[COMMON + SHIFT :]
-        if not np.any(change):
-            return camera
+    def cameras(self, parameters: Parameters) -> list[Camera]:
+        """(n,) corrected cameras, where all frames share one lens."""
+        change = parameters.shared[COMMON + SHIFT :]
+        if not (self.same_lens and np.any(change)):
+            return self._cameras
+        corrected = {camera: self._changed(camera, change) for camera in set(self._cameras)}
+        return [corrected[camera] for camera in self._cameras]
+
+    @staticmethod
+    def _changed(camera: Camera, change: Array) -> Camera:
         distortion = np.zeros(max(4, len(camera.distortion)))
         distortion[: len(camera.distortion)] = camera.distortion
         distortion[:2] += change[3:]
@@ -179,10 +185,8 @@ class StatedFrames:
         return rotation, self._position + np.einsum("nij,nj->ni", self._rotation, own[:, :3])
 
     def _by_camera(self, parameters: Parameters, frames: Index) -> list[tuple[Camera, Index]]:
-        if self.same_camera:
-            return [(self.camera(parameters), np.arange(len(frames)))]
         groups: dict[Camera, list[int]] = {}
-        for i, camera in enumerate(self._cameras):
+        for i, camera in enumerate(self.cameras(parameters)):
             groups.setdefault(camera, []).append(i)
         return [(c, np.flatnonzero(np.isin(frames, which))) for c, which in groups.items()]
 

@@ -136,11 +136,10 @@ class PreparedFrames:
         rotation = base_from_j[:3, :3].T
         return rotation @ base_from_k[:3, :3], rotation @ (base_from_k - base_from_j)[:3, 3]
 
-    def adjust(self, poses: SE3, camera: Camera | None) -> None:
-        """Replace the poses (n,), base_from_camera, and, if given, the camera of all frames."""
+    def adjust(self, poses: SE3, cameras: list[Camera] | None) -> None:
+        """Replace the poses (n,), base_from_camera, and, if given, the cameras (n,)."""
         self._move(poses)
-        if camera is not None:
-            self.cameras = [camera] * len(self)
+        self.cameras = cameras or self.cameras
 
     def _move(self, poses: SE3) -> None:
         # A pose of a batch takes long to multiply; `relative` is called for every observation.

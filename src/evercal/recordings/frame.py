@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from evercal.errors import InputError, is_plain
 from evercal.geometry import SE3, Camera
 from evercal.recordings.images import Picture, pixels_of
 
+Mount = Literal["eye_to_hand", "eye_in_hand"]
 MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
 MIN_GRIPPER_FRAMES = 8  # the same for a camera on the gripper: a few views around one place
 

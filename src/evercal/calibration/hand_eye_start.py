@@ -1,0 +1,248 @@
+"""A first hand-eye transform from images and gripper poses; bundle adjustment refines it.
+
+Features of similar frames are matched. An essential matrix gives the rotation of every pair. Let A
+be the motion of the gripper and B that of the camera between two images, and X the transform from
+the camera to what it is mounted on: A X = X B gives the rotation of X from the axes of rotation
+(Park and Martin, IEEE T-RA 1994). With X, the gripper poses predict an epipolar line for every
+match. The distances from these lines (Sampson's approximation) are minimised over all six
+parameters of X; a first position need not be near.
+
+A camera on the gripper moves in the base. A fixed camera moves, as the gripper sees it, around the
+thing that the gripper holds, with the inverse poses.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import OptimizeResult, least_squares
+from scipy.spatial.transform import Rotation
+
+from evercal.calibration.pose_pairs.checks import require_rotations
+from evercal.errors import InputError
+from evercal.features.encoder import Encoder
+from evercal.features.sift import epipolar_pair, sift_features
+from evercal.features.views import working_image
+from evercal.features.vlad import similar_pairs
+from evercal.geometry import SE3, cross_matrix
+from evercal.mapping.selection import spread_poses
+from evercal.processes import cores
+from evercal.progress import OnProgress
+from evercal.recordings.frame import Frame, Mount, stated_grippers
+
+Array = NDArray[np.float64]
+
+
+FRAMES, PARTNERS = 120, 6
+"""Maximum number of frames, and number of most similar frames that each is matched to."""
+ANGLE_DEG, AGREE_DEG = 3.0, 0.5
+"""Largest difference of the rotation angles of a pair, and largest median angle between the rays of
+its matches and their epipolar planes."""
+LEAST_ROTATION_DEG, LEAST_PAIRS = 5.7, 6
+"""Root mean square angle between frames about each of two axes, and pairs that must agree."""
+SPREAD_M: dict[Mount, float] = {"eye_in_hand": 0.2, "eye_to_hand": 2.0}
+"""Standard deviation of the position of the camera before any image."""
+DEPTHS_M = (0.3, 0.6, 1.2, 2.4)
+"""First distances between a fixed camera and the gripper."""
+MATCHES = 30
+"""Matches of a pair that count, at most."""
+ENCODED_SIDE = 240
+"""Short side of the images that are encoded, pixels."""
+LEAST_SHARE = 0.1
+"""Share of the pairs that must agree; before a chessboard most match the wrong squares."""
+SAMPLES = 300
+"""Samples of two pairs that the rotation is estimated from."""
+
+
+class ImagePair(NamedTuple):
+    """Two images and their matches."""
+
+    first: int
+    second: int
+    rotation: Rotation
+    """second_camera_from_first_camera, by the essential matrix."""
+    rays: Array
+    """(2, n, 3) rays of the matches in both camera frames, at depth 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandEyeStart:
+    """A first transform from the camera to what it is mounted on."""
+
+    parent_from_camera: SE3
+    """gripper_from_camera of eye_in_hand, base_from_camera of eye_to_hand."""
+    pairs: int
+    """Pairs of frames that agree with it, of those with matches."""
+    of_pairs: int
+    matches: tuple[ImagePair, ...] = ()
+    """The pairs that agree."""
+    distance_deg: float = 0.0
+    """Median angle of matches from their epipolar planes, median of the pairs."""
+
+
+def scene_from_parent(frames: Sequence[Frame], mount: Mount) -> SE3:
+    """(n,) poses that move the camera: base_from_gripper, or gripper_from_base of eye_to_hand."""
+    poses = stated_grippers(frames)
+    return poses if mount == "eye_in_hand" else poses.inverse()
+
+
+def hand_eye_start(
+    frames: Sequence[Frame],
+    mount: Mount,
+    encoder: Encoder,
+    on_progress: OnProgress = lambda *_: None,
+) -> HandEyeStart:
+    """Estimate the transform of a camera from frames that all have `base_from_gripper`."""
+    poses = scene_from_parent(frames, mount)
+    require_rotations(poses, LEAST_ROTATION_DEG, LEAST_ROTATION_DEG)
+    if len(frames) > FRAMES:
+        some = spread_poses(poses, FRAMES)
+        frames, poses = [frames[i] for i in some], poses[some]
+    return solve_pairs(poses, image_pairs(frames, encoder, on_progress), mount)
+
+
+def solve_pairs(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> HandEyeStart:
+    """Solve for the transform from pairs between n frames with `scene_from_parent` (n,)."""
+    if len(pairs) < LEAST_PAIRS:
+        raise InputError(
+            f"only {len(pairs)} pairs of images show the same place from two sides, at least"
+            f" {LEAST_PAIRS} are needed: record more views that overlap, of a place with"
+            " texture"
+        )
+    first, second = np.array([(pair.first, pair.second) for pair in pairs]).T
+    moved = poses[second].inverse() @ poses[first]
+    stated = Rotation.from_quat(moved.rotation_wxyz, scalar_first=True).as_rotvec()
+    measured = np.array([pair.rotation.as_rotvec() for pair in pairs])
+    difference = np.linalg.norm(stated, axis=1) - np.linalg.norm(measured, axis=1)
+    same_angle = np.abs(difference) < np.deg2rad(ANGLE_DEG)
+    _refuse_disagreement(same_angle)
+    rotation = _robust_rotation(stated[same_angle], measured[same_angle])
+    epipolar = _EpipolarFit(poses, pairs, rotation, SPREAD_M[mount])
+    best = min((epipolar.solve(start) for start in epipolar.starts(mount)), key=lambda fit: fit.cost)
+    distance = epipolar.medians(best.x)
+    agree = distance < np.deg2rad(AGREE_DEG)
+    _refuse_disagreement(agree)
+    return HandEyeStart(
+        epipolar.transform(best.x),
+        int(agree.sum()),
+        len(pairs),
+        tuple(pair for pair, good in zip(pairs, agree, strict=True) if good),
+        float(np.rad2deg(np.median(distance))),
+    )
+
+
+def _refuse_disagreement(agree: NDArray[np.bool_]) -> None:
+    if agree.sum() < max(LEAST_PAIRS, LEAST_SHARE * len(agree)):
+        raise InputError(
+            f"the gripper's motion and the images agree in only {agree.sum()} of {len(agree)} pairs"
+            " of frames: check that the poses belong to these images, that they are poses of the"
+            " gripper in the base (not the inverse), and the order of their quaternions or angles"
+        )
+
+
+def _robust_rotation(gripper: Array, camera: Array) -> Rotation:
+    """The rotation that most rotation vectors (n, 3) agree on: a plane has two essential matrices."""
+    rng, best, least = np.random.default_rng(0), Rotation.identity(), np.inf
+    for _ in range(SAMPLES):
+        two = rng.choice(len(gripper), 2, replace=False)
+        rotation = Rotation.align_vectors(gripper[two], camera[two])[0]
+        distance = np.linalg.norm(gripper - rotation.apply(camera), axis=1)
+        cost = float(np.log1p((distance / np.deg2rad(ANGLE_DEG / 3)) ** 2).sum())
+        if cost < least:
+            best, least = rotation, cost
+    return best
+
+
+class _EpipolarFit:
+    """Sampson distances of matches from the epipolar lines of a transform, as angles."""
+
+    def __init__(self, poses: SE3, pairs: Sequence[ImagePair], rotation: Rotation, spread_m: float):
+        self.rotation, self.spread_m = rotation, spread_m
+        self.matrices, self.pairs = poses.matrix(), pairs
+        some = [
+            np.unique(np.linspace(0, n - 1, min(n, MATCHES)).round().astype(int))
+            for n in (pair.rays.shape[1] for pair in pairs)
+        ]
+        rays = [pair.rays[:, take] for pair, take in zip(pairs, some, strict=True)]
+        self.first, self.second = np.concatenate(rays, axis=1)
+        self.number = np.repeat(np.arange(len(pairs)), [len(take) for take in some])
+
+    def starts(self, mount: Mount) -> list[Array]:
+        """First parameters (6,): rotation vector after `rotation`, position."""
+        if mount == "eye_in_hand":
+            return [np.zeros(6)]
+        towards = self.rotation.apply(np.concatenate([self.first, self.second]).mean(0))
+        towards = towards / np.linalg.norm(towards)
+        gripper = np.linalg.inv(self.matrices)[:, :3, 3].mean(0)
+        return [np.r_[np.zeros(3), gripper - depth * towards] for depth in DEPTHS_M]
+
+    def solve(self, start: Array) -> OptimizeResult:
+        """Minimise from a start."""
+        scale = float(np.deg2rad(AGREE_DEG))
+        first, fit = start[3:], OptimizeResult(x=start)
+        for _ in range(2):
+            fit = least_squares(
+                lambda x: np.r_[self.distances(x), scale / self.spread_m * (x[3:] - first)],
+                fit.x,
+                loss="cauchy",
+                f_scale=scale,
+                x_scale=np.r_[np.full(3, 0.01), np.full(3, 0.1)],
+                max_nfev=50,
+            )
+            scale = min(scale, max(3 * float(np.median(np.abs(self.distances(fit.x)))), 1e-4))
+        return fit
+
+    def distances(self, x: Array) -> Array:
+        """(m,) angles of matches from their epipolar planes, radians."""
+        camera = self.matrices @ self.transform(x).matrix()
+        pairs = np.array([pair[:2] for pair in self.pairs])
+        second_from_first = np.linalg.inv(camera[pairs[:, 1]]) @ camera[pairs[:, 0]]
+        moved = second_from_first[:, :3, 3]
+        direction = moved / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-9)
+        essential = (cross_matrix(direction) @ second_from_first[:, :3, :3])[self.number]
+        by_second = np.einsum("mij,mj->mi", essential, self.first)
+        by_first = np.einsum("mji,mj->mi", essential, self.second)
+        squares = (by_second[:, :2] ** 2).sum(1) + (by_first[:, :2] ** 2).sum(1)
+        return (self.second * by_second).sum(1) / np.sqrt(np.maximum(squares, 1e-12))
+
+    def medians(self, x: Array) -> Array:
+        """Median distance of the matches of each pair, radians."""
+        distance = np.abs(self.distances(x))
+        return np.array([np.median(distance[self.number == i]) for i in range(len(self.pairs))])
+
+    def transform(self, x: Array) -> SE3:
+        """parent_from_camera of parameters (6,)."""
+        turned = Rotation.from_rotvec(x[:3]) * self.rotation
+        return SE3(turned.as_quat(canonical=True, scalar_first=True), x[3:])
+
+
+def image_pairs(
+    frames: Sequence[Frame], encoder: Encoder, on_progress: OnProgress
+) -> list[ImagePair]:
+    """Similar frames with enough matches."""
+    images, cameras, features = [], [], []
+    for frame in frames:
+        image = frame.read_image()
+        grey, camera = working_image(image, frame.camera, min(480, *image.shape[:2]))
+        images.append(grey)
+        cameras.append(camera)
+        features.append(encoder.encode(grey, ENCODED_SIDE).reshape(-1, encoder.width))
+    pairs = similar_pairs(features, encoder.vlad(features), PARTNERS)
+    matched: list[ImagePair] = []
+    with ThreadPoolExecutor(cores()) as pool:
+        points = list(pool.map(sift_features, images))
+
+        def matched_pair(pair: tuple[int, int]) -> ImagePair | None:
+            i, j = pair
+            found = epipolar_pair(points[i], points[j], cameras[i], cameras[j])
+            if found is None:
+                return None
+            return ImagePair(i, j, found.rotation, found.rays)
+
+        for done, pair in enumerate(pool.map(matched_pair, pairs), start=1):
+            matched += [pair] if pair is not None else []
+            on_progress("matching", done, len(pairs))
+    return matched

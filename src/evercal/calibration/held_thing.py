@@ -1,0 +1,118 @@
+"""What a fixed camera sees of a thing that the gripper holds: everything that moves with it.
+
+A pixel that shows the same patch in other images, up to gain and offset, stands still. The rest is
+the thing, the arm, and people. Matches that agree with the gripper's motion tell where the thing
+is; a window around it makes a thing of a few pixels as large as the encoder needs.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.calibration.hand_eye_start import HandEyeStart, ImagePair, scene_from_parent
+from evercal.geometry import SE3
+from evercal.recordings.frame import Frame
+
+PATCH_PX, SAME, STILL_IN, LEAST_CONTRAST = 9, 0.8, 2, 30.0
+"""Side of a patch; correlation of equal patches; other images that show a patch where it stands
+still; variance of a patch below which it shows nothing."""
+LONG_SIDE = 640
+"""Images are compared at this size, pixels."""
+MARGIN = 1.2
+"""Side of the window around a thing, as a factor."""
+MOST_WINDOW = 0.75
+"""Windows larger than this share of the image are not worth it."""
+
+
+def moving_parts(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], float]:
+    """The frames without what stands still, and the share of their texture that stands still."""
+    images = [frame.read_image() for frame in frames]
+    scale = min(1.0, LONG_SIDE / max(images[0].shape[:2]))
+    greys = [
+        cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None, None, scale, scale, cv2.INTER_AREA)
+        for image in images
+    ]
+    still, contrast = _still(greys)
+    textured = contrast > LEAST_CONTRAST
+    share = float((still & textured).sum() / max(textured.sum(), 1))
+    return tuple(
+        replace(frame, image=_without(image, ~stands & visible))
+        for frame, image, stands, visible in zip(frames, images, still, textured, strict=True)
+    ), share
+
+
+def _still(greys: Sequence[NDArray[np.uint8]]) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """(n, h, w) whether a patch is repeated at its place, and its variance."""
+    size = (PATCH_PX, PATCH_PX)
+    images = [grey.astype(np.float32) for grey in greys]
+    means = [cv2.blur(image, size) for image in images]
+    variances = np.stack(
+        [np.maximum(cv2.blur(i * i, size) - m * m, 0) for i, m in zip(images, means, strict=True)]
+    )
+    repeated = np.zeros(variances.shape, np.int16)
+    for i, image in enumerate(images):
+        for j in range(i):
+            covariance = cv2.blur(image * images[j], size) - means[i] * means[j]
+            # The constant is the variance of the noise of two sensors.
+            scale = np.sqrt((variances[i] + 4) * (variances[j] + 4))
+            same = covariance > SAME * scale
+            repeated[i] += same
+            repeated[j] += same
+    return repeated >= STILL_IN, variances
+
+
+def _without(image: NDArray[np.uint8], moving: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The image with its mean colour, through a soft edge, where nothing moves."""
+    mask = cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    soft = cv2.dilate(mask, np.ones((PATCH_PX, PATCH_PX), np.uint8)).astype(np.float32)
+    soft = cv2.resize(cv2.GaussianBlur(soft, (0, 0), 3), image.shape[1::-1])[..., None]
+    colour = (image * soft).sum((0, 1)) / max(float(soft.sum()), 1e-6)
+    return (image * soft + colour * (1 - soft)).astype(np.uint8)
+
+
+def windows(frames: Sequence[Frame], start: HandEyeStart) -> NDArray[np.int64] | None:
+    """(n, 3) left, top and side of a window around the thing; None if it fills the images."""
+    poses = scene_from_parent(frames, "eye_to_hand") @ start.parent_from_camera
+    points = _points(poses, start.matches)
+    if not len(points):
+        return None
+    inner = np.abs(points - np.median(points, 0))
+    points = points[(inner < 4 * np.median(inner, 0) + 1e-6).all(1)]
+    low, high = [], []
+    for frame, pose in zip(frames, poses, strict=True):
+        pixels = frame.camera.project(pose.inverse().apply(points))
+        low.append(np.nanquantile(pixels, 0.01, axis=0))
+        high.append(np.nanquantile(pixels, 0.99, axis=0))
+    size = np.array([frames[0].camera.width, frames[0].camera.height])
+    low, high = np.clip(low, 0, size - 1), np.clip(high, 0, size - 1)
+    side = int(MARGIN * np.max(high - low)) + 2 * PATCH_PX
+    if not np.isfinite(low + high).all() or side > MOST_WINDOW * size.min():
+        return None
+    corner = np.clip(np.rint((low + high - side) / 2), 0, size - side).astype(np.int64)
+    return np.c_[corner, np.full(len(corner), side)]
+
+
+def cropped(frame: Frame, window: NDArray[np.int64]) -> Frame:
+    """The part of a frame in a window."""
+    left, top, side = window.tolist()
+    camera = frame.camera
+    image = frame.read_image()[top : top + side, left : left + side]
+    part = replace(camera, width=side, height=side, cx=camera.cx - left, cy=camera.cy - top)
+    return replace(frame, image=np.ascontiguousarray(image), camera=part)
+
+
+def _points(poses: SE3, pairs: Sequence[ImagePair]) -> NDArray[np.float64]:
+    """(m, 3) matches triangulated in the frame of the gripper."""
+    matrices, points = poses.matrix(), [np.zeros((0, 3))]
+    for pair in pairs:
+        first, second = matrices[pair.first], matrices[pair.second]
+        a, b = pair.rays[0] @ first[:3, :3].T, pair.rays[1] @ second[:3, :3].T
+        between = second[:3, 3] - first[:3, 3]
+        # Nearest points of two rays: a s - b t = between.
+        aa, ab, bb = (a * a).sum(1), (a * b).sum(1), (b * b).sum(1)
+        along = (bb * (a @ between) - ab * (b @ between)) / np.maximum(aa * bb - ab**2, 1e-9)
+        points.append(first[:3, 3] + a * along[:, None])
+    return np.concatenate(points)
