@@ -90,7 +90,7 @@ def learned_mount(recording: Recording, truth: SE3, store: Path) -> tuple[Row, L
     """Learn a wrist recording and compare its `gripper_from_camera` with the true one."""
     report = Map.open(store).learn(recording)
     assert report.hand_eye is not None
-    return pose_error(report.hand_eye.gripper_from_camera, truth), report
+    return pose_error(report.hand_eye.parent_from_camera, truth), report
 
 
 def _wrist_draw(scene: Recording, room: Path, store: Path, draw: int) -> Row:

@@ -86,7 +86,7 @@ def _fold(recording: Recording, truth: SE3, fold: int, store: Path) -> tuple[Row
     except InputError as error:
         return NOTHING | {"reason": str(error)[:80]}, []
     assert report.hand_eye is not None
-    estimate = report.hand_eye.gripper_from_camera
+    estimate = report.hand_eye.parent_from_camera
     rows = []
     for true, frame in zip(recording.test, recording.train, strict=True):
         if frame in train:

@@ -19,7 +19,7 @@ def main(out: Path) -> None:
     cell = evercal.Map.open(out / "cell.evercal")
     report = cell.learn(CELL / "wrist")
     assert report.hand_eye is not None, "the recording states gripper poses"
-    gripper_from_camera = report.hand_eye.gripper_from_camera
+    gripper_from_camera = report.hand_eye.parent_from_camera
     print(f"gripper_from_camera: {1000 * gripper_from_camera.pose.translation_m} mm")
     print(f"standard deviation: {gripper_from_camera.sigma_mm:.2f} mm per axis")
 

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, Self
 
 from evercal.errors import InputError
 from evercal.mapping.store import MapStore
-from evercal.recordings.frame import Recording
+from evercal.recordings.frame import Mount, Recording
 
 if TYPE_CHECKING:
     import numpy as np
 
     from evercal.calibration.align import MapAlignment
-    from evercal.calibration.calibration import Calibration, Mount
+    from evercal.calibration.calibration import Calibration
     from evercal.calibration.drift import Shift
     from evercal.calibration.from_images import ImageSource
     from evercal.evaluation import Scores
@@ -134,6 +134,47 @@ class Map:
             InputError: A recording that cannot be used, a name that is taken, or another process
                 is writing into the map.
         """
+        return self._learn(recording, name, memory, gripper_from_camera, options, on_progress)
+
+    def eye_to_hand(
+        self,
+        recording: PathLike | Recording,
+        *,
+        name: str | None = None,
+        on_progress: OnProgress | None = None,
+    ) -> Calibration:
+        """Calibrate a fixed camera by any textured thing in the gripper; no marker is needed.
+
+        The thing becomes a scene of the map, in the frame of the gripper. `calibrate` and `check`
+        with `robot_poses` use it again: for this camera, and for others that see the thing.
+
+        Args:
+            recording: Images of the fixed camera and `base_from_gripper` at each, or their path.
+                The gripper turns the thing by 20 degrees and more about two axes.
+            name: Of the scene. Default: the recording's name.
+            on_progress: Called with the current step, how much of it is done, and its total.
+                Default: bars on stderr.
+
+        Returns:
+            base_from_camera with its covariance.
+
+        Raises:
+            InputError: A recording that cannot be used, with the cause; a name that is taken; or
+                another process is writing into the map.
+        """
+        report = self._learn(recording, name, None, None, None, on_progress, "eye_to_hand")
+        return self.calibration(report.scene)
+
+    def _learn(
+        self,
+        recording: PathLike | Recording,
+        name: str | None,
+        memory: str | int | None,
+        gripper_from_camera: SE3 | None,
+        options: MapOptions | None,
+        on_progress: OnProgress | None,
+        mount: Mount = "eye_in_hand",
+    ) -> LearnReport:
         from evercal.learning.scene import learn_scene
         from evercal.progress import shown
         from evercal.recordings import load_recording
@@ -144,7 +185,7 @@ class Map:
         with self._store.writing(), shown(on_progress) as step:
             contents = self._store.contents
             scene, report = learn_scene(
-                loaded, contents, memory, gripper_from_camera, options, step
+                loaded, contents, memory, gripper_from_camera, options, step, mount
             )
             self._store.commit(scene, asdict(report))
         self._localizer = None
@@ -383,7 +424,7 @@ class Map:
         Args:
             images: a folder, image files or arrays (H, W, 3), all from one camera.
             robot_poses: base_from_gripper of every image, as a file or (n,) poses, for a camera on
-                the gripper.
+                the gripper, and where the scene is a thing in the gripper.
             camera: Intrinsics. Default: those of the camera that recorded the scene.
             mount: `eye_to_hand` or `eye_in_hand`. Default: decided from the camera's motion.
             on_image: called after each image.
@@ -464,6 +505,7 @@ class Map:
         images: ImageSource,
         calibration: Calibration,
         *,
+        robot_poses: PathLike | SE3 | None = None,
         camera: Camera | None = None,
         on_image: Callable[[], object] = lambda: None,
     ) -> Shift:
@@ -472,6 +514,8 @@ class Map:
         Args:
             images: of the camera as it stands now.
             calibration: its calibration.
+            robot_poses: base_from_gripper of every image, as a file or (n,) poses, where the scene
+                is a thing in the gripper.
             camera: Intrinsics. Default: those of the calibration.
             on_image: called after each image.
 
@@ -481,8 +525,9 @@ class Map:
         from evercal.calibration.drift import check
         from evercal.calibration.from_images import Images
 
-        given = Images.of(images, camera)
-        return check(self.localizer, given.images, calibration, given.camera, on_image)
+        given = Images.of(images, camera, robot_poses)
+        poses = given.base_from_gripper
+        return check(self.localizer, given.images, calibration, given.camera, on_image, poses)
 
     def evaluate(
         self,

@@ -16,7 +16,7 @@ from evercal.calibration.from_images import Images, calibrate
 from evercal.calibration.from_images import _from_many_spots as from_many_spots
 from evercal.calibration.from_images import _lens_advice as lens_advice
 from evercal.calibration.from_images import _spots as spots_of
-from evercal.calibration.located import ImagePose, deviations, fuse, in_gripper_frame
+from evercal.calibration.located import ImagePose, deviations, fuse, in_parent_frame
 from evercal.errors import InputError
 from evercal.geometry import SE3, UncertainPose, pose_distance
 from evercal.localization.estimate import PoseEstimate
@@ -317,7 +317,7 @@ def squared_distance(seed: int, base_mm: float) -> float:
         answer = UncertainPose(SE3.identity(), base) @ UncertainPose(pose, own)
         estimate = PoseEstimate("ok", "", "hall", pose, answer.covariance, 100, 0.5, 1.0)
         located.append(ImagePose(str(i), estimate, pose, answer.covariance))
-    moved = in_gripper_frame(located, grippers)
+    moved = in_parent_frame(located, grippers.inverse())
     fused = fuse(moved)
     covariance, terms = from_many_spots(located, moved, fused, grippers, base)
     assert sum(term.name == "base frame" for term in terms) == 1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.eye_in_hand_start import (
+from evercal.calibration.hand_eye_start import (
     LEAST_ROTATION_DEG,
     PairMotion,
     solve_motions,

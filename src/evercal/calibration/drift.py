@@ -13,7 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, ImageUse
-from evercal.calibration.located import Fused, ImagePose, deviations, fuse, length_mm_deg, locate
+from evercal.calibration.located import (
+    Fused,
+    ImagePose,
+    deviations,
+    fuse,
+    in_parent_frame,
+    length_mm_deg,
+    locate,
+    shows_held_thing,
+)
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, axis_deviation
 from evercal.recordings.images import Picture
@@ -59,9 +68,14 @@ def check(
     reference: Calibration,
     camera: Camera | None = None,
     on_image: Callable[[], object] = lambda: None,
+    base_from_gripper: SE3 | None = None,
 ) -> Shift:
     """Test whether a camera has moved since its calibration, see `Map.check`."""
     located = locate(localizer, images, camera or reference.camera, on_image)
+    if shows_held_thing(localizer, located, base_from_gripper) and base_from_gripper is not None:
+        sigma = [float(reference.checks.get(f"arm_sigma_{unit}") or 0.0) for unit in ("mm", "deg")]
+        arm = np.diag(np.repeat([sigma[0] / 1000, np.deg2rad(sigma[1])], 3) ** 2)
+        located = in_parent_frame(located, base_from_gripper, arm)
     return shift_between(reference, fuse(located), located, localizer)
 
 

@@ -22,8 +22,9 @@ from evercal.calibration.located import (
     deviations,
     fuse,
     halves_apart,
-    in_gripper_frame,
+    in_parent_frame,
     locate,
+    shows_held_thing,
 )
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
@@ -108,22 +109,26 @@ def calibrate(
     if mount == "eye_in_hand" and grippers is None:
         raise InputError("eye_in_hand needs the gripper's pose at every image: give --robot-poses")
     located = locate(localizer, given.images, given.camera, on_image)
+    held = shows_held_thing(localizer, located, grippers)
+    if held and mount == "eye_in_hand":
+        raise InputError("eye_in_hand: the gripper holds the scene, which shows fixed cameras only")
     if mount is None:
-        mount = "eye_to_hand" if grippers is None or _stands_still(located) else "eye_in_hand"
-    moved = located
-    if mount == "eye_in_hand" and grippers is not None:
-        moved = in_gripper_frame(located, grippers)
+        still = held or grippers is None or _stands_still(located)
+        mount = "eye_to_hand" if still else "eye_in_hand"
+    moved, parents = located, None
+    if grippers is not None and (held or mount == "eye_in_hand"):
+        parents = grippers if held else grippers.inverse()
+        moved = in_parent_frame(located, parents)
     fused = fuse(moved)
     scene = localizer.contents.metric_scene(fused.scene)
     first = pixels_of(given.images[0][1])
     stated = cameras_in_scenes(given.camera, first, [scene])[0]
     camera = estimated_camera(fused.select(located), stated)
-    if mount == "eye_to_hand":
+    if parents is None:
         covariance, terms = _from_one_spot(moved, fused)
     else:
-        assert grippers is not None, "checked before"
         base = scene.frame.base_covariance
-        covariance, terms = _from_many_spots(located, moved, fused, grippers, base)
+        covariance, terms = _from_many_spots(located, moved, fused, parents, base)
     checks: dict[str, Any] = {
         "images_given": len(moved),
         "images_used": int(fused.used.sum()),
@@ -196,18 +201,18 @@ def _from_many_spots(
     located: Sequence[ImagePose],
     moved: Sequence[ImagePose],
     fused: Fused,
-    base_from_gripper: SE3,
+    parent_from_scene: SE3,
     base_covariance: Array | None,
 ) -> tuple[Array, tuple[ErrorTerm, ...]]:
-    """Covariance of a camera on the gripper: scatter among spots, one spot's, the base frame's."""
+    """Covariance of a camera that moves in its scene: scatter among spots, one spot, the base."""
     from scipy import stats
 
     used, cameras = fused.select(moved), [item.pose for item in fused.select(located)]
     spots = _spots(cameras)
     count = int(spots.max()) + 1
     base = np.zeros((6, 6)) if base_covariance is None else base_covariance
-    grippers = fused.select(list(base_from_gripper))
-    slopes = np.stack([_by_base_motion(g, c) for g, c in zip(grippers, cameras, strict=True)])
+    parents = fused.select(list(parent_from_scene))
+    slopes = np.stack([_by_scene_motion(p, c) for p, c in zip(parents, cameras, strict=True)])
     shared = slopes.mean(0) @ base @ slopes.mean(0).T
     whole = np.mean([item.covariance for item in used], axis=0)
     own = (whole - (slopes @ base @ slopes.transpose(0, 2, 1)).mean(0)) / count
@@ -230,12 +235,12 @@ def _from_many_spots(
     )
 
 
-def _by_base_motion(base_from_gripper: SE3, base_from_camera: SE3) -> Array:
-    inverse = base_from_gripper.rotation_matrix().T
+def _by_scene_motion(parent_from_scene: SE3, scene_from_camera: SE3) -> Array:
+    rotation = parent_from_scene.rotation_matrix()
     slope = np.zeros((6, 6))
-    slope[:3, :3] = inverse
-    slope[:3, 3:] = -inverse @ cross_matrix(base_from_camera.translation_m)
-    slope[3:, 3:] = base_from_camera.rotation_matrix().T
+    slope[:3, :3] = rotation
+    slope[:3, 3:] = -rotation @ cross_matrix(scene_from_camera.translation_m)
+    slope[3:, 3:] = scene_from_camera.rotation_matrix().T
     return slope
 
 

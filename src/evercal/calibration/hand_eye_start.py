@@ -51,8 +51,9 @@ MATCHES = 30
 """Matches of a pair that count, at most."""
 ENCODED_SIDE = 240
 """Short side of the images that are encoded, pixels."""
-LEAST_SHARE = 0.1
-"""Share of the pairs that must agree; before a chessboard most match the wrong squares."""
+LEAST_SHARE, SURE_SHARE = 0.3, 0.8
+"""Share of the pairs that must agree, and share from which no other mount is tried. Before a
+chessboard half of the pairs match the wrong squares; of another mount up to 0.3 agree."""
 SAMPLES = 300
 """Samples of two pairs that the rotation is estimated from."""
 
@@ -74,6 +75,7 @@ class HandEyeStart:
 
     parent_from_camera: SE3
     """gripper_from_camera of eye_in_hand, base_from_camera of eye_to_hand."""
+    mount: Mount
     pairs: int
     """Pairs of frames that agree with it, of those with matches."""
     of_pairs: int
@@ -101,7 +103,42 @@ def hand_eye_start(
     if len(frames) > FRAMES:
         some = spread_poses(poses, FRAMES)
         frames, poses = [frames[i] for i in some], poses[some]
-    return solve_pairs(poses, image_pairs(frames, encoder, on_progress), mount)
+    pairs, start, refusal = image_pairs(frames, encoder, on_progress), None, None
+    try:
+        start = solve_pairs(poses, pairs, mount)
+    except InputError as error:
+        refusal = error
+    if start is None or start.pairs < SURE_SHARE * start.of_pairs:
+        _refuse_other_mount(poses.inverse(), pairs, mount, start)
+    if start is None:
+        raise refusal or AssertionError
+    return start
+
+
+def _refuse_other_mount(
+    poses: SE3, pairs: Sequence[ImagePair], mount: Mount, start: HandEyeStart | None
+) -> None:
+    """Refuse a recording whose images fit the other mount better."""
+    try:
+        other = solve_pairs(
+            poses, pairs, "eye_in_hand" if mount == "eye_to_hand" else "eye_to_hand"
+        )
+    except InputError:
+        return
+    if start is not None and other.distance_deg > start.distance_deg / 2:
+        return
+    agree = f"in {other.pairs} of {other.of_pairs} pairs of frames"
+    if mount == "eye_to_hand":
+        raise InputError(
+            f"the camera moves with the gripper ({agree}): 'evercal learn MAP RECORDING"
+            " --calibration FILE' calibrates it, or the poses are those of the base in the gripper:"
+            " invert them"
+        )
+    raise InputError(
+        f"the images fit the inverse poses ({agree}): invert them if they are those of the base in"
+        " the gripper; if the camera stands still and shows what the gripper holds, use 'evercal"
+        " eye-to-hand'"
+    )
 
 
 def solve_pairs(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> HandEyeStart:
@@ -121,12 +158,15 @@ def solve_pairs(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> HandEye
     _refuse_disagreement(same_angle)
     rotation = _robust_rotation(stated[same_angle], measured[same_angle])
     epipolar = _EpipolarFit(poses, pairs, rotation, SPREAD_M[mount])
-    best = min((epipolar.solve(start) for start in epipolar.starts(mount)), key=lambda fit: fit.cost)
+    best = min(
+        (epipolar.solve(start) for start in epipolar.starts(mount)), key=lambda fit: fit.cost
+    )
     distance = epipolar.medians(best.x)
     agree = distance < np.deg2rad(AGREE_DEG)
     _refuse_disagreement(agree)
     return HandEyeStart(
         epipolar.transform(best.x),
+        mount,
         int(agree.sum()),
         len(pairs),
         tuple(pair for pair, good in zip(pairs, agree, strict=True) if good),
@@ -144,7 +184,10 @@ def _refuse_disagreement(agree: NDArray[np.bool_]) -> None:
 
 
 def _robust_rotation(gripper: Array, camera: Array) -> Rotation:
-    """The rotation that most rotation vectors (n, 3) agree on: a plane has two essential matrices."""
+    """The rotation that most rotation vectors (n, 3) agree on.
+
+    A plane has two essential matrices, so half of the measured ones may be wrong.
+    """
     rng, best, least = np.random.default_rng(0), Rotation.identity(), np.inf
     for _ in range(SAMPLES):
         two = rng.choice(len(gripper), 2, replace=False)
@@ -181,12 +224,16 @@ class _EpipolarFit:
 
     def solve(self, start: Array) -> OptimizeResult:
         """Minimise from a start."""
-        scale = float(np.deg2rad(AGREE_DEG))
-        first, fit = start[3:], OptimizeResult(x=start)
+        scale, first, fit = float(np.deg2rad(AGREE_DEG)), start[3:], OptimizeResult(x=start)
+
+        def residuals(x: Array, scale: float) -> Array:
+            return np.r_[self.distances(x), scale / self.spread_m * (x[3:] - first)]
+
         for _ in range(2):
             fit = least_squares(
-                lambda x: np.r_[self.distances(x), scale / self.spread_m * (x[3:] - first)],
+                residuals,
                 fit.x,
+                args=(scale,),
                 loss="cauchy",
                 f_scale=scale,
                 x_scale=np.r_[np.full(3, 0.01), np.full(3, 0.1)],

@@ -32,7 +32,9 @@ def moving_parts(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], float]:
     images = [frame.read_image() for frame in frames]
     scale = min(1.0, LONG_SIDE / max(images[0].shape[:2]))
     greys = [
-        cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None, None, scale, scale, cv2.INTER_AREA)
+        cv2.resize(
+            cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None, None, scale, scale, cv2.INTER_AREA
+        )
         for image in images
     ]
     still, contrast = _still(greys)

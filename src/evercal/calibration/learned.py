@@ -20,7 +20,7 @@ def calibration_at(path: str | os.PathLike[str]) -> Calibration:
 
 def learned_calibration(root: Path, scene: str | None = None) -> Calibration:
     """Return the `gripper_from_camera` of a scene, by default the only one with gripper poses."""
-    from evercal.calibration.eye_in_hand import HandEyeReport
+    from evercal.calibration.hand_eye import HandEyeReport
     from evercal.mapping.store import stored_scenes
 
     stored = {name: (camera, report) for name, camera, report in stored_scenes(root)}

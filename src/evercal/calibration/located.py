@@ -76,13 +76,36 @@ def locate(
     return located
 
 
-def in_gripper_frame(located: Sequence[ImagePose], base_from_gripper: SE3) -> list[ImagePose]:
-    """Return the n images with `gripper_from_camera` as the pose."""
-    moved = []
-    for item, gripper in zip(located, base_from_gripper, strict=True):
-        pose = gripper.inverse() @ UncertainPose(item.pose, item.covariance)
+def in_parent_frame(
+    located: Sequence[ImagePose], parent_from_scene: SE3, arm: Array | None = None
+) -> list[ImagePose]:
+    """Return the n images with `parent_from_camera` as the pose.
+
+    Args:
+        located: Images with poses in the frame of their scene.
+        parent_from_scene: (n,) of each image: gripper_from_base for a camera on the gripper,
+            base_from_gripper where the scene is a thing in the gripper.
+        arm: (6, 6) covariance of each of them. Default: exact.
+    """
+    moved, arm = [], np.zeros((6, 6)) if arm is None else arm
+    for item, parent in zip(located, parent_from_scene, strict=True):
+        pose = UncertainPose(parent, arm) @ UncertainPose(item.pose, item.covariance)
         moved.append(ImagePose(item.name, item.estimate, pose.pose, pose.covariance))
     return moved
+
+
+def shows_held_thing(
+    localizer: "Localizer", located: Sequence[ImagePose], base_from_gripper: SE3 | None
+) -> bool:
+    """Whether the first located image shows a thing in the gripper, which needs gripper poses."""
+    name = next((item.estimate.scene for item in located if item.is_located), None)
+    held = name is not None and localizer.contents.scene(name).parent_frame == "gripper"
+    if held and base_from_gripper is None:
+        raise InputError(
+            f"scene {name} is a thing in the gripper: give the gripper's pose at every image with"
+            " --robot-poses"
+        )
+    return held
 
 
 def fuse(located: Sequence[ImagePose]) -> Fused:

@@ -20,7 +20,7 @@ from evercal.errors import InputError, printable
 
 VERBS = {
     "Map": ["learn", "localize", "track", "view", "refresh", "evaluate", "info", "map", "serve"],
-    "Calibrate": ["studio", "calibrate", "check", "watch", "audit", "align"],
+    "Calibrate": ["studio", "eye-to-hand", "calibrate", "check", "watch", "audit", "align"],
     "Boards and pose pairs": ["detect", "solve"],
     "Results": ["export", "report"],
     "Recordings": ["inspect", "convert", "reconstruct", "simulate", "demo"],
@@ -94,7 +94,8 @@ def _complain(message: str, as_json: bool) -> int:
 
 def verb_class(name: str) -> Any:
     """The class of a verb."""
-    return getattr(importlib.import_module(f"evercal.cli.{name}"), name.capitalize())
+    module = importlib.import_module(f"evercal.cli.{name.replace('-', '_')}")
+    return getattr(module, name.title().replace("-", ""))
 
 
 def _help() -> str:

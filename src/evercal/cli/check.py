@@ -29,21 +29,27 @@ class Check(args.Verb):
     images: args.ImageFiles
     """New images of one camera, or a folder of them; five or more reveal smaller shifts."""
     reference: Reference
+    robot_poses: args.File = None
+    """base_from_gripper of every image, where the scene is a thing in the gripper."""
+    convention: args.Name = None
+    """Format of the robot poses, if the file does not state it."""
     camera: args.File = None
     """Intrinsics. Default: those of the reference."""
 
     def run(self) -> int:
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.drift import check
+        from evercal.calibration.from_images import Images
         from evercal.recordings.image_files import image_files
 
         files = image_files(self.images)
         reference = read_calibration(self.reference)
         camera = args.camera_for(self.camera, files)
-        images = [(str(path), path) for path in files]
+        given = Images.of(files, camera, self.robot_poses, self.convention)
+        images, poses = given.images, given.base_from_gripper
         localizer = args.open_map(self.store)
         with progress_bar("localizing", len(images), "image") as bar:
-            shift = check(localizer, images, reference, camera, on_image=bar.update)
+            shift = check(localizer, images, reference, camera, bar.update, poses)
         rejected = [use for use in shift.images if not use.used]
         self.answer(
             check_record(shift),

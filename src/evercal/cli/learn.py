@@ -242,7 +242,7 @@ def summary(report: "LearnReport") -> Iterator[str]:
             few = f"{report.landmarks / report.frames_kept:.0f} landmarks a keyframe are few"
             yield f"warning: {few}: most images will be refused; record sharper and textured views"
     if (found := report.hand_eye) is not None:
-        pose = found.gripper_from_camera
+        pose = found.parent_from_camera
         x, y, z = (1000 * value for value in found.translation_m)
         quaternion = ", ".join(f"{value:.5f}" for value in found.quaternion_wxyz)
         yield (
@@ -262,7 +262,7 @@ def summary(report: "LearnReport") -> Iterator[str]:
 
 
 def _warnings(adjusted: "Adjusted") -> Iterator[str]:
-    from evercal.calibration.eye_in_hand import MOST_FOCAL_PERCENT
+    from evercal.calibration.hand_eye import MOST_FOCAL_PERCENT
 
     if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
         yield (

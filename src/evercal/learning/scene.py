@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from evercal.errors import InputError
-from evercal.geometry import SE3
+from evercal.geometry import SE3, Camera
 from evercal.learning.stated_scatter import with_scatter
 from evercal.localization.acceptance import differ
 from evercal.localization.localizer import Localizer
@@ -28,7 +28,7 @@ from evercal.recordings.held_out import HeldOutSplit, require_frames, split_held
 from evercal.recordings.pictures import look_at
 
 if TYPE_CHECKING:
-    from evercal.calibration.eye_in_hand import HandEyeReport
+    from evercal.calibration.hand_eye import HandEyeReport
 
 
 @dataclass(frozen=True)
@@ -79,14 +79,17 @@ def learn_scene(
         gripper_from_camera: A rough one that the estimate is compared with.
         options: Sizes and priors of the map; `memory` overrides theirs.
         on_progress: Called with the current step, how much of it is done, and its total.
+        mount: Of the camera, where the recording states gripper poses only. The map of a fixed
+            camera is that of the thing that the gripper holds, in the frame of the gripper.
     """
     began = time.perf_counter()
     budget, options = MemoryBudget.parse(memory), options or MapOptions()
     start, least = None, MIN_TRAIN_FRAMES
     if not (shown := look_at(recording.train)).usable:
         raise InputError(f"scene {recording.name!r}: {'; '.join(shown.warnings)}")
+    whole = recording.train[0].camera
     if lacks_camera_poses(recording):
-        from evercal.calibration.eye_in_hand import posed_by_gripper
+        from evercal.calibration.hand_eye import posed_by_gripper
 
         recording, start = posed_by_gripper(recording, mount, contents.encoder, on_progress)
         options = options.for_hand_eye(mount)
@@ -99,6 +102,8 @@ def learn_scene(
     options = _sized(options, budget, contents.short_side)
     options = replace(options, metric=recording.metric)
     built = build_map(recording.name, split.train, contents.encoder, options, on_progress)
+    if options.mount == "eye_to_hand":
+        built = replace(built, scene=of_whole_images(built.scene, whole))
     if budget.auto:
         from evercal.learning.fewest_keyframes import fewest_keyframes
 
@@ -125,11 +130,20 @@ def learn_scene(
         else replace(built.adjusted, common_translation_mm=None, pose_sigma_mm=None),
     )
     if start is not None:
-        from evercal.calibration.eye_in_hand import hand_eye_report
+        from evercal.calibration.hand_eye import hand_eye_report
 
         hand_eye = hand_eye_report(start, built, split.train, gripper_from_camera)
         report = replace(report, hand_eye=hand_eye)
     return scene, report
+
+
+def of_whole_images(scene: SceneMap, whole: Camera) -> SceneMap:
+    """The map of a thing in the gripper, with the camera of whole images instead of windows."""
+    part, adjusted = scene.camera, scene.adjusted_camera
+    moved = adjusted.cx - part.cx, adjusted.cy - part.cy
+    size = {"width": whole.width, "height": whole.height}
+    adjusted = replace(adjusted, **size, cx=whole.cx + moved[0], cy=whole.cy + moved[1])
+    return replace(scene, camera=whole, adjusted_camera=adjusted, parent_frame="gripper")
 
 
 def located_as_stated(

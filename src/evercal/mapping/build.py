@@ -38,10 +38,6 @@ from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, Mount, stated_grippers, stated_poses
 
-HAND_EYE_COVARIANCE_SCALE = 1.0
-"""Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
-over many frames, which residuals do not show: the squared error in 30 trials was 1.8 times the
-formal one (research/handeye.md)."""
 GAP, MOST_PARTS = 10, 12
 """Frames without keyframes before and after a part that is left out, and number of parts at most.
 Frames between similar keyframes are located more exactly than new images are."""
@@ -83,6 +79,7 @@ class MapOptions:
             self.bundle,
             common_stated=False,
             correlation=2.7,
+            least_share=0.01,
             common_sigma_m=0.2,
             common_sigma_deg=10.0,
             least_sigma_m=2e-4,
@@ -126,10 +123,19 @@ class HandEyeCorrection:
     """gripper_from_camera is the rough one times this."""
     by_noise: NDArray[np.float64]
     """(6, 6) covariance by noise of images and gripper poses; camera frame, metres and radians."""
+    by_lens: NDArray[np.float64]
+    """(6, 6) covariance by the uncertainty of the intrinsics."""
     by_drift: NDArray[np.float64]
     """(6, 6) covariance by errors of gripper poses that vary slowly over the recording."""
     residuals: dict[str, NDArray[np.float64]]
-    """(6,) deviation of each frame's gripper pose from the images, by name; camera frame."""
+    """(6,) deviation of each frame's gripper pose from the images, by name; gripper frame."""
+    moved: dict[str, NDArray[np.float64]]
+    """(6,) the same as a motion of the camera, camera frame."""
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """(6, 6) of all causes."""
+        return self.by_noise + self.by_lens + self.by_drift
 
 
 @dataclass(frozen=True, eq=False)
@@ -398,12 +404,15 @@ def _finish(
         if not options.bundle.common_stated:
             # The common transform is part of the answer and not an error to undo.
             by_noise = np.asarray(adjustment.common_covariance, np.float64)
-            by_noise = HAND_EYE_COVARIANCE_SCALE * by_noise
+            by_lens = np.asarray(adjustment.common_by_lens, np.float64)
             by_drift = np.asarray(adjustment.common_systematic, np.float64)
-            names = (frame.name for frame in frames.frames)
+            names = [frame.name for frame in frames.frames]
             residuals = dict(zip(names, adjustment.errors, strict=True))
-            hand_eye = HandEyeCorrection(common, by_noise, by_drift, residuals)
-            base = frame_covariance(frames.stated @ common, by_noise + by_drift)
+            moved = dict(zip(names, adjustment.correction, strict=True))
+            hand_eye = HandEyeCorrection(
+                common, by_noise - by_lens, by_lens, by_drift, residuals, moved
+            )
+            base = frame_covariance(frames.stated @ common, hand_eye.covariance)
             frame = replace(frame, common=SE3.identity(), base_covariance=base)
     return BuiltMap(
         SceneMap(

@@ -84,6 +84,8 @@ class BundleOptions:
     """Prior standard deviation of k1 and k2 where the recording states no distortion."""
     relevance: float = 4.0
     """A group of parameters is adjusted when its squares are this many times their variance."""
+    least_share: float = 1e-6
+    """Variance that a group keeps where the images require no change, as a share of its prior."""
     tail: float = 5.0
     """Degrees of freedom of the Student distribution of pose errors; a few frames may be far
     off."""
@@ -101,7 +103,7 @@ class Adjustment:
     poses: SE3
     """(n,) base_from_camera of the frames."""
     cameras: list[Camera] | None
-    """(n,) adjusted intrinsics; None where frames have different cameras or nothing was adjusted."""
+    """(n,) adjusted intrinsics; None where lenses differ or nothing was adjusted."""
     common: SE3
     """stated_camera_from_camera: stated poses are corrected by this on the right."""
     shift_frames: float
@@ -114,6 +116,8 @@ class Adjustment:
     """Median reprojection error, pixels."""
     common_covariance: Array
     """(6, 6) of the common transform, camera frame, metres and radians."""
+    common_by_lens: Array
+    """(6, 6) part of it that known intrinsics would take away."""
     common_systematic: Array
     """(6, 6) of the same, due to errors of stated poses that vary linearly over the recording."""
     correction: Array
@@ -359,7 +363,7 @@ class BundleAdjustment:
             clear = (squares[part] / noise[part]).mean() > self.options.relevance
             wanted = (squares[part] - noise[part]).mean() if clear else 0.0
             wide = np.clip(wanted, prior[part] / 16, widest[part])
-            variances[part] = np.maximum(wide, 1e-6 * widest[part])
+            variances[part] = np.maximum(wide, self.options.least_share * widest[part])
         return variances
 
     def _result(self, tracks: BundleTracks, estimate: Estimate, variances: Variances) -> Adjustment:
@@ -376,6 +380,7 @@ class BundleAdjustment:
             sigma_rad=float(variances.sigma[3]),
             residual_px=float(np.median(np.linalg.norm(residual, axis=1))),
             common_covariance=root[n].T @ root[n],
+            common_by_lens=self._by_lens(estimate.root),
             common_systematic=self._systematic(estimate, variances),
             correction=self._deviation(parameters),
             errors=self._errors(parameters),
@@ -383,6 +388,10 @@ class BundleAdjustment:
             covariance=np.stack([columns.T @ columns for columns in root[:n]]),
             inverse_depth=parameters.inverse_depth,
         )
+
+    def _by_lens(self, root: Array) -> Array:
+        common, lens = root[:, 6 * self.n : 6 * self.n + 6], root[:, -INTRINSICS:]
+        return common.T @ lens @ np.linalg.solve(lens.T @ lens, lens.T @ common)
 
     def _systematic(self, estimate: Estimate, variances: Variances) -> Array:
         """Covariance (6, 6) of the common transform due to systematic errors of stated poses.

@@ -35,6 +35,8 @@ class SceneMap:
     """Frames that the map was built from."""
     metric: bool = True
     """Whether the recording was in metres; False where its unit of length is unknown."""
+    parent_frame: str = "base"
+    """Frame of the answers: base, or gripper for the map of a thing that the gripper holds."""
     unit: float = 1.0
     """Units of length of the recording per unit of the map; 1 where the recording is in metres."""
 

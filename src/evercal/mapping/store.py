@@ -44,7 +44,7 @@ REFRESHES = "refreshes.json"
 _STATE, PREVIOUS = (SCENE, KEYFRAMES, CORRECTION), "previous-"
 """Files that a refresh replaces, and the prefix of their state before."""
 
-_FIELDS = "name", "camera", "adjusted_camera", "train_frames", "metric", "unit"
+_FIELDS = ("name", "camera", "adjusted_camera", "train_frames", "metric", "parent_frame", "unit")
 """Fields of `SceneMap` in scene.json, beside `frame`."""
 
 
@@ -243,7 +243,12 @@ def read_scene(folder: Path) -> SceneMap:
 
 
 def _read_scene(folder: Path) -> SceneMap:
-    content = {"metric": True, "unit": 1.0, **json.loads((folder / SCENE).read_text())}
+    content = {
+        "metric": True,
+        "unit": 1.0,
+        "parent_frame": "base",
+        **json.loads((folder / SCENE).read_text()),
+    }
     correction = None
     if (folder / CORRECTION).exists():
         correction = correction_of(load_tensors(folder / CORRECTION))

@@ -79,7 +79,7 @@ def test_the_map_keeps_the_calibration(learned: tuple[Path, LearnReport], tmp_pa
     calibration = cell.calibration()
     assert (calibration.mount, calibration.parent_frame) == ("eye_in_hand", "gripper")
     assert tier(calibration) in TIERS
-    estimate = report.hand_eye.gripper_from_camera
+    estimate = report.hand_eye.parent_from_camera
     assert max(pose_distance(calibration.parent_from_child, estimate.pose)) < 1e-12
     np.testing.assert_array_equal(calibration.covariance, estimate.covariance)
     assert calibration.camera == cell.localizer.contents.scenes[0].adjusted_camera

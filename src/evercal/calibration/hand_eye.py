@@ -1,15 +1,19 @@
-"""A camera on the gripper, from nothing: images and gripper poses give `gripper_from_camera`.
+"""A camera from nothing: images and gripper poses give `gripper_from_camera` or `base_from_camera`.
 
-`hand_eye_start` estimates a first transform from pairs of images, which the map's bundle
-adjustment refines together with all poses and landmarks.
+A camera on the gripper sees a scene that stands still. A fixed camera sees a thing that the
+gripper holds: `gripper_from_base` moves the camera around it, so it is the same problem in the
+frame of the gripper. `hand_eye_start` estimates a first transform from pairs of images. The map's
+bundle adjustment refines it together with all poses and landmarks.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
 from evercal.calibration.hand_eye_start import HandEyeStart, hand_eye_start, scene_from_parent
@@ -20,18 +24,23 @@ from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
-from evercal.mapping.build import Adjusted, BuiltMap
+from evercal.mapping.build import Adjusted, BuiltMap, HandEyeCorrection
 from evercal.progress import OnProgress
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame, Mount, Recording, stated_grippers
 from evercal.recordings.held_out import require_frames
 
 MOST_FOCAL_PERCENT, MOST_POSE_SIGMA_MM = 1.0, 5.0
 """Larger corrections indicate systematic errors, which the covariance does not contain."""
+STILL_SHARE = 0.3
+"""Share of the texture that stands still before a fixed camera; the gripper shows a wrist camera
+less of itself."""
+SLIP_CHANCE, SLIP_SHARE = 1e-4, 0.5
+"""Greatest probability of a step by chance, and least share of the residuals that it explains."""
 
 
 @dataclass(frozen=True)
 class HandEyeReport:
-    """The estimated camera on the gripper, as JSON values."""
+    """The estimated camera, as JSON values."""
 
     translation_m: tuple[float, ...]
     quaternion_wxyz: tuple[float, ...]
@@ -43,6 +52,11 @@ class HandEyeReport:
     start_mm: float
     """Change of the first estimate by bundle adjustment."""
     start_deg: float
+    mount: Mount = "eye_in_hand"
+    """eye_in_hand estimates `gripper_from_camera`, eye_to_hand `base_from_camera`."""
+    arm_sigma_mm: float = 0.0
+    """Standard deviation of a gripper pose per axis."""
+    arm_sigma_deg: float = 0.0
     given_mm: float | None = None
     """Distance from a given `gripper_from_camera`, such as from CAD."""
     given_deg: float | None = None
@@ -57,23 +71,28 @@ class HandEyeReport:
     """Use of each frame; residuals are those of its gripper pose."""
 
     @property
-    def gripper_from_camera(self) -> UncertainPose:
+    def parent_from_camera(self) -> UncertainPose:
         """The transform with its covariance."""
         pose = SE3(np.array(self.quaternion_wxyz), np.array(self.translation_m))
         return UncertainPose(pose, np.array(self.covariance))
 
     def calibration(self, camera: Camera, scene: str, frames: int) -> Calibration:
         """Return the estimate as a calibration with the intrinsics that the map adjusted."""
-        estimate = self.gripper_from_camera
+        estimate, fixed = self.parent_from_camera, self.mount == "eye_to_hand"
         calibration = Calibration(
-            "eye_in_hand",
+            self.mount,
             estimate.pose,
             estimate.covariance,
-            parent_frame="gripper",
+            parent_frame="base" if fixed else "gripper",
             camera=camera,
             images=self.images,
             error_terms=self.error_terms,
-            source={"command": "learn", "scene": scene, "frames": frames},
+            checks={"arm_sigma_mm": self.arm_sigma_mm, "arm_sigma_deg": self.arm_sigma_deg},
+            source={
+                "command": "eye-to-hand" if fixed else "learn",
+                "scene": scene,
+                "frames": frames,
+            },
             created=self.created,
         )
         warnings = [f"Do not rely on it: {warning}." for warning in self.warnings]
@@ -95,13 +114,18 @@ def posed_by_gripper(
     """
     frames = tuple(frame for frame in recording.train if frame.base_from_gripper is not None)
     require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
-    still = 0.0
     if mount == "eye_to_hand":
-        frames, still = moving_parts(frames)
+        frames, _ = moving_parts(frames)
     try:
         start = hand_eye_start(frames, mount, encoder, on_progress)
     except InputError as error:
-        raise InputError(f"{recording.name}: {error}") from None
+        hint = ""
+        if mount == "eye_in_hand" and (still := moving_parts(frames)[1]) > STILL_SHARE:
+            hint = (
+                f"; {100 * still:.0f} % of what the images show stands still: 'evercal eye-to-hand'"
+                " calibrates a fixed camera by a thing in the gripper"
+            )
+        raise InputError(f"{recording.name}: {error}{hint}") from None
     poses = scene_from_parent(frames, mount) @ start.parent_from_camera
     if mount == "eye_to_hand" and (around := windows(frames, start)) is not None:
         frames = tuple(cropped(*both) for both in zip(frames, around, strict=True))
@@ -122,12 +146,13 @@ def hand_eye_report(
     """
     correction = built.hand_eye
     assert correction is not None, "the map was built for a hand-eye calibration"
+    _refuse_slip(frames, correction, start.mount)
     # The covariance of the correction is about camera axes, as that of a pose after an exact one.
-    covariance = correction.by_noise + correction.by_drift
-    start_from_camera = UncertainPose(correction.start_camera_from_camera, covariance)
+    start_from_camera = UncertainPose(correction.start_camera_from_camera, correction.covariance)
     estimate = start.parent_from_camera @ start_from_camera
     start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.parent_from_camera)
-    left = open_position(stated_grippers(frames), estimate.pose)
+    fixed = start.mount == "eye_to_hand"
+    left = None if fixed else open_position(stated_grippers(frames), estimate.pose)
     widest_mm = 1000 * float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1]))
     from_given = (None, None) if given is None else pose_distance_mm_deg(estimate.pose, given)
     return HandEyeReport(
@@ -140,15 +165,72 @@ def hand_eye_report(
         start_deg=start_deg,
         given_mm=from_given[0],
         given_deg=from_given[1],
+        mount=start.mount,
+        arm_sigma_mm=built.adjusted.pose_sigma_mm or 0.0,
+        arm_sigma_deg=built.adjusted.pose_sigma_deg,
         warnings=_warnings(built.adjusted),
         advice=left.sentence(widest_mm) if left else "",
         error_terms=(
             ErrorTerm.of("noise of images and gripper poses", correction.by_noise),
+            ErrorTerm.of("intrinsics", correction.by_lens),
             ErrorTerm.of("slowly varying errors of gripper poses", correction.by_drift),
         ),
         images=tuple(use for frame in frames if (use := _use(frame, built)) is not None),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
+
+
+def _refuse_slip(frames: Sequence[Frame], correction: HandEyeCorrection, mount: Mount) -> None:
+    """Refuse a recording of a fixed camera in which the camera or the thing moved once.
+
+    A thing that slips in the gripper steps in the gripper's residuals, a camera in its own.
+    """
+    if mount == "eye_in_hand":
+        return
+    names = [frame.name for frame in frames if frame.name in correction.residuals]
+    steps = [
+        (step, what)
+        for values, what in (
+            (correction.residuals, "what the gripper holds"),
+            (correction.moved, "the camera"),
+        )
+        if (step := largest_step(np.array([values[name] for name in names]))) is not None
+    ]
+    if steps:
+        step, what = max(steps, key=lambda both: both[0].share)
+        millimetres, degrees = length_mm_deg(step.size)
+        raise InputError(
+            f"{what} moved by {millimetres:.1f} mm and {degrees:.2f} deg before image"
+            f" {names[step.before]}: fasten it and record again, or use the images before or after"
+        )
+
+
+class Step(NamedTuple):
+    """A step in a sequence."""
+
+    before: int
+    """Number of the first element after it."""
+    size: NDArray[np.float64]
+    """(6,) metres and radians."""
+    share: float
+    """Share of the sum of squares that it explains."""
+
+
+def largest_step(values: NDArray[np.float64]) -> Step | None:
+    """The step that explains most of deviations (n, 6), metres and radians; None by chance."""
+    from scipy import stats
+
+    n, best = len(values), None
+    for k in range(2, n - 1):
+        size = values[k:].mean(0) - values[:k].mean(0)
+        total = ((values - values.mean(0)) ** 2).reshape(n, 2, 3).sum((0, 2))
+        by_step = k * (n - k) / n * (size**2).reshape(2, 3).sum(1)
+        rest = np.maximum(total - by_step, 1e-18)
+        chance = stats.f.sf((by_step / 3) / (rest / (3 * (n - 2))), 3, 3 * (n - 2)).min() * 2 * n
+        share = float((by_step / np.maximum(total, 1e-18)).max())
+        if chance < SLIP_CHANCE and share > SLIP_SHARE and (best is None or share > best.share):
+            best = Step(k, size, share)
+    return best
 
 
 def _use(frame: Frame, built: BuiltMap) -> ImageUse | None:

@@ -1,0 +1,59 @@
+"""`evercal eye-to-hand`."""
+
+import sys
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from evercal.cli import args
+from evercal.cli.calibrate import calibration_lines
+from evercal.cli.console import require_writable
+from evercal.progress import Bars
+
+
+@dataclass(frozen=True)
+class EyeToHand(args.Verb):
+    """Calibrate a fixed camera by any textured thing in the gripper; no board, no map.
+
+    The recording has images of the fixed camera and the gripper's pose at each. The arm holds a
+    box, a book or a printed picture, and turns it by 20 degrees and more about two axes.
+
+    Example: evercal eye-to-hand recording/ --camera camera.json --out tripod.json
+    """
+
+    recording: Annotated[Positional[Path], args.shown("RECORDING")]
+    """Folder of images with base_from_gripper.csv or joints.csv, or a bag."""
+    out: args.OutFile = Path("calibration.json")
+    """Output file."""
+    map: args.File = None
+    """Keep the thing as a scene of this map: `check` and `calibrate` with --robot-poses use it."""
+    name: args.Name = None
+    """Name of that scene. Default: the recording's own name."""
+    reading: Annotated[args.Reading, arg(name="")] = field(default_factory=args.Reading)
+    at: args.At = None
+
+    def run(self) -> int:
+        require_writable(self.out, "--out")
+        point = args.Point.parse(self.at)
+        from evercal.calibration.verdict import tier
+        from evercal.map import Map
+
+        recording = self.reading.recording(self.recording, self.name)
+        with tempfile.TemporaryDirectory() as folder:
+            cell = Map.open(self.map or Path(folder) / "thing")
+            start = f"{recording.name}: {len(recording.train)} images"
+            with Bars(sys.stderr if self.json else sys.stdout, start) as bars:
+                calibration = cell.eye_to_hand(recording, on_progress=bars.step)
+        calibration.write(self.out)
+        record = calibration.to_dict()
+        if point is not None:
+            record["at"] = point.record(calibration.uncertain_pose)
+        self.answer(
+            record,
+            *calibration_lines(calibration, point),
+            then=("export", self.out, "--format", "easy_handeye2"),
+        )
+        return 0 if tier(calibration) else 1
