@@ -61,7 +61,7 @@ def test_gripper_from_camera_within_its_covariance(
     assert (whole.train_frames, whole.held_out_frames) == (14, 0)
     assert whole.frames_kept >= 8
     assert report is not None
-    estimate = report.gripper_from_camera
+    estimate = report.parent_from_camera
     metres, radians = pose_distance(estimate.pose, truth)
     assert metres < 0.002
     assert np.rad2deg(radians) < 0.1

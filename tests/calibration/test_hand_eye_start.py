@@ -8,12 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from evercal.calibration.hand_eye_start import (
     LEAST_ROTATION_DEG,
-    PairMotion,
-    solve_motions,
+    ImagePair,
+    solve_pairs,
 )
 from evercal.calibration.pose_pairs.checks import require_rotations
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
+from evercal.recordings.frame import Mount
 
 TRUTH = SE3.exp([0.05, -0.08, 0.12, 0.4, -1.2, 2.0])
 
@@ -23,40 +24,46 @@ def grippers(count: int, seed: int, size: tuple[float, float] = (0.3, 0.4)) -> S
     return SE3.exp(rng.normal(0, np.repeat(size, 3), (count, 6)))
 
 
-def motions(poses: SE3, truth: SE3, noise_rad: float = 0.0, wrong: int = 0) -> list[PairMotion]:
-    """Camera motions from pairs of images, without length; some of them random."""
+def image_pairs(poses: SE3, truth: SE3, noise_px: float = 0.0, wrong: int = 0) -> list[ImagePair]:
+    """Pairs of images of points in front of the cameras, at 500 px; some of them random."""
     rng, pairs = np.random.default_rng(1), []
     cameras = poses @ truth
+    middle = cameras.apply(np.array([0.0, 0.0, 0.6])).mean(0)
+    points = middle + rng.normal(0, 0.1, (40, 3))
     for i in range(len(poses)):
         for j in range(i + 1, min(i + 4, len(poses))):
             moved = cameras[j].inverse() @ cameras[i]
             rotation = Rotation.from_quat(moved.rotation_wxyz, scalar_first=True)
-            rotation = rotation * Rotation.from_rotvec(rng.normal(0, noise_rad, 3))
-            length = np.linalg.norm(moved.translation_m)
-            direction = moved.translation_m + rng.normal(0, noise_rad, 3) * length
-            pairs.append(PairMotion(i, j, rotation, direction / np.linalg.norm(direction)))
+            seen = [cameras[k].inverse().apply(points) for k in (i, j)]
+            rays = np.stack([points / points[:, 2:] for points in seen])
+            rays[..., :2] += rng.normal(0, noise_px / 500, rays[..., :2].shape)
+            pairs.append(ImagePair(i, j, rotation, rays))
     for k in rng.choice(len(pairs), wrong, replace=False).tolist():
-        random, rotation = rng.normal(size=3), Rotation.random(rng=rng)
-        pairs[k] = pairs[k]._replace(rotation=rotation, direction=random / np.linalg.norm(random))
+        rays = np.concatenate([rng.normal(0, 0.3, (2, 40, 2)), np.ones((2, 40, 1))], 2)
+        pairs[k] = pairs[k]._replace(rotation=Rotation.random(rng=rng), rays=rays)
     return pairs
 
 
-def test_exact_motions_give_the_exact_transform() -> None:
-    poses = grippers(12, 0)
-    start = solve_motions(poses, motions(poses, TRUTH))
-    metres, radians = pose_distance(start.gripper_from_camera, TRUTH)
-    assert metres < 1e-6
-    assert radians < 1e-6
+@pytest.mark.parametrize("mount", ["eye_in_hand", "eye_to_hand"])
+def test_exact_pairs_give_the_exact_transform(mount: Mount) -> None:
+    poses, truth = grippers(12, 0), TRUTH
+    if mount == "eye_to_hand":  # a fixed camera, 1.3 m from the base
+        truth = SE3.exp([1.0, -0.3, 0.8, 0.4, -1.2, 2.0])
+        poses = (SE3.from_translation(truth.apply(np.array([0.0, 0.0, 0.6]))) @ poses).inverse()
+    start = solve_pairs(poses, image_pairs(poses, truth), mount)
+    metres, radians = pose_distance(start.parent_from_camera, truth)
+    assert metres < 1e-4
+    assert radians < 1e-4
     assert start.pairs == start.of_pairs
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_wrong_pairs_are_rejected(seed: int) -> None:
     poses = grippers(30, seed)
-    start = solve_motions(poses, motions(poses, TRUTH, 0.005, wrong=20))
-    metres, radians = pose_distance(start.gripper_from_camera, TRUTH)
-    assert metres < 0.01
-    assert np.rad2deg(radians) < 0.3
+    start = solve_pairs(poses, image_pairs(poses, TRUTH, 0.5, wrong=20), "eye_in_hand")
+    metres, radians = pose_distance(start.parent_from_camera, TRUTH)
+    assert metres < 0.003
+    assert np.rad2deg(radians) < 0.1
     assert start.pairs <= start.of_pairs - 15
 
 
@@ -67,16 +74,29 @@ def test_a_camera_that_orbits_one_place_does_not_end_there(seed: int) -> None:
     turns = SE3.exp(np.pad(rng.normal(0, 0.25, (25, 3)), ((0, 0), (3, 0))))
     poses = turns @ SE3.from_translation((0.0, 0.0, -0.6)) @ TRUTH.inverse()
     noisy = poses @ SE3.exp(rng.normal(0, np.repeat([3e-4, 3e-4], 3), (25, 6)))
-    start = solve_motions(noisy, motions(poses, TRUTH, 0.01))
-    assert pose_distance(start.gripper_from_camera, TRUTH)[0] < 0.2
+    start = solve_pairs(noisy, image_pairs(poses, TRUTH, 0.5), "eye_in_hand")
+    assert pose_distance(start.parent_from_camera, TRUTH)[0] < 0.3
+
+
+def test_both_rotations_of_a_plane_are_survived() -> None:
+    """An essential matrix from a plane has a twin, so two thirds of the rotations are wrong."""
+    poses, rng = grippers(15, 3), np.random.default_rng(0)
+    pairs = image_pairs(poses, TRUTH, 0.2)
+    for k in range(0, len(pairs), 3):
+        for twin in (k, k + 1):
+            turned = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) * pairs[twin].rotation
+            pairs[twin] = pairs[twin]._replace(rotation=turned)
+    start = solve_pairs(poses, pairs, "eye_in_hand")
+    assert pose_distance(start.parent_from_camera, TRUTH)[0] < 0.003
+    assert start.pairs == start.of_pairs
 
 
 def test_inverted_poses_and_too_few_pairs_are_refused() -> None:
     poses = grippers(20, 0)
     with pytest.raises(InputError, match=r"agree in only .*not the inverse"):
-        solve_motions(poses.inverse(), motions(poses, TRUTH))
+        solve_pairs(poses.inverse(), image_pairs(poses, TRUTH), "eye_in_hand")
     with pytest.raises(InputError, match="only 3 pairs"):
-        solve_motions(poses[:3], motions(poses[:3], TRUTH))
+        solve_pairs(poses[:3], image_pairs(poses[:3], TRUTH), "eye_in_hand")
 
 
 @pytest.mark.parametrize(

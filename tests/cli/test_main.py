@@ -17,7 +17,7 @@ from evercal.cli import main
 
 VERBS = {
     "Map": ["learn", "localize", "track", "view", "refresh", "evaluate", "info", "map", "serve"],
-    "Calibrate": ["studio", "calibrate", "check", "watch", "audit", "align"],
+    "Calibrate": ["studio", "eye-to-hand", "calibrate", "check", "watch", "audit", "align"],
     "Boards and pose pairs": ["detect", "solve"],
     "Results": ["export", "report"],
     "Recordings": ["inspect", "convert", "reconstruct", "simulate", "demo"],

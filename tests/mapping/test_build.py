@@ -166,15 +166,17 @@ def test_landmarks_are_tracked_again_after_noticeable_changes(
     stated, zero = SE3.exp(np.random.default_rng(0).normal(size=(10, 6))), np.zeros((10, 6, 6))
     adjustment = Adjustment(
         poses=stated @ SE3.exp(np.broadcast_to(change, (10, 6))),
-        camera=camera,
+        cameras=camera and [camera] * 10,
         common=SE3.identity(),
         shift_frames=0.0,
         sigma_m=0.0,
         sigma_rad=0.0,
         residual_px=0.1,
         common_covariance=zero[0],
+        common_by_lens=zero[0],
         common_systematic=zero[0],
         correction=zero[:, 0],
+        errors=zero[:, 0],
         weight=np.ones(10),
         covariance=zero,
         inverse_depth=np.full(7, 0.5),
@@ -283,7 +285,7 @@ def test_parts_are_left_out_with_the_keyframes_near_them(
         assert set(part.keyframes.tolist()) == set(np.flatnonzero(away > 10).tolist())
         assert 0 < len(part.keyframes) < len(recorded)
     assert built.left_out(frames[:29]) == []
-    moved = HandEyeCorrection(SE3.identity(), np.eye(6), np.eye(6), {})
+    moved = HandEyeCorrection(SE3.identity(), np.eye(6), np.eye(6), np.eye(6), {}, {})
     assert replace(built, hand_eye=moved).left_out(frames) == []
 
 

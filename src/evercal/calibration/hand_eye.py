@@ -54,6 +54,8 @@ class HandEyeReport:
     start_deg: float
     mount: Mount = "eye_in_hand"
     """eye_in_hand estimates `gripper_from_camera`, eye_to_hand `base_from_camera`."""
+    map: str = ""
+    """Digest of the scene, see `SceneMap.digest`."""
     arm_sigma_mm: float = 0.0
     """Standard deviation of a gripper pose per axis."""
     arm_sigma_deg: float = 0.0
@@ -92,6 +94,7 @@ class HandEyeReport:
                 "command": "eye-to-hand" if fixed else "learn",
                 "scene": scene,
                 "frames": frames,
+                "map": self.map,
             },
             created=self.created,
         )
@@ -166,6 +169,7 @@ def hand_eye_report(
         given_mm=from_given[0],
         given_deg=from_given[1],
         mount=start.mount,
+        map=built.scene.digest,
         arm_sigma_mm=built.adjusted.pose_sigma_mm or 0.0,
         arm_sigma_deg=built.adjusted.pose_sigma_deg,
         warnings=_warnings(built.adjusted),

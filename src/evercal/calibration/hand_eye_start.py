@@ -13,6 +13,7 @@ thing that the gripper holds, with the inverse poses.
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -118,26 +119,21 @@ def hand_eye_start(
 def _refuse_other_mount(
     poses: SE3, pairs: Sequence[ImagePair], mount: Mount, start: HandEyeStart | None
 ) -> None:
-    """Refuse a recording whose images fit the other mount better."""
-    try:
-        other = solve_pairs(
-            poses, pairs, "eye_in_hand" if mount == "eye_to_hand" else "eye_to_hand"
-        )
-    except InputError:
+    """Refuse a recording whose images fit the inverse poses better."""
+    rivals = []
+    for other in SPREAD_M:
+        with suppress(InputError):
+            rivals.append(solve_pairs(poses, pairs, other))
+    rival = min(rivals, key=lambda rival: rival.distance_deg, default=None)
+    if rival is None or (start is not None and rival.distance_deg > start.distance_deg / 2):
         return
-    if start is not None and other.distance_deg > start.distance_deg / 2:
-        return
-    agree = f"in {other.pairs} of {other.of_pairs} pairs of frames"
-    if mount == "eye_to_hand":
-        raise InputError(
-            f"the camera moves with the gripper ({agree}): 'evercal learn MAP RECORDING"
-            " --calibration FILE' calibrates it, or the poses are those of the base in the gripper:"
-            " invert them"
-        )
+    another = "the camera moves with the gripper ('evercal learn MAP RECORDING --calibration FILE')"
+    if mount == "eye_in_hand":
+        another = "the camera stands still and shows what the gripper holds ('evercal eye-to-hand')"
     raise InputError(
-        f"the images fit the inverse poses ({agree}): invert them if they are those of the base in"
-        " the gripper; if the camera stands still and shows what the gripper holds, use 'evercal"
-        " eye-to-hand'"
+        f"the inverse poses agree with the images in {rival.pairs} of {rival.of_pairs} pairs of"
+        f" frames: either the poses are those of the base in the gripper, then invert them, or"
+        f" {another}"
     )
 
 
@@ -226,8 +222,13 @@ class _EpipolarFit:
         """Minimise from a start."""
         scale, first, fit = float(np.deg2rad(AGREE_DEG)), start[3:], OptimizeResult(x=start)
 
+        matches = len(self.number) / len(self.pairs)
+
         def residuals(x: Array, scale: float) -> Array:
-            return np.r_[self.distances(x), scale / self.spread_m * (x[3:] - first)]
+            # The matches of a pair share the errors of its poses, so each pair counts as one match.
+            squares = matches * ((x[3:] - first) ** 2).sum() / self.spread_m**2
+            # The loss of this residual is `squares`: the prior is no outlier.
+            return np.r_[self.distances(x), scale * np.sqrt(np.expm1(min(squares, 500.0)))]
 
         for _ in range(2):
             fit = least_squares(

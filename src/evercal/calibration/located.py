@@ -76,20 +76,15 @@ def locate(
     return located
 
 
-def in_parent_frame(
-    located: Sequence[ImagePose], parent_from_scene: SE3, arm: Array | None = None
-) -> list[ImagePose]:
+def in_parent_frame(located: Sequence[ImagePose], parent_from_scene: SE3) -> list[ImagePose]:
     """Return the n images with `parent_from_camera` as the pose.
 
-    Args:
-        located: Images with poses in the frame of their scene.
-        parent_from_scene: (n,) of each image: gripper_from_base for a camera on the gripper,
-            base_from_gripper where the scene is a thing in the gripper.
-        arm: (6, 6) covariance of each of them. Default: exact.
+    `parent_from_scene` (n,) is gripper_from_base for a camera on the gripper, and base_from_gripper
+    where the scene is a thing in the gripper.
     """
-    moved, arm = [], np.zeros((6, 6)) if arm is None else arm
+    moved = []
     for item, parent in zip(located, parent_from_scene, strict=True):
-        pose = UncertainPose(parent, arm) @ UncertainPose(item.pose, item.covariance)
+        pose = parent @ UncertainPose(item.pose, item.covariance)
         moved.append(ImagePose(item.name, item.estimate, pose.pose, pose.covariance))
     return moved
 
