@@ -48,6 +48,8 @@ SPREAD_M: dict[Mount, float] = {"eye_in_hand": 0.2, "eye_to_hand": 2.0}
 """Standard deviation of the position of the camera before any image."""
 DEPTHS_M = (0.3, 0.6, 1.2, 2.4)
 """First distances between a fixed camera and the gripper."""
+STILL_PX = 2.0
+"""Before a fixed camera, matches that move less stand still."""
 MATCHES = 30
 """Matches of a pair that count, at most."""
 ENCODED_SIDE = 240
@@ -104,7 +106,8 @@ def hand_eye_start(
     if len(frames) > FRAMES:
         some = spread_poses(poses, FRAMES)
         frames, poses = [frames[i] for i in some], poses[some]
-    pairs, start, refusal = image_pairs(frames, encoder, on_progress), None, None
+    least_px = STILL_PX if mount == "eye_to_hand" else 0.0
+    pairs, start, refusal = image_pairs(frames, encoder, on_progress, least_px), None, None
     try:
         start = solve_pairs(poses, pairs, mount)
     except InputError as error:
@@ -268,9 +271,12 @@ class _EpipolarFit:
 
 
 def image_pairs(
-    frames: Sequence[Frame], encoder: Encoder, on_progress: OnProgress
+    frames: Sequence[Frame],
+    encoder: Encoder,
+    on_progress: OnProgress = lambda *_: None,
+    least_px: float = 0.0,
 ) -> list[ImagePair]:
-    """Similar frames with enough matches."""
+    """Similar frames with enough matches; those that move by less than `least_px` do not count."""
     images, cameras, features = [], [], []
     for frame in frames:
         image = frame.read_image()
@@ -285,7 +291,7 @@ def image_pairs(
 
         def matched_pair(pair: tuple[int, int]) -> ImagePair | None:
             i, j = pair
-            found = epipolar_pair(points[i], points[j], cameras[i], cameras[j])
+            found = epipolar_pair(points[i], points[j], cameras[i], cameras[j], least_px)
             if found is None:
                 return None
             return ImagePair(i, j, found.rotation, found.rays)

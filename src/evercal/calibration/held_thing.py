@@ -5,6 +5,7 @@ the thing, the arm, and people. Matches that agree with the gripper's motion tel
 is; a window around it makes a thing of a few pixels as large as the encoder needs.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -16,9 +17,11 @@ from evercal.calibration.hand_eye_start import HandEyeStart, ImagePair, scene_fr
 from evercal.geometry import SE3
 from evercal.recordings.frame import Frame
 
-PATCH_PX, SAME, STILL_IN, LEAST_CONTRAST = 9, 0.8, 2, 30.0
+PATCH_PX, SAME, STILL_IN, LEAST_CONTRAST = 9, 0.8, 2, 2.0
 """Side of a patch; correlation of equal patches; other images that show a patch where it stands
-still; variance of a patch below which it shows nothing."""
+still; least variance of a patch that shows something, in variances of the noise."""
+LEAST_NOISE = 2.0
+"""Standard deviation of intensities that every camera has at least."""
 LONG_SIDE = 640
 """Images are compared at this size, pixels."""
 MARGIN = 1.2
@@ -37,8 +40,7 @@ def moving_parts(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], float]:
         )
         for image in images
     ]
-    still, contrast = _still(greys)
-    textured = contrast > LEAST_CONTRAST
+    still, textured = _still(greys)
     share = float((still & textured).sum() / max(textured.sum(), 1))
     return tuple(
         replace(frame, image=_without(image, ~stands & visible))
@@ -46,24 +48,29 @@ def moving_parts(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], float]:
     ), share
 
 
-def _still(greys: Sequence[NDArray[np.uint8]]) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """(n, h, w) whether a patch is repeated at its place, and its variance."""
+def _still(greys: Sequence[NDArray[np.uint8]]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(n, h, w) whether a patch is repeated at its place, and whether it shows anything."""
     size = (PATCH_PX, PATCH_PX)
     images = [grey.astype(np.float32) for grey in greys]
     means = [cv2.blur(image, size) for image in images]
     variances = np.stack(
         [np.maximum(cv2.blur(i * i, size) - m * m, 0) for i, m in zip(images, means, strict=True)]
     )
+    # Most of two images is equal but for the noise.
+    changes = [
+        float(np.median(cv2.blur((b - a) ** 2, size) - cv2.blur(b - a, size) ** 2)) / 2
+        for a, b in itertools.pairwise(images)
+    ]
+    noise = max(float(np.median(changes)), LEAST_NOISE**2)
+    signals = np.maximum(variances - noise, noise)
     repeated = np.zeros(variances.shape, np.int16)
     for i, image in enumerate(images):
         for j in range(i):
             covariance = cv2.blur(image * images[j], size) - means[i] * means[j]
-            # The constant is the variance of the noise of two sensors.
-            scale = np.sqrt((variances[i] + 4) * (variances[j] + 4))
-            same = covariance > SAME * scale
+            same = covariance > SAME * np.sqrt(signals[i] * signals[j])
             repeated[i] += same
             repeated[j] += same
-    return repeated >= STILL_IN, variances
+    return repeated >= STILL_IN, variances > (1 + LEAST_CONTRAST) * noise
 
 
 def _without(image: NDArray[np.uint8], moving: NDArray[np.bool_]) -> NDArray[np.uint8]:

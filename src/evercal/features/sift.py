@@ -55,9 +55,12 @@ def sift_features(image: NDArray[np.uint8]) -> SiftFeatures:
 
 
 def epipolar_pair(
-    a: SiftFeatures, b: SiftFeatures, first: Camera, second: Camera
+    a: SiftFeatures, b: SiftFeatures, first: Camera, second: Camera, least_px: float = 0.0
 ) -> EpipolarPair | None:
-    """Match two images and estimate the camera's motion; None for fewer than `MIN_INLIERS`."""
+    """Match two images and estimate the camera's motion; None for fewer than `MIN_INLIERS`.
+
+    Matches that move by less than `least_px` in the image do not count.
+    """
     import poselib
 
     if min(len(a.pixels), len(b.pixels)) < MIN_INLIERS:
@@ -66,7 +69,8 @@ def epipolar_pair(
     # Undistorted here, so that PoseLib needs no camera model.
     ideal_a = first.unproject(a.pixels[rows])[:, :2] * first.fx
     ideal_b = second.unproject(b.pixels[matched])[:, :2] * second.fx
-    valid = np.isfinite(ideal_a + ideal_b).all(1)
+    moved = np.linalg.norm(a.pixels[rows] - b.pixels[matched], axis=1)
+    valid = np.isfinite(ideal_a + ideal_b).all(1) & (moved >= least_px)
     if valid.sum() < MIN_INLIERS:
         return None
     pose, info = poselib.estimate_relative_pose(
