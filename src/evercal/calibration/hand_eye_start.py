@@ -106,8 +106,7 @@ def hand_eye_start(
     if len(frames) > FRAMES:
         some = spread_poses(poses, FRAMES)
         frames, poses = [frames[i] for i in some], poses[some]
-    least_px = STILL_PX if mount == "eye_to_hand" else 0.0
-    pairs, start, refusal = image_pairs(frames, encoder, on_progress, least_px), None, None
+    pairs, start, refusal = image_pairs(frames, mount, encoder, on_progress), None, None
     try:
         start = solve_pairs(poses, pairs, mount)
     except InputError as error:
@@ -272,26 +271,33 @@ class _EpipolarFit:
 
 def image_pairs(
     frames: Sequence[Frame],
+    mount: Mount,
     encoder: Encoder,
     on_progress: OnProgress = lambda *_: None,
-    least_px: float = 0.0,
 ) -> list[ImagePair]:
-    """Similar frames with enough matches; those that move by less than `least_px` do not count."""
+    """Similar frames with enough matches; of a fixed camera, those that stand still do not count."""
     images, cameras, features = [], [], []
+    fixed = mount == "eye_to_hand"
     for frame in frames:
         image = frame.read_image()
-        grey, camera = working_image(image, frame.camera, min(480, *image.shape[:2]))
+        short_side = min(960 if fixed else 480, *image.shape[:2])
+        grey, camera = working_image(image, frame.camera, short_side)
         images.append(grey)
         cameras.append(camera)
-        features.append(encoder.encode(grey, ENCODED_SIDE).reshape(-1, encoder.width))
-    pairs = similar_pairs(features, encoder.vlad(features), PARTNERS)
+        if not fixed:
+            features.append(encoder.encode(grey, ENCODED_SIDE).reshape(-1, encoder.width))
+    pairs = (
+        _turned_least(frames)
+        if fixed
+        else similar_pairs(features, encoder.vlad(features), PARTNERS)
+    )
     matched: list[ImagePair] = []
     with ThreadPoolExecutor(cores()) as pool:
         points = list(pool.map(sift_features, images))
 
         def matched_pair(pair: tuple[int, int]) -> ImagePair | None:
             i, j = pair
-            found = epipolar_pair(points[i], points[j], cameras[i], cameras[j], least_px)
+            found = epipolar_pair(points[i], points[j], cameras[i], cameras[j], STILL_PX * fixed)
             if found is None:
                 return None
             return ImagePair(i, j, found.rotation, found.rays)
@@ -300,3 +306,13 @@ def image_pairs(
             matched += [pair] if pair is not None else []
             on_progress("matching", done, len(pairs))
     return matched
+
+
+def _turned_least(frames: Sequence[Frame]) -> list[tuple[int, int]]:
+    """Pairs of frames, each with those between which the gripper turned least."""
+    rotation = Rotation.from_quat(stated_grippers(frames).rotation_wxyz, scalar_first=True)
+    pairs = set()
+    for i, first in enumerate(rotation):
+        nearest = np.argsort((first.inv() * rotation).magnitude(), kind="stable")[1:]
+        pairs |= {(min(i, j), max(i, j)) for j in nearest[:PARTNERS].tolist()}
+    return sorted(pairs)
