@@ -45,7 +45,7 @@ FIRST_DAMPING, MAX_RAISES = 1e-4, 8
 """Levenberg-Marquardt damping after the first rejected step, and rejections in a row at most."""
 ROUNDING = 1e-9
 """Share by which rounding may raise the cost of an accepted step."""
-SYSTEMATIC = 1.0, 1.0
+SYSTEMATIC = 5.0, 1.0
 """Prior of the variance of systematic errors: its weight in observed directions, and its size in
 variances of the noise."""
 CONVERGED = 1e-9

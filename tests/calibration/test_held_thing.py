@@ -1,0 +1,93 @@
+"""What a fixed camera sees of a thing in the gripper: masks, windows, and a thing that slips."""
+
+import cv2
+import numpy as np
+import pytest
+
+from evercal.calibration.hand_eye import largest_step
+from evercal.calibration.hand_eye_start import HandEyeStart, ImagePair
+from evercal.calibration.held_thing import cropped, moving_parts, windows
+from evercal.geometry import SE3, Camera
+from evercal.recordings.frame import Frame
+
+CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
+
+
+def texture(seed: int, height: int, width: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2)
+    return 120 + 40 * smooth / smooth.std()
+
+
+def frames_of(count: int, noise: float, gain: float = 0.0) -> tuple[list[Frame], list[np.ndarray]]:
+    """A textured square that moves before a textured wall, and where it is in each image."""
+    rng, wall, thing = np.random.default_rng(0), texture(1, 240, 320), texture(2, 60, 60)
+    frames, masks = [], []
+    for i in range(count):
+        left, top = rng.integers(20, 230), rng.integers(20, 150)
+        image, mask = wall * (1 + gain * rng.normal()), np.zeros((240, 320), bool)
+        turned = cv2.warpAffine(thing, cv2.getRotationMatrix2D((30, 30), 40.0 * i, 1.0), (60, 60))
+        image[top : top + 60, left : left + 60] = turned
+        mask[top + 8 : top + 52, left + 8 : left + 52] = True
+        image = image + rng.normal(0, noise, image.shape)
+        grey = np.clip(image, 0, 255).astype(np.uint8)
+        frames.append(Frame(str(i), np.repeat(grey[..., None], 3, 2), CAMERA, None, SE3.identity()))
+        masks.append(mask)
+    return frames, masks
+
+
+@pytest.mark.parametrize(("noise", "gain"), [(1.0, 0.0), (8.0, 0.0), (3.0, 0.1)])
+def test_what_stands_still_is_removed(noise: float, gain: float) -> None:
+    frames, masks = frames_of(8, noise, gain)
+    moving, share = moving_parts(frames)
+    assert 0.7 < share < 0.95
+    for frame, old, mask in zip(moving, frames, masks, strict=True):
+        change = np.abs(frame.read_image().astype(int) - old.read_image())[..., 0]
+        assert (change[mask] <= 2).mean() > 0.9
+        away = cv2.dilate(mask.astype(np.uint8), np.ones((61, 61))) == 0
+        left = frame.read_image()[away][:, 0].std()
+        assert left < 0.35 * old.read_image()[away][:, 0].std()
+
+
+def test_a_window_follows_the_thing_and_keeps_its_rays() -> None:
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (60, 3))
+    base_from_camera = SE3.identity()
+    grippers = SE3.stack(
+        [
+            SE3.from_translation((x, 0.05 * (-1) ** i, 1.0)) @ SE3.exp([0, 0, 0, 0.3 * x, x, i])
+            for i, x in enumerate(np.linspace(-0.2, 0.2, 6))
+        ]
+    )
+    image = np.zeros((240, 320, 3), np.uint8)
+    frames = [Frame(str(i), image, CAMERA, None, pose) for i, pose in enumerate(grippers)]
+    seen = [pose.apply(points) for pose in grippers]
+    rays = [rows / rows[:, 2:] for rows in seen]
+    pairs = tuple(
+        ImagePair(i, i + 1, SE3.identity(), np.stack([rays[i], rays[i + 1]]))  # pyright: ignore[reportArgumentType]
+        for i in range(5)
+    )
+    around = windows(frames, HandEyeStart(base_from_camera, "eye_to_hand", 5, 5, pairs))
+    assert around is not None
+    assert around[0, 2] < 90
+    for frame, window, rows in zip(frames, around, seen, strict=True):
+        part = cropped(frame, window)
+        pixels = part.camera.project(rows)
+        assert ((pixels > 0) & (pixels < window[2])).all()
+        whole = CAMERA.project(rows) - window[:2]
+        np.testing.assert_allclose(pixels, whole, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["none", "step", "drift"])
+def test_a_step_is_told_from_noise_and_drift(kind: str) -> None:
+    sigma, found = np.repeat([2e-4, 3e-4], 3), 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        values = rng.normal(0, sigma, (20, 6))
+        if kind == "step":
+            values[12:, 1] += 2e-3
+        if kind == "drift":
+            values[:, 1] += np.linspace(-1e-4, 1e-4, 20)
+        step = largest_step(values)
+        found += step is not None
+        assert step is None or kind != "step" or step.before == 12
+    assert found == (40 if kind == "step" else 0)
