@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import OptimizeResult, least_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.pose_pairs.checks import require_rotations
@@ -28,7 +28,7 @@ from evercal.features.encoder import Encoder
 from evercal.features.sift import epipolar_pair, sift_features
 from evercal.features.views import working_image
 from evercal.features.vlad import similar_pairs
-from evercal.geometry import SE3, cross_matrix
+from evercal.geometry import SE3, Camera, cross_matrix
 from evercal.mapping.selection import spread_poses
 from evercal.processes import cores
 from evercal.progress import OnProgress
@@ -50,6 +50,8 @@ DEPTHS_M = (0.3, 0.6, 1.2, 2.4)
 """First distances between a fixed camera and the gripper."""
 STILL_PX = 2.0
 """Before a fixed camera, matches that move less stand still."""
+BESIDE_M = 0.1
+"""First positions of a camera on the gripper: there, and this far along each axis."""
 MATCHES = 30
 """Matches of a pair that count, at most."""
 ENCODED_SIDE = 240
@@ -156,14 +158,14 @@ def solve_pairs(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> HandEye
     _refuse_disagreement(same_angle)
     rotation = _robust_rotation(stated[same_angle], measured[same_angle])
     epipolar = _EpipolarFit(poses, pairs, rotation, SPREAD_M[mount])
-    best = min(
-        (epipolar.solve(start) for start in epipolar.starts(mount)), key=lambda fit: fit.cost
-    )
-    distance = epipolar.medians(best.x)
-    agree = distance < np.deg2rad(AGREE_DEG)
+    starts, most = epipolar.starts(mount), np.deg2rad(AGREE_DEG)
+    fits = [epipolar.solve(start, np.mean(starts, axis=0)) for start in starts]
+    best = min(fits, key=lambda x: np.minimum(epipolar.medians(x), most).mean())
+    distance = epipolar.medians(best)
+    agree = distance < most
     _refuse_disagreement(agree)
     return HandEyeStart(
-        epipolar.transform(best.x),
+        epipolar.transform(best),
         mount,
         int(agree.sum()),
         len(pairs),
@@ -194,6 +196,11 @@ def _robust_rotation(gripper: Array, camera: Array) -> Rotation:
         cost = float(np.log1p((distance / np.deg2rad(ANGLE_DEG / 3)) ** 2).sum())
         if cost < least:
             best, least = rotation, cost
+    for _ in range(10):
+        distance = np.linalg.norm(gripper - best.apply(camera), axis=1)
+        spread = max(1.48 * float(np.median(distance)), 1e-5)
+        weight = 1 / (1 + (distance / spread) ** 2) ** 2
+        best = Rotation.align_vectors(gripper, camera, weights=weight)[0]
     return best
 
 
@@ -214,36 +221,37 @@ class _EpipolarFit:
     def starts(self, mount: Mount) -> list[Array]:
         """First parameters (6,): rotation vector after `rotation`, position."""
         if mount == "eye_in_hand":
-            return [np.zeros(6)]
+            beside = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * BESIDE_M
+            return list(np.pad(beside, ((0, 0), (3, 0))))
         towards = self.rotation.apply(np.concatenate([self.first, self.second]).mean(0))
         towards = towards / np.linalg.norm(towards)
         gripper = np.linalg.inv(self.matrices)[:, :3, 3].mean(0)
         return [np.r_[np.zeros(3), gripper - depth * towards] for depth in DEPTHS_M]
 
-    def solve(self, start: Array) -> OptimizeResult:
-        """Minimise from a start."""
-        scale, first, fit = float(np.deg2rad(AGREE_DEG)), start[3:], OptimizeResult(x=start)
-
+    def solve(self, start: Array, centre: Array) -> Array:
+        """Minimise from a start, with a prior about `centre`; all are parameters (6,)."""
+        scale, x = float(np.deg2rad(ANGLE_DEG)), start
         matches = len(self.number) / len(self.pairs)
 
         def residuals(x: Array, scale: float) -> Array:
             # The matches of a pair share the errors of its poses, so each pair counts as one match.
-            squares = matches * ((x[3:] - first) ** 2).sum() / self.spread_m**2
-            # The loss of this residual is `squares`: the prior is no outlier.
-            return np.r_[self.distances(x), scale * np.sqrt(np.expm1(min(squares, 500.0)))]
+            away = np.sqrt(matches) * (x - centre)[3:] / self.spread_m
+            # The loss of these residuals is quadratic: the prior is no outlier.
+            prior = scale * np.sign(away) * np.sqrt(np.expm1(np.minimum(away**2, 500.0)))
+            return np.r_[self.distances(x), prior]
 
-        for _ in range(2):
-            fit = least_squares(
+        for _ in range(3):
+            x = least_squares(
                 residuals,
-                fit.x,
+                x,
                 args=(scale,),
                 loss="cauchy",
                 f_scale=scale,
                 x_scale=np.r_[np.full(3, 0.01), np.full(3, 0.1)],
                 max_nfev=50,
-            )
-            scale = min(scale, max(3 * float(np.median(np.abs(self.distances(fit.x)))), 1e-4))
-        return fit
+            ).x
+            scale = min(scale, max(3 * float(np.median(np.abs(self.distances(x)))), 1e-4))
+        return x
 
     def distances(self, x: Array) -> Array:
         """(m,) angles of matches from their epipolar planes, radians."""
@@ -275,8 +283,10 @@ def image_pairs(
     encoder: Encoder,
     on_progress: OnProgress = lambda *_: None,
 ) -> list[ImagePair]:
-    """Similar frames with enough matches; of a fixed camera, those that stand still do not count."""
-    images, cameras, features = [], [], []
+    """Similar frames with enough matches, without those that stand still before a fixed camera."""
+    images: list[NDArray[np.uint8]] = []
+    cameras: list[Camera] = []
+    features: list[NDArray[np.float32]] = []
     fixed = mount == "eye_to_hand"
     for frame in frames:
         image = frame.read_image()

@@ -45,9 +45,10 @@ FIRST_DAMPING, MAX_RAISES = 1e-4, 8
 """Levenberg-Marquardt damping after the first rejected step, and rejections in a row at most."""
 ROUNDING = 1e-9
 """Share by which rounding may raise the cost of an accepted step."""
-SYSTEMATIC = 5.0, 1.0
+SYSTEMATIC, HIDDEN = (1.0, 1.0), 4.0
 """Prior of the variance of systematic errors: its weight in observed directions, and its size in
-variances of the noise."""
+variances of the noise. Directions that the images hide vary by this factor more: a real arm that
+orbits one place moves its mount by 19 mm along the axis (research/trust.md)."""
 CONVERGED = 1e-9
 """Adjustment ends when a step is this small, in standard deviations, and variances change by less
 than this share."""
@@ -423,7 +424,9 @@ class BundleAdjustment:
         own = common[:, : 6 * n].reshape(6, n, 6) - common[:, None, 6 * n : 6 * n + 6]
         drift = common[:, 6 * n + COMMON, None, None] * self.velocity
         scaled = weight * self.lever / variances.sigma[:, None]
-        response = np.einsum("knj,nij,nr->kri", own - drift, scaled, basis) * np.sqrt(ratio)
+        response = np.einsum("knj,nij,nr->kri", own - drift, scaled, basis) * np.sqrt(
+            HIDDEN * ratio
+        )
         rows = response.reshape(6, -1)
         return rows @ rows.T
 
