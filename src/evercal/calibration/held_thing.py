@@ -8,6 +8,7 @@ is; a window around it makes a thing of a few pixels as large as the encoder nee
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -48,7 +49,7 @@ def moving_parts(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], float]:
     ), share
 
 
-def _still(greys: Sequence[NDArray[np.uint8]]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _still(greys: Sequence[NDArray[Any]]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(n, h, w) whether a patch is repeated at its place, and whether it shows anything."""
     size = (PATCH_PX, PATCH_PX)
     images = [grey.astype(np.float32) for grey in greys]
