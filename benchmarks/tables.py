@@ -235,7 +235,10 @@ TABLES: dict[str, Callable[[], Table]] = {
         "reprojection_mm",
         "handeye-boards",
     ),
-    "boards: mistakes": _rows("mistake,mount,refused,named,warned", "mistakes"),
+    "boards: sessions": lambda: _rows(
+        "condition,trials,median_mm,inside_95,truth_d2,answers_d2,lens_d2", "handeye-boards"
+    )().query("`truth d2` != ''"),
+    "boards: mistakes": _rows("mistake,draws,refused,warned,named,safe", "mistakes"),
     "boards: detection": _rows("board,tilt_deg,finder,found,any_of_opencv,rms_px,ms", "boards"),
     "results: cameras from images": _trials,
     "handeye: bumps": _bump,
