@@ -230,11 +230,11 @@ TABLES: dict[str, Callable[[], Table]] = {
     ),
     "results: speed": _rows("what,beside,now,ratio", "speed"),
     "speed: AVX2": _rows("what,beside,now,ratio", "speed-avx2"),
-    "boards: solvers": _rows(
+    "boards: solvers": lambda: _rows(
         "condition,median_mm,p95_mm,inside_95,size_flagged,ms,Park_mm,Daniilidis_mm,"
         "reprojection_mm",
         "handeye-boards",
-    ),
+    )().query("not condition.str.startswith('two sessions')"),
     "boards: sessions": lambda: _rows(
         "condition,trials,median_mm,inside_95,truth_d2,answers_d2,lens_d2", "handeye-boards"
     )().query("`truth d2` != ''"),
