@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from evercal.recordings import Recording
 
 KEYS = {"path", "status", "reason", "scene", "base_from_camera", "covariance", "inliers"}
-KEYS |= {"inlier_ratio", "support", "ms", "error_terms", "unit", "alternatives"}
+KEYS |= {"inlier_ratio", "support", "ms", "error_terms", "unit", "alternatives", "parent_frame"}
 CAUSES = ["view", "lens", "map", "stated poses", "base frame"]
 
 

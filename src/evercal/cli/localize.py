@@ -139,7 +139,9 @@ def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
         sd[0] = f"  sd {_numbers(1000 * spread[:3], '.2f')} mm"
         sd[1] = f"  sd {_numbers(spread[3:] * 180 / math.pi, '.3f')} deg"
     unit = f"m{sd[0]}" if answer.unit_known else "in an unknown unit: run 'evercal align' first"
-    yield f"  scene        {estimate.scene}"
+    held = estimate.parent_frame == "gripper"
+    note = " (a thing in the gripper: the pose is gripper_from_camera)" if held else ""
+    yield f"  scene        {estimate.scene}{note}"
     yield f"  translation  {_numbers(pose.translation_m, '+.4f')} {unit}"
     yield f"  quaternion   {_numbers(pose.rotation_wxyz, '+.4f')} wxyz{sd[1]}"
     parts = sorted(budget_of(estimate), key=lambda part: -part[1])

@@ -153,6 +153,7 @@ def answer(
     if not accepted(best):
         return replace(rejected, reason=rejection(best, scene))
     estimate, terms = in_base(best, scene)
+    rejected = replace(rejected, parent_frame=scene.parent_frame)
     if rival is not None and rival.pose is not None:
         other = scene.frame.to_base(rival.pose).pose
         mm, deg = pose_distance_mm_deg(estimate.pose, other)

@@ -55,6 +55,9 @@ class PoseEstimate:
     """The poses base_from_camera of an ambiguous image, the stronger one first."""
     omitted: tuple[str, ...] = ()
     """Steps that a time for the frame left out, see `TrackOptions.at_most_ms`."""
+    parent_frame: str = "base"
+    """gripper in the map of a thing that the gripper holds: the pose is then
+    gripper_from_camera."""
     support: float = 0.0
     """-log10 of the probability of as many inliers at a wrong pose; 0 for networks."""
 

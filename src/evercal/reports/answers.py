@@ -51,6 +51,7 @@ def answer_row(answer: Answer) -> dict[str, object]:
         "reason": estimate.reason,
         "scene": estimate.scene,
         "unit": unit if pose is not None or estimate.alternatives else None,
+        "parent_frame": estimate.parent_frame,
         "base_from_camera": pose,
         "alternatives": [pose_to_dict(other) for other in estimate.alternatives],
         "covariance": None if uncertain is None else uncertain.covariance.tolist(),

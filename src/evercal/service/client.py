@@ -164,7 +164,7 @@ def _poses_part(poses: str | os.PathLike[str] | SE3) -> Part:
 
 def _estimate(row: Mapping[str, Any]) -> PoseEstimate:
     covariance = row["covariance"]
-    same = ("status", "reason", "scene", "inliers", "inlier_ratio", "support")
+    same = ("status", "reason", "scene", "inliers", "inlier_ratio", "support", "parent_frame")
     return PoseEstimate(
         **{key: row[key] for key in same},
         base_from_camera=_pose(row["base_from_camera"]),
