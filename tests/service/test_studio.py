@@ -127,7 +127,7 @@ def test_the_arm_moves_only_while_somebody_sees_it(cell: VirtualCell, tmp_path: 
     studio.watched = lambda: next(looks, False)
     with pytest.raises(InputError, match="open its page"):
         studio.record(silent)
-    assert len(studio.recorder.frames) == 2  # each view asks twice
+    assert len(studio.recorders["wrist"].frames) == 2  # each view asks twice
     page = StudioPage(studio, "127.0.0.1", 0)
     try:
         before = cell.robot.joints_rad()
@@ -158,7 +158,7 @@ def test_recording_by_itself_ends_complete_or_when_it_is_stopped(
     done: list[float] = []
     studio.record(lambda _what, good, _total: done.append(good), lambda: len(done) >= 4)
     assert done == [1, 2, 3, 4]
-    assert len(studio.recorder.frames) == 5
+    assert len(studio.recorders["wrist"].frames) == 5
     studio.record(silent)
     covered = studio.coverage()
     assert (covered.ready, covered.missing) == (True, ())
@@ -201,7 +201,7 @@ def test_an_image_of_a_moving_arm_is_refused(cell: VirtualCell, tmp_path: Path) 
     studio = studio_in(tmp_path, cell, robot=turning)
     with pytest.raises(InputError, match="let it stand still"):
         studio.take_sample()
-    assert studio.recorder.frames == ()
+    assert studio.recorders["wrist"].frames == ()
 
 
 def test_images_of_the_fixed_camera_are_numbered_and_removed(

@@ -37,8 +37,8 @@ class Simulate(args.Verb):
         from evercal.simulation import cell_recording as cell
         from evercal.simulation.virtual_cell import CellOptions
 
-        began, frames = time.perf_counter(), cell.WRIST_IMAGES if self.frames is None else self.frames
-        options = CellOptions()
+        began, options = time.perf_counter(), CellOptions()
+        frames = cell.WRIST_IMAGES if self.frames is None else self.frames
         if self.size is not None:
             size = re.fullmatch(r"(\d+)x(\d+)", self.size)
             if size is None:

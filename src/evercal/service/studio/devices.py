@@ -91,8 +91,8 @@ class Connection:
         """Read an image."""
         camera = self.devices.cameras.get(which)
         if camera is None:
-            where, option = ("on the gripper", "camera") if which == "wrist" else ("fixed", "fixed")
-            raise InputError("no fixed camera was given; start the studio with --fixed SOURCE")
+            option = "camera" if which == "wrist" else "fixed"
+            raise InputError(f"no {which} camera was given; restart with --{option} SOURCE")
         with self._lock:
             self.images[which] = camera.read()[1]
         self.problems.pop(which, None)
