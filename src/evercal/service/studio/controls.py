@@ -171,7 +171,6 @@ class Controls:
         studio = self._studio
         self._samples("fixed")
         self._button("Calibrate", lambda: studio.learn(self._tasks.step, "fixed"))
-        self._button("Check", studio.check_fixed)
         self._keep(self._gui.add_html(""), content=lambda: self._numbers("fixed"))
 
     def _export(self) -> None:

@@ -1,4 +1,4 @@
-"""The page of the studio: a server of viser with the controls of five steps and the scene."""
+"""The page of the studio: a server of viser with the controls of the steps and the scene."""
 
 import logging
 import threading

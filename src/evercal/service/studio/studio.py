@@ -68,7 +68,8 @@ class Studio:
         for which in ("wrist", "fixed"):
             path = self.calibration_file(which)
             found = read_calibration(path) if path.is_file() else None
-            if found is not None and found.source.get("scene") in self._map_of(found).scenes:
+            scenes = *self.cell.scenes, *self.thing.scenes
+            if found is not None and found.source.get("scene") in scenes:
                 self._keep(which, found, write=False)
 
     def calibration_file(self, which: Which) -> Path:
@@ -138,11 +139,13 @@ class Studio:
         before = [*stated_grippers(self.recorders[which].frames), *self._refused]
         if poses is None:
             return None
-        away = [np.full(len(poses), np.inf)]
+        away = np.full(len(poses), np.inf)
         for pose in before:
             metres, radians = pose_distance(poses, pose)
-            away.append(np.hypot(1000 * metres / SAME_MM, np.rad2deg(radians) / SAME_DEG))
-        return poses[int(np.argmax(np.min(away, axis=0)))]
+            apart = np.maximum(1000 * metres / SAME_MM, np.rad2deg(radians) / SAME_DEG)
+            away = np.minimum(away, apart)
+        farthest = int(np.argmax(away))
+        return poses[farthest] if away[farthest] > 1 else None
 
     def take_sample(self, which: Which = "wrist") -> str:
         """Record image and pose."""
@@ -258,13 +261,8 @@ class Studio:
 
     def check_fixed(self) -> str:
         """Test with a new image whether the fixed camera has moved."""
-        reference, poses = self._made("fixed"), None
-        if (cell := self._map_of(reference)) is self.thing:
-            image, pose = self.connection.sample("fixed")
-            poses = SE3.stack([pose])
-        else:
-            image = self.connection.image("fixed")
-        shift = cell.check([image], reference, robot_poses=poses)
+        reference, image = self._made("fixed"), self.connection.image("fixed")
+        shift = self.cell.check([image], reference)
         size = f"{shift.translation_mm:.2f} mm and {shift.rotation_deg:.3f} deg"
         if not shift.moved:
             return f"The camera has not moved: it is within {size} of its calibration."
@@ -295,9 +293,6 @@ class Studio:
 
     def _fixed_intrinsics(self) -> Camera | None:
         return read_camera(self._fixed_camera) if self._fixed_camera.is_file() else None
-
-    def _map_of(self, calibration: Calibration) -> Map:
-        return self.thing if calibration.source.get("command") == "eye-to-hand" else self.cell
 
     def _keep(self, which: Which, calibration: Calibration, write: bool = True) -> None:
         if write:
