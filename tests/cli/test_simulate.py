@@ -13,7 +13,7 @@ def test_a_cell_has_the_stated_parts(run: Any, tmp_path: Path) -> None:
     ran = run("simulate", "cell", "--out", out, *words)
     assert ran.code == 0, ran.err
     report = json.loads(ran.out)
-    assert (report["scenes"], report["frames"]) == ([str(out / "wrist")], 3 + 8)
+    assert (report["scenes"], report["frames"]) == ([str(out / "wrist")], 3 + 8 + 25)
     frames = load_recording(out / "wrist").train
     assert [frame.read_image().shape for frame in frames] == 3 * [(64, 64, 3)]
     assert len(list(Path(report["tripod"]).iterdir())) == 8

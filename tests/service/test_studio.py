@@ -16,10 +16,10 @@ import pytest
 
 pytest.importorskip("viser")
 
-from evercal.calibration.calibration import Calibration
+from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.calibration.export.formats import FORMATS
 from evercal.errors import InputError
-from evercal.geometry import SE3, pose_distance
+from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
 from evercal.live.camera import StreamCamera
 from evercal.live.robot import PoseFileRobot
 from evercal.map import Map
@@ -39,6 +39,8 @@ def devices_of(cell: VirtualCell) -> Devices:
         cell.tripod_camera,
         cell.intrinsics,
         cell.reachable_poses(60),
+        cell.holding_poses(60),
+        cell.hold,
         nominal_mount(),
         settle_s=0.0,
     )
@@ -67,14 +69,16 @@ def says(studio: Studio, step: str) -> str:
 
 def calibration(scene: str) -> Calibration:
     pose = SE3.from_translation((0.3, 0, 0.5))
-    return Calibration("eye_in_hand", pose, 1e-6 * np.eye(6), "gripper", source={"scene": scene})
+    return Calibration(
+        "eye_in_hand", pose, 1e-6 * np.eye(6), "gripper", source={"scene": scene, "frames": 1}
+    )
 
 
 def test_samples_are_on_disk_at_once_and_a_new_studio_goes_on(
     cell: VirtualCell, tmp_path: Path
 ) -> None:
     studio = studio_in(tmp_path, cell)
-    assert [status(studio, step) for step in STEPS] == ["to do", *["waits"] * 4]
+    assert [status(studio, step) for step in STEPS] == ["to do", *["waits"] * 3, "to do", "waits"]
     assert studio.next_view() is None
     studio.connection.look()
     assert status(studio, "1 Connect") == "done"
@@ -85,7 +89,7 @@ def test_samples_are_on_disk_at_once_and_a_new_studio_goes_on(
     again = studio_in(tmp_path, cell)
     assert again.bad_samples() == ["0001.jpg"]
     assert again.remove(*again.bad_samples()) == "Removed 0001.jpg."
-    assert again.remove(*again.bad_samples()) == "There is no bad sample."
+    assert again.remove(*again.bad_samples()) == "There is no such sample."
     assert [f.name for f in load_recording(tmp_path / "wrist").train] == ["0000.jpg"]
     assert status(again, "3 Learn") == "waits"
 
@@ -114,10 +118,12 @@ def test_the_next_view_is_reachable_lowers_sigma_and_is_not_repeated(
 
 def test_a_pose_out_of_reach_is_not_proposed_again(cell: VirtualCell, tmp_path: Path) -> None:
     far = SE3.stack([SE3.from_translation((2.0, 0, 0.5))])
-    studio = studio_in(tmp_path, cell, reachable=far)
+    farther = SE3.stack([SE3.from_translation((3.0, 0, 0.5))])
+    studio = studio_in(tmp_path, cell, reachable=far, holding=farther)
     studio.take_sample()
     assert studio.next_view() is not None
     assert studio.record(silent) == "1 samples are recorded."
+    assert studio.record(silent, which="fixed") == "0 samples are recorded."
     assert studio.next_view() is None
 
 
@@ -127,7 +133,7 @@ def test_the_arm_moves_only_while_somebody_sees_it(cell: VirtualCell, tmp_path: 
     studio.watched = lambda: next(looks, False)
     with pytest.raises(InputError, match="open its page"):
         studio.record(silent)
-    assert len(studio.recorder.frames) == 2  # each view asks twice
+    assert len(studio.recorders["wrist"].frames) == 2  # each view asks twice
     page = StudioPage(studio, "127.0.0.1", 0)
     try:
         before = cell.robot.joints_rad()
@@ -158,7 +164,7 @@ def test_recording_by_itself_ends_complete_or_when_it_is_stopped(
     done: list[float] = []
     studio.record(lambda _what, good, _total: done.append(good), lambda: len(done) >= 4)
     assert done == [1, 2, 3, 4]
-    assert len(studio.recorder.frames) == 5
+    assert len(studio.recorders["wrist"].frames) == 5
     studio.record(silent)
     covered = studio.coverage()
     assert (covered.ready, covered.missing) == (True, ())
@@ -201,7 +207,7 @@ def test_an_image_of_a_moving_arm_is_refused(cell: VirtualCell, tmp_path: Path) 
     studio = studio_in(tmp_path, cell, robot=turning)
     with pytest.raises(InputError, match="let it stand still"):
         studio.take_sample()
-    assert studio.recorder.frames == ()
+    assert studio.recorders["wrist"].frames == ()
 
 
 def test_images_of_the_fixed_camera_are_numbered_and_removed(
@@ -222,15 +228,11 @@ class Cell:
     def __init__(self, root: Path, *scenes: str):
         self.path, self.scenes = root, scenes
 
-    @property
-    def localizer(self) -> Any:
-        scenes = [SimpleNamespace(name=name, adjusted_camera=None) for name in self.scenes]
-        return SimpleNamespace(contents=SimpleNamespace(scenes=scenes))
-
     def learn(self, _: object, name: str, on_progress: object) -> Any:
         self.scenes = (*self.scenes, name)
-        found = SimpleNamespace(calibration=lambda _camera, scene, _count: calibration(scene))
-        return SimpleNamespace(hand_eye=found, train_frames=1)
+
+    def calibration(self, scene: str) -> Calibration:
+        return calibration(scene)
 
     def remove(self, name: str) -> None:
         self.scenes = tuple(scene for scene in self.scenes if scene != name)
@@ -248,17 +250,17 @@ def test_samples_learned_again_replace_their_scene_and_no_other(
     studio = studio_in(tmp_path, cell)
     studio.take_sample()
     for _ in range(2):
-        assert studio.samples_changed
+        assert studio.samples_changed()
         assert studio.learn(silent) == f"Learned 1 images; wrote {tmp_path}/wrist.json."
         assert opened.scenes == ("wrist", "wrist-2", "wrist-3")
         again = studio_in(tmp_path, cell)
-        assert (again.scene, again.samples_changed) == ("wrist-3", False)
+        assert (again.scene, again.samples_changed()) == ("wrist-3", False)
         assert status(again, "3 Learn") == "done"
         os.utime(tmp_path / "wrist" / "base_from_gripper.csv")  # the same samples
-        assert not again.samples_changed
+        assert not again.samples_changed()
         again.take_sample()
         os.utime(tmp_path / "wrist" / "base_from_gripper.csv", (1e9, 1e9))  # the clock was set back
-        assert again.samples_changed
+        assert again.samples_changed()
 
     def fail(*_: object, **__: object) -> None:
         raise InputError("too few images")
@@ -267,6 +269,30 @@ def test_samples_learned_again_replace_their_scene_and_no_other(
     with pytest.raises(InputError, match="too few"):
         studio.learn(silent)
     assert opened.scenes == ("wrist", "wrist-2", "wrist-3")
+
+
+def test_a_held_thing_leads_from_an_empty_folder_to_the_fixed_camera(tmp_path: Path) -> None:
+    """No map, no camera on the gripper: within 1 mm and 0.1 deg, and within the stated error."""
+    cell = VirtualCell(3, CellOptions(width=320, height=240))
+    studio, truth = studio_in(tmp_path, cell, wrist_camera=None), cell.truth.base_from_tripod
+    studio.connection.look("fixed")
+    assert status(studio, "1 Connect") == "done"
+    frames = studio.recorders["fixed"]
+    studio.record(silent, lambda: len(frames.frames) == 8, "fixed")
+    studio.remove("0007.jpg", which="fixed")
+    assert "1 more images to start with" in says(studio, "or Hold")
+    studio.record(silent, lambda: len(frames.frames) == 12, "fixed")
+    assert studio.coverage("fixed").ready
+    assert studio.learn(silent, "fixed") == f"Learned 12 images; wrote {tmp_path}/fixed.json."
+    again = studio_in(tmp_path, cell, wrist_camera=None)
+    assert [status(again, step) for step in ("4 Fixed", "or Hold")] == ["done", "done"]
+    again.export("fixed", "easy_handeye2")
+    found = read_calibration(tmp_path / "fixed.json")
+    millimetres, degrees = pose_distance_mm_deg(found.parent_from_child, truth)
+    assert millimetres < 1
+    assert degrees < 0.1
+    assert found.uncertain_pose.squared_mahalanobis(truth) < 22.5  # 0.999 of chi-square, 6 degrees
+    assert (tmp_path / "export/fixed.calib").is_file()
 
 
 def test_every_format_is_exported_or_says_why_not(cell: VirtualCell, tmp_path: Path) -> None:

@@ -108,9 +108,10 @@ def test_a_moving_camera_blurs() -> None:
 
 def test_a_recording_is_read_back_and_states_its_truth_apart(tmp_path: Path) -> None:
     out = tmp_path / "cell"
-    assert len(list(record_cell(out, 6, 4, SMALL))) == 4 + 8
+    assert len(list(record_cell(out, 6, 4, SMALL))) == 4 + 8 + 25
     frames = load_recording(out / "wrist").train
     assert len(frames) == 4
+    assert len(load_recording(out / "held").train) == 25
     assert len(list((out / "tripod").glob("*.jpg"))) == 8
     assert len(read_robot_poses(out / "reachable.csv").poses) == 200
     truth = json.loads((out / "truth.json").read_text())
@@ -132,7 +133,7 @@ def test_reserved_seeds_are_refused() -> None:
 
 @pytest.mark.slow("src/evercal/simulation")
 def test_the_whole_chain_finds_the_truth(tmp_path: Path) -> None:
-    """Wrist recording to mount and fixed camera: within 1 mm and 0.05 deg."""
+    """Mount, fixed camera by the scene, fixed camera by a held thing: to 1 mm and 0.05 deg."""
     from evercal import Map
 
     list(record_cell(tmp_path / "cell", 3))
@@ -141,9 +142,11 @@ def test_the_whole_chain_finds_the_truth(tmp_path: Path) -> None:
     report = learned.learn(tmp_path / "cell/wrist").hand_eye
     assert report is not None
     fixed = learned.calibrate(tmp_path / "cell/tripod").parent_from_child
+    held = Map.open(tmp_path / "thing").eye_to_hand(tmp_path / "cell/held").parent_from_child
     for found, true in (
-        (report.gripper_from_camera.pose, truth.gripper_from_camera),
+        (report.parent_from_camera.pose, truth.gripper_from_camera),
         (fixed, truth.base_from_tripod),
+        (held, truth.base_from_tripod),
     ):
         millimetres, degrees = pose_distance_mm_deg(found, true)
         assert millimetres < 1

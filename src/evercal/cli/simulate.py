@@ -34,11 +34,11 @@ class Simulate(args.Verb):
     """Sensor noise as a fraction of full scale. Default: 0.008."""
 
     def run(self) -> int:
-        from evercal.simulation.cell_recording import TRIPOD_IMAGES, WRIST_IMAGES, record_cell
+        from evercal.simulation import cell_recording as cell
         from evercal.simulation.virtual_cell import CellOptions
 
-        began, frames = time.perf_counter(), WRIST_IMAGES if self.frames is None else self.frames
-        options = CellOptions()
+        began, options = time.perf_counter(), CellOptions()
+        frames = cell.WRIST_IMAGES if self.frames is None else self.frames
         if self.size is not None:
             size = re.fullmatch(r"(\d+)x(\d+)", self.size)
             if size is None:
@@ -48,11 +48,12 @@ class Simulate(args.Verb):
             options = replace(options, width=int(size[1]), height=int(size[2]))
         if self.noise is not None:
             options = replace(options, image_noise=self.noise)
-        with progress_bar("recording", frames + TRIPOD_IMAGES, "image") as bar:
-            for _ in record_cell(self.out, self.seed, frames, options):
+        images = frames + cell.TRIPOD_IMAGES + cell.HELD_IMAGES
+        with progress_bar("recording", images, "image") as bar:
+            for _ in cell.record_cell(self.out, self.seed, frames, options):
                 bar.update()
         seconds = time.perf_counter() - began
-        parts = {name: str(self.out / name) for name in ("wrist", "tripod", "truth.json")}
+        parts = {name: str(self.out / name) for name in ("wrist", "tripod", "held", "truth.json")}
         record = {"scenes": [parts["wrist"]], **parts, "frames": bar.n, "seconds": seconds}
         self.answer(record, then=("learn", "MAP", self.out / "wrist"))
         return 0

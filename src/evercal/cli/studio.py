@@ -21,8 +21,9 @@ _REAL = "camera intrinsics poses pose_convention most_age reachable gripper_from
 class Studio(Page):
     """Calibrate wrist and fixed camera in the browser, step by step.
 
-    Everything is written to --out as it is made; the same command continues there. With --virtual,
-    a virtual arm with two cameras stands in for yours.
+    Everything is written to --out as it is made; the same command continues there. Without
+    --camera, the fixed camera is calibrated by a textured thing in the gripper. With --virtual, a
+    virtual arm with two cameras stands in for yours.
 
     Example: evercal studio --camera 0 --intrinsics camera.json --poses poses.csv
     """
@@ -32,7 +33,8 @@ class Studio(Page):
     camera: args.Source = None
     """Camera on the gripper: number (0) or device, address (rtsp://...), video or folder."""
     intrinsics: args.File = None
-    """Intrinsics of --camera. Default: those in --out, where it was begun before."""
+    """Intrinsics of --camera. Default: those in --out, where it was begun before; without
+    --camera, --fixed-intrinsics."""
     poses: args.File = None
     """Gripper poses: a table or JSON lines that your robot's program appends to."""
     pose_convention: args.Name = None
@@ -76,8 +78,9 @@ class Studio(Page):
             raise InputError(
                 f"{args.option(given[0])}: the virtual cell has its own; omit it or --virtual"
             )
-        if not self.virtual and (self.camera is None or self.poses is None):
-            missing = "--camera SOURCE" if self.camera is None else "--poses FILE"
+        blind = self.camera is None and self.fixed is None
+        if not self.virtual and (blind or self.poses is None):
+            missing = "--camera SOURCE" if blind else "--poses FILE"
             raise InputError(f"no {missing} given; give both, or --virtual to try it without")
         if self.fixed_intrinsics is not None and self.fixed is None:
             raise InputError("--fixed-intrinsics: is of --fixed, which is missing")
@@ -97,6 +100,8 @@ class Studio(Page):
             robot=cell.robot,
             fixed_camera=cell.tripod_camera,  # of the same make, so it has the same intrinsics
             reachable=cell.reachable_poses(200),
+            holding=cell.holding_poses(200),
+            hold=cell.hold,
             rough=nominal_mount(),
             settle_s=0.0,
             arm=lambda: joint_frames(np.array(cell.robot.joints_rad()))[:, :3, 3],
@@ -111,13 +116,13 @@ class Studio(Page):
         from evercal.recordings.streams import is_live
         from evercal.service.studio.devices import Devices
 
-        assert self.camera is not None, "checked before"
         assert self.poses is not None, "checked before"
-        convention, fixed = self.pose_convention, self.fixed
-        fixed_intrinsics = self.fixed_intrinsics
-        wrist_camera = StreamCamera(self.camera)
-        before = self.out / "wrist" / "camera.json"
-        intrinsics = self.intrinsics or (before if before.is_file() else None)
+        convention, fixed_intrinsics = self.pose_convention, self.fixed_intrinsics
+        sources = self.camera, self.fixed
+        wrist, fixed = (None if source is None else StreamCamera(source) for source in sources)
+        begun = self.out / "wrist" / "camera.json"
+        default = fixed_intrinsics if self.camera is None else begun if begun.is_file() else None
+        intrinsics = self.intrinsics or default
         if intrinsics is None:
             raise InputError("no --intrinsics FILE given: a new recording needs the intrinsics")
         reachable = None
@@ -125,12 +130,12 @@ class Studio(Page):
             poses = read_robot_poses(self.reachable, convention, option="--pose-convention")
             reachable = poses.poses
         return Devices(
-            wrist_camera=wrist_camera,
+            wrist_camera=wrist,
             intrinsics=read_camera(intrinsics),
             robot=PoseFileRobot(self.poses, convention, self.most_age),
-            fixed_camera=None if fixed is None else StreamCamera(fixed),
+            fixed_camera=fixed,
             fixed_intrinsics=fixed_intrinsics and read_camera(fixed_intrinsics),
             reachable=reachable,
             rough=args.transform_of(self.gripper_from_camera),
-            live=is_live(self.camera) and (fixed is None or is_live(fixed)),
+            live=all(source is None or is_live(source) for source in sources),
         )

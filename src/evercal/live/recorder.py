@@ -1,4 +1,4 @@
-"""A wrist recording that grows sample by sample, in the format `wrist`.
+"""A recording with gripper poses that grows sample by sample, in the format `wrist`.
 
     ROOT/images/0000.jpg, ...     one image of each sample
     ROOT/base_from_gripper.csv    its gripper pose
@@ -27,19 +27,17 @@ _COLUMNS = "x,y,z,qw,qx,qy,qz"
 
 
 class WristRecorder:
-    """Adds and removes samples of a wrist recording; one of the same camera is continued."""
+    """Adds and removes samples of a recording; one of the same camera is continued."""
 
     def __init__(self, root: Path, camera: Camera):
         self._root, self._camera = Path(root), camera
         self._frames: list[Frame] = []
-        (self._root / "images").mkdir(parents=True, exist_ok=True)
         if wrist.detect(self._root):
             if not (self._root / POSES).is_file():
                 raise InputError(f"{root}: holds gripper poses, but no {POSES}; use a new folder")
             self._frames = list(wrist.load(self._root).train)
             if any(frame.camera != camera for frame in self._frames):
                 raise InputError(f"{root}: was recorded with other intrinsics; use a new folder")
-        write_json(self._root / "camera.json", asdict(camera))
 
     @property
     def frames(self) -> tuple[Frame, ...]:
@@ -53,6 +51,9 @@ class WristRecorder:
                 f"image of shape {image.shape}: the camera is {self._camera.width}x"
                 f"{self._camera.height}; give the intrinsics of this image size"
             )
+        if not self._frames:
+            (self._root / "images").mkdir(parents=True, exist_ok=True)
+            write_json(self._root / "camera.json", asdict(self._camera))
         numbers = [int(Path(frame.name).stem) for frame in self._frames]
         name = f"{max(numbers, default=-1) + 1:04d}.jpg"
         path = self._root / "images" / name

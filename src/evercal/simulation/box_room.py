@@ -61,7 +61,8 @@ class BoxRoom:
         for _ in range(int(rng.integers(4, 13))):
             self._add_picture(rng)
 
-    def _texture(self, rng: np.random.Generator, calm: bool) -> tuple[np.ndarray, ...]:
+    def texture(self, rng: np.random.Generator, calm: bool) -> tuple[np.ndarray, ...]:
+        """A new texture with its halvings; a calm one shows less."""
         import cv2
 
         side = self.texture_px
@@ -84,7 +85,7 @@ class BoxRoom:
     ) -> None:
         """Add a textured box from its lowest corner (3,) and its sides (3,), see `box_faces`."""
         for corner, u, v in box_faces(low, np.diag(size), inward):
-            pyramid = self._texture(rng, calm=inward or rng.random() < 0.3)
+            pyramid = self.texture(rng, calm=inward or rng.random() < 0.3)
             self.surfaces.append(Surface(corner, u, v, pyramid))
 
     def _add_picture(self, rng: np.random.Generator) -> None:
@@ -95,7 +96,7 @@ class BoxRoom:
         v = rng.uniform(0.3 * length_v, max(length_v - size[1], 0.31 * length_v))
         unit_u, unit_v = wall.edge_u_m / length_u, wall.edge_v_m / length_v
         corner = wall.corner_m + u * unit_u + v * unit_v + 0.01 * wall.normal
-        pyramid = self._texture(rng, calm=False)
+        pyramid = self.texture(rng, calm=False)
         self.surfaces.append(Surface(corner, unit_u * size[0], unit_v * size[1], pyramid))
 
     def render(

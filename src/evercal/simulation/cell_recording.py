@@ -2,6 +2,7 @@
 
 OUT/wrist/                    a recording of the camera on the gripper, see `live.recorder`
 OUT/tripod/0000.jpg, ...      images of the fixed camera while the arm moves
+OUT/held/                     a recording of the fixed camera, while the gripper turns a box
 OUT/reachable.csv             gripper poses that the arm can reach, for further views
 OUT/rough.txt                 gripper_from_camera as in the drawing of the cell, 4x4
 OUT/truth.json                true gripper_from_camera and base_from_tripod, and all settings
@@ -19,7 +20,7 @@ from evercal.recordings.images import write_jpeg
 from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
 from evercal.storage import write_bytes, write_json
 
-WRIST_IMAGES, TRIPOD_IMAGES = 25, 8
+WRIST_IMAGES, TRIPOD_IMAGES, HELD_IMAGES = 25, 8, 25
 REACHABLE = 200
 
 
@@ -28,7 +29,7 @@ def record_cell(
 ) -> Iterator[None]:
     """Record a virtual cell into a new folder; yields after each image.
 
-    The wrist poses are spread over the reachable ones. No other command reads the truth.
+    Poses of recordings are spread over the reachable ones. No other command reads the truth.
     """
     if out.exists() and any(out.iterdir()):
         raise InputError(f"{out}: is not empty; give a new folder")
@@ -46,6 +47,12 @@ def record_cell(
     for i in range(TRIPOD_IMAGES):
         cell.robot.move_to(reachable[i])
         write_jpeg(out / f"tripod/{i:04d}.jpg", cell.tripod_camera.read()[1], JPEG_QUALITY)
+        yield
+    cell.hold(True)
+    recorder, views = WristRecorder(out / "held", cell.intrinsics), cell.holding_poses(REACHABLE)
+    for i in spread_poses(views, HELD_IMAGES):
+        cell.robot.move_to(views[i])
+        recorder.add(cell.tripod_camera.read()[1], cell.robot.base_from_gripper())
         yield
     write_bytes(out / "reachable.csv", pose_rows(reachable).encode())
     rough = "\n".join(" ".join(f"{x:.9g}" for x in row) for row in nominal_mount().matrix())

@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from evercal.geometry import SE3
 from evercal.simulation.box_room import BoxRoom, Surface, box_faces
 from evercal.simulation.panda_arm import joint_frames
 
@@ -16,6 +17,9 @@ TABLE_M = 0.75
 """Height of the table over the floor."""
 WORK_AREA_M = np.array([0.52, 0.0, 0.04])
 """Centre of the work area that cameras look at, base frame."""
+
+THING_LOW_M, THING_SIZE_M = np.array([-0.08, -0.06, 0.1]), np.array([0.16, 0.12, 0.24])
+"""Lowest corner and sides of what the gripper holds, flange frame: the fingers are 10 cm long."""
 
 _TABLE_LOW, _TABLE_HIGH = np.array([-0.35, -0.65]), np.array([1.05, 0.65])
 _FREE_M = 0.28
@@ -63,6 +67,23 @@ def arm_surfaces(joints_rad: np.ndarray) -> list[Surface]:
         low = start - (edges[0] + edges[1]) / 2
         surfaces += [Surface(*face, _link_texture()) for face in box_faces(low, edges)]
     return surfaces
+
+
+def thing_surfaces(seed: int, base_from_gripper: SE3) -> list[Surface]:
+    """The textured box that the gripper holds."""
+    rotation = base_from_gripper.rotation_matrix()
+    return [
+        Surface(base_from_gripper.apply(corner), rotation @ u, rotation @ v, pyramid)
+        for corner, u, v, pyramid in _thing(seed)
+    ]
+
+
+@lru_cache(maxsize=4)
+def _thing(seed: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, ...]]]:
+    rng, edges = np.random.default_rng([seed, 36]), np.diag(THING_SIZE_M)
+    bottom = THING_LOW_M + edges[1], edges[0], -edges[1]
+    faces = [*box_faces(THING_LOW_M, edges), bottom]
+    return [(*face, cell_room(seed).texture(rng, calm=False)) for face in faces]
 
 
 @lru_cache(maxsize=1)

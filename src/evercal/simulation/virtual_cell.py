@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.simulation.box_room import default_camera, look_at
-from evercal.simulation.cell_room import WORK_AREA_M, arm_surfaces, cell_room
+from evercal.simulation.cell_room import (
+    THING_LOW_M,
+    THING_SIZE_M,
+    WORK_AREA_M,
+    arm_surfaces,
+    cell_room,
+    thing_surfaces,
+)
 from evercal.simulation.panda_arm import base_from_flange
 from evercal.simulation.virtual_robot import Clock, VirtualRobot
 
@@ -22,6 +29,9 @@ NEAREST_M, FARTHEST_M, OFF_AXIS_DEG = 0.28, 0.75, 22.0
 """Reachable views have the work area within these distances, and this near the optical axis."""
 LOWEST_M = 0.2
 """Height of the flange over the table."""
+HELD_TURN_DEG, HIDDEN_DEG = 40.0, 60.0
+"""Poses for a held thing are turned by at most this about each axis; the arm hides the thing from a
+camera within this angle of the flange's back."""
 
 _CENTRE_RAD = np.array([0.0, -0.6, 0.0, -2.2, 0.0, 1.75, 0.785])
 _SPREAD_RAD = np.array([0.8, 0.6, 0.5, 0.5, 0.7, 0.55, 1.2])
@@ -80,7 +90,7 @@ class VirtualCamera:
         cell = self._cell
         base_from_gripper, joints = cell.robot.true_state(now_s)
         pose = base_from_gripper @ self._mounted if self._on_gripper else self._mounted
-        return cell.render(pose, joints)
+        return cell.render(pose, base_from_gripper, joints)
 
 
 class VirtualCell:
@@ -100,6 +110,7 @@ class VirtualCell:
         self.truth = CellTruth(_mount(rng), _tripod(rng))
         self.wrist_camera = VirtualCamera(self, self.truth.gripper_from_camera, True)
         self.tripod_camera = VirtualCamera(self, self.truth.base_from_tripod, False)
+        self._holds = False
         self.seed, self.noise = seed, np.random.default_rng([seed, 34])
 
     def reachable_poses(self, count: int, seed: int = 0) -> SE3:
@@ -116,10 +127,36 @@ class VirtualCell:
                 poses.append(gripper)
         return SE3.stack(poses)
 
-    def render(self, base_from_camera: SE3, joints_rad: np.ndarray) -> NDArray[np.uint8]:
+    def hold(self, thing: bool) -> None:
+        """Let the gripper hold a textured box, which hides the scene from its camera, or let go."""
+        self._holds = thing
+
+    def holding_poses(self, count: int, seed: int = 0) -> SE3:
+        """Random gripper poses (count,) at which the fixed camera sees all of the held thing."""
+        rng = np.random.default_rng([self.seed, 37, seed])
+        base_from_camera, middle = self.truth.base_from_tripod, base_from_flange(_CENTRE_RAD)
+        corners = THING_LOW_M + THING_SIZE_M * np.indices((2, 2, 2)).reshape(3, 8).T
+        image = self.intrinsics.width, self.intrinsics.height
+        poses: list[SE3] = []
+        while len(poses) < count:
+            gripper = base_from_flange(_CENTRE_RAD + _SPREAD_RAD * rng.uniform(-1, 1, 7))
+            points, turn = gripper.apply(corners), (middle.inverse() @ gripper).log()[3:]
+            pixels = self.intrinsics.project(base_from_camera.inverse().apply(points))
+            to_camera = (gripper.inverse() @ base_from_camera).translation_m - corners.mean(0)
+            seen = ((pixels > 0) & (pixels < image)).all()
+            front = to_camera[2] > -np.cos(np.deg2rad(HIDDEN_DEG)) * np.linalg.norm(to_camera)
+            near = np.abs(turn).max() < np.deg2rad(HELD_TURN_DEG)
+            if seen and front and near and points[:, 2].min() > 0:
+                poses.append(gripper)
+        return SE3.stack(poses)
+
+    def render(
+        self, base_from_camera: SE3, base_from_gripper: SE3, joints_rad: np.ndarray
+    ) -> NDArray[np.uint8]:
         """An ideal image, (H, W, 3), of a camera at a pose while the arm has joint angles (7,)."""
-        arm = arm_surfaces(joints_rad) if self.options.show_arm else []
-        return cell_room(self.seed).render(self.intrinsics, base_from_camera, arm)
+        moving = arm_surfaces(joints_rad) if self.options.show_arm else []
+        moving += thing_surfaces(self.seed, base_from_gripper) if self._holds else []
+        return cell_room(self.seed).render(self.intrinsics, base_from_camera, moving)
 
 
 def nominal_mount() -> SE3:

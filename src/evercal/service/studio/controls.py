@@ -74,13 +74,21 @@ class Controls:
         """Calls that bring single controls up to date."""
         gui = self._gui
         gui.main_panel.dock_right()
-        self._camera = gui.add_dropdown("Camera", tuple(_CAMERAS))
+        given = studio.connection.devices.cameras
+        self._camera = gui.add_dropdown("Camera", [n for n, w in _CAMERAS.items() if w in given])
         self._picture = gui.add_image(np.zeros((3, 4, 3), np.uint8))
         self._keep(gui.add_html(""), content=self._message)
         bar = gui.add_progress_bar(0.0, animated=True)
         self._keep(bar, visible=lambda: tasks.busy, value=lambda: 100 * tasks.progress)
         tabs = gui.add_tab_group()
-        contents = (self._connect, self._record, self._learn, self._fixed, self._export)
+        contents = (
+            self._connect,
+            self._samples,
+            self._learn,
+            self._fixed,
+            self._hold,
+            self._export,
+        )
         for (title, state), add in zip(STEPS.items(), contents, strict=True):
             with tabs.add_tab(title):
                 self._keep(gui.add_html(""), content=lambda state=state: chip_html(*state(studio)))
@@ -111,18 +119,33 @@ class Controls:
     def _connect(self) -> None:
         self._arrives = self._gui.add_html("")
 
-    def _record(self) -> None:
+    def _samples(self, which: Which = "wrist") -> None:
         studio, gui, tasks = self._studio, self._gui, self._tasks
-        self._button("Take sample", studio.take_sample, key="T")
+        take, move = ("T", "M") if which == "wrist" else (None, None)
+        self._button("Take sample", lambda: studio.take_sample(which), take)
         if studio.can_move:
-            self._button("Move there", self._move, key="M")
-            self._button("Record by itself", lambda: studio.record(tasks.step, tasks.stop.is_set))
+            self._button("Move there", lambda: studio.move_on(which), move)
+            self._button(
+                "Record by itself", lambda: studio.record(tasks.step, tasks.stop.is_set, which)
+            )
             gui.add_button("Stop", color="red").on_click(lambda _: tasks.stop.set())
-        self._keep(gui.add_html(""), content=self._coverage)
-        self._sample: Any = gui.add_dropdown("Sample", ("-",))
-        self._updates.append(self._show_names)
-        self._button("Remove", lambda: studio.remove(self._sample.value))
-        self._button("Remove the bad ones", lambda: studio.remove(*studio.bad_samples()))
+        self._keep(gui.add_html(""), content=lambda: self._coverage(which))
+        sample: Any = gui.add_dropdown("Sample", ("-",))
+
+        def names() -> tuple[str, ...]:
+            return tuple(frame.name for frame in reversed(studio.recorders[which].frames))
+
+        def show_names() -> None:
+            if (shown := names() or ("-",)) != sample.options:
+                sample.options, sample.value = shown, shown[0]  # the one taken last
+
+        self._updates.append(show_names)
+        self._button("Remove", lambda: studio.remove(sample.value, which=which))
+        self._button(
+            "Remove the bad ones",
+            lambda: studio.remove(*studio.bad_samples(which), which=which),
+        )
+        self._button("Remove all", lambda: studio.remove(*names(), which=which))
 
     def _learn(self) -> None:
         self._button("Learn the recording", lambda: self._studio.learn(self._tasks.step))
@@ -132,13 +155,23 @@ class Controls:
         studio, gui, step = self._studio, self._gui, self._tasks.step
         moves = studio.can_move
         move = gui.add_checkbox("Move the arm between images", moves, visible=moves)
+
+        def images() -> str:
+            return rows_html([("images", str(len(studio.fixed_images)))])
+
         series = f"Take {FIXED_IMAGES} images"
         self._button("Take image", studio.take_fixed)
         self._button(series, lambda: studio.take_fixed_series(step, move.value))
         self._button("Calibrate", lambda: studio.calibrate_fixed(step))
         self._button("Check", studio.check_fixed)
         self._button("Remove all images", studio.clear_fixed)
-        self._keep(gui.add_html(""), content=lambda: self._numbers("fixed"))
+        self._keep(gui.add_html(""), content=lambda: images() + self._numbers("fixed"))
+
+    def _hold(self) -> None:
+        studio = self._studio
+        self._samples("fixed")
+        self._button("Calibrate", lambda: studio.learn(self._tasks.step, "fixed"))
+        self._keep(self._gui.add_html(""), content=lambda: self._numbers("fixed"))
 
     def _export(self) -> None:
         camera = self._gui.add_dropdown("Calibration", tuple(_CAMERAS))
@@ -164,29 +197,19 @@ class Controls:
         if key is not None:
             self._gui.add_command(label, hotkey=key).on_trigger(start)
 
-    def _show_names(self) -> None:
-        names = tuple(frame.name for frame in reversed(self._studio.recorder.frames)) or ("-",)
-        if names != self._sample.options:
-            self._sample.options, self._sample.value = names, names[0]  # the one taken last
-
-    def _move(self) -> str:
-        if self._view is None:
-            return "There is no next view."
-        return self._studio.move_to(self._view.poses[0])
-
     def _message(self) -> str:
         tasks = self._tasks
         kind = "failed" if tasks.failed else "working" if tasks.busy else "done"
         return chip_html(kind, tasks.message) if tasks.message else ""
 
-    def _coverage(self) -> str:
-        covered, rows = self._studio.coverage(), []
+    def _coverage(self, which: Which) -> str:
+        covered, rows = self._studio.coverage(which), []
         axes = [(axis, "°", ROTATION_DEG) for axis in covered.rotations]
         axes += [(axis, " mm", POSITION_MM) for axis in covered.positions]
         for axis, unit, wanted in axes:
             enough = "✓" if axis.covered else f"of {wanted:.0f}{unit}"
             rows.append((axis.name, f"{axis.spread:.0f}{unit} {enough}"))
-        if self._view is not None:
+        if which == "wrist" and self._view is not None:
             x, y, z = 1000 * self._view.poses[0].translation_m
             now, then = self._view.sigma_mm[:2]
             rows.append(("next view (amber)", f"gripper at {x:+.0f} {y:+.0f} {z:+.0f} mm"))
@@ -195,9 +218,8 @@ class Controls:
         return rows_html(rows + bad)
 
     def _numbers(self, which: Which) -> str:
-        found, rows = self._studio.calibrations.get(which), []
-        if which == "fixed":
-            rows.append(("images", str(len(self._studio.fixed_images))))
-        if found is not None:
-            rows += [*calibration_rows(found), ("file", str(self._studio.calibration_file(which)))]
-        return rows_html(rows)
+        if (found := self._studio.calibrations.get(which)) is None:
+            return ""
+        return rows_html(
+            [*calibration_rows(found), ("file", str(self._studio.calibration_file(which)))]
+        )

@@ -24,10 +24,10 @@ STILL_MM, STILL_DEG = 0.2, 0.05
 class Devices:
     """Cameras and the robot."""
 
-    wrist_camera: LiveCamera
-    """The camera on the gripper."""
+    wrist_camera: LiveCamera | None
+    """The camera on the gripper; None where only a fixed camera is calibrated."""
     intrinsics: Camera
-    """Its intrinsics, at the size of its images."""
+    """Its intrinsics, at the size of its images; those of the fixed camera if it is None."""
     robot: Robot
     """It moves on request if it is a `MovingRobot`."""
     fixed_camera: LiveCamera | None = None
@@ -35,6 +35,10 @@ class Devices:
     """Those of the fixed camera; None for those of the camera on the gripper."""
     reachable: SE3 | None = None
     """(n,) gripper poses that the arm can reach; None if unknown."""
+    holding: SE3 | None = None
+    """(n,) gripper poses at which the fixed camera sees what the gripper holds; None if unknown."""
+    hold: Callable[[bool], None] = lambda _: None
+    """Lets a virtual gripper hold something or let go; a real one is loaded by hand."""
     rough: SE3 | None = None
     """A rough gripper_from_camera."""
     arm: Callable[[], NDArray[np.floating]] | None = None
@@ -44,6 +48,13 @@ class Devices:
     and would show the arm on its way."""
     live: bool = True
     """Whether images are shown all the time; those of a file are read for samples only."""
+
+    @property
+    def cameras(self) -> dict[Which, LiveCamera]:
+        """The cameras that were given, that on the gripper first."""
+        given: dict[Which, LiveCamera | None]
+        given = {"wrist": self.wrist_camera, "fixed": self.fixed_camera}
+        return {which: camera for which, camera in given.items() if camera is not None}
 
 
 class Connection:
@@ -61,8 +72,9 @@ class Connection:
     @property
     def complete(self) -> bool:
         """Whether image and pose have arrived and nothing failed since."""
-        have = "wrist" in self.images and self.base_from_gripper is not None
-        return have and not self.problems.keys() & {"wrist", "robot"}
+        first = next(iter(self.devices.cameras))
+        have = first in self.images and self.base_from_gripper is not None
+        return have and not self.problems.keys() & {first, "robot"}
 
     def look(self, which: Which | None = "wrist") -> None:
         """Read the pose and an image of one camera, or none; failures are kept in `problems`."""
@@ -77,18 +89,19 @@ class Connection:
 
     def image(self, which: Which) -> Image:
         """Read an image."""
-        devices = self.devices
-        camera = devices.wrist_camera if which == "wrist" else devices.fixed_camera
+        camera = self.devices.cameras.get(which)
         if camera is None:
-            raise InputError("no fixed camera was given; start the studio with --fixed SOURCE")
+            option = "camera" if which == "wrist" else "fixed"
+            raise InputError(f"no {which} camera was given; restart with --{option} SOURCE")
         with self._lock:
             self.images[which] = camera.read()[1]
         self.problems.pop(which, None)
         return self.images[which]
 
-    def sample(self) -> tuple[Image, SE3]:
-        """Read an image of the camera on the gripper, and the pose at which it was taken."""
-        before, image, after = self._pose(), self.image("wrist"), self._pose()
+    def sample(self, which: Which = "wrist") -> tuple[Image, SE3]:
+        """Read an image, of a fixed camera one of a held thing, and the pose of the gripper."""
+        self.devices.hold(which == "fixed")
+        before, image, after = self._pose(), self.image(which), self._pose()
         if _moved(before, after):
             raise InputError("the arm moved while the image was taken; let it stand still")
         return image, after

@@ -1,4 +1,4 @@
-"""The page of the studio: a server of viser with the controls of five steps and the scene."""
+"""The page of the studio: a server of viser with the controls of the steps and the scene."""
 
 import logging
 import threading
@@ -113,8 +113,8 @@ class _Drawing:
         if gripper is None:
             return
         place(self._gripper, gripper)
-        place(self._live, gripper @ self._mount())
         if "wrist" in connection.images:
+            place(self._live, gripper @ self._mount())
             self._live.image = resized(connection.images["wrist"], THUMBNAIL_PX)
         if arm is not None:
             joints = np.vstack([np.zeros(3), arm()])
@@ -125,7 +125,7 @@ class _Drawing:
 
     def show_samples(self, next_view: NextViews | None) -> None:
         """Draw the samples, the bad ones in red, and the next view."""
-        frames, bad = self._studio.recorder.frames, self._studio.bad_samples()
+        frames, bad = self._studio.recorders["wrist"].frames, self._studio.bad_samples()
         for name in self._samples.keys() - {frame.name for frame in frames}:
             self._samples.pop(name).remove()
         for frame in frames:
@@ -145,13 +145,17 @@ class _Drawing:
         studio = self._studio
         found = {str(which): calibration for which, calibration in studio.calibrations.items()}
         drawn = (studio.cell.scenes, *found.values())
-        if studio.cell.scenes and drawn != self._drawn:
+        if drawn == self._drawn:
+            return
+        shown, self._drawn = None, drawn
+        if studio.cell.scenes:
             scenes = studio.cell.localizer.contents.scenes
             shown = DrawnMap(self._server, scenes)
             shown.show(studio.scene or scenes[0].name)
-            camera, size_m = scenes[0].adjusted_camera, 1.3 * _SIZE_M
-            add_calibrations(self._server, found, shown, camera, size_m)
-            self._drawn = drawn
+        for name in found:  # by a held thing it has no scene, by the map it has
+            self._server.scene.remove_by_name(f"/base/{name}")
+        camera = studio.connection.devices.intrinsics
+        add_calibrations(self._server, found, shown, camera, 1.3 * _SIZE_M)
 
     def _mount(self) -> SE3:
         return self._studio.mount or SE3.identity()

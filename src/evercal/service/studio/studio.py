@@ -13,11 +13,12 @@ from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.calibration.export.formats import FORMATS, export_files
 from evercal.calibration.next_views import NextViews, looked_at, next_views
 from evercal.errors import InputError
-from evercal.geometry import SE3
-from evercal.live.coverage import IMAGES, Coverage, Sample, coverage
+from evercal.geometry import SE3, Camera, pose_distance
+from evercal.live.coverage import IMAGES, SAME_DEG, SAME_MM, Coverage, Sample, coverage
 from evercal.live.recorder import JPEG_QUALITY, POSES, WristRecorder
 from evercal.live.robot import MovingRobot
 from evercal.map import Map
+from evercal.recordings.frame import MIN_GRIPPER_FRAMES, stated_grippers
 from evercal.recordings.images import write_jpeg
 from evercal.recordings.poses.camera_file import read_camera
 from evercal.service.studio.devices import Connection, Devices, Which
@@ -48,8 +49,7 @@ class Studio:
     def __init__(self, devices: Devices, out: Path, map: Path | None = None):
         self.connection, self.out = Connection(devices), out
         out.mkdir(parents=True, exist_ok=True)
-        self.cell = Map.open(map or out / "map")
-        self.recorder = WristRecorder(out / "wrist", devices.intrinsics)
+        self.cell, self.thing = Map.open(map or out / "map"), Map.open(out / "thing")
         self.mount = devices.rough
         """gripper_from_camera, rough or calibrated; None if nothing is known."""
         self.watched: Callable[[], bool] = lambda: True
@@ -58,16 +58,27 @@ class Studio:
         self._fixed_camera = out / "fixed_camera.json"
         if devices.fixed_intrinsics is not None:
             write_json(self._fixed_camera, asdict(devices.fixed_intrinsics))
+        fixed = self._fixed_intrinsics() or devices.intrinsics
+        self.recorders: dict[Which, WristRecorder] = {
+            "wrist": WristRecorder(self.recording("wrist"), devices.intrinsics),
+            "fixed": WristRecorder(self.recording("fixed"), fixed),
+        }
+        """Samples of the camera on the gripper, and of a thing in the gripper."""
         self.calibrations: dict[Which, Calibration] = {}
         for which in ("wrist", "fixed"):
             path = self.calibration_file(which)
             found = read_calibration(path) if path.is_file() else None
-            if found is not None and found.source.get("scene") in self.cell.scenes:
-                self._keep(which, found)
+            scenes = *self.cell.scenes, *self.thing.scenes
+            if found is not None and found.source.get("scene") in scenes:
+                self._keep(which, found, write=False)
 
     def calibration_file(self, which: Which) -> Path:
         """Calibration of a camera."""
         return self.out / f"{which}.json"
+
+    def recording(self, which: Which) -> Path:
+        """Samples of the camera on the gripper, or of a fixed camera that sees a held thing."""
+        return self.out / ("wrist" if which == "wrist" else "held")
 
     @property
     def can_move(self) -> bool:
@@ -80,14 +91,13 @@ class Studio:
         found = self.calibrations.get("wrist")
         return None if found is None else str(found.source["scene"])
 
-    @property
-    def samples_changed(self) -> bool:
+    def samples_changed(self, which: Which = "wrist") -> bool:
         """Whether samples were added or removed since they were learned."""
-        found, table = self.calibrations.get("wrist"), self._table_sha256()
+        found, table = self.calibrations.get(which), self._table_sha256(which)
         return found is None or table is None or found.source.get(_TABLE) != table
 
-    def _table_sha256(self) -> str | None:
-        table = self.out / "wrist" / POSES
+    def _table_sha256(self, which: Which) -> str | None:
+        table = self.recording(which) / POSES
         return sha256_file(table) if table.is_file() else None
 
     @property
@@ -95,13 +105,14 @@ class Studio:
         """Images of the fixed camera, in order."""
         return sorted((self.out / "fixed").glob("*.jpg"))
 
-    def coverage(self) -> Coverage:
+    def coverage(self, which: Which = "wrist") -> Coverage:
         """What the samples cover."""
-        return coverage([_measured(frame) for frame in self.recorder.frames], self.mount)
+        mount = self.mount if which == "wrist" else None
+        return coverage([_measured(frame) for frame in self.recorders[which].frames], mount)
 
-    def bad_samples(self) -> list[str]:
+    def bad_samples(self, which: Which = "wrist") -> list[str]:
         """Names of the samples with problems."""
-        return [row.name for row in self.coverage().samples if row.problems]
+        return [row.name for row in self.coverage(which).samples if row.problems]
 
     def next_view(self) -> NextViews | None:
         """The view that would lower the uncertainty most; None before the first good sample.
@@ -109,7 +120,7 @@ class Studio:
         It is one of the reachable poses, else one near those of the samples.
         """
         rows = self.coverage().samples
-        poses = [_measured(frame).base_from_gripper for frame in self.recorder.frames]
+        poses = [_measured(frame).base_from_gripper for frame in self.recorders["wrist"].frames]
         good = [pose for pose, row in zip(poses, rows, strict=True) if not row.problems]
         if not good:
             return None
@@ -120,17 +131,33 @@ class Studio:
         views = next_views(SE3.stack(good), reachable, 1, self.mount, excluded)
         return views if len(views.poses) else None
 
-    def take_sample(self) -> str:
+    def next_pose(self, which: Which = "wrist") -> SE3 | None:
+        """The gripper pose of the next view; for a held thing the one farthest from all before."""
+        if which == "wrist":
+            return view.poses[0] if (view := self.next_view()) else None
+        poses = self.connection.devices.holding
+        before = [*stated_grippers(self.recorders[which].frames), *self._refused]
+        if poses is None:
+            return None
+        away = np.full(len(poses), np.inf)
+        for pose in before:
+            metres, radians = pose_distance(poses, pose)
+            apart = np.maximum(1000 * metres / SAME_MM, np.rad2deg(radians) / SAME_DEG)
+            away = np.minimum(away, apart)
+        farthest = int(np.argmax(away))
+        return poses[farthest] if away[farthest] > 1 else None
+
+    def take_sample(self, which: Which = "wrist") -> str:
         """Record image and pose."""
-        name = self.recorder.add(*self.connection.sample()).name
-        bad = "; ".join(self.coverage().samples[-1].problems)
+        name = self.recorders[which].add(*self.connection.sample(which)).name
+        bad = "; ".join(self.coverage(which).samples[-1].problems)
         return f"Took sample {name}{f', {bad}: better remove it' if bad else ''}."
 
-    def remove(self, *names: str) -> str:
+    def remove(self, *names: str, which: Which = "wrist") -> str:
         """Remove samples."""
         for name in names:
-            self.recorder.remove(name)
-        return f"Removed {', '.join(names)}." if names else "There is no bad sample."
+            self.recorders[which].remove(name)
+        return f"Removed {', '.join(names)}." if names else "There is no such sample."
 
     def move_to(self, base_from_gripper: SE3) -> str:
         """Move the arm."""
@@ -147,45 +174,52 @@ class Studio:
         self.connection.look(None)
         return "The arm is there."
 
-    def record(self, on_step: OnStep, stopping: Callable[[], bool] = lambda: False) -> str:
+    def move_on(self, which: Which = "wrist") -> str:
+        """Move the arm to the next view."""
+        pose = self.next_pose(which)
+        return "There is no next view." if pose is None else self.move_to(pose)
+
+    def record(
+        self,
+        on_step: OnStep,
+        stopping: Callable[[], bool] = lambda: False,
+        which: Which = "wrist",
+    ) -> str:
         """Move from one best view to the next and take samples until nothing is missing."""
-        if not self.recorder.frames:
+        if which == "wrist" and not self.recorders[which].frames:
             self.take_sample()
         while not stopping():
-            reached, view = self.coverage(), self.next_view()
+            reached, pose = self.coverage(which), self.next_pose(which)
             good = sum(not row.problems for row in reached.samples)
-            if not reached.missing or view is None or good >= 2 * IMAGES:
+            if not reached.missing or pose is None or good >= 2 * IMAGES:
                 break
             on_step(f"recording, {good} good images", min(good, IMAGES), IMAGES)
             self._require_watched()
             try:
-                self.move_to(view.poses[0])
+                self.move_to(pose)
             except InputError:  # out of reach, and never proposed again
                 continue
-            self.take_sample()
-        return f"{len(self.recorder.frames)} samples are recorded."
+            self.take_sample(which)
+        return f"{len(self.recorders[which].frames)} samples are recorded."
 
-    def learn(self, on_step: OnStep) -> str:
-        """Learn the recording and calibrate the camera on the gripper.
+    def learn(self, on_step: OnStep, which: Which = "wrist") -> str:
+        """Learn the recording and calibrate the camera on the gripper, or one that sees the thing.
 
         The scene that the studio learned before is replaced once the new one is in the map.
         """
-        old, cell, path = self.scene, self.cell, self.calibration_file("wrist")
-        table = self._table_sha256()
-        scene = _free_name("wrist", cell.scenes)
-        report = cell.learn(self.out / "wrist", name=scene, on_progress=on_step)
+        folder, table = self.recording(which), self._table_sha256(which)
+        cell, old = self.cell, self.scene
+        if which == "fixed":
+            cell, old = self.thing, next(iter(self.thing.scenes), None)
+        scene = _free_name(folder.name, cell.scenes)
+        learn = cell.learn if which == "wrist" else cell.eye_to_hand
+        learn(folder, name=scene, on_progress=on_step)
         if old is not None:
             cell.remove(old)
             cell.rename(scene, old)
-            scene = old
-        assert report.hand_eye is not None, "the recording states gripper poses"
-        scenes = cell.localizer.contents.scenes
-        camera = next(found.adjusted_camera for found in scenes if found.name == scene)
-        calibration = report.hand_eye.calibration(camera, scene, report.train_frames)
-        calibration = replace(calibration, source={**calibration.source, _TABLE: table})
-        calibration.write(path)
-        self._keep("wrist", calibration)
-        return f"Learned {report.train_frames} images; wrote {path}."
+        found = cell.calibration(old or scene)
+        self._keep(which, replace(found, source={**found.source, _TABLE: table}))
+        return f"Learned {found.source['frames']} images; wrote {self.calibration_file(which)}."
 
     def take_fixed(self) -> str:
         """Take an image of the fixed camera."""
@@ -197,12 +231,11 @@ class Studio:
 
     def take_fixed_series(self, on_step: OnStep, move: bool) -> str:
         """Take several images; the arm may go to poses of samples, so that it hides other parts."""
-        poses = [frame.base_from_gripper for frame in self.recorder.frames] if move else []
+        poses = stated_grippers(self.recorders["wrist"].frames if move else ())
         for i in range(FIXED_IMAGES):
             on_step("taking images", i, FIXED_IMAGES)
-            pose = poses[i * len(poses) // FIXED_IMAGES] if poses else None
-            if pose is not None:
-                self.move_to(pose)
+            if len(poses):
+                self.move_to(poses[i * len(poses) // FIXED_IMAGES])
             self.take_fixed()
         return f"Took {FIXED_IMAGES} images."
 
@@ -214,18 +247,16 @@ class Studio:
 
     def calibrate_fixed(self, on_step: OnStep) -> str:
         """Calibrate the fixed camera."""
-        files, given = self.fixed_images, self._fixed_camera
+        files = self.fixed_images
         if not files:
             raise InputError("no image of the fixed camera yet; take one first")
         on_step("locating images", 0, len(files))
         found = self.cell.calibrate(
             files,
-            camera=read_camera(given) if given.is_file() else None,
+            camera=self._fixed_intrinsics(),
             mount="eye_to_hand",
         )
-        found = replace(found, source={**found.source, "store": str(self.cell.path)})
-        found.write(self.calibration_file("fixed"))
-        self._keep("fixed", found)
+        self._keep("fixed", replace(found, source={**found.source, "store": str(self.cell.path)}))
         return f"Calibrated the fixed camera; wrote {self.calibration_file('fixed')}."
 
     def check_fixed(self) -> str:
@@ -260,7 +291,12 @@ class Studio:
             raise InputError(f"the {which} camera is not calibrated yet")
         return self.calibrations[which]
 
-    def _keep(self, which: Which, calibration: Calibration) -> None:
+    def _fixed_intrinsics(self) -> Camera | None:
+        return read_camera(self._fixed_camera) if self._fixed_camera.is_file() else None
+
+    def _keep(self, which: Which, calibration: Calibration, write: bool = True) -> None:
+        if write:
+            calibration.write(self.calibration_file(which))
         self.calibrations[which] = calibration
         if which == "wrist":
             self.mount = calibration.parent_from_child
@@ -286,17 +322,22 @@ def _free_name(name: str, taken: tuple[str, ...]) -> str:
     return name if name not in taken else next(free for free in numbered if free not in taken)
 
 
+_NO_FIXED = "No fixed camera was given; restart with --fixed SOURCE, or go on."
+
+
 def _connect(studio: Studio) -> State:
     if studio.connection.complete:
         return "done", "Images and gripper poses arrive."
-    problems = studio.connection.problems
-    return "to do", problems.get("wrist") or problems.get("robot") or "Waiting for image and pose."
+    problems = studio.connection.problems.values()
+    return "to do", next(iter(problems), "Waiting for image and pose.")
 
 
 def _record(studio: Studio) -> State:
     covered = studio.coverage()
     if covered.samples:
         return "done" if covered.ready else "to do", covered.verdict
+    if studio.connection.devices.wrist_camera is None:
+        return "waits", "No camera on the gripper was given; go on to 'or Hold'."
     if not studio.connection.complete:
         return "waits", "Connect the camera and the robot first."
     return "to do", "Move the arm until the camera sees the work area; take the first sample."
@@ -304,7 +345,7 @@ def _record(studio: Studio) -> State:
 
 def _learn(studio: Studio) -> State:
     found, covered = studio.calibrations.get("wrist"), studio.coverage()
-    if found is not None and not studio.samples_changed:
+    if found is not None and not studio.samples_changed():
         return "done", found.verdict
     if not covered.ready:
         return "waits", "The recording cannot be learned yet."
@@ -315,15 +356,30 @@ def _learn(studio: Studio) -> State:
 
 def _fixed(studio: Studio) -> State:
     images, found = len(studio.fixed_images), studio.calibrations.get("fixed")
-    if not studio.cell.scenes:
-        return "waits", "Learn the scene first."
     if found is not None:
         return "done", found.verdict.replace("--camera", "--fixed-intrinsics")
+    if not studio.cell.scenes:
+        return "waits", "Learn the scene first, or let the gripper hold something: see 'or Hold'."
     if studio.connection.devices.fixed_camera is None:
-        return "waits", "No fixed camera was given; restart with --fixed SOURCE, or go on."
+        return "waits", _NO_FIXED
     if not images:
         return "to do", "Take images of the scene, 5 to 10."
     return "to do", f"{images} images; take more, or calibrate."
+
+
+def _hold(studio: Studio) -> State:
+    found, covered = studio.calibrations.get("fixed"), studio.coverage("fixed")
+    if found is not None and not studio.samples_changed("fixed"):
+        return "done", found.verdict
+    if studio.connection.devices.fixed_camera is None:
+        return "waits", _NO_FIXED
+    if covered.samples:
+        return "to do", covered.verdict
+    return "to do", (
+        "Calibrates the fixed camera without a scene. The gripper holds a textured thing, such as a"
+        f" box or a book, and turns it by 20° and more about two axes: {MIN_GRIPPER_FRAMES} images"
+        f" or more, better {IMAGES}."
+    )
 
 
 def _export(studio: Studio) -> State:
@@ -340,6 +396,7 @@ STEPS: dict[str, Callable[[Studio], State]] = {
     "2 Record": _record,
     "3 Learn": _learn,
     "4 Fixed": _fixed,
+    "or Hold": _hold,
     "5 Export": _export,
 }
-"""All steps in order, each with its state."""
+"""All steps in order, each with its state; a held thing stands in for steps 2 to 4."""

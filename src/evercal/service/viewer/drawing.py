@@ -136,16 +136,20 @@ class DrawnMap:
 def add_calibrations(
     server: viser.ViserServer,
     calibrations: dict[str, Calibration],
-    drawn: DrawnMap,
+    drawn: DrawnMap | None,
     default: Camera,
     size_m: float,
 ) -> None:
-    """Add cameras in their scenes or on the gripper, with ellipsoids of their positions."""
+    """Add cameras in their scenes or on the gripper, with ellipsoids of their positions.
+
+    Where no map is drawn, they are in the base.
+    """
     scale = readable_scale([Ellipsoid.of(c.uncertain_pose) for c in calibrations.values()])
     for name, found in calibrations.items():
         ellipsoid = Ellipsoid.of(found.uncertain_pose)
         on_gripper = found.mount == "eye_in_hand"
-        parent = GRIPPER if on_gripper else drawn.node(found.source.get("scene"))
+        base = drawn.node(found.source.get("scene")) if drawn else "/base"
+        parent = GRIPPER if on_gripper else base
         node = f"{parent}/{name.replace('/', '_')}"
         frustum = Frustum.of(found.parent_from_child, found.camera or default)
         add_frustum(server, node, frustum, size_m, MAGENTA)
