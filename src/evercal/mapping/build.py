@@ -79,7 +79,7 @@ class MapOptions:
             self.bundle,
             common_stated=False,
             correlation=2.7,
-            least_share=0.01,
+            least_share=0.0025,
             common_sigma_m=0.2,
             common_sigma_deg=10.0,
             least_sigma_m=2e-4,
