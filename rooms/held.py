@@ -326,15 +326,16 @@ def _carton(size_m: tuple[float, float, float], pictures: list[np.ndarray]) -> P
     return parts
 
 
-def _print(rng: np.random.Generator, rows: int, columns: int, leaves: int | None = None) -> np.ndarray:
+def _print(
+    rng: np.random.Generator, rows: int, columns: int, leaves: int | None = None
+) -> np.ndarray:
     """A printed page: a picture with a label on it."""
-    page = dead_leaves(rows, columns, rng, leaves)
-    side = min(rows, columns) * 3 // 5
-    badge = label("", tuple(rng.uniform(0.1, 0.9, 3)), rng).texture
     import cv2
 
-    badge = cv2.resize(badge, (side, side), interpolation=cv2.INTER_AREA)
+    page, side = dead_leaves(rows, columns, rng, leaves), min(rows, columns) * 3 // 5
+    badge = label("", tuple(rng.uniform(0.1, 0.9, 3)), rng).texture
     top, left = (int(rng.integers(0, n - side)) for n in (rows, columns))
+    badge = cv2.resize(badge, (side, side), interpolation=cv2.INTER_AREA)
     page[top : top + side, left : left + side] = badge
     return page
 

@@ -19,9 +19,7 @@ from rooms.shapes import Mesh
 _MESHES = "share/example-robot-data/robots/panda_description/meshes/visual"
 
 
-def panda_meshes(
-    joints_rad: np.ndarray, opening_m: float = 0.03
-) -> list[tuple[Mesh, Material]]:
+def panda_meshes(joints_rad: np.ndarray, opening_m: float = 0.03) -> list[tuple[Mesh, Material]]:
     """Meshes of the arm in the base frame, one named mesh for each colour.
 
     Args:

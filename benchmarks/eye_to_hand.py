@@ -1,0 +1,267 @@
+"""A fixed camera, and a textured thing in the gripper: errors, ellipsoids, refusals.
+
+Recordings are rendered on demand by `rooms.held`. Every answer is one JSON line in OUT/rows.jsonl
+and is not repeated.
+"""
+
+import json
+import tempfile
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from benchmarks.accuracy import pose_error, wrong
+from benchmarks.hand_eye import pose, rotations
+from benchmarks.hand_eye_boards import opencv_solvers
+from benchmarks.rows import Row, save
+from evercal.calibration.boards.board_poses import board_poses
+from evercal.calibration.boards.detection import Board, dictionary_of, find_board
+from evercal.calibration.calibration import Calibration
+from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
+from evercal.calibration.pose_pairs.solve import solve
+from evercal.errors import InputError
+from evercal.evaluation.metrics import CHI2_6
+from evercal.geometry import SE3, Camera, pose_distance_mm_deg
+from evercal.recordings import load_recording
+from evercal.storage import write_json
+from rooms.held import FAULTS, SQUARES, Setting, render, write_poses
+
+FIRST_SEED = 200
+"""Seeds below it are for development."""
+ARM = (0.1, 0.02)
+"""Standard deviation of the stated gripper poses per axis, millimetres and degrees."""
+CLOSED, SOLVED, HELD = "closed form", "evercal solve", "eye_to_hand"
+"""Names of the methods; the first two need the board."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Recordings of ten seeds, and what is done to them before they are solved."""
+
+    scene: dict[str, object] = field(default_factory=dict)
+    """Fields of `rooms.held.Setting`."""
+    images: int = 25
+    """The first ones of the recording are used."""
+    arm: tuple[float, float] = ARM
+    spoiled: str = ""
+    """other, shuffled: gripper poses; focal: stated 5 % too long."""
+
+    def setting(self, seed: int) -> Setting:
+        """The recording of a seed; recordings are rendered once, with their largest length."""
+        return Setting(seed, **{"images": 25, **self.scene})  # pyright: ignore[reportArgumentType]
+
+
+LONG: dict[str, object] = {"images": 40}
+SMALL: dict[str, object] = {"size": (320, 240), "px": 100, "images": 20}
+THINGS = ("box", "bottle", "book", "tool")
+MAIN = {
+    "box": Condition(LONG),
+    **{thing: Condition({"thing": thing}) for thing in THINGS[1:]},
+    "board": Condition({"thing": "board"}),
+    **{f"box, {n} images": Condition(LONG, n) for n in (8, 15, 40)},
+    "box, arm 0.5 mm 0.1 deg": Condition(LONG, arm=(0.5, 0.1)),
+    "box, arm 2 mm 0.5 deg": Condition(LONG, arm=(2.0, 0.5)),
+    "board, arm 0.5 mm 0.1 deg": Condition({"thing": "board"}, arm=(0.5, 0.1)),
+    "board, arm 2 mm 0.5 deg": Condition({"thing": "board"}, arm=(2.0, 0.5)),
+    "box, hobby arm 5 mm 2 deg": Condition(LONG, arm=(5.0, 2.0)),
+    "box, poses of another recording": Condition(LONG, spoiled="other"),
+    "box, poses shuffled": Condition(LONG, spoiled="shuffled"),
+    "box, focal length 5 % wrong": Condition(LONG, spoiled="focal"),
+    **{f"box, {px} px": Condition({"px": px}) for px in (60, 100, 300)},
+    "box, 1280x720": Condition({"size": (1280, 720)}),
+    **{f"board, {px} px": Condition({"thing": "board", "px": px}) for px in (60, 100, 300)},
+}
+FAILING = {
+    f"small images, {fault or 'nothing wrong'}": Condition({**SMALL, "fault": fault}, 20)
+    for fault in ("", *FAULTS)
+}
+CONDITIONS = {**MAIN, **FAILING}
+
+
+def run(
+    data: Path = Path("runs/held"),
+    out: Path = Path("runs/eye-to-hand"),
+    only: tuple[str, ...] = (),
+    draws: int = 10,
+    methods: tuple[str, ...] = (CLOSED, SOLVED, HELD),
+    render_only: bool = False,
+) -> None:
+    """Calibrate fixed cameras from a thing in the gripper, beside a board in the gripper.
+
+    Args:
+        data: Folder of the rendered recordings; missing ones are rendered.
+        out: Folder of the rows.
+        only: Conditions; all if omitted.
+        draws: Recordings of each condition.
+        methods: Which of closed form, evercal solve and eye_to_hand.
+        render_only: Whether the recordings are rendered and nothing is solved.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / "rows.jsonl"
+    lines = file.read_text().splitlines() if file.exists() else []
+    rows: list[Row] = [json.loads(line) for line in lines]
+    done = {(row["condition"], row["seed"], row["method"]) for row in rows}
+    for name in tqdm(only or CONDITIONS, unit="condition"):
+        condition = CONDITIONS[name]
+        for seed in range(FIRST_SEED, FIRST_SEED + draws):
+            setting = condition.setting(seed)
+            for _ in tqdm(render(setting, data), setting.name, leave=False, unit="image"):
+                pass
+            for method in methods:
+                if render_only or (name, seed, method) in done:
+                    continue
+                if method != HELD and setting.thing != "board":
+                    continue
+                row: Row = {"condition": name, "seed": seed, "method": method}
+                row |= _measured(method, condition, data, setting)
+                rows.append(row)
+                with file.open("a") as stream:
+                    stream.write(json.dumps(row) + "\n")
+    if rows:
+        save(out / "eye-to-hand.csv", summary(rows))
+
+
+def _measured(method: str, condition: Condition, data: Path, setting: Setting) -> Row:
+    """Error of one method in one recording, or its refusal."""
+    truth = json.loads((data / setting.name / "truth.json").read_text())
+    # A camera that is bumped half way has two true poses.
+    true_cameras = _poses(truth["base_from_camera"])[[0, condition.images - 1]]
+    with tempfile.TemporaryDirectory() as folder:
+        recording = Path(folder) / setting.name
+        _spoil(recording, condition, data, setting)
+        began = time.process_time()
+        try:
+            if method == HELD:
+                from evercal.calibration.eye_to_hand import eye_to_hand
+
+                answer = eye_to_hand(load_recording(recording))
+            else:
+                answer = _from_board(method, recording, float(truth["scale"]))
+        except InputError as error:
+            return {"refused": str(error), "seconds": time.process_time() - began}
+    seconds = time.process_time() - began
+    if isinstance(answer, dict):  # one pose by each closed-form solver
+        row: Row = {"seconds": seconds}
+        for name, found in answer.items():
+            row[f"{name}_mm"], row[f"{name}_deg"] = pose_distance_mm_deg(found, true_cameras[0])
+        return row
+    errors = [pose_error(answer.uncertain_pose, true_camera) for true_camera in true_cameras]
+    nearest = min(errors, key=lambda error: float(error["mm"]))
+    return {**nearest, "verdict": answer.verdict, "seconds": seconds}
+
+
+def _spoil(recording: Path, condition: Condition, data: Path, setting: Setting) -> None:
+    """Write the recording that a condition makes of a rendered one."""
+    source, n = data / setting.name, condition.images
+    truth = json.loads((source / "truth.json").read_text())
+    rng = np.random.default_rng([setting.seed, 31])
+    recording.mkdir()
+    for i in range(n):
+        image = source / "recording" / f"{i:03d}.png"
+        (recording / image.name).symlink_to(image.absolute())
+    camera = json.loads((source / "recording" / "camera.json").read_text())
+    if condition.spoiled == "focal":
+        camera |= {"fx": 1.05 * camera["fx"], "fy": 1.05 * camera["fy"]}
+    write_json(recording / "camera.json", camera)
+    if condition.spoiled == "other":
+        others = sorted(data.glob(setting.name.removesuffix(str(setting.seed)) + "*/truth.json"))
+        other = others[(others.index(source / "truth.json") + 1) % len(others)]
+        truth = json.loads(other.read_text())
+    poses = _poses(truth["base_from_gripper"])[:n]
+    if condition.spoiled == "shuffled":
+        poses = poses[rng.permutation(n)]
+    sigma = np.repeat([condition.arm[0] / 1000, np.deg2rad(condition.arm[1])], 3)
+    write_poses(recording, poses @ SE3.exp(rng.normal(0, sigma, (n, 6))))
+
+
+def _poses(rows: list[dict]) -> SE3:
+    return SE3.stack([SE3(row["quaternion_wxyz"], row["translation_m"]) for row in rows])
+
+
+def _from_board(method: str, recording: Path, scale: float) -> Calibration | dict[str, SE3]:
+    """`evercal detect` and `solve`, or OpenCV's detection, solvePnP and closed-form solvers."""
+    board = replace(SQUARES, size_m=SQUARES.size_m * scale, marker_m=SQUARES.marker_m * scale)
+    frames = load_recording(recording).train
+    camera, grippers = frames[0].camera, SE3.stack([f.base_from_gripper for f in frames])
+    pictures = {frame.name: frame.read_image() for frame in frames}
+    if method == SOLVED:
+        views = {name: find_board(image, board) for name, image in pictures.items()}
+        images = board_poses(board, camera, views).images
+        seen = [image.camera_from_board for image in images]
+    else:
+        images, seen = [], [_opencv_board(image, board, camera) for image in pictures.values()]
+    rows = [i for i, found in enumerate(seen) if found is not None]
+    if len(rows) < 3:
+        raise InputError(f"the board is detected in {len(rows)} of {len(seen)} images")
+    names = tuple(frames[i].name for i in rows)
+    pairs = PosePairs(names, grippers[rows], SE3.stack([seen[i] for i in rows]))
+    if method == CLOSED:
+        return {"Park": park(pairs), **opencv_solvers(pairs, "eye_to_hand")}
+    corners = BoardCorners(camera, tuple(images[i].view for i in rows), stated=True)
+    return solve(pairs, "eye_to_hand", corners=corners)
+
+
+def _opencv_board(image: np.ndarray, board: Board, camera: Camera) -> SE3 | None:
+    """camera_from_board by OpenCV's detector and iterative solvePnP."""
+    printed = cv2.aruco.CharucoBoard(
+        (board.columns, board.rows), board.size_m, board.marker_m, dictionary_of(board)
+    )
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    pixels, ids, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(grey)
+    if ids is None or len(ids) < 6:
+        return None
+    points = np.asarray(printed.getChessboardCorners())[np.ravel(ids)]
+    if np.linalg.matrix_rank(points - points.mean(0), tol=0.5 * board.size_m) < 2:
+        return None
+    ok, rotvec, shift = cv2.solvePnP(points, np.reshape(pixels, (-1, 1, 2)), camera.matrix(), None)
+    return pose(Rotation.from_rotvec(rotvec.ravel()), shift.ravel()) if ok else None
+
+
+def park(pairs: PosePairs) -> SE3:
+    """base_from_camera by Park and Martin (IEEE T-RA 1994) over all pairs of images."""
+    robot, board = pairs.base_from_gripper.inverse(), pairs.camera_from_board
+    i, j = np.triu_indices(len(robot), 1)
+    # gripper motion A = g_j g_i^-1 in the base, board motion B in the camera: A X = X B
+    a, b = robot[j].inverse() @ robot[i], board[j] @ board[i].inverse()
+    turns = [rotations(motion).as_rotvec() for motion in (a, b)]
+    u, _, vt = np.linalg.svd(turns[0].T @ turns[1])
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    left = (a.rotation_matrix() - np.eye(3)).reshape(-1, 3)
+    right = (b.translation_m @ rotation.T - a.translation_m).ravel()
+    return pose(Rotation.from_matrix(rotation), np.linalg.lstsq(left, right, rcond=None)[0])
+
+
+def summary(rows: list[Row]) -> list[Row]:
+    """One row for each condition and method; `wrong`: over 10 mm and over five sigma."""
+    table, result = pd.DataFrame(rows), []
+    for column in ("refused", "mm", "deg", "sigma_mm", "sigma_deg", "squared_mahalanobis"):
+        table[column] = table.get(column, np.nan)
+    for (name, method), group in table.groupby(["condition", "method"], sort=False):
+        condition = CONDITIONS[str(name)]
+        setting = condition.setting(FIRST_SEED)
+        solver = ""
+        if method == CLOSED:
+            median = group.filter(like="_mm").drop(columns="sigma_mm").median()
+            solver = str(median.fillna(np.inf).idxmin()).removesuffix("_mm")
+            group = group.assign(mm=group[f"{solver}_mm"], deg=group[f"{solver}_deg"])
+        squared = group["squared_mahalanobis"].to_numpy(float)
+        known = squared[np.isfinite(squared)]
+        row: Row = {"condition": str(name), "method": str(method), "solver": solver}
+        row |= {"thing": setting.thing, "px": setting.px, "images": condition.images}
+        row |= {"size": "x".join(map(str, setting.size)), "draws": len(group)}
+        row["refused"] = int(group["refused"].notna().sum())
+        for unit in ("mm", "deg"):
+            row |= {unit: group[unit].median(), f"{unit}_90": group[unit].quantile(0.9)}
+            row[f"sigma_{unit}"] = group[f"sigma_{unit}"].median()
+        if len(known):
+            row["inside_95"] = 100 * float((known < CHI2_6).mean())
+            row["squared_mahalanobis"] = float(known.mean())
+            row["wrong"] = int(wrong(group["mm"].to_numpy(float), squared).sum())
+        result.append(row | {"seconds": group["seconds"].median()})
+    return result
