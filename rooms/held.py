@@ -49,7 +49,7 @@ FARTHEST_M = 1.5
 TURN_DEG = 32.0
 """Largest turn about each axis of the thing to either side."""
 _GRIPPED_M, _TIPS_M = 0.02, 0.112
-_SAMPLES, _NOISE = 8, 0.012
+_SAMPLES, _NOISE = 4, 0.012
 _ARM_SIGMA = np.repeat([1e-4, np.deg2rad(0.02)], 3)
 
 
@@ -175,7 +175,7 @@ def make_plan(setting: Setting) -> Plan:
         middle = rng.uniform((0.45, -0.12, 0.4), (0.58, 0.12, 0.5))
         azimuth, elevation = rng.uniform(-1.0, 1.0), rng.uniform(-0.05, 0.55)
         if setting.fault == "hidden":
-            azimuth += np.pi
+            azimuth = np.pi + 0.3 * azimuth  # the arm is between
         towards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) * np.cos(elevation)
         towards[2] = np.sin(elevation)
         eye = middle + distance * towards
@@ -183,7 +183,7 @@ def make_plan(setting: Setting) -> Plan:
         around = middle + rng.uniform(-0.2, 0.2, (50, 3))
         if not (scene.is_free(line, 0.04).all() and scene.is_free(around, 0.0).all()):
             continue
-        aside = (0.5 if setting.fault == "out" else 0.08) * distance * width / focal
+        aside = (0.42 if setting.fault == "out" else 0.08) * distance * width / focal
         aim = middle + aside * rng.choice([-1, 1]) * np.cross(towards, [0.0, 0, 1])
         pose = look_at(eye, aim + rng.uniform(-0.1, 0.1, 3) * distance / 3, rng.uniform(-0.1, 0.1))
         gripper_from_thing = _grip(setting, scale, rng)
