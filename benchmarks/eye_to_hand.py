@@ -7,26 +7,29 @@ and is not repeated.
 import json
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-import pandas as pd
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from benchmarks.accuracy import pose_error, wrong
+from benchmarks.arm_noise import grippers
 from benchmarks.hand_eye import pose, rotations
 from benchmarks.hand_eye_boards import opencv_solvers
 from benchmarks.rows import Row, save
 from evercal.calibration.boards.board_poses import board_poses
+from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.boards.detection import Board, dictionary_of, find_board
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.errors import InputError
-from evercal.evaluation.metrics import CHI2_6
+from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg
 from evercal.recordings import load_recording
 from evercal.storage import write_json
@@ -180,35 +183,40 @@ def _spoil(recording: Path, condition: Condition, data: Path, setting: Setting) 
     write_poses(recording, poses @ SE3.exp(rng.normal(0, sigma, (n, 6))))
 
 
-def _poses(rows: list[dict]) -> SE3:
+def _poses(rows: Sequence[Mapping[str, Any]]) -> SE3:
     return SE3.stack([SE3(row["quaternion_wxyz"], row["translation_m"]) for row in rows])
 
 
 def _from_board(method: str, recording: Path, scale: float) -> Calibration | dict[str, SE3]:
     """`evercal detect` and `solve`, or OpenCV's detection, solvePnP and closed-form solvers."""
     board = replace(SQUARES, size_m=SQUARES.size_m * scale, marker_m=SQUARES.marker_m * scale)
-    frames = load_recording(recording).train
-    camera, grippers = frames[0].camera, SE3.stack([f.base_from_gripper for f in frames])
-    pictures = {frame.name: frame.read_image() for frame in frames}
+    loaded = load_recording(recording)
+    names, robot = [frame.name for frame in loaded.train], grippers(loaded)
+    camera, images = loaded.train[0].camera, [frame.read_image() for frame in loaded.train]
+    found: list[tuple[int, SE3, BoardView | None]] = []
     if method == SOLVED:
-        views = {name: find_board(image, board) for name, image in pictures.items()}
-        images = board_poses(board, camera, views).images
-        seen = [image.camera_from_board for image in images]
+        detected = {name: find_board(image, board) for name, image in zip(names, images, strict=True)}
+            name: find_board(image, board) for name, image in zip(names, images, strict=True)
+        }
+        for i, fit in enumerate(board_poses(board, camera, detected).images):
+            found += [] if fit.camera_from_board is None else [(i, fit.camera_from_board, fit.view)]
     else:
-        images, seen = [], [_opencv_board(image, board, camera) for image in pictures.values()]
-    rows = [i for i, found in enumerate(seen) if found is not None]
-    if len(rows) < 3:
-        raise InputError(f"the board is detected in {len(rows)} of {len(seen)} images")
-    names = tuple(frames[i].name for i in rows)
-    pairs = PosePairs(names, grippers[rows], SE3.stack([seen[i] for i in rows]))
+        for i, image in enumerate(images):
+            seen = _opencv_board(image, board, camera)
+            found += [] if seen is None else [(i, seen, None)]
+    if len(found) < 3:
+        raise InputError(f"the board is detected in {len(found)} of {len(images)} images")
+    rows = [i for i, _, _ in found]
+    poses = SE3.stack([camera_from_board for _, camera_from_board, _ in found])
+    pairs = PosePairs(tuple(names[i] for i in rows), robot[rows], poses)
     if method == CLOSED:
         return {"Park": park(pairs), **opencv_solvers(pairs, "eye_to_hand")}
-    corners = BoardCorners(camera, tuple(images[i].view for i in rows), stated=True)
+    corners = BoardCorners(camera, tuple(v for _, _, v in found if v is not None), stated=True)
     return solve(pairs, "eye_to_hand", corners=corners)
 
 
 def _opencv_board(image: np.ndarray, board: Board, camera: Camera) -> SE3 | None:
-    """camera_from_board by OpenCV's detector and iterative solvePnP."""
+    """camera_from_board by the detector and the iterative solvePnP of OpenCV."""
     printed = cv2.aruco.CharucoBoard(
         (board.columns, board.rows), board.size_m, board.marker_m, dictionary_of(board)
     )
@@ -216,7 +224,7 @@ def _opencv_board(image: np.ndarray, board: Board, camera: Camera) -> SE3 | None
     pixels, ids, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(grey)
     if ids is None or len(ids) < 6:
         return None
-    points = np.asarray(printed.getChessboardCorners())[np.ravel(ids)]
+    points = np.asarray(printed.getChessboardCorners(), float)[np.ravel(ids).astype(int)]
     if np.linalg.matrix_rank(points - points.mean(0), tol=0.5 * board.size_m) < 2:
         return None
     ok, rotvec, shift = cv2.solvePnP(points, np.reshape(pixels, (-1, 1, 2)), camera.matrix(), None)
@@ -229,39 +237,42 @@ def park(pairs: PosePairs) -> SE3:
     i, j = np.triu_indices(len(robot), 1)
     # gripper motion A = g_j g_i^-1 in the base, board motion B in the camera: A X = X B
     a, b = robot[j].inverse() @ robot[i], board[j] @ board[i].inverse()
-    turns = [rotations(motion).as_rotvec() for motion in (a, b)]
-    u, _, vt = np.linalg.svd(turns[0].T @ turns[1])
+    u, _, vt = np.linalg.svd(rotations(a).as_rotvec().T @ rotations(b).as_rotvec())
     rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
     left = (a.rotation_matrix() - np.eye(3)).reshape(-1, 3)
     right = (b.translation_m @ rotation.T - a.translation_m).ravel()
     return pose(Rotation.from_matrix(rotation), np.linalg.lstsq(left, right, rcond=None)[0])
 
 
-def summary(rows: list[Row]) -> list[Row]:
+def summary(rows: Sequence[Row]) -> list[Row]:
     """One row for each condition and method; `wrong`: over 10 mm and over five sigma."""
-    table, result = pd.DataFrame(rows), []
-    for column in ("refused", "mm", "deg", "sigma_mm", "sigma_deg", "squared_mahalanobis"):
-        table[column] = table.get(column, np.nan)
-    for (name, method), group in table.groupby(["condition", "method"], sort=False):
-        condition = CONDITIONS[str(name)]
-        setting = condition.setting(FIRST_SEED)
-        solver = ""
-        if method == CLOSED:
-            median = group.filter(like="_mm").drop(columns="sigma_mm").median()
-            solver = str(median.fillna(np.inf).idxmin()).removesuffix("_mm")
-            group = group.assign(mm=group[f"{solver}_mm"], deg=group[f"{solver}_deg"])
-        squared = group["squared_mahalanobis"].to_numpy(float)
-        known = squared[np.isfinite(squared)]
-        row: Row = {"condition": str(name), "method": str(method), "solver": solver}
-        row |= {"thing": setting.thing, "px": setting.px, "images": condition.images}
-        row |= {"size": "x".join(map(str, setting.size)), "draws": len(group)}
-        row["refused"] = int(group["refused"].notna().sum())
-        for unit in ("mm", "deg"):
-            row |= {unit: group[unit].median(), f"{unit}_90": group[unit].quantile(0.9)}
-            row[f"sigma_{unit}"] = group[f"sigma_{unit}"].median()
-        if len(known):
-            row["inside_95"] = 100 * float((known < CHI2_6).mean())
-            row["squared_mahalanobis"] = float(known.mean())
-            row["wrong"] = int(wrong(group["mm"].to_numpy(float), squared).sum())
-        result.append(row | {"seconds": group["seconds"].median()})
-    return result
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((str(row["condition"]), str(row["method"])), []).append(row)
+    return [_summary(name, method, group) for (name, method), group in groups.items()]
+
+
+def _summary(name: str, method: str, group: list[Row]) -> Row:
+    condition = CONDITIONS[name]
+    setting, answers = condition.setting(FIRST_SEED), [row for row in group if "refused" not in row]
+
+    def column(key: str) -> np.ndarray:
+        return np.array([float(row[key]) for row in answers])
+
+    row: Row = {"condition": name, "method": method, "thing": setting.thing, "px": setting.px}
+    row |= {"size": "x".join(map(str, setting.size)), "images": condition.images}
+    row |= {"draws": len(group), "refused": len(group) - len(answers)}
+    if not answers:
+        return row
+    solvers = [key[:-3] for key in answers[0] if key.endswith("_mm") and method == CLOSED]
+    best = min(solvers, key=lambda solver: float(np.median(column(f"{solver}_mm"))), default="")
+    for unit in ("mm", "deg"):
+        errors = column(f"{best}_{unit}" if best else unit)
+        row |= {unit: float(np.median(errors)), f"{unit}_90": float(np.quantile(errors, 0.9))}
+    if best:
+        return row | {"solver": best}
+    squared = column("squared_mahalanobis")
+    row |= {f"sigma_{unit}": float(np.median(column(f"sigma_{unit}"))) for unit in ("mm", "deg")}
+    row |= {"inside_95": share_inside(squared), "squared_mahalanobis": float(squared.mean())}
+    row["wrong"] = int(wrong(column("mm"), squared).sum())
+    return row | {"seconds": float(np.median(column("seconds")))}

@@ -321,7 +321,8 @@ def _carton(size_m: tuple[float, float, float], pictures: list[np.ndarray]) -> P
         normal, v = np.zeros(3), np.zeros(3)
         normal[axis], v[up] = 1 - 2 * (k % 2), -1.0  # upright where the gripper is above
         u = np.cross(v, normal)
-        mesh = sheet((normal - u - v) * half, 2 * u * half, 2 * v * half)
+        corner, right, top = ((normal - u - v) * half, 2 * u * half, 2 * v * half)
+        mesh = sheet(corner.tolist(), right.tolist(), top.tolist())
         parts.append((mesh, Material("", pictures[k], kind="coated", roughness=0.3)))
     return parts
 
