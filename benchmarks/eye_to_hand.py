@@ -195,10 +195,9 @@ def _from_board(method: str, recording: Path, scale: float) -> Calibration | dic
     camera, images = loaded.train[0].camera, [frame.read_image() for frame in loaded.train]
     found: list[tuple[int, SE3, BoardView | None]] = []
     if method == SOLVED:
-        detected = {name: find_board(image, board) for name, image in zip(names, images, strict=True)}
-            name: find_board(image, board) for name, image in zip(names, images, strict=True)
-        }
-        for i, fit in enumerate(board_poses(board, camera, detected).images):
+        views = [find_board(image, board) for image in images]
+        fits = board_poses(board, camera, dict(zip(names, views, strict=True))).images
+        for i, fit in enumerate(fits):
             found += [] if fit.camera_from_board is None else [(i, fit.camera_from_board, fit.view)]
     else:
         for i, image in enumerate(images):
