@@ -60,23 +60,23 @@ class Condition:
         return Setting(seed, **{"images": 25, **self.scene})  # pyright: ignore[reportArgumentType]
 
 
-LONG: dict[str, object] = {"images": 40}
 SMALL: dict[str, object] = {"size": (320, 240), "px": 100, "images": 20}
 THINGS = ("box", "bottle", "book", "tool")
 MAIN = {
-    "box": Condition(LONG),
+    "box": Condition(),
     **{thing: Condition({"thing": thing}) for thing in THINGS[1:]},
     "board": Condition({"thing": "board"}),
-    **{f"box, {n} images": Condition(LONG, n) for n in (8, 15, 40)},
-    "box, arm 0.5 mm 0.1 deg": Condition(LONG, arm=(0.5, 0.1)),
-    "box, arm 2 mm 0.5 deg": Condition(LONG, arm=(2.0, 0.5)),
+    **{f"box, {n} images": Condition(images=n) for n in (8, 15)},
+    "box, arm 0.5 mm 0.1 deg": Condition(arm=(0.5, 0.1)),
+    "box, arm 2 mm 0.5 deg": Condition(arm=(2.0, 0.5)),
     "board, arm 0.5 mm 0.1 deg": Condition({"thing": "board"}, arm=(0.5, 0.1)),
     "board, arm 2 mm 0.5 deg": Condition({"thing": "board"}, arm=(2.0, 0.5)),
-    "box, hobby arm 5 mm 2 deg": Condition(LONG, arm=(5.0, 2.0)),
-    "box, poses of another recording": Condition(LONG, spoiled="other"),
-    "box, poses shuffled": Condition(LONG, spoiled="shuffled"),
-    "box, focal length 5 % wrong": Condition(LONG, spoiled="focal"),
+    "box, hobby arm 5 mm 2 deg": Condition(arm=(5.0, 2.0)),
+    "box, poses of another recording": Condition(spoiled="other"),
+    "box, poses shuffled": Condition(spoiled="shuffled"),
+    "box, focal length 5 % wrong": Condition(spoiled="focal"),
     **{f"box, {px} px": Condition({"px": px}) for px in (60, 100, 300)},
+    "box, 40 images": Condition({"images": 40}, 40),
     "box, 1280x720": Condition({"size": (1280, 720)}),
     **{f"board, {px} px": Condition({"thing": "board", "px": px}) for px in (60, 100, 300)},
 }

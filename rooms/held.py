@@ -4,9 +4,11 @@
     OUT/NAME/truth.json        true poses, joint angles, the thing; written last
 
 The gripper frame is the flange. The thing's frame has its origin in its middle, z away from the
-gripper and its front at +y. A finished image is not rendered again.
+gripper and its front at +y. A finished image is not rendered again, and a
+recording can be continued with more images.
 """
 
+import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -46,6 +48,8 @@ FAULTS = (
 """Assumptions that fail while a recording is made."""
 FARTHEST_M = 1.5
 """Largest distance from the camera; a thing that must look smaller is smaller."""
+MOST_IMAGES = 40
+"""Images of a recording; a shorter one is its beginning and can be continued."""
 TURN_DEG = 32.0
 """Largest turn about each axis of the thing to either side."""
 _GRIPPED_M, _TIPS_M = 0.02, 0.112
@@ -100,7 +104,7 @@ def render(setting: Setting, out: Path) -> Iterator[int]:
     import cv2
 
     root, folder = out / setting.name, out / setting.name / "recording"
-    if (root / "truth.json").exists():
+    if _finished(root) >= setting.images:
         return
     plan, half = make_plan(setting), setting.images // 2
     things = [] if setting.fault == "bare" else thing_parts(setting, plan.scale)
@@ -133,6 +137,11 @@ def render(setting: Setting, out: Path) -> Iterator[int]:
     camera = asdict(plan.camera)
     write_json(folder / "camera.json", {k: camera[k] for k in camera if k != "distortion"})
     write_json(root / "truth.json", _truth(setting, plan))
+
+
+def _finished(root: Path) -> int:
+    file = root / "truth.json"
+    return json.loads(file.read_text())["images"] if file.exists() else 0
 
 
 def write_poses(folder: Path, base_from_gripper: SE3) -> None:
@@ -190,7 +199,7 @@ def make_plan(setting: Setting) -> Plan:
         facing = np.arctan2(towards[1], towards[0]) + rng.uniform(-0.35, 0.35)
         poses = _arm_poses(setting, camera, pose, middle, facing, gripper_from_thing, scale, rng)
         if poses is not None:
-            joints = np.stack(poses)
+            joints = np.stack(poses)[: setting.images]
             grippers = SE3.stack([base_from_flange(angles) for angles in joints])
             cameras, grips = SE3.stack([pose] * len(joints)), [gripper_from_thing] * len(joints)
             plan = Plan(scene, camera, cameras, grippers, SE3.stack(grips), joints, scale)
@@ -227,7 +236,7 @@ def _arm_poses(
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
     found, start = [], HOME_RAD
-    for _ in range(8 * setting.images):
+    for _ in range(8 * MOST_IMAGES):
         turn = np.deg2rad(TURN_DEG) * rng.uniform(-1, 1, 3)
         turn = {"still": 0.04 * turn, "axis": axis * turn[0]}.get(setting.fault, turn)
         place = middle + 0.35 * sides[2] * rng.uniform(-1, 1, 3)
@@ -246,7 +255,7 @@ def _arm_poses(
         apart = np.linalg.norm(frames - base_from_camera.translation_m, axis=1).min()
         if frames[:, 2].min() > 0.1 and apart > 0.2:
             found, start = [*found, joints], joints
-        if len(found) == setting.images:
+        if len(found) == MOST_IMAGES:
             return found
     return None
 
