@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from benchmarks.accuracy import pose_error, wrong
 from benchmarks.arm_noise import grippers
-from benchmarks.hand_eye import pose, rotations
+from benchmarks.hand_eye import pose
 from benchmarks.hand_eye_boards import opencv_solvers
 from benchmarks.rows import Row, save
 from evercal.calibration.boards.board_poses import board_poses
@@ -209,7 +209,7 @@ def _from_board(method: str, recording: Path, scale: float) -> Calibration | dic
     poses = SE3.stack([camera_from_board for _, camera_from_board, _ in found])
     pairs = PosePairs(tuple(names[i] for i in rows), robot[rows], poses)
     if method == CLOSED:
-        return {"Park": park(pairs), **opencv_solvers(pairs, "eye_to_hand")}
+        return {"Shah": shah(pairs), **opencv_solvers(pairs, "eye_to_hand")}
     corners = BoardCorners(camera, tuple(v for _, _, v in found if v is not None), stated=True)
     return solve(pairs, "eye_to_hand", corners=corners)
 
@@ -230,17 +230,18 @@ def _opencv_board(image: np.ndarray, board: Board, camera: Camera) -> SE3 | None
     return pose(Rotation.from_rotvec(rotvec.ravel()), shift.ravel()) if ok else None
 
 
-def park(pairs: PosePairs) -> SE3:
-    """base_from_camera by Park and Martin (IEEE T-RA 1994) over all pairs of images."""
-    robot, board = pairs.base_from_gripper.inverse(), pairs.camera_from_board
-    i, j = np.triu_indices(len(robot), 1)
-    # gripper motion A = g_j g_i^-1 in the base, board motion B in the camera: A X = X B
-    a, b = robot[j].inverse() @ robot[i], board[j] @ board[i].inverse()
-    u, _, vt = np.linalg.svd(rotations(a).as_rotvec().T @ rotations(b).as_rotvec())
-    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    left = (a.rotation_matrix() - np.eye(3)).reshape(-1, 3)
-    right = (b.translation_m @ rotation.T - a.translation_m).ravel()
-    return pose(Rotation.from_matrix(rotation), np.linalg.lstsq(left, right, rcond=None)[0])
+def shah(pairs: PosePairs) -> SE3:
+    """base_from_camera X with G Y = X B, by Shah (ASME J. Mechanisms and Robotics 2013)."""
+    robot, board = pairs.base_from_gripper, pairs.camera_from_board
+    turned = robot.rotation_matrix()
+    products = [np.kron(b, g) for g, b in zip(turned, board.rotation_matrix(), strict=True)]
+    left, _, _ = np.linalg.svd(np.sum(products, 0))
+    raw = left[:, 0].reshape(3, 3).T
+    u, _, vt = np.linalg.svd(raw * np.sign(np.linalg.det(raw)))
+    moved = board.translation_m @ (u @ vt).T - robot.translation_m
+    matrix = np.concatenate([turned, -np.broadcast_to(np.eye(3), turned.shape)], 2).reshape(-1, 6)
+    shifts = np.linalg.lstsq(matrix, moved.ravel(), rcond=None)[0]
+    return pose(Rotation.from_matrix(u @ vt), shifts[3:])
 
 
 def summary(rows: Sequence[Row]) -> list[Row]:
