@@ -8,6 +8,7 @@ import tyro
 VERBS = {
     "maps": ("maps", "accuracy of maps: degraded images, fixed cameras, wrong poses, many scenes"),
     "calibration": ("calibration", "cameras calibrated from images, beside the simulator's truth"),
+    "eye-to-hand": ("eye_to_hand", "a fixed camera and a textured thing in the gripper"),
     "trust": ("trust", "other cameras, few images, an inaccurate arm: errors and deviations"),
     "same-model": ("same_model", "images of other cameras of the recording's model"),
     "repeat": ("repeat", "a wrist camera before a chessboard, in three folds"),

@@ -17,15 +17,14 @@ from rooms.materials import Material, plain
 from rooms.shapes import Mesh
 
 _MESHES = "share/example-robot-data/robots/panda_description/meshes/visual"
-_OPENING_M = 0.03
-"""Way of each finger from the middle."""
 
 
-def panda_meshes(joints_rad: np.ndarray) -> list[tuple[Mesh, Material]]:
+def panda_meshes(joints_rad: np.ndarray, opening_m: float = 0.03) -> list[tuple[Mesh, Material]]:
     """Meshes of the arm in the base frame, one named mesh for each colour.
 
     Args:
         joints_rad: Joint angles, shape (7,).
+        opening_m: Way of each finger from the middle.
 
     Raises:
         InputError: The robot's meshes or the packages that read them are not installed.
@@ -33,7 +32,7 @@ def panda_meshes(joints_rad: np.ndarray) -> list[tuple[Mesh, Material]]:
     frames = joint_frames(np.asarray(joints_rad, float))
     hand = frames[7] @ SE3.exp([0, 0, 0, 0, 0, -np.pi / 4]).matrix()
     places = {f"link{i}": [frame] for i, frame in enumerate([np.eye(4), *frames[:7]])}
-    places |= {"hand": [hand], "finger": [hand @ finger for finger in _fingers()]}
+    places |= {"hand": [hand], "finger": [hand @ finger for finger in _fingers(opening_m)]}
     groups: dict[str, tuple[Material, list[Mesh]]] = {}
     for link, matrices in places.items():
         for matrix in matrices:
@@ -43,9 +42,9 @@ def panda_meshes(joints_rad: np.ndarray) -> list[tuple[Mesh, Material]]:
     return [(Mesh.merged(group), material) for material, group in groups.values()]
 
 
-def _fingers() -> list[np.ndarray]:
+def _fingers(opening_m: float) -> list[np.ndarray]:
     """hand_from_finger of both fingers; the second one is the first one turned about z."""
-    left = SE3.from_translation((0, _OPENING_M, 0.0584))
+    left = SE3.from_translation((0, opening_m, 0.0584))
     return [left.matrix(), (SE3.exp([0, 0, 0, 0, 0, np.pi]) @ left).matrix()]
 
 
