@@ -31,6 +31,7 @@ from evercal.calibration.pose_pairs.solve import solve
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg
+from evercal.map import Map
 from evercal.recordings import load_recording
 from evercal.storage import write_json
 from rooms.held import FAULTS, SQUARES, Setting, render, write_poses
@@ -141,9 +142,10 @@ def _measured(method: str, condition: Condition, data: Path, setting: Setting) -
         began = time.process_time()
         try:
             if method == HELD:
-                from evercal.calibration.eye_to_hand import eye_to_hand
-
-                answer = eye_to_hand(load_recording(recording))
+                cell = Map.open(Path(folder) / "thing")
+                answer = cell.eye_to_hand(
+                    load_recording(recording), name="thing", on_progress=lambda *_: None
+                )
             else:
                 answer = _from_board(method, recording, float(truth["scale"]))
         except InputError as error:
