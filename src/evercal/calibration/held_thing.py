@@ -21,6 +21,8 @@ from evercal.recordings.frame import Frame
 PATCH_PX, SAME, STILL_IN, LEAST_CONTRAST = 9, 0.8, 2, 2.0
 """Side of a patch; correlation of equal patches; other images that show a patch where it stands
 still; least variance of a patch that shows something, in variances of the noise."""
+COMPARED = 40
+"""Images that each one is compared with, about."""
 LEAST_NOISE = 2.0
 """Standard deviation of intensities that every camera has at least."""
 LONG_SIDE = 640
@@ -64,9 +66,10 @@ def _still(greys: Sequence[NDArray[Any]]) -> tuple[NDArray[np.bool_], NDArray[np
     ]
     noise = max(float(np.median(changes)), LEAST_NOISE**2)
     signals = np.maximum(variances - noise, noise)
+    apart = -(-len(images) // COMPARED)
     repeated = np.zeros(variances.shape, np.int16)
     for i, image in enumerate(images):
-        for j in range(i):
+        for j in range(i % apart, i, apart):
             covariance = cv2.blur(image * images[j], size) - means[i] * means[j]
             same = covariance > SAME * np.sqrt(signals[i] * signals[j])
             repeated[i] += same
