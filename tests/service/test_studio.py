@@ -293,6 +293,20 @@ def test_a_held_thing_leads_from_an_empty_folder_to_the_fixed_camera(tmp_path: P
     assert degrees < 0.1
     assert found.uncertain_pose.squared_mahalanobis(truth) < 22.5  # 0.999 of chi-square, 6 degrees
     assert (tmp_path / "export/fixed.calib").is_file()
+    view = cell.holding_poses(3, seed=5)
+    images = []
+    for pose in view:
+        cell.robot.move_to(pose)
+        images.append(cell.tripod_camera.read()[1])
+    thing, now = Map.open(tmp_path / "thing"), np.stack(images)
+    assert not thing.check(now, found, robot_poses=view).moved
+    bumped = replace(found, parent_from_child=SE3.from_translation((0.004, 0, 0)) @ truth)
+    assert thing.check(now, bumped, robot_poses=view).moved
+    second = thing.calibrate(now, robot_poses=view)
+    assert second.mount == "eye_to_hand"
+    assert second.uncertain_pose.squared_mahalanobis(truth) < 22.5
+    with pytest.raises(InputError, match="is a thing in the gripper: give"):
+        thing.check(now, found)
 
 
 def test_every_format_is_exported_or_says_why_not(cell: VirtualCell, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ light and of objects in view.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +24,7 @@ from evercal.calibration.located import (
     shows_held_thing,
 )
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation
+from evercal.geometry import SE3, Camera, axis_deviation
 from evercal.recordings.images import Picture
 
 if TYPE_CHECKING:
@@ -72,14 +72,16 @@ def check(
 ) -> Shift:
     """Test whether a camera has moved since its calibration, see `Map.check`."""
     located = locate(localizer, images, camera or reference.camera, on_image)
-    by_arm = np.zeros((6, 6))
     if shows_held_thing(localizer, located, base_from_gripper) and base_from_gripper is not None:
-        sigma = [float(reference.checks.get(f"arm_sigma_{unit}") or 0.0) for unit in ("mm", "deg")]
-        arm = np.diag(np.repeat([sigma[0] / 1000, np.deg2rad(sigma[1])], 3) ** 2)
-        parents = [UncertainPose(gripper, arm) for gripper in base_from_gripper]
-        some = [(parents[i] @ item.pose).covariance for i, item in enumerate(located)]
-        located, by_arm = in_parent_frame(located, base_from_gripper), np.mean(some, axis=0)
-    return shift_between(reference, fuse(located), located, localizer, by_arm=by_arm)
+        # The lens errs now as it did then. The map does not: the thing is seen from another side.
+        located = [
+            replace(item, covariance=sum(t.covariance for t in terms if t.name != "lens"))
+            if (terms := item.estimate.terms)
+            else item
+            for item in located
+        ]
+        located = in_parent_frame(located, base_from_gripper)
+    return shift_between(reference, fuse(located), located, localizer)
 
 
 def shift_between(
@@ -88,12 +90,8 @@ def shift_between(
     located: list[ImagePose],
     localizer: "Localizer",
     confidence: float = CONFIDENCE,
-    by_arm: Array | None = None,
 ) -> Shift:
-    """Compare `fused`, the pose of a camera now from `located` images, with its calibration.
-
-    `by_arm` (6, 6) is the covariance of one image by the arm that holds the scene.
-    """
+    """Compare `fused`, the pose of a camera now from `located` images, with its calibration."""
     from scipy import stats
 
     if reference.mount != "eye_to_hand":
@@ -105,7 +103,7 @@ def shift_between(
     same = reference.source.get("map") == scene.digest
     off = deviations(SE3.stack([fused.pose]), reference.parent_from_child)[0]
     count = int(fused.used.sum())
-    floor = np.diag(_FLOOR**2) + (0 if by_arm is None else by_arm / count)
+    floor = np.diag(_FLOOR**2)
     measured = [(fused.scatter, count)]
     if same:
         # One camera in one map: the scatter of its images is the same before and now.
@@ -113,6 +111,8 @@ def shift_between(
         measured.append((np.array(reference.checks.get("image_scatter", np.zeros((6, 6)))), before))
         scatter = _scatter(measured)
         covariance = scatter / count + scatter / before + floor
+        if scene.parent_frame == "gripper":
+            covariance += np.mean([item.covariance for item in fused.select(located)], 0) / count
     else:
         used = [item.covariance for item in fused.select(located)]
         covariance = _scatter(measured) / count + floor

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
 from evercal.calibration.hand_eye_start import HandEyeStart, hand_eye_start, scene_from_parent
 from evercal.calibration.held_thing import cropped, moving_parts, windows
-from evercal.calibration.located import length_mm_deg
+from evercal.calibration.located import deviations, length_mm_deg
 from evercal.calibration.next_views import open_position
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
@@ -28,6 +28,9 @@ from evercal.mapping.build import Adjusted, BuiltMap, HandEyeCorrection
 from evercal.progress import OnProgress
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame, Mount, Recording, stated_grippers
 from evercal.recordings.held_out import require_frames
+
+if TYPE_CHECKING:
+    from evercal.localization.localizer import Localizer
 
 MOST_FOCAL_PERCENT, MOST_POSE_SIGMA_MM = 1.0, 5.0
 """Larger corrections indicate systematic errors, which the covariance does not contain."""
@@ -56,9 +59,10 @@ class HandEyeReport:
     """eye_in_hand estimates `gripper_from_camera`, eye_to_hand `base_from_camera`."""
     map: str = ""
     """Digest of the scene, see `SceneMap.digest`."""
-    arm_sigma_mm: float = 0.0
-    """Standard deviation of a gripper pose per axis."""
-    arm_sigma_deg: float = 0.0
+    image_scatter: tuple[tuple[float, ...], ...] = ()
+    """(6, 6) covariance of `base_from_camera` from single images of a located thing."""
+    images_located: int = 0
+    """Images that it was measured with."""
     given_mm: float | None = None
     """Distance from a given `gripper_from_camera`, such as from CAD."""
     given_deg: float | None = None
@@ -81,6 +85,8 @@ class HandEyeReport:
     def calibration(self, camera: Camera, scene: str, frames: int) -> Calibration:
         """Return the estimate as a calibration with the intrinsics that the map adjusted."""
         estimate, fixed = self.parent_from_camera, self.mount == "eye_to_hand"
+        scatter = [list(row) for row in self.image_scatter]
+        checks = {"images_used": self.images_located, "image_scatter": scatter} if scatter else {}
         calibration = Calibration(
             self.mount,
             estimate.pose,
@@ -89,7 +95,7 @@ class HandEyeReport:
             camera=camera,
             images=self.images,
             error_terms=self.error_terms,
-            checks={"arm_sigma_mm": self.arm_sigma_mm, "arm_sigma_deg": self.arm_sigma_deg},
+            checks=checks,
             source={
                 "command": "eye-to-hand" if fixed else "learn",
                 "scene": scene,
@@ -170,8 +176,6 @@ def hand_eye_report(
         given_deg=from_given[1],
         mount=start.mount,
         map=built.scene.digest,
-        arm_sigma_mm=built.adjusted.pose_sigma_mm or 0.0,
-        arm_sigma_deg=built.adjusted.pose_sigma_deg,
         warnings=_warnings(built.adjusted),
         advice=left.sentence(widest_mm) if left else "",
         error_terms=(
@@ -182,6 +186,28 @@ def hand_eye_report(
         images=tuple(use for frame in frames if (use := _use(frame, built)) is not None),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
+
+
+def with_image_scatter(
+    report: HandEyeReport, localizer: "Localizer", frames: Sequence[Frame]
+) -> HandEyeReport:
+    """The report with the scatter of single images, which tells `check` whether a camera moved.
+
+    The frames are located in the finished map of the thing. Their gripper poses lead to the base.
+    """
+    posed = [frame for frame in frames if frame.base_from_gripper is not None]
+    camera = report.parent_from_camera.pose
+    found = [localizer.localize(f.read_image(), f.camera).base_from_camera for f in posed]
+    poses = [
+        frame.base_from_gripper @ pose
+        for frame, pose in zip(posed, found, strict=True)
+        if pose is not None and frame.base_from_gripper is not None
+    ]
+    if len(poses) < 2:
+        return report
+    off = deviations(SE3.stack(poses), camera)
+    rows = tuple(tuple(row) for row in (off.T @ off / len(off)).tolist())
+    return replace(report, image_scatter=rows, images_located=len(off))
 
 
 def _refuse_slip(frames: Sequence[Frame], correction: HandEyeCorrection, mount: Mount) -> None:

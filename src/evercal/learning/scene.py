@@ -87,7 +87,7 @@ def learn_scene(
     start, least = None, MIN_TRAIN_FRAMES
     if not (shown := look_at(recording.train)).usable:
         raise InputError(f"scene {recording.name!r}: {'; '.join(shown.warnings)}")
-    whole = recording.train[0].camera
+    whole = recording.train
     if lacks_camera_poses(recording):
         from evercal.calibration.hand_eye import posed_by_gripper
 
@@ -103,7 +103,7 @@ def learn_scene(
     options = replace(options, metric=recording.metric)
     built = build_map(recording.name, split.train, contents.encoder, options, on_progress)
     if options.mount == "eye_to_hand":
-        built = replace(built, scene=of_whole_images(built.scene, whole))
+        built = replace(built, scene=of_whole_images(built.scene, whole[0].camera))
     if budget.auto:
         from evercal.learning.fewest_keyframes import fewest_keyframes
 
@@ -133,6 +133,12 @@ def learn_scene(
         from evercal.calibration.hand_eye import hand_eye_report
 
         hand_eye = hand_eye_report(start, built, split.train, gripper_from_camera)
+        if mount == "eye_to_hand":
+            from evercal.calibration.hand_eye import with_image_scatter
+
+            others = [frame for frame in whole if frame.name not in built.keyframe_names]
+            localizer = Localizer(contents.empty().with_scene(scene))
+            hand_eye = with_image_scatter(hand_eye, localizer, others or whole)
         report = replace(report, hand_eye=hand_eye)
     return scene, report
 
