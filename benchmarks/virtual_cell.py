@@ -23,7 +23,7 @@ def errors_of(seed: int, images: int, options: CellOptions) -> tuple[float, floa
         report = learned.learn(root / "cell/wrist").hand_eye
         tripod = learned.calibrate(root / "cell/tripod").parent_from_child
     assert report is not None
-    mount = report.gripper_from_camera.pose
+    mount = report.parent_from_camera.pose
     return (
         *pose_distance_mm_deg(mount, truth.gripper_from_camera),
         *pose_distance_mm_deg(tripod, truth.base_from_tripod),
