@@ -138,6 +138,16 @@ def test_a_wrist_camera_from_nothing(cell: Path, tmp_path: Path) -> None:
 
 
 @pages
+def test_a_camera_beside_the_robot(tmp_path: Path) -> None:
+    printed = run(text_of("fixed-camera"), tmp_path)
+    assert "The camera has not moved" in printed
+    truth = json.loads((tmp_path / "robot/truth.json").read_text())["base_from_tripod"]
+    true = SE3(truth["quaternion_wxyz"], truth["translation_m"])
+    for name in ("tripod.json", "second.json"):
+        assert pose_distance_mm_deg(read_transform(tmp_path / name), true)[0] < 2
+
+
+@pages
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
 def test_a_fleet(tmp_path: Path) -> None:
     pytest.importorskip("fastapi")
@@ -235,5 +245,5 @@ def test_steps_are_read_in_order() -> None:
 
 
 def test_every_page_has_a_test() -> None:
-    tested = {"wrist-camera", "phone-video", "fleet", "own-method"}
+    tested = {"wrist-camera", "fixed-camera", "phone-video", "fleet", "own-method"}
     assert {path.stem for path in PAGES.glob("*.md")} == tested

@@ -30,7 +30,7 @@ def test_coverage_and_next_poses_of_a_wrist_recording(run: Any, tmp_path: Path) 
     cell = tmp_path / "cell"
     ran = run("simulate", "cell", "--out", cell, "--frames", "9", "--size", "160x120", "--json")
     made = json.loads(ran.out)
-    assert (ran.code, made["wrist"], made["frames"]) == (0, str(cell / "wrist"), 17)
+    assert (ran.code, made["wrist"], made["frames"]) == (0, str(cell / "wrist"), 42)
     words = ["inspect", cell / "wrist", "--coverage", "--next", cell / "reachable.csv"]
     words += ["--count", "3", "--gripper-from-camera", cell / "rough.txt"]
     record = json.loads(run(*words, "--json").out)

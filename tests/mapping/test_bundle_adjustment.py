@@ -201,7 +201,7 @@ def test_systematic_errors_of_an_arm_widen_the_covariance(systematic: bool) -> N
         made.truth @ SE3.exp(errors), [CAMERA] * FRAMES, np.zeros((FRAMES, 6)), options
     ).solve(made.tracks)
     ratio = np.trace(result.common_systematic) / np.trace(result.common_covariance)
-    assert ratio > 1 if systematic else ratio < 0.5
+    assert ratio > 1 if systematic else ratio < 1
 
 
 def test_an_arm_errs_at_the_gripper() -> None:

@@ -1,11 +1,11 @@
 """Simulated recordings of a robot cell.
 
-OUT/wrist/                    a recording of the camera on the gripper, see `live.recorder`
-OUT/tripod/0000.jpg, ...      images of the fixed camera while the arm moves
-OUT/held/                     a recording of the fixed camera, while the gripper turns a box
-OUT/reachable.csv             gripper poses that the arm can reach, for further views
-OUT/rough.txt                 gripper_from_camera as in the drawing of the cell, 4x4
-OUT/truth.json                true gripper_from_camera and base_from_tripod, and all settings
+OUT/wrist/                    a recording of the camera on the gripper, see `live.recorder`.
+OUT/tripod/0000.jpg, ...      images of the fixed camera while the arm moves.
+OUT/held/                     the fixed camera while the gripper turns a box.
+OUT/reachable.csv             gripper poses that the arm can reach, for further views.
+OUT/rough.txt                 gripper_from_camera as in the drawing of the cell, 4x4.
+OUT/truth.json                true gripper_from_camera and base_from_tripod, and all settings.
 """
 
 from collections.abc import Iterator

@@ -90,7 +90,7 @@ class VirtualCamera:
         cell = self._cell
         base_from_gripper, joints = cell.robot.true_state(now_s)
         pose = base_from_gripper @ self._mounted if self._on_gripper else self._mounted
-        return cell.render(pose, base_from_gripper, joints)
+        return cell.render(pose, joints, base_from_gripper)
 
 
 class VirtualCell:
@@ -151,11 +151,16 @@ class VirtualCell:
         return SE3.stack(poses)
 
     def render(
-        self, base_from_camera: SE3, base_from_gripper: SE3, joints_rad: np.ndarray
+        self, base_from_camera: SE3, joints_rad: np.ndarray, base_from_gripper: SE3 | None = None
     ) -> NDArray[np.uint8]:
-        """An ideal image, (H, W, 3), of a camera at a pose while the arm has joint angles (7,)."""
+        """An ideal image, (H, W, 3), of a camera at a pose while the arm has joint angles (7,).
+
+        `base_from_gripper` is the pose of what the gripper holds. Default: that of the joints.
+        """
         moving = arm_surfaces(joints_rad) if self.options.show_arm else []
-        moving += thing_surfaces(self.seed, base_from_gripper) if self._holds else []
+        if self._holds:
+            gripper = base_from_gripper or base_from_flange(joints_rad)
+            moving += thing_surfaces(self.seed, gripper)
         return cell_room(self.seed).render(self.intrinsics, base_from_camera, moving)
 
 
