@@ -80,6 +80,8 @@ class MapOptions:
             common_stated=False,
             correlation=2.7,
             least_share=0.0025,
+            # Before one place, the adjusted mount depends on its start by more than the noise.
+            least_systematic=1.0 if mount == "eye_in_hand" else 0.1,
             common_sigma_m=0.2,
             common_sigma_deg=10.0,
             least_sigma_m=2e-4,

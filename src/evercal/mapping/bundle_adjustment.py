@@ -87,6 +87,8 @@ class BundleOptions:
     """A group of parameters is adjusted when its squares are this many times their variance."""
     least_share: float = 1e-6
     """Variance that a group keeps where the images require no change, as a share of its prior."""
+    least_systematic: float = 0.1
+    """Least variance of systematic errors of an arm, in variances of the noise."""
     tail: float = 5.0
     """Degrees of freedom of the Student distribution of pose errors; a few frames may be far
     off."""
@@ -418,7 +420,8 @@ class BundleAdjustment:
         for part in (slice(0, 3), slice(3, 6)):
             k = share[:, part]
             excess = (residual[:, part] ** 2 - k).sum() + SYSTEMATIC[0] * SYSTEMATIC[1]
-            ratio[part] = max(excess, 0.0) / ((k**2).sum() + SYSTEMATIC[0])
+            estimated = excess / ((k**2).sum() + SYSTEMATIC[0])
+            ratio[part] = max(estimated, self.options.least_systematic)
         common = estimate.root[:, 6 * n : 6 * n + 6].T @ estimate.root
         # Response of the common transform to an error of each stated pose: (6, n, 6).
         own = common[:, : 6 * n].reshape(6, n, 6) - common[:, None, 6 * n : 6 * n + 6]
