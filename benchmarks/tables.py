@@ -238,6 +238,10 @@ TABLES: dict[str, Callable[[], Table]] = {
     "boards: sessions": lambda: _rows(
         "condition,trials,median_mm,inside_95,truth_d2,answers_d2,lens_d2", "handeye-boards"
     )().query("`truth d2` != ''"),
+    "handeye: a thing in the gripper": _rows(
+        "condition,method,draws,refused,mm,mm_90,deg,sigma_mm,inside_95,squared_mahalanobis",
+        "eye-to-hand",
+    ),
     "boards: mistakes": _rows("mistake,draws,refused,warned,named,safe", "mistakes"),
     "boards: detection": _rows("board,tilt_deg,finder,found,any_of_opencv,rms_px,ms", "boards"),
     "results: cameras from images": _trials,
