@@ -38,6 +38,9 @@ from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, Mount, stated_grippers, stated_poses
 
+HAND_EYE_COVARIANCE_SCALE = 2.5
+"""Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
+over many frames, which residuals do not show (research/handeye.md)."""
 GAP, MOST_PARTS = 10, 12
 """Frames without keyframes before and after a part that is left out, and number of parts at most.
 Frames between similar keyframes are located more exactly than new images are."""
@@ -78,8 +81,6 @@ class MapOptions:
         bundle = replace(
             self.bundle,
             common_stated=False,
-            correlation=2.7,
-            least_share=0.0025,
             # Before one place, the adjusted mount depends on its start by more than the noise.
             least_systematic=1.0 if mount == "eye_in_hand" else 0.1,
             common_sigma_m=0.2,
@@ -87,6 +88,8 @@ class MapOptions:
             least_sigma_m=2e-4,
             least_sigma_deg=0.015,
         )
+        if mount == "eye_to_hand":
+            bundle = replace(bundle, correlation=2.7, least_share=0.0025)
         return replace(self, bundle=bundle, mount=mount)
 
 
@@ -406,6 +409,8 @@ def _finish(
         if not options.bundle.common_stated:
             # The common transform is part of the answer and not an error to undo.
             by_noise = np.asarray(adjustment.common_covariance, np.float64)
+            if options.mount == "eye_in_hand":
+                by_noise = HAND_EYE_COVARIANCE_SCALE * by_noise
             by_lens = np.asarray(adjustment.common_by_lens, np.float64)
             by_drift = np.asarray(adjustment.common_systematic, np.float64)
             names = [frame.name for frame in frames.frames]
