@@ -191,7 +191,7 @@ def hand_eye_report(
 def with_image_scatter(
     report: HandEyeReport, localizer: "Localizer", frames: Sequence[Frame]
 ) -> HandEyeReport:
-    """The report with the scatter of single images, which tells `check` whether a camera moved.
+    """The report with the scatter of single images, which `check` compares a shift with.
 
     The frames are located in the finished map of the thing. Their gripper poses lead to the base.
     """

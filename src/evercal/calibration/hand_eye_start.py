@@ -108,15 +108,14 @@ def hand_eye_start(
     if len(frames) > FRAMES:
         some = spread_poses(poses, FRAMES)
         frames, poses = [frames[i] for i in some], poses[some]
-    pairs, start, refusal = image_pairs(frames, mount, encoder, on_progress), None, None
+    pairs = image_pairs(frames, mount, encoder, on_progress)
     try:
         start = solve_pairs(poses, pairs, mount)
-    except InputError as error:
-        refusal = error
-    if start is None or start.pairs < SURE_SHARE * start.of_pairs:
+    except InputError:
+        _refuse_other_mount(poses.inverse(), pairs, mount, None)
+        raise
+    if start.pairs < SURE_SHARE * start.of_pairs:
         _refuse_other_mount(poses.inverse(), pairs, mount, start)
-    if start is None:
-        raise refusal or AssertionError
     return start
 
 

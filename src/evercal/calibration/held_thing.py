@@ -1,8 +1,8 @@
 """What a fixed camera sees of a thing that the gripper holds: everything that moves with it.
 
 A pixel that shows the same patch in other images, up to gain and offset, stands still. The rest is
-the thing, the arm, and people. Matches that agree with the gripper's motion tell where the thing
-is; a window around it makes a thing of a few pixels as large as the encoder needs.
+the thing, the arm, and people. Matches that agree with the gripper's motion locate the thing; a
+window around it makes a thing of a few pixels as large as the encoder needs.
 """
 
 import itertools

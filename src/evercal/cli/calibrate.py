@@ -61,7 +61,7 @@ class Calibrate(args.Verb):
         calibration = self._calibrated(args.open_map(self.store), given)
         calibration.write(self.out)
         self.answer(
-            {**calibration.to_dict(), **_at_record(calibration, point)},
+            {**calibration.to_dict(), **at_record(calibration, point)},
             *calibration_lines(calibration, point),
             then=("export", self.out, "--format", "easy_handeye2"),
         )
@@ -105,12 +105,13 @@ class Calibrate(args.Verb):
         rig.write(self.out)
         record = rig.to_dict()
         for name, calibration in rig.cameras.items():
-            record["cameras"][name] |= _at_record(calibration, point)
+            record["cameras"][name] |= at_record(calibration, point)
         self.answer(record, *_rig_lines(rig, point))
         return 0
 
 
-def _at_record(calibration: "Calibration", point: args.Point | None) -> dict[str, object]:
+def at_record(calibration: "Calibration", point: args.Point | None) -> dict[str, object]:
+    """The entry of --at in the JSON answer; empty without a point."""
     return {} if point is None else {"at": point.record(calibration.uncertain_pose)}
 
 

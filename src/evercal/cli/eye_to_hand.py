@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
-from evercal.cli.calibrate import calibration_lines
+from evercal.cli.calibrate import at_record, calibration_lines
 from evercal.cli.console import require_writable
 from evercal.progress import Bars
 
@@ -48,11 +48,8 @@ class EyeToHand(args.Verb):
             with Bars(sys.stderr if self.json else sys.stdout, start) as bars:
                 calibration = cell.eye_to_hand(recording, on_progress=bars.step)
         calibration.write(self.out)
-        record = calibration.to_dict()
-        if point is not None:
-            record["at"] = point.record(calibration.uncertain_pose)
         self.answer(
-            record,
+            {**calibration.to_dict(), **at_record(calibration, point)},
             *calibration_lines(calibration, point),
             then=("export", self.out, "--format", "easy_handeye2"),
         )

@@ -130,12 +130,10 @@ def learn_scene(
         else replace(built.adjusted, common_translation_mm=None, pose_sigma_mm=None),
     )
     if start is not None:
-        from evercal.calibration.hand_eye import hand_eye_report
+        from evercal.calibration.hand_eye import hand_eye_report, with_image_scatter
 
         hand_eye = hand_eye_report(start, built, split.train, gripper_from_camera)
         if mount == "eye_to_hand":
-            from evercal.calibration.hand_eye import with_image_scatter
-
             others = [frame for frame in whole if frame.name not in built.keyframe_names]
             localizer = Localizer(contents.empty().with_scene(scene))
             hand_eye = with_image_scatter(hand_eye, localizer, others or whole)

@@ -188,6 +188,8 @@ class StatedFrames:
         groups: dict[Camera, list[int]] = {}
         for i, camera in enumerate(self.cameras(parameters)):
             groups.setdefault(camera, []).append(i)
+        if len(groups) == 1:
+            return [(camera, np.arange(len(frames))) for camera in groups]
         return [(c, np.flatnonzero(np.isin(frames, which))) for c, which in groups.items()]
 
 
