@@ -45,7 +45,7 @@ REFUSED = {
     "calibrate MAP empty": "no images in this folder",
     "calibrate MAP image.png --mount eye_in_hand": "--robot-poses",
     "calibrate MAP a=image.png image.png": "cannot be mixed",
-    "calibrate MAP a=image.png --robot-poses x": "cameras of a rig are fixed",
+    "calibrate MAP a=image.png --mount eye_in_hand": "cameras of a rig are fixed",
     "calibrate MAP black.png": "0 of 1 images were located",
     "calibrate NETWORKS image.png": STRANGER,
     "check MAP image.png --reference none.json": "calibration file is missing",

@@ -12,6 +12,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg, pose_to_dict
 from evercal.live.coverage import sharpness
 from evercal.recordings import load_recording, read_robot_poses
+from evercal.recordings.frame import stated_grippers
 from evercal.simulation.cell_recording import record_cell
 from evercal.simulation.cell_room import TABLE_M, cell_room
 from evercal.simulation.panda_arm import (
@@ -142,7 +143,9 @@ def test_the_whole_chain_finds_the_truth(tmp_path: Path) -> None:
     report = learned.learn(tmp_path / "cell/wrist").hand_eye
     assert report is not None
     fixed = learned.calibrate(tmp_path / "cell/tripod").parent_from_child
-    held = Map.open(tmp_path / "thing").eye_to_hand(tmp_path / "cell/held").parent_from_child
+    thing, recorded = Map.open(tmp_path / "thing"), load_recording(tmp_path / "cell/held")
+    reference = thing.eye_to_hand(recorded)
+    held = reference.parent_from_child
     for found, true in (
         (report.parent_from_camera.pose, truth.gripper_from_camera),
         (fixed, truth.base_from_tripod),
@@ -151,3 +154,21 @@ def test_the_whole_chain_finds_the_truth(tmp_path: Path) -> None:
         millimetres, degrees = pose_distance_mm_deg(found, true)
         assert millimetres < 1
         assert degrees < 0.05
+
+    # The thing is taken again another way, with the camera in its place or not.
+    images = [frame.read_image() for frame in recorded.train[::2]]
+    grippers, grip = stated_grippers(recorded.train[::2]), SE3.exp([0.02, -0.01, 0.03, 0.1, 0.2, 0])
+    moved = SE3.exp([0.01, 0, 0, 0, 0.02, 0])
+    for by_camera, by_grip in (("", ""), ("", "grip"), ("camera", ""), ("camera", "grip")):
+        stated = grippers @ grip.inverse() if by_grip else grippers
+        stated = moved @ stated if by_camera else stated
+        shift = thing.check(images, reference, robot_poses=stated)
+        assert shift.moved == bool(by_camera)
+        assert ("another way" in shift.note) == bool(by_grip)
+        again = thing.calibrate(images, robot_poses=stated)
+        true = moved @ truth.base_from_tripod if by_camera else truth.base_from_tripod
+        assert pose_distance_mm_deg(again.parent_from_child, true)[0] < 2
+        assert ("another way" in again.verdict) == bool(by_grip)
+    alone = thing.check(images[:1], reference, robot_poses=(moved @ grippers)[:1])
+    assert alone.moved
+    assert "The camera, or the thing" in alone.note

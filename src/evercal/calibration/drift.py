@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, ImageUse
+from evercal.calibration.held_again import LEAST_IMAGES, held_again
 from evercal.calibration.located import (
     Fused,
     ImagePose,
@@ -21,6 +22,7 @@ from evercal.calibration.located import (
     in_parent_frame,
     length_mm_deg,
     locate,
+    of_cause,
     shows_held_thing,
 )
 from evercal.errors import InputError
@@ -41,6 +43,10 @@ _FLOOR = np.repeat([0.2e-3, np.deg2rad(0.008)], 3)
 """Standard deviation per axis from changes of light and objects, metres and radians."""
 _USUAL_SCATTER, _USUAL_WEIGHT = np.repeat([0.4e-3, np.deg2rad(0.01)], 3), 5.0
 """Prior scatter of a single image per axis, metres and radians, and its weight in images."""
+_CAMERA_OR_GRIP = (
+    f"The camera, or the thing in the gripper: {LEAST_IMAGES} images that turn it about two axes"
+    " show which of them moved."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +66,8 @@ class Shift:
     same_map: bool
     """Whether both poses come from one map, so that its errors cancel."""
     images: tuple[ImageUse, ...] = ()
+    note: str = ""
+    """What else differs, or could: a thing that the gripper holds another way. Empty without."""
 
 
 def check(
@@ -73,14 +81,16 @@ def check(
     """Test whether a camera has moved since its calibration, see `Map.check`."""
     located = locate(localizer, images, camera or reference.camera, on_image)
     if shows_held_thing(localizer, located, base_from_gripper) and base_from_gripper is not None:
+        if (another := held_again(located, base_from_gripper)) is not None:
+            calibration = another.solution.calibration()
+            now, uses = calibration.uncertain_pose, calibration.images
+            covariance = now.covariance + reference.covariance
+            return _shift(reference, now.pose, covariance, CONFIDENCE, uses, another.sentence)
         # The lens errs now as it did then. The map does not: the thing is seen from another side.
-        located = [
-            replace(item, covariance=sum(t.covariance for t in terms if t.name != "lens"))
-            if (terms := item.estimate.terms)
-            else item
-            for item in located
-        ]
-        located = in_parent_frame(located, base_from_gripper)
+        located = in_parent_frame(of_cause(located, lens=False), base_from_gripper)
+        shift = shift_between(reference, fuse(located), located, localizer)
+        few = shift.moved and sum(item.is_located for item in located) < LEAST_IMAGES
+        return replace(shift, note=_CAMERA_OR_GRIP) if few else shift
     return shift_between(reference, fuse(located), located, localizer)
 
 
@@ -92,16 +102,8 @@ def shift_between(
     confidence: float = CONFIDENCE,
 ) -> Shift:
     """Compare `fused`, the pose of a camera now from `located` images, with its calibration."""
-    from scipy import stats
-
-    if reference.mount != "eye_to_hand":
-        raise InputError(
-            "the reference is a camera on the gripper, whose pose in the base changes with every"
-            " move; give the calibration of a camera that stands still"
-        )
     scene = localizer.contents.metric_scene(fused.scene)
     same = reference.source.get("map") == scene.digest
-    off = deviations(SE3.stack([fused.pose]), reference.parent_from_child)[0]
     count = int(fused.used.sum())
     floor = np.diag(_FLOOR**2)
     measured = [(fused.scatter, count)]
@@ -117,19 +119,40 @@ def shift_between(
         used = [item.covariance for item in fused.select(located)]
         covariance = _scatter(measured) / count + floor
         covariance = covariance + reference.covariance + np.mean(used, axis=0)
+    return _shift(reference, fused.pose, covariance, confidence, fused.uses, same_map=same)
+
+
+def _shift(
+    reference: Calibration,
+    pose: SE3,
+    covariance: Array,
+    confidence: float,
+    images: tuple[ImageUse, ...],
+    note: str = "",
+    same_map: bool = False,
+) -> Shift:
+    from scipy import stats
+
+    if reference.mount != "eye_to_hand":
+        raise InputError(
+            "the reference is a camera on the gripper, whose pose in the base changes with every"
+            " move; give the calibration of a camera that stands still"
+        )
+    off = deviations(SE3.stack([pose]), reference.parent_from_child)[0]
     probability = float(stats.chi2.cdf(off @ np.linalg.solve(covariance, off), 6))
     millimetres, degrees = length_mm_deg(off)
     sigma_mm, sigma_deg = axis_deviation(covariance)
     return Shift(
-        reference_from_now=reference.parent_from_child.inverse() @ fused.pose,
+        reference_from_now=reference.parent_from_child.inverse() @ pose,
         translation_mm=millimetres,
         rotation_deg=degrees,
         sigma_mm=sigma_mm,
         sigma_deg=sigma_deg,
         confidence=probability,
         moved=probability >= confidence and (millimetres > _LEAST_MM or degrees > _LEAST_DEG),
-        same_map=same,
-        images=fused.uses,
+        same_map=same_map,
+        images=images,
+        note=note,
     )
 
 

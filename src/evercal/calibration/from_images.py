@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, ErrorTerm, Mount, largest_term
+from evercal.calibration.held_again import held_again
 from evercal.calibration.located import (
     Fused,
     ImagePose,
@@ -24,6 +25,7 @@ from evercal.calibration.located import (
     halves_apart,
     in_parent_frame,
     locate,
+    of_cause,
     shows_held_thing,
 )
 from evercal.calibration.verdict import verdict
@@ -122,8 +124,27 @@ def calibrate(
     fused = fuse(moved)
     scene = localizer.contents.metric_scene(fused.scene)
     first = pixels_of(given.images[0][1])
+    source = {
+        "command": "calibrate",
+        "scene": fused.scene,
+        "map": scene.digest,
+        "intrinsics": "map" if given.camera is None else "given",
+    }
     stated = cameras_in_scenes(given.camera, first, [scene])[0]
     camera = estimated_camera(fused.select(located), stated)
+    if held and grippers is not None and (another := held_again(located, grippers)) is not None:
+        calibration = another.solution.calibration()
+        own = in_parent_frame(of_cause(located, lens=True), grippers)
+        shown = [item.covariance for item in own if item.is_located]
+        lens = np.mean(shown, axis=0) / len(shown)
+        calibration = replace(
+            calibration,
+            covariance=calibration.covariance + lens,
+            error_terms=(*calibration.error_terms, ErrorTerm.of("lens", lens)),
+            camera=camera.resized(first.shape[1], first.shape[0]),
+            source=source,
+        )
+        return replace(calibration, verdict=f"{calibration.verdict} {another.sentence}")
     if parents is None:
         covariance, terms = _from_one_spot(moved, fused)
     else:
@@ -147,12 +168,7 @@ def calibrate(
         images=fused.uses,
         error_terms=terms,
         checks=checks,
-        source={
-            "command": "calibrate",
-            "scene": fused.scene,
-            "map": scene.digest,
-            "intrinsics": "map" if given.camera is None else "given",
-        },
+        source=source,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
     sentences = [verdict(calibration), *_advice(calibration, fused, camera, stated)]

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -87,6 +87,20 @@ def in_parent_frame(located: Sequence[ImagePose], parent_from_scene: SE3) -> lis
         pose = parent @ UncertainPose(item.pose, item.covariance)
         moved.append(ImagePose(item.name, item.estimate, pose.pose, pose.covariance))
     return moved
+
+
+def of_cause(located: Sequence[ImagePose], lens: bool) -> list[ImagePose]:
+    """The images with only the part of their covariance that is due to the lens, or only the rest.
+
+    An estimate without terms has no such part, and keeps all of its covariance as the rest.
+    """
+    changed = []
+    for item in located:
+        terms = [term.covariance for term in item.estimate.terms if (term.name == "lens") == lens]
+        whole = item.covariance * (not lens)
+        covariance = sum(terms, np.zeros((6, 6))) if item.estimate.terms else whole
+        changed.append(replace(item, covariance=covariance))
+    return changed
 
 
 def shows_held_thing(

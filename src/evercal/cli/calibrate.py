@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from evercal.calibration.from_images import Images
     from evercal.localization.localizer import Localizer
 
+Mount = Literal["eye_to_hand", "eye_in_hand"]
+
 
 @dataclass(frozen=True)
 class Calibrate(args.Verb):
@@ -34,12 +36,11 @@ class Calibrate(args.Verb):
     """Image files or folders of them, all of one camera; or NAME=FOLDER for each camera of a
     rig."""
     robot_poses: args.File = None
-    """base_from_gripper of every image: a pose table, JSON, NPY or NPZ."""
+    """base_from_gripper of every image: a pose table, JSON, NPY or NPZ. Those of a rig before a
+    thing in the gripper are found by the names of the images, which may repeat between folders."""
     convention: args.Name = None
     """Format of the robot poses, if the file does not state it."""
-    mount: Annotated[
-        Literal["eye_to_hand", "eye_in_hand"] | None, args.shown("eye_to_hand|eye_in_hand")
-    ] = None
+    mount: Annotated[Mount | None, args.shown("eye_to_hand|eye_in_hand")] = None
     """eye_to_hand for a fixed camera, eye_in_hand for one on the gripper. Default: decided from
     the camera's motion."""
     camera: args.File = None
@@ -58,7 +59,7 @@ class Calibrate(args.Verb):
         if folders:
             return self._rig(folders, point)
         given = self._given(image_files(self.images))
-        calibration = self._calibrated(args.open_map(self.store), given)
+        calibration = self._calibrated(args.open_map(self.store), given, self.mount)
         calibration.write(self.out)
         self.answer(
             {**calibration.to_dict(), **at_record(calibration, point)},
@@ -75,8 +76,8 @@ class Calibrate(args.Verb):
                 f"{named[0]}: NAME=FOLDER and plain images cannot be mixed; give NAME=FOLDER for"
                 " every camera of the rig"
             )
-        if named and self.robot_poses is not None:
-            raise InputError("--robot-poses: the cameras of a rig are fixed; omit the option")
+        if named and self.mount == "eye_in_hand":
+            raise InputError("--mount: the cameras of a rig are fixed; omit the option")
         return {name: Path(path) for name, _, path in (word.partition("=") for word in named)}
 
     def _given(self, files: list[Path]) -> "Images":
@@ -85,11 +86,13 @@ class Calibrate(args.Verb):
         camera = args.camera_for(self.camera, files)
         return Images.of(files, camera, self.robot_poses, self.convention)
 
-    def _calibrated(self, localizer: "Localizer", given: "Images") -> "Calibration":
+    def _calibrated(
+        self, localizer: "Localizer", given: "Images", mount: Mount | None
+    ) -> "Calibration":
         from evercal.calibration.from_images import calibrate
 
         with progress_bar("localizing", len(given.images), "image") as bar:
-            calibration = calibrate(localizer, given, self.mount, on_image=bar.update)
+            calibration = calibrate(localizer, given, mount, on_image=bar.update)
         return replace(calibration, source={**calibration.source, "store": str(self.store)})
 
     def _rig(self, folders: dict[str, Path], point: args.Point | None) -> int:
@@ -98,7 +101,7 @@ class Calibrate(args.Verb):
 
         localizer = args.open_map(self.store)
         cameras = {
-            name: self._calibrated(localizer, self._given(image_files([folder])))
+            name: self._calibrated(localizer, self._given(image_files([folder])), "eye_to_hand")
             for name, folder in folders.items()
         }
         rig = rig_of(cameras)

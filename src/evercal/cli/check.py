@@ -54,6 +54,7 @@ class Check(args.Verb):
         self.answer(
             check_record(shift),
             shift_line(shift),
+            *([shift.note] if shift.note else []),
             *(f"  rejected  {use.name}: {use.reason}" for use in rejected),
             then=("calibrate", self.store, *self.images[:1]) if shift.moved else (),
         )

@@ -88,6 +88,7 @@ def shift_dict(shift: "Shift") -> dict[str, object]:
         "sigma_deg": shift.sigma_deg,
         "confidence": shift.confidence,
         "same_map": shift.same_map,
+        "note": shift.note,
         "reference_from_now": shift.reference_from_now.matrix().tolist(),
     }
 
