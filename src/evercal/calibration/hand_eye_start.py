@@ -1,11 +1,9 @@
 """A first hand-eye transform from images and gripper poses; bundle adjustment refines it.
 
-Features of similar frames are matched. An essential matrix gives the rotation of every pair. Let A
-be the motion of the gripper and B that of the camera between two images, and X the transform from
-the camera to what it is mounted on: A X = X B gives the rotation of X from the axes of rotation
-(Park and Martin, IEEE T-RA 1994). With X, the gripper poses predict an epipolar line for every
-match. The distances from these lines (Sampson's approximation) are minimised over all six
-parameters of X; a first position need not be near.
+Features of similar frames are matched. Let A be the motion of the gripper between two images, and
+X the transform from the camera to what it is mounted on. X and the gripper poses predict an
+epipolar line for every match. The distances from these lines (Sampson's approximation) are
+minimised over all six parameters of X, from rotations all around.
 
 A camera on the gripper moves in the base. A fixed camera moves, as the gripper sees it, around the
 thing that the gripper holds, with the inverse poses.
@@ -40,8 +38,8 @@ Array = NDArray[np.float64]
 FRAMES, PARTNERS = 120, 6
 """Maximum number of frames, and number of most similar frames that each is matched to."""
 ANGLE_DEG, AGREE_DEG = 3.0, 0.5
-"""Largest difference of the rotation angles of a pair, and largest median angle between the rays of
-its matches and their epipolar planes."""
+"""Scale of the first angles between the rays of matches and their epipolar planes, and largest
+median of a pair that agrees."""
 LEAST_ROTATION_DEG, LEAST_PAIRS = 5.7, 6
 """Root mean square angle between frames about each of two axes, and pairs that must agree."""
 SPREAD_M: dict[Mount, float] = {"eye_in_hand": 0.2, "eye_to_hand": 2.0}
@@ -59,8 +57,10 @@ ENCODED_SIDE = 240
 LEAST_SHARE, SURE_SHARE = 0.3, 0.8
 """Share of the pairs that must agree, and share from which no other mount is tried. Before a
 chessboard half of the pairs match the wrong squares; of another mount up to 0.3 agree."""
-SAMPLES = 300
-"""Samples of two pairs that the rotation is estimated from."""
+ROTATIONS, FIRST_PAIRS, FIRST_MATCHES = 48, 40, 10
+"""First rotations that are tried, on this many pairs and matches of each."""
+X_SCALE = np.repeat([0.01, 0.1], 3)
+"""Radians and metres by which a pose of a camera changes."""
 
 
 class ImagePair(NamedTuple):
@@ -68,8 +68,6 @@ class ImagePair(NamedTuple):
 
     first: int
     second: int
-    rotation: Rotation
-    """second_camera_from_first_camera, by the essential matrix."""
     rays: Array
     """(2, n, 3) rays of the matches in both camera frames, at depth 1."""
 
@@ -148,15 +146,8 @@ def solve_pairs(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> HandEye
             f" {LEAST_PAIRS} are needed: record more views that overlap, of a place with"
             " texture"
         )
-    first, second = np.array([(pair.first, pair.second) for pair in pairs]).T
-    moved = poses[second].inverse() @ poses[first]
-    stated = Rotation.from_quat(moved.rotation_wxyz, scalar_first=True).as_rotvec()
-    measured = np.array([pair.rotation.as_rotvec() for pair in pairs])
-    difference = np.linalg.norm(stated, axis=1) - np.linalg.norm(measured, axis=1)
-    same_angle = np.abs(difference) < np.deg2rad(ANGLE_DEG)
-    _refuse_disagreement(same_angle)
-    rotation = _robust_rotation(stated[same_angle], measured[same_angle])
-    epipolar = _EpipolarFit(poses, pairs, rotation, SPREAD_M[mount])
+    epipolar = _EpipolarFit(poses, pairs, SPREAD_M[mount])
+    epipolar.rotation = _first_rotation(poses, pairs, mount)
     starts, most = epipolar.starts(mount), np.deg2rad(AGREE_DEG)
     fits = [epipolar.solve(start, np.mean(starts, axis=0)) for start in starts]
     best = min(fits, key=lambda x: np.minimum(epipolar.medians(x), most).mean())
@@ -182,35 +173,53 @@ def _refuse_disagreement(agree: NDArray[np.bool_]) -> None:
         )
 
 
-def _robust_rotation(gripper: Array, camera: Array) -> Rotation:
-    """The rotation that most rotation vectors (n, 3) agree on.
+def _first_rotation(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> Rotation:
+    """The rotation from which the distances of some matches become smallest.
 
-    A plane has two essential matrices, so half of the measured ones may be wrong.
+    Essential matrices would give it faster, but those of a small or flat thing may be wrong by any
+    angle, and these distances are not.
     """
-    rng, best, least = np.random.default_rng(0), Rotation.identity(), np.inf
-    for _ in range(SAMPLES):
-        two = rng.choice(len(gripper), 2, replace=False)
-        rotation = Rotation.align_vectors(gripper[two], camera[two])[0]
-        distance = np.linalg.norm(gripper - rotation.apply(camera), axis=1)
-        cost = float(np.log1p((distance / np.deg2rad(ANGLE_DEG / 3)) ** 2).sum())
+    some = np.unique(np.linspace(0, len(pairs) - 1, FIRST_PAIRS).round().astype(int))
+    epipolar = _EpipolarFit(poses, [pairs[i] for i in some], SPREAD_M[mount], FIRST_MATCHES)
+    scale, best, least = np.deg2rad(ANGLE_DEG), Rotation.identity(), np.inf
+    for rotation in spread_rotations(ROTATIONS):
+        epipolar.rotation = rotation
+        fit = least_squares(
+            epipolar.distances,
+            np.mean(epipolar.starts(mount), axis=0),
+            loss="cauchy",
+            f_scale=scale,
+            x_scale=X_SCALE,
+            max_nfev=15,
+        )
+        cost = np.minimum(np.abs(epipolar.distances(fit.x)), scale).mean()
         if cost < least:
-            best, least = rotation, cost
-    for _ in range(10):
-        distance = np.linalg.norm(gripper - best.apply(camera), axis=1)
-        spread = max(1.48 * float(np.median(distance)), 1e-5)
-        weight = 1 / (1 + (distance / spread) ** 2) ** 2
-        best = Rotation.align_vectors(gripper, camera, weights=weight)[0]
+            best, least = Rotation.from_rotvec(fit.x[:3]) * rotation, cost
     return best
+
+
+def spread_rotations(count: int) -> Rotation:
+    """(count,) rotations in about equal distances.
+
+    A spiral through all unit quaternions: Alexa, Super-Fibonacci spirals (CVPR 2022).
+    """
+    share = (np.arange(count) + 0.5) / count
+    inner, outer = np.sqrt(share), np.sqrt(1 - share)
+    a, b = 2 * np.pi * count * share / np.array([[np.sqrt(2)], [1.533751168755204288118041]])
+    parts = inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)
+    return Rotation.from_quat(np.stack(parts, -1))
 
 
 class _EpipolarFit:
     """Sampson distances of matches from the epipolar lines of a transform, as angles."""
 
-    def __init__(self, poses: SE3, pairs: Sequence[ImagePair], rotation: Rotation, spread_m: float):
-        self.rotation, self.spread_m = rotation, spread_m
+    def __init__(
+        self, poses: SE3, pairs: Sequence[ImagePair], spread_m: float, most: int = MATCHES
+    ):
+        self.rotation, self.spread_m = Rotation.identity(), spread_m
         self.matrices, self.pairs = poses.matrix(), pairs
         some = [
-            np.unique(np.linspace(0, n - 1, min(n, MATCHES)).round().astype(int))
+            np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int))
             for n in (pair.rays.shape[1] for pair in pairs)
         ]
         rays = [pair.rays[:, take] for pair, take in zip(pairs, some, strict=True)]
@@ -246,7 +255,7 @@ class _EpipolarFit:
                 args=(scale,),
                 loss="cauchy",
                 f_scale=scale,
-                x_scale=np.r_[np.full(3, 0.01), np.full(3, 0.1)],
+                x_scale=X_SCALE,
                 max_nfev=50,
             ).x
             scale = min(scale, max(3 * float(np.median(np.abs(self.distances(x)))), 1e-4))
@@ -309,7 +318,7 @@ def image_pairs(
             found = epipolar_pair(points[i], points[j], cameras[i], cameras[j], STILL_PX * fixed)
             if found is None:
                 return None
-            return ImagePair(i, j, found.rotation, found.rays)
+            return ImagePair(i, j, found.rays)
 
         for done, pair in enumerate(pool.map(matched_pair, pairs), start=1):
             matched += [pair] if pair is not None else []
