@@ -63,7 +63,7 @@ def test_a_window_follows_the_thing_and_keeps_its_rays() -> None:
     seen = [pose.apply(points) for pose in grippers]
     rays = [rows / rows[:, 2:] for rows in seen]
     pairs = tuple(
-        ImagePair(i, i + 1, SE3.identity(), np.stack([rays[i], rays[i + 1]]))  # pyright: ignore[reportArgumentType]
+        ImagePair(i, i + 1, np.stack([rays[i], rays[i + 1]]))
         for i in range(5)
     )
     around = windows(frames, HandEyeStart(base_from_camera, "eye_to_hand", 5, 5, pairs))
