@@ -62,10 +62,7 @@ def test_a_window_follows_the_thing_and_keeps_its_rays() -> None:
     frames = [Frame(str(i), image, CAMERA, None, pose) for i, pose in enumerate(grippers)]
     seen = [pose.apply(points) for pose in grippers]
     rays = [rows / rows[:, 2:] for rows in seen]
-    pairs = tuple(
-        ImagePair(i, i + 1, np.stack([rays[i], rays[i + 1]]))
-        for i in range(5)
-    )
+    pairs = tuple(ImagePair(i, i + 1, np.stack([rays[i], rays[i + 1]])) for i in range(5))
     around = windows(frames, HandEyeStart(base_from_camera, "eye_to_hand", 5, 5, pairs))
     assert around is not None
     assert around[0, 2] < 90

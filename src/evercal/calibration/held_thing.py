@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from evercal.calibration.hand_eye_start import HandEyeStart, ImagePair, scene_from_parent
 from evercal.geometry import SE3
 from evercal.recordings.frame import Frame
+from evercal.recordings.masks import without
 
 PATCH_PX, SAME, STILL_IN, LEAST_CONTRAST = 9, 0.8, 2, 2.0
 """Side of a patch; correlation of equal patches; other images that show a patch where it stands
@@ -46,7 +47,7 @@ def moving_parts(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], float]:
     still, textured = _still(greys)
     share = float((still & textured).sum() / max(textured.sum(), 1))
     return tuple(
-        replace(frame, image=_without(image, ~stands & visible))
+        replace(frame, image=without(image, _opened(~stands & visible)))
         for frame, image, stands, visible in zip(frames, images, still, textured, strict=True)
     ), share
 
@@ -77,13 +78,9 @@ def _still(greys: Sequence[NDArray[Any]]) -> tuple[NDArray[np.bool_], NDArray[np
     return repeated >= STILL_IN, variances > (1 + LEAST_CONTRAST) * noise
 
 
-def _without(image: NDArray[np.uint8], moving: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The image with its mean colour, through a soft edge, where nothing moves."""
-    mask = cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    soft = cv2.dilate(mask, np.ones((PATCH_PX, PATCH_PX), np.uint8)).astype(np.float32)
-    soft = cv2.resize(cv2.GaussianBlur(soft, (0, 0), 3), image.shape[1::-1])[..., None]
-    colour = (image * soft).sum((0, 1)) / max(float(soft.sum()), 1e-6)
-    return (image * soft + colour * (1 - soft)).astype(np.uint8)
+def _opened(moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Without single pixels."""
+    return cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
 
 
 def windows(frames: Sequence[Frame], start: HandEyeStart) -> NDArray[np.int64] | None:

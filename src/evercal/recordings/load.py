@@ -90,6 +90,10 @@ def load_recording(
                 f" {', '.join(users)}; leave it out"
             )
     recording = read(root, options) if uses else read(root)
+    if (root / "masks").is_dir():
+        from evercal.recordings.masks import with_masks
+
+        recording = with_masks(recording, root)
     if options.every > 1:
         train, test = (part[:: options.every] for part in (recording.train, recording.test))
         recording = dataclasses.replace(recording, train=train, test=test)

@@ -1,0 +1,71 @@
+"""Masks beside images: what is black in a mask is not learned from, such as a person or a cable.
+
+masks/NAME.png for images/NAME.jpg; also masks/NAME.jpg.png, as COLMAP names them
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.errors import InputError
+from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.images import StoredImage, read_image
+
+SOFT_PX = 9
+"""Side of the square that softens the edge of what is left: a hard one would be texture."""
+
+
+@dataclass(frozen=True, eq=False)
+class MaskedImage(StoredImage):
+    """An image file without what is black in its mask."""
+
+    image: Path
+    mask: Path
+
+    def read(self) -> NDArray[np.uint8]:
+        """(H, W, 3), with its mean colour where the mask is black."""
+        image, mask = read_image(self.image), read_image(self.mask)[..., 0] > 0
+        if mask.shape != image.shape[:2]:
+            raise InputError(
+                f"{self.mask}: mask is {mask.shape[1]}x{mask.shape[0]}, its image"
+                f" {image.shape[1]}x{image.shape[0]}; give both the same size"
+            )
+        return without(image, mask)
+
+
+def without(image: NDArray[np.uint8], keep: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The image (H, W, 3) with its mean colour, through a soft edge, outside `keep`.
+
+    `keep` has the image's size, or is smaller.
+    """
+    soft = cv2.dilate(keep.astype(np.uint8), np.ones((SOFT_PX, SOFT_PX), np.uint8))
+    soft = cv2.GaussianBlur(soft.astype(np.float32), (0, 0), SOFT_PX / 3)
+    soft = cv2.resize(soft, image.shape[1::-1])[..., None]
+    colour = (image * soft).sum((0, 1)) / max(float(soft.sum()), 1e-6)
+    return (image * soft + colour * (1 - soft)).astype(np.uint8)
+
+
+def with_masks(recording: Recording, root: Path) -> Recording:
+    """The recording with the masks in its folder on its training frames."""
+    folder = root / "masks"
+    train = tuple(_masked(frame, folder) for frame in recording.train)
+    count = sum(isinstance(frame.image, MaskedImage) for frame in train)
+    if not count:
+        raise InputError(
+            f"{folder}: no mask has the name of an image; name them as the images, or rename the"
+            " folder"
+        )
+    note = f"Masks of {count} of {len(train)} images are used."
+    return replace(recording, train=train, notes=(*recording.notes, note))
+
+
+def _masked(frame: Frame, folder: Path) -> Frame:
+    if not isinstance(frame.image, Path):
+        return frame
+    file = frame.image
+    places = [folder / f"{file.stem}.png", folder / f"{file.name}.png"]
+    mask = next((place for place in places if place.is_file()), None)
+    return frame if mask is None else replace(frame, image=MaskedImage(file, mask))
