@@ -26,8 +26,8 @@ def cameras(count: int, rng: np.random.Generator) -> SE3:
     middle = GRID.mean(0)
     for _ in range(count):
         side = rng.uniform(-0.15, 0.15, 2)
-        eye = middle + [*side, -rng.uniform(0.15, 0.3)]
-        away = middle + [*rng.uniform(-0.06, 0.06, 2), 0.0]
+        eye = middle + np.r_[side, -rng.uniform(0.15, 0.3)]
+        away = middle + np.r_[rng.uniform(-0.06, 0.06, 2), 0.0]
         poses.append(look_at(eye, away, rng.uniform(-3, 3)))
     return SE3.stack(poses)
 
