@@ -146,6 +146,7 @@ def test_the_whole_chain_finds_the_truth(tmp_path: Path) -> None:
     thing, recorded = Map.open(tmp_path / "thing"), load_recording(tmp_path / "cell/held")
     reference = thing.eye_to_hand(recorded)
     held = reference.parent_from_child
+    assert all(Path(image.name).is_file() for image in reference.images)
     for found, true in (
         (report.parent_from_camera.pose, truth.gripper_from_camera),
         (fixed, truth.base_from_tripod),

@@ -132,7 +132,10 @@ def learn_scene(
     if start is not None:
         from evercal.calibration.hand_eye import hand_eye_report, with_image_scatter
 
-        hand_eye = hand_eye_report(start, built, split.train, gripper_from_camera)
+        # The frames of a fixed camera are windows by now.
+        used = [frame for frame in whole if frame.base_from_gripper is not None]
+        used = used if mount == "eye_to_hand" else split.train
+        hand_eye = hand_eye_report(start, built, used, gripper_from_camera)
         if mount == "eye_to_hand":
             others = [frame for frame in whole if frame.name not in built.keyframe_names]
             localizer = Localizer(contents.empty().with_scene(scene))

@@ -146,8 +146,8 @@ def annotate_images(
         return AnnotatedImages(annotated, tuple(missing))
     scene, digest = _scene_of(calibration, localizer), calibration.source.get("map")
     other = digest is not None and (scene is None or scene.digest != digest)
-    shown = calibration.mount == "eye_to_hand" and scene is not None and scene.unit_known
-    around = Surroundings.of(scene if shown else None)
+    still = scene is not None and scene.unit_known and scene.parent_frame == "base"
+    around = Surroundings.of(scene if still and calibration.mount == "eye_to_hand" else None)
     return AnnotatedImages(annotated, tuple(missing), other, around)
 
 
@@ -177,8 +177,9 @@ def _with_evidence(
     scene = calibration.source.get("scene")
     if scene is not None and estimate.scene not in (None, scene):
         return LandmarkPicture(large, 0, f"shows {estimate.scene}, not {scene}")
-    # A camera on the gripper moves, so its images are compared with their own poses.
-    pose = calibration.parent_from_child if calibration.mount == "eye_to_hand" else None
+    # A camera or a thing on the gripper moves, so images are compared with their own poses.
+    still = calibration.mount == "eye_to_hand" and estimate.parent_frame == "base"
+    pose = calibration.parent_from_child if still else None
     return draw_landmarks(image, estimate, evidence, camera, pose)
 
 
