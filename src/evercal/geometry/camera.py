@@ -283,11 +283,12 @@ class Camera:
         radius = np.polynomial.Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4])
         slope, most = radius.deriv(), math.atan(self.widest)
         angles = np.minimum(radii, most)
+        off = radius(angles) - radii
         for _ in range(50):  # Newton's method: a few steps but close to a fold
-            off = radius(angles) - radii
             if (np.abs(off) < _EXACT).all():
                 break
             angles = np.clip(angles - off / np.maximum(slope(angles), 1e-6), 0, most)
+            off = radius(angles) - radii
         return np.where(np.abs(off) < _EXACT, angles, np.nan)
 
     def _undistorted(self, distorted: Array) -> Array:

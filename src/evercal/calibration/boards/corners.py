@@ -162,7 +162,8 @@ def _refined(points: Array, pixels: Array, camera: Camera, start: SE3) -> tuple[
     translation = start.translation_m.reshape(3, 1).copy()
     if camera.model == "pinhole":
         lens = camera.matrix(), lens_vector(camera)[4:]
-        return cv2.solvePnPRefineLM(points, pixels, *lens, rotvec.copy(), translation)
+        refined = cv2.solvePnPRefineLM(points, pixels, *lens, rotvec.copy(), translation)
+        return np.asarray(refined[0], np.float64), np.asarray(refined[1], np.float64)
     for _ in range(20):  # Gauss and Newton
         projected, by_pose, _ = _projected(points, camera, rotvec, translation)
         step = np.linalg.lstsq(by_pose, (pixels - projected).ravel(), rcond=None)[0]
@@ -186,7 +187,7 @@ def _projected(
     else:
         pixels, slopes, *_ = cv2.projectPoints(points, rotvec, translation, matrix, terms)
         by_pose, by_camera = np.split(np.asarray(slopes, np.float64), [6], 1)
-    return pixels.reshape(-1, 2), by_pose, by_camera[:, : 4 + len(terms)]
+    return np.reshape(pixels, (-1, 2)).astype(float), by_pose, by_camera[:, : 4 + len(terms)]
 
 
 def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
