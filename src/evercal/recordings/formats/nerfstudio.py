@@ -1,17 +1,18 @@
-"""nerfstudio's `transforms.json`, as written by phone apps and `ns-process-data`.
+"""nerfstudio's `transforms.json`, as written by phone apps, `ns-process-data` and ScanNet++.
 
 `transform_matrix` is the camera in the world with OpenGL's axes (y up, looking along -z).
 Intrinsics stand at the top or in each frame. The centre of the top-left pixel is (0.5, 0.5), as in
 COLMAP. `applied_transform` and `applied_scale` are undone, so the base frame and the unit of length
-are set by the program that estimated the poses. Files in `val_filenames` and `test_filenames` are
-test frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data conventions.)
+are set by the program that estimated the poses. Files in `val_filenames` and `test_filenames`,
+entries of `test_frames`, and Blender's transforms_val.json and transforms_test.json are test
+frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data conventions.)
 """
 
 import math
 from collections.abc import Container, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +32,23 @@ from evercal.recordings.text_files import (
 )
 
 FILE = "transforms.json"
+# The first one there is read. ScanNet++ keeps undistorted images beside fisheye images.
+_FILES = (
+    FILE, "transforms_train.json", *(
+        f"{folder}{name}" for folder in ("", "nerfstudio/", "dslr/nerfstudio/")
+        for name in ("transforms_undistorted.json", FILE)
+    ),
+)  # fmt: skip
+_IMAGE_FOLDERS = {
+    "transforms_undistorted.json": ("undistorted_images", "resized_undistorted_images"),
+    FILE: ("resized_images", "images"),
+}
+"""Folders beside that of ScanNet++'s files."""
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 # OpenGL axes (right, up, backward) from OpenCV axes (right, down, forward).
 _GL_FROM_CV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
+_LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""Numbers of `distortion_params`, in this order."""
 _TOLERANCE = 1e-2
 USES = ("metres",)
 
@@ -49,41 +64,64 @@ def frame_note(file: str, metric: bool) -> str:
 
 
 def detect(root: Path) -> bool:
-    """Whether `root` holds, or is, a transforms.json."""
-    return (root / FILE).is_file() or (root.name == FILE and root.is_file())
+    """Whether `root` holds, or is, a transforms.json or a file of that kind."""
+    named = root.name.startswith("transforms") and root.suffix == ".json" and root.is_file()
+    return named or any((root / name).is_file() for name in _FILES)
 
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read the poses and the size of one image of every camera; no other image is opened."""
     metric = options is not None and options.metres
-    file = root if root.is_file() else root / FILE
-    root = file.parent
+    files = [root / name for name in _FILES if (root / name).is_file()] or [root / FILE]
+    file = root if root.is_file() else files[0]
+    train, test, bad = _frames(file)
+    if file.name == "transforms_train.json" and not root.is_file():
+        for other in (root / f"transforms_{split}.json" for split in ("val", "test")):
+            frames, more, left_out = _frames(other) if other.is_file() else ([], [], 0)
+            test, bad = [*test, *frames, *more], bad + left_out
+    with named_errors(file, "nerfstudio file"):
+        names = (frame.name for frame in (*train, *test))
+        refuse_repeated(names, "keep one entry for each image")
+    notes = [f"{bad} frames are marked as bad and left out"] if bad else []
+    name = (root if root.is_dir() else file.parent).resolve().name
+    notes.append(frame_note(file.name, metric))
+    return Recording(name, tuple(train), tuple(test), bad, notes=tuple(notes), metric=metric)
+
+
+def _frames(file: Path) -> tuple[list[Frame], list[Frame], int]:
+    """Training and test frames of a file, and the number of frames that are marked as bad."""
     data = read_json(file, "nerfstudio file", "export it again")
     with named_errors(file, "nerfstudio file"):
         undo, scale = _applied(data)
-        entries = data.get("frames")
-        if not isinstance(entries, list) or not entries:
+        parts = [data.get("frames"), data.get("test_frames", [])]
+        if not all(isinstance(part, list) for part in parts) or not parts[0]:
             raise ValueError("'frames' is a list with at least one frame")
-        first = entries[0]
-        # Without a stated image size, that of the first image is taken.
-        if isinstance(first, dict) and "file_path" in first and not {"w", "h"} & {*data, *first}:
-            width, height = image_size(_image(root, str(first["file_path"])))
-            data |= {"w": width, "h": height}
-        frames = []
-        for i, entry in enumerate(entries):
+        entries = [(key, entry) for key, part in enumerate(parts) for entry in part]
+        good = [each for each in entries if not (_mapping(each[1]) and each[1].get("is_bad"))]
+        root, first = file.parent, good[0][1] if good else entries[0][1]
+        if _mapping(first) and "file_path" in first:
+            image = _image(root, str(first["file_path"]))
+            others = (root.parent / name for name in _IMAGE_FOLDERS.get(file.name, ()))
+            beside = (other for other in others if _image(other, str(first["file_path"])).is_file())
+            root = root if image.is_file() else next(beside, root)
+            # Without a stated image size, that of the first image is taken.
+            if not {"w", "h"} & {*data, *first}:
+                width, height = image_size(_image(root, str(first["file_path"])))
+                data |= {"w": width, "h": height}
+        frames: list[list[Frame]] = [[], []]
+        for i, (part, entry) in enumerate(good):
             with naming(f"frame {i}"):
-                frames.append(_frame(root, data, entry, undo, scale))
-        test = _test_images(root, data, {frame.image for frame in frames})
-        refuse_repeated((frame.name for frame in frames), "keep one entry for each image")
-    require_images(frames, file)
-    frames = _resized(file, frames)
-    return Recording(
-        root.resolve().name,
-        tuple(frame for frame in frames if frame.image not in test),
-        tuple(frame for frame in frames if frame.image in test),
-        notes=(frame_note(FILE, metric),),
-        metric=metric,
-    )
+                frames[part].append(_frame(root, data, entry, undo, scale))
+        test = _test_images(root, data, {frame.image for frame in frames[0]})
+    require_images([*frames[0], *frames[1]], file)
+    train, tested = (_resized(file, part) for part in frames)
+    tested += [frame for frame in train if frame.image in test]
+    train = [frame for frame in train if frame.image not in test]
+    return train, tested, len(entries) - len(good)
+
+
+def _mapping(entry: object) -> TypeGuard[dict[str, Any]]:
+    return isinstance(entry, dict)
 
 
 def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
@@ -114,9 +152,9 @@ def _frame(root: Path, data: Mapping[str, object], entry: object, undo: SE3, sca
 
 def _image(root: Path, name: str) -> Path:
     image = root / name
-    if image.suffix:
+    if image.suffix.lower() in IMAGE_ENDINGS:
         return image
-    return next((f for e in IMAGE_ENDINGS if (f := image.with_suffix(e)).is_file()), image)
+    return next((f for e in IMAGE_ENDINGS if (f := Path(f"{image}{e}")).is_file()), image)
 
 
 def _camera(data: Mapping[str, object]) -> Camera:
@@ -128,7 +166,16 @@ def _camera(data: Mapping[str, object]) -> Camera:
         )
     if data.get("is_fisheye"):
         raise ValueError("fisheye images are not supported; undistort them first")
-    if _number(data, "k4", 0.0):
+    lens = dict.fromkeys(_LENS, 0.0) | {key: _number(data, key) for key in _LENS if key in data}
+    if (listed := data.get("distortion_params")) is not None:
+        numbers = number_array(listed, "'distortion_params'")
+        if numbers.shape != (len(_LENS),) or any(lens.values()):
+            raise ValueError(
+                f"'distortion_params' is {' '.join(_LENS)} and stands alone, got {listed!r}; write"
+                f" k1, k2, p1, p2, k3 instead"
+            )
+        lens = dict(zip(_LENS, numbers.tolist(), strict=True))
+    if lens["k4"]:
         raise ValueError("k4 is not 0; only k1, k2, k3, p1 and p2 are supported")
     width, height = _number(data, "w"), _number(data, "h")
     fx, fy = _focal(data, "x", width), _focal(data, "y", height)
@@ -137,7 +184,7 @@ def _camera(data: Mapping[str, object]) -> Camera:
         raise ValueError("'fl_x' is missing, and so are 'fl_y' and 'camera_angle_x'")
     # Half a pixel: the file counts from the image's corner.
     cx, cy = _number(data, "cx", width / 2) - 0.5, _number(data, "cy", height / 2) - 0.5
-    distortion = tuple(_number(data, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
+    distortion = tuple(lens[key] for key in ("k1", "k2", "p1", "p2", "k3"))
     size: Any = width, height  # whole numbers, checked when constructed
     return Camera(size[0], size[1], fx, fy, cx, cy, distortion)
 

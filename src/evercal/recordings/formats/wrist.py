@@ -1,28 +1,66 @@
-"""A plain folder: images, and the gripper pose or joint angles at each, see docs/formats.md.
+"""Images and their poses in a table or in a file each, see docs/formats.md.
 
-Images with a pose become training frames with base_from_gripper; gripper_from_camera is unknown.
-All images come from one camera.
+A plain folder states the gripper pose, the joint angles or the camera pose at each image. Folders
+of other programs state camera poses. Of gripper poses, gripper_from_camera is unknown. All images
+come from one camera, unless there is a camera file for each. EuRoC states the pose of the body, and
+that of the camera on it in sensor.yaml. Record3D lists a rotation (quaternion xyzw) and a position,
+with OpenGL's axes.
 """
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
+from typing import NamedTuple
+
+import numpy as np
 
 from evercal.errors import InputError
-from evercal.geometry import Camera
+from evercal.geometry import SE3, Camera
+from evercal.recordings.formats.seven_scenes import read_numbers
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, image_size
-from evercal.recordings.poses.camera_file import read_camera_of_size
+from evercal.recordings.poses.camera_file import (
+    camera_from_fields,
+    check_size,
+    fields_of,
+    read_camera_of_size,
+)
+from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
 from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
 from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
-from evercal.recordings.poses.row_files import natural_key, read_rows
+from evercal.recordings.poses.row_files import natural_key, number_array, read_rows
 from evercal.recordings.read_options import ReadOptions, flag
-from evercal.recordings.text_files import named_errors, refuse_repeated
+from evercal.recordings.text_files import named_errors, read_json, refuse_repeated
 
 USES = ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention")
-_POSES = tuple(
-    f"base_from_gripper.{ending}" for ending in ("csv", "json", "npy", "npz", "tum", "txt")
+
+
+class Layout(NamedTuple):
+    """Paths in a recording of camera poses."""
+
+    poses: str
+    """Table, or folder with a 4x4 matrix for each image; those with inf or nan are left out."""
+    images: str = ""
+    """Folder of images; empty for `_FOLDERS`."""
+    camera: str = ""
+    """Camera file, or folder of one for each image; where it is missing, one of `_CAMERAS`."""
+    convention: str | None = None
+    """Convention of the table, if it does not define it."""
+
+
+LAYOUTS = (
+    Layout("groundtruth.txt", "rgb", convention="tum:m"),  # TUM RGB-D
+    Layout("pose", "color", "intrinsic/intrinsic_color.txt"),  # ScanNet's SensReader
+    Layout("train/poses", "train/rgb", "train/calibration"),  # ACE, with the same in test
+    Layout("metadata", "rgb", "metadata"),  # Record3D
+    Layout("metadata.json", "rgb", "metadata.json"),
+    Layout("state_groundtruth_estimate0/data.csv", "cam0/data", "cam0/sensor.yaml"),  # EuRoC
+    Layout("mav0/state_groundtruth_estimate0/data.csv", "mav0/cam0/data", "mav0/cam0/sensor.yaml"),
 )
+_ENDINGS = ("csv", "json", "npy", "npz", "tum", "txt")
+_POSES = tuple(f"base_from_gripper.{ending}" for ending in _ENDINGS)
+_CAMERA_POSES = tuple(f"base_from_camera.{ending}" for ending in _ENDINGS)
 _JOINTS = ("joints.csv", "joints.json")
 _CAMERAS = tuple(
     f"{stem}.{ending}"
@@ -33,37 +71,108 @@ _FOLDERS = (".", "images", "rgb")
 
 
 def detect(root: Path) -> bool:
-    """Whether `root` holds gripper poses or joint angles beside images."""
-    return any((root / name).is_file() for name in _POSES + _JOINTS)
+    """Whether `root` holds poses or joint angles beside images."""
+    return root.is_dir() and bool(_layouts(root))
 
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
-    """Read poses, intrinsics and the size of one image; no other image is opened."""
-    options = options or ReadOptions()
-    file = _pose_file(root)
-    rows, notes = _rows(root, file, options)
-    images = _images(root)
-    camera = _camera(root, options.camera, images[0])
-    poses, pairing_notes = pair_images(images, rows, _stamps(root), file)
-    frames = tuple(
-        Frame(image.name, image, camera, None, pose)
-        for image, pose in zip(images, poses, strict=True)
-        if pose is not None
-    )
-    lost = len(images) - len(frames)
-    return Recording(root.resolve().name, frames, (), lost, notes=(*notes, *pairing_notes))
+    """Read poses, intrinsics and sizes of images; no image is opened whole."""
+    options, layouts = options or ReadOptions(), _layouts(root)
+    if len(layouts) != 1:
+        names = " and ".join(layout.poses for layout in layouts)
+        what = f"holds {names}; keep the one with poses" if layouts else "no poses; expected"
+        expected = "" if layouts else f" {', '.join(_POSES + _JOINTS + _CAMERA_POSES)}"
+        raise InputError(f"{root}: {what}{expected}")
+    split = (layouts[0], Layout(*(p and p.replace("train/", "test/") for p in layouts[0])))
+    parts = [part for part in dict.fromkeys(split) if (root / part.poses).exists()]
+    read = [_frames(root, part, options) for part in parts]
+    posed = [
+        tuple(f for f in part if f.base_from_camera or f.base_from_gripper) for part, _ in read
+    ]
+    lost = sum(len(part) for part, _ in read) - sum(map(len, posed))
+    notes = tuple(note for _, more in read for note in more)
+    return Recording(root.resolve().name, posed[0], (*posed, ())[1], lost, notes=notes)
 
 
-def _pose_file(root: Path) -> Path:
-    names = [name for name in _POSES + _JOINTS if (root / name).is_file()]
-    if len(names) > 1:
-        raise InputError(f"{root}: holds {' and '.join(names)}; keep the one with gripper poses")
-    if not names:
-        raise InputError(f"{root}: no gripper poses; expected {', '.join(_POSES + _JOINTS)}")
-    return root / names[0]
+def _layouts(root: Path) -> list[Layout]:
+    tables = [Layout(name) for name in _POSES + _JOINTS if (root / name).is_file()]
+    for file in (root / name for name in _CAMERA_POSES if (root / name).is_file()):
+        # base_from_camera.txt may hold the one pose of a fixed camera.
+        if file.suffix != ".txt" or len(file.read_bytes().split()) > 16:
+            tables.append(Layout(file.name))
+    there = [each for each in LAYOUTS if (root / each.poses).exists()]
+    return tables or [each for each in there if (root / each.images).is_dir()]
 
 
-def _rows(root: Path, file: Path, options: ReadOptions) -> tuple[RobotPoses, list[str]]:
+def _frames(root: Path, layout: Layout, options: ReadOptions) -> tuple[list[Frame], list[str]]:
+    images = _images(root, [layout.images] if layout.images else _FOLDERS)
+    source, file = root / layout.poses, root / layout.camera
+    lenses: dict[str, Camera] = {}
+    notes: list[str] = []
+    if source.is_dir():
+        rows = _matrices(_by_image(source, images))
+    elif source == file:
+        rows, lenses = _record3d(file)
+    else:
+        rows, notes = _rows(root, source, options, layout.convention)
+    poses, pairing_notes = pair_images(images, rows, _stamps(root), source)
+    if file.name == "sensor.yaml":
+        with named_errors(file, "camera file"):
+            on_body = number_array(fields_of(file)["T_BS"]["data"], "T_BS").reshape(4, 4)
+            poses = [pose and pose @ SE3.from_matrix(on_body) for pose in poses]
+    if options.camera is None and layout.camera and file.is_dir():
+        files = _by_image(file, images)
+        for image in images:
+            own = files.get(image.name, file / f"{image.stem}.txt")
+            lenses[image.name] = read_camera_of_size(own, image_size(image), image.name)
+    elif options.camera is not None or not lenses:
+        stated = file if file.is_file() else None
+        lenses = {"": _camera(root, options.camera or stated, images[0])}
+    first = next(iter(lenses.values()))
+    check_size(str(file), first, image_size(images[0]), images[0].name)
+    owner = "gripper" if layout.poses in _POSES + _JOINTS else "camera"
+    split = "" if layout.images in ("", ".") else layout.images[: layout.images.find("/") + 1]
+    frames = []
+    for image, pose in zip(images, poses, strict=True):
+        camera = lenses.get(image.name, lenses.get(image.stem, first))
+        stated = {"base_from_camera": None, f"base_from_{owner}": pose}
+        frames.append(Frame(split + image.name, image, camera, **stated))
+    return frames, [*notes, *pairing_notes]
+
+
+def _record3d(file: Path) -> tuple[RobotPoses, dict[str, Camera]]:
+    data = read_json(file, "Record3D file", "export the recording again")
+    with named_errors(file, "Record3D file"):
+        numbers = number_array(data["poses"], "'poses'")[:, [4, 5, 6, 0, 1, 2, 3]]
+        names = tuple(map(str, range(len(numbers))))
+        poses = poses_from_numbers(numbers, pose_convention("xyzw:opengl"))
+        each = data.get("perFrameIntrinsicCoeffs") or [data["K"]] * len(names)
+        size = {"width": data["w"], "height": data["h"]}
+        cameras = [camera_from_fields({"K": numbers, **size}) for numbers in each]
+        return RobotPoses(names, None, poses), dict(zip(names, cameras, strict=True))
+
+
+def _matrices(files: Mapping[str, Path]) -> RobotPoses:
+    read = {name: read_numbers(file, 16, "4x4 base_from_camera") for name, file in files.items()}
+    read = {name: numbers.reshape(4, 4) for name, numbers in read.items()}
+    poses = {name: SE3.from_matrix(m, 1e-2) for name, m in read.items() if np.isfinite(m).all()}
+    return RobotPoses(tuple(poses), None, SE3.stack([*poses.values()]))
+
+
+def _by_image(folder: Path, images: Sequence[Path]) -> dict[str, Path]:
+    """Text files by the image that has their name, up to the ending or to the first dot."""
+    files = {file.stem: file for file in folder.glob("*.txt")}
+    short = {stem.partition(".")[0]: file for stem, file in files.items()}
+    files = {**short, **files} if len(short) == len(files) else files
+    found = {i.name: files.get(i.stem, files.get(i.name.partition(".")[0])) for i in images}
+    if not any(found.values()):
+        raise InputError(f"{folder}: no file has the name of an image; name them as the images")
+    return {name: file for name, file in found.items() if file is not None}
+
+
+def _rows(
+    root: Path, file: Path, options: ReadOptions, convention: str | None
+) -> tuple[RobotPoses, list[str]]:
     if file.name in _JOINTS:
         model = RobotModel(options.urdf or _urdf(root, file))
         links = options.base_frame, options.gripper_frame
@@ -71,10 +180,11 @@ def _rows(root: Path, file: Path, options: ReadOptions) -> tuple[RobotPoses, lis
     unused = [n for n in ("urdf", "base_frame", "gripper_frame") if getattr(options, n) is not None]
     if unused:
         raise InputError(
-            f"{flag(unused[0])}: {file} holds gripper poses already; leave the option out, or give"
+            f"{flag(unused[0])}: {file} holds poses already; leave the option out, or give"
             f" joint angles in joints.csv instead"
         )
-    return read_robot_poses(file, options.pose_convention, option="--pose-convention"), []
+    convention = options.pose_convention or convention
+    return read_robot_poses(file, convention, what="file of poses", option="--pose-convention"), []
 
 
 def _urdf(root: Path, joints: Path) -> Path:
@@ -85,13 +195,14 @@ def _urdf(root: Path, joints: Path) -> Path:
     return files[0]
 
 
-def _images(root: Path) -> list[Path]:
-    for folder in _FOLDERS:
+def _images(root: Path, folders: Sequence[str]) -> list[Path]:
+    for folder in folders:
         names = os.listdir(root / folder) if (root / folder).is_dir() else []
         images = [name for name in names if Path(name).suffix.lower() in IMAGE_ENDINGS]
         if images:
             return [root / folder / name for name in sorted(images, key=natural_key)]
-    raise InputError(f"{root}: no images ({', '.join(IMAGE_ENDINGS)}) in it, in images or in rgb")
+    where = " or in ".join("it" if folder == "." else folder for folder in folders)
+    raise InputError(f"{root}: no images ({', '.join(IMAGE_ENDINGS)}) in {where}")
 
 
 def _camera(root: Path, file: Path | None, image: Path) -> Camera:
