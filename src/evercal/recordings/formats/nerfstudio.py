@@ -12,7 +12,7 @@ import math
 from collections.abc import Container, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,18 +32,12 @@ from evercal.recordings.text_files import (
 )
 
 FILE = "transforms.json"
-# The first one there is read. ScanNet++ keeps undistorted images beside fisheye images.
+# The first one there is read. ScanNet++ keeps undistorted images beside those of the fisheye lens.
 _FILES = (
-    FILE, "transforms_train.json", *(
-        f"{folder}{name}" for folder in ("", "nerfstudio/", "dslr/nerfstudio/")
-        for name in ("transforms_undistorted.json", FILE)
-    ),
+    FILE, "transforms_train.json", "transforms_undistorted.json",
+    "nerfstudio/transforms_undistorted.json", f"nerfstudio/{FILE}",
+    "dslr/nerfstudio/transforms_undistorted.json", f"dslr/nerfstudio/{FILE}",
 )  # fmt: skip
-_IMAGE_FOLDERS = {
-    "transforms_undistorted.json": ("undistorted_images", "resized_undistorted_images"),
-    FILE: ("resized_images", "images"),
-}
-"""Folders beside that of ScanNet++'s files."""
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 # OpenGL axes (right, up, backward) from OpenCV axes (right, down, forward).
 _GL_FROM_CV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
@@ -74,54 +68,52 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     metric = options is not None and options.metres
     files = [root / name for name in _FILES if (root / name).is_file()] or [root / FILE]
     file = root if root.is_file() else files[0]
-    train, test, bad = _frames(file)
+    frames, test, bad = _frames(file)
     if file.name == "transforms_train.json" and not root.is_file():
         for other in (root / f"transforms_{split}.json" for split in ("val", "test")):
-            frames, more, left_out = _frames(other) if other.is_file() else ([], [], 0)
-            test, bad = [*test, *frames, *more], bad + left_out
+            if other.is_file():
+                more, _, left_out = _frames(other)
+                frames, bad, test = [*frames, *more], bad + left_out, test | {f.image for f in more}
     with named_errors(file, "nerfstudio file"):
-        names = (frame.name for frame in (*train, *test))
-        refuse_repeated(names, "keep one entry for each image")
+        refuse_repeated((frame.name for frame in frames), "keep one entry for each image")
     notes = [f"{bad} frames are marked as bad and left out"] if bad else []
-    name = (root if root.is_dir() else file.parent).resolve().name
-    notes.append(frame_note(file.name, metric))
-    return Recording(name, tuple(train), tuple(test), bad, notes=tuple(notes), metric=metric)
+    return Recording(
+        (root if root.is_dir() else file.parent).resolve().name,
+        tuple(frame for frame in frames if frame.image not in test),
+        tuple(frame for frame in frames if frame.image in test),
+        bad,
+        notes=(*notes, frame_note(file.name, metric)),
+        metric=metric,
+    )
 
 
-def _frames(file: Path) -> tuple[list[Frame], list[Frame], int]:
-    """Training and test frames of a file, and the number of frames that are marked as bad."""
+def _frames(file: Path) -> tuple[list[Frame], set[Path], int]:
+    """Frames of a file, images of test frames, and the number of frames that are marked as bad."""
     data = read_json(file, "nerfstudio file", "export it again")
     with named_errors(file, "nerfstudio file"):
         undo, scale = _applied(data)
-        parts = [data.get("frames"), data.get("test_frames", [])]
-        if not all(isinstance(part, list) for part in parts) or not parts[0]:
+        entries, tested = data.get("frames"), data.get("test_frames", [])
+        if not isinstance(entries, list) or not isinstance(tested, list) or not entries:
             raise ValueError("'frames' is a list with at least one frame")
-        entries = [(key, entry) for key, part in enumerate(parts) for entry in part]
-        good = [each for each in entries if not (_mapping(each[1]) and each[1].get("is_bad"))]
-        root, first = file.parent, good[0][1] if good else entries[0][1]
-        if _mapping(first) and "file_path" in first:
-            image = _image(root, str(first["file_path"]))
-            others = (root.parent / name for name in _IMAGE_FOLDERS.get(file.name, ()))
-            beside = (other for other in others if _image(other, str(first["file_path"])).is_file())
-            root = root if image.is_file() else next(beside, root)
+        root, first = file.parent, entries[0]
+        if isinstance(first, dict) and "file_path" in first:
+            kind = "undistorted_images" if "undistorted" in file.name else "images"
+            folders = (root, root.parent / kind, root.parent / f"resized_{kind}")
+            found = (folder for folder in folders if _image(folder, first["file_path"]).is_file())
+            root = next(found, root)
             # Without a stated image size, that of the first image is taken.
             if not {"w", "h"} & {*data, *first}:
                 width, height = image_size(_image(root, str(first["file_path"])))
                 data |= {"w": width, "h": height}
-        frames: list[list[Frame]] = [[], []]
-        for i, (part, entry) in enumerate(good):
+        every, frames = [*entries, *tested], []
+        bad = [isinstance(entry, dict) and bool(entry.get("is_bad")) for entry in every]
+        for i, entry in ((i, entry) for i, entry in enumerate(every) if not bad[i]):
             with naming(f"frame {i}"):
-                frames[part].append(_frame(root, data, entry, undo, scale))
-        test = _test_images(root, data, {frame.image for frame in frames[0]})
-    require_images([*frames[0], *frames[1]], file)
-    train, tested = (_resized(file, part) for part in frames)
-    tested += [frame for frame in train if frame.image in test]
-    train = [frame for frame in train if frame.image not in test]
-    return train, tested, len(entries) - len(good)
-
-
-def _mapping(entry: object) -> TypeGuard[dict[str, Any]]:
-    return isinstance(entry, dict)
+                frames.append(_frame(root, data, entry, undo, scale))
+        test = _test_images(root, data, {frame.image for frame in frames})
+        test |= {_image(root, entry["file_path"]) for entry in tested}
+    require_images(frames, file)
+    return _resized(file, frames), test, sum(bad)
 
 
 def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
@@ -166,17 +158,12 @@ def _camera(data: Mapping[str, object]) -> Camera:
         )
     if data.get("is_fisheye"):
         raise ValueError("fisheye images are not supported; undistort them first")
-    lens = dict.fromkeys(_LENS, 0.0) | {key: _number(data, key) for key in _LENS if key in data}
-    if (listed := data.get("distortion_params")) is not None:
-        numbers = number_array(listed, "'distortion_params'")
-        if numbers.shape != (len(_LENS),) or any(lens.values()):
-            raise ValueError(
-                f"'distortion_params' is {' '.join(_LENS)} and stands alone, got {listed!r}; write"
-                f" k1, k2, p1, p2, k3 instead"
-            )
-        lens = dict(zip(_LENS, numbers.tolist(), strict=True))
-    if lens["k4"]:
-        raise ValueError("k4 is not 0; only k1, k2, k3, p1 and p2 are supported")
+    own = [_number(data, key, 0.0) for key in _LENS]
+    lens = number_array(data.get("distortion_params", own), "'distortion_params'").tolist()
+    if len(lens) != len(own) or lens[3] or (any(own) and lens != own):
+        raise ValueError(
+            f"distortion is k1, k2, k3, k4 = 0, p1, p2, also as 'distortion_params', got {lens}"
+        )
     width, height = _number(data, "w"), _number(data, "h")
     fx, fy = _focal(data, "x", width), _focal(data, "y", height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
@@ -184,7 +171,7 @@ def _camera(data: Mapping[str, object]) -> Camera:
         raise ValueError("'fl_x' is missing, and so are 'fl_y' and 'camera_angle_x'")
     # Half a pixel: the file counts from the image's corner.
     cx, cy = _number(data, "cx", width / 2) - 0.5, _number(data, "cy", height / 2) - 0.5
-    distortion = tuple(lens[key] for key in ("k1", "k2", "p1", "p2", "k3"))
+    distortion = tuple(lens[i] for i in (0, 1, 4, 5, 2))
     size: Any = width, height  # whole numbers, checked when constructed
     return Camera(size[0], size[1], fx, fy, cx, cy, distortion)
 

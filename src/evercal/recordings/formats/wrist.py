@@ -9,6 +9,7 @@ with OpenGL's axes.
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import NamedTuple
 
@@ -19,12 +20,7 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.formats.seven_scenes import read_numbers
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, image_size
-from evercal.recordings.poses.camera_file import (
-    camera_from_fields,
-    check_size,
-    fields_of,
-    read_camera_of_size,
-)
+from evercal.recordings.poses import camera_file
 from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
 from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
 from evercal.recordings.poses.pairing import pair_images
@@ -78,20 +74,18 @@ def detect(root: Path) -> bool:
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read poses, intrinsics and sizes of images; no image is opened whole."""
     options, layouts = options or ReadOptions(), _layouts(root)
-    if len(layouts) != 1:
+    if not layouts:
+        expected = ", ".join(_POSES + _JOINTS + _CAMERA_POSES)
+        raise InputError(f"{root}: no gripper poses; expected {expected}")
+    if len(layouts) > 1:
         names = " and ".join(layout.poses for layout in layouts)
-        what = f"holds {names}; keep the one with poses" if layouts else "no poses; expected"
-        expected = "" if layouts else f" {', '.join(_POSES + _JOINTS + _CAMERA_POSES)}"
-        raise InputError(f"{root}: {what}{expected}")
-    split = (layouts[0], Layout(*(p and p.replace("train/", "test/") for p in layouts[0])))
-    parts = [part for part in dict.fromkeys(split) if (root / part.poses).exists()]
-    read = [_frames(root, part, options) for part in parts]
-    posed = [
-        tuple(f for f in part if f.base_from_camera or f.base_from_gripper) for part, _ in read
-    ]
-    lost = sum(len(part) for part, _ in read) - sum(map(len, posed))
-    notes = tuple(note for _, more in read for note in more)
-    return Recording(root.resolve().name, posed[0], (*posed, ())[1], lost, notes=notes)
+        raise InputError(f"{root}: holds {names}; keep the one with the poses of the images")
+    paths = [path.replace("train/", "test/") for path in layouts[0][:3]]
+    split = dict.fromkeys((layouts[0], Layout(*paths, layouts[0].convention)))
+    read = [_frames(root, part, options) for part in split if (root / part.poses).exists()]
+    train, test = (*(frames for frames, _, _ in read), ())[:2]
+    lost, notes = sum(lost for _, lost, _ in read), [note for *_, more in read for note in more]
+    return Recording(root.resolve().name, train, test, lost, notes=tuple(notes))
 
 
 def _layouts(root: Path) -> list[Layout]:
@@ -104,7 +98,10 @@ def _layouts(root: Path) -> list[Layout]:
     return tables or [each for each in there if (root / each.images).is_dir()]
 
 
-def _frames(root: Path, layout: Layout, options: ReadOptions) -> tuple[list[Frame], list[str]]:
+def _frames(
+    root: Path, layout: Layout, options: ReadOptions
+) -> tuple[tuple[Frame, ...], int, list[str]]:
+    """Frames with a pose, the number of images without, and notes."""
     images = _images(root, [layout.images] if layout.images else _FOLDERS)
     source, file = root / layout.poses, root / layout.camera
     lenses: dict[str, Camera] = {}
@@ -115,41 +112,43 @@ def _frames(root: Path, layout: Layout, options: ReadOptions) -> tuple[list[Fram
         rows, lenses = _record3d(file)
     else:
         rows, notes = _rows(root, source, options, layout.convention)
-    poses, pairing_notes = pair_images(images, rows, _stamps(root), source)
+    poses, more = pair_images(images, rows, _stamps(root), source)
     if file.name == "sensor.yaml":
         with named_errors(file, "camera file"):
-            on_body = number_array(fields_of(file)["T_BS"]["data"], "T_BS").reshape(4, 4)
-            poses = [pose and pose @ SE3.from_matrix(on_body) for pose in poses]
+            numbers = camera_file.numbers_of(camera_file.fields_of(file).get("T_BS"), "T_BS", 16)
+            body_from_camera = SE3.from_matrix(np.reshape(numbers, (4, 4)))
+        poses = [pose and pose @ body_from_camera for pose in poses]
     if options.camera is None and layout.camera and file.is_dir():
         files = _by_image(file, images)
         for image in images:
             own = files.get(image.name, file / f"{image.stem}.txt")
-            lenses[image.name] = read_camera_of_size(own, image_size(image), image.name)
+            lens = camera_file.read_camera_of_size(own, image_size(image), image.name)
+            lenses[image.stem] = lens
     elif options.camera is not None or not lenses:
-        stated = file if file.is_file() else None
-        lenses = {"": _camera(root, options.camera or stated, images[0])}
-    first = next(iter(lenses.values()))
-    check_size(str(file), first, image_size(images[0]), images[0].name)
-    owner = "gripper" if layout.poses in _POSES + _JOINTS else "camera"
-    split = "" if layout.images in ("", ".") else layout.images[: layout.images.find("/") + 1]
-    frames = []
-    for image, pose in zip(images, poses, strict=True):
-        camera = lenses.get(image.name, lenses.get(image.stem, first))
-        stated = {"base_from_camera": None, f"base_from_{owner}": pose}
-        frames.append(Frame(split + image.name, image, camera, **stated))
-    return frames, [*notes, *pairing_notes]
+        stated = options.camera or (file if file.is_file() else None)
+        lenses = dict.fromkeys((i.stem for i in images), _camera(root, stated, images[0]))
+    owner = "base_from_gripper" if layout.poses in _POSES + _JOINTS else "base_from_camera"
+    split = layout.images.rpartition("rgb")[0]
+    frames = tuple(
+        replace(Frame(split + image.name, image, lenses[image.stem], None), **{owner: pose})
+        for image, pose in zip(images, poses, strict=True)
+        if pose is not None
+    )
+    return frames, len(images) - len(frames), [*notes, *more]
 
 
 def _record3d(file: Path) -> tuple[RobotPoses, dict[str, Camera]]:
     data = read_json(file, "Record3D file", "export the recording again")
     with named_errors(file, "Record3D file"):
-        numbers = number_array(data["poses"], "'poses'")[:, [4, 5, 6, 0, 1, 2, 3]]
+        numbers = number_array(data.get("poses"), "'poses'")
+        if numbers.ndim != 2 or numbers.shape[1] != 7:
+            raise ValueError("'poses' is a list of qx qy qz qw x y z of each image")
         names = tuple(map(str, range(len(numbers))))
-        poses = poses_from_numbers(numbers, pose_convention("xyzw:opengl"))
-        each = data.get("perFrameIntrinsicCoeffs") or [data["K"]] * len(names)
-        size = {"width": data["w"], "height": data["h"]}
-        cameras = [camera_from_fields({"K": numbers, **size}) for numbers in each]
-        return RobotPoses(names, None, poses), dict(zip(names, cameras, strict=True))
+        poses = poses_from_numbers(np.roll(numbers, 3, axis=1), pose_convention("xyzw:opengl"))
+        size = {"width": data.get("w"), "height": data.get("h")}
+        each = data.get("perFrameIntrinsicCoeffs") or [data.get("K")] * len(names)
+        lenses = [camera_file.camera_from_fields({"K": numbers, **size}) for numbers in each]
+        return RobotPoses(names, None, poses), dict(zip(names, lenses, strict=True))
 
 
 def _matrices(files: Mapping[str, Path]) -> RobotPoses:
@@ -216,7 +215,7 @@ def _camera(root: Path, file: Path | None, image: Path) -> Camera:
                 f" .npz or .txt"
             )
         file = root / names[0]
-    return read_camera_of_size(file, image_size(image), image.name)
+    return camera_file.read_camera_of_size(file, image_size(image), image.name)
 
 
 def _stamps(root: Path) -> dict[str, float] | None:

@@ -21,17 +21,15 @@ from evercal.geometry import Camera
 from evercal.recordings.poses.row_files import arrays_as_lists, is_number
 from evercal.recordings.text_files import named_errors, naming, read_text, yaml_documents
 
-# Names of models by kind, and of fields, in lower case without spaces, dashes and underscores.
+# Kinds of models by name, and names of fields, in lower case without spaces, dashes, underscores.
 _MODELS = {
-    "brown": (
-        "plumbbob", "rationalpolynomial", "brownconrady", "radtan", "radialtangential", "opencv",
-        "fullopencv", "pinhole", "perspective", "rectified", "",
-    ),
-    "none": ("none", "null"),
-    "fisheye": (
-        "equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4",
-        "kannalabrandt8",
-    ),
+    **dict.fromkeys(
+        ("", "plumbbob", "rationalpolynomial", "brownconrady", "radtan", "radialtangential",
+         "opencv", "fullopencv", "pinhole", "perspective", "rectified"), "brown"),
+    **dict.fromkeys(("none", "null"), "none"),
+    **dict.fromkeys(
+        ("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4",
+         "kannalabrandt8"), "fisheye"),
 }  # fmt: skip
 _SUPPORTED = ("brown", "none", "zero")
 _MODEL_KEYS = ("distortionmodel", "model", "cameramodel", "modeltype", "projectionmodel")
@@ -39,11 +37,12 @@ _LENGTHS = (0, 4, 5, 8)
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _ALIASES = {
     "camera_matrix": (
-        "cameramatrix", "intrinsicmatrix", "cameraintrinsics", "intrinsics", "intrinsic", "k", "mtx"
+        "cameramatrix", "intrinsicmatrix", "cameraintrinsics", "intrinsics", "intrinsic",
+        "projectionparameters", "k", "mtx",
     ),
     "distortion_coefficients": (
-        "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "distortion",
-        "dist", "coeffs", "d", "kc",
+        "distortioncoefficients", "distortioncoeffs", "distortionparameters", "distortionparams",
+        "distcoeffs", "distcoeff", "distortion", "dist", "coefficients", "coeffs", "d", "kc",
     ),
     "image_width": ("imagewidth", "width", "w"),
     "image_height": ("imageheight", "height", "h"),
@@ -53,22 +52,14 @@ _ALIASES = {
     "cx": ("cx", "ppx"),
     "cy": ("cy", "ppy"),
 }  # fmt: skip
-_ROS = ("distortionmodel", "rectificationmatrix", "projectionmatrix", "header", "roi", "p", "r")
-# Objects of numbers that have names themselves and belong to the camera around them.
-_GROUPS = ("camera_matrix", "distortion_coefficients", "projectionparameters",
-           "distortionparameters", "distortionparams")  # fmt: skip
-_AROUND = re.compile(
-    f"{'|'.join(_MODEL_KEYS)}|image_(width|height|size)|[kp][1-6]|binning[xy]|roi"
-    r"|.*(dist|radial|tangent|coef|lens|fish).*"
-)
-"""Fields that a camera takes from the entries around it."""
-_KNOWN = {*sum(_ALIASES.values(), ()), *_COEFFICIENTS, *_MODEL_KEYS, *_ROS, "binningx", "binningy",
-          "fisheyemodel"}  # fmt: skip
+_LENS = ("distortion_coefficients", *_COEFFICIENTS)
+_ROS = ("rectificationmatrix", "projectionmatrix", "header", "roi", "p", "r")
+_KNOWN = {*_ALIASES, *_COEFFICIENTS, *_MODEL_KEYS, *_ROS, "binningx", "binningy", "fisheyemodel"}
 _HARMLESS = re.compile(
     r"error|rms|repro|resid|std|dev|sigma|covar|uncert|fps|rate|freq|square|board|marker|pattern"
     r"|chess|tag|count|num|frames|images|views|points|flags|date|time|stamp|version|serial|index"
     r"|id$|baseline|depth|range|temp|apert|expos|gain|fov|angle|focal|aspect|mm$|rotation|trans"
-    r"|vec|quat|extrin|pose|position|orient|imu|noise|rgb|^bf$|^new|imagescale|overlaps"
+    r"|vec|quat|extrin|pose|position|orient|imu|noise|rgb|track|^bf$|^new|imagescale|overlaps"
 )
 """Names of numbers that do not change where a point lies in the image."""
 _EXPECTED = (
@@ -125,38 +116,34 @@ def camera_from_fields(data: Mapping[str, Any], size: tuple[int, int] | None = N
 
 def _undotted(data: Mapping[str, Any]) -> dict[str, Any]:
     """ORB-SLAM's `Camera1.fx` as an entry `Camera1`; `Camera.fps` holds for all cameras."""
-    plain: dict[str, Any] = {}
-    groups: dict[str, dict[str, Any]] = {}
+    groups: dict[str, dict[str, Any]] = {"": {}, "Camera": {}}
     for key, value in data.items():
-        group, dot, name = str(key).partition(".")
-        if dot and group != "Camera":
-            groups.setdefault(group, {})[name] = value
-        else:
-            plain[{"type": "camera_model"}.get(name, name) if dot else key] = value
-    return {**groups, **plain}
+        group, _, name = str(key).rpartition(".")
+        groups.setdefault(group, {})["camera_model" if key == "Camera.type" else name] = value
+    return {**groups.pop(""), **groups.pop("Camera"), **groups}
 
 
 def _entries(
     data: Mapping[str, Any], around: Mapping[str, Any], name: str
 ) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Fields of all cameras in nested entries, by name, with those that hold for them around."""
+    """Fields of all cameras in nested entries, by name, with numbers that stand around them."""
     data = dict(data)
-    for key, value in [*data.items()]:
-        if isinstance(value, Mapping) and "data" not in value and _canonical(key) in _GROUPS:
+    for key, value in [*data.items()]:  # such as intrinsics: {fx: ...}
+        group = _canonical(key) in ("camera_matrix", "distortion_coefficients")
+        if group and isinstance(value, Mapping) and "data" not in value:
             data |= {**data.pop(key), **data}
     own = _fields(data)
-    if "distortion_coefficients" in own or not own.keys().isdisjoint(_COEFFICIENTS):
-        around = {k: v for k, v in around.items() if not re.search(r"[kp]\d|coeff", k)}
-    around = {key: value for key, value in around.items() if key not in own}
+    hidden = {*own, *(() if own.keys().isdisjoint(_LENS) else _LENS)}
+    around = {key: value for key, value in around.items() if key not in hidden}
     if "fx" in own or isinstance(own.get("camera_matrix"), list | Mapping):
         yield name, {**around, **data}
-    around = {**around, **{k: v for k, v in own.items() if _AROUND.fullmatch(k)}}
+    focal = ("camera_matrix", "fx", "fy", "cx", "cy")
+    around |= {key: value for key, value in own.items() if key not in focal}
     for key, value in data.items():
-        inside = value if isinstance(value, list) else [value]
-        for i, each in enumerate(inside):
+        for i, each in enumerate(value if isinstance(value, list) else [value]):
             if isinstance(each, Mapping):
-                number = f"[{i}]" if each is not value else ""
-                yield from _entries(each, around, f"{name}.{key}{number}".lstrip("."))
+                inner = f"{name}.{key}" + (f"[{i}]" if each is not value else "")
+                yield from _entries(each, around, inner.lstrip("."))
 
 
 def _camera(data: Mapping[str, Any], size: tuple[int, int] | None) -> Camera:
@@ -166,13 +153,14 @@ def _camera(data: Mapping[str, Any], size: tuple[int, int] | None) -> Camera:
         raise ValueError(f"the image is a cut-out (roi {roi}); give the whole image's camera_info")
     if fields.get("fisheyemodel"):
         raise ValueError("fisheye_model is set; rectify the images or calibrate without it")
-    models = {_model_kind(str(fields[key])): fields[key] for key in _MODEL_KEYS if key in fields}
-    distortion = _distortion(fields, data, ros and "none" not in models)
+    models = {_model_kind(fields[key]): fields[key] for key in _MODEL_KEYS if key in fields}
+    required = (ros or "distortionmodel" in fields) and "none" not in models
+    distortion = _distortion(fields, data, required)
     for kind in models.keys() - {"brown"}:
         if kind not in _SUPPORTED or any(distortion):
             raise ValueError(
-                f"distortion_model {models[kind]!r} with {_listed(distortion) or 'no numbers'} is"
-                f" not supported; rectify the images or calibrate with plumb_bob"
+                f"distortion_model {models[kind]!r} is not supported with the coefficients"
+                f" {distortion}; rectify the images or calibrate with plumb_bob"
             )
     matrix = _matrix(fields, data)
     width, height = _size(fields, data, None if ros else size)
@@ -182,33 +170,32 @@ def _camera(data: Mapping[str, Any], size: tuple[int, int] | None) -> Camera:
     if size != (camera.width, camera.height):
         by = [max(1, int(fields.get(f"binning{axis}") or 1)) for axis in "xy"]
         camera = camera.resized(camera.width // by[0], camera.height // by[1])
-    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
-    if min(fx, fy) < camera.width / 10 or not (
-        0 <= cx <= camera.width and 0 <= cy <= camera.height
-    ):
+    wide, high = camera.width, camera.height
+    inside = 0 <= camera.cx <= wide and 0 <= camera.cy <= high
+    if min(camera.fx, camera.fy) < wide / 10 or not inside:
         raise ValueError(
-            f"fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} do not fit {camera.width}x{camera.height}"
-            f" pixels; give them in pixels, not millimetres or shares, and of this image size"
+            f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} do not fit"
+            f" {wide}x{high} images; give them in pixels and of this image size"
         )
     return camera
 
 
-def _model_kind(model: str) -> str:
-    """A key of `_MODELS`; `zero` for models that are read without distortion only, else empty."""
-    plain = re.sub(r"[\s_-]", "", model.rpartition(".")[2].lower())
-    kinds = (kind for kind, names in _MODELS.items() if plain in names)
+def _model_kind(model: object) -> str:
+    """A value of `_MODELS`; `zero` for models that are read without distortion only, else empty."""
+    plain = re.sub(r"[\s_-]", "", str(model).rpartition(".")[2].lower())
     # RealSense prints distortion.inverse_brown_conrady, mostly with zeros.
-    return next(kinds, "zero" if "conrady" in plain else "")
+    return _MODELS.get(plain, "zero" if "conrady" in plain else "")
 
 
 def _refuse_unknown(data: Mapping[str, Any]) -> None:
     for key, value in data.items():
+        if _canonical(key) in _KNOWN or _HARMLESS.search(_plain(key)):
+            continue
         value = value.get("data") if isinstance(value, Mapping) else value
         cells = np.ravel(np.array(value, dtype=object)).tolist()
-        rows = value if isinstance(value, list) else []
-        matrix = len(cells) in (9, 16) or (rows[2:] and all(np.size(row) > 2 for row in rows))
-        numbers = all(map(is_number, cells)) and any(map(float, cells)) and not matrix
-        if numbers and _plain(key) not in _KNOWN and not _HARMLESS.search(_plain(key)):
+        rows = value if isinstance(value, list) and value[2:] else [value]
+        matrix = len(cells) in (9, 16) or (rows[1:] and all(np.size(row) > 2 for row in rows))
+        if all(map(is_number, cells)) and any(map(float, cells)) and not matrix:
             raise ValueError(
                 f"{key!r} is not known and may change the image; name distortion k1, k2, p1, p2,"
                 f" k3, or distortion_coefficients in this order, and leave other numbers out"
@@ -294,13 +281,13 @@ def _fields(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def _matrix(fields: Mapping[str, Any], data: Mapping[str, Any]) -> np.ndarray:
     if "camera_matrix" in fields:
-        numbers = _numbers(fields["camera_matrix"], "camera_matrix")
+        numbers = numbers_of(fields["camera_matrix"], "camera_matrix")
         if len(numbers) == 4 and 0.8 * numbers[1] < numbers[0] < 1.25 * numbers[1]:
             fx, fy, cx, cy = numbers  # as Kalibr writes it; other orders differ in the first two
             return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         if len(numbers) == 16 and numbers[3::4] == numbers[12:] == [0, 0, 0, 1]:
             numbers = np.reshape(numbers, (4, 4))[:3, :3].ravel().tolist()
-        matrix = np.reshape(_numbers(numbers, "camera_matrix", 9), (3, 3))
+        matrix = np.reshape(numbers_of(numbers, "camera_matrix", 9), (3, 3))
         # Open3D writes it column after column.
         return matrix.T if not matrix[:2, 2].any() and matrix[2, :2].any() else matrix
     names = ("fx", "fy", "cx", "cy")
@@ -308,19 +295,19 @@ def _matrix(fields: Mapping[str, Any], data: Mapping[str, Any]) -> np.ndarray:
     if missing:
         what = f"camera {missing[0]!r}" if len(missing) < 4 else "'camera_matrix'"
         raise ValueError(f"{what} is missing, there is {_listed(data) or 'nothing'}; {_EXPECTED}")
-    fx, fy, cx, cy = _numbers([fields[name] for name in names], "fx, fy, cx, cy", 4)
+    fx, fy, cx, cy = numbers_of([fields[name] for name in names], "fx, fy, cx, cy", 4)
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
 def _distortion(fields: Mapping[str, Any], data: Mapping[str, Any], required: bool) -> list[float]:
     name = "distortion_coefficients"
     stated = [key for key in _COEFFICIENTS if key in fields]
-    if str(fields.get(name, "")).lower() in _MODELS["none"]:
+    if str(fields.get(name, "")).lower() in ("none", "null"):
         numbers = []
     elif name in fields:
-        numbers = _numbers(fields[name], name)
+        numbers = numbers_of(fields[name], name)
     elif stated:
-        numbers = _numbers([fields.get(key, 0.0) for key in _COEFFICIENTS], stated[0])
+        numbers = numbers_of([fields.get(key, 0.0) for key in _COEFFICIENTS], stated[0])
         numbers = numbers if any(numbers[5:]) else numbers[:5]
     elif required:
         raise ValueError(
@@ -348,7 +335,7 @@ def _size(
         stated = size if len(missing) == 2 else None
     if stated is None:
         raise ValueError(f"{missing[0]!r} is missing (no image size), there is {_listed(data)}")
-    width, height = _numbers(list(stated), "image size (width, height)", 2)
+    width, height = numbers_of(list(stated), "image size (width, height)", 2)
     return width, height
 
 
@@ -356,7 +343,8 @@ def _listed(keys: Iterable[object]) -> str:
     return ", ".join(map(str, keys))
 
 
-def _numbers(value: Any, name: str, count: int | None = None) -> list[float]:
+def numbers_of(value: Any, name: str, count: int | None = None) -> list[float]:
+    """Numbers of nested lists, or of an array of OpenCV or ROS; ValueError for others."""
     value = value.get("data") if isinstance(value, dict) else value
     try:
         if not isinstance(value, list) or any(isinstance(v, bool) for v in value):
