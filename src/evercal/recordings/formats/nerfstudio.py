@@ -73,7 +73,8 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
         for other in (root / f"transforms_{split}.json" for split in ("val", "test")):
             if other.is_file():
                 more, _, left_out = _frames(other)
-                frames, bad, test = [*frames, *more], bad + left_out, test | {f.image for f in more}
+                frames, bad = [*frames, *more], bad + left_out
+                test |= {frame.image for frame in more if isinstance(frame.image, Path)}
     with named_errors(file, "nerfstudio file"):
         refuse_repeated((frame.name for frame in frames), "keep one entry for each image")
     notes = [f"{bad} frames are marked as bad and left out"] if bad else []

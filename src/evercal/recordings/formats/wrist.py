@@ -80,8 +80,9 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     if len(layouts) > 1:
         names = " and ".join(layout.poses for layout in layouts)
         raise InputError(f"{root}: holds {names}; keep the one with the poses of the images")
-    paths = [path.replace("train/", "test/") for path in layouts[0][:3]]
-    split = dict.fromkeys((layouts[0], Layout(*paths, layouts[0].convention)))
+    first = layouts[0]
+    paths = {key: getattr(first, key).replace("train/", "test/") for key in first._fields[:3]}
+    split = dict.fromkeys((first, first._replace(**paths)))
     read = [_frames(root, part, options) for part in split if (root / part.poses).exists()]
     train, test = (*(frames for frames, _, _ in read), ())[:2]
     lost, notes = sum(lost for _, lost, _ in read), [note for *_, more in read for note in more]
@@ -107,7 +108,7 @@ def _frames(
     lenses: dict[str, Camera] = {}
     notes: list[str] = []
     if source.is_dir():
-        rows = _matrices(_by_image(source, images))
+        rows = _matrices(source, _by_image(source, images))
     elif source == file:
         rows, lenses = _record3d(file)
     else:
@@ -151,11 +152,14 @@ def _record3d(file: Path) -> tuple[RobotPoses, dict[str, Camera]]:
         return RobotPoses(names, None, poses), dict(zip(names, lenses, strict=True))
 
 
-def _matrices(files: Mapping[str, Path]) -> RobotPoses:
+def _matrices(folder: Path, files: Mapping[str, Path]) -> RobotPoses:
     read = {name: read_numbers(file, 16, "4x4 base_from_camera") for name, file in files.items()}
-    read = {name: numbers.reshape(4, 4) for name, numbers in read.items()}
-    poses = {name: SE3.from_matrix(m, 1e-2) for name, m in read.items() if np.isfinite(m).all()}
-    return RobotPoses(tuple(poses), None, SE3.stack([*poses.values()]))
+    tracked = {name: numbers for name, numbers in read.items() if np.isfinite(numbers).all()}
+    with named_errors(folder, "camera poses"):
+        if not tracked:
+            raise ValueError("holds no pose of an image; call the files as the images, with .txt")
+        matrices = np.stack([*tracked.values()]).reshape(-1, 4, 4)
+        return RobotPoses(tuple(tracked), None, SE3.from_matrix(matrices, 1e-2))
 
 
 def _by_image(folder: Path, images: Sequence[Path]) -> dict[str, Path]:
@@ -164,8 +168,6 @@ def _by_image(folder: Path, images: Sequence[Path]) -> dict[str, Path]:
     short = {stem.partition(".")[0]: file for stem, file in files.items()}
     files = {**short, **files} if len(short) == len(files) else files
     found = {i.name: files.get(i.stem, files.get(i.name.partition(".")[0])) for i in images}
-    if not any(found.values()):
-        raise InputError(f"{folder}: no file has the name of an image; name them as the images")
     return {name: file for name, file in found.items() if file is not None}
 
 

@@ -193,8 +193,8 @@ def _refuse_unknown(data: Mapping[str, Any]) -> None:
             continue
         value = value.get("data") if isinstance(value, Mapping) else value
         cells = np.ravel(np.array(value, dtype=object)).tolist()
-        rows = value if isinstance(value, list) and value[2:] else [value]
-        matrix = len(cells) in (9, 16) or (rows[1:] and all(np.size(row) > 2 for row in rows))
+        rows: list[Any] = value if isinstance(value, list) else []
+        matrix = len(cells) in (9, 16) or (rows[2:] and all(np.size(row) > 2 for row in rows))
         if all(map(is_number, cells)) and any(map(float, cells)) and not matrix:
             raise ValueError(
                 f"{key!r} is not known and may change the image; name distortion k1, k2, p1, p2,"
