@@ -34,7 +34,7 @@ from evercal.recordings.text_files import (
 FILE = "transforms.json"
 # The first one there is read. ScanNet++ keeps undistorted images beside those of the fisheye lens.
 _FILES = (
-    FILE, "transforms_train.json", "transforms_undistorted.json",
+    "transforms_undistorted.json", FILE, "transforms_train.json",
     "nerfstudio/transforms_undistorted.json", f"nerfstudio/{FILE}",
     "dslr/nerfstudio/transforms_undistorted.json", f"dslr/nerfstudio/{FILE}",
 )  # fmt: skip
@@ -100,19 +100,19 @@ def _frames(file: Path) -> tuple[list[Frame], set[Path], int]:
         if isinstance(first, dict) and "file_path" in first:
             kind = "undistorted_images" if "undistorted" in file.name else "images"
             folders = (root, root.parent / kind, root.parent / f"resized_{kind}")
-            found = (folder for folder in folders if _image(folder, first["file_path"]).is_file())
-            root = next(found, root)
+            name = str(first["file_path"])
+            root = next((each for each in folders if _image(each, name).is_file()), root)
             # Without a stated image size, that of the first image is taken.
             if not {"w", "h"} & {*data, *first}:
-                width, height = image_size(_image(root, str(first["file_path"])))
+                width, height = image_size(_image(root, name))
                 data |= {"w": width, "h": height}
         every, frames = [*entries, *tested], []
-        bad = [isinstance(entry, dict) and bool(entry.get("is_bad")) for entry in every]
+        bad = [isinstance(each, dict) and bool(each.get("is_bad")) for each in every]
         for i, entry in ((i, entry) for i, entry in enumerate(every) if not bad[i]):
             with naming(f"frame {i}"):
                 frames.append(_frame(root, data, entry, undo, scale))
-        test = _test_images(root, data, {frame.image for frame in frames})
-        test |= {_image(root, entry["file_path"]) for entry in tested}
+        images = [_image(root, str(each.get("file_path"))) for each in every]
+        test = _test_images(root, data, images) | {*images[len(entries) :]}
     require_images(frames, file)
     return _resized(file, frames), test, sum(bad)
 
