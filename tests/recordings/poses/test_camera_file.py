@@ -395,6 +395,8 @@ def test_no_distortion_may_be_stated_in_words(tmp_path: Path) -> None:
         ({"K": K, "radial": D[:2], **SIZE}, "'radial' is not known and may change the image"),
         ({"K": K, "lens": {"data": D}, **SIZE}, "'lens' is not known"),
         ({"K": K, "dc": [D], **SIZE}, "'dc' is not known"),
+        ({"K": K, "dist_vec": D, **SIZE}, "'dist_vec' is not known"),
+        ({"K": K, "r": D[:2], "D": [0] * 5, **SIZE}, "'r' is not known"),
         ({"K": K, "dist": D, "xi": 1, **SIZE}, "'xi' is not known"),
         ({"camera": {"K": K, **SIZE}, "tangential": [1e-3, 0]}, "'tangential' is not known"),
         ({"K": K, "distortion_params": [0.1] * 6, **SIZE}, "0, 4, 5 or 8"),

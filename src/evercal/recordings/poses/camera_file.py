@@ -44,22 +44,18 @@ _ALIASES = {
         "distortioncoefficients", "distortioncoeffs", "distortionparameters", "distortionparams",
         "distcoeffs", "distcoeff", "distortion", "dist", "coefficients", "coeffs", "d", "kc",
     ),
-    "image_width": ("imagewidth", "width", "w"),
-    "image_height": ("imageheight", "height", "h"),
+    "image_width": ("imagewidth", "width", "w"), "image_height": ("imageheight", "height", "h"),
     "image_size": ("imagesize", "imgsize", "resolution", "size"),
-    "fx": ("fx",),
-    "fy": ("fy",),
-    "cx": ("cx", "ppx"),
-    "cy": ("cy", "ppy"),
+    "fx": ("fx",), "fy": ("fy",), "cx": ("cx", "ppx"), "cy": ("cy", "ppy"),
 }  # fmt: skip
 _LENS = ("distortion_coefficients", *_COEFFICIENTS)
 _ROS = ("rectificationmatrix", "projectionmatrix", "header", "roi", "p", "r")
-_KNOWN = {*_ALIASES, *_COEFFICIENTS, *_MODEL_KEYS, *_ROS, "binningx", "binningy", "fisheyemodel"}
+_KNOWN = {*_ALIASES, *_LENS, *_MODEL_KEYS, *_ROS[:4], "binningx", "binningy", "fisheyemodel"}
 _HARMLESS = re.compile(
     r"error|rms|repro|resid|std|dev|sigma|covar|uncert|fps|rate|freq|square|board|marker|pattern"
     r"|chess|tag|count|num|frames|images|views|points|flags|date|time|stamp|version|serial|index"
     r"|id$|baseline|depth|range|temp|apert|expos|gain|fov|angle|focal|aspect|mm$|rotation|trans"
-    r"|vec|quat|extrin|pose|position|orient|imu|noise|rgb|track|^bf$|^new|imagescale|overlaps"
+    r"|[rt]vec|quat|extrin|pose|position|orient|imu|noise|rgb|track|^bf$|^new|imagescale|overlaps"
 )
 """Names of numbers that do not change where a point lies in the image."""
 _EXPECTED = (
@@ -194,7 +190,8 @@ def _refuse_unknown(data: Mapping[str, Any]) -> None:
         value = value.get("data") if isinstance(value, Mapping) else value
         cells = np.ravel(np.array(value, dtype=object)).tolist()
         rows: list[Any] = value if isinstance(value, list) else []
-        matrix = len(cells) in (9, 16) or (rows[2:] and all(np.size(row) > 2 for row in rows))
+        whole = (9, 12, 16) if _plain(key) == "p" else (9, 16)
+        matrix = len(cells) in whole or (rows[2:] and all(np.size(row) > 2 for row in rows))
         if all(map(is_number, cells)) and any(map(float, cells)) and not matrix:
             raise ValueError(
                 f"{key!r} is not known and may change the image; name distortion k1, k2, p1, p2,"
