@@ -217,7 +217,7 @@ def test_several_image_topics_need_a_choice(tmp_path: Path) -> None:
     ("made", "message"),
     [
         ({"focal": 0.0}, "K is all zeros: the camera is not calibrated; give --camera"),
-        ({"model": "equidistant"}, "distortion_model 'equidistant' is not supported"),
+        ({"model": "fov"}, "distortion_model 'fov' is not supported"),
         ({"size": (64, 48)}, "is for images of 64x48, /cam/image_raw is 32x24"),
         ({"encoding": "nv21"}, "encoding 'nv21' is not supported; use one of rgb8, bgr8"),
     ],

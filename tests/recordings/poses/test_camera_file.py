@@ -287,6 +287,35 @@ def test_camera_files_of_other_programs_are_read(tmp_path: Path, text: str) -> N
     assert replace(camera, distortion=RADTAN.distortion) == RADTAN
 
 
+FISHEYE = replace(CAMERA, distortion=(0.1, -0.02, 0.001, 1e-5), model="fisheye")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        KALIBR.replace("radtan", "equidistant"),
+        ORB_SLAM.replace("PinHole", "KannalaBrandt8").replace("p1", "k3").replace("p2", "k4"),
+        json.dumps(FISHEYE.to_dict()),
+        MESSAGE.replace("rational_polynomial", "equidistant").replace("- 0.03\n- 0.0\n", "- 0.0\n"),
+        json.dumps({"K": FLAT, "D": D[:4], **SIZE, "camera_model": "OPENCV_FISHEYE"}),
+        json.dumps({"K": FLAT, "D": [*D[:4], 0], **SIZE, "model": "fisheye"}),
+    ],
+)
+def test_fisheyes_have_k1_to_k4(tmp_path: Path, text: str) -> None:
+    assert read_camera(written(tmp_path, text.replace("- 0.0\n", ""))) == FISHEYE
+
+
+def test_a_fisheye_states_its_distortion(tmp_path: Path) -> None:
+    for fields, message in (
+        ({}, "'distortion_coefficients' is missing"),
+        ({"D": None, "k5": 1.0}, "got k5"),
+        ({"D": D}, "0 or 4 finite coefficients"),
+        ({"k1": 0.1, "p1": 0.01}, "a fisheye has k1, k2, k3, k4, got p1"),
+    ):
+        text = json.dumps({"K": FLAT, **SIZE, "model": "fisheye", **fields})
+        refused(message, read_camera, written(tmp_path, text))
+
+
 def test_zivid_has_no_size(tmp_path: Path) -> None:
     camera = read_camera(written(tmp_path, ZIVID), (640, 480))
     assert camera == replace(CAMERA, distortion=(*CAMERA.distortion[:4], 0.0))
@@ -384,7 +413,7 @@ def test_no_distortion_may_be_stated_in_words(tmp_path: Path) -> None:
         (CALIBRATION.replace("image_width", "breadth"), "'image_width' is missing"),
         (CALIBRATION.replace("640", "wide"), "image size"),
         (CALIBRATION.replace("640", "0"), "width"),
-        (CALIBRATION.replace("plumb_bob", "equidistant"), "equidistant"),
+        (CALIBRATION.replace("plumb_bob", "fov"), "fov"),
         (CALIBRATION.replace("[525.25, 0,", "[525.25,"), "9 numbers, got 8"),
         (CALIBRATION.replace("[0.1, -0.02,", "[true, -0.02,"), "distortion_coefficients"),
         (CALIBRATION.replace("0.03]", "0.03, 0.5, 0.5]"), "0, 4, 5 or 8"),
@@ -408,7 +437,7 @@ def test_no_distortion_may_be_stated_in_words(tmp_path: Path) -> None:
         ({"K": K, "dist": D, "d": D, **SIZE}, "dist and d are the same; keep one"),
         ({"K": K, "image_size": [480, 640, 3]}, r"image size \(width, height\) has 2 numbers"),
         ({**REALSENSE, "coeffs": D, "model": "inverse_brown_conrady"}, "is not supported"),
-        ({**REALSENSE, "coeffs": [0] * 5, "model": "kannala_brandt4"}, "is not supported"),
+        ({**REALSENSE, "coeffs": [0] * 5, "model": "f_theta"}, "is not supported"),
         ({"K": K[:2], **SIZE}, "camera_matrix has 9 numbers, got 6"),
     ],
 )

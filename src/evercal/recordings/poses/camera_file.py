@@ -9,8 +9,9 @@ A camera may stand inside other entries, such as `cam0` of a Kalibr chain. In al
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +32,11 @@ _MODELS = {
         ("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4",
          "kannalabrandt8"), "fisheye"),
 }  # fmt: skip
-_SUPPORTED = ("brown", "none", "zero")
+_SUPPORTED = ("brown", "none", "zero", "fisheye")
 _MODEL_KEYS = ("distortionmodel", "model", "cameramodel", "modeltype", "projectionmodel")
 _LENGTHS = (0, 4, 5, 8)
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FISHEYE = ("k1", "k2", "k3", "k4")
 _ALIASES = {
     "camera_matrix": (
         "cameramatrix", "intrinsicmatrix", "cameraintrinsics", "intrinsics", "intrinsic",
@@ -150,9 +152,10 @@ def _camera(data: Mapping[str, Any], size: tuple[int, int] | None) -> Camera:
     if fields.get("fisheyemodel"):
         raise ValueError("fisheye_model is set; rectify the images or calibrate without it")
     models = {_model_kind(fields[key]): fields[key] for key in _MODEL_KEYS if key in fields}
-    required = (ros or "distortionmodel" in fields) and "none" not in models
-    distortion = _distortion(fields, data, required)
-    for kind in models.keys() - {"brown"}:
+    fisheye = "fisheye" in models
+    required = (ros or fisheye or "distortionmodel" in fields) and "none" not in models
+    distortion = _distortion(fields, data, required, _FISHEYE if fisheye else _COEFFICIENTS)
+    for kind in models.keys() - {"brown", "fisheye"}:
         if kind not in _SUPPORTED or any(distortion):
             raise ValueError(
                 f"distortion_model {models[kind]!r} is not supported with the coefficients"
@@ -161,7 +164,9 @@ def _camera(data: Mapping[str, Any], size: tuple[int, int] | None) -> Camera:
     matrix = _matrix(fields, data)
     width, height = _size(fields, data, None if ros else size)
     _refuse_unknown(data)
-    camera = Camera.from_matrix(matrix, width, height, tuple(distortion))
+    camera = Camera.from_matrix(matrix, width, height)
+    model = "fisheye" if fisheye else "pinhole"
+    camera = replace(camera, distortion=tuple(distortion), model=model)
     # ROS states intrinsics and size of the sensor, before it combines pixels.
     if size != (camera.width, camera.height):
         by = [max(1, int(fields.get(f"binning{axis}") or 1)) for axis in "xy"]
@@ -296,15 +301,19 @@ def _matrix(fields: Mapping[str, Any], data: Mapping[str, Any]) -> np.ndarray:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
-def _distortion(fields: Mapping[str, Any], data: Mapping[str, Any], required: bool) -> list[float]:
+def _distortion(
+    fields: Mapping[str, Any], data: Mapping[str, Any], required: bool, names: Sequence[str]
+) -> list[float]:
     name = "distortion_coefficients"
-    stated = [key for key in _COEFFICIENTS if key in fields]
+    stated = [key for key in names if key in fields]
+    if other := [key for key in _COEFFICIENTS if fields.get(key) and key not in names]:
+        raise ValueError(f"a fisheye has {_listed(names)}, got {_listed(other)}; leave others out")
     if str(fields.get(name, "")).lower() in ("none", "null"):
         numbers = []
     elif name in fields:
         numbers = numbers_of(fields[name], name)
     elif stated:
-        numbers = numbers_of([fields.get(key, 0.0) for key in _COEFFICIENTS], stated[0])
+        numbers = numbers_of([fields.get(key, 0.0) for key in names], stated[0])
         numbers = numbers if any(numbers[5:]) else numbers[:5]
     elif required:
         raise ValueError(
@@ -314,7 +323,7 @@ def _distortion(fields: Mapping[str, Any], data: Mapping[str, Any], required: bo
     else:
         numbers = []
     # Longer models add terms that are mostly zero and can then be dropped.
-    while len(numbers) not in _LENGTHS and numbers[-1] == 0:
+    while len(numbers) not in (_LENGTHS if len(names) > 4 else (0, 4)) and numbers[-1] == 0:
         numbers.pop()
     return numbers
 
