@@ -41,6 +41,7 @@ from .recordings.formats import (
     test_lerobot,
     test_nerfstudio,
     test_scenes,
+    test_wrist,
 )
 
 if TYPE_CHECKING:
@@ -131,6 +132,14 @@ def lerobot(version: str) -> Callable[[Path], Path]:
     return lambda root: test_lerobot.make(root, version, "image")
 
 
+def folder(write: Callable[[Path], None]) -> Callable[[Path], Path]:
+    def make(root: Path) -> Path:
+        write(root)
+        return root
+
+    return make
+
+
 def read_lerobot(root: Path) -> None:
     lens = {"camera": root / "lens.txt", "image_topic": test_lerobot.WRIST}
     recording(root, **lens)
@@ -186,6 +195,13 @@ camera_matrix: {rows: 3, cols: 3, data: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}
 distortion_model: plumb_bob
 distortion_coefficients: {rows: 1, cols: 5, data: [0.1, 0, 0, 0, 0]}
 """
+CHAIN = b"""cam0:
+  camera_model: pinhole
+  intrinsics: [60, 61, 31.5, 23.5]
+  distortion_model: radtan
+  distortion_coeffs: [0.1, 0, 0, 0]
+  resolution: [64, 48]
+"""
 MATRIX = b"60 0 31.5\n0 60 23.5\n0 0 1\n"
 PICTURE = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
 PNG, JPEG = (cv2.imencode(ending, PICTURE)[1].tobytes() for ending in (".png", ".jpg"))
@@ -202,6 +218,9 @@ READERS = {
     "colmap-bin": Reader(colmap("bin"), recording, "sparse/0/*.bin"),
     "colmap-txt": Reader(colmap("txt"), recording, "sparse/0/*.txt"),
     "wrist": Reader(wrist, recording, "wrist/*.*"),
+    "record3d": Reader(folder(test_wrist.record3d), recording, "metadata"),
+    "euroc": Reader(folder(test_wrist.euroc), recording, "mav0/**/*.[cy]*"),
+    "scannet": Reader(folder(test_wrist.scannet), recording, "*/*.txt"),
     "lerobot-2.1": Reader(lerobot("v2.1"), read_lerobot, "**/*.[jp]*"),
     "lerobot-3.0": Reader(lerobot("v3.0"), read_lerobot, "**/*.[jp]*"),
     "bag-ros1": Reader(bag("ros1"), recording, "*.bag"),
@@ -215,6 +234,7 @@ READERS = {
     "camera-text": Reader(file("lens.txt", MATRIX), read_size),
     "camera-json": Reader(file("lens.json", json.dumps(LENS.to_dict()).encode()), read_size),
     "camera-ros": Reader(file("lens.yaml", INFO), read_size),
+    "camera-kalibr": Reader(file("chain.yaml", CHAIN), read_size),
     "camera-npz": Reader(camera_npz, read_size),
     "camera-opencv-yaml": Reader(lambda root: opencv_storage(root, ".yml"), read_size),
     "camera-opencv-xml": Reader(lambda root: opencv_storage(root, ".xml"), read_size),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -74,6 +75,25 @@ def test_calibration_has_the_estimated_transform_and_the_adjusted_camera(
     [scene] = MapStore.open(tmp_path / "s").contents.scenes
     assert calibration.camera == scene.adjusted_camera
     assert scene.adjusted_camera.fx / scene.camera.fx == pytest.approx(1 / 1.01, abs=0.005)
+
+
+def test_intrinsics_that_the_images_contradict_are_shown(
+    run: Any, rooms: Any, tmp_path: Path
+) -> None:
+    room = shutil.copytree(rooms[0], tmp_path / "room")
+    scene = json.loads((room / "scene.json").read_text())
+    for camera in scene["cameras"].values():
+        camera |= {"fx": 1.06 * camera["fx"], "fy": 1.06 * camera["fy"]}
+    (room / "scene.json").write_text(json.dumps(scene))
+    ran = run("learn", tmp_path / "s", room)
+    assert ran.code == 0, ran.err
+    [line] = [line for line in ran.out.splitlines() if "move the corners" in line]
+    found = re.search(r"by (\S+) px: .* stated as (.*), adjusted (.*); check", line)
+    assert found is not None
+    stated, adjusted = (float(part.split()[0]) for part in found.groups()[1:])
+    assert adjusted / stated == pytest.approx(1 / 1.06, abs=0.01)
+    assert float(found[1]) > 3
+    assert "move the corners" not in run("learn", tmp_path / "s2", rooms[0]).out
 
 
 def test_interrupt_leaves_no_map(rooms: Any, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ RECORDINGS = {
     "kitchen": (["images/000000.png"], 1, 0),
     "wave": (["image-1.png", "image-2.png"], 2, 0),
     "timed": (["image-1.png", "image-2.png"], 2, 0),
+    "walk": (["image-1.png", "image-2.png"], 2, 0),
     "redkitchen": (["seq-01/frame-000000.color.png", "seq-02/frame-000000.color.png"], 1, 1),
     "apartment": (["data/frame-000000.color.jpg", "data/frame-000001.color.jpg"], 1, 1),
     "phone": (["images/frame_00001.png"], 0, 1),
@@ -43,6 +45,7 @@ CAMERAS = {
     "camera.json", "camera_info.yaml", "camera_opencv.yaml", "camera_opencv.json",
     "camera_realsense.json",
 }  # fmt: skip
+CHAINS = {"camchain.yaml", "orb_slam.yaml"}
 POSE_FILES = {
     "poses.csv": None, "kuka.txt": "kuka", "poses.tum": None, "kitti.txt": None,
     "matrices.txt": None, "ur.script": None, "frames.dat": None, "poses.json": None,
@@ -65,7 +68,7 @@ def page(tmp_path: Path) -> Path:
 
 def test_every_example_is_read_here() -> None:
     assert PAGE.read_text().count("```") == 2 * len(EXAMPLES)
-    files = SINGLE_FILES | CAMERAS | POSE_FILES.keys()
+    files = SINGLE_FILES | CAMERAS | CHAINS | POSE_FILES.keys()
     assert {name.split("/")[0] for name in EXAMPLES if name not in files} == set(RECORDINGS)
     assert set(EXAMPLES) >= files
 
@@ -108,6 +111,13 @@ def test_camera_files(page: Path, name: str) -> None:
     assert read_camera(page / name) == CAMERA
     expected = Camera(640, 480, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
     assert read_camera(page / "camera.txt", (640, 480)) == expected
+
+
+@pytest.mark.parametrize("name", sorted(CHAINS))
+def test_cameras_inside_other_entries(page: Path, name: str) -> None:
+    camera = read_camera(page / name)
+    assert camera.coefficients == (*CAMERA.distortion[:4], 0, 0, 0, 0)
+    assert replace(camera, distortion=CAMERA.distortion) == CAMERA
 
 
 @pytest.mark.parametrize(("name", "convention"), POSE_FILES.items())

@@ -2,7 +2,7 @@
 
 import dataclasses
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 FEW_LANDMARKS = 50
 """Landmarks a keyframe; of a dark, overexposed or blurred room with 9, 21, 58 and 83 of them, 50,
 60, 100 and 90 % of the images were located."""
+MOST_CORNER_PX = 3.0
+"""Change of the corners of the image by adjusted intrinsics, pixels."""
 
 
 @dataclass(frozen=True)
@@ -263,12 +265,21 @@ def summary(report: "LearnReport") -> Iterator[str]:
 
 def _warnings(adjusted: "Adjusted") -> Iterator[str]:
     from evercal.calibration.hand_eye import MOST_FOCAL_PERCENT
+    from evercal.geometry import Camera
 
     if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
         yield (
             "warning: images and stated poses ask for a focal length"
             f" {adjusted.focal_percent:+.1f} % from the stated one; the intrinsics or the scale of"
             " the poses are wrong"
+        )
+    if adjusted.corner_px > MOST_CORNER_PX:
+        cameras = (Camera.from_dict(camera) for camera in adjusted.intrinsics)
+        stated, now = ((c.fx, c.fy, c.cx, c.cy, *c.distortion) for c in cameras)
+        yield (
+            f"warning: the images move the corners of the image by {adjusted.corner_px:.1f} px: fx,"
+            f" fy, cx, cy and distortion are stated as {_few_digits(stated)}, adjusted"
+            f" {_few_digits(now)}; check the camera file"
         )
     if abs(adjusted.time_shift_frames) > 0.02:
         yield (
@@ -283,3 +294,7 @@ def _warnings(adjusted: "Adjusted") -> Iterator[str]:
         if names:
             more = f" and {len(names) - 8} more" if len(names) > 8 else ""
             yield f"{what}: {', '.join(names[:8])}{more}"
+
+
+def _few_digits(values: Iterable[float]) -> str:
+    return " ".join(f"{value:.5g}" for value in values)

@@ -124,6 +124,10 @@ class Adjusted:
     """Frames that could not be tracked in other images, or not enough; they are excluded."""
     doubtful_poses: tuple[str, ...]
     """Frames whose stated pose has an unusually large error; they were given less weight."""
+    corner_px: float = 0.0
+    """Largest change of a corner of the first frame's image by the intrinsics, pixels."""
+    intrinsics: tuple[dict[str, object], ...] = ()
+    """Its intrinsics as stated and as adjusted; none without adjustment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -464,10 +468,13 @@ def _adjusted(prepared: _Prepared, adjustment: Adjustment | None, camera: Camera
     tangent = adjustment.common.log()
     shift, rotation = 1000 * tangent[:3], np.rad2deg(tangent[3:])
     doubtful = np.flatnonzero(adjustment.weight < 0.25)
+    stated = frames.frames[0].camera
+    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * (stated.width, stated.height) - 0.5
+    moved = np.linalg.norm(camera.project(stated.unproject(corners)) - corners, axis=-1)
     return Adjusted(
         common_translation_mm=(float(shift[0]), float(shift[1]), float(shift[2])),
         common_rotation_deg=(float(rotation[0]), float(rotation[1]), float(rotation[2])),
-        focal_percent=100 * (camera.fx / frames.frames[0].camera.fx - 1),
+        focal_percent=100 * (camera.fx / stated.fx - 1),
         residual_px=adjustment.residual_px,
         pose_sigma_mm=1000 * adjustment.sigma_m,
         pose_sigma_deg=float(np.rad2deg(adjustment.sigma_rad)),
@@ -475,4 +482,6 @@ def _adjusted(prepared: _Prepared, adjustment: Adjustment | None, camera: Camera
         wrong_poses=wrong,
         untracked=untracked,
         doubtful_poses=tuple(frames.frames[i].name for i in doubtful),
+        corner_px=float(np.fmax.reduce(moved, initial=0.0)),
+        intrinsics=(stated.to_dict(), camera.to_dict()),
     )

@@ -38,7 +38,9 @@ FORMATS = {
     "12scenes": Format("twelve_scenes", "info.txt and data"),
     "nerfstudio": Format("nerfstudio", "transforms.json"),
     "colmap": Format("colmap", "sparse/0 with cameras and images"),
-    "wrist": Format("wrist", "images beside base_from_gripper.csv or joints.csv"),
+    "wrist": Format(
+        "wrist", "images beside base_from_gripper.csv, joints.csv, base_from_camera.csv"
+    ),
     "lerobot": Format("lerobot", "meta/info.json"),
     "rosbag": Format("ros_bag", "a .bag or .mcap file or bag folder"),
 }

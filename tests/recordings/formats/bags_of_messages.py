@@ -116,7 +116,7 @@ class Bag:
 
     def info(self, topic: str, focal: float = 30.0, distortion: Iterable[float] = (0.1, 0, 0, 0, 0),
              model: str = "plumb_bob", rectified_focal: float = 28.0,
-             size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:  # fmt: skip
+             size: tuple[int, int] = (WIDTH, HEIGHT), binning: int = 0) -> None:  # fmt: skip
         """A camera_info."""
         k = [focal, 0, 15.0, 0, focal, 11.0, 0, 0, 1] if focal else [0.0] * 9
         p = [rectified_focal, 0, 16.0, 0, 0, rectified_focal, 12.0, 0, 0, 0, 1, 0]
@@ -133,8 +133,8 @@ class Bag:
             width=size[0],
             height=size[1],
             distortion_model=model,
-            binning_x=0,
-            binning_y=0,
+            binning_x=binning,
+            binning_y=binning,
             roi=roi,
             **{name: np.array(value, np.float64) for name, value in values.items()},
         )

@@ -15,6 +15,8 @@ from evercal.recordings import Frame, load_recording, write_image
 from evercal.recordings.formats import nerfstudio
 from evercal.recordings.inspection import inspect_recording
 
+from ..checks import refused
+
 LENS = {"fl_x": 40.0, "fl_y": 42.0, "cx": 13.0, "cy": 17.5, "w": 24, "h": 36,
         "k1": 0.05, "k2": -0.02, "p1": 0.003, "p2": -0.002}  # fmt: skip
 
@@ -178,7 +180,10 @@ def one(matrix: np.ndarray) -> list[dict[str, Any]]:
 BREAKS: list[tuple[dict[str, Any], str]] = [
     ({"camera_model": "OPENCV_FISHEYE"}, "camera_model 'OPENCV_FISHEYE' is not supported, only"),
     ({"is_fisheye": True}, "fisheye images are not supported; undistort"),
-    ({"k4": 0.1}, "k4 is not 0"),
+    ({"k4": 0.1}, "distortion is k1, k2, k3, k4 = 0"),
+    ({"distortion_params": [0.1] * 4}, "distortion is k1, k2, k3, k4 = 0"),
+    ({"distortion_params": [0.1, 0, 0, 0, 0, 0]}, "also as 'distortion_params', got"),
+    ({"test_frames": {}}, "'frames' is a list"),
     ({"fl_x": None, "fl_y": None}, "'fl_x' is missing, and so are"),
     ({"fl_x": None, "camera_angle_x": 28.0}, "'camera_angle_x' is between 0 and pi radians"),
     ({"fl_x": 0}, "fx is finite"),
@@ -211,3 +216,69 @@ def test_broken_files_are_refused(change: dict[str, Any], message: str, tmp_path
     with pytest.raises(InputError, match=message) as caught:
         load_recording(tmp_path)
     assert "transforms.json" in str(caught.value)
+
+
+def test_distortion_params_are_k1_k2_k3_k4_p1_p2(tmp_path: Path) -> None:
+    plain = {key: value for key, value in LENS.items() if key not in ("k1", "k2", "p1", "p2")}
+    params = [0.05, -0.02, 0.01, 0.0, 0.003, -0.002]  # nerfstudio's get_distortion_params
+    write(tmp_path / "top", entries(ring(1)), **plain, distortion_params=params)
+    write(tmp_path / "frame", entries(ring(1), distortion_params=params), **plain)
+    write(tmp_path / "named", entries(ring(1)), **LENS, k3=0.01)
+    cameras = [load_recording(tmp_path / n).train[0].camera for n in ("top", "frame", "named")]
+    assert cameras[0] == cameras[1] == cameras[2]
+
+
+def test_bad_frames_are_left_out(tmp_path: Path) -> None:
+    frames = entries(ring(4))
+    frames[1]["is_bad"], frames[2]["is_bad"] = True, False
+    write(tmp_path, frames, **LENS, test_filenames=["images/frame_00001.png"])
+    recording = load_recording(tmp_path)
+    assert [frame.name[-5] for frame in recording.train] == ["0", "2", "3"]
+    assert (recording.test, recording.untracked) == ((), 1)
+    assert recording.notes[0] == "1 frames are marked as bad and left out"
+
+
+def test_blender_has_a_file_for_each_split(tmp_path: Path) -> None:
+    angle = {"camera_angle_x": 0.6}
+    for split, count in (("train", 3), ("val", 1), ("test", 2)):
+        frames = entries(ring(count))
+        for i, frame in enumerate(frames):
+            frame["file_path"] = f"./{split}/r_{i}.5"  # without ending, with a dot
+            write_image(made(tmp_path / split / f"r_{i}.5.png"), np.zeros((36, 24, 3), np.uint8))
+        file = tmp_path / f"transforms_{split}.json"
+        file.write_text(json.dumps({**angle, "frames": frames}))
+    recording = load_recording(tmp_path)
+    assert (len(recording.train), len(recording.test)) == (3, 3)
+    assert {frame.name.split("/")[1] for frame in recording.test} == {"val", "test"}
+    alone = load_recording(tmp_path / "transforms_test.json")
+    assert (len(alone.train), alone.test, alone.name) == (2, (), tmp_path.name)
+
+
+def made(file: Path) -> Path:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    return file
+
+
+@pytest.mark.parametrize("folder", ["undistorted_images", "resized_undistorted_images"])
+def test_scannetpp_keeps_images_beside_the_folder_of_the_file(folder: str, tmp_path: Path) -> None:
+    frames = [
+        {"file_path": f"DSC{i:05d}.JPG", "transform_matrix": matrix.tolist(), "is_bad": i == 1}
+        for i, matrix in enumerate(ring(5))
+    ]
+    for i in range(5):
+        write_image(made(tmp_path / "dslr" / folder / f"{i}.png"), np.zeros((36, 24, 3), np.uint8))
+        (tmp_path / "dslr" / folder / f"{i}.png").rename(
+            tmp_path / "dslr" / folder / f"DSC{i:05d}.JPG"
+        )
+    data = {**LENS, "camera_model": "PINHOLE", "frames": frames[:3], "test_frames": frames[3:]}
+    file = made(tmp_path / "dslr" / "nerfstudio" / "transforms_undistorted.json")
+    file.write_text(json.dumps(data))
+    file.with_name("transforms.json").write_text(
+        json.dumps(data | {"camera_model": "OPENCV_FISHEYE"})
+    )
+    for root in (tmp_path, file, file.parent):
+        recording = load_recording(root)
+        assert [frame.name for frame in recording.train] == ["DSC00000.JPG", "DSC00002.JPG"]
+        assert [frame.name for frame in recording.test] == ["DSC00003.JPG", "DSC00004.JPG"]
+        assert recording.untracked == 1
+    refused("OPENCV_FISHEYE", load_recording, file.with_name("transforms.json"))

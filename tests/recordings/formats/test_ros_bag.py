@@ -67,6 +67,14 @@ def test_old_ros2_bags_without_definitions_are_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_recording(path).train[4].read_image(), picture(4))
 
 
+def test_binned_images_have_smaller_intrinsics(tmp_path: Path) -> None:
+    bag = arm(Bag("mcap"))
+    bag.image(1.0, "/camera/image_raw", picture(0))
+    bag.info("/camera/camera_info", focal=60.0, size=(64, 48), binning=2)
+    [frame] = load_recording(bag.write(tmp_path)).train
+    assert frame.camera == Camera(64, 48, 60, 60, 15, 11, CAMERA.distortion).resized(32, 24)
+
+
 def test_every_second_image_is_taken(tmp_path: Path) -> None:
     path = recorded_bag("ros1").write(tmp_path)
     recording = load_recording(path, options=ReadOptions(every=2))
@@ -209,7 +217,7 @@ def test_several_image_topics_need_a_choice(tmp_path: Path) -> None:
     ("made", "message"),
     [
         ({"focal": 0.0}, "K is all zeros: the camera is not calibrated; give --camera"),
-        ({"model": "equidistant"}, "distortion_model 'equidistant' is not supported"),
+        ({"model": "fov"}, "distortion_model 'fov' is not supported"),
         ({"size": (64, 48)}, "is for images of 64x48, /cam/image_raw is 32x24"),
         ({"encoding": "nv21"}, "encoding 'nv21' is not supported; use one of rgb8, bgr8"),
     ],

@@ -1,7 +1,7 @@
 """A folder of images and gripper poses, paired by name, by time or in order."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -180,10 +180,183 @@ def test_missing_and_ambiguous_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "joints.csv").write_text("a\n1\n")
     refused(r"holds base_from_gripper\.csv and joints\.csv", load_recording, tmp_path)
     (tmp_path / "joints.csv").unlink()
-    with pytest.raises(InputError, match=r"--gripper-frame: .* holds gripper poses already"):
+    write_image(tmp_path / "1.png", np.zeros((24, 32, 3), np.uint8))
+    with pytest.raises(InputError, match=r"--gripper-frame: .* holds poses already"):
         load_recording(tmp_path, options=ReadOptions(gripper_frame="tool0"))
     (tmp_path / "base_from_gripper.csv").unlink()
     refused("no gripper poses; expected base_from_gripper", wrist.load, tmp_path)
+
+
+CAMERA_POSES = some_poses(4, seed=5)
+LENS_TEXT = "30 0 15\n0 31 11\n0 0 1\n"
+PLAIN = Camera(32, 24, 30.0, 31.0, 15.0, 11.0)
+GL = np.diag([1.0, -1.0, -1.0, 1.0])
+BODY_FROM_CAMERA = some_poses(1, seed=6)[0]
+
+
+def quaternions(poses: SE3) -> np.ndarray:
+    """(n, 7) x y z qw qx qy qz."""
+    return np.hstack([poses.translation_m, poses.rotation_wxyz])
+
+
+def matrix_files(folder: Path, names: Sequence[str], poses: SE3) -> None:
+    folder.mkdir(parents=True)
+    for name, pose in zip(names, poses, strict=True):
+        np.savetxt(folder / name, pose.matrix())
+
+
+def table(root: Path) -> None:
+    make_folder(root, [f"{i}.png" for i in range(4)], None, "images")
+    (root / "camera.json").unlink()
+    (root / "camera.txt").write_text(LENS_TEXT)
+    rows = quaternions(CAMERA_POSES)
+    np.savetxt(root / "base_from_camera.csv", rows, delimiter=",", header="x,y,z,qw,qx,qy,qz")
+
+
+def tum(root: Path) -> None:
+    """As https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats describes it."""
+    make_folder(root, [f"{1305031102.1 + i:.6f}.png" for i in range(4)], None, "rgb")
+    (root / "camera.json").unlink()
+    (root / "camera.txt").write_text(LENS_TEXT)
+    rows = quaternions(CAMERA_POSES)[:, [0, 1, 2, 4, 5, 6, 3]]
+    lines = [
+        f"{1305031102.1 + i + d:.4f} {' '.join(map(str, row))}"
+        for i, row in enumerate(rows) for d in (-0.01, 0.01)
+    ]  # fmt: skip
+    comments = "# ground truth trajectory\n# file: 'a.bag'\n# timestamp tx ty tz qx qy qz qw\n"
+    (root / "groundtruth.txt").write_text(comments + "\n".join(lines))
+
+
+def euroc(root: Path) -> None:
+    """ASL's layout: poses of the body in nanoseconds, and the camera on it in sensor.yaml."""
+    mav = root / "mav0"
+    stamps = [1403636579763555584 + 50_000_000 * i for i in range(4)]
+    make_folder(mav, [f"{stamp}.png" for stamp in stamps], None, "cam0/data")
+    numbers = ", ".join(map(str, BODY_FROM_CAMERA.matrix().ravel()))
+    (mav / "cam0" / "sensor.yaml").write_text(
+        f"sensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n  data: [{numbers}]\nrate_hz: 20\n"
+        "resolution: [32, 24]\ncamera_model: pinhole\nintrinsics: [30, 31, 15, 11]\n"
+        "distortion_model: radial-tangential\ndistortion_coefficients: [0, 0, 0, 0]\n"
+    )
+    names = ["timestamp", *(f" p_RS_R_{a} [m]" for a in "xyz"), *(f" q_RS_{a} []" for a in "wxyz"),
+             *(f" v_RS_R_{a} [m s^-1]" for a in "xyz"),
+             *(f" b_w_RS_S_{a} [rad s^-1]" for a in "xyz")]  # fmt: skip
+    rows = quaternions(CAMERA_POSES @ BODY_FROM_CAMERA.inverse())
+    lines = [
+        ",".join(map(str, [stamp, *row, *[0.1] * 6]))
+        for stamp, row in zip(stamps, rows, strict=True)
+    ]
+    (mav / "state_groundtruth_estimate0").mkdir()
+    file = mav / "state_groundtruth_estimate0" / "data.csv"
+    file.write_text("#" + ",".join(names) + "\n" + "\n".join(lines))
+
+
+def scannet(root: Path) -> None:
+    """As ScanNet's SensReader writes it: matrices of 4x4, also of the intrinsics."""
+    make_folder(root, [f"{i}.png" for i in range(5)], None, "color")
+    matrix_files(root / "pose", [f"{i}.txt" for i in range(4)], CAMERA_POSES)
+    np.savetxt(root / "pose" / "4.txt", np.full((4, 4), -np.inf))
+    (root / "intrinsic").mkdir()
+    matrix = np.eye(4)
+    matrix[:3, :3] = PLAIN.matrix()
+    np.savetxt(root / "intrinsic" / "intrinsic_color.txt", matrix)
+
+
+def ace(root: Path) -> None:
+    """As the scripts of ACE write 7-Scenes, but with a 3x3 matrix; a half for testing."""
+    for split, part in (("train", (0, 1)), ("test", (2, 3))):
+        names = [f"seq-01-frame-{i:06d}" for i in part]
+        make_folder(root / split, [f"{name}.color.png" for name in names], None, "rgb")
+        poses = CAMERA_POSES[np.array(part)]
+        matrix_files(root / split / "poses", [f"{name}.pose.txt" for name in names], poses)
+        (root / split / "calibration").mkdir()
+        for name in names:
+            file = root / split / "calibration" / f"{name}.calibration.txt"
+            file.write_text(LENS_TEXT)
+
+
+def record3d(root: Path) -> None:
+    """Quaternion, then position, OpenGL's axes, and a matrix column after column."""
+    make_folder(root, [f"{i}.png" for i in range(4)], None, "rgb")
+    rows = quaternions(SE3.from_matrix(CAMERA_POSES.matrix() @ GL))[:, [4, 5, 6, 3, 0, 1, 2]]
+    data = {"w": 32, "h": 24, "dw": 16, "dh": 12, "fps": 60, "K": PLAIN.matrix().T.ravel().tolist(),
+            "poses": rows.tolist()}  # fmt: skip
+    (root / "metadata").write_text(json.dumps(data))
+
+
+@pytest.mark.parametrize("write", [table, tum, euroc, scannet, ace, record3d])
+def test_folders_of_camera_poses_are_read(tmp_path: Path, write: Callable[[Path], object]) -> None:
+    write(tmp_path)
+    recording = load_recording(tmp_path)
+    assert len(recording.test) == (2 if write is ace else 0)
+    frames = [*recording.train, *recording.test]
+    for frame, pose in zip(frames, CAMERA_POSES, strict=True):
+        assert_pose(frame.base_from_camera, pose, 1e-5 if write is tum else 1e-7)
+        assert frame.base_from_gripper is None
+        assert frame.camera == PLAIN
+        assert frame.read_image().shape == (24, 32, 3)
+    assert recording.untracked == (write is scannet)
+    assert recording.metric
+
+
+def test_cameras_of_single_images_are_read(tmp_path: Path) -> None:
+    ace(tmp_path / "ace")
+    file = tmp_path / "ace/train/calibration/seq-01-frame-000001.calibration.txt"
+    file.write_text("33.5")
+    cameras = [frame.camera for frame in load_recording(tmp_path / "ace").train]
+    assert cameras == [PLAIN, Camera(32, 24, 33.5, 33.5, 15.5, 11.5)]
+    file.unlink()
+    refused("camera file is missing", load_recording, tmp_path / "ace")
+    own = ReadOptions(camera=tmp_path / "ace/train/calibration/seq-01-frame-000000.calibration.txt")
+    assert load_recording(tmp_path / "ace", options=own).train[1].camera == PLAIN
+    record3d(tmp_path / "phone")
+    metadata = tmp_path / "phone" / "metadata"
+    data = json.loads(metadata.read_text())
+    data["perFrameIntrinsicCoeffs"] = [[30 + i, 31 + i, 15, 11] for i in range(4)]
+    metadata.write_text(json.dumps(data))
+    focal = [frame.camera.fx for frame in load_recording(tmp_path / "phone").train]
+    assert focal == [30, 31, 32, 33]
+
+
+def test_broken_camera_poses_are_refused(tmp_path: Path) -> None:
+    for write in (scannet, euroc, record3d, table):
+        write(tmp_path / write.__name__)
+    np.savetxt(tmp_path / "scannet" / "pose" / "2.txt", np.diag([2.0, 2, 2, 1]))
+    refused("pose: .*rotation", load_recording, tmp_path / "scannet")
+    for file in (tmp_path / "scannet" / "pose").glob("*.txt"):
+        file.write_text("-inf " * 16)
+    refused("holds no pose of an image", load_recording, tmp_path / "scannet")
+    sensor = tmp_path / "euroc/mav0/cam0/sensor.yaml"
+    text = sensor.read_text()
+    sensor.write_text(text.replace("T_BS", "T_CB"))
+    refused(r"sensor\.yaml: 'T_BS' is a list of numbers", load_recording, tmp_path / "euroc")
+    sensor.unlink()
+    refused(r"sensor\.yaml: camera file is missing", load_recording, tmp_path / "euroc")
+    metadata = tmp_path / "record3d" / "metadata"
+    for change, message in (
+        ({"poses": None}, "'poses' is a list of qx"),
+        ({"poses": [[1, 0, 0, 0]]}, "'poses' is a list of qx"),
+        ({"K": None}, "camera_matrix"),
+        ({"w": None}, "camera width is"),
+    ):
+        data = json.loads(metadata.read_text()) | change
+        (tmp_path / "record3d" / "metadata.json").write_text(json.dumps(data))
+        metadata.rename(tmp_path / "kept")
+        refused(message, load_recording, tmp_path / "record3d")
+        (tmp_path / "kept").rename(metadata)
+    refused("holds metadata and metadata.json; keep", load_recording, tmp_path / "record3d")
+    write_poses(tmp_path / "table" / "base_from_gripper.csv", CAMERA_POSES)
+    refused(
+        "holds base_from_gripper.csv and base_from_camera.csv", load_recording, tmp_path / "table"
+    )
+
+
+def test_the_one_pose_of_a_fixed_camera_is_no_table(tmp_path: Path) -> None:
+    make_folder(tmp_path, ["1.png", "2.png"], None)
+    np.savetxt(tmp_path / "base_from_camera.txt", np.eye(4))
+    assert not wrist.detect(tmp_path)
+    np.savetxt(tmp_path / "base_from_camera.txt", CAMERA_POSES[:2].matrix().reshape(2, 16))
+    assert_pose(load_recording(tmp_path).train[1].base_from_camera, CAMERA_POSES[1])
 
 
 @pytest.mark.parametrize(

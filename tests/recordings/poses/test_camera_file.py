@@ -1,6 +1,7 @@
 """Intrinsics from text, JSON and ROS files: the same camera from each, and damage named."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,8 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
+from evercal.calibration.boards.board_poses import BoardPoses
+from evercal.calibration.boards.detection import Board
+from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
-from evercal.geometry import Camera
+from evercal.geometry import SE3, Camera
 from evercal.recordings.poses.camera_file import read_camera
 
 from ..checks import refused
@@ -119,9 +123,11 @@ def test_opencv_storage_is_read(tmp_path: Path) -> None:
 
 
 def test_ros_files_state_their_distortion(tmp_path: Path) -> None:
-    text = CALIBRATION.replace("distortion_coefficients", "lens")
-    refused("'distortion_coefficients' is missing", read_camera, written(tmp_path, text))
-    assert read_camera(written(tmp_path, text + "d: [0, 0, 0, 0]\n")).distortion == ()
+    text = CALIBRATION.replace("0.1, -0.02, 0.001, 1e-05, 0.03", "0, 0, 0, 0, 0")
+    other = text.replace("distortion_coefficients", "lens")
+    refused("'distortion_coefficients' is missing", read_camera, written(tmp_path, other))
+    assert read_camera(written(tmp_path, text)).distortion == ()
+    assert read_camera(written(tmp_path, other.replace("plumb_bob", "none"))).distortion == ()
     old = MESSAGE.replace("d:\n", "D:\n").replace("k: [", "K: [")  # ROS 1
     assert read_camera(written(tmp_path, old)).fx == CAMERA.fx
     longer = CALIBRATION.replace("1e-05, 0.03]", "1e-05, 0.03, 0, 0, 0, 0, 0, 0, 0]")
@@ -190,6 +196,208 @@ def test_files_with_a_matrix_alone_have_no_distortion(tmp_path: Path) -> None:
     assert read_camera(stored(tmp_path, dist_coeffs=np.zeros(5))) == ideal
 
 
+KALIBR = """\
+cam0:
+  camera_model: pinhole
+  intrinsics: [525.25, 526.5, 319.5, 239.25]
+  distortion_model: radtan
+  distortion_coeffs: [0.1, -0.02, 0.001, 1e-05]
+  T_cam_imu:
+  - [0.0148, -0.9998, 0.0041, -0.0216]
+  - [0.9995, 0.0149, 0.0257, -0.0646]
+  - [-0.0257, 0.0037, 0.9996, 0.0098]
+  - [0.0, 0.0, 0.0, 1.0]
+  timeshift_cam_imu: -8.121e-05
+  cam_overlaps: [1]
+  rostopic: /cam0/image_raw
+  resolution: [640, 480]
+"""
+EUROC = """\
+sensor_type: camera
+comment: VI-Sensor cam0 (MT9M034)
+T_BS:
+  cols: 4
+  rows: 4
+  data: [0, -1, 0, -0.02, 1, 0, 0, -0.06, 0, 0, 1, 0.01, 0, 0, 0, 1]
+rate_hz: 20
+resolution: [640, 480]
+camera_model: pinhole
+intrinsics: [525.25, 526.5, 319.5, 239.25] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [0.1, -0.02, 0.001, 1e-05]
+"""
+ORB_SLAM = """\
+%YAML:1.0
+
+File.version: "1.0"
+Camera.type: "PinHole"
+Camera1.fx: 525.25
+Camera1.fy: 526.5
+Camera1.cx: 319.5
+Camera1.cy: 239.25
+Camera1.k1: 0.1
+Camera1.k2: -0.02
+Camera1.p1: 0.001
+Camera1.p2: 1e-05
+Camera.width: 640
+Camera.height: 480
+Camera.newWidth: 320
+Camera.fps: 30.0
+Camera.RGB: 1
+Camera.bf: 47.9
+ORBextractor.nFeatures: 1200
+ORBextractor.scaleFactor: 1.2
+IMU.T_b_c1: !!opencv-matrix
+   rows: 4
+   cols: 4
+   dt: f
+   data: [1, 0, 0, 0.1, 0, 1, 0, 0.2, 0, 0, 1, 0.3, 0, 0, 0, 1]
+Viewer.ViewpointF: 500.0
+"""
+VINS = """\
+%YAML:1.0
+---
+model_type: PINHOLE
+camera_name: camera
+image_width: 640
+image_height: 480
+distortion_parameters:
+   k1: 0.1
+   k2: -0.02
+   p1: 0.001
+   p2: 1e-05
+projection_parameters:
+   fx: 525.25
+   fy: 526.5
+   cx: 319.5
+   cy: 239.25
+"""
+ZIVID = """\
+__version__: {serializer: 1, data: 12}
+CameraMatrix: {CX: 319.5, CY: 239.25, FX: 525.25, FY: 526.5}
+Distortion: {K1: 0.1, K2: -0.02, K3: 0, P1: 0.001, P2: 0.00001}
+"""
+RADTAN = replace(CAMERA, distortion=CAMERA.distortion[:4])
+
+
+@pytest.mark.parametrize("text", [KALIBR, EUROC, ORB_SLAM, ORB_SLAM.replace("a1.", "a."), VINS])
+def test_camera_files_of_other_programs_are_read(tmp_path: Path, text: str) -> None:
+    camera = read_camera(written(tmp_path, text))
+    assert camera.coefficients == RADTAN.coefficients
+    assert replace(camera, distortion=RADTAN.distortion) == RADTAN
+
+
+FISHEYE = replace(CAMERA, distortion=(0.1, -0.02, 0.001, 1e-5), model="fisheye")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        KALIBR.replace("radtan", "equidistant"),
+        ORB_SLAM.replace("PinHole", "KannalaBrandt8").replace("p1", "k3").replace("p2", "k4"),
+        json.dumps(FISHEYE.to_dict()),
+        MESSAGE.replace("rational_polynomial", "equidistant").replace("- 0.03\n- 0.0\n", "- 0.0\n"),
+        json.dumps({"K": FLAT, "D": D[:4], **SIZE, "camera_model": "OPENCV_FISHEYE"}),
+        json.dumps({"K": FLAT, "D": [*D[:4], 0], **SIZE, "model": "fisheye"}),
+    ],
+)
+def test_fisheyes_have_k1_to_k4(tmp_path: Path, text: str) -> None:
+    assert read_camera(written(tmp_path, text.replace("- 0.0\n", ""))) == FISHEYE
+
+
+def test_a_fisheye_states_its_distortion(tmp_path: Path) -> None:
+    for fields, message in (
+        ({}, "'distortion_coefficients' is missing"),
+        ({"D": None, "k5": 1.0}, "got k5"),
+        ({"D": D}, "0 or 4 finite coefficients"),
+        ({"k1": 0.1, "p1": 0.01}, "a fisheye has k1, k2, k3, k4, got p1"),
+    ):
+        text = json.dumps({"K": FLAT, **SIZE, "model": "fisheye", **fields})
+        refused(message, read_camera, written(tmp_path, text))
+
+
+def test_zivid_has_no_size(tmp_path: Path) -> None:
+    camera = read_camera(written(tmp_path, ZIVID), (640, 480))
+    assert camera == replace(CAMERA, distortion=(*CAMERA.distortion[:4], 0.0))
+    refused("no image size", read_camera, written(tmp_path, ZIVID))
+
+
+def test_a_camera_may_stand_inside_other_entries(tmp_path: Path) -> None:
+    numbers = {"fx": CAMERA.fx, "fy": CAMERA.fy, "cx": CAMERA.cx, "cy": CAMERA.cy}
+    named = dict(zip(("k1", "k2", "p1", "p2", "k3"), D, strict=True))
+    for fields in (
+        {"camera": CAMERA.to_dict(), "matrix": np.eye(4).tolist(), "sigma_mm": 0.4},
+        {"camera_info": {"K": K, "D": D, **SIZE}},
+        {"intrinsics": numbers, "distortion": named, **SIZE},
+        {
+            "cameras": [{"name": "left", "intrinsics": {**numbers, **named}}],
+            "resolution": [640, 480],
+        },
+        {"rig": {"front": {"K": K}}, "dist": D, **SIZE},
+        {"K": [*FLAT[:3], 0, *FLAT[3:6], 0, *FLAT[6:], 0, 0, 0, 0, 1], "kc": D, **SIZE},
+    ):
+        assert read_camera(written(tmp_path, json.dumps(fields))) == CAMERA
+        assert read_camera(written(tmp_path, yaml.safe_dump(fields))) == CAMERA
+
+
+def test_detected_boards_and_calibrations_are_camera_files(tmp_path: Path) -> None:
+    file = tmp_path / "saved.json"
+    Calibration("eye_to_hand", SE3.identity(), np.eye(6), camera=CAMERA).write(file)
+    assert read_camera(file, (640, 480)) == CAMERA
+    BoardPoses(Board("chessboard", 0.025, 9, 6), CAMERA, (), 0.1).write(file)
+    assert read_camera(file, (640, 480)) == CAMERA
+
+
+def test_of_several_cameras_the_one_of_the_images_is_read(tmp_path: Path) -> None:
+    second = KALIBR.replace("cam0", "cam1").replace("525.25", "500")
+    file = written(tmp_path, KALIBR + second)
+    refused(r"several cameras: cam0 \(640x480, fx 525\.2\), cam1 \(.*", read_camera, file)
+    refused("give a file of the right one", read_camera, file, (640, 480))
+    written(tmp_path, KALIBR + second.replace("[640, 480]", "[1280, 960]"))
+    assert read_camera(file, (640, 480)) == RADTAN
+    assert read_camera(written(tmp_path, KALIBR + KALIBR.replace("cam0", "cam1"))) == RADTAN
+    written(tmp_path, KALIBR + second.replace("radtan", "fov"))
+    refused("cam1: distortion_model 'fov' is not supported", read_camera, file)
+    stereo = ORB_SLAM.replace("a1.", "a.") + "LEFT.K: [600, 0, 320, 0, 600, 240, 0, 0, 1]\n"
+    refused("outside of these .*, LEFT", read_camera, written(tmp_path, stereo + "LEFT.D: [0]\n"))
+
+
+def test_opencv_stores_a_camera_inside_a_map(tmp_path: Path) -> None:
+    for ending in ("yml", "xml", "json"):
+        file = str(tmp_path / f"nested.{ending}")
+        storage = cv2.FileStorage(file, cv2.FILE_STORAGE_WRITE)
+        storage.write("board", "9x6")
+        storage.startWriteStruct("left", cv2.FileNode_MAP)
+        storage.write("K", CAMERA.matrix())
+        storage.write("D", np.array(D))  # OpenCV 5 writes opencv-nd-matrix
+        storage.startWriteStruct("resolution", cv2.FileNode_SEQ | cv2.FileNode_FLOW)
+        storage.write("", 640)
+        storage.write("", 480)
+        storage.endWriteStruct()
+        storage.endWriteStruct()
+        storage.release()
+        assert read_camera(file) == CAMERA
+
+
+def test_binned_pixels_shrink_the_intrinsics(tmp_path: Path) -> None:
+    file = written(tmp_path, MESSAGE.replace("roi:", "binning_x: 2\nbinning_y: 2\nroi:"))
+    half = replace(CAMERA, distortion=(*CAMERA.distortion, 0.0, 0.0, 0.0)).resized(320, 240)
+    assert read_camera(file) == read_camera(file, (320, 240)) == half
+    assert read_camera(file, (640, 480)).fx == CAMERA.fx  # of drivers that state the image's size
+
+
+def test_a_focal_length_alone_has_its_principal_point_in_the_middle(tmp_path: Path) -> None:
+    assert read_camera(written(tmp_path, "525.25\n"), (640, 480)) == Camera(
+        640, 480, 525.25, 525.25, 319.5, 239.5
+    )
+
+
+def test_no_distortion_may_be_stated_in_words(tmp_path: Path) -> None:
+    for fields in ({"distortion": None}, {"dist": "none"}, {"model": "none"}, {"model": None}):
+        file = written(tmp_path, yaml.safe_dump({"K": K, **SIZE, **fields}))
+        assert read_camera(file) == CAMERA.pinhole
+
+
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
@@ -205,7 +413,7 @@ def test_files_with_a_matrix_alone_have_no_distortion(tmp_path: Path) -> None:
         (CALIBRATION.replace("image_width", "breadth"), "'image_width' is missing"),
         (CALIBRATION.replace("640", "wide"), "image size"),
         (CALIBRATION.replace("640", "0"), "width"),
-        (CALIBRATION.replace("plumb_bob", "equidistant"), "equidistant"),
+        (CALIBRATION.replace("plumb_bob", "fov"), "fov"),
         (CALIBRATION.replace("[525.25, 0,", "[525.25,"), "9 numbers, got 8"),
         (CALIBRATION.replace("[0.1, -0.02,", "[true, -0.02,"), "distortion_coefficients"),
         (CALIBRATION.replace("0.03]", "0.03, 0.5, 0.5]"), "0, 4, 5 or 8"),
@@ -213,11 +421,23 @@ def test_files_with_a_matrix_alone_have_no_distortion(tmp_path: Path) -> None:
         (MESSAGE.replace("525.25", "0.0"), "fx"),
         ({"K": K, "D": D}, "'image_width' is missing .no image size"),
         ({"K": K, "D": D, "width": 640}, "'image_height' is missing"),
-        ({"K": K, "distortion_parameters": D, **SIZE}, "there is distortion_parameters"),
+        ({"K": K, "radial": D[:2], **SIZE}, "'radial' is not known and may change the image"),
+        ({"K": K, "lens": {"data": D}, **SIZE}, "'lens' is not known"),
+        ({"K": K, "dc": [D], **SIZE}, "'dc' is not known"),
+        ({"K": K, "dist_vec": D, **SIZE}, "'dist_vec' is not known"),
+        ({"K": K, "r": D[:2], "D": [0] * 5, **SIZE}, "'r' is not known"),
+        ({"K": K, "dist": D, "xi": 1, **SIZE}, "'xi' is not known"),
+        ({"camera": {"K": K, **SIZE}, "tangential": [1e-3, 0]}, "'tangential' is not known"),
+        ({"K": K, "distortion_params": [0.1] * 6, **SIZE}, "0, 4, 5 or 8"),
+        ({"K": K, "dist": D, "model": "none", **SIZE}, "'none' is not supported with"),
+        ({"intrinsics": [525, 319.5, 526, 239.3], **SIZE}, "9 numbers, got 4"),
+        ({"fx": 4.2, "fy": 4.2, "cx": 320, "cy": 240, **SIZE}, "fx 4.2, .* do not fit 640x480"),
+        ({"fx": 0.82, "fy": 1.1, "cx": 0.5, "cy": 0.5, **SIZE}, "give them in pixels"),
+        ({"fx": 1160, "fy": 1160, "cx": 650, "cy": 480, **SIZE}, "and of this image size"),
         ({"K": K, "dist": D, "d": D, **SIZE}, "dist and d are the same; keep one"),
         ({"K": K, "image_size": [480, 640, 3]}, r"image size \(width, height\) has 2 numbers"),
         ({**REALSENSE, "coeffs": D, "model": "inverse_brown_conrady"}, "is not supported"),
-        ({**REALSENSE, "coeffs": [0] * 5, "model": "kannala_brandt4"}, "is not supported"),
+        ({**REALSENSE, "coeffs": [0] * 5, "model": "f_theta"}, "is not supported"),
         ({"K": K[:2], **SIZE}, "camera_matrix has 9 numbers, got 6"),
     ],
 )

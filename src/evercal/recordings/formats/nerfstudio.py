@@ -1,10 +1,11 @@
-"""nerfstudio's `transforms.json`, as written by phone apps and `ns-process-data`.
+"""nerfstudio's `transforms.json`, as written by phone apps, `ns-process-data` and ScanNet++.
 
 `transform_matrix` is the camera in the world with OpenGL's axes (y up, looking along -z).
 Intrinsics stand at the top or in each frame. The centre of the top-left pixel is (0.5, 0.5), as in
 COLMAP. `applied_transform` and `applied_scale` are undone, so the base frame and the unit of length
-are set by the program that estimated the poses. Files in `val_filenames` and `test_filenames` are
-test frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data conventions.)
+are set by the program that estimated the poses. Files in `val_filenames` and `test_filenames`,
+entries of `test_frames`, and Blender's transforms_val.json and transforms_test.json are test
+frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data conventions.)
 """
 
 import math
@@ -31,9 +32,17 @@ from evercal.recordings.text_files import (
 )
 
 FILE = "transforms.json"
+# The first one there is read. ScanNet++ keeps undistorted images beside those of the fisheye lens.
+_FILES = (
+    "transforms_undistorted.json", FILE, "transforms_train.json",
+    "nerfstudio/transforms_undistorted.json", f"nerfstudio/{FILE}",
+    "dslr/nerfstudio/transforms_undistorted.json", f"dslr/nerfstudio/{FILE}",
+)  # fmt: skip
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 # OpenGL axes (right, up, backward) from OpenCV axes (right, down, forward).
 _GL_FROM_CV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
+_LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""Numbers of `distortion_params`, in this order."""
 _TOLERANCE = 1e-2
 USES = ("metres",)
 
@@ -49,41 +58,63 @@ def frame_note(file: str, metric: bool) -> str:
 
 
 def detect(root: Path) -> bool:
-    """Whether `root` holds, or is, a transforms.json."""
-    return (root / FILE).is_file() or (root.name == FILE and root.is_file())
+    """Whether `root` holds, or is, a transforms.json or a file of that kind."""
+    named = root.name.startswith("transforms") and root.suffix == ".json" and root.is_file()
+    return named or any((root / name).is_file() for name in _FILES)
 
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read the poses and the size of one image of every camera; no other image is opened."""
     metric = options is not None and options.metres
-    file = root if root.is_file() else root / FILE
-    root = file.parent
+    files = [root / name for name in _FILES if (root / name).is_file()] or [root / FILE]
+    file = root if root.is_file() else files[0]
+    frames, test, bad = _frames(file)
+    if file.name == "transforms_train.json" and not root.is_file():
+        for other in (root / f"transforms_{split}.json" for split in ("val", "test")):
+            if other.is_file():
+                more, _, left_out = _frames(other)
+                frames, bad = [*frames, *more], bad + left_out
+                test |= {frame.image for frame in more if isinstance(frame.image, Path)}
+    with named_errors(file, "nerfstudio file"):
+        refuse_repeated((frame.name for frame in frames), "keep one entry for each image")
+    notes = [f"{bad} frames are marked as bad and left out"] if bad else []
+    return Recording(
+        (root if root.is_dir() else file.parent).resolve().name,
+        tuple(frame for frame in frames if frame.image not in test),
+        tuple(frame for frame in frames if frame.image in test),
+        bad,
+        notes=(*notes, frame_note(file.name, metric)),
+        metric=metric,
+    )
+
+
+def _frames(file: Path) -> tuple[list[Frame], set[Path], int]:
+    """Frames of a file, images of test frames, and the number of frames that are marked as bad."""
     data = read_json(file, "nerfstudio file", "export it again")
     with named_errors(file, "nerfstudio file"):
         undo, scale = _applied(data)
-        entries = data.get("frames")
-        if not isinstance(entries, list) or not entries:
+        entries, tested = data.get("frames"), data.get("test_frames", [])
+        if not isinstance(entries, list) or not isinstance(tested, list) or not entries:
             raise ValueError("'frames' is a list with at least one frame")
-        first = entries[0]
-        # Without a stated image size, that of the first image is taken.
-        if isinstance(first, dict) and "file_path" in first and not {"w", "h"} & {*data, *first}:
-            width, height = image_size(_image(root, str(first["file_path"])))
-            data |= {"w": width, "h": height}
-        frames = []
-        for i, entry in enumerate(entries):
+        root, first = file.parent, entries[0]
+        if isinstance(first, dict) and "file_path" in first:
+            kind = "undistorted_images" if "undistorted" in file.name else "images"
+            folders = (root, root.parent / kind, root.parent / f"resized_{kind}")
+            name = str(first["file_path"])
+            root = next((each for each in folders if _image(each, name).is_file()), root)
+            # Without a stated image size, that of the first image is taken.
+            if not {"w", "h"} & {*data, *first}:
+                width, height = image_size(_image(root, name))
+                data |= {"w": width, "h": height}
+        every, frames = [*entries, *tested], []
+        bad = [isinstance(each, dict) and bool(each.get("is_bad")) for each in every]
+        for i, entry in ((i, entry) for i, entry in enumerate(every) if not bad[i]):
             with naming(f"frame {i}"):
                 frames.append(_frame(root, data, entry, undo, scale))
-        test = _test_images(root, data, {frame.image for frame in frames})
-        refuse_repeated((frame.name for frame in frames), "keep one entry for each image")
+        images = [_image(root, str(each.get("file_path"))) for each in every]
+        test = _test_images(root, data, images) | {*images[len(entries) :]}
     require_images(frames, file)
-    frames = _resized(file, frames)
-    return Recording(
-        root.resolve().name,
-        tuple(frame for frame in frames if frame.image not in test),
-        tuple(frame for frame in frames if frame.image in test),
-        notes=(frame_note(FILE, metric),),
-        metric=metric,
-    )
+    return _resized(file, frames), test, sum(bad)
 
 
 def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
@@ -114,9 +145,9 @@ def _frame(root: Path, data: Mapping[str, object], entry: object, undo: SE3, sca
 
 def _image(root: Path, name: str) -> Path:
     image = root / name
-    if image.suffix:
+    if image.suffix.lower() in IMAGE_ENDINGS:
         return image
-    return next((f for e in IMAGE_ENDINGS if (f := image.with_suffix(e)).is_file()), image)
+    return next((f for e in IMAGE_ENDINGS if (f := Path(f"{image}{e}")).is_file()), image)
 
 
 def _camera(data: Mapping[str, object]) -> Camera:
@@ -128,8 +159,12 @@ def _camera(data: Mapping[str, object]) -> Camera:
         )
     if data.get("is_fisheye"):
         raise ValueError("fisheye images are not supported; undistort them first")
-    if _number(data, "k4", 0.0):
-        raise ValueError("k4 is not 0; only k1, k2, k3, p1 and p2 are supported")
+    own = [_number(data, key, 0.0) for key in _LENS]
+    lens = number_array(data.get("distortion_params", own), "'distortion_params'").tolist()
+    if len(lens) != len(own) or lens[3] or (any(own) and lens != own):
+        raise ValueError(
+            f"distortion is k1, k2, k3, k4 = 0, p1, p2, also as 'distortion_params', got {lens}"
+        )
     width, height = _number(data, "w"), _number(data, "h")
     fx, fy = _focal(data, "x", width), _focal(data, "y", height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
@@ -137,7 +172,7 @@ def _camera(data: Mapping[str, object]) -> Camera:
         raise ValueError("'fl_x' is missing, and so are 'fl_y' and 'camera_angle_x'")
     # Half a pixel: the file counts from the image's corner.
     cx, cy = _number(data, "cx", width / 2) - 0.5, _number(data, "cy", height / 2) - 0.5
-    distortion = tuple(_number(data, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
+    distortion = tuple(lens[i] for i in (0, 1, 4, 5, 2))
     size: Any = width, height  # whole numbers, checked when constructed
     return Camera(size[0], size[1], fx, fy, cx, cy, distortion)
 

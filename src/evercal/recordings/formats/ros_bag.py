@@ -74,7 +74,7 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     if options.camera is not None:
         camera = read_camera_of_size(options.camera, (width, height), topic)
     else:
-        info_topic, camera = _bag_camera(bag, topic)
+        info_topic, camera = _bag_camera(bag, topic, (width, height))
         check_size(f"{root}: {info_topic}", camera, (width, height), topic)
     stamps = np.array([shot.stamp_ns for shot in shots])
     poses = poses_at_images(bag, stamps, shots[0].frame_id, options)
@@ -162,7 +162,7 @@ def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
     return sorted(shots, key=lambda shot: shot.stamp_ns), notes
 
 
-def _bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
+def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> tuple[str, Camera]:
     """The first camera_info beside an image topic, such as `/cam/image_raw/compressed`.
 
     Rectified images take P without distortion, others K and D.
@@ -177,10 +177,10 @@ def _bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
         )
     message = bag.first(beside)
     with named_errors(f"{bag.path}: {beside}", "camera_info"):
-        return beside, _camera(message, image.rpartition("/")[2].startswith("image_rect"))
+        return beside, _camera(message, size, image.rpartition("/")[2].startswith("image_rect"))
 
 
-def _camera(message: Any, rectified: bool) -> Camera:
+def _camera(message: Any, image_size: tuple[int, int], rectified: bool) -> Camera:
     # ROS 1 writes K, D and P, ROS 2 k, d and p.
     k, d, p = (
         np.asarray(getattr(message, name, getattr(message, name.upper(), []))).reshape(-1).tolist()
@@ -195,7 +195,8 @@ def _camera(message: Any, rectified: bool) -> Camera:
         data = {"k": [*p[:3], *p[4:7], *p[8:11]], "d": [], "distortion_model": ""}
     offsets = {name: int(getattr(message.roi, name)) for name in ("x_offset", "y_offset")}
     size = {"width": int(message.width), "height": int(message.height)}
-    return camera_from_fields({**data, **size, "roi": offsets})
+    binning = {name: int(getattr(message, name)) for name in ("binning_x", "binning_y")}
+    return camera_from_fields({**data, **size, **binning, "roi": offsets}, image_size)
 
 
 def unsupported(encoding: str) -> str | None:

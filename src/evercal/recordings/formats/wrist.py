@@ -1,28 +1,62 @@
-"""A plain folder: images, and the gripper pose or joint angles at each, see docs/formats.md.
+"""Images and their poses in a table or in a file each, see docs/formats.md.
 
-Images with a pose become training frames with base_from_gripper; gripper_from_camera is unknown.
-All images come from one camera.
+A plain folder states the gripper pose, the joint angles or the camera pose at each image. Folders
+of other programs state camera poses. Of gripper poses, gripper_from_camera is unknown. All images
+come from one camera, unless there is a camera file for each. EuRoC states the pose of the body, and
+that of the camera on it in sensor.yaml. Record3D lists a rotation (quaternion xyzw) and a position,
+with OpenGL's axes.
 """
 
 import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePath
+from typing import NamedTuple
+
+import numpy as np
 
 from evercal.errors import InputError
-from evercal.geometry import Camera
+from evercal.geometry import SE3, Camera
+from evercal.recordings.formats.seven_scenes import read_numbers
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, image_size
-from evercal.recordings.poses.camera_file import read_camera_of_size
+from evercal.recordings.poses import camera_file
+from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
 from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
 from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
-from evercal.recordings.poses.row_files import natural_key, read_rows
+from evercal.recordings.poses.row_files import natural_key, number_array, read_rows
 from evercal.recordings.read_options import ReadOptions, flag
-from evercal.recordings.text_files import named_errors, refuse_repeated
+from evercal.recordings.text_files import named_errors, read_json, refuse_repeated
 
 USES = ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention")
-_POSES = tuple(
-    f"base_from_gripper.{ending}" for ending in ("csv", "json", "npy", "npz", "tum", "txt")
+
+
+class Layout(NamedTuple):
+    """Paths in a recording of camera poses."""
+
+    poses: str
+    """Table, or folder with a 4x4 matrix for each image; those with inf or nan are left out."""
+    images: str = ""
+    """Folder of images; empty for `_FOLDERS`."""
+    camera: str = ""
+    """Camera file, or folder of one for each image; where it is missing, one of `_CAMERAS`."""
+    convention: str | None = None
+    """Convention of the table, if it does not define it."""
+
+
+LAYOUTS = (
+    Layout("groundtruth.txt", "rgb", convention="tum:m"),  # TUM RGB-D
+    Layout("pose", "color", "intrinsic/intrinsic_color.txt"),  # ScanNet's SensReader
+    Layout("train/poses", "train/rgb", "train/calibration"),  # ACE, with the same in test
+    Layout("metadata", "rgb", "metadata"),  # Record3D
+    Layout("metadata.json", "rgb", "metadata.json"),
+    Layout("state_groundtruth_estimate0/data.csv", "cam0/data", "cam0/sensor.yaml"),  # EuRoC
+    Layout("mav0/state_groundtruth_estimate0/data.csv", "mav0/cam0/data", "mav0/cam0/sensor.yaml"),
 )
+_ENDINGS = ("csv", "json", "npy", "npz", "tum", "txt")
+_POSES = tuple(f"base_from_gripper.{ending}" for ending in _ENDINGS)
+_CAMERA_POSES = tuple(f"base_from_camera.{ending}" for ending in _ENDINGS)
 _JOINTS = ("joints.csv", "joints.json")
 _CAMERAS = tuple(
     f"{stem}.{ending}"
@@ -33,37 +67,113 @@ _FOLDERS = (".", "images", "rgb")
 
 
 def detect(root: Path) -> bool:
-    """Whether `root` holds gripper poses or joint angles beside images."""
-    return any((root / name).is_file() for name in _POSES + _JOINTS)
+    """Whether `root` holds poses or joint angles beside images."""
+    return root.is_dir() and bool(_layouts(root))
 
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
-    """Read poses, intrinsics and the size of one image; no other image is opened."""
-    options = options or ReadOptions()
-    file = _pose_file(root)
-    rows, notes = _rows(root, file, options)
-    images = _images(root)
-    camera = _camera(root, options.camera, images[0])
-    poses, pairing_notes = pair_images(images, rows, _stamps(root), file)
+    """Read poses, intrinsics and sizes of images; no image is opened whole."""
+    options, layouts = options or ReadOptions(), _layouts(root)
+    if not layouts:
+        expected = ", ".join(_POSES + _JOINTS + _CAMERA_POSES)
+        raise InputError(f"{root}: no gripper poses; expected {expected}")
+    if len(layouts) > 1:
+        names = " and ".join(layout.poses for layout in layouts)
+        raise InputError(f"{root}: holds {names}; keep the one with the poses of the images")
+    first = layouts[0]
+    paths = {key: getattr(first, key).replace("train/", "test/") for key in first._fields[:3]}
+    split = dict.fromkeys((first, first._replace(**paths)))
+    read = [_frames(root, part, options) for part in split if (root / part.poses).exists()]
+    train, test = (*(frames for frames, _, _ in read), ())[:2]
+    lost, notes = sum(lost for _, lost, _ in read), [note for *_, more in read for note in more]
+    return Recording(root.resolve().name, train, test, lost, notes=tuple(notes))
+
+
+def _layouts(root: Path) -> list[Layout]:
+    tables = [Layout(name) for name in _POSES + _JOINTS if (root / name).is_file()]
+    for file in (root / name for name in _CAMERA_POSES if (root / name).is_file()):
+        # base_from_camera.txt may hold the one pose of a fixed camera.
+        if file.suffix != ".txt" or len(file.read_bytes().split()) > 16:
+            tables.append(Layout(file.name))
+    there = [each for each in LAYOUTS if (root / each.poses).exists()]
+    return tables or [each for each in there if (root / each.images).is_dir()]
+
+
+def _frames(
+    root: Path, layout: Layout, options: ReadOptions
+) -> tuple[tuple[Frame, ...], int, list[str]]:
+    """Frames with a pose, the number of images without, and notes."""
+    images = _images(root, [layout.images] if layout.images else _FOLDERS)
+    source, file = root / layout.poses, root / layout.camera
+    lenses: dict[str, Camera] = {}
+    notes: list[str] = []
+    if source.is_dir():
+        rows = _matrices(source, _by_image(source, images))
+    elif source == file:
+        rows, lenses = _record3d(file)
+    else:
+        rows, notes = _rows(root, source, options, layout.convention)
+    poses, more = pair_images(images, rows, _stamps(root), source)
+    if file.name == "sensor.yaml":
+        with named_errors(file, "camera file"):
+            numbers = camera_file.numbers_of(camera_file.fields_of(file).get("T_BS"), "T_BS", 16)
+            body_from_camera = SE3.from_matrix(np.reshape(numbers, (4, 4)))
+        poses = [pose and pose @ body_from_camera for pose in poses]
+    if options.camera is None and layout.camera and file.is_dir():
+        files = _by_image(file, images)
+        for image in images:
+            own = files.get(image.name, file / f"{image.stem}.txt")
+            lens = camera_file.read_camera_of_size(own, image_size(image), image.name)
+            lenses[image.stem] = lens
+    elif options.camera is not None or not lenses:
+        stated = options.camera or (file if file.is_file() else None)
+        lenses = dict.fromkeys((i.stem for i in images), _camera(root, stated, images[0]))
+    owner = "base_from_gripper" if layout.poses in _POSES + _JOINTS else "base_from_camera"
+    split = layout.images.rpartition("rgb")[0]
     frames = tuple(
-        Frame(image.name, image, camera, None, pose)
+        replace(Frame(split + image.name, image, lenses[image.stem], None), **{owner: pose})
         for image, pose in zip(images, poses, strict=True)
         if pose is not None
     )
-    lost = len(images) - len(frames)
-    return Recording(root.resolve().name, frames, (), lost, notes=(*notes, *pairing_notes))
+    return frames, len(images) - len(frames), [*notes, *more]
 
 
-def _pose_file(root: Path) -> Path:
-    names = [name for name in _POSES + _JOINTS if (root / name).is_file()]
-    if len(names) > 1:
-        raise InputError(f"{root}: holds {' and '.join(names)}; keep the one with gripper poses")
-    if not names:
-        raise InputError(f"{root}: no gripper poses; expected {', '.join(_POSES + _JOINTS)}")
-    return root / names[0]
+def _record3d(file: Path) -> tuple[RobotPoses, dict[str, Camera]]:
+    data = read_json(file, "Record3D file", "export the recording again")
+    with named_errors(file, "Record3D file"):
+        numbers = number_array(data.get("poses"), "'poses'")
+        if numbers.ndim != 2 or numbers.shape[1] != 7:
+            raise ValueError("'poses' is a list of qx qy qz qw x y z of each image")
+        names = tuple(map(str, range(len(numbers))))
+        poses = poses_from_numbers(np.roll(numbers, 3, axis=1), pose_convention("xyzw:opengl"))
+        size = {"width": data.get("w"), "height": data.get("h")}
+        each = data.get("perFrameIntrinsicCoeffs") or [data.get("K")] * len(names)
+        lenses = [camera_file.camera_from_fields({"K": numbers, **size}) for numbers in each]
+        return RobotPoses(names, None, poses), dict(zip(names, lenses, strict=True))
 
 
-def _rows(root: Path, file: Path, options: ReadOptions) -> tuple[RobotPoses, list[str]]:
+def _matrices(folder: Path, files: Mapping[str, Path]) -> RobotPoses:
+    read = {name: read_numbers(file, 16, "4x4 base_from_camera") for name, file in files.items()}
+    tracked = {name: numbers for name, numbers in read.items() if np.isfinite(numbers).all()}
+    with named_errors(folder, "camera poses"):
+        if not tracked:
+            raise ValueError("holds no pose of an image; call the files as the images, with .txt")
+        matrices = np.stack([*tracked.values()]).reshape(-1, 4, 4)
+        return RobotPoses(tuple(tracked), None, SE3.from_matrix(matrices, 1e-2))
+
+
+def _by_image(folder: Path, images: Sequence[Path]) -> dict[str, Path]:
+    """Text files by the image that has their name, up to the ending or to the first dot."""
+    files = {file.stem: file for file in folder.glob("*.txt")}
+    short = {stem.partition(".")[0]: file for stem, file in files.items()}
+    files = {**short, **files} if len(short) == len(files) else files
+    found = {i.name: files.get(i.stem, files.get(i.name.partition(".")[0])) for i in images}
+    return {name: file for name, file in found.items() if file is not None}
+
+
+def _rows(
+    root: Path, file: Path, options: ReadOptions, convention: str | None
+) -> tuple[RobotPoses, list[str]]:
     if file.name in _JOINTS:
         model = RobotModel(options.urdf or _urdf(root, file))
         links = options.base_frame, options.gripper_frame
@@ -71,10 +181,11 @@ def _rows(root: Path, file: Path, options: ReadOptions) -> tuple[RobotPoses, lis
     unused = [n for n in ("urdf", "base_frame", "gripper_frame") if getattr(options, n) is not None]
     if unused:
         raise InputError(
-            f"{flag(unused[0])}: {file} holds gripper poses already; leave the option out, or give"
+            f"{flag(unused[0])}: {file} holds poses already; leave the option out, or give"
             f" joint angles in joints.csv instead"
         )
-    return read_robot_poses(file, options.pose_convention, option="--pose-convention"), []
+    convention = options.pose_convention or convention
+    return read_robot_poses(file, convention, what="file of poses", option="--pose-convention"), []
 
 
 def _urdf(root: Path, joints: Path) -> Path:
@@ -85,13 +196,14 @@ def _urdf(root: Path, joints: Path) -> Path:
     return files[0]
 
 
-def _images(root: Path) -> list[Path]:
-    for folder in _FOLDERS:
+def _images(root: Path, folders: Sequence[str]) -> list[Path]:
+    for folder in folders:
         names = os.listdir(root / folder) if (root / folder).is_dir() else []
         images = [name for name in names if Path(name).suffix.lower() in IMAGE_ENDINGS]
         if images:
             return [root / folder / name for name in sorted(images, key=natural_key)]
-    raise InputError(f"{root}: no images ({', '.join(IMAGE_ENDINGS)}) in it, in images or in rgb")
+    where = " or in ".join("it" if folder == "." else folder for folder in folders)
+    raise InputError(f"{root}: no images ({', '.join(IMAGE_ENDINGS)}) in {where}")
 
 
 def _camera(root: Path, file: Path | None, image: Path) -> Camera:
@@ -105,7 +217,7 @@ def _camera(root: Path, file: Path | None, image: Path) -> Camera:
                 f" .npz or .txt"
             )
         file = root / names[0]
-    return read_camera_of_size(file, image_size(image), image.name)
+    return camera_file.read_camera_of_size(file, image_size(image), image.name)
 
 
 def _stamps(root: Path) -> dict[str, float] | None:

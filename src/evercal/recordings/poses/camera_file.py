@@ -1,14 +1,17 @@
-"""Camera files: a 3x3 matrix, JSON, YAML, NPZ, ROS camera_info, OpenCV's FileStorage.
+"""Camera files: a matrix, JSON, YAML, NPZ, ROS camera_info, OpenCV's FileStorage, and others.
 
 The content decides the kind, not the file ending; docs/formats.md lists the names of the fields. Of
 ROS, both calibration files and printed messages are read, with the matrix K and D of the raw image.
-In all kinds, pixel (0, 0) is the centre of the top-left pixel, and images are upright.
+A camera may stand inside other entries, such as `cam0` of a Kalibr chain. In all kinds, pixel
+(0, 0) is the centre of the top-left pixel, and images are upright.
 """
 
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,30 +20,46 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.recordings.poses.row_files import arrays_as_lists, is_number
-from evercal.recordings.text_files import named_errors, read_text, yaml_documents
+from evercal.recordings.text_files import named_errors, naming, read_text, yaml_documents
 
-_MODELS = (
-    "plumbbob", "rationalpolynomial", "brownconrady", "radtan", "opencv", "pinhole", "none", "",
-)  # fmt: skip
-_MODEL_KEYS = ("distortionmodel", "model", "cameramodel")
+# Kinds of models by name, and names of fields, in lower case without spaces, dashes, underscores.
+_MODELS = {
+    **dict.fromkeys(
+        ("", "plumbbob", "rationalpolynomial", "brownconrady", "radtan", "radialtangential",
+         "opencv", "fullopencv", "pinhole", "perspective", "rectified"), "brown"),
+    **dict.fromkeys(("none", "null"), "none"),
+    **dict.fromkeys(
+        ("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4",
+         "kannalabrandt8"), "fisheye"),
+}  # fmt: skip
+_SUPPORTED = ("brown", "none", "zero", "fisheye")
+_MODEL_KEYS = ("distortionmodel", "model", "cameramodel", "modeltype", "projectionmodel")
 _LENGTHS = (0, 4, 5, 8)
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-# Names of the fields in lower case without underscores.
+_FISHEYE = ("k1", "k2", "k3", "k4")
 _ALIASES = {
-    "camera_matrix": ("cameramatrix", "intrinsicmatrix", "intrinsics", "k", "mtx"),
-    "distortion_coefficients": (
-        "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "distortion",
-        "dist", "coeffs", "d",
+    "camera_matrix": (
+        "cameramatrix", "intrinsicmatrix", "cameraintrinsics", "intrinsics", "intrinsic",
+        "projectionparameters", "k", "mtx",
     ),
-    "image_width": ("imagewidth", "width", "w"),
-    "image_height": ("imageheight", "height", "h"),
+    "distortion_coefficients": (
+        "distortioncoefficients", "distortioncoeffs", "distortionparameters", "distortionparams",
+        "distcoeffs", "distcoeff", "distortion", "dist", "coefficients", "coeffs", "d", "kc",
+    ),
+    "image_width": ("imagewidth", "width", "w"), "image_height": ("imageheight", "height", "h"),
     "image_size": ("imagesize", "imgsize", "resolution", "size"),
-    "fx": ("fx",),
-    "fy": ("fy",),
-    "cx": ("cx", "ppx"),
-    "cy": ("cy", "ppy"),
+    "fx": ("fx",), "fy": ("fy",), "cx": ("cx", "ppx"), "cy": ("cy", "ppy"),
 }  # fmt: skip
-_ROS = ("distortionmodel", "rectificationmatrix", "projectionmatrix", "header", "roi", "p", "r")
+_LENS = ("distortion_coefficients", *_COEFFICIENTS)
+_ROS = ("rectificationmatrix", "projectionmatrix", "header", "roi", "p", "r")
+_KNOWN = {*_ALIASES, *_LENS, *_MODEL_KEYS, *_ROS[:4], "binningx", "binningy", "fisheyemodel"}
+_HARMLESS = re.compile(
+    r"error|rms|repro|resid|std|dev|sigma|covar|uncert|fps|rate|freq|square|board|marker|pattern"
+    r"|chess|tag|count|num|frames|images|views|points|flags|date|time|stamp|version|serial|index"
+    r"|id$|baseline|depth|range|temp|apert|expos|gain|fov|angle|focal|aspect|mm$|rotation|trans"
+    r"|^[rt]vec|quat|extrin|pose|position|orient|imu|noise|rgb|track|^bf$|^new|imagescale|overlaps"
+)
+"""Names of numbers that do not change where a point lies in the image."""
 _EXPECTED = (
     "give a 3x3 matrix as text, JSON, YAML or NPZ with camera_matrix and dist_coeffs, a ROS"
     " camera_info or OpenCV's storage"
@@ -54,7 +73,7 @@ def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
     """
     path = Path(path)
     with named_errors(path, "camera file"):
-        return camera_from_fields(_fields_of(path), size)
+        return camera_from_fields(fields_of(path, size), size)
 
 
 def read_camera_of_size(path: Path, size: tuple[int, int], images: str) -> Camera:
@@ -76,30 +95,120 @@ def check_size(source: str, camera: Camera, size: tuple[int, int], images: str) 
 def camera_from_fields(data: Mapping[str, Any], size: tuple[int, int] | None = None) -> Camera:
     """Build a camera from the fields of a file, or of a ROS message.
 
+    The camera may stand inside other fields. Of several, the only one of the images' size is taken.
     `size` is (width, height) in pixels of the images, if the fields may lack it. ValueError: the
-    fields are no camera, or the images are distorted otherwise or cut out.
+    fields are no camera or several, or the images are distorted otherwise or cut out.
     """
+    entries = [*_entries(_undotted(data), {}, "")] or [("", data)]
+    cameras: dict[str, Camera] = {}
+    for name, entry in entries:
+        with naming(name) if name else nullcontext():
+            cameras[name or "outside of these"] = _camera(entry, size)
+    fitting = {c for c in cameras.values() if size in (None, (c.width, c.height))}
+    choice = fitting or {*cameras.values()}
+    if len(choice) > 1:
+        each = (f"{n} ({c.width}x{c.height}, fx {c.fx:.1f})" for n, c in cameras.items())
+        raise ValueError(f"holds several cameras: {_listed(each)}; give a file of the right one")
+    return choice.pop()
+
+
+def _undotted(data: Mapping[str, Any]) -> dict[str, Any]:
+    """ORB-SLAM's `Camera1.fx` as an entry `Camera1`; `Camera.fps` holds for all cameras."""
+    groups: dict[str, dict[str, Any]] = {"": {}, "Camera": {}}
+    for key, value in data.items():
+        group, _, name = str(key).rpartition(".")
+        groups.setdefault(group, {})["camera_model" if key == "Camera.type" else name] = value
+    return {**groups.pop(""), **groups.pop("Camera"), **groups}
+
+
+def _entries(
+    data: Mapping[str, Any], around: Mapping[str, Any], name: str
+) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Fields of all cameras in nested entries, by name, with numbers that stand around them."""
+    data = dict(data)
+    for key, value in [*data.items()]:  # such as intrinsics: {fx: ...}
+        group = _canonical(key) in ("camera_matrix", "distortion_coefficients")
+        if group and isinstance(value, Mapping) and "data" not in value:
+            data |= {**data.pop(key), **data}
+    own = _fields(data)
+    hidden = {*own, *(() if own.keys().isdisjoint(_LENS) else _LENS)}
+    around = {key: value for key, value in around.items() if key not in hidden}
+    if "fx" in own or isinstance(own.get("camera_matrix"), list | Mapping):
+        yield name, {**around, **data}
+    focal = ("camera_matrix", "fx", "fy", "cx", "cy")
+    around |= {key: value for key, value in own.items() if key not in focal}
+    for key, value in data.items():
+        for i, each in enumerate(value if isinstance(value, list) else [value]):
+            if isinstance(each, Mapping):
+                inner = f"{name}.{key}" + (f"[{i}]" if each is not value else "")
+                yield from _entries(each, around, inner.lstrip("."))
+
+
+def _camera(data: Mapping[str, Any], size: tuple[int, int] | None) -> Camera:
     fields, ros = _fields(data), not {_plain(key) for key in data}.isdisjoint(_ROS)
     roi = data.get("roi")
     if isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset")):
         raise ValueError(f"the image is a cut-out (roi {roi}); give the whole image's camera_info")
     if fields.get("fisheyemodel"):
         raise ValueError("fisheye_model is set; rectify the images or calibrate without it")
+    models = {_model_kind(fields[key]): fields[key] for key in _MODEL_KEYS if key in fields}
+    fisheye = "fisheye" in models
+    required = (ros or fisheye or "distortionmodel" in fields) and "none" not in models
+    distortion = _distortion(fields, data, required, _FISHEYE if fisheye else _COEFFICIENTS)
+    for kind in models.keys() - {"brown", "fisheye"}:
+        if kind not in _SUPPORTED or any(distortion):
+            raise ValueError(
+                f"distortion_model {models[kind]!r} is not supported with the coefficients"
+                f" {distortion}; rectify the images or calibrate with plumb_bob"
+            )
     matrix = _matrix(fields, data)
     width, height = _size(fields, data, None if ros else size)
-    distortion = _distortion(fields, data, ros)
-    for model in (str(fields[key]) for key in _MODEL_KEYS if key in fields):
-        # RealSense prints distortion.inverse_brown_conrady, mostly with zeros.
-        known = _plain(model.rpartition(".")[2].replace(" ", "")) in _MODELS
-        if not known and (any(distortion) or "conrady" not in model.lower()):
+    _refuse_unknown(data)
+    camera = Camera.from_matrix(matrix, width, height)
+    model = "fisheye" if fisheye else "pinhole"
+    camera = replace(camera, distortion=tuple(distortion), model=model)
+    # ROS states intrinsics and size of the sensor, before it combines pixels.
+    if size != (camera.width, camera.height):
+        by = [max(1, int(fields.get(f"binning{axis}") or 1)) for axis in "xy"]
+        camera = camera.resized(camera.width // by[0], camera.height // by[1])
+    wide, high = camera.width, camera.height
+    inside = 0 <= camera.cx <= wide and 0 <= camera.cy <= high
+    if min(camera.fx, camera.fy) < wide / 10 or not inside:
+        raise ValueError(
+            f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} do not fit"
+            f" {wide}x{high} images; give them in pixels and of this image size"
+        )
+    return camera
+
+
+def _model_kind(model: object) -> str:
+    """A value of `_MODELS`; `zero` for models that are read without distortion only, else empty."""
+    plain = re.sub(r"[\s_-]", "", str(model).rpartition(".")[2].lower())
+    # RealSense prints distortion.inverse_brown_conrady, mostly with zeros.
+    return _MODELS.get(plain, "zero" if "conrady" in plain else "")
+
+
+def _refuse_unknown(data: Mapping[str, Any]) -> None:
+    for key, value in data.items():
+        if _canonical(key) in _KNOWN or _HARMLESS.search(_plain(key)):
+            continue
+        value = value.get("data") if isinstance(value, Mapping) else value
+        cells = np.ravel(np.array(value, dtype=object)).tolist()
+        rows: list[Any] = value if isinstance(value, list) else []
+        whole = (9, 12, 16) if _plain(key) == "p" else (9, 16)
+        matrix = len(cells) in whole or (rows[2:] and all(np.size(row) > 2 for row in rows))
+        if all(map(is_number, cells)) and any(map(float, cells)) and not matrix:
             raise ValueError(
-                f"distortion_model {model!r} is not supported; rectify the images or calibrate with"
-                f" plumb_bob or rational_polynomial"
+                f"{key!r} is not known and may change the image; name distortion k1, k2, p1, p2,"
+                f" k3, or distortion_coefficients in this order, and leave other numbers out"
             )
-    return Camera.from_matrix(matrix, width, height, tuple(distortion))
 
 
-def _fields_of(path: Path) -> Mapping[str, Any]:
+def fields_of(path: Path, size: tuple[int, int] | None = None) -> Mapping[str, Any]:
+    """Entries of a camera file, as written; ValueError for other files.
+
+    A focal length alone has its principal point in the middle of images of `size`.
+    """
     with path.open("rb") as file:
         zipped = file.read(2) == b"PK"
     if zipped:
@@ -109,6 +218,9 @@ def _fields_of(path: Path) -> Mapping[str, Any]:
         return _xml_of_opencv(text)
     words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
     if all(map(is_number, words)):
+        if len(words) == 1 and size is not None:
+            cx, cy = (size[0] - 1) / 2, (size[1] - 1) / 2
+            words = [words[0], "0", str(cx), "0", words[0], str(cy), "0", "0", "1"]
         return {"camera_matrix": [float(word) for word in words]}
     try:
         if text.lstrip().startswith("{"):
@@ -135,25 +247,34 @@ def _xml_of_opencv(text: str) -> dict[str, Any]:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise ValueError(f"not valid XML ({error}); {_EXPECTED}") from None
-    found: dict[str, Any] = {}
-    for element in root:
-        data, word = element.find("data"), element.text or ""
-        if data is not None:
-            found[element.tag] = {"data": (data.text or "").split()}
-        elif is_number(word):
-            found[element.tag] = float(word)
-    return found
+    return _xml_value(root)
+
+
+def _xml_value(element: Any) -> Any:
+    data, words = element.find("data"), (element.text or "").split()
+    if data is not None:
+        return {"data": (data.text or "").split()}
+    if len(element):
+        values = [(child.tag, _xml_value(child)) for child in element]
+        return [value for _, value in values] if values[0][0] == "_" else dict(values)
+    if not words or not all(map(is_number, words)):
+        return " ".join(words)
+    return float(words[0]) if len(words) == 1 else [float(word) for word in words]
 
 
 def _plain(key: object) -> str:
     return str(key).lower().replace("_", "")
 
 
+def _canonical(key: object) -> str:
+    plain = _plain(key)
+    return next((name for name, aliases in _ALIASES.items() if plain in aliases), plain)
+
+
 def _fields(data: Mapping[str, Any]) -> dict[str, Any]:
     keys: dict[str, str] = {}
     for key in data:
-        plain = _plain(key)
-        name = next((name for name, aliases in _ALIASES.items() if plain in aliases), plain)
+        name = _canonical(key)
         if name in keys and name in (*_ALIASES, *_COEFFICIENTS):
             raise ValueError(f"{keys[name]} and {key} are the same; keep one of them")
         keys[name] = key
@@ -162,7 +283,13 @@ def _fields(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def _matrix(fields: Mapping[str, Any], data: Mapping[str, Any]) -> np.ndarray:
     if "camera_matrix" in fields:
-        matrix = np.reshape(_numbers(fields["camera_matrix"], "camera_matrix", 9), (3, 3))
+        numbers = numbers_of(fields["camera_matrix"], "camera_matrix")
+        if len(numbers) == 4 and 0.8 * numbers[1] < numbers[0] < 1.25 * numbers[1]:
+            fx, fy, cx, cy = numbers  # as Kalibr writes it; other orders differ in the first two
+            return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        if len(numbers) == 16 and numbers[3::4] == numbers[12:] == [0, 0, 0, 1]:
+            numbers = np.reshape(numbers, (4, 4))[:3, :3].ravel().tolist()
+        matrix = np.reshape(numbers_of(numbers, "camera_matrix", 9), (3, 3))
         # Open3D writes it column after column.
         return matrix.T if not matrix[:2, 2].any() and matrix[2, :2].any() else matrix
     names = ("fx", "fy", "cx", "cy")
@@ -170,28 +297,33 @@ def _matrix(fields: Mapping[str, Any], data: Mapping[str, Any]) -> np.ndarray:
     if missing:
         what = f"camera {missing[0]!r}" if len(missing) < 4 else "'camera_matrix'"
         raise ValueError(f"{what} is missing, there is {_listed(data) or 'nothing'}; {_EXPECTED}")
-    fx, fy, cx, cy = _numbers([fields[name] for name in names], "fx, fy, cx, cy", 4)
+    fx, fy, cx, cy = numbers_of([fields[name] for name in names], "fx, fy, cx, cy", 4)
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
-def _distortion(fields: Mapping[str, Any], data: Mapping[str, Any], ros: bool) -> list[float]:
+def _distortion(
+    fields: Mapping[str, Any], data: Mapping[str, Any], required: bool, names: Sequence[str]
+) -> list[float]:
     name = "distortion_coefficients"
-    stated = [key for key in _COEFFICIENTS if key in fields]
-    if name in fields:
-        numbers = _numbers(fields[name], name)
+    stated = [key for key in names if key in fields]
+    if other := [key for key in _COEFFICIENTS if fields.get(key) and key not in names]:
+        raise ValueError(f"a fisheye has {_listed(names)}, got {_listed(other)}; leave others out")
+    if str(fields.get(name, "")).lower() in ("none", "null"):
+        numbers = []
+    elif name in fields:
+        numbers = numbers_of(fields[name], name)
     elif stated:
-        numbers = _numbers([fields.get(key, 0.0) for key in _COEFFICIENTS], stated[0])
+        numbers = numbers_of([fields.get(key, 0.0) for key in names], stated[0])
         numbers = numbers if any(numbers[5:]) else numbers[:5]
+    elif required:
+        raise ValueError(
+            f"{name!r} is missing, there is {_listed(data)}; write four zeros if images have no"
+            f" lens distortion"
+        )
     else:
-        other = [key for key in data if "dist" in _plain(key) and _plain(key) not in _MODEL_KEYS]
-        if ros or other:
-            raise ValueError(
-                f"{name!r} is missing, there is {_listed(other or data)}; write four zeros if"
-                f" images have no lens distortion"
-            )
         numbers = []
     # Longer models add terms that are mostly zero and can then be dropped.
-    while len(numbers) not in _LENGTHS and numbers[-1] == 0:
+    while len(numbers) not in (_LENGTHS if len(names) > 4 else (0, 4)) and numbers[-1] == 0:
         numbers.pop()
     return numbers
 
@@ -209,7 +341,7 @@ def _size(
         stated = size if len(missing) == 2 else None
     if stated is None:
         raise ValueError(f"{missing[0]!r} is missing (no image size), there is {_listed(data)}")
-    width, height = _numbers(list(stated), "image size (width, height)", 2)
+    width, height = numbers_of(list(stated), "image size (width, height)", 2)
     return width, height
 
 
@@ -217,7 +349,8 @@ def _listed(keys: Iterable[object]) -> str:
     return ", ".join(map(str, keys))
 
 
-def _numbers(value: Any, name: str, count: int | None = None) -> list[float]:
+def numbers_of(value: Any, name: str, count: int | None = None) -> list[float]:
+    """Numbers of nested lists, or of an array of OpenCV or ROS; ValueError for others."""
     value = value.get("data") if isinstance(value, dict) else value
     try:
         if not isinstance(value, list) or any(isinstance(v, bool) for v in value):

@@ -1,4 +1,4 @@
-"""Pairing of gripper poses with images by name, by time, or in order."""
+"""Pairing of poses with images by name, by time, or in order."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ Pairing = tuple[list[SE3 | None], list[str]]
 def pair_images(
     images: Sequence[Path], rows: RobotPoses, stamps_s: Mapping[str, float] | None, file: Path
 ) -> Pairing:
-    """Find the gripper pose of every image.
+    """Find the pose of every image.
 
     Rows with names are paired with the images of these names. Rows with times are interpolated at
     the image times `stamps_s`, by name, or the times in the image names. Otherwise rows and images,
@@ -91,11 +91,11 @@ def _by_time(times: NDArray[np.float64], track: PoseTrack, file: Path) -> Pairin
             f" {times.max():.3f} s, poses at {first:.3f} to {last:.3f} s; are the clocks the same?"
             f" If not, name the image of each row in a column image"
         )
-    notes = [f"gripper poses were interpolated at the times of {_count(len(times), 'image')}"]
+    notes = [f"poses were interpolated at the times of {_count(len(times), 'image')}"]
     if not valid.all():
         notes.append(
             f"{_count(int((~valid).sum()), 'image')} taken outside the recorded poses or in a gap"
-            f" of more than {MAX_GAP_S:g} s in which the gripper moved"
+            f" of more than {MAX_GAP_S:g} s with motion"
         )
     return [pose if ok else None for pose, ok in zip(poses, valid, strict=True)], notes
 

@@ -70,9 +70,10 @@ class Columns(NamedTuple):
 
 _GRID = [f"{row}{column}" for row in range(4) for column in range(4)]
 HEADERS = {
-    "position": Columns(",t,t_,p,pos_,position_,translation_,tvec_", "xyz"),
+    "position": Columns(",t,t_,p,pos_,position_,translation_,tvec_,p_rs_r_", "xyz"),
     "quaternion": Columns(
-        "q,q_,quat_,quaternion_,orientation_,rotation_", "wxyz", ("wxyz", "xyzw", "tum", "abb")
+        "q,q_,quat_,quaternion_,orientation_,rotation_,q_rs_", "wxyz",
+        ("wxyz", "xyzw", "tum", "abb"),
     ),
     "rotation vector": Columns("rotvec_,rvec_,rotation_vector_", "xyz", ("ur",)),
     "matrix": Columns("m", _GRID, ("matrix", "franka")),
