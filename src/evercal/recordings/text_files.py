@@ -1,6 +1,7 @@
 """Text and JSON files that a user names, and their errors."""
 
 import json
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PureWindowsPath
@@ -11,6 +12,9 @@ from evercal.errors import InputError
 
 _DEPTH = 50
 """Nested lists and objects in YAML."""
+_CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f-\x9f]")
+_OF_OPENCV = re.compile(r"^%.*$|!!opencv-[a-z-]+", re.MULTILINE)
+"""Not valid YAML. cv2.FileStorage can end the process on such files."""
 
 
 @contextmanager
@@ -44,10 +48,31 @@ def naming(what: str) -> Iterator[None]:
 
 
 def read_text(path: Path, what: str, remedy: str = "check the path") -> str:
-    """Read a UTF-8 text file; `what` names its contents in messages."""
+    """Read a text file; `what` names its contents in messages."""
     with named_errors(path, what, remedy):
         require_at_most(path.stat().st_size, "text_bytes", "bytes")
-        return path.read_text(encoding="utf-8-sig")
+        return decoded(path.read_bytes())
+
+
+def decoded(data: bytes) -> str:
+    """Text of UTF-8, of UTF-16, or else of Latin-1; UnicodeDecodeError if that makes no text.
+
+    Every second byte of UTF-16 is mostly zero, so it needs no byte order mark.
+    """
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        text = data.decode("utf-16")
+    elif 2 * data[1::2].count(0) > len(data[1::2]) > 0:
+        text = data.decode("utf-16-le")
+    elif 2 * data[::2].count(0) > len(data[::2]) > 0:
+        text = data.decode("utf-16-be")
+    else:
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = data.decode("latin-1")
+            if _CONTROL.search(text):
+                raise
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str, Any]:
@@ -69,6 +94,7 @@ def yaml_documents(text: str) -> list[Any]:
     """
     import yaml
 
+    text = _OF_OPENCV.sub("", text)
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     depth = nodes = 0
     try:

@@ -156,6 +156,7 @@ def _read(files: PairFiles, role: Literal["robot", "camera"]) -> _Poses:
         option=f"--{role}-convention",
         # Inverted, the file of the camera states board_from_camera.
         camera_from=role == "camera" and not inverted,
+        robot=role == "robot",
     )
     stamps, numbers = table.stamps_s, None
     if role == "camera" and stamps is None and table.names is not None:

@@ -14,15 +14,13 @@ from evercal.recordings.images import IMAGE_ENDINGS, image_size
 from evercal.recordings.poses.camera_file import read_camera_of_size
 from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
 from evercal.recordings.poses.pairing import pair_images
-from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
+from evercal.recordings.poses.robot_poses import POSE_ENDINGS, RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, read_rows
 from evercal.recordings.read_options import ReadOptions, flag
 from evercal.recordings.text_files import named_errors, refuse_repeated
 
 USES = ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention")
-_POSES = tuple(
-    f"base_from_gripper.{ending}" for ending in ("csv", "json", "npy", "npz", "tum", "txt")
-)
+_POSES = tuple(f"base_from_gripper{ending}" for ending in POSE_ENDINGS)
 _JOINTS = ("joints.csv", "joints.json")
 _CAMERAS = tuple(
     f"{stem}.{ending}"

@@ -9,6 +9,7 @@ script manual, RoboDK's converters (Staubli, Kawasaki) and libfranka's reference
 """
 
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from itertools import product
 from typing import Any
 
@@ -22,6 +23,7 @@ Array = NDArray[np.float64]
 
 _FAR_M = 10.0  # largest distance of a gripper from its base, metres
 _NEAR_M = 0.01  # smallest distance of a gripper from its base, metres, for at least one pose
+_LARGEST_DEG = 361.0
 _TOLERANCE = 1e-2  # error of a quaternion's length, or of R^T R, if printed with three digits
 _OPENGL_FROM_OPENCV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))  # its own inverse
 
@@ -33,7 +35,8 @@ class PoseConvention:
     name: str
     """Name with modifiers."""
     layout: str
-    """`wxyz`, `xyzw`, `vector` or Euler axes of scipy after a position, else `rows`, `columns`."""
+    """`wxyz`, `xyzw`, `vector` or Euler axes of scipy after a position, else `rows`, `columns` or
+    `rt` (rotation matrix row after row, then position)."""
     meaning: str
     metres_per_unit: float = 1.0
     degrees: bool = False
@@ -47,7 +50,7 @@ class PoseConvention:
     @property
     def is_matrix(self) -> bool:
         """Whether the numbers are a matrix."""
-        return self.layout in ("rows", "columns")
+        return self.layout in ("rows", "columns", "rt")
 
     @property
     def has_angles(self) -> bool:
@@ -57,7 +60,9 @@ class PoseConvention:
     @property
     def counts(self) -> tuple[int, ...]:
         """Possible lengths of a pose; matrices may lack the row 0 0 0 1."""
-        return (12, 16) if self.is_matrix else (6,) if self.has_angles else (7,)
+        if self.is_matrix:
+            return (12,) if self.layout == "rt" else (12, 16)
+        return (6,) if self.has_angles else (7,)
 
     def has(self, *modifiers: str) -> bool:
         """Whether the name has one of these modifiers."""
@@ -92,12 +97,19 @@ CONVENTIONS = {
         PoseConvention("kawasaki", "ZYZ", "X Y Z O A T, mm, degrees, about z y z", 0.001, True),
         PoseConvention("matrix", "rows", "4x4 or 3x4 matrix row after row, metres"),
         PoseConvention("franka", "columns", "matrix column after column, metres (O_T_EE)"),
+        PoseConvention("rt", "rt", "3x3 rotation matrix row after row, then x y z, metres"),
     )
 }
 """All conventions by name, without modifiers."""
+VENDORS = {
+    "mitsubishi": "yaskawa", "denso": "yaskawa", "techman": "yaskawa", "jaka": "yaskawa",
+    "dobot": "yaskawa", "aubo": "yaskawa", "xarm": "yaskawa", "epson": "kuka", "nachi": "kuka",
+    "doosan": "kawasaki", "comau": "kawasaki", "universal_robots": "ur", "motoman": "yaskawa",
+}  # fmt: skip
+"""Conventions of further vendors, whose units are millimetres and degrees."""
 KNOWN_CONVENTIONS = (
-    f"{', '.join(CONVENTIONS)}, fixed_xyz or moving_zyx with any order of axes, followed by :m,"
-    f" :mm, :rad, :deg, :inverse or :opengl where needed"
+    f"{', '.join([*CONVENTIONS, *VENDORS])}, fixed_xyz or moving_zyx with any order of axes,"
+    f" followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
 )
 CONVENTIONS |= {
     f"{sense}_{axes}": PoseConvention(
@@ -119,8 +131,10 @@ UNITS: dict[str, dict[str, Any]] = {
 def pose_convention(name: str) -> PoseConvention:
     """Parse the name of a convention with modifiers, such as `kuka:m:inverse`."""
     base, *modifiers = name.strip().lower().split(":")
+    base = VENDORS.get(base, base)
     if base not in CONVENTIONS:
-        problem = f"pose convention {name!r} is not known"
+        close = get_close_matches(base, [*CONVENTIONS, *VENDORS], 1)
+        problem = f"pose convention {name!r} is not known{f', {close[0]} is' if close else ''}"
         raise ConventionError(problem, f"NAME, one of {KNOWN_CONVENTIONS}")
     convention = replace(CONVENTIONS[base], name=":".join([base, *modifiers]))
     kinds = [("m", "mm"), ("rad", "deg"), ("inverse",), ("opengl",)]
@@ -174,6 +188,9 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
     if convention.is_matrix:
         matrix = poses.matrix()
         matrix[..., :3, 3] = translation
+        if layout == "rt":
+            rotation = matrix[..., :3, :3].reshape(*poses.shape, 9)
+            return np.concatenate([rotation, translation], axis=-1)
         matrix = matrix if layout == "rows" else np.swapaxes(matrix, -1, -2)
         return matrix.reshape(*poses.shape, 16)
     rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
@@ -188,15 +205,16 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
 
 def matrix_convention(numbers: Array) -> PoseConvention:
     """`matrix` or `franka`, whichever makes rigid transforms of (n, 12 or 16) numbers."""
-    orders = [CONVENTIONS[name] for name in ("matrix", "franka")]
+    orders = [CONVENTIONS[name] for name in ("matrix", "franka", "rt")]
+    orders = [order for order in orders if numbers.shape[-1] in order.counts]
     rigid = [order for order in orders if _rigid(_matrices(numbers, order.layout)).all()]
     if len(rigid) == 1:
         return rigid[0]
+    # 12 numbers that are rigid as franka are rigid as rt, with transposed rotations.
     which = "both orders" if rigid else "no order"
-    raise ConventionError(
-        f"rows of {numbers.shape[-1]} numbers are rigid transforms in {which}",
-        "matrix (row after row) or franka (column after column)",
-    )
+    named = " or ".join(f"{order.name} ({order.meaning})" for order in rigid or orders)
+    problem = f"rows of {numbers.shape[-1]} numbers are rigid transforms in {which}"
+    raise ConventionError(problem, named)
 
 
 def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
@@ -207,10 +225,12 @@ def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
         if convention.is_matrix:
             at = _matrices(numbers, convention.layout)[..., 3]
         _check_lengths(np.linalg.norm(at[..., :3], axis=-1), convention)
+    angles = np.abs(numbers[..., 3:]) if convention.has_angles else np.zeros(0)
+    angles = np.linalg.norm(angles, axis=-1) if convention.layout == "vector" else angles
+    largest = float(angles.max(initial=0.0))
+    if convention.degrees and largest > _LARGEST_DEG:
+        raise ValueError(f"angles up to {largest:.4g} deg; do columns hold {convention.meaning}?")
     if convention.has_angles and not convention.has("rad", "deg"):
-        angles = np.abs(numbers[..., 3:])
-        angles = np.linalg.norm(angles, axis=-1) if convention.layout == "vector" else angles
-        largest = float(angles.max(initial=0.0))
         degrees = largest > 2 * np.pi + 1e-6
         if largest > 0 and degrees != convention.degrees:
             problem = f"angles up to {largest:.4g} look like"
@@ -261,6 +281,9 @@ def _rotations(numbers: Array, convention: PoseConvention) -> Rotation:
 def _matrices(numbers: Array, layout: str) -> Array:
     """(..., 3 or 4, 4) matrices of numbers (..., 12 or 16)."""
     height = numbers.shape[-1] // 4
+    if layout == "rt":
+        rotation = numbers[..., :9].reshape(*numbers.shape[:-1], 3, 3)
+        return np.concatenate([rotation, numbers[..., 9:, None]], axis=-1)
     if layout == "rows":
         return numbers.reshape(*numbers.shape[:-1], height, 4)
     return np.swapaxes(numbers.reshape(*numbers.shape[:-1], 4, height), -1, -2)
@@ -275,7 +298,8 @@ def _rigid(matrices: Array) -> NDArray[np.bool_]:
 
 def _from_matrices(numbers: Array, convention: PoseConvention) -> SE3:
     matrices = _matrices(numbers, convention.layout)
-    stated, other = ("matrix", "franka") if convention.layout == "rows" else ("franka", "matrix")
+    stated = convention.base
+    other = "franka" if stated == "matrix" else "matrix"
     broken = ~_rigid(matrices)
     if broken.any() and _rigid(_matrices(numbers, CONVENTIONS[other].layout)).all():
         remedy = ":".join([other, *convention.name.split(":")[1:]])
