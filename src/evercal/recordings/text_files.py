@@ -59,19 +59,15 @@ def decoded(data: bytes) -> str:
 
     Every second byte of UTF-16 is mostly zero, so it needs no byte order mark.
     """
-    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        text = data.decode("utf-16")
-    elif 2 * data[1::2].count(0) > len(data[1::2]) > 0:
-        text = data.decode("utf-16-le")
-    elif 2 * data[::2].count(0) > len(data[::2]) > 0:
-        text = data.decode("utf-16-be")
-    else:
-        try:
-            text = data.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            text = data.decode("latin-1")
-            if _CONTROL.search(text):
-                raise
+    half = len(data) // 4
+    encoding = "utf-16-be" if data[::2].count(0) > half else "utf-8-sig"
+    encoding = "utf-16-le" if data[1::2].count(0) > half else encoding
+    try:
+        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else encoding)
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")
+        if _CONTROL.search(text):
+            raise
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

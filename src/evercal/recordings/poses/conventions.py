@@ -35,8 +35,7 @@ class PoseConvention:
     name: str
     """Name with modifiers."""
     layout: str
-    """`wxyz`, `xyzw`, `vector` or Euler axes of scipy after a position, else `rows`, `columns` or
-    `rt` (rotation matrix row after row, then position)."""
+    """`wxyz`, `xyzw`, `vector` or Euler axes of scipy after a position, else `rows`, `columns`."""
     meaning: str
     metres_per_unit: float = 1.0
     degrees: bool = False
@@ -50,7 +49,7 @@ class PoseConvention:
     @property
     def is_matrix(self) -> bool:
         """Whether the numbers are a matrix."""
-        return self.layout in ("rows", "columns", "rt")
+        return self.layout in ("rows", "columns")
 
     @property
     def has_angles(self) -> bool:
@@ -60,9 +59,7 @@ class PoseConvention:
     @property
     def counts(self) -> tuple[int, ...]:
         """Possible lengths of a pose; matrices may lack the row 0 0 0 1."""
-        if self.is_matrix:
-            return (12,) if self.layout == "rt" else (12, 16)
-        return (6,) if self.has_angles else (7,)
+        return (12, 16) if self.is_matrix else (6,) if self.has_angles else (7,)
 
     def has(self, *modifiers: str) -> bool:
         """Whether the name has one of these modifiers."""
@@ -97,7 +94,6 @@ CONVENTIONS = {
         PoseConvention("kawasaki", "ZYZ", "X Y Z O A T, mm, degrees, about z y z", 0.001, True),
         PoseConvention("matrix", "rows", "4x4 or 3x4 matrix row after row, metres"),
         PoseConvention("franka", "columns", "matrix column after column, metres (O_T_EE)"),
-        PoseConvention("rt", "rt", "3x3 rotation matrix row after row, then x y z, metres"),
     )
 }
 """All conventions by name, without modifiers."""
@@ -188,9 +184,6 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
     if convention.is_matrix:
         matrix = poses.matrix()
         matrix[..., :3, 3] = translation
-        if layout == "rt":
-            rotation = matrix[..., :3, :3].reshape(*poses.shape, 9)
-            return np.concatenate([rotation, translation], axis=-1)
         matrix = matrix if layout == "rows" else np.swapaxes(matrix, -1, -2)
         return matrix.reshape(*poses.shape, 16)
     rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
@@ -205,16 +198,20 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
 
 def matrix_convention(numbers: Array) -> PoseConvention:
     """`matrix` or `franka`, whichever makes rigid transforms of (n, 12 or 16) numbers."""
-    orders = [CONVENTIONS[name] for name in ("matrix", "franka", "rt")]
-    orders = [order for order in orders if numbers.shape[-1] in order.counts]
+    orders = [CONVENTIONS[name] for name in ("matrix", "franka")]
     rigid = [order for order in orders if _rigid(_matrices(numbers, order.layout)).all()]
-    if len(rigid) == 1:
+    if len(rigid) == 1 and (rigid[0].name == "matrix" or numbers.shape[-1] == 16):
         return rigid[0]
-    # 12 numbers that are rigid as franka are rigid as rt, with transposed rotations.
-    which = "both orders" if rigid else "no order"
-    named = " or ".join(f"{order.name} ({order.meaning})" for order in rigid or orders)
-    problem = f"rows of {numbers.shape[-1]} numbers are rigid transforms in {which}"
-    raise ConventionError(problem, named)
+    problem = f"rows of {numbers.shape[-1]} numbers are rigid transforms in"
+    if len(rigid) == 1:
+        raise ConventionError(
+            f"{problem} columns, or rotations in rows before x y z",
+            "franka (column after column), or a header r11,r12,r13,r21,r22,r23,r31,r32,r33,x,y,z",
+        )
+    raise ConventionError(
+        f"{problem} {'both orders' if rigid else 'no order'}",
+        "matrix (row after row) or franka (column after column)",
+    )
 
 
 def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
@@ -281,9 +278,6 @@ def _rotations(numbers: Array, convention: PoseConvention) -> Rotation:
 def _matrices(numbers: Array, layout: str) -> Array:
     """(..., 3 or 4, 4) matrices of numbers (..., 12 or 16)."""
     height = numbers.shape[-1] // 4
-    if layout == "rt":
-        rotation = numbers[..., :9].reshape(*numbers.shape[:-1], 3, 3)
-        return np.concatenate([rotation, numbers[..., 9:, None]], axis=-1)
     if layout == "rows":
         return numbers.reshape(*numbers.shape[:-1], height, 4)
     return np.swapaxes(numbers.reshape(*numbers.shape[:-1], 4, height), -1, -2)
@@ -298,8 +292,7 @@ def _rigid(matrices: Array) -> NDArray[np.bool_]:
 
 def _from_matrices(numbers: Array, convention: PoseConvention) -> SE3:
     matrices = _matrices(numbers, convention.layout)
-    stated = convention.base
-    other = "franka" if stated == "matrix" else "matrix"
+    stated, other = ("matrix", "franka") if convention.layout == "rows" else ("franka", "matrix")
     broken = ~_rigid(matrices)
     if broken.any() and _rigid(_matrices(numbers, CONVENTIONS[other].layout)).all():
         remedy = ":".join([other, *convention.name.split(":")[1:]])

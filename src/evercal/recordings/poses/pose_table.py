@@ -60,9 +60,6 @@ class Columns(NamedTuple):
     """Conventions that the columns of a rotation may hold."""
     ask: str = ""
     """Conventions to ask for; empty if the columns define the first one."""
-    fixed: bool = False
-    """Whether the columns hold nothing but their own conventions."""
-
     axes: str = ""
     """Axis of each column, for conventions that order their numbers by axis."""
 
@@ -76,44 +73,42 @@ class Columns(NamedTuple):
         """Columns of this rotation in the order of a convention; none if they do not hold it."""
         layout, stated = convention.layout.lower(), convention.base in self.conventions
         generic = convention.base.startswith(("fixed_", "moving_"))
-        if layout == "columns":
-            return np.reshape(columns, (-1, 4)).T.ravel().tolist() if stated else []
-        if self.axes and sorted(layout) == sorted(self.axes):
-            return [columns[self.axes.index(axis)] for axis in layout] if stated or generic else []
+        if layout == "columns" and stated:
+            return np.reshape(columns, (-1, 4)).T.ravel().tolist()
+        if self.axes and sorted(layout) == sorted(self.axes) and (stated or generic):
+            return [columns[self.axes.index(axis)] for axis in layout]
         # Letters without an axis are in the order of the convention that is stated.
-        free = convention.has_angles and layout != "vector" and len(columns) == 3 and not self.fixed
-        return columns if stated or (free and (not self.axes or len({*layout}) < 3)) else []
+        free = (
+            convention.has_angles and len(layout) == len(columns) and len({*layout, *self.axes}) < 4
+        )
+        free = free and (not self.axes or len({*layout}) < 3)
+        return columns if stated or free else []
 
 
 _GRID = [f"{row}{column}" for row in range(4) for column in range(4)]
-_GRID_3 = [f"{row}{column}" for row in range(3) for column in range(3)]
+_GRIDS = [
+    [f"{row + first}{column + first}" for row in range(3) for column in range(3)]
+    for first in (0, 1)
+]
 _ANGLES = ("ur", "yaskawa", "staubli", "fanuc", "rpy")
-_QUATERNIONS = ("abb", "wxyz", "xyzw", "tum")
+_ORDERS = ("abb", "wxyz", "xyzw", "tum")
+_Q, _R = "q,q_,quat,quat_,quaternion_,orientation_,rotation_", "r,r_,rot_,rotation_"
 HEADERS = {
     "position": Columns(",t,t_,p,pos_,position_,translation_,tvec_", "xyz"),
-    "quaternion": Columns(
-        "q,q_,quat_,quaternion_,orientation_,rotation_", "wxyz", ("wxyz", "xyzw", "tum", "abb"), axes="wxyz"
-    ),
-    "rotation vector": Columns("rotvec_,rvec_,rotation_vector_", "xyz", ("ur",), fixed=True),
+    "quaternion": Columns(_Q, "wxyz", ("wxyz", *_ORDERS), axes="wxyz"),
+    "rotation vector": Columns("rotvec_,rvec_,rotation_vector_", "xyz", ("ur",), axes="rotvec"),
     "matrix": Columns("m", _GRID, ("matrix", "franka")),
     "3x4 matrix": Columns("m", _GRID[:12], ("matrix", "franka")),
-    "rotation matrix": Columns("r,r_,rot_,rotation_", _GRID_3, ("rt",)),
-    "matrix from r11": Columns(
-        "r,r_,rot_,rotation_", [f"{int(at) + 11}" for at in _GRID_3], ("rt",)
-    ),
+    "rotation matrix": Columns(_R, _GRIDS[0], ("matrix",)),
+    "rotation matrix from 11": Columns(_R, _GRIDS[1], ("matrix",)),
     "W P R": Columns("", "wpr", ("fanuc",)),
     "O A T": Columns("", "oat", ("kawasaki",)),
-    "q1 to q4": Columns("q,quat,quat_,quaternion_", "1234", _QUATERNIONS, "abb, wxyz or xyzw"),
-    "q0 to q3": Columns(
-        "q,quat,quat_,quaternion_,orientation_,rotation_", "0123", _QUATERNIONS, "wxyz or xyzw"
-    ),
-    "angles": Columns(
-        "r,r_,rot_,rotation_", "xyz", _ANGLES,
-        "ur (rotation vector), yaskawa, staubli, fanuc or rpy", axes="xyz",
-    ),
+    "q1 to q4": Columns(_Q, "1234", _ORDERS, "abb, wxyz or xyzw"),
+    "q0 to q3": Columns(_Q, "0123", _ORDERS, "wxyz or xyzw"),
+    "angles": Columns(_R, "xyz", _ANGLES, "ur (rotation vector), yaskawa, staubli, fanuc or rpy", "xyz"),
     "roll pitch yaw": Columns(
         "", ("roll", "pitch", "yaw"), ("rpy", "yaskawa", "staubli", "fanuc", "kuka"),
-        "rpy:rad or rpy:deg", axes="xyz",
+        "rpy:rad or rpy:deg", "xyz",
     ),
     "A B C": Columns("", "abc", ("kuka",), "kuka (A about z) or mitsubishi (A about x)"),
     "U V W": Columns("", "uvw", ("kuka",), "epson (U about z)"),
@@ -171,11 +166,8 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     texts = [i for i, cell in enumerate(rows[0].tolist()) if not is_number(cell)]
     numbers = cell_numbers(np.delete(rows, texts[:1], axis=1))
     if texts or numbers.shape[1] != 4:
-        return plain_numbers(
-            numbers,
-            given,
-            tuple(str(cell).rstrip(":=") for cell in rows[:, texts[0]]) if texts else None,
-        )
+        names = [str(cell).rstrip(":=") for cell in rows[:, texts[0]]] if texts else None
+        return plain_numbers(numbers, given, names and tuple(names))
     whole = (numbers == (0, 0, 0, 1)).all(1).any() or (given and given.layout == "columns")
     height = 3 if len(numbers) % 3 == 0 and not whole else 4
     if len(numbers) % height:
@@ -183,7 +175,7 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     return plain_numbers(numbers.reshape(-1, height, 4), given)
 
 
-def names_position(words: Sequence[str]) -> bool:
+def has_position(words: Sequence[str]) -> bool:
     """Whether columns of these names hold a position."""
     return "position" in _groups(words)
 
@@ -196,24 +188,20 @@ def named_numbers(words: Sequence[str], rows: Cells, given: PoseConvention | Non
     free = ["" if i in used else word for i, word in enumerate(words)]
     names, stamps, others = row_labels(free, rows.T.tolist(), len(rows))
     convention = given or pose_convention(_defined(groups, words))
-    position = groups.get("position", [])
-    rotations = [
-        HEADERS[key].ordered(groups[key], convention) for key in groups if key != "position"
-    ]
-    columns = next(filter(None, rotations), [])
-    if not rotations:
-        counting = [name_and_unit(words[i])[0] in _INDICES for i in others]
-        columns = [i for i, counts in zip(others, counting, strict=True) if not counts]
-        columns = [i for i in columns if i not in position]
-        position = position or ([] if convention.is_matrix else columns[:3])
-        columns = [i for i in columns if i not in position]
+    position = groups.pop("position", [])
+    ordered = [HEADERS[key].ordered(groups[key], convention) for key in groups]
+    columns = next(filter(None, ordered), [])
+    if not groups:
+        others = [i for i in others if name_and_unit(words[i])[0] not in _INDICES]
+        position = position or others[: 0 if convention.is_matrix else 3]
+        columns = [i for i in others if i not in position]
     convention = _in_units(convention, [words[i] for i in position], "m", "mm")
     if convention.has_angles:
         convention = _in_units(convention, [words[i] for i in columns], "rad", "deg")
-    if convention.layout == "rt":
-        columns = columns + position
-    elif not convention.is_matrix:
+    if not convention.is_matrix:
         columns = position + columns
+    elif len(columns) == 9 and len(position) == 3:
+        columns = np.c_[np.reshape(columns, (3, 3)), position].ravel().tolist()
     if len(columns) in convention.counts:
         numbers = cell_numbers(rows[:, columns], [words[column] for column in columns])
         return PoseTable(numbers, convention, names, stamps)
@@ -229,13 +217,11 @@ def _in_units(convention: PoseConvention, words: Sequence[str], *known: str) -> 
     if len(units) > 1:
         raise ValueError(f"the columns {', '.join(words)} differ in unit")
     unit = units.pop() if units else None
-    if unit is not None and unit not in known:
-        raise ValueError(
-            f"the columns {', '.join(words)} are in {unit}; write {' or '.join(known)}"
-        )
-    return (
-        convention if unit is None or convention.has(*known) else replace(convention, **UNITS[unit])
-    )
+    if unit not in (None, *known):
+        problem = f"the columns {', '.join(words)} are in {unit}"
+        raise ValueError(f"{problem}; write {' or '.join(known)}")
+    keep = unit is None or convention.has(*known)
+    return convention if keep else replace(convention, **UNITS[unit])
 
 
 def plain_numbers(numbers: Array, given: PoseConvention | None, names: Names = None) -> PoseTable:
@@ -280,7 +266,13 @@ def _without_brackets(
     if not kinds:
         return _without_lists(lines), given
     pattern, header = _NOTATIONS[kinds[0]]
-    _refuse_beside(re.sub(pattern, " ", text), kinds[0])
+    for line in re.sub(pattern, " ", text).splitlines():
+        cells = [*filter(None, re.split(r"[^\w.+#-]+", line))]
+        numbers = sum(map(is_number, cells))
+        if numbers > 2 and 2 * numbers > len(cells) and ":=" not in line:
+            raise ValueError(
+                f"{line.strip()[:60]!r} is beside poses in {kinds[0]}; use one notation"
+            )
     found = re.findall(pattern, text)
     words = [word for word, *_ in found]
     named = all(words) and (len(found) == 1 or len({*words}) > 1)  # else a type, such as E6POS
@@ -295,21 +287,11 @@ def _without_brackets(
     return [label + header, *rows], given or (pose_convention("kuka") if kinds[0] == "{" else None)
 
 
-def _refuse_beside(rest: str, kind: str) -> None:
-    """Refuse rows of numbers that are left beside a notation."""
-    for line in rest.splitlines():
-        cells = re.split(r"[^\w.+#-]+", line.strip())
-        numbers = sum(map(is_number, cells))
-        if numbers > 2 and 2 * numbers > len(cells) and ":=" not in line:
-            raise ValueError(f"{line.strip()[:60]!r} is beside poses in {kind}; use one notation")
-
-
 def _without_lists(lines: list[str]) -> list[str]:
     """Lines without the brackets of numpy, Python and robots' functions, such as XY(...)."""
     lines = [re.sub(r"^[^\[\]]*[:=]\s*(?=$|\[\[)", "", line) for line in lines]  # titles
     lines = [line for line in lines if line]
-    bracket = [bool(re.search(r"[\[({]\s*[-+.\d]", line)) for line in lines]
-    if not any(bracket[:1]):
+    if not lines or not re.search(r"[\[({]\s*[-+.\d]", lines[0]):
         return lines
     text = re.sub(r"\b\w+\(", "(", "\n".join(lines))
     text = re.sub(r"\[[^\[\]]*\]", lambda row: row[0].replace("\n", " "), text)  # wrapped by numpy

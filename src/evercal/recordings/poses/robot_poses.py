@@ -7,6 +7,7 @@ one such file for each pose. docs/formats.md has examples of all kinds.
 import json
 import os
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -144,22 +145,21 @@ def _folder(path: Path, given: PoseConvention | None, what: str, robot: bool) ->
     for name in sorted(os.listdir(path), key=natural_key):
         if name[0] != "." and Path(name).suffix.lower() in POSE_ENDINGS:
             kinds.setdefault(re.sub(r"\d+", "N", name), []).append(name)
+    several = {kind: names for kind, names in kinds.items() if len(names) > 1} or kinds
     # ViSP's poses of the end effector and of the object in the camera.
-    own = [kind for kind in kinds if ("fPe" if robot else "cPo") in kind] or [*kinds]
-    own = own if len(own) == 1 else [kind for kind in own if len(kinds[kind]) > 1]
+    own = [kind for kind in several if ("fPe" if robot else "cPo") in kind] or [*several]
     if len(own) != 1:
-        found = " and ".join(own or kinds) or f"no file of {', '.join(POSE_ENDINGS)}"
+        found = " and ".join(own) or f"no file of {', '.join(POSE_ENDINGS)}"
         raise ValueError(f"the folder holds {found}; give a folder of one file for each pose")
-    names = kinds[own[0]]
     tables = []
-    for name in names:
+    for name in several[own[0]]:
         with named_errors(path / name, what):
             tables.append(_file(path / name, given, what, robot))
-    single = [len(table.numbers) == 1 for table in tables]
-    if not all(single):
-        raise ValueError(f"{names[single.index(False)]} holds several poses; give that file")
+            if len(tables[-1].numbers) != 1:
+                raise ValueError("holds several poses, in a folder of one file for each pose")
     numbers = np.concatenate([table.numbers for table in tables])
-    return PoseTable(numbers, tables[0].convention, tuple(Path(name).stem for name in names))
+    stems = tuple(Path(name).stem for name in several[own[0]])
+    return PoseTable(numbers, tables[0].convention, stems)
 
 
 def _table(text: str, ending: str, given: PoseConvention | None, robot: bool = True) -> PoseTable:
@@ -185,19 +185,15 @@ def _poses(table: PoseTable, camera_from: bool = False) -> SE3:
     try:
         poses = poses_from_numbers(table.numbers, table.convention, camera_from)
         check_units(table.numbers, table.convention)
-    except ValueError:
-        if table.convention.is_matrix:
-            raise
-        turned = np.roll(table.numbers, 3, axis=-1)
-        try:
-            poses_from_numbers(turned, table.convention)
-            check_units(turned, table.convention)
-        except ValueError:
-            turned = None
-        if turned is None:
-            raise
-        raise ValueError(
-            f"the rotation comes before the position; write {table.convention.meaning}, or a"
-            f" header that names the columns"
-        ) from None
-    return poses
+        return poses
+    except ValueError as error:
+        if not table.convention.is_matrix:
+            with suppress(ValueError):
+                turned = np.roll(table.numbers, 3, axis=-1)
+                poses_from_numbers(turned, table.convention)
+                check_units(turned, table.convention)
+                error = ValueError(
+                    f"the rotation is before the position; write {table.convention.meaning}, or a"
+                    f" header that names the columns"
+                )
+        raise error from None

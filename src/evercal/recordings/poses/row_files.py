@@ -35,8 +35,8 @@ _UNIT = re.compile(
     r"(?<![\s_/])[\s_/]*[\s_/\[(]\s*(mm|cm|m|inch(?:es)?|(?:milli)?met(?:er|re)s?|deg(?:rees?)?"
     r"|rad(?:ians?)?|ns|us|ms|s)\s*[\])]?$|(?<!\s)\s*\[\s*\]$"
 )
-_SHORT = {"d": "deg", "r": "rad", "mi": "mm", "me": "m", "in": "inch"}
-"""Units by the beginning of their whole word."""
+_SHORT = {"deg": "deg", "rad": "rad", "mil": "mm", "met": "m", "inc": "inch"}
+"""Units by the first three letters of their names."""
 _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _EARLIEST_S, _LATEST_S = 1e9, 4e9  # 2001 and 2096 in seconds since 1970
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$")
@@ -135,9 +135,9 @@ def cell_numbers(cells: Cells, words: Sequence[str] = ()) -> Array:
     for (row, column), cell in np.ndenumerate(cells):
         if not is_number(cell) or not np.isfinite(float(cell)):
             name = repr(words[column]) if words else column + 1
-            hint = "; write all poses with brackets, or none" if "[" in cell else ""
-            where = f"row {row + 1}, column {name}"
-            raise ValueError(f"{where}: {str(cell)!r} is not a finite number{hint}")
+            hint = "; write all poses with brackets, or none" * ("[" in cell)
+            problem = f"{str(cell)!r} is not a finite number{hint}"
+            raise ValueError(f"row {row + 1}, column {name}: {problem}")
     return cells.astype(np.float64)
 
 
@@ -148,10 +148,7 @@ def name_and_unit(cell: str) -> tuple[str, str | None]:
     match = _UNIT.search(re.sub("[°º]", " deg", name))
     unit = match.group(1) if match else None
     name = match.string[: match.start()] if match else name
-    short = next(
-        (_SHORT[key] for key in _SHORT if len(unit or "") > 2 and unit[: len(key)] == key), unit
-    )
-    return re.sub(r"[\s.]+", "_", name), short
+    return re.sub(r"[\s.]+", "_", name), _SHORT.get((unit or "")[:3], unit)
 
 
 def row_labels(
@@ -221,10 +218,9 @@ def arrays_as_lists(path: Path) -> Any:
 def _matlab(file: IO[bytes]) -> dict[str, Any]:
     from scipy.io import loadmat, whosmat
 
-    numeric = ("double", "single", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32")
-    shapes = {name: shape for name, shape, kind in whosmat(file) if kind in numeric}
-    for shape in shapes.values():
-        require_at_most(math.prod(shape), "numbers", "numbers")
+    kinds = re.compile("double|single|u?int(8|16|32|64)")
+    shapes = {name: shape for name, shape, kind in whosmat(file) if kinds.fullmatch(kind)}
+    require_at_most(sum(map(math.prod, shapes.values())), "numbers", "numbers")
     file.seek(0)
     loaded = loadmat(file, variable_names=[*shapes])
     return {name: loaded[name].tolist() for name in shapes}
