@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -62,13 +62,13 @@ def decoded(data: bytes) -> str:
     half = len(data) // 4
     encoding = "utf-16-be" if data[::2].count(0) > half else "utf-8-sig"
     encoding = "utf-16-le" if data[1::2].count(0) > half else encoding
-    try:
-        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else encoding)
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")
-        if _CONTROL.search(text):
-            raise
-    return text.replace("\r\n", "\n").replace("\r", "\n")
+    encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else encoding
+    for each in (encoding, "latin-1"):
+        with suppress(UnicodeDecodeError):
+            text = data.decode(each)
+            if each == "utf-8-sig" or not _CONTROL.search(text):
+                return text.replace("\r\n", "\n").replace("\r", "\n")
+    raise UnicodeDecodeError("utf-8", data, 0, 1, "no text")
 
 
 def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str, Any]:

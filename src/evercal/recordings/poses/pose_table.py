@@ -78,10 +78,8 @@ class Columns(NamedTuple):
         if self.axes and sorted(layout) == sorted(self.axes) and (stated or generic):
             return [columns[self.axes.index(axis)] for axis in layout]
         # Letters without an axis are in the order of the convention that is stated.
-        free = (
-            convention.has_angles and len(layout) == len(columns) and len({*layout, *self.axes}) < 4
-        )
-        free = free and (not self.axes or len({*layout}) < 3)
+        free = not self.axes or (self.axes == "xyz" and len({*layout}) < 3)
+        free = free and convention.has_angles and len(layout) == len(columns)
         return columns if stated or free else []
 
 
@@ -96,7 +94,7 @@ _Q, _R = "q,q_,quat,quat_,quaternion_,orientation_,rotation_", "r,r_,rot_,rotati
 HEADERS = {
     "position": Columns(",t,t_,p,pos_,position_,translation_,tvec_", "xyz"),
     "quaternion": Columns(_Q, "wxyz", ("wxyz", *_ORDERS), axes="wxyz"),
-    "rotation vector": Columns("rotvec_,rvec_,rotation_vector_", "xyz", ("ur",), axes="rotvec"),
+    "rotation vector": Columns("rotvec_,rvec_,rotation_vector_", "xyz", ("ur",), axes="-"),
     "matrix": Columns("m", _GRID, ("matrix", "franka")),
     "3x4 matrix": Columns("m", _GRID[:12], ("matrix", "franka")),
     "rotation matrix": Columns(_R, _GRIDS[0], ("matrix",)),
@@ -105,7 +103,9 @@ HEADERS = {
     "O A T": Columns("", "oat", ("kawasaki",)),
     "q1 to q4": Columns(_Q, "1234", _ORDERS, "abb, wxyz or xyzw"),
     "q0 to q3": Columns(_Q, "0123", _ORDERS, "wxyz or xyzw"),
-    "angles": Columns(_R, "xyz", _ANGLES, "ur (rotation vector), yaskawa, staubli, fanuc or rpy", "xyz"),
+    "angles": Columns(
+        _R, "xyz", _ANGLES, "ur (rotation vector), yaskawa, staubli, fanuc or rpy", "xyz"
+    ),
     "roll pitch yaw": Columns(
         "", ("roll", "pitch", "yaw"), ("rpy", "yaskawa", "staubli", "fanuc", "kuka"),
         "rpy:rad or rpy:deg", "xyz",
@@ -132,7 +132,7 @@ _NOTATIONS = {
     "P[": (r"()\bP\[\d+[^\]\n]*\]\s*\{([^{}]*)\}()", "X,Y,Z,W,P,R"),
     "p[": (rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?p\[([^\[\]{{}}]*)\]()',
            "x,y,z,rotvec_x,rotvec_y,rotvec_z"),
-    "{": (rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?\{{([^\[\]{{}}]*\bX\s[^\[\]{{}}]*)\}}()',
+    "{": (rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?\{{([^\[\]{{}}]*\bX\s+[-+.\d][^\[\]{{}}]*)\}}()',
           "X,Y,Z,A,B,C"),
 }  # fmt: skip
 """By how it begins: a pose as a pattern of a name or stamp and two parts, and its columns.
@@ -166,8 +166,8 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     texts = [i for i, cell in enumerate(rows[0].tolist()) if not is_number(cell)]
     numbers = cell_numbers(np.delete(rows, texts[:1], axis=1))
     if texts or numbers.shape[1] != 4:
-        names = [str(cell).rstrip(":=") for cell in rows[:, texts[0]]] if texts else None
-        return plain_numbers(numbers, given, names and tuple(names))
+        names = tuple(rows[:, texts[0]].tolist()) if texts else None
+        return plain_numbers(numbers, given, names)
     whole = (numbers == (0, 0, 0, 1)).all(1).any() or (given and given.layout == "columns")
     height = 3 if len(numbers) % 3 == 0 and not whole else 4
     if len(numbers) % height:
@@ -290,7 +290,12 @@ def _without_brackets(
 def _without_lists(lines: list[str]) -> list[str]:
     """Lines without the brackets of numpy, Python and robots' functions, such as XY(...)."""
     lines = [re.sub(r"^[^\[\]]*[:=]\s*(?=$|\[\[)", "", line) for line in lines]  # titles
-    lines = [line for line in lines if line]
+    separators = [next((s for s in ";,\t" if s in line), " ") for line in lines]
+    lines = [
+        re.sub(r"^([^\s,;:=]+)\s*(?::\s|=)\s*(?=[-+.\d])", rf"\1{separator}", line)  # P1 = 412.0
+        for line, separator in zip(lines, separators, strict=True)
+        if line
+    ]
     if not lines or not re.search(r"[\[({]\s*[-+.\d]", lines[0]):
         return lines
     text = re.sub(r"\b\w+\(", "(", "\n".join(lines))

@@ -187,13 +187,14 @@ def _poses(table: PoseTable, camera_from: bool = False) -> SE3:
         check_units(table.numbers, table.convention)
         return poses
     except ValueError as error:
+        problem: ValueError = error
         if not table.convention.is_matrix:
             with suppress(ValueError):
                 turned = np.roll(table.numbers, 3, axis=-1)
                 poses_from_numbers(turned, table.convention)
                 check_units(turned, table.convention)
-                error = ValueError(
+                problem = ValueError(
                     f"the rotation is before the position; write {table.convention.meaning}, or a"
                     f" header that names the columns"
                 )
-        raise error from None
+        raise problem from None

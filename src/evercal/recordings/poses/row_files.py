@@ -290,3 +290,13 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
         (0, len(p.lstrip("0")), f"{p.lstrip('0')} {p}") if p[0] in "0123456789" else (1, 0, p)
         for p in parts
     )
+
+
+def same_numbers(first: Sequence[str], second: Sequence[str]) -> bool:
+    """Whether names of two kinds end in the same numbers, as pose_1 and image-001.png."""
+    numbers = [
+        [re.findall(r"\d+", without_ending(name))[-1:] for name in names]
+        for names in (first, second)
+    ]
+    plain = [[int(each[0]) if each else None for each in names] for names in numbers]
+    return None not in plain[0] and plain[0] == plain[1]
