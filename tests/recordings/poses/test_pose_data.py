@@ -247,13 +247,14 @@ def test_vendors_state_millimetres_and_degrees() -> None:
 
 Form = Callable[[int, list[float]], str]
 PRINTED: dict[str, tuple[str, str | None, Form]] = {
-    "tf2_echo": ("xyzw", None, lambda i, r: f"At time {i}.5\n- Translation: {r[:3]}\n- Rotation: in"
-                 f" Quaternion (xyzw) {r[3:]}\n- Rotation: in RPY (radian) [0, 0, 0]\n- Matrix:\n 1 2 3 4"),
+    "tf2_echo": ("xyzw", None, lambda i, r: f"At time {i}.5\n- Translation: {r[:3]}\n- Rotation:"
+                 f" in Quaternion (xyzw) {r[3:]}\n- Rotation: in RPY (radian) [0, 0, 0]\n- Matrix:\n"
+                 " 1 2 3 4"),
     "robtarget": ("abb", None, lambda i, r: f"CONST robtarget p{i}:=[{r[:3]},{r[3:]},[0,0,0,0],"
                   "[9E9,9E9,9E9,9E9,9E9,9E9]];"),
     "pairs of lists": ("xyzw", "xyzw", lambda _, r: f"{r[:3]} {r[3:]}"),
-    "FANUC": ("fanuc", None, lambda i, r: "P[%d]{\n GP1:\n UF : 0, UT : 1, CONFIG : 'N U T, 0, 0, 0',\n"
-              " X = %r mm, Y = %r mm, Z = %r mm,\n W = %r deg, P = %r deg, R = %r deg\n};" % (i, *r)),
+    "FANUC": ("fanuc", None, lambda i, r: f"P[{i}]{{\n GP1:\n UF : 0, UT : 1,\n X = {r[0]} mm, Y ="
+              f" {r[1]} mm, Z = {r[2]} mm,\n W = {r[3]} deg, P = {r[4]} deg, R = {r[5]} deg\n}};"),
     "Mitsubishi": ("yaskawa", "mitsubishi", lambda i, r: f"P{i}={tuple(r)}"),
     "Epson": ("kuka", "epson", lambda i, r: f"P{i} = XY{tuple(r)}"),
     "Doosan": ("kawasaki", "doosan", lambda _, r: f"posx{tuple(r)}"),
