@@ -46,7 +46,8 @@ CAMERAS = {
 POSE_FILES = {
     "poses.csv": None, "kuka.txt": "kuka", "poses.tum": None, "kitti.txt": None,
     "matrices.txt": None, "ur.script": None, "frames.dat": None, "poses.json": None,
-    "arrays.json": None, "named.json": None, "echo.yaml": None, "echo.txt": None, "targets.mod": None,
+    "arrays.json": None, "named.json": None, "echo.yaml": None, "echo.txt": None,
+    "targets.mod": None,
 }  # fmt: skip
 """Examples with their conventions."""
 NAMED = (

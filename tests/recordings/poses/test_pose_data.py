@@ -248,8 +248,8 @@ def test_vendors_state_millimetres_and_degrees() -> None:
 Form = Callable[[int, list[float]], str]
 PRINTED: dict[str, tuple[str, str | None, Form]] = {
     "tf2_echo": ("xyzw", None, lambda i, r: f"At time {i}.5\n- Translation: {r[:3]}\n- Rotation:"
-                 f" in Quaternion (xyzw) {r[3:]}\n- Rotation: in RPY (radian) [0, 0, 0]\n- Matrix:\n"
-                 " 1 2 3 4"),
+                 f" in Quaternion (xyzw) {r[3:]}\n- Rotation: in RPY (radian) [0, 0, 0]\n"
+                 "- Matrix:\n 1 2 3 4"),
     "robtarget": ("abb", None, lambda i, r: f"CONST robtarget p{i}:=[{r[:3]},{r[3:]},[0,0,0,0],"
                   "[9E9,9E9,9E9,9E9,9E9,9E9]];"),
     "pairs of lists": ("xyzw", "xyzw", lambda _, r: f"{r[:3]} {r[3:]}"),
@@ -260,6 +260,7 @@ PRINTED: dict[str, tuple[str, str | None, Form]] = {
     "Doosan": ("kawasaki", "doosan", lambda _, r: f"posx{tuple(r)}"),
     "URScript": ("ur", None, lambda _, r: f"  movel(p{r}, a=1.2, v=0.25)"),
     "names": ("wxyz", "wxyz", lambda i, r: f"im{i}.png: {str(r)[1:-1]}"),
+    "plain titles": ("matrix", None, lambda i, r: f"Pose{i}:\n{np.reshape(r, (4, 4))}"),
     "titles": ("matrix", None, lambda i, r: f"Pose {i}:\n{np.reshape(r, (4, 4))}"),
     "assigned": ("matrix", None, lambda i, r: f"T_{i} = {np.reshape(r, (4, 4)).tolist()}"),
     "repr": ("matrix", None, lambda _, r: repr(np.reshape(r, (4, 4)))),
@@ -346,7 +347,7 @@ def test_commas_may_be_decimal_beside_other_separators(
         (table(numbers("wxyz")) + f"\n{M[0]}", "wxyz", "all poses with brackets, or none"),
         (f"p{numbers('ur')[0]}\n{table(numbers('ur'))}", None, "is beside poses in p"),
         ("x;y;z;rx;ry;rz\n1,234;0.5;3;1;2;3", "ur:mm:deg", "'1,234' is not a finite number"),
-        ("\n".join(f"P{i}={tuple(r)}(7,0)" for i, r in enumerate(numbers("kuka"))), "kuka", "8 num"),
+        ("\n".join(f"P{i}={tuple(r)}(7,0)" for i, r in enumerate(numbers("kuka"))), "kuka", "8 nu"),
     ],
 )  # fmt: skip
 def test_what_is_unclear_is_refused_with_a_way_on(

@@ -146,7 +146,7 @@ def test_conventions_of_matrices_take_12_numbers(tmp_path: Path) -> None:
             lines(rows.reshape(5, 12), lambda i, row: f"{i}.png {i}.5 {plain(row)}")
         )
         assert_arm(read_robot_poses(tmp_path / "p.txt", name).poses)
-    with pytest.raises(InputError, match="in columns, or rotations .*give the convention franka"):
+    with pytest.raises(InputError, match=r"in columns, or rotations .*give the convention franka"):
         read_robot_poses(tmp_path / "p.txt")
 
 

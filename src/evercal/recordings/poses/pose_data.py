@@ -55,8 +55,9 @@ def pose_data(data: Any, given: PoseConvention | None, robot: bool = True) -> Po
 
     ValueError: these are no poses, or it is not clear which ones.
     """
+    data = _plain(data)
     if isinstance(data, Mapping):
-        return _of_object({str(key): data[key] for key in data}, given, robot)
+        return _of_object(data, given, robot)
     if not isinstance(data, list) or len({isinstance(each, Mapping) for each in data}) != 1:
         raise ValueError("poses are a list of objects, or of lists of numbers, not of both")
     if not isinstance(data[0], Mapping):
@@ -67,8 +68,6 @@ def pose_data(data: Any, given: PoseConvention | None, robot: bool = True) -> Po
         return plain_numbers(numbers[None] if single else numbers, given)
     if all(isinstance(entry.get("transforms"), list) for entry in data):  # messages of /tf
         data = [each for entry in data for each in entry["transforms"]]
-    if all(_is_matrix(entry) for entry in data):
-        return pose_data([_unwrapped(entry) for entry in data], given)
     rows = [_flat(entry) for entry in data]
     keys = dict.fromkeys(key for row in rows for key in row)
     require_at_most(len(keys), "columns", "keys")
@@ -92,9 +91,7 @@ def _of_object(data: Columns, given: PoseConvention | None, robot: bool) -> Pose
     numbered = len(stems) == 1 and not stems & data.keys()
     if data and (numbered or all(key.lower().endswith(IMAGE_ENDINGS) for key in data)):
         return pose_data([*data.values()], given, robot)._replace(names=tuple(data))
-    if _is_matrix(data):
-        return pose_data(_unwrapped(data), given)
-    columns = _of_role({key: _unwrapped(data[key]) for key in data}, given, robot)
+    columns = _of_role(data, given, robot)
     inner = [key for key in columns if key in _KEYS and len(_shape(columns[key])) < 2]
     if len(inner) == 1:
         return _labelled(pose_data(columns[inner[0]], given, robot), columns, plural=True)
@@ -194,30 +191,28 @@ def _labelled(table: PoseTable, columns: Columns, plural: bool) -> PoseTable:
     return table._replace(names=table.names or names, stamps_s=stamps)
 
 
-def _is_matrix(data: object) -> bool:
-    return isinstance(data, Mapping) and {"rows", "cols", "data"} <= data.keys()
-
-
-def _unwrapped(data: Any) -> Any:
-    """A matrix of OpenCV or ViSP as nested lists."""
-    if not _is_matrix(data):
-        return data
-    return number_array(data["data"], "data").reshape(data["rows"], data["cols"]).tolist()
+def _plain(data: Any) -> Any:
+    """Matrices of OpenCV and ViSP (rows, cols, data) as nested lists, and keys as text."""
+    if isinstance(data, Mapping) and {"rows", "cols", "data"} <= data.keys():
+        return number_array(data["data"], "data").reshape(data["rows"], data["cols"]).tolist()
+    if isinstance(data, Mapping):
+        return {str(key): _plain(value) for key, value in data.items()}
+    nested = isinstance(data, list) and any(isinstance(each, Mapping) for each in data)
+    return [_plain(each) for each in data] if nested else data
 
 
 def _flat(entry: Columns) -> dict[str, Any]:
     """Values of nested objects; the stamp of a ROS message as seconds."""
     cells: dict[str, Any] = {}
     for key, value in entry.items():
-        require_at_most(len(str(key)), "name_characters", "characters of a key")
-        value = _unwrapped(value)
+        require_at_most(len(key), "name_characters", "characters of a key")
         if key == "stamp" and isinstance(value, Mapping) and len(value) == 2:
             seconds, nanoseconds = value.values()
             cells["stamp_s"] = seconds + 1e-9 * nanoseconds
         elif isinstance(value, Mapping):
             cells |= {f"{key}_{inner}": each for inner, each in _flat(value).items()}
         else:
-            cells[str(key)] = value
+            cells[key] = value
     return cells
 
 

@@ -84,10 +84,7 @@ class Columns(NamedTuple):
 
 
 _GRID = [f"{row}{column}" for row in range(4) for column in range(4)]
-_GRIDS = [
-    [f"{row + first}{column + first}" for row in range(3) for column in range(3)]
-    for first in (0, 1)
-]
+_GRID_3 = [f"{row}{column}" for row in range(3) for column in range(3)]
 _ANGLES = ("ur", "yaskawa", "staubli", "fanuc", "rpy")
 _ORDERS = ("abb", "wxyz", "xyzw", "tum")
 _Q, _R = "q,q_,quat,quat_,quaternion_,orientation_,rotation_", "r,r_,rot_,rotation_"
@@ -97,8 +94,8 @@ HEADERS = {
     "rotation vector": Columns("rotvec_,rvec_,rotation_vector_", "xyz", ("ur",), axes="-"),
     "matrix": Columns("m", _GRID, ("matrix", "franka")),
     "3x4 matrix": Columns("m", _GRID[:12], ("matrix", "franka")),
-    "rotation matrix": Columns(_R, _GRIDS[0], ("matrix",)),
-    "rotation matrix from 11": Columns(_R, _GRIDS[1], ("matrix",)),
+    "rotation matrix": Columns(_R, _GRID_3, ("matrix",)),
+    "matrix from r11": Columns(_R, [f"{int(at) + 11}" for at in _GRID_3], ("matrix",)),
     "W P R": Columns("", "wpr", ("fanuc",)),
     "O A T": Columns("", "oat", ("kawasaki",)),
     "q1 to q4": Columns(_Q, "1234", _ORDERS, "abb, wxyz or xyzw"),
@@ -129,7 +126,7 @@ _NOTATIONS = {
         r"\s*,\s*\[[^\[\]]*\]\s*,\s*\[[^\[\]]*\]\s*\]",
         "x_mm,y_mm,z_mm,qw,qx,qy,qz",
     ),
-    "P[": (r"()\bP\[\d+[^\]\n]*\]\s*\{([^{}]*)\}()", "X,Y,Z,W,P,R"),
+    "P[": (r"()\bP\[\d[^\[\]\n]*\]\s*\{([^{}]*)\}()", "X,Y,Z,W,P,R"),
     "p[": (rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?p\[([^\[\]{{}}]*)\]()',
            "x,y,z,rotvec_x,rotvec_y,rotvec_z"),
     "{": (rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?\{{([^\[\]{{}}]*\bX\s+[-+.\d][^\[\]{{}}]*)\}}()',
@@ -217,11 +214,12 @@ def _in_units(convention: PoseConvention, words: Sequence[str], *known: str) -> 
     if len(units) > 1:
         raise ValueError(f"the columns {', '.join(words)} differ in unit")
     unit = units.pop() if units else None
-    if unit not in (None, *known):
+    if unit is None:
+        return convention
+    if unit not in known:
         problem = f"the columns {', '.join(words)} are in {unit}"
         raise ValueError(f"{problem}; write {' or '.join(known)}")
-    keep = unit is None or convention.has(*known)
-    return convention if keep else replace(convention, **UNITS[unit])
+    return convention if convention.has(*known) else replace(convention, **UNITS[unit])
 
 
 def plain_numbers(numbers: Array, given: PoseConvention | None, names: Names = None) -> PoseTable:
@@ -290,12 +288,10 @@ def _without_brackets(
 def _without_lists(lines: list[str]) -> list[str]:
     """Lines without the brackets of numpy, Python and robots' functions, such as XY(...)."""
     lines = [re.sub(r"^[^\[\]]*[:=]\s*(?=$|\[\[)", "", line) for line in lines]  # titles
-    separators = [next((s for s in ";,\t" if s in line), " ") for line in lines]
-    lines = [
-        re.sub(r"^([^\s,;:=]+)\s*(?::\s|=)\s*(?=[-+.\d])", rf"\1{separator}", line)  # P1 = 412.0
-        for line, separator in zip(lines, separators, strict=True)
-        if line
-    ]
+    lines = [line for line in lines if line]
+    cut = next((s for s in ";,\t" if s in "".join(lines[:1])), " ")
+    label = re.compile(r"^([^\s,;:=]+)\s*(?::\s|=)\s*(?=[-+.\d])")  # P1 = 412.0
+    lines = [label.sub(rf"\1{cut}", line) for line in lines]
     if not lines or not re.search(r"[\[({]\s*[-+.\d]", lines[0]):
         return lines
     text = re.sub(r"\b\w+\(", "(", "\n".join(lines))

@@ -35,7 +35,10 @@ from evercal.recordings.text_files import (
 )
 
 POSE_ENDINGS = (".csv", ".json", ".jsonl", ".yaml", ".yml", ".npy", ".npz", ".mat", ".tum", ".txt")
-_YAML = re.compile(r"(?:\s*#.*\n)*(?:%YAML|---\s*\n|(?:- )?[A-Za-z_]\w*:(?:\s*\n| \{[^X]))")
+_YAML = re.compile(
+    r"(?:\s*#.*\n)*(?:%YAML|---\s*\n|(?:- )?[A-Za-z_]\w*:(?:\s*\n\s*(?:- )?[A-Za-z_]\w*:"
+    r"| \{\s*[a-z]))"
+)
 """Beginning of YAML in a file with another ending."""
 _END_BYTES = 1 << 16
 """Bytes read at each end of a file that grows."""

@@ -294,9 +294,6 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 
 def same_numbers(first: Sequence[str], second: Sequence[str]) -> bool:
     """Whether names of two kinds end in the same numbers, as pose_1 and image-001.png."""
-    numbers = [
-        [re.findall(r"\d+", without_ending(name))[-1:] for name in names]
-        for names in (first, second)
-    ]
-    plain = [[int(each[0]) if each else None for each in names] for names in numbers]
-    return None not in plain[0] and plain[0] == plain[1]
+    numbers = [re.findall(r"(\d+)\D*$", without_ending(name)) for name in (*first, *second)]
+    plain = [int(each[0]) if each else -1 for each in numbers]
+    return -1 not in plain and plain[: len(first)] == plain[len(first) :]
