@@ -137,6 +137,16 @@ def test_the_poses_of_the_camera_are_read_beside_those_of_the_robot(tmp_path: Pa
     assert_arm(file, robot=False)
 
 
+def test_samples_of_a_fixed_camera_are_inverse_in_easy_handeye(tmp_path: Path) -> None:
+    rows = numbers_from_poses(ARM.inverse(), pose_convention("xyzw")).tolist()
+    samples = [{"robot": message(row, ("translation", "rotation"))} for row in rows]
+    for stated in ({"calibration_type": "eye_on_base"}, {"eye_on_hand": False}):
+        data = {"parameters": stated, "samples": samples}
+        (tmp_path / "p.yaml").write_text(yaml.safe_dump(data))
+        refused("gripper_from_base .* wxyz:inverse", read_robot_poses, tmp_path / "p.yaml")
+        assert_arm(tmp_path / "p.yaml", "wxyz:inverse")
+
+
 MATLAB: dict[str, dict[str, Any]] = {
     "4x4xn": {"T": np.moveaxis(M, 0, -1)},
     "nx4x4": {"T": M},

@@ -91,6 +91,11 @@ def _of_object(data: Columns, given: PoseConvention | None, robot: bool) -> Pose
     numbered = len(stems) == 1 and not stems & data.keys()
     if data and (numbered or all(key.lower().endswith(IMAGE_ENDINGS) for key in data)):
         return pose_data([*data.values()], given, robot)._replace(names=tuple(data))
+    kind = data["parameters"] if isinstance(data.get("parameters"), Mapping) and robot else {}
+    fixed = kind.get("calibration_type") == "eye_on_base" or kind.get("eye_on_hand") is False
+    if fixed and not (given and given.has("inverse")):
+        problem = "easy_handeye states gripper_from_base for a fixed camera"
+        raise ConventionError(problem, "wxyz:inverse")
     columns = _of_role(data, given, robot)
     inner = [key for key in columns if key in _KEYS and len(_shape(columns[key])) < 2]
     if len(inner) == 1:
