@@ -10,6 +10,7 @@ VERBS = {
     "calibration": ("calibration", "cameras calibrated from images, beside the simulator's truth"),
     "eye-to-hand": ("eye_to_hand", "a fixed camera and a textured thing in the gripper"),
     "trust": ("trust", "other cameras, few images, an inaccurate arm: errors and deviations"),
+    "fisheye": ("fisheye", "rooms through lenses of 150 and 180 degrees, beside a pinhole"),
     "same-model": ("same_model", "images of other cameras of the recording's model"),
     "repeat": ("repeat", "a wrist camera before a chessboard, in three folds"),
     "handeye": ("hand_eye", "pose pairs: errors, ellipsoids, outliers, scale, time"),

@@ -4,10 +4,11 @@ Recordings are rendered on demand by `rooms.held`. Every answer is one JSON line
 and is not repeated.
 """
 
+import itertools
 import json
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -113,10 +114,8 @@ def run(
     done = {(row["condition"], row["seed"], row["method"]) for row in rows}
     for name in tqdm(only or CONDITIONS, unit="condition"):
         condition = CONDITIONS[name]
-        for seed in range(FIRST_SEED, FIRST_SEED + draws):
-            setting = condition.setting(seed)
-            for _ in tqdm(render(setting, data), setting.name, leave=False, unit="image"):
-                pass
+        for setting in itertools.islice(_rendered(condition, data), draws):
+            seed = setting.seed
             for method in methods:
                 if render_only or (name, seed, method) in done:
                     continue
@@ -129,6 +128,19 @@ def run(
                     stream.write(json.dumps(row) + "\n")
     if rows:
         save(out / "eye-to-hand.csv", summary(rows))
+
+
+def _rendered(condition: Condition, data: Path) -> Iterator[Setting]:
+    """Settings of the seeds whose room has a place for such a camera, rendered."""
+    for seed in itertools.count(FIRST_SEED):
+        setting = condition.setting(seed)
+        try:
+            for _ in tqdm(render(setting, data), setting.name, leave=False, unit="image"):
+                pass
+        except InputError as error:
+            tqdm.write(str(error))
+            continue
+        yield setting
 
 
 def _measured(method: str, condition: Condition, data: Path, setting: Setting) -> Row:

@@ -1,6 +1,7 @@
 """The camera against OpenCV, against closed forms, and against itself at other sizes."""
 
 from dataclasses import replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -9,10 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evercal.geometry import Camera
+from evercal.geometry.camera import Model
 
 KINECT = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
 RATIONAL = (0.1, -0.05, 0.001, -0.002, 0.01, 0.05, 0.01, 0.002)
 LENSES = [(), (-0.2, 0.05, 0.001, -0.0005), KINECT, RATIONAL]
+FISHEYES = [(0.0,) * 4, (0.1, -0.02, 0.003, -0.0005), (-0.05, 0.01, -0.004, 0.0007)]
 
 
 def camera_with(distortion: tuple[float, ...]) -> Camera:
@@ -85,22 +88,19 @@ def test_short_side(size: tuple[int, int], expected: tuple[int, int]) -> None:
     assert (camera.width, camera.height) == expected
 
 
-@pytest.mark.parametrize("distortion", LENSES)
-def test_slopes_equal_finite_differences(distortion: tuple[float, ...]) -> None:
-    camera, step = camera_with(distortion), 1e-6
+@pytest.mark.parametrize(
+    ("distortion", "model"), [*product(LENSES, ["pinhole"]), *product(FISHEYES, ["fisheye"])]
+)
+def test_slopes_equal_finite_differences(distortion: tuple[float, ...], model: Model) -> None:
+    camera, step = camera_with(()), 1e-6
+    camera = replace(camera, distortion=distortion, model=model)
     plane = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2))
 
     def pixels_of(camera: Camera, move: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
         return camera.project(np.concatenate([plane + move, np.ones((20, 1))], 1))
 
     def changed(size: float) -> list[Camera]:
-        k, grown = np.array(camera.coefficients), np.exp(size)
-        return [
-            replace(camera, fx=camera.fx * grown, fy=camera.fy * grown),
-            replace(camera, cx=camera.cx + size),
-            replace(camera, cy=camera.cy + size),
-            *(replace(camera, distortion=tuple(k + size * np.eye(8)[i])) for i in (0, 1)),
-        ]
+        return [camera.changed(row) for row in size * np.eye(5)]
 
     by_plane, by_lens = camera.slopes(plane)
     ahead, behind = ([pixels_of(c) for c in changed(size)] for size in (step, -step))
@@ -142,6 +142,54 @@ def test_pixels_beyond_the_fold_have_no_ray() -> None:
 )
 def test_range_of_the_distortion(distortion: tuple[float, ...], widest: float) -> None:
     assert camera_with(distortion).widest == pytest.approx(widest)
+
+
+def fisheye(distortion: tuple[float, ...], focal: float = 180.0) -> Camera:
+    return Camera(640, 480, focal, 1.01 * focal, 318.6, 235.3, distortion, "fisheye")
+
+
+@pytest.mark.parametrize("distortion", FISHEYES)
+def test_a_fisheye_agrees_with_opencv(distortion: tuple[float, ...]) -> None:
+    camera, rng = fisheye(distortion), np.random.default_rng(0)
+    angle, around = np.deg2rad(rng.uniform(0, 84, 300)), rng.uniform(0, 2 * np.pi, 300)
+    points = np.stack(
+        [np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], -1
+    ) * rng.uniform(0.5, 3, (300, 1))
+    lens = np.array(distortion)
+    twin, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), camera.matrix(), lens
+    )
+    np.testing.assert_allclose(camera.project(points), twin[:, 0], atol=1e-9)
+    np.testing.assert_allclose(
+        camera.unproject(twin[:, 0]), points / points[:, 2:], rtol=1e-6, atol=1e-9
+    )
+
+
+def test_a_fisheye_ends_at_85_deg_or_where_its_polynomial_folds() -> None:
+    assert fisheye((0.0,) * 4).widest == pytest.approx(np.tan(np.deg2rad(85)))
+    folds = (-0.3, 0.0, 0.0, 0.0)  # 1 - 0.9 t^2 = 0
+    assert fisheye(folds).widest == pytest.approx(np.tan((0.9) ** -0.5))
+    far = np.array([[np.tan(np.deg2rad(84.9)), 0, 1], [np.tan(np.deg2rad(85.1)), 0, 1]])
+    assert np.isfinite(fisheye((0.0,) * 4).project(far)).all(1).tolist() == [True, False]
+    across = np.array([[318.6 + 180 * np.deg2rad(deg), 235.3] for deg in (0, 84.9, 85.1, 120)])
+    rays = fisheye((0.0,) * 4).unproject(across)
+    assert np.isfinite(rays).all(1).tolist() == [True, True, False, False]
+
+
+@pytest.mark.parametrize("distortion", FISHEYES)
+def test_a_fisheye_survives_sizes_dictionaries_and_changes(distortion: tuple[float, ...]) -> None:
+    camera = fisheye(distortion)
+    assert Camera.from_dict(camera.to_dict()) == camera
+    assert camera.resized(320, 240).resized(640, 480).model == "fisheye"
+    assert camera.pinhole.distortion == ()
+    assert camera.pinhole.model == "pinhole"
+    changed = camera.changed([0.0, 1.0, 0.0, 0.01, -0.02])
+    assert changed.distortion[:2] == pytest.approx((distortion[0] + 0.01, distortion[1] - 0.02))
+    assert changed.cx == camera.cx + 1
+    with pytest.raises(ValueError, match="k1 k2 k3 k4"):
+        fisheye((0.1,) * 5)
+    with pytest.raises(ValueError, match="pinhole or fisheye"):
+        replace(camera, model="omni")  # pyright: ignore[reportArgumentType]
 
 
 def test_zero_coefficients_and_points_behind_the_camera() -> None:

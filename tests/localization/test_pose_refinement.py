@@ -23,7 +23,6 @@ from evercal.localization.intrinsics import (
 from evercal.localization.pose_refinement import (
     Minimum,
     Observed,
-    changed_camera,
     linearise,
     minimise,
 )
@@ -130,7 +129,7 @@ def test_derivatives_equal_finite_differences(lens: tuple[float, ...]) -> None:
 
     def residual(tangent: Array, change: Array) -> Array:
         moved = matrix_and_position(NEAR @ SE3.exp(tangent))
-        return linearise(pixels, points_m, *moved, changed_camera(camera, change))[0]
+        return linearise(pixels, points_m, *moved, camera.changed(change))[0]
 
     _, slope = linearise(pixels, points_m, *matrix_and_position(NEAR), camera, True)
     by_pose = linearise(pixels, points_m, *matrix_and_position(NEAR), camera)[1]
@@ -167,7 +166,7 @@ CHANGE = np.array([0.004, 1.5, -1.0, 0.004, -0.003])
 def seen_with(change: Array, seed: int, sigma_px: float, noise_px: float) -> Observed:
     """300 points seen with other intrinsics than those of `CAMERA`."""
     points_m, noise = points(300, seed), np.random.default_rng(seed).normal(size=(300, 2))
-    pixels = project(points_m, changed_camera(CAMERA, change)) + noise_px * noise
+    pixels = project(points_m, CAMERA.changed(change)) + noise_px * noise
     return Observed(pixels, points_m, precise(300, sigma_px))
 
 
@@ -215,7 +214,7 @@ def test_a_far_camera_is_reached_by_repetition(factor: float) -> None:
         at, change = matrix_and_position(result.pose.pose), result.change
         result = self_calibrated(seen, CAMERA, at, change, prior)
     assert moved[-1] < 0.2 < moved[-2]
-    truth = changed_camera(CAMERA, far)
+    truth = CAMERA.changed(far)
     assert result.camera.fx == pytest.approx(truth.fx, rel=2e-3)
     np.testing.assert_allclose(result.camera.distortion[:2], truth.distortion[:2], atol=0.01)
     assert result.pose.squared_mahalanobis(POSE) < 22.5

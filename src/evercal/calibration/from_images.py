@@ -182,7 +182,8 @@ def estimated_camera(used: Sequence[ImagePose], stated: Camera) -> Camera:
         return stated
     rows = [[c.fx, c.fy, c.cx, c.cy, *c.coefficients] for c in cameras]
     fx, fy, cx, cy, *distortion = np.median(rows, axis=0).tolist()
-    median = Camera(stated.width, stated.height, fx, fy, cx, cy, tuple(distortion))
+    terms = tuple(distortion[: 4 if stated.model == "fisheye" else 8])
+    median = replace(stated, fx=fx, fy=fy, cx=cx, cy=cy, distortion=terms)
     across = np.linspace(0, 1, 5)[:, None] * [stated.width - 1, stated.height - 1]
     pixels = np.stack(np.meshgrid(*across.T), -1)
     # Compare angles between rays: the principal point trades against the rotation.

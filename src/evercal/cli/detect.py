@@ -49,6 +49,8 @@ class Detect(args.Verb):
     """Number of the tag."""
     camera: args.File = None
     """File of the intrinsics; if omitted, they are estimated from the board."""
+    lens: Literal["pinhole", "fisheye"] = "pinhole"
+    """Model of the estimated intrinsics: fisheye for wide lenses, from about 110 degrees."""
     out: args.OutFile = Path("board.json")
     """File of poses and corners to write."""
     make_board: Annotated[Path | None, args.shown("FILE.pdf|png")] = None
@@ -85,7 +87,7 @@ class Detect(args.Verb):
             name, reason = next(iter(views.items()))
             raise InputError(f"no board in any of {len(files)} images ({name}: {reason})")
         if camera is None:
-            camera, source = calibrate_camera(detected, width, height).camera, "board"
+            camera, source = calibrate_camera(detected, width, height, self.lens).camera, "board"
         poses = board_poses(board, camera, views, source)
         poses.write(self.out)
         words = ("--robot-poses", "FILE", "--camera-poses", self.out, "--mount", "eye_in_hand")

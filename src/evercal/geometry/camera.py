@@ -1,4 +1,8 @@
-"""The camera: pinhole with OpenCV's distortion.
+"""The camera: a pinhole with OpenCV's distortion, or a fisheye.
+
+A fisheye (Kannala and Brandt, PAMI 2006; `cv2.fisheye`) maps the angle t to the optical axis to the
+radius f t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8). Both are distortions of the plane z = 1, which
+ends before 90 degrees: rays of a fisheye beyond `FISHEYE_DEG` are left out.
 
 Conventions: OpenCV axes (x right, y down, z forward). Pixel (0, 0) is the CENTRE of the top-left
 pixel, as in OpenCV and ROS, so an image covers -0.5 .. width - 0.5 and its middle is at
@@ -9,14 +13,17 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-_COEFFICIENT_COUNTS = (0, 4, 5, 8)
+Model = Literal["pinhole", "fisheye"]
+FISHEYE_DEG = 85.0
+"""Largest angle to the optical axis of a ray of a fisheye."""
+_COEFFICIENT_COUNTS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
 _EXACT = 1e-10
 """Tolerance of undistorted points on the plane z = 1."""
 _ASPECT_TOLERANCE = 0.01
@@ -47,7 +54,9 @@ class Camera:
     cy: float
     """Principal point in pixels; 0 is the centre of the topmost pixel."""
     distortion: tuple[float, ...] = ()
-    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty without distortion. Zeros become empty."""
+    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty without distortion. Zeros become empty.
+    Of a fisheye k1 k2 k3 k4, also zeros."""
+    model: Model = "pinhole"
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
@@ -60,13 +69,18 @@ class Camera:
             if not math.isfinite(value) or (name.startswith("f") and value <= 0):
                 raise ValueError(f"camera {name} is finite (and > 0 for fx, fy), got {value}")
             object.__setattr__(self, name, value)
+        if self.model not in _COEFFICIENT_COUNTS:
+            raise ValueError(f"camera model is pinhole or fisheye, got {self.model!r}")
         distortion = tuple(float(value) for value in self.distortion)
-        if len(distortion) not in _COEFFICIENT_COUNTS or not all(map(math.isfinite, distortion)):
+        counts = _COEFFICIENT_COUNTS[self.model]
+        if len(distortion) not in counts or not all(map(math.isfinite, distortion)):
+            names = "k1 k2 k3 k4" if self.model == "fisheye" else "k1 k2 p1 p2 k3 k4 k5 k6"
             raise ValueError(
-                f"camera distortion has 0, 4, 5 or 8 finite coefficients"
-                f" (OpenCV's k1 k2 p1 p2 k3 k4 k5 k6), got {distortion}"
+                f"camera distortion has {', '.join(map(str, counts[:-1]))} or {counts[-1]} finite"
+                f" coefficients (OpenCV's {names}), got {distortion}"
             )
-        object.__setattr__(self, "distortion", distortion if any(distortion) else ())
+        none = (0.0,) * 4 if self.model == "fisheye" else ()
+        object.__setattr__(self, "distortion", distortion if any(distortion) else none)
 
     @classmethod
     def from_matrix(
@@ -94,24 +108,38 @@ class Camera:
 
         Beyond it the polynomial folds back, so points far outside the view land in the image.
         """
+        if self.model == "fisheye":
+            folds = _roots(
+                [1.0, *(n * k for n, k in zip((3, 5, 7, 9), self.distortion, strict=True))]
+            )
+            return math.tan(min(math.sqrt(min(folds, default=9.0)), math.radians(FISHEYE_DEG)))
         k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
         if not (k4 or k5 or k6):
-            roots = np.polynomial.polynomial.polyroots(
-                np.trim_zeros([1.0, 3 * k1, 5 * k2, 7 * k3], "b")
-            )
-        else:
-            squared = np.polynomial.Polynomial([0, 1])
-            above = np.polynomial.Polynomial([1, k1, k2, k3])
-            below = np.polynomial.Polynomial([1, k4, k5, k6])
-            slope = above * below + 2 * squared * (above.deriv() * below - above * below.deriv())
-            roots = np.concatenate([slope.trim().roots(), below.trim().roots()])
-        real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
-        return math.sqrt(min(real, default=math.inf))
+            return math.sqrt(min(_roots([1.0, 3 * k1, 5 * k2, 7 * k3]), default=math.inf))
+        squared = np.polynomial.Polynomial([0, 1])
+        above = np.polynomial.Polynomial([1, k1, k2, k3])
+        below = np.polynomial.Polynomial([1, k4, k5, k6])
+        slope = above * below + 2 * squared * (above.deriv() * below - above * below.deriv())
+        return math.sqrt(min([*_roots(slope.coef), *_roots(below.coef)], default=math.inf))
 
     @property
     def pinhole(self) -> "Camera":
         """The same camera without distortion."""
-        return replace(self, distortion=()) if self.distortion else self
+        return replace(self, distortion=(), model="pinhole") if self.distortion else self
+
+    def changed(self, change: ArrayLike) -> "Camera":
+        """The camera after a change (5,) of the parameters of `slopes`."""
+        log_focal, x, y, *radial = np.asarray(change, np.float64).tolist()
+        coefficients = self.coefficients[: max(4, len(self.distortion))]
+        factor, (k1, k2, *others) = math.exp(log_focal), coefficients
+        return replace(
+            self,
+            fx=factor * self.fx,
+            fy=factor * self.fy,
+            cx=self.cx + x,
+            cy=self.cy + y,
+            distortion=(k1 + radial[0], k2 + radial[1], *others),
+        )
 
     def fits(self, width: int, height: int) -> bool:
         """Whether an image has the aspect ratio of this camera, to 1 %."""
@@ -126,7 +154,8 @@ class Camera:
         """The camera of the same image resized to `width` x `height` pixels."""
         sx, sy = width / self.width, height / self.height
         cx, cy = resize_pixels((self.cx, self.cy), np.array([sx, sy])).tolist()
-        return Camera(width, height, self.fx * sx, self.fy * sy, cx, cy, self.distortion)
+        fx, fy = self.fx * sx, self.fy * sy
+        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def short_side_resized(self, short_side: int) -> "Camera":
         """The camera of the image resized so that its shorter side is `short_side` pixels."""
@@ -181,18 +210,25 @@ class Camera:
         by_plane[0, 0], by_plane[0, 1] = self.fx * a, self.fx * b
         by_plane[1, 0], by_plane[1, 1] = self.fy * b, self.fy * d
         r2 = x * x + y * y
-        _, _, _, _, _, k4, k5, k6 = self.coefficients
-        first = r2 / (1 + r2 * (k4 + r2 * (k5 + r2 * k6))) if k4 or k5 or k6 else r2
+        first, next_power = r2, r2
+        if self.model == "fisheye":
+            next_power = np.arctan(np.sqrt(r2)) ** 2
+            first = next_power * _angle_per_radius(r2)
+        elif any(self.coefficients[5:]):
+            _, _, _, _, _, k4, k5, k6 = self.coefficients
+            first = r2 / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
         for row, focal, ideal, distorted in ((0, self.fx, x, u), (1, self.fy, y, v)):
             lens[row, 0] = focal * distorted
             lens[row, 1 + row] = 1
             lens[row, 3] = focal * ideal * first
-            lens[row, 4] = lens[row, 3] * r2
+            lens[row, 4] = lens[row, 3] * next_power
         return np.moveaxis(by_plane, (0, 1), (-2, -1)), np.moveaxis(lens, (0, 1), (-2, -1))
 
     def to_dict(self) -> dict[str, object]:
-        """Plain numbers for JSON."""
-        return {**asdict(self), "distortion": list(self.distortion)}
+        """Plain numbers for JSON; the model only of a fisheye."""
+        model = {"model": self.model} if self.model == "fisheye" else {}
+        numbers = {name: value for name, value in asdict(self).items() if name != "model"}
+        return {**numbers, "distortion": list(self.distortion), **model}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, object]) -> Self:
@@ -202,11 +238,14 @@ class Camera:
         distortion = data.get("distortion", ())
         if not isinstance(distortion, (list, tuple)):
             raise ValueError(f"camera 'distortion' is a list of numbers, got {distortion!r}")
-        return cls(**numbers, distortion=tuple(_number(k, "distortion") for k in distortion))
+        model: Any = data.get("model", "pinhole")
+        return cls(
+            **numbers, distortion=tuple(_number(k, "distortion") for k in distortion), model=model
+        )
 
     def _distorted(self, x: Array, y: Array) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
         """Distorted points (u, v), and their derivatives du/dx, du/dy = dv/dx and dv/dy."""
-        _, _, p1, p2, *_ = self.coefficients
+        p1, p2 = (0.0, 0.0) if self.model == "fisheye" else self.coefficients[2:4]
         r2 = x * x + y * y
         radial, change = self._radial(r2)
         twice = 2 * change
@@ -220,6 +259,15 @@ class Camera:
         return (u, v), (a, cross, d)
 
     def _radial(self, r2: Array) -> tuple[Array, Array]:
+        """Distorted over ideal radius, and its derivative by the ideal squared radius `r2`."""
+        if self.model == "fisheye":
+            k1, k2, k3, k4 = self.distortion
+            ratio, t2 = _angle_per_radius(r2), np.arctan(np.sqrt(r2)) ** 2
+            longer = 1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
+            steeper = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+            radial = ratio * longer
+            change = (steeper / (1 + r2) - radial) / (2 * np.maximum(r2, 1e-8))
+            return radial, np.where(r2 > 1e-8, change, k1 - 1 / 3)
         k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
         above = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         steeper = k1 + r2 * (2 * k2 + r2 * 3 * k3)
@@ -229,7 +277,23 @@ class Camera:
         radial = above / below
         return radial, (steeper - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
 
+    def _angles(self, radii: Array) -> Array:
+        """Angles of a fisheye at distorted radii (...); NaN outside its range."""
+        k1, k2, k3, k4 = self.distortion
+        radius = np.polynomial.Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4])
+        slope, most = radius.deriv(), math.atan(self.widest)
+        angles = np.minimum(radii, most)
+        for _ in range(50):  # Newton's method: a few steps but close to a fold
+            off = radius(angles) - radii
+            if (np.abs(off) < _EXACT).all():
+                break
+            angles = np.clip(angles - off / np.maximum(slope(angles), 1e-6), 0, most)
+        return np.where(np.abs(off) < _EXACT, angles, np.nan)
+
     def _undistorted(self, distorted: Array) -> Array:
+        if self.model == "fisheye":
+            radii = np.linalg.norm(distorted, axis=-1, keepdims=True)
+            return distorted * np.tan(self._angles(radii)) / np.maximum(radii, 1e-12)
         plane, lost = distorted, np.ones(distorted.shape[:-1], bool)
         for _ in range(50):  # Newton's method: a few steps but close to `widest`
             far = np.sqrt((plane**2).sum(-1, keepdims=True))
@@ -242,6 +306,18 @@ class Camera:
             step = np.stack([d * u - b * v, a * v - b * u], -1) / (a * d - b * b)[..., None]
             plane = plane - step
         return np.where(lost[..., None], np.nan, plane)
+
+
+def _roots(coefficients: ArrayLike) -> list[float]:
+    """Positive real roots of a polynomial, from its coefficients in ascending order."""
+    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(np.asarray(coefficients), "b"))
+    return roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].tolist()
+
+
+def _angle_per_radius(r2: Array) -> Array:
+    """atan(r) / r of squared radii."""
+    r = np.sqrt(np.maximum(r2, 1e-12))
+    return np.arctan(r) / r
 
 
 def _number(value: object, name: str) -> float:

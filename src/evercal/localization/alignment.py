@@ -13,7 +13,6 @@ from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import (
     INTRINSICS,
     Observed,
-    changed_camera,
     minimise,
 )
 from evercal.mapping.landmarks import project_surface
@@ -97,7 +96,7 @@ def align_pose(
     change = np.zeros(INTRINSICS) if change is None else change
     observed, again = None, 0
     while True:
-        passed = search.rounds(rounds, changed_camera(camera, change), pose, observed)
+        passed = search.rounds(rounds, camera.changed(change), pose, observed)
         if passed is None:
             return None
         pose, observed = passed

@@ -57,7 +57,7 @@ class IntrinsicsPrior:
     """Probability that the image is of another camera of the same model, see `SAME_MODEL`."""
 
     def variances(self, camera: Camera) -> Array:
-        """(5,) variances of a change of intrinsics, see `pose_refinement.changed_camera`."""
+        """(5,) variances of a change of intrinsics, see `Camera.changed`."""
         centre = self.centre * max(camera.width, camera.height)
         return np.square([self.focal, centre, centre, self.k1, self.k2])
 

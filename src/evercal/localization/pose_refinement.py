@@ -136,7 +136,7 @@ def minimise(
     linear in them: the caller repeats it after a large change.
     """
     (rotation, position), best, ahead = start, None, {}
-    now, moved, white = changed_camera(camera, change), change.copy(), observed.whitening
+    now, moved, white = camera.changed(change), change.copy(), observed.whitening
     free, bent = len(variances), _BENT_PX**2 * float((white**2).sum()) / 2
     for _ in range(max(iterations, 1)):
         raw, slope = linearise(
@@ -170,7 +170,7 @@ def minimise(
             break
     assert best is not None, "at least one iteration"
     best = replace(best, **ahead)
-    return replace(best, camera=changed_camera(camera, best.change))
+    return replace(best, camera=camera.changed(best.change) if best.change.any() else camera)
 
 
 def robust_variance(squares: Array) -> float:
@@ -186,21 +186,6 @@ def cells_of(pixels: Array, camera: Camera) -> Array:
     side = min(camera.width, camera.height) / SHARED_CELLS
     cell = (pixels // side).astype(np.int64) @ [1, 1000]
     return (cell[:, None] == np.unique(cell)).astype(np.float64)
-
-
-def changed_camera(camera: Camera, change: Array) -> Camera:
-    """A camera with changed intrinsics."""
-    if not change.any():
-        return camera
-    factor, (k1, k2, *others) = float(np.exp(change[0])), camera.coefficients
-    return replace(
-        camera,
-        fx=factor * camera.fx,
-        fy=factor * camera.fy,
-        cx=camera.cx + float(change[1]),
-        cy=camera.cy + float(change[2]),
-        distortion=(k1 + float(change[3]), k2 + float(change[4]), *others),
-    )
 
 
 def inverse_of(information: Array) -> Array:

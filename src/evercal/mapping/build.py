@@ -75,8 +75,8 @@ class MapOptions:
     def for_hand_eye(self, mount: Mount) -> "MapOptions":
         """The same options for poses from a rough `gripper_from_camera`.
 
-        The common transform has no prior. The poses of arms have errors of some tenths of a
-        millimetre, which bounds the estimated errors of stated poses.
+        The common transform has no prior. The poses of arms have errors of a tenth of a millimetre
+        at least, which bounds the estimated errors of stated poses.
         """
         bundle = replace(
             self.bundle,
@@ -89,7 +89,13 @@ class MapOptions:
             least_sigma_deg=0.015,
         )
         if mount == "eye_to_hand":
-            bundle = replace(bundle, correlation=2.7, least_share=0.0025)
+            bundle = replace(
+                bundle,
+                correlation=2.7,
+                least_share=0.0025,
+                least_sigma_m=1e-4,
+                least_sigma_deg=0.01,
+            )
         return replace(self, bundle=bundle, mount=mount)
 
 

@@ -116,19 +116,9 @@ class StatedFrames:
 
     @staticmethod
     def _changed(camera: Camera, change: Array) -> Camera:
-        distortion = np.zeros(max(4, len(camera.distortion)))
-        distortion[: len(camera.distortion)] = camera.distortion
-        distortion[:2] += change[3:]
-        scale = np.exp(change[0])
+        changed = camera.changed(change)
         distorts = np.abs(change[3:]).max() > MIN_DISTORTION
-        return replace(
-            camera,
-            fx=camera.fx * scale,
-            fy=camera.fy * scale,
-            cx=camera.cx + change[1],
-            cy=camera.cy + change[2],
-            distortion=tuple(distortion) if distorts else camera.distortion,
-        )
+        return changed if distorts else replace(changed, distortion=camera.distortion)
 
     def linearise(self, tracks: BundleTracks, parameters: Parameters) -> Linearised:
         """Residuals and derivatives at given parameters."""

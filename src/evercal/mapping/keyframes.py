@@ -85,9 +85,10 @@ class Keyframes:
 
         Returns:
             `images` (bytes, concatenated), `lengths` (n,), `cameras` (n, 14), `distortion` (n,)
-            number of coefficients, `poses` (n, 7) quaternion wxyz and metres. With depths also
-            `inverse_depth` (concatenated) and `cells` (n,). With landmarks also their fields
-            (concatenated, `landmark_*`), `landmark_counts` (n,) and `descriptors` (n, width).
+            number of coefficients, negative of a fisheye, `poses` (n, 7) quaternion wxyz and
+            metres. With depths also `inverse_depth` (concatenated) and `cells` (n,). With landmarks
+            also their fields (concatenated, `landmark_*`), `landmark_counts` (n,) and `descriptors`
+            (n, width).
         """
         joined = np.frombuffer(b"".join(self.images), np.uint8).copy()
         cameras = np.zeros((len(self.images), 14))
@@ -100,7 +101,7 @@ class Keyframes:
             "images": joined,
             "lengths": np.array([len(image) for image in self.images], np.int64),
             "cameras": cameras,
-            "distortion": np.array([len(c.distortion) for c in self.cameras], np.int64),
+            "distortion": np.array([_signed_count(c) for c in self.cameras], np.int64),
             "poses": poses.reshape(-1, 7),
         }
         if self.inverse_depth:
@@ -131,7 +132,10 @@ class Keyframes:
             depths = _split(tensors["inverse_depth"], tensors["cells"])
         return cls(
             images=images,
-            cameras=tuple(Camera(*row[:6], distortion=row[6 : 6 + k]) for row, k in cameras),
+            cameras=tuple(
+                Camera(*row[:6], row[6 : 6 + abs(k)], "fisheye" if k < 0 else "pinhole")
+                for row, k in cameras
+            ),
             base_from_camera=SE3(poses[:, :4], poses[:, 4:]),
             inverse_depth=depths,
             landmarks=_landmarks_of(tensors) if "landmark_counts" in tensors else (),
@@ -146,6 +150,10 @@ def _landmarks_of(tensors: Mapping[str, NDArray[Any]]) -> tuple[Landmarks, ...]:
         for name in _LANDMARK_FIELDS
     ]
     return tuple(Landmarks(*fields) for fields in zip(*columns, strict=True))
+
+
+def _signed_count(camera: Camera) -> int:
+    return len(camera.distortion) * (-1 if camera.model == "fisheye" else 1)
 
 
 def _split(joined: NDArray[Any], counts: NDArray[Any]) -> tuple[NDArray[Any], ...]:

@@ -114,7 +114,8 @@ def inspect_recording(recording: Recording) -> Inspection:
 def _camera_lines(cameras: Counter[Camera]) -> Iterator[str]:
     if len(cameras) <= MOST_CAMERAS_LISTED:
         for c, count in cameras.items():
-            distortion = f"distortion {' '.join(f'{k:g}' for k in c.distortion)}"
+            kind = "fisheye" if c.model == "fisheye" else "distortion"
+            distortion = f"{kind} {' '.join(f'{k:g}' for k in c.distortion)}"
             yield (
                 f"{c.width}x{c.height}, fx {c.fx:.1f} fy {c.fy:.1f} cx {c.cx:.1f} cy {c.cy:.1f},"
                 f" {distortion if c.distortion else 'no distortion'}; {count} frames"

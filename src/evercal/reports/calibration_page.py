@@ -254,6 +254,7 @@ def camera_table(calibration: Calibration) -> Table:
         sigma = calibration.checks.get("camera_sigma", {})
         values = {f"{name} (px)": getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
         names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        names = ("k1", "k2", "k3", "k4") if camera.model == "fisheye" else names
         values |= dict(zip(names, camera.distortion, strict=False))
         rows = [
             (name, f"{value:.4f}", _fixed(sigma.get(name.partition(" ")[0]), 4))

@@ -21,6 +21,13 @@ MODELS = {
     "RADIAL": [50, 31, 25, -0.1, 0.02],
     "OPENCV": [50, 52, 31, 25, -0.1, 0.02, 0.003, -0.002],
     "FULL_OPENCV": [50, 52, 31, 25, -0.1, 0.02, 0.003, -0.002, 0.01, 0.05, -0.02, 0.004],
+    "SIMPLE_FISHEYE": [40, 31, 25],
+    "FISHEYE": [40, 42, 31, 25],
+    "SIMPLE_RADIAL_FISHEYE": [40, 31, 25, 0.05],
+    "RADIAL_FISHEYE": [40, 31, 25, 0.05, -0.01],
+    "OPENCV_FISHEYE": [40, 42, 31, 25, 0.05, -0.01, 0.002, -0.0005],
+    "FOV": [40, 42, 31, 25, 0.9],
+    "EUCM": [40, 42, 31, 25, 0.6, 1.1],
 }
 WIDTH, HEIGHT = 64, 48
 
@@ -99,9 +106,9 @@ def test_one_of_several_models_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("model", "params"),
-    [("OPENCV_FISHEYE", [50, 50, 31, 25, 0, 0, 0, 0]), ("FOV", [50, 50, 31, 25, 0.5])],
+    [("THIN_PRISM_FISHEYE", [50, 50, 31, 25, *[0] * 8]), ("DIVISION", [50, 50, 31, 25, 0.1])],
 )
-def test_fisheye_cameras_are_refused(model: str, params: list[float], tmp_path: Path) -> None:
+def test_other_models_are_refused_by_name(model: str, params: list[float], tmp_path: Path) -> None:
     make(tmp_path, model, params=params)
     refused(f"{model} is not supported.*image_undistorter", load_recording, tmp_path)
 

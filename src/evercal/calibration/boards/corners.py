@@ -19,6 +19,7 @@ from scipy.stats import norm
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, cross_matrix
+from evercal.geometry.camera import Model
 
 Array = NDArray[np.floating]
 
@@ -121,8 +122,6 @@ def board_pose(
     view: BoardView, camera: Camera, start: SE3 | None = None, bend: Bend | None = None
 ) -> BoardPose:
     """Fit the pose of a board to its corners, from a start or from the better of its candidates."""
-    import cv2
-
     if start is None:
         starts = board_pose_candidates(view, camera)
         fits = (board_pose(view, camera, s, bend) for s in starts)
@@ -130,32 +129,18 @@ def board_pose(
     bend = bend or Bend.none([view])
     by_bend = bend.slopes(view.points_m)
     points = view.points_m + np.outer(by_bend @ bend.curvature, [0, 0, 1])
-    coefficients = np.zeros(max(len(camera.distortion), 5))
-    coefficients[: len(camera.distortion)] = camera.distortion
-    lens = camera.matrix(), coefficients
-    rotvec = Rotation.from_quat(start.rotation_wxyz, scalar_first=True).as_rotvec()
-    translation = start.translation_m.reshape(3, 1).copy()
-    rotvec, translation = cv2.solvePnPRefineLM(
-        points, view.pixels, *lens, rotvec.reshape(3, 1).copy(), translation
-    )
-    projected, slopes, *_ = cv2.projectPoints(points, rotvec, translation, *lens)
-    slopes = np.asarray(slopes, dtype=np.float64)
+    rotvec, translation = _refined(points, view.pixels, camera, start)
+    projected, by_pose, by_camera = _projected(points, camera, rotvec, translation)
     rotation = Rotation.from_rotvec(np.ravel(rotvec))
-    by_point = slopes[:, 3:6].reshape(-1, 2, 3)
+    by_point = by_pose[:, 3:].reshape(-1, 2, 3)
     by_rotation = by_point @ (-rotation.as_matrix() @ cross_matrix(points))
     jacobian = np.concatenate([by_point, by_rotation], 2).reshape(-1, 6)
-    error = (view.pixels - projected.reshape(-1, 2)).ravel()
+    error = (view.pixels - projected).ravel()
     normal = jacobian.T @ jacobian
     unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     covariance = np.outer(unit, unit) * np.linalg.pinv(normal * np.outer(unit, unit), 1e-12)
     by_z = by_point @ rotation.as_matrix()[:, 2:]
-    by_lens = np.concatenate(
-        [
-            slopes[:, 6 : 10 + max(len(camera.distortion), 5)],
-            (by_z * by_bend[:, None]).reshape(-1, len(BEND)),
-        ],
-        1,
-    )
+    by_lens = np.c_[by_camera, (by_z * by_bend[:, None]).reshape(-1, len(BEND))]
     lens_slope = -covariance @ (jacobian.T @ by_lens)
     unexplained = by_lens + jacobian @ lens_slope
     quaternion = rotation.as_quat(canonical=True, scalar_first=True)
@@ -169,6 +154,41 @@ def board_pose(
     )
 
 
+def _refined(points: Array, pixels: Array, camera: Camera, start: SE3) -> tuple[Array, Array]:
+    """Rotation vector and translation (3, 1) of the board that fit its corners best."""
+    import cv2
+
+    rotvec = Rotation.from_quat(start.rotation_wxyz, scalar_first=True).as_rotvec().reshape(3, 1)
+    translation = start.translation_m.reshape(3, 1).copy()
+    if camera.model == "pinhole":
+        lens = camera.matrix(), lens_vector(camera)[4:]
+        return cv2.solvePnPRefineLM(points, pixels, *lens, rotvec.copy(), translation)
+    for _ in range(20):  # Gauss and Newton
+        projected, by_pose, _ = _projected(points, camera, rotvec, translation)
+        step = np.linalg.lstsq(by_pose, (pixels - projected).ravel(), rcond=None)[0]
+        rotvec, translation = rotvec + step[:3, None], translation + step[3:, None]
+        if np.abs(step).max() < 1e-10:
+            break
+    return rotvec, translation
+
+
+def _projected(
+    points: Array, camera: Camera, rotvec: Array, translation: Array
+) -> tuple[Array, Array, Array]:
+    """Pixels (k, 2) and their derivatives (2 k, 6) by the pose and (2 k, q) by the intrinsics."""
+    import cv2
+
+    matrix, terms = camera.matrix(), lens_vector(camera)[4:]
+    if camera.model == "fisheye":
+        at = points[:, None].copy()
+        pixels, slopes = cv2.fisheye.projectPoints(at, rotvec, translation, matrix, terms)
+        by_camera, by_pose = np.split(np.asarray(slopes, np.float64)[:, :14], [8], 1)
+    else:
+        pixels, slopes, *_ = cv2.projectPoints(points, rotvec, translation, matrix, terms)
+        by_pose, by_camera = np.split(np.asarray(slopes, np.float64), [6], 1)
+    return pixels.reshape(-1, 2), by_pose, by_camera[:, : 4 + len(terms)]
+
+
 def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
     """Return the possible poses of the board: up to three for a flat board, else mostly one."""
     import cv2
@@ -178,6 +198,12 @@ def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
     # Both poses of IPPE are wrong for a small board that faces the camera.
     solvers = (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_SQPNP) if flat else (cv2.SOLVEPNP_SQPNP,)
     lens = camera.matrix(), np.array(camera.distortion)
+    if camera.model == "fisheye":
+        rays = camera.unproject(view.pixels)
+        within = np.isfinite(rays).all(1)
+        # ValueError if fewer than four are left.
+        view = BoardView(view.points_m[within], camera.pinhole.project(rays[within]))
+        lens = camera.matrix(), np.zeros(0)
     poses = []
     for solver in solvers:
         found = cv2.solvePnPGeneric(view.points_m, view.pixels, *lens, flags=solver)
@@ -233,18 +259,22 @@ def _apart(view: BoardView, pose: BoardPose) -> tuple[Array, float]:
 
 
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+FISHEYE = (*LENS[:6], "k3", "k4")
 MIN_VIEWS = 5
 """Minimum number of views of a flat board."""
 _USUAL_CENTRE, _USUAL_ASPECT, _ROUGH_FOCAL = 0.1, 0.02, 0.5
 """Standard deviations of the principal point from the middle of the image, in widths, of the ratio
 of both focal lengths from one, and of a rough focal length, relative."""
 _USUAL_DISTORTION = (0.3, 0.5, 2e-3, 2e-3, 0.5, 0.1, 0.1, 0.1)
+_USUAL_FISHEYE, _STATED_FISHEYE = (0.1, 0.1, 0.1, 0.1), (0.01, 0.01, 0.01, 0.01)
 _STATED = 0.005
 """Standard deviation of a stated focal length and principal point, relative to the focal length."""
 _STATED_DISTORTION = (0.02, 0.05, 5e-4, 5e-4, 0.1, 0.02, 0.02, 0.02)
 _USUAL_BEND = 0.15
 """Standard deviation of the curvatures of a board, 1 / metres: over 300 mm, the second
 order moves the edges by 1.7 mm, the third by 0.6 mm and the fourth by 0.1 mm."""
+_HALF_ANGLES_DEG = (35, 45, 55, 65, 75, 85, 95, 110)
+"""Half of the horizontal field of view of a fisheye, the first one is the nearest of these."""
 _FOCAL_SIGMA = 0.1
 """Maximum relative standard deviation of the focal length."""
 _FALSE = 10.0
@@ -263,7 +293,8 @@ class LensPrior(NamedTuple):
     def stated(cls, camera: Camera) -> "LensPrior":
         """Prior of intrinsics from the maker or from another calibration."""
         mean = lens_vector(camera)
-        sigma = np.r_[np.full(4, _STATED * camera.fx), _STATED_DISTORTION][: len(mean)]
+        terms = _STATED_FISHEYE if camera.model == "fisheye" else _STATED_DISTORTION
+        sigma = np.r_[np.full(4, _STATED * camera.fx), terms][: len(mean)]
         return cls(
             np.r_[mean, np.zeros(len(BEND))],
             np.diag(np.r_[sigma, [_USUAL_BEND] * len(BEND)] ** -2.0),
@@ -275,7 +306,8 @@ class LensPrior(NamedTuple):
         mean = np.zeros(len(lens_vector(camera)))
         mean[:2] = camera.fx
         mean[2:4] = (camera.width - 1) / 2, (camera.height - 1) / 2
-        sigma = np.r_[np.full(4, _USUAL_CENTRE * camera.width), _USUAL_DISTORTION][: len(mean)]
+        terms = _USUAL_FISHEYE if camera.model == "fisheye" else _USUAL_DISTORTION
+        sigma = np.r_[np.full(4, _USUAL_CENTRE * camera.width), terms][: len(mean)]
         information = np.diag(np.r_[sigma, [_USUAL_BEND] * len(BEND)] ** -2.0)
         aspect = np.array([[1.0, -1.0], [-1.0, 1.0]]) / (_USUAL_ASPECT * camera.fx) ** 2
         information[:2, :2] = aspect + np.eye(2) / (_ROUGH_FOCAL * camera.fx) ** 2
@@ -307,8 +339,8 @@ def lens_estimate(
 
 
 def lens_vector(camera: Camera) -> Array:
-    """Return the 9 or 12 intrinsics in the order of `LENS`."""
-    distortion = np.zeros(max(5, len(camera.distortion)))
+    """Return the 9 or 12 intrinsics in the order of `LENS`, or the 8 of `FISHEYE`."""
+    distortion = np.zeros(max(4 if camera.model == "fisheye" else 5, len(camera.distortion)))
     distortion[: len(camera.distortion)] = camera.distortion
     return np.r_[camera.fx, camera.fy, camera.cx, camera.cy, distortion]
 
@@ -322,23 +354,28 @@ def moved_lens(camera: Camera, bend: Bend, change: Array) -> tuple[Camera, Bend]
 def moved_camera(camera: Camera, change: Array) -> Camera:
     """Return the camera after a change of its intrinsics."""
     fx, fy, cx, cy, *distortion = (float(value) for value in lens_vector(camera) + change)
-    return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion))
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
 
 
-def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Intrinsics:
-    """Estimate focal lengths, principal point and distortion (k1 k2 p1 p2 k3), with weak priors."""
+def calibrate_camera(
+    views: Sequence[BoardView], width: int, height: int, model: Model = "pinhole"
+) -> Intrinsics:
+    """Estimate focal lengths, principal point and distortion, with weak priors.
+
+    The distortion is k1 k2 p1 p2 k3, or k1 k2 k3 k4 of a fisheye.
+    """
     if len(views) < MIN_VIEWS:
         raise InputError(
             f"the board was detected in {len(views)} images, intrinsics take at least {MIN_VIEWS};"
             f" take 15 with the board tilted by 20 to 45 deg, or give --camera"
         )
-    views = _consistent(views, _rough(views, width, height))
+    views = _consistent(views, _rough(views, width, height, model))
     if len(views) < MIN_VIEWS:
         raise InputError(
             f"the corners of {len(views)} images are those of a flat board, intrinsics take at"
             f" least {MIN_VIEWS}; check --size, or give --camera"
         )
-    camera = _rough(views, width, height)
+    camera = _rough(views, width, height, model)
     prior, bend = LensPrior.usual(camera), Bend.none(views)
     open_focal = (
         "the images leave the focal length open{}; tilt the board by 20 to 45 deg in several"
@@ -358,7 +395,7 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
         stray = strays(views, poses, camera, bend)
         if np.concatenate(stray).any():
             used = [view[~mask] for view, mask in zip(views, stray, strict=True)]
-            return calibrate_camera(used, width, height)
+            return calibrate_camera(used, width, height, model)
     except ValueError:
         raise InputError(open_focal.format("")) from None
     unit = 1 / np.sqrt(np.diag(information))
@@ -378,10 +415,24 @@ def _consistent(views: Sequence[BoardView], camera: Camera) -> list[BoardView]:
     return [view for view, error in zip(views, rms, strict=True) if error <= most < np.inf]
 
 
-def _rough(views: Sequence[BoardView], width: int, height: int) -> Camera:
+def _misfit(views: Sequence[BoardView], camera: Camera) -> float:
+    """Median of the views' root mean square residuals, pixels."""
+    rms = []
+    for view in views:
+        with suppress(ValueError):
+            rms.append(board_pose(view, camera).rms_px)
+    return float(np.median(rms)) if 2 * len(rms) > len(views) else np.inf
+
+
+def _rough(views: Sequence[BoardView], width: int, height: int, model: Model) -> Camera:
     """Return a camera without distortion whose only unknown is the focal length."""
     import cv2
 
+    if model == "fisheye":
+        centre = (width - 1) / 2, (height - 1) / 2
+        focals = [width / 2 / np.deg2rad(half) for half in _HALF_ANGLES_DEG]
+        fits = [Camera(width, height, f, f, *centre, model=model) for f in focals]
+        return min(fits, key=lambda camera: _misfit(views, camera))
     middle = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
     points = [view.points_m.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]

@@ -159,13 +159,16 @@ def easy_handeye(export: Export) -> str:
 def camera_info(export: Export) -> str:
     """Write the intrinsics for camera_calibration and camera_info_manager."""
     camera = export.camera
-    distortion = [*camera.distortion, *(0.0,) * max(0, 5 - len(camera.distortion))]
+    distortion = [*camera.distortion]
+    if camera.model == "pinhole":
+        distortion += [0.0] * (5 - len(distortion))
+    models = {4: "equidistant", 5: "plumb_bob", 8: "rational_polynomial"}
     info = {
         "image_width": camera.width,
         "image_height": camera.height,
         "camera_name": re.sub(r"\W", "_", export.child),
         "camera_matrix": _matrix(camera.matrix()),
-        "distortion_model": "plumb_bob" if len(distortion) == 5 else "rational_polynomial",
+        "distortion_model": models[len(distortion)],
         "distortion_coefficients": _matrix(np.array([distortion])),
         "rectification_matrix": _matrix(np.eye(3)),
         "projection_matrix": _matrix(np.c_[camera.matrix(), np.zeros(3)]),
@@ -213,6 +216,8 @@ def opencv(export: Export) -> str:
         storage.write("image_width", camera.width)
         storage.write("image_height", camera.height)
         storage.write("camera_matrix", camera.matrix())
+        if camera.model == "fisheye":  # as in OpenCV's example of calibration
+            storage.write("fisheye_model", 1)
         distortion = camera.distortion or (0.0,) * 5
         storage.write("distortion_coefficients", np.array(distortion).reshape(-1, 1))
     return storage.releaseAndGetString()
@@ -277,7 +282,10 @@ def colmap(export: Export) -> dict[str, str]:
         pose = " ".join(map(repr, [*row[3:], *row[:3]]))
         lines += [f"{i + 1} {pose} 1 {name}", ""]
     model, parameters = "PINHOLE", [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]
-    if any(camera.distortion):
+    if camera.model == "fisheye":
+        model = "OPENCV_FISHEYE"
+        parameters += camera.distortion
+    elif any(camera.distortion):
         four = len(camera.distortion) == 4
         model = "OPENCV" if four else "FULL_OPENCV"
         parameters += camera.distortion if four else camera.coefficients
@@ -294,18 +302,20 @@ def nerfstudio(export: Export) -> str:
     """Write transforms.json: base_from_camera with camera axes x right, y up, z back."""
     camera, (names, poses) = export.camera, _image_poses(export)
     matrices = pose_numbers(poses, "matrix:opengl").reshape(-1, 4, 4).tolist()
-    k1, k2, p1, p2, k3, *rational = camera.coefficients
-    if any(rational):
+    fisheye = camera.model == "fisheye"
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    if any(camera.distortion[len(names) :]):
         # nerfstudio's k4 is the fourth coefficient of a polynomial, not OpenCV's k4.
         raise InputError(
             "there are no terms for k4 k5 k6 of this camera; calibrate it with k1 k2 p1 p2 k3,"
             " or undistort the images"
         )
     record = {
-        "camera_model": "OPENCV",
+        "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
         **{"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy},
         **{"cx": camera.cx + 0.5, "cy": camera.cy + 0.5},
-        **{"k1": k1, "k2": k2, "k3": k3, "k4": 0.0, "p1": p1, "p2": p2},
+        **dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0),
+        **dict(zip(names, camera.coefficients, strict=False)),
         "frames": [
             {"file_path": name, "transform_matrix": matrix}
             for name, matrix in zip(names, matrices, strict=True)

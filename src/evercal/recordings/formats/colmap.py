@@ -16,6 +16,7 @@ from evercal.processes import status_of
 from evercal.recordings.formats.nerfstudio import frame_note
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS
+from evercal.recordings.poses.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import natural_key
 from evercal.recordings.read_options import ReadOptions
 from evercal.recordings.text_files import named_errors, path_inside
@@ -23,7 +24,8 @@ from evercal.recordings.text_files import named_errors, path_inside
 USES = ("metres",)
 
 _MODEL_FOLDERS = (".", "sparse", "colmap/sparse", "distorted/sparse")
-# Indices of fx, fy, cx, cy and OpenCV's distortion in COLMAP's parameters; None for 0.
+# Indices of fx, fy, cx, cy and OpenCV's distortion in COLMAP's parameters; None for 0. Those of
+# FOV and EUCM are parameters of `RADIAL_MODELS`.
 _PARAMETERS: dict[str, tuple[int, int, int, int, tuple[int | None, ...]]] = {
     "SIMPLE_PINHOLE": (0, 0, 1, 2, ()),
     "PINHOLE": (0, 1, 2, 3, ()),
@@ -31,6 +33,13 @@ _PARAMETERS: dict[str, tuple[int, int, int, int, tuple[int | None, ...]]] = {
     "RADIAL": (0, 0, 1, 2, (3, 4, None, None)),
     "OPENCV": (0, 1, 2, 3, (4, 5, 6, 7)),
     "FULL_OPENCV": (0, 1, 2, 3, (4, 5, 6, 7, 8, 9, 10, 11)),
+    "SIMPLE_FISHEYE": (0, 0, 1, 2, ()),
+    "FISHEYE": (0, 1, 2, 3, ()),
+    "SIMPLE_RADIAL_FISHEYE": (0, 0, 1, 2, (3, None, None, None)),
+    "RADIAL_FISHEYE": (0, 0, 1, 2, (3, 4, None, None)),
+    "OPENCV_FISHEYE": (0, 1, 2, 3, (4, 5, 6, 7)),
+    "FOV": (0, 1, 2, 3, (4,)),
+    "EUCM": (0, 1, 2, 3, (4, 5)),
 }
 _READ = "import pycolmap, sys; print(flush=True); pycolmap.Reconstruction(sys.argv[1])"
 _LEAST_S, _SLOWEST_BYTES_PER_S = 1.0, 5e6
@@ -134,8 +143,12 @@ def _camera(folder: Path, camera: Any) -> Camera:
     # Half a pixel: COLMAP counts from the image's corner.
     pinhole = p[fx], p[fy], p[cx] - 0.5, p[cy] - 0.5
     coefficients = tuple(0.0 if i is None else float(p[i]) for i in distortion)
+    size, kind = (int(camera.width), int(camera.height)), name.lower()
     with named_errors(folder, "COLMAP model"):
-        return Camera(int(camera.width), int(camera.height), *pinhole, coefficients)
+        if kind in RADIAL_MODELS:
+            return nearest_fisheye(kind, coefficients, size, pinhole[:2], pinhole[2:])[0]
+        model = "fisheye" if kind.endswith("fisheye") else "pinhole"
+        return Camera(*size, *pinhole, coefficients, model)
 
 
 def _base_from_camera(folder: Path, image: Any) -> SE3:

@@ -1,0 +1,60 @@
+"""Images of a fisheye, and a map that is made of them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evercal.geometry import SE3, Camera, pose_distance_mm_deg
+from evercal.recordings.frame import Frame, Recording
+from evercal.simulation.box_room import BoxRoom, default_camera
+from evercal.simulation.fisheye import fisheye_image
+
+FOCAL = 160 / np.deg2rad(75)
+WIDE = Camera(320, 240, FOCAL, FOCAL, 159.5, 119.5, model="fisheye")
+
+
+def test_a_fisheye_shows_what_its_projection_says() -> None:
+    """A room whose colour is the direction: each pixel shows its own ray."""
+
+    def render(camera: Camera, pose: SE3) -> np.ndarray:
+        v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+        rays = camera.unproject(np.stack([u, v], -1)) @ pose.rotation_matrix().T
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        return np.round(127.5 + 127.5 * rays).astype(np.uint8)
+
+    pose = SE3.exp([0.3, 0.1, 0.2, 0.4, -0.8, 0.3])
+    image = fisheye_image(WIDE, pose, render)
+    v, u = np.mgrid[0:240, 0:320]
+    rays = WIDE.unproject(np.stack([u, v], -1)) @ pose.rotation_matrix().T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    angle = np.hypot(u - 159.5, v - 119.5) / FOCAL
+    inside = angle < np.deg2rad(84)
+    assert np.abs(image[inside] - (127.5 + 127.5 * rays[inside])).max() < 3
+    assert (image[angle > np.deg2rad(86)] == 0).all()
+
+
+@pytest.mark.slow("src/evercal/mapping", "src/evercal/localization", "src/evercal/geometry")
+def test_a_map_of_a_fisheye_locates_as_that_of_a_pinhole(tmp_path: Path) -> None:
+    from evercal import Map
+
+    room, rows = BoxRoom(6), {}
+    path, tests = room.path(40, 1), room.path(4, 2)
+    for name, camera in (("pinhole", default_camera()), ("fisheye", WIDE)):
+
+        def image(pose: SE3, camera: Camera = camera) -> np.ndarray:
+            if camera.model == "pinhole":
+                return room.render(camera, pose)
+            return fisheye_image(camera, pose, room.render)
+
+        frames = [Frame(str(i), image(pose), camera, pose) for i, pose in enumerate(path)]
+        cell = Map.open(tmp_path / name)
+        cell.learn(Recording(name, tuple(frames), ()), on_progress=lambda *_: None)
+        again = Map.open(tmp_path / name)  # from the disk
+        off = []
+        for pose in tests:
+            found = again.localize(image(pose), camera).base_from_camera
+            assert found is not None
+            off.append(pose_distance_mm_deg(found, pose)[0])
+        rows[name] = np.median(off)
+    assert rows["fisheye"] < max(1.5 * rows["pinhole"], 0.5)
