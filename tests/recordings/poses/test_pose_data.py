@@ -82,6 +82,8 @@ DATA: dict[str, Any] = {
     "columns of OpenCV": [
         {"rvec": [[v] for v in row[3:]], "tvec": [[v] for v in row[:3]]} for row in numbers("ur")
     ],
+    "quat_xyzw": [{"xyz": row[:3], "quat_xyzw": row[3:]} for row in numbers("xyzw")],
+    "t and q_wxyz": [{"t": row[:3], "q_wxyz": row[3:]} for row in numbers("wxyz")],
     "by name": dict(zip(NAMES, M.tolist(), strict=True)),
     "objects by name": {
         name: {"R": m[:3, :3].tolist(), "t": m[:3, 3].tolist()}

@@ -43,8 +43,7 @@ _INVERSE = re.compile("base2gripper|gripper_from_base|cam2target|board_from_came
 _WIDTHS = (6, 7, 8, 12, 13, 16, 17)
 """Numbers of a pose, possibly after a stamp."""
 _MATRICES = ((4, 4), (3, 4))
-_LISTS = {"translation_m": ("x_m", "y_m", "z_m"), "quaternion_wxyz": ("qw", "qx", "qy", "qz"),
-          "quaternion_xyzw": ("qx", "qy", "qz", "qw")}  # fmt: skip
+_LISTS = {"translation_m": ("x_m", "y_m", "z_m"), "xyz": "xyz", "rpy": ("roll", "pitch", "yaw")}
 """Columns of lists."""
 _ROTATION = re.compile(r"(?:rotation_matri(?:x|ces)|rotations?|rot|rmats?|rvecs?|rotvecs?|r)(_.*)?")
 _TRANSLATION = re.compile(r"(?:translation_vectors?|translations?|tvecs?|positions?|pos|t)(_.*)?")
@@ -190,7 +189,7 @@ def _first(array: Array, shapes: tuple[tuple[int, int], ...]) -> Array:
 
 
 def _labelled(table: PoseTable, columns: Columns, plural: bool) -> PoseTable:
-    lists = {key: value for key, value in columns.items() if isinstance(value, list)}
+    lists = {key: value for key, value in columns.items() if len(_shape(value)) == 1}
     names, stamps, _ = row_labels([*lists], [*lists.values()], len(table.numbers), plural)
     stamps = stamps if table.stamps_s is None else table.stamps_s
     return table._replace(names=table.names or names, stamps_s=stamps)
@@ -228,6 +227,8 @@ def _cells(row: Columns) -> dict[str, object]:
         values = value if isinstance(value, list) else [value]
         require_at_most(len(values), "columns", "numbers of one key")
         names = [f"{key}_{i}" for i in range(len(values))] if values is value else [key]
+        order = key[-4:].lower()  # such as quaternion_wxyz
+        names = [f"q{axis}" for axis in order] if order in ("wxyz", "xyzw") else names
         cells |= dict(zip(_LISTS.get(key, names), values, strict=False))
     return cells
 

@@ -66,7 +66,7 @@ class Columns(NamedTuple):
     def names(self, index: int) -> set[str]:
         """Possible names of one column."""
         prefixes = self.prefixes.split(",")
-        by_index = {f"{p}{index}" for p in prefixes if self.ends == "xyz" and p[2:].endswith("_")}
+        by_index = {f"{p}{index}" for p in prefixes if self.ends == "xyz" and p.endswith("_")}
         return {prefix + self.ends[index] for prefix in prefixes} | by_index
 
     def ordered(self, columns: list[int], convention: PoseConvention) -> list[int]:
