@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import pytest
+import yaml
+from scipy.io import savemat
 
 from evercal.calibration.boards.board_poses import read_board_poses
 from evercal.calibration.calibration import read_calibration, read_transform
@@ -155,6 +157,10 @@ def poses(name: str) -> Callable[[Path], Path]:
             np.save(path, POSES.matrix())
         elif path.suffix == ".npz":
             np.savez(path, poses=POSES.matrix())
+        elif path.suffix == ".mat":
+            savemat(path, {"T": POSES.matrix()})
+        elif path.suffix == ".yaml":
+            path.write_text(yaml.safe_dump([{"T": pose.matrix().tolist()} for pose in POSES]))
         elif path.suffix == ".tum":
             np.savetxt(path, np.hstack([np.arange(9)[:, None], rows]))
         elif path.suffix == ".json":
@@ -230,6 +236,8 @@ READERS = {
     "poses-json": Reader(poses("poses.json"), read_robot_poses),
     "poses-npy": Reader(poses("poses.npy"), read_robot_poses),
     "poses-npz": Reader(poses("poses.npz"), read_robot_poses),
+    "poses-mat": Reader(poses("poses.mat"), read_robot_poses),
+    "poses-yaml": Reader(poses("poses.yaml"), read_robot_poses),
     "poses-tum": Reader(poses("poses.tum"), read_robot_poses),
     "camera-text": Reader(file("lens.txt", MATRIX), read_size),
     "camera-json": Reader(file("lens.json", json.dumps(LENS.to_dict()).encode()), read_size),

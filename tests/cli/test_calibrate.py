@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from evercal.recordings import Frame, Recording
 
 CHECK_KEYS = {"moved", "translation_mm", "rotation_deg", "sigma_mm", "sigma_deg", "confidence"}
-CHECK_KEYS |= {"same_map", "reference_from_now", "images", "left_out"}
+CHECK_KEYS |= {"same_map", "reference_from_now", "images", "left_out", "note"}
 
 
 def truth_of(frame: Frame) -> SE3:

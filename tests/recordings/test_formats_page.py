@@ -49,11 +49,20 @@ CHAINS = {"camchain.yaml", "orb_slam.yaml"}
 POSE_FILES = {
     "poses.csv": None, "kuka.txt": "kuka", "poses.tum": None, "kitti.txt": None,
     "matrices.txt": None, "ur.script": None, "frames.dat": None, "poses.json": None,
-    "arrays.json": None,
+    "arrays.json": None, "named.json": None, "echo.yaml": None, "echo.txt": None,
+    "targets.mod": None,
 }  # fmt: skip
 """Examples with their conventions."""
-NAMED = ("poses.csv", "kuka.txt", "ur.script", "frames.dat", "poses.json", "arrays.json")
-TIMED = ("poses.csv", "poses.tum", "poses.json")
+NAMED = (
+    "poses.csv",
+    "kuka.txt",
+    "ur.script",
+    "frames.dat",
+    "poses.json",
+    "arrays.json",
+    "named.json",
+)
+TIMED = ("poses.csv", "poses.tum", "poses.json", "echo.yaml", "echo.txt")
 
 
 @pytest.fixture

@@ -1,8 +1,9 @@
 """Text and JSON files that a user names, and their errors."""
 
 import json
+import re
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -11,6 +12,9 @@ from evercal.errors import InputError
 
 _DEPTH = 50
 """Nested lists and objects in YAML."""
+_CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f-\x9f]")
+_OF_OPENCV = re.compile(r"^%.*$|!!opencv-[a-z-]+", re.MULTILINE)
+"""Not valid YAML. cv2.FileStorage can end the process on such files."""
 
 
 @contextmanager
@@ -44,10 +48,27 @@ def naming(what: str) -> Iterator[None]:
 
 
 def read_text(path: Path, what: str, remedy: str = "check the path") -> str:
-    """Read a UTF-8 text file; `what` names its contents in messages."""
+    """Read a text file; `what` names its contents in messages."""
     with named_errors(path, what, remedy):
         require_at_most(path.stat().st_size, "text_bytes", "bytes")
-        return path.read_text(encoding="utf-8-sig")
+        return decoded(path.read_bytes())
+
+
+def decoded(data: bytes) -> str:
+    """Text of UTF-8, of UTF-16, or else of Latin-1; UnicodeDecodeError if that makes no text.
+
+    Every second byte of UTF-16 is mostly zero, so it needs no byte order mark.
+    """
+    half = len(data) // 4
+    encoding = "utf-16-be" if data[::2].count(0) > half else "utf-8-sig"
+    encoding = "utf-16-le" if data[1::2].count(0) > half else encoding
+    encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else encoding
+    for each in (encoding, "latin-1"):
+        with suppress(UnicodeDecodeError):
+            text = data.decode(each)
+            if each == "utf-8-sig" or not _CONTROL.search(text):
+                return text.replace("\r\n", "\n").replace("\r", "\n")
+    raise UnicodeDecodeError("utf-8", data, 0, 1, "no text")
 
 
 def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str, Any]:
@@ -69,6 +90,7 @@ def yaml_documents(text: str) -> list[Any]:
     """
     import yaml
 
+    text = _OF_OPENCV.sub("", text)
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     depth = nodes = 0
     try:

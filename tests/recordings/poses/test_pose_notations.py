@@ -146,7 +146,7 @@ def test_conventions_of_matrices_take_12_numbers(tmp_path: Path) -> None:
             lines(rows.reshape(5, 12), lambda i, row: f"{i}.png {i}.5 {plain(row)}")
         )
         assert_arm(read_robot_poses(tmp_path / "p.txt", name).poses)
-    with pytest.raises(InputError, match="look like millimetres; give the convention franka:mm"):
+    with pytest.raises(InputError, match=r"in columns, or rotations .*give the convention franka"):
         read_robot_poses(tmp_path / "p.txt")
 
 
@@ -162,9 +162,11 @@ def test_arrays_by_name_are_read(tmp_path: Path) -> None:
         assert read.names == NAMES
         assert read.stamps_s is not None
         np.testing.assert_array_equal(read.stamps_s, stamps)
-    np.savez(file, robot=MATRICES, board=MATRICES, **camera)
-    refused(r"robot and board of its keys .* call the right one", read_robot_poses, file)
-    np.savez(file, robot=MATRICES, board=MATRICES, base_from_gripper=MATRICES)
+    np.savez(file, one=MATRICES, other=MATRICES, **camera)
+    refused(r"one and other of its keys .* call the right one", read_robot_poses, file)
+    np.savez(file, robot=MATRICES, gripper=MATRICES, **camera)
+    refused(r"robot and gripper of its keys .* call the right one", read_robot_poses, file)
+    np.savez(file, board=MATRICES[::-1], base_from_gripper=MATRICES)
     assert_arm(read_robot_poses(file).poses)
     np.savez(file, **camera)
     refused(r"none of its keys \(K, D\)", read_robot_poses, file)

@@ -242,7 +242,8 @@ def test_given_convention_overrides_the_header(tmp_path: Path) -> None:
         ([{"matrix": np.eye(3).tolist()}], None, r"or \(n, k\) numbers, got \(1, 3, 3\)"),
         ([{"translation_m": [500, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}], None, "millimetres"),
         ([], None, "a list of objects"),
-        ([1, 2], None, "not of both"),
+        ([1, 2], None, "2 columns without a header"),
+        ([[1, 2], {"x": 1}], None, "not of both"),
         ("text", None, "a list of objects"),
     ],
 )
@@ -262,7 +263,7 @@ def test_missing_and_broken_files_are_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "o.npy", np.array([{}, {}], dtype=object), allow_pickle=True)
     np.save(tmp_path / "v.npy", np.zeros((2, 3, 4, 5)))
     for name, content, message in (
-        ("b.csv", b"\xff\xfe\x00\x80", "not a text file"),
+        ("b.csv", b"\x80\x00\x81", "not a text file"),
         ("b.json", b"{", r"b\.json: "),
         ("b.npy", b"hello", r"b\.npy: "),
         ("o.npy", None, r"o\.npy: "),

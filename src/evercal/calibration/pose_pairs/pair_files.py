@@ -15,7 +15,12 @@ from evercal.geometry import SE3
 from evercal.recordings.poses.conventions import PoseConvention
 from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.poses.robot_poses import read_robot_poses
-from evercal.recordings.poses.row_files import natural_key, times_in_names, without_ending
+from evercal.recordings.poses.row_files import (
+    natural_key,
+    same_numbers,
+    times_in_names,
+    without_ending,
+)
 from evercal.recordings.text_files import read_json
 
 Inverted = Literal["robot", "camera", "both"]
@@ -156,6 +161,7 @@ def _read(files: PairFiles, role: Literal["robot", "camera"]) -> _Poses:
         option=f"--{role}-convention",
         # Inverted, the file of the camera states board_from_camera.
         camera_from=role == "camera" and not inverted,
+        robot=role == "robot",
     )
     stamps, numbers = table.stamps_s, None
     if role == "camera" and stamps is None and table.names is not None:
@@ -193,6 +199,8 @@ def _rows_by_name(
             f" image a unique name"
         )
     rows = [row_of.get(without_ending(name)) for name in camera]
+    if all(row is None for row in rows) and same_numbers(robot, camera):
+        return [*range(len(camera))]
     if all(row is None for row in rows):
         raise InputError(
             f"{files.robot}: names no image of {files.camera}; its first is {robot[0]!r}, the first"

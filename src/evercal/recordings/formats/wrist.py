@@ -24,7 +24,7 @@ from evercal.recordings.poses import camera_file
 from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
 from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
 from evercal.recordings.poses.pairing import pair_images
-from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
+from evercal.recordings.poses.robot_poses import POSE_ENDINGS, RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, number_array, read_rows
 from evercal.recordings.read_options import ReadOptions, flag
 from evercal.recordings.text_files import named_errors, read_json, refuse_repeated
@@ -54,9 +54,8 @@ LAYOUTS = (
     Layout("state_groundtruth_estimate0/data.csv", "cam0/data", "cam0/sensor.yaml"),  # EuRoC
     Layout("mav0/state_groundtruth_estimate0/data.csv", "mav0/cam0/data", "mav0/cam0/sensor.yaml"),
 )
-_ENDINGS = ("csv", "json", "npy", "npz", "tum", "txt")
-_POSES = tuple(f"base_from_gripper.{ending}" for ending in _ENDINGS)
-_CAMERA_POSES = tuple(f"base_from_camera.{ending}" for ending in _ENDINGS)
+_POSES = tuple(f"base_from_gripper{ending}" for ending in POSE_ENDINGS)
+_CAMERA_POSES = tuple(f"base_from_camera{ending}" for ending in POSE_ENDINGS)
 _JOINTS = ("joints.csv", "joints.json")
 _CAMERAS = tuple(
     f"{stem}.{ending}"

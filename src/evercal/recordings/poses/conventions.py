@@ -9,6 +9,7 @@ script manual, RoboDK's converters (Staubli, Kawasaki) and libfranka's reference
 """
 
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from itertools import product
 from typing import Any
 
@@ -22,6 +23,7 @@ Array = NDArray[np.float64]
 
 _FAR_M = 10.0  # largest distance of a gripper from its base, metres
 _NEAR_M = 0.01  # smallest distance of a gripper from its base, metres, for at least one pose
+_LARGEST_DEG = 361.0
 _TOLERANCE = 1e-2  # error of a quaternion's length, or of R^T R, if printed with three digits
 _OPENGL_FROM_OPENCV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))  # its own inverse
 
@@ -95,9 +97,15 @@ CONVENTIONS = {
     )
 }
 """All conventions by name, without modifiers."""
+VENDORS = {
+    "mitsubishi": "yaskawa", "denso": "yaskawa", "techman": "yaskawa", "jaka": "yaskawa",
+    "dobot": "yaskawa", "aubo": "yaskawa", "xarm": "yaskawa", "epson": "kuka", "nachi": "kuka",
+    "doosan": "kawasaki", "comau": "kawasaki", "universal_robots": "ur", "motoman": "yaskawa",
+}  # fmt: skip
+"""Conventions of further vendors, whose units are millimetres and degrees."""
 KNOWN_CONVENTIONS = (
-    f"{', '.join(CONVENTIONS)}, fixed_xyz or moving_zyx with any order of axes, followed by :m,"
-    f" :mm, :rad, :deg, :inverse or :opengl where needed"
+    f"{', '.join([*CONVENTIONS, *VENDORS])}, fixed_xyz or moving_zyx with any order of axes,"
+    f" followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
 )
 CONVENTIONS |= {
     f"{sense}_{axes}": PoseConvention(
@@ -119,8 +127,10 @@ UNITS: dict[str, dict[str, Any]] = {
 def pose_convention(name: str) -> PoseConvention:
     """Parse the name of a convention with modifiers, such as `kuka:m:inverse`."""
     base, *modifiers = name.strip().lower().split(":")
+    base = VENDORS.get(base, base)
     if base not in CONVENTIONS:
-        problem = f"pose convention {name!r} is not known"
+        close = get_close_matches(base, [*CONVENTIONS, *VENDORS], 1)
+        problem = f"pose convention {name!r} is not known{f', {close[0]} is' if close else ''}"
         raise ConventionError(problem, f"NAME, one of {KNOWN_CONVENTIONS}")
     convention = replace(CONVENTIONS[base], name=":".join([base, *modifiers]))
     kinds = [("m", "mm"), ("rad", "deg"), ("inverse",), ("opengl",)]
@@ -190,11 +200,16 @@ def matrix_convention(numbers: Array) -> PoseConvention:
     """`matrix` or `franka`, whichever makes rigid transforms of (n, 12 or 16) numbers."""
     orders = [CONVENTIONS[name] for name in ("matrix", "franka")]
     rigid = [order for order in orders if _rigid(_matrices(numbers, order.layout)).all()]
-    if len(rigid) == 1:
+    if len(rigid) == 1 and (rigid[0].name == "matrix" or numbers.shape[-1] == 16):
         return rigid[0]
-    which = "both orders" if rigid else "no order"
+    problem = f"rows of {numbers.shape[-1]} numbers are rigid transforms in"
+    if len(rigid) == 1:
+        raise ConventionError(
+            f"{problem} columns, or rotations in rows before x y z",
+            "franka (column after column), or a header r11,r12,r13,r21,r22,r23,r31,r32,r33,x,y,z",
+        )
     raise ConventionError(
-        f"rows of {numbers.shape[-1]} numbers are rigid transforms in {which}",
+        f"{problem} {'both orders' if rigid else 'no order'}",
         "matrix (row after row) or franka (column after column)",
     )
 
@@ -207,10 +222,12 @@ def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
         if convention.is_matrix:
             at = _matrices(numbers, convention.layout)[..., 3]
         _check_lengths(np.linalg.norm(at[..., :3], axis=-1), convention)
+    angles = np.abs(numbers[..., 3:]) if convention.has_angles else np.zeros(0)
+    angles = np.linalg.norm(angles, axis=-1) if convention.layout == "vector" else angles
+    largest = float(angles.max(initial=0.0))
+    if convention.degrees and largest > _LARGEST_DEG:
+        raise ValueError(f"angles up to {largest:.4g} deg; do columns hold {convention.meaning}?")
     if convention.has_angles and not convention.has("rad", "deg"):
-        angles = np.abs(numbers[..., 3:])
-        angles = np.linalg.norm(angles, axis=-1) if convention.layout == "vector" else angles
-        largest = float(angles.max(initial=0.0))
         degrees = largest > 2 * np.pi + 1e-6
         if largest > 0 and degrees != convention.degrees:
             problem = f"angles up to {largest:.4g} look like"

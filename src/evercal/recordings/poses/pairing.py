@@ -11,7 +11,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
-from evercal.recordings.poses.row_files import natural_key, times_in_names
+from evercal.recordings.poses.row_files import natural_key, same_numbers, times_in_names
 from evercal.recordings.text_files import named_errors, refuse_repeated
 
 Pairing = tuple[list[SE3 | None], list[str]]
@@ -67,6 +67,10 @@ def _by_name(images: Sequence[Path], names: Sequence[str], poses: SE3, file: Pat
     by_name = dict(zip(keys, poses, strict=True))
     # A table may omit the ending.
     paired = [by_name.pop(i.name, None) or by_name.pop(i.stem, None) for i in images]
+    if all(pose is None for pose in paired) and same_numbers(
+        names, [image.name for image in images]
+    ):
+        return list(poses), [f"paired by numbers: {names[0]} with {images[0].name}, and so on"]
     if not any(pose is not None for pose in paired):
         raise InputError(
             f"{file}: names no image of {images[0].parent}; its first is {names[0]!r}, the first"

@@ -1,7 +1,7 @@
 """Tables of poses: columns with names, plain numbers, matrices, and robots' own notations.
 
-Lines that start with # are ignored, except that the last of them before the numbers may be the
-header, as in files of numpy and TUM. Rows without a header have the numbers of a convention,
+Lines that start with #, % or // are ignored, except that the last of them before the numbers may be
+the header, as in files of numpy and TUM. Rows without a header have the numbers of a convention,
 optionally preceded by a stamp, and a name before or after them. Matrices may be blocks of 3 or 4
 lines, with numpy's brackets or without. Notations are `p[...]` of Universal Robots and
 `{X ..., C ...}` of KUKA.
@@ -60,45 +60,85 @@ class Columns(NamedTuple):
     """Conventions that the columns of a rotation may hold."""
     ask: str = ""
     """Conventions to ask for; empty if the columns define the first one."""
+    axes: str = ""
+    """Axis of each column, for conventions that order their numbers by axis."""
 
     def names(self, index: int) -> set[str]:
         """Possible names of one column."""
         prefixes = self.prefixes.split(",")
-        by_index = {f"{prefix}{index}" for prefix in prefixes if "vec_" in prefix}
+        by_index = {f"{p}{index}" for p in prefixes if self.ends == "xyz" and p.endswith("_")}
         return {prefix + self.ends[index] for prefix in prefixes} | by_index
+
+    def ordered(self, columns: list[int], convention: PoseConvention) -> list[int]:
+        """Columns of this rotation in the order of a convention; none if they do not hold it."""
+        layout, stated = convention.layout.lower(), convention.base in self.conventions
+        generic = convention.base.startswith(("fixed_", "moving_"))
+        if layout == "columns" and stated:
+            return np.reshape(columns, (-1, 4)).T.ravel().tolist()
+        if self.axes and sorted(layout) == sorted(self.axes) and (stated or generic):
+            return [columns[self.axes.index(axis)] for axis in layout]
+        # Letters without an axis are in the order of the convention that is stated.
+        free = not self.axes or (self.axes == "xyz" and len({*layout}) < 3)
+        free = free and convention.has_angles and len(layout) == len(columns)
+        return columns if stated or free else []
 
 
 _GRID = [f"{row}{column}" for row in range(4) for column in range(4)]
+_GRID_3 = [f"{row}{column}" for row in range(3) for column in range(3)]
+_ANGLES = ("ur", "yaskawa", "staubli", "fanuc", "rpy")
+_ORDERS = ("abb", "wxyz", "xyzw", "tum")
+_Q, _R = "q,q_,quat,quat_,quaternion_,orientation_,rotation_,q_rs_", "r,r_,rot_,rotation_"
 HEADERS = {
     "position": Columns(",t,t_,p,pos_,position_,translation_,tvec_,p_rs_r_", "xyz"),
-    "quaternion": Columns(
-        "q,q_,quat_,quaternion_,orientation_,rotation_,q_rs_", "wxyz",
-        ("wxyz", "xyzw", "tum", "abb"),
-    ),
-    "rotation vector": Columns("rotvec_,rvec_,rotation_vector_", "xyz", ("ur",)),
+    "quaternion": Columns(_Q, "wxyz", ("wxyz", *_ORDERS), axes="wxyz"),
+    "rotation vector": Columns("rotvec_,rvec_,rotation_vector_", "xyz", ("ur",), axes="-"),
     "matrix": Columns("m", _GRID, ("matrix", "franka")),
     "3x4 matrix": Columns("m", _GRID[:12], ("matrix", "franka")),
+    "rotation matrix": Columns(_R, _GRID_3, ("matrix",)),
+    "matrix from r11": Columns(_R, [f"{int(at) + 11}" for at in _GRID_3], ("matrix",)),
     "W P R": Columns("", "wpr", ("fanuc",)),
+    "O A T": Columns("", "oat", ("kawasaki",)),
+    "q1 to q4": Columns(_Q, "1234", _ORDERS, "abb, wxyz or xyzw"),
+    "q0 to q3": Columns(_Q, "0123", _ORDERS, "wxyz or xyzw"),
     "angles": Columns(
-        "r,r_,rot_,rotation_", "xyz", ("ur", "yaskawa", "staubli", "fanuc", "rpy"),
-        "ur (rotation vector), yaskawa, staubli, fanuc or rpy",
+        _R, "xyz", _ANGLES, "ur (rotation vector), yaskawa, staubli, fanuc or rpy", "xyz"
     ),
     "roll pitch yaw": Columns(
         "", ("roll", "pitch", "yaw"), ("rpy", "yaskawa", "staubli", "fanuc", "kuka"),
-        "rpy:rad or rpy:deg",
+        "rpy:rad or rpy:deg", "xyz",
     ),
-    "A B C": Columns("", "abc", ("kuka",), "kuka"),
-    "q1 to q4": Columns("q", "1234", ("abb", "wxyz", "xyzw", "tum"), "abb, wxyz or xyzw"),
+    "A B C": Columns("", "abc", ("kuka",), "kuka (A about z) or mitsubishi (A about x)"),
+    "U V W": Columns("", "uvw", ("kuka",), "epson (U about z)"),
 }  # fmt: skip
 """Columns of a position and of rotations; definite rotations come first."""
-_AXES = {"quaternion": "wxyz", "angles": "xyz", "roll pitch yaw": "xyz"}
-"""Columns that conventions order by axis; rx and roll rotate about x."""
+_COMMENTS = ("#", "%", "//")
+_INDICES = ("", "index", "idx", "id", "no", "nr", "i", "n", "number", "row", "pose", "sample")
+"""Columns that only count."""
 _WORD = r'[^\s\[\](){}=,;:"]'
-_NOTATION = re.compile(rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?(p\[|\{{)([^\[\]{{}}]*)[\]}}]')
-"""A word, if there is one, the bracket and what it holds. A word is read once, from its start."""
+_NOTATIONS = {
+    "Translation: [": (
+        r"(?:At time (\S+)\s+)?- Translation: \[([^\[\]]*)\]\s+- Rotation: in Quaternion[^\[\n]*"
+        r"\[([^\[\]]*)\](?:\n(?!At time |- Translation).*)*",
+        "x,y,z,qx,qy,qz,qw",
+    ),
+    "robtarget [": (
+        r"()\[\s*\[([^\[\],]*(?:,[^\[\],]*){2})\]\s*,\s*\[([^\[\],]*(?:,[^\[\],]*){3})\]"
+        r"\s*,\s*\[[^\[\]]*\]\s*,\s*\[[^\[\]]*\]\s*\]",
+        "x_mm,y_mm,z_mm,qw,qx,qy,qz",
+    ),
+    "P[": (r"()\bP\[\d[^\[\]\n]*\]\s*\{([^{}]*)\}()", "X,Y,Z,W,P,R"),
+    "p[": (rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?p\[([^\[\]{{}}]*)\]()',
+           "x,y,z,rotvec_x,rotvec_y,rotvec_z"),
+    "{": (rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?\{{([^\[\]{{}}]*\bX\s+[-+.\d][^\[\]{{}}]*)\}}()',
+          "X,Y,Z,A,B,C"),
+}  # fmt: skip
+"""By how it begins: a pose as a pattern of a name or stamp and two parts, and its columns.
 
-_Groups = dict[str, tuple[list[int], str | None]]
-"""Columns and their unit, if stated, by key of `HEADERS`."""
+They are tf2_echo of ROS, RAPID of ABB, LS of FANUC, URScript and KRL of KUKA. A word is read once,
+from its start."""
+
+_Groups = dict[str, list[int]]
+"""Columns by key of `HEADERS`."""
 
 
 def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
@@ -107,7 +147,7 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     ValueError, also of the functions below: this is no table, or its convention is not defined.
     """
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    plain = [line for line in lines if line[0] != "#"]
+    plain = [line for line in lines if not line.startswith(_COMMENTS)]
     comments = lines[: lines.index(plain[0])] if plain else []
     plain, given = _without_brackets(plain, given)
     rows = table_cells(plain)
@@ -115,7 +155,7 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     if _is_header(words):
         rows = rows[1:]
     else:
-        words = table_cells([line.lstrip("# ") for line in comments[-1:]]).ravel().tolist()
+        words = table_cells([line.lstrip("#%/ ") for line in comments[-1:]]).ravel().tolist()
     if not len(rows):
         raise ValueError("no line of numbers in it")
     if len(words) == rows.shape[1] and _is_header(words):
@@ -123,7 +163,8 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     texts = [i for i, cell in enumerate(rows[0].tolist()) if not is_number(cell)]
     numbers = cell_numbers(np.delete(rows, texts[:1], axis=1))
     if texts or numbers.shape[1] != 4:
-        return plain_numbers(numbers, given, tuple(rows[:, texts[0]].tolist()) if texts else None)
+        names = tuple(rows[:, texts[0]].tolist()) if texts else None
+        return plain_numbers(numbers, given, names)
     whole = (numbers == (0, 0, 0, 1)).all(1).any() or (given and given.layout == "columns")
     height = 3 if len(numbers) % 3 == 0 and not whole else 4
     if len(numbers) % height:
@@ -131,33 +172,54 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     return plain_numbers(numbers.reshape(-1, height, 4), given)
 
 
+def has_position(words: Sequence[str]) -> bool:
+    """Whether columns of these names hold a position."""
+    return "position" in _groups(words)
+
+
 def named_numbers(words: Sequence[str], rows: Cells, given: PoseConvention | None) -> PoseTable:
     """Numbers of rows (n, k) whose columns have names."""
     require_at_most(len(words), "columns", "columns")
     groups = _groups(words)
-    names, stamps, others = row_labels(words, rows.T.tolist(), len(rows))
+    used = {column for columns in groups.values() for column in columns}
+    free = ["" if i in used else word for i, word in enumerate(words)]
+    names, stamps, others = row_labels(free, rows.T.tolist(), len(rows))
     convention = given or pose_convention(_defined(groups, words))
-    columns = others if groups.keys() <= {"position"} else []
-    position, length = groups.get("position", ([], None))
-    for key, (rotation, unit) in groups.items():
-        if convention.base not in HEADERS[key].conventions or columns:
-            continue
-        if convention.layout == "columns":
-            rotation = np.reshape(rotation, (-1, 4)).T.ravel().tolist()
-        elif key in _AXES and convention.layout != "vector":
-            rotation = [rotation[_AXES[key].index(axis)] for axis in convention.layout.lower()]
-        columns = rotation if convention.is_matrix else position + rotation
-        if length is not None and not convention.has("m", "mm"):
-            convention = replace(convention, **UNITS[length])
-        if unit is not None and not convention.has("rad", "deg"):
-            convention = replace(convention, **UNITS[unit])
+    position = groups.pop("position", [])
+    ordered = [HEADERS[key].ordered(groups[key], convention) for key in groups]
+    columns = next(filter(None, ordered), [])
+    if not groups:
+        others = [i for i in others if name_and_unit(words[i])[0] not in _INDICES]
+        position = position or others[: 0 if convention.is_matrix else 3]
+        columns = [i for i in others if i not in position]
+    convention = _in_units(convention, [words[i] for i in position], "m", "mm")
+    if convention.has_angles:
+        convention = _in_units(convention, [words[i] for i in columns], "rad", "deg")
+    if not convention.is_matrix:
+        columns = position + columns
+    elif len(columns) == 9 and len(position) == 3:
+        columns = np.c_[np.reshape(columns, (3, 3)), position].ravel().tolist()
     if len(columns) in convention.counts:
         numbers = cell_numbers(rows[:, columns], [words[column] for column in columns])
         return PoseTable(numbers, convention, names, stamps)
     raise ConventionError(
         f"the columns {', '.join(words)} are none of {convention.name} ({convention.meaning})",
-        "of the columns, or leave it out if their names define it",
+        f"of the columns, or name them as {convention.meaning.split(',')[0]!r}",
     )
+
+
+def _in_units(convention: PoseConvention, words: Sequence[str], *known: str) -> PoseConvention:
+    """The convention in the unit that columns state, unless its own name has one."""
+    units = {name_and_unit(word)[1] for word in words}
+    if len(units) > 1:
+        raise ValueError(f"the columns {', '.join(words)} differ in unit")
+    unit = units.pop() if units else None
+    if unit is None:
+        return convention
+    if unit not in known:
+        problem = f"the columns {', '.join(words)} are in {unit}"
+        raise ValueError(f"{problem}; write {' or '.join(known)}")
+    return convention if convention.has(*known) else replace(convention, **UNITS[unit])
 
 
 def plain_numbers(numbers: Array, given: PoseConvention | None, names: Names = None) -> PoseTable:
@@ -196,29 +258,45 @@ def _without_brackets(
 ) -> tuple[list[str], PoseConvention | None]:
     """Lines of a table without brackets, and the convention that a robot's notation defines."""
     text = "\n".join(lines)
-    found = _NOTATION.findall(text)
-    # Units are in brackets, too, and KUKA has braces for other things.
-    found = [each for each in found if re.search(r"\bX\s" if each[1] == "{" else ",", each[2])]
-    if not found:
-        if lines and re.search(r"\[\s*[-+.\d]", lines[0]):  # by numpy, which wraps long rows
-            text = re.sub(r"\[[^\[\]]*\]", lambda row: row[0].replace("\n", " "), text)
-            lines = re.sub(r'[\[\],;="]', " ", text).splitlines()
-        return lines, given
-    kinds = {bracket for _, bracket, _ in found}
-    kinds |= set(re.findall(r"p?\[", text)) if "p[" in kinds else set()
+    kinds = [kind for kind, (pattern, _) in _NOTATIONS.items() if re.search(pattern, text)]
     if len(kinds) > 1:
         raise ValueError(f"it mixes the brackets {' and '.join(sorted(kinds))}; use one notation")
+    if not kinds:
+        return _without_lists(lines), given
+    pattern, header = _NOTATIONS[kinds[0]]
+    for line in re.sub(pattern, " ", text).splitlines():
+        cells = [*filter(None, re.split(r"[^\w.+#-]+", line))]
+        numbers = sum(map(is_number, cells))
+        if numbers > 2 and 2 * numbers > len(cells) and ":=" not in line:
+            raise ValueError(
+                f"{line.strip()[:60]!r} is beside poses in {kinds[0]}; use one notation"
+            )
+    found = re.findall(pattern, text)
     words = [word for word, *_ in found]
     named = all(words) and (len(found) == 1 or len({*words}) > 1)  # else a type, such as E6POS
     rows = []
-    for word, bracket, inside in found:
-        values = dict(re.findall(r"\b([XYZABC])\s+([^\s,]+)", inside))
-        row = inside if bracket == "p[" else ",".join(values.get(key, "") for key in "XYZABC")
+    for word, first, second in found:
+        row = f"{first},{second}" if second else first
+        if header[0] == "X":
+            values = dict(re.findall(r"\b([XYZABCWPR])[\s=]+([^\s,]+)", first))
+            row = ",".join(values.get(key, "") for key in header.split(","))
         rows.append(f"{word},{row}" if named else row)
     label = "" if not named else "stamp," if is_number(words[0]) else "image,"
-    if "{" in kinds:
-        return [label + "X,Y,Z,A,B,C", *rows], given or pose_convention("kuka")
-    return [label + "x,y,z,rotvec_x,rotvec_y,rotvec_z", *rows], given
+    return [label + header, *rows], given or (pose_convention("kuka") if kinds[0] == "{" else None)
+
+
+def _without_lists(lines: list[str]) -> list[str]:
+    """Lines without the brackets of numpy, Python and robots' functions, such as XY(...)."""
+    lines = [re.sub(r"^[^\[\]]*[:=]\s*(?=$|\[\[)", "", line) for line in lines]  # titles
+    lines = [line for line in lines if line]
+    cut = next((s for s in ";,\t" if s in "".join(lines[:1])), " ")
+    label = re.compile(r"^([^\s,;:=]+)\s*(?::\s|=)\s*(?=[-+.\d])")  # P1 = 412.0
+    lines = [label.sub(rf"\1{cut}", line) for line in lines]
+    if not lines or not re.search(r"[\[({]\s*[-+.\d]", lines[0]):
+        return lines
+    text = re.sub(r"\b\w+\(", "(", "\n".join(lines))
+    text = re.sub(r"\[[^\[\]]*\]", lambda row: row[0].replace("\n", " "), text)  # wrapped by numpy
+    return re.sub(r'[\[\](){},;="]|:(?=\s)', " ", text).splitlines()
 
 
 def _is_header(words: Sequence[str]) -> bool:
@@ -227,7 +305,7 @@ def _is_header(words: Sequence[str]) -> bool:
 
 
 def _groups(words: Sequence[str]) -> _Groups:
-    names, units = zip(*map(name_and_unit, words), strict=True)
+    names = [name_and_unit(word)[0] for word in words]
     groups: _Groups = {}
     for key, group in HEADERS.items():
         found = [
@@ -236,29 +314,26 @@ def _groups(words: Sequence[str]) -> _Groups:
         ]
         columns = [candidates[0] for candidates in found if candidates]
         # rotation_x belongs to a quaternion if there is a rotation_w.
-        if not all(found) or any({*columns} & {*used} for used, _ in groups.values()):
+        if not all(found) or any({*columns} & {*used} for used in groups.values()):
             continue
         for repeated in (candidates for candidates in found if len(candidates) > 1):
             which = " and ".join(words[column] for column in repeated)
             raise ValueError(f"the columns {which} may both be the {key}'s; keep those of the pose")
-        unit = units[columns[0]]
-        if any(units[column] != unit for column in columns):
-            raise ValueError(f"the columns {', '.join(words[c] for c in columns)} differ in unit")
-        stated = unit in (("m", "mm") if key == "position" else ("rad", "deg"))
-        groups[key] = columns, unit if stated else None
+        groups[key] = columns
     return groups
 
 
 def _defined(groups: _Groups, words: Sequence[str]) -> str:
     rotations = [key for key in groups if key != "position"]
-    sure = [k for k in rotations if not HEADERS[k].ask or (k == "roll pitch yaw" and groups[k][1])]
+    stated = {key: name_and_unit(words[groups[key][0]])[1] for key in rotations}
+    sure = [k for k in rotations if not HEADERS[k].ask or (k == "roll pitch yaw" and stated[k])]
     conventions = [HEADERS[key].conventions[0] for key in sure]
     if len(sure) == 1 and ("position" in groups or conventions == ["matrix"]):
         return conventions[0]
     if sure[1:]:
         raise ConventionError(f"the header names {' and '.join(sure)}", " or ".join(conventions))
     if rotations and not sure:
-        columns = ", ".join(words[column] for column in groups[rotations[0]][0])
+        columns = ", ".join(words[column] for column in groups[rotations[0]])
         problem = f"columns {columns} do not define a rotation"
         raise ConventionError(problem, HEADERS[rotations[0]].ask)
     raise ConventionError(

@@ -1,12 +1,13 @@
-"""Pose files: a table (CSV, TUM, text), JSON, NPY or NPZ, in a named convention.
+"""Pose files: a table (CSV, TUM, text), JSON, YAML, NPY, NPZ or MAT, in a named convention.
 
-A convention is required if the file does not define the meaning of its numbers. docs/formats.md
-has examples of all kinds.
+A convention is required if the file does not define the meaning of its numbers. A folder may hold
+one such file for each pose. docs/formats.md has examples of all kinds.
 """
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.bounds import require_at_most
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.conventions import (
@@ -24,29 +24,24 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
     poses_from_numbers,
 )
-from evercal.recordings.poses.pose_table import (
-    PoseTable,
-    named_numbers,
-    plain_numbers,
-    read_pose_table,
+from evercal.recordings.poses.pose_data import pose_data
+from evercal.recordings.poses.pose_table import PoseTable, read_pose_table
+from evercal.recordings.poses.row_files import Names, arrays_as_lists, natural_key
+from evercal.recordings.text_files import (
+    named_errors,
+    read_text,
+    refuse_repeated,
+    yaml_documents,
 )
-from evercal.recordings.poses.row_files import (
-    Names,
-    arrays_as_lists,
-    number_array,
-    row_labels,
-    text_cells,
-)
-from evercal.recordings.text_files import named_errors, read_text, refuse_repeated
 
-_KEYS = ("poses", "base_from_gripper", "camera_from_board", "T", "transforms", "matrices")
-"""Keys of poses in JSON and NPZ."""
-_WIDTHS = (6, 7, 8, 12, 13, 16, 17)
-"""Numbers of a pose, possibly after a stamp."""
+POSE_ENDINGS = (".csv", ".json", ".jsonl", ".yaml", ".yml", ".npy", ".npz", ".mat", ".tum", ".txt")
+_YAML = re.compile(
+    r"(?:\s*#.*\n)*(?:%YAML|---\s*\n|(?:- )?[A-Za-z_]\w*:(?:\s*\n\s*(?:- )?[A-Za-z_]\w*:"
+    r"| \{\s*[a-z]))"
+)
+"""Beginning of YAML in a file with another ending."""
 _END_BYTES = 1 << 16
 """Bytes read at each end of a file that grows."""
-_LISTS = {"translation_m": ("x_m", "y_m", "z_m"), "quaternion_wxyz": ("qw", "qx", "qy", "qz")}
-"""Columns of lists in JSON."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,16 +71,19 @@ def read_robot_poses(
     what: str = "file of robot poses",
     option: str | None = None,
     camera_from: bool = False,
+    robot: bool = True,
 ) -> RobotPoses:
     """Read a pose file.
 
     Args:
-        path: A `.json`, `.npy` or `.npz` file; other endings are read as a table.
+        path: A `.json`, `.yaml`, `.npy`, `.npz` or `.mat` file, a folder of files of one pose each;
+            other endings are read as a table.
         convention: Convention of the numbers, such as `kuka`, `ur` or `matrix:mm`. Required if the
             file does not define it.
         what: Kind of file, for messages.
         option: Option of the convention, such as `--convention`, for messages.
         camera_from: Whether the file states camera_from_something, for `:opengl`.
+        robot: Whether the poses are of the robot, in files with those of the camera, too.
 
     Raises:
         InputError: The file is missing or broken, or the numbers do not fit the convention.
@@ -93,11 +91,8 @@ def read_robot_poses(
     path = Path(path)
     with named_errors(path, what):
         try:
-            given, ending = _given(path, convention), path.suffix.lower()
-            if ending in (".npy", ".npz"):
-                table = _data_table(arrays_as_lists(path), given)
-            else:
-                table = _table(read_text(path, what), ending, given)
+            given = _given(path, convention)
+            table = (_folder if path.is_dir() else _file)(path, given, what, robot)
             poses = _poses(table, camera_from)
         except ConventionError as error:
             raise InputError(f"{path}: {error.naming(option)}") from None
@@ -117,7 +112,7 @@ def read_last_robot_pose(path: str | os.PathLike[str], convention: str | None = 
             lines = _complete_lines(file.read(_END_BYTES))
             file.seek(max(0, file.seek(0, os.SEEK_END) - _END_BYTES))
             last = _complete_lines(file.read())[-1:]
-        ending = path.suffix.lower().removesuffix("l")
+        ending = path.suffix.lower().removesuffix("l")  # one line of .jsonl is JSON
         first = next((i for i, line in enumerate(lines) if line[:1] != "#"), len(lines))
         if first == len(lines):
             raise ValueError("no complete line of a pose in it yet")
@@ -128,6 +123,8 @@ def read_last_robot_pose(path: str | os.PathLike[str], convention: str | None = 
 
 
 def _complete_lines(part: bytes) -> list[str]:
+    if b"\0" in part:
+        raise ValueError("it is UTF-16; let the program that writes it write UTF-8")
     text = part[: part.rfind(b"\n") + 1].decode("utf-8", "replace")
     return [line for line in text.splitlines() if line.strip()]
 
@@ -138,80 +135,69 @@ def _given(path: Path, convention: str | None) -> PoseConvention | None:
     return None if convention is None else pose_convention(convention)
 
 
-def _table(text: str, ending: str, given: PoseConvention | None) -> PoseTable:
-    if ending == ".json":
-        return _data_table(json.loads(text), given)
+def _file(path: Path, given: PoseConvention | None, what: str, robot: bool) -> PoseTable:
+    ending = path.suffix.lower()
+    if ending in (".npy", ".npz", ".mat"):
+        return pose_data(arrays_as_lists(path), given, robot)
+    return _table(read_text(path, what), ending, given, robot)
+
+
+def _folder(path: Path, given: PoseConvention | None, what: str, robot: bool) -> PoseTable:
+    """Poses of files that are named alike, in the order of the numbers in their names."""
+    kinds: dict[str, list[str]] = {}
+    for name in sorted(os.listdir(path), key=natural_key):
+        if name[0] != "." and Path(name).suffix.lower() in POSE_ENDINGS:
+            kinds.setdefault(re.sub(r"\d+", "N", name), []).append(name)
+    several = {kind: names for kind, names in kinds.items() if len(names) > 1} or kinds
+    # ViSP's poses of the end effector and of the object in the camera.
+    own = [kind for kind in several if ("fPe" if robot else "cPo") in kind] or [*several]
+    if len(own) != 1:
+        found = " and ".join(own) or f"no file of {', '.join(POSE_ENDINGS)}"
+        raise ValueError(f"the folder holds {found}; give a folder of one file for each pose")
+    tables = []
+    for name in several[own[0]]:
+        with named_errors(path / name, what):
+            tables.append(_file(path / name, given, what, robot))
+            if len(tables[-1].numbers) != 1:
+                raise ValueError("holds several poses, in a folder of one file for each pose")
+    numbers = np.concatenate([table.numbers for table in tables])
+    stems = tuple(Path(name).stem for name in several[own[0]])
+    return PoseTable(numbers, tables[0].convention, stems)
+
+
+def _table(text: str, ending: str, given: PoseConvention | None, robot: bool = True) -> PoseTable:
+    if ending in (".json", ".jsonl"):
+        return pose_data(_json(text), given, robot)
+    if ending in (".yaml", ".yml") or _YAML.match(text):
+        documents = [each for each in yaml_documents(text) if each is not None]
+        return pose_data(documents[0] if len(documents) == 1 else documents, given, robot)
     return read_pose_table(text, given)
 
 
+def _json(text: str) -> Any:
+    """JSON, or a value in each line."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        if error.msg != "Extra data":
+            raise
+        return [json.loads(line) for line in text.splitlines() if line.strip()]
+
+
 def _poses(table: PoseTable, camera_from: bool = False) -> SE3:
-    poses = poses_from_numbers(table.numbers, table.convention, camera_from)
-    check_units(table.numbers, table.convention)
-    return poses
-
-
-def _data_table(data: Any, given: PoseConvention | None) -> PoseTable:
-    if isinstance(data, Mapping) and not {"matrix", "translation_m"} & data.keys():
-        key = _pose_key(data)
-        lists = {k: v for k, v in data.items() if k != key and isinstance(v, list)}
-        return _labelled(_data_table(data[key], given), lists, plural=True)
-    entries = data if isinstance(data, list) else [data]
-    if entries and all(isinstance(entry, list) for entry in entries):
-        numbers = number_array(entries, "a list of poses")
-        single = numbers.shape in ((4, 4), (3, 4))
-        return plain_numbers(numbers[None] if single else numbers, given)
-    if not entries or not all(isinstance(entry, Mapping) for entry in entries):
-        raise ValueError("poses are a list of objects, or of lists of numbers, not of both")
-    keys = dict.fromkeys(key for entry in entries for key in entry)
-    require_at_most(len(keys), "columns", "keys")
-    require_at_most(len(keys) * len(entries), "numbers", "values")
-    columns = {key: [entry.get(key) for entry in entries] for key in keys}
-    if all("matrix" in entry for entry in entries):
-        return _labelled(_data_table(columns["matrix"], given), columns)
-    rows = [_flat(entry) for entry in entries]
-    words = [*rows[0]]
-    cells = text_cells([str(row.get(word)) for word in words] for row in rows)
-    table = _labelled(named_numbers(words, cells, given), columns)
-    return table._replace(fixed="quaternion_wxyz" in columns)
-
-
-def _labelled(
-    table: PoseTable, columns: Mapping[str, Sequence[object]], plural: bool = False
-) -> PoseTable:
-    names, stamps, _ = row_labels([*columns], [*columns.values()], len(table.numbers), plural)
-    stamps = stamps if table.stamps_s is None else table.stamps_s
-    return table._replace(names=table.names or names, stamps_s=stamps)
-
-
-def _flat(entry: Mapping[str, Any]) -> dict[str, object]:
-    cells: dict[str, object] = {}
-    for key, value in entry.items():
-        require_at_most(len(key), "name_characters", "characters of a key")
-        if isinstance(value, Mapping):
-            cells |= _flat({f"{key}_{inner}": each for inner, each in value.items()})
-        elif isinstance(value, list):
-            require_at_most(len(value), "columns", "numbers of one key")
-            names = _LISTS.get(key, [f"{key}_{i}" for i in range(len(value))])
-            cells |= dict(zip(names, value, strict=False))
-        else:
-            cells[key] = value
-    return cells
-
-
-def _shape(value: object) -> tuple[int, ...]:
-    """Lengths of nested lists, by the first of each: all are compared when numbers are read."""
-    return (len(value), *_shape(value[0] if value else None)) if isinstance(value, list) else ()
-
-
-def _pose_key(data: Mapping[str, Any]) -> str:
-    keys = [key for key in data if key in _KEYS]
-    for key in () if keys else data:
-        shape = _shape(data[key])
-        table = len(shape) == 2 and shape[1] in _WIDTHS
-        keys += [key] if table or shape[-2:] in ((4, 4), (3, 4)) else []
-    if len(keys) != 1:
-        raise ValueError(
-            f"{' and '.join(keys) or 'none'} of its keys ({', '.join(data)}) may hold the poses;"
-            f" call the right one 'poses'"
-        )
-    return keys[0]
+    try:
+        poses = poses_from_numbers(table.numbers, table.convention, camera_from)
+        check_units(table.numbers, table.convention)
+        return poses
+    except ValueError as error:
+        problem: ValueError = error
+        if not table.convention.is_matrix:
+            with suppress(ValueError):
+                turned = np.roll(table.numbers, 3, axis=-1)
+                poses_from_numbers(turned, table.convention)
+                check_units(turned, table.convention)
+                problem = ValueError(
+                    f"the rotation is before the position; write {table.convention.meaning}, or a"
+                    f" header that names the columns"
+                )
+        raise problem from None

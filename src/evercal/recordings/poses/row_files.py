@@ -32,9 +32,11 @@ _NAMES = (
 )  # fmt: skip
 _STAMPS = ("stamp", "timestamp", "time_stamp", "time", "t")
 _UNIT = re.compile(
-    r"(?<![\s_])[\s_]*[\s_\[(](mm|m|degrees|deg|radians|rad|ns|us|ms|s)[\])]?$|(?<!\s)\s*\[\s*\]$"
+    r"(?<![\s_/])[\s_/]*[\s_/\[(]\s*(mm|cm|m|inch(?:es)?|(?:milli)?met(?:er|re)s?|deg(?:rees?)?"
+    r"|rad(?:ians?)?|ns|us|ms|s)\s*[\])]?$|(?<!\s)\s*\[\s*\]$"
 )
-_SHORT = {"degrees": "deg", "radians": "rad"}
+_SHORT = {"deg": "deg", "rad": "rad", "mil": "mm", "met": "m", "inc": "inch"}
+"""Units by the first three letters of their names."""
 _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _EARLIEST_S, _LATEST_S = 1e9, 4e9  # 2001 and 2096 in seconds since 1970
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$")
@@ -68,11 +70,11 @@ def read_rows(path: Path, contents: str) -> Rows:
 def table_cells(lines: Sequence[str]) -> Cells:
     """(n, k) cells of lines of text; missing cells at the end of a line are empty.
 
-    Semicolons, commas, tabs or blanks of the first line separate them. If it is semicolons, the
-    comma may be a decimal point.
+    Semicolons, commas, tabs or blanks of the first line separate them. Other than between commas,
+    the comma may be a decimal point.
     """
     first = next((line for line in lines if line.strip()), "")
-    separator = next((s for s in (";", ",", "\t") if s in first), " ")
+    separator = _separator(first)
     count = len(first.split()) if separator == " " else first.count(separator) + 1
     _require_few_cells(count, len(lines))
     if separator == " ":
@@ -95,9 +97,20 @@ def table_cells(lines: Sequence[str]) -> Cells:
         raise ValueError("no table: a quotation mark is not closed")
     if not cells:
         return np.empty((0, 0), dtype=object)
-    if separator == ";":
+    cells = [[cell.strip() for cell in row] for row in cells]
+    # Beside numbers with points, commas are those of thousands.
+    if separator != "," and not any(
+        "." in cell and is_number(cell) for row in cells for cell in row
+    ):
         cells = [[_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in row] for row in cells]
-    return text_cells([map(str.strip, row) for row in cells])
+    return text_cells(cells)
+
+
+def _separator(line: str) -> str:
+    words = line.split()
+    if words[1:] and all("," not in word or _DECIMAL_COMMA.match(word) for word in words):
+        return next((s for s in (";", "\t") if s in line), " ")
+    return next((s for s in (";", ",", "\t") if s in line), " ")
 
 
 def _require_few_cells(columns: int, rows: int) -> None:
@@ -122,18 +135,20 @@ def cell_numbers(cells: Cells, words: Sequence[str] = ()) -> Array:
     for (row, column), cell in np.ndenumerate(cells):
         if not is_number(cell) or not np.isfinite(float(cell)):
             name = repr(words[column]) if words else column + 1
-            raise ValueError(f"row {row + 1}, column {name}: {str(cell)!r} is not a finite number")
+            hint = "; write all poses with brackets, or none" * ("[" in cell)
+            problem = f"{str(cell)!r} is not a finite number{hint}"
+            raise ValueError(f"row {row + 1}, column {name}: {problem}")
     return cells.astype(np.float64)
 
 
 def name_and_unit(cell: str) -> tuple[str, str | None]:
     """Split a column's name into its plain name and its unit."""
     require_at_most(len(cell), "name_characters", "characters of a name")
-    name = re.sub(r"^(pose|transform)[._/]", "", cell.strip().lower())
-    match = _UNIT.search(name)
+    name = re.sub(r"^((pose|transform|header)[._/])+", "", cell.strip().lower())
+    match = _UNIT.search(re.sub("[°º]", " deg", name))
     unit = match.group(1) if match else None
-    name = name[: match.start()] if match else name
-    return re.sub(r"[\s.]+", "_", name), _SHORT.get(unit or "", unit)
+    name = match.string[: match.start()] if match else name
+    return re.sub(r"[\s.]+", "_", name), _SHORT.get((unit or "")[:3], unit)
 
 
 def row_labels(
@@ -178,9 +193,11 @@ def number_array(values: object, what: str) -> Array:
 
 
 def arrays_as_lists(path: Path) -> Any:
-    """An array of NPY as lists, or the arrays of NPZ by name; ValueError for damaged files."""
+    """An array of NPY as lists, or arrays of NPZ or MAT by name; ValueError for damaged files."""
     with path.open("rb") as file:
         try:
+            if path.suffix.lower() == ".mat":
+                return _matlab(file)
             if zipfile.is_zipfile(file):
                 with zipfile.ZipFile(file) as archive:
                     for entry in archive.infolist():
@@ -196,6 +213,17 @@ def arrays_as_lists(path: Path) -> Any:
             return {key: loaded[key].tolist() for key in loaded.files}
         except Exception as error:  # numpy raises many types for damaged files
             raise ValueError(f"no readable arrays ({' '.join(str(error).split())[:200]})") from None
+
+
+def _matlab(file: IO[bytes]) -> dict[str, Any]:
+    from scipy.io import loadmat, whosmat
+
+    kinds = re.compile("double|single|u?int(8|16|32|64)")
+    shapes = {name: shape for name, shape, kind in whosmat(file) if kinds.fullmatch(kind)}
+    require_at_most(sum(map(math.prod, shapes.values())), "numbers", "numbers")
+    file.seek(0)
+    loaded = loadmat(file, variable_names=[*shapes])
+    return {name: loaded[name].tolist() for name in shapes}
 
 
 def _require_few_numbers(file: IO[bytes]) -> None:
@@ -262,3 +290,10 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
         (0, len(p.lstrip("0")), f"{p.lstrip('0')} {p}") if p[0] in "0123456789" else (1, 0, p)
         for p in parts
     )
+
+
+def same_numbers(first: Sequence[str], second: Sequence[str]) -> bool:
+    """Whether names of two kinds end in the same numbers, as pose_1 and image-001.png."""
+    numbers = [re.findall(r"(\d+)\D*$", without_ending(name)) for name in (*first, *second)]
+    plain = [int(each[0]) if each else -1 for each in numbers]
+    return -1 not in plain and plain[: len(first)] == plain[len(first) :]
