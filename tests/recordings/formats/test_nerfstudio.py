@@ -177,11 +177,19 @@ def one(matrix: np.ndarray) -> list[dict[str, Any]]:
     return [{"file_path": "a.png", "transform_matrix": matrix.tolist()}]
 
 
+@pytest.mark.parametrize("stated", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+def test_a_fisheye_has_k1_to_k4(tmp_path: Path, stated: dict[str, Any]) -> None:
+    terms = {"k1": 0.1, "k2": -0.02, "k3": 0.003, "k4": 1e-4, "p1": 0.0, "p2": 0.0}
+    write(tmp_path, entries(ring(2)), **{**LENS, **terms, **stated})
+    camera = load_recording(tmp_path).train[0].camera
+    assert (camera.model, camera.distortion) == ("fisheye", (0.1, -0.02, 0.003, 1e-4))
+
+
 BREAKS: list[tuple[dict[str, Any], str]] = [
-    ({"camera_model": "OPENCV_FISHEYE"}, "camera_model 'OPENCV_FISHEYE' is not supported, only"),
-    ({"is_fisheye": True}, "fisheye images are not supported; undistort"),
-    ({"k4": 0.1}, "distortion is k1, k2, k3, k4 = 0"),
-    ({"distortion_params": [0.1] * 4}, "distortion is k1, k2, k3, k4 = 0"),
+    ({"camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR' is not supported, only"),
+    ({"is_fisheye": True, "p1": 0.1}, "with p1 and p2 0 for"),
+    ({"k4": 0.1}, "with k4 0 for OPENCV"),
+    ({"distortion_params": [0.1] * 4}, "distortion is k1, k2, k3, k4, p1, p2"),
     ({"distortion_params": [0.1, 0, 0, 0, 0, 0]}, "also as 'distortion_params', got"),
     ({"test_frames": {}}, "'frames' is a list"),
     ({"fl_x": None, "fl_y": None}, "'fl_x' is missing, and so are"),

@@ -150,7 +150,7 @@ SEVEN = [
     ("TestSplit.txt", b"office", r"TestSplit\.txt.*'office'"),
     ("TestSplit.txt", b"sequence9", r"TestSplit\.txt.*seq-09"),
     ("TestSplit.txt", b"sequence1", "seq-01 is in both"),
-    ("TestSplit.txt", b"\xff\xfe", r"TestSplit\.txt: .*not a text file"),
+    ("TestSplit.txt", b"\x89PNG\r\n\x1a\n", r"TestSplit\.txt: .*not a text file"),
     ("*Split.txt", b"\n", "are empty"),
     ("seq-02/*.png", None, "seq-02: no images"),
     (POSE, None, r"seq-02/frame-000002\.pose\.txt: .*is missing"),

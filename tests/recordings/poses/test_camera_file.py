@@ -15,6 +15,7 @@ from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.poses.camera_file import read_camera
+from evercal.recordings.poses.radial_models import RADIAL_MODELS
 
 from ..checks import refused
 
@@ -106,7 +107,7 @@ def test_opencv_storage_is_read(tmp_path: Path) -> None:
     assert read_camera(stored(tmp_path, size=False), (640, 480)) == CAMERA
     refused("'image_width' is missing", read_camera, stored(tmp_path, size=False))
     for more, expected in (
-        ({"fisheye_model": 1}, "fisheye_model is set"),
+        ({"fisheye_model": 1}, "has 0 or 4 finite coefficients"),
         ({"K": np.eye(3)}, "camera_matrix and K are the same; keep one"),
         ({"camera_matrix": np.eye(2)}, "camera_matrix has 9 numbers, got 4"),
     ):
@@ -316,6 +317,34 @@ def test_a_fisheye_states_its_distortion(tmp_path: Path) -> None:
         refused(message, read_camera, written(tmp_path, text))
 
 
+@pytest.mark.parametrize("kind", ["omni", "eucm", "ds"])
+def test_models_of_kalibr_become_the_nearest_fisheye(tmp_path: Path, kind: str) -> None:
+    own, focal = {"omni": [1.2], "eucm": [0.6, 1.1], "ds": [-0.2, 0.6]}[kind], 300.0
+    text = f"""
+cam0:
+  camera_model: {kind}
+  intrinsics: {[*own, focal, focal, 320.0, 240.0]}
+  distortion_model: none
+  distortion_coeffs: []
+  resolution: [640, 480]
+"""
+    camera = read_camera(written(tmp_path, text))
+    assert camera.model == "fisheye"
+    angles = np.deg2rad(np.linspace(1, 60, 30))
+    points = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], -1)
+    radii = focal * RADIAL_MODELS[kind].radius(angles, *own)
+    np.testing.assert_allclose(camera.project(points)[:, 0] - 320.0, radii, atol=0.01)
+    bent = text.replace("coeffs: []", "coeffs: [0.1, 0.0, 0.0, 0.0]")
+    refused("no other distortion", read_camera, written(tmp_path, bent))
+
+
+def test_the_model_fov_has_one_coefficient(tmp_path: Path) -> None:
+    fields = {"K": [300.0, 300.0, 320.0, 240.0], "distortion_model": "fov", "D": [0.9], **SIZE}
+    camera = read_camera(written(tmp_path, json.dumps(fields)))
+    x = camera.project([np.tan(0.8), 0.0, 1.0])[0]
+    assert x == pytest.approx(320 + 300 * np.arctan(2 * np.tan(0.8) * np.tan(0.45)) / 0.9, abs=0.01)
+
+
 def test_zivid_has_no_size(tmp_path: Path) -> None:
     camera = read_camera(written(tmp_path, ZIVID), (640, 480))
     assert camera == replace(CAMERA, distortion=(*CAMERA.distortion[:4], 0.0))
@@ -357,7 +386,7 @@ def test_of_several_cameras_the_one_of_the_images_is_read(tmp_path: Path) -> Non
     assert read_camera(file, (640, 480)) == RADTAN
     assert read_camera(written(tmp_path, KALIBR + KALIBR.replace("cam0", "cam1"))) == RADTAN
     written(tmp_path, KALIBR + second.replace("radtan", "fov"))
-    refused("cam1: distortion_model 'fov' is not supported", read_camera, file)
+    refused("cam1: a camera of model fov has omega", read_camera, file)
     stereo = ORB_SLAM.replace("a1.", "a.") + "LEFT.K: [600, 0, 320, 0, 600, 240, 0, 0, 1]\n"
     refused("outside of these .*, LEFT", read_camera, written(tmp_path, stereo + "LEFT.D: [0]\n"))
 

@@ -38,7 +38,7 @@ _FILES = (
     "nerfstudio/transforms_undistorted.json", f"nerfstudio/{FILE}",
     "dslr/nerfstudio/transforms_undistorted.json", f"dslr/nerfstudio/{FILE}",
 )  # fmt: skip
-_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
 # OpenGL axes (right, up, backward) from OpenCV axes (right, down, forward).
 _GL_FROM_CV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -157,13 +157,15 @@ def _camera(data: Mapping[str, object]) -> Camera:
             f"camera_model {model!r} is not supported, only {', '.join(_MODELS)}; undistort the"
             f" images first (for COLMAP: colmap image_undistorter)"
         )
-    if data.get("is_fisheye"):
-        raise ValueError("fisheye images are not supported; undistort them first")
+    fisheye = model == "OPENCV_FISHEYE" or bool(data.get("is_fisheye"))
     own = [_number(data, key, 0.0) for key in _LENS]
     lens = number_array(data.get("distortion_params", own), "'distortion_params'").tolist()
-    if len(lens) != len(own) or lens[3] or (any(own) and lens != own):
+    none = [4, 5] if fisheye else [3]
+    if len(lens) != len(own) or any(lens[i] for i in none) or (any(own) and lens != own):
+        zeros = " and ".join(_LENS[i] for i in none)
         raise ValueError(
-            f"distortion is k1, k2, k3, k4 = 0, p1, p2, also as 'distortion_params', got {lens}"
+            f"distortion is {', '.join(_LENS)}, with {zeros} 0 for {model}, also as"
+            f" 'distortion_params', got {lens}"
         )
     width, height = _number(data, "w"), _number(data, "h")
     fx, fy = _focal(data, "x", width), _focal(data, "y", height)
@@ -172,9 +174,9 @@ def _camera(data: Mapping[str, object]) -> Camera:
         raise ValueError("'fl_x' is missing, and so are 'fl_y' and 'camera_angle_x'")
     # Half a pixel: the file counts from the image's corner.
     cx, cy = _number(data, "cx", width / 2) - 0.5, _number(data, "cy", height / 2) - 0.5
-    distortion = tuple(lens[i] for i in (0, 1, 4, 5, 2))
+    distortion = tuple(lens[i] for i in ((0, 1, 2, 3) if fisheye else (0, 1, 4, 5, 2)))
     size: Any = width, height  # whole numbers, checked when constructed
-    return Camera(size[0], size[1], fx, fy, cx, cy, distortion)
+    return Camera(*size, fx, fy, cx, cy, distortion, "fisheye" if fisheye else "pinhole")
 
 
 def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:

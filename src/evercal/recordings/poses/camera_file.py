@@ -19,6 +19,7 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
+from evercal.recordings.poses.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import arrays_as_lists, is_number
 from evercal.recordings.text_files import named_errors, naming, read_text, yaml_documents
 
@@ -31,6 +32,7 @@ _MODELS = {
     **dict.fromkeys(
         ("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4",
          "kannalabrandt8"), "fisheye"),
+    **{name: name for name in RADIAL_MODELS}, "doublesphere": "ds", "atan": "fov",
 }  # fmt: skip
 _SUPPORTED = ("brown", "none", "zero", "fisheye")
 _MODEL_KEYS = ("distortionmodel", "model", "cameramodel", "modeltype", "projectionmodel")
@@ -149,10 +151,10 @@ def _camera(data: Mapping[str, Any], size: tuple[int, int] | None) -> Camera:
     roi = data.get("roi")
     if isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset")):
         raise ValueError(f"the image is a cut-out (roi {roi}); give the whole image's camera_info")
-    if fields.get("fisheyemodel"):
-        raise ValueError("fisheye_model is set; rectify the images or calibrate without it")
     models = {_model_kind(fields[key]): fields[key] for key in _MODEL_KEYS if key in fields}
-    fisheye = "fisheye" in models
+    fisheye = "fisheye" in models or bool(fields.get("fisheyemodel"))
+    if radial := next((kind for kind in models if kind in RADIAL_MODELS), None):
+        return _of_radial_model(radial, fields, _size(fields, data, size))
     required = (ros or fisheye or "distortionmodel" in fields) and "none" not in models
     distortion = _distortion(fields, data, required, _FISHEYE if fisheye else _COEFFICIENTS)
     for kind in models.keys() - {"brown", "fisheye"}:
@@ -179,6 +181,23 @@ def _camera(data: Mapping[str, Any], size: tuple[int, int] | None) -> Camera:
             f" {wide}x{high} images; give them in pixels and of this image size"
         )
     return camera
+
+
+def _of_radial_model(kind: str, fields: Mapping[str, Any], size: tuple[Any, Any]) -> Camera:
+    """As Kalibr states it: parameters before the focal lengths, or the one of `fov` after them."""
+    numbers, lens = numbers_of(fields.get("camera_matrix"), "intrinsics"), "distortion_coefficients"
+    terms = numbers_of(fields.get(lens, []), lens)
+    if kind == "fov":
+        numbers, terms = [*terms, *numbers], []
+    names = (*RADIAL_MODELS[kind].parameters, "fx", "fy", "cx", "cy")
+    if len(numbers) != len(names) or any(terms):
+        raise ValueError(
+            f"a camera of model {kind} has {_listed(names)} and no other distortion, got {numbers}"
+            f" and {terms}; rectify the images or calibrate an equidistant model"
+        )
+    *own, fx, fy, cx, cy = numbers
+    width, height = int(size[0]), int(size[1])
+    return nearest_fisheye(kind, own, (width, height), (fx, fy), (cx, cy))[0]
 
 
 def _model_kind(model: object) -> str:
