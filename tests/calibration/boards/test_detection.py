@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.board_poses import BoardPoses, board_poses, read_board_poses
 from evercal.calibration.boards.corners import (
     BoardView,
@@ -17,7 +18,7 @@ from evercal.calibration.boards.corners import (
     calibrate_camera,
     pixel_sigma,
 )
-from evercal.calibration.boards.detection import Board, find_board
+from evercal.calibration.boards.detection import find_board
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 
@@ -65,8 +66,8 @@ def test_images_without_the_board_give_a_reason() -> None:
 @pytest.mark.parametrize(
     ("create", "message"),
     [
-        (lambda: Board("chessboard", 0.03), "size of 3x3 or more"),
-        (lambda: Board("chessboard", 0.0, 9, 6), "allowed are 0 to 10 m"),
+        (lambda: Board("chessboard", 0.03), "size of 3x3 to 200x200"),
+        (lambda: Board("chessboard", 0.0, 9, 6), "allowed are 0.5 to 2000 mm"),
         (lambda: Board("charuco", 0.03, 5, 7, 0.04, "4X4_50"), "markers of a ChArUco board"),
         (lambda: Board("apriltag", 0.03, dictionary="36h11"), "dictionary '36h11' is not known"),
     ],

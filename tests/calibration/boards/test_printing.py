@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.corners import BoardView
-from evercal.calibration.boards.detection import Board, find_board
+from evercal.calibration.boards.detection import find_board
 from evercal.calibration.boards.printing import drawing, write_board
 from evercal.errors import InputError
 from evercal.recordings.images import read_image

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.boards.detection import Board, dictionary_of
+from evercal.calibration.boards.board import Board, dictionary_of
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
