@@ -22,7 +22,16 @@ from evercal.calibration.boards.detection import find_board
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 
-from .printed import CAMERA, CHARUCO, CHESSBOARD, TAG, grid, photographed, view_of
+from .printed import (
+    BOARDS,
+    CAMERA,
+    CHARUCO,
+    CHESSBOARD,
+    TAG,
+    grid,
+    photographed,
+    view_of,
+)
 
 
 def detect(board: Board, pose: SE3, seed: int = 0) -> BoardView:
@@ -31,7 +40,7 @@ def detect(board: Board, pose: SE3, seed: int = 0) -> BoardView:
     return view
 
 
-@pytest.mark.parametrize("board", [CHESSBOARD, CHARUCO, TAG], ids=lambda b: b.kind)
+@pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.kind)
 def test_corners_and_poses_match_the_print(board: Board) -> None:
     errors = []
     for seed in range(3):

@@ -14,10 +14,10 @@ from evercal.calibration.boards.printing import drawing, write_board
 from evercal.errors import InputError
 from evercal.recordings.images import read_image
 
-from .printed import CHARUCO, CHESSBOARD, TAG
+from .printed import BOARDS, CHESSBOARD, TAG, UP
 
 
-@pytest.mark.parametrize("board", [CHESSBOARD, CHARUCO, TAG], ids=lambda b: b.kind)
+@pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.kind)
 def test_a_print_is_detected_at_its_size(board: Board, tmp_path: Path) -> None:
     file = tmp_path / "board.png"
     write_board(file, board, "a3")
@@ -29,8 +29,8 @@ def test_a_print_is_detected_at_its_size(board: Board, tmp_path: Path) -> None:
     assert isinstance(view, BoardView), view
     millimetres = view.pixels * 25.4 / dpi
     expected = 1000 * view.points_m[:, :2]
-    if board.kind == "apriltag":
-        expected[:, 1] *= -1  # y is up on a tag
+    if board.kind in UP:
+        expected[:, 1] *= -1  # y is up
     assert np.ptp(millimetres - expected, axis=0) == pytest.approx([0, 0], abs=0.05)
 
 

@@ -80,6 +80,12 @@ class Board:
         return self.kind in ("aprilgrid", "arucogrid")
 
     @property
+    def marker_share(self) -> float:
+        """Side of a marker, parts of the distance from one square or marker to the next."""
+        marker = self.size_m if self.is_grid else self.marker_m
+        return marker / (self.size_m + self.gap_m)
+
+    @property
     def half_turn(self) -> bool:
         """Whether the board looks the same after a rotation by 180 degrees."""
         return self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0
