@@ -20,11 +20,10 @@ Ids = NDArray[np.int64]
 Plane = NDArray[np.complexfloating]
 """x + i y."""
 
-_SQUARE = np.array([-1 - 1j, 1 - 1j, 1 + 1j, -1 + 1j]) / 2
+_SQUARE: Plane = np.array([-1 - 1j, 1 - 1j, 1 + 1j, -1 + 1j], dtype=np.complex128) / 2
 """Corners of a marker in OpenCV's order and axes, sides."""
-_PASSES = tuple((border, threshold) for threshold in (15, 40, 7) for border in (1, 2))
-"""Cells in the black border of a marker, two in Kalibr's print, and constants of OpenCV's
-threshold: larger ones separate markers from squares that touch their corners."""
+_THRESHOLDS = (15, 40, 7)
+"""Constants of OpenCV's threshold: large ones separate markers from squares at their corners."""
 _MIN_CORNERS = 6
 """Minimum number of ChArUco corners."""
 _NEAREST, _FEWEST_STEPS = 4, 8
@@ -65,7 +64,7 @@ class Layout(NamedTuple):
 
     columns: int
     """Markers in a row, or squares of a ChArUco board."""
-    count: int
+    markers: int
     """Number of markers."""
     first: int = 0
     """Number of the first marker."""
@@ -91,7 +90,7 @@ class Layout(NamedTuple):
 
     def has(self, ids: Ids) -> NDArray[np.bool_]:
         """Return (n,) whether markers are on the board."""
-        return (ids >= self.first) & (ids < self.first + self.count)
+        return (ids >= self.first) & (ids < self.first + self.markers)
 
     def fit(self, markers: Markers) -> tuple[NDArray[np.bool_], float]:
         """Return (m,) which steps fit the layout, and the side of a marker in cells."""
@@ -108,19 +107,24 @@ def find_markers(grey: NDArray, board: Board) -> Markers:
     """Detect the markers of a board's dictionary, to hundredths of a pixel."""
     import cv2
 
-    found: dict[int, Array] = {}
-    used, parameters = None, cv2.aruco.DetectorParameters()
+    dictionary, parameters = dictionary_of(board), cv2.aruco.DetectorParameters()
     count = board.columns * board.rows if board.is_grid else 1
-    for border, threshold in _PASSES if board.kind != "charuco" else ((1, 7),):
-        if used in (None, border):
-            parameters.markerBorderBits = border
+    found: dict[int, Array] = {}
+    # Kalibr's tags have a border of two cells. With one, OpenCV reads large ones as well, but
+    # places their corners one cell inside.
+    for border in (2, 1) if board.dictionary.startswith("APRILTAG") else (1,):
+        parameters.markerBorderBits, read, done = border, dict[int, Array](), False
+        for threshold in _THRESHOLDS if board.kind != "charuco" else (7,):
             parameters.adaptiveThreshConstant = threshold
-            detector = cv2.aruco.ArucoDetector(dictionary_of(board), parameters)
+            detector = cv2.aruco.ArucoDetector(dictionary, parameters)
             squares, numbers, _ = detector.detectMarkers(grey)
-            ids = [] if numbers is None else np.ravel(numbers).tolist()
-            found = dict(zip(ids, squares, strict=True)) | found
-            used = border if found else None
-        if len(found) >= count and (board.kind != "apriltag" or board.tag in {None, *found}):
+            ids = [] if numbers is None else [int(number) for number in np.ravel(numbers)]
+            read = {**dict(zip(ids, map(np.asarray, squares), strict=True)), **read}
+            done = len(read) >= count and (board.kind != "apriltag" or board.tag in {None, *read})
+            if done:
+                break
+        found = max(found, read, key=len)
+        if done:
             break
     ids = np.array([*found], dtype=np.int64)
     corners = np.reshape([*found.values()], (-1, 4, 2)).astype(np.float64)
@@ -176,11 +180,11 @@ def find_charuco(grey: NDArray, board: Board) -> BoardView | str:
     found = list(markers.corners[:, None].astype(np.float32)), markers.ids[:, None].astype(np.int32)
     detector = cv2.aruco.CharucoDetector(printed)
     pixels, ids = detector.detectBoard(grey, None, None, *found)[:2] if found[0] else (None, None)
-    count = 0 if ids is None else len(ids)
+    count = 0 if ids is None or pixels is None else len(ids)
     if count >= _MIN_CORNERS:
         every = np.asarray(printed.getChessboardCorners(), dtype=np.float64)
         points = every[np.asarray(ids, dtype=np.int64).ravel()]
-        corners = np.reshape(pixels, (-1, 2)).astype(np.float64)
+        corners = np.reshape(np.asarray(pixels), (-1, 2)).astype(np.float64)
         flat = np.linalg.svd(points - points.mean(0), compute_uv=False)
         if flat[1] > 0.5 * board.size_m:
             return sharpened(grey, BoardView(points, corners), board)
