@@ -112,7 +112,8 @@ def find_markers(grey: NDArray, board: Board) -> Markers:
     found: dict[int, Array] = {}
     # Kalibr's tags have a border of two cells. With one, OpenCV reads large ones as well, but
     # places their corners one cell inside.
-    for border in (2, 1) if board.dictionary.startswith("APRILTAG") else (1,):
+    kalibr = board.kind != "charuco" and board.dictionary.startswith("APRILTAG")
+    for border in (2, 1) if kalibr else (1,):
         parameters.markerBorderBits, read, done = border, dict[int, Array](), False
         for threshold in _THRESHOLDS if board.kind != "charuco" else (7,):
             parameters.adaptiveThreshConstant = threshold
@@ -203,8 +204,8 @@ def grid_views(
     views: dict[str, BoardView | str] = {}
     for name, markers in found.items():
         bad = markers.start[~layout.fit(markers)[0]]
-        use = layout.has(markers.ids)
-        use &= [2 * (bad == k).sum() <= (markers.start == k).sum() for k in markers.ids]
+        near = [2 * (bad == k).sum() <= (markers.start == k).sum() for k in markers.ids]
+        use = layout.has(markers.ids) & np.array(near, dtype=bool)
         if wrong or not use.any():
             views[name] = wrong or f"no markers of the grid, {board.dictionary} from {layout.first}"
             continue
@@ -222,11 +223,12 @@ def _layout(markers: Markers, board: Board) -> tuple[Layout, str]:
     layout = _best(markers, board, [board.columns], count)
     good, side = layout.fit(markers)
     if len(good) >= _FEWEST_STEPS and good.mean() < _AGREEING:
-        layout = _best(markers, board, _COLUMNS, 1 << 30)
+        layout = _best(markers, replace(board, tag=None), _COLUMNS, 1 << 30)
         fits = "they lie on no such board"
         if layout.fit(markers)[0].mean() >= _AGREEING:
             rows = -(-(ids[-1] - layout.first + 1) * (2 if charuco else 1) // layout.columns)
             older = ", OpenCV's legacy pattern" if layout.parity == 0 else ""
+            older += "" if board.tag is None else f" from --tag {layout.first}"
             fits = f"they fit {layout.columns}x{rows} {'squares' if charuco else 'markers'}{older}"
         return layout, OtherBoard(
             f"markers {ids[0]} to {ids[-1]} are visible, {fits}, not"
