@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.corners import BoardView
-from evercal.calibration.boards.detection import Board
 from evercal.calibration.boards.printing import board_image
 from evercal.geometry import SE3, Camera
 

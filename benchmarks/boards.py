@@ -11,8 +11,9 @@ from tqdm import tqdm
 
 from benchmarks.board_images import CAMERA, CHARUCO, CHESSBOARD, LARGE, TAG, Photo, render
 from benchmarks.rows import save
+from evercal.calibration.boards.board import Board, dictionary_of
 from evercal.calibration.boards.corners import BoardView
-from evercal.calibration.boards.detection import Board, dictionary_of, find_board
+from evercal.calibration.boards.detection import find_board
 from evercal.geometry import Camera
 
 WIDE = Camera(1280, 800, 1000.0, 1000.0, 639.5, 399.5, (-0.2, 0.06, 0.0, 0.0))

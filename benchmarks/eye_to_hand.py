@@ -23,9 +23,10 @@ from benchmarks.arm_noise import grippers
 from benchmarks.hand_eye import pose
 from benchmarks.hand_eye_boards import opencv_solvers
 from benchmarks.rows import Row, save
+from evercal.calibration.boards.board import Board, dictionary_of
 from evercal.calibration.boards.board_poses import board_poses
 from evercal.calibration.boards.corners import BoardView
-from evercal.calibration.boards.detection import Board, dictionary_of, find_board
+from evercal.calibration.boards.detection import find_board
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.solve import solve

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evercal.calibration.boards.detection import Board
+from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.printing import board_image
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_to_dict

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.board_poses import board_poses
 from evercal.calibration.boards.corners import BoardView
-from evercal.calibration.boards.detection import Board
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate

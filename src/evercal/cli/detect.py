@@ -15,11 +15,18 @@ from evercal.errors import InputError
 from evercal.progress import progress_bar
 
 if TYPE_CHECKING:
+    from evercal.calibration.boards.board import Board
     from evercal.calibration.boards.board_poses import BoardPoses
     from evercal.calibration.boards.corners import BoardView
-    from evercal.calibration.boards.detection import Board
+    from evercal.calibration.boards.detection import Image
 
-_DICTIONARIES = {"chessboard": "", "charuco": "4X4_50", "apriltag": "APRILTAG_36h11"}
+_DICTIONARIES = {
+    "chessboard": "",
+    "charuco": "4X4_50",
+    "apriltag": "APRILTAG_36h11",
+    "aprilgrid": "APRILTAG_36h11",
+    "arucogrid": "4X4_50",
+}
 
 
 @dataclass(frozen=True)
@@ -31,22 +38,24 @@ class Detect(args.Verb):
     Example: evercal detect images/ --board chessboard --size 9x6 --square-mm 25
     """
 
-    board: Literal["chessboard", "charuco", "apriltag"]
-    """Printed board."""
+    board: Literal["chessboard", "charuco", "apriltag", "aprilgrid", "arucogrid"]
+    """Printed board; aprilgrid: Kalibr's, arucogrid: OpenCV's GridBoard."""
     images: Annotated[Positional[tuple[Path, ...]], args.shown("[IMAGE...]")] = ()
     """Image files of one camera, or a folder of them."""
     size: Annotated[str | None, args.shown("CxR")] = None
-    """Inner corners of a chessboard (9x6), or squares of a ChArUco board."""
+    """Inner corners of a chessboard (9x6), squares of a ChArUco board, or markers of a grid."""
     square_mm: Annotated[float | None, args.shown("MM")] = None
-    """Side of a square, or of the black square of a tag, millimetres."""
+    """Side of a square, or of the black square of a tag or marker, millimetres."""
     marker_mm: Annotated[float, args.shown("MM")] = 0.0
     """Side of a marker of a ChArUco board, millimetres."""
+    gap_mm: Annotated[float, args.shown("MM")] = 0.0
+    """Distance between two markers of a grid, millimetres."""
     dictionary: Annotated[
-        str | None, args.shown("NAME", "(default: 4X4_50, APRILTAG_36h11 for tags)")
+        str | None, args.shown("NAME", "(default: 4X4_50, APRILTAG_36h11 for tags and aprilgrid)")
     ] = None
     """Dictionary of markers or tags, OpenCV's name without DICT_."""
     tag: Annotated[int | None, args.shown("ID", "(default: any)")] = None
-    """Number of the tag."""
+    """Number of the tag, or of the first marker of a grid."""
     camera: args.File = None
     """File of the intrinsics; if omitted, they are estimated from the board."""
     lens: Literal["pinhole", "fisheye"] = "pinhole"
@@ -81,11 +90,8 @@ class Detect(args.Verb):
         camera, source = None, "file"
         if self.camera is not None:
             camera = read_camera_of_size(self.camera, (width, height), "the first image")
-        views = self._detected(files, board, width, height)
+        board, views = self._detected(files, board, width, height)
         detected = [view for view in views.values() if isinstance(view, BoardView)]
-        if not detected:
-            name, reason = next(iter(views.items()))
-            raise InputError(f"no board in any of {len(files)} images ({name}: {reason})")
         if camera is None:
             camera, source = calibrate_camera(detected, width, height, self.lens).camera, "board"
         poses = board_poses(board, camera, views, source)
@@ -109,7 +115,7 @@ class Detect(args.Verb):
         return 0
 
     def _board(self) -> "Board":
-        from evercal.calibration.boards.detection import Board
+        from evercal.calibration.boards.board import Board
 
         if self.square_mm is None:
             raise InputError("--square-mm: give the side of a square, or of the tag, millimetres")
@@ -122,31 +128,33 @@ class Detect(args.Verb):
             columns=int(match[1]),
             rows=int(match[2]),
             marker_m=self.marker_mm / 1000,
+            gap_m=self.gap_mm / 1000,
             dictionary=self.dictionary or _DICTIONARIES[self.board],
             tag=self.tag,
         )
 
     def _detected(
         self, files: Sequence[Path], board: "Board", width: int, height: int
-    ) -> "dict[str, BoardView | str]":
-        """The corners of each image, or the reason why there are none."""
-        from evercal.calibration.boards.detection import find_board
+    ) -> "tuple[Board, dict[str, BoardView | str]]":
+        """The board with its first marker, and the corners of each image or a reason."""
+        from evercal.calibration.boards.detection import find_boards
         from evercal.recordings import read_image
 
-        views: dict[str, BoardView | str] = {}
         folder = self.out.absolute().parent
+        names = {Path(os.path.relpath(f.absolute(), folder)).as_posix(): f for f in files}
         with progress_bar("detecting", len(files), "image") as bar:
-            for path in files:
-                image = read_image(path)
+
+            def read(name: str) -> "Image":
+                bar.update()
+                image = read_image(names[name])
                 if image.shape[:2] != (height, width):
                     raise InputError(
-                        f"{path}: is {image.shape[1]}x{image.shape[0]}, the first image"
+                        f"{names[name]}: is {image.shape[1]}x{image.shape[0]}, the first image"
                         f" {width}x{height}; give images of one camera"
                     )
-                name = Path(os.path.relpath(path.absolute(), folder)).as_posix()
-                views[name] = find_board(image, board)
-                bar.update()
-        return views
+                return image
+
+            return find_boards(list(names), read, board)
 
 
 def _lines(poses: "BoardPoses") -> Iterator[str]:

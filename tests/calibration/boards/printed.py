@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.boards.detection import Board
+from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.printing import board_image
 from evercal.geometry import SE3, Camera
 
@@ -12,7 +12,18 @@ CAMERA = Camera(640, 480, 600, 602, 318, 242)
 CHESSBOARD = Board("chessboard", 0.03, 9, 6)
 CHARUCO = Board("charuco", 0.04, 6, 5, 0.03, "4X4_50")
 TAG = Board("apriltag", 0.08, dictionary="APRILTAG_36h11", tag=3)
-CENTRE = {"chessboard": (0.12, 0.075, 0), "charuco": (0.12, 0.1, 0), "apriltag": (0, 0, 0)}
+APRILGRID = Board("aprilgrid", 0.04, 4, 3, dictionary="APRILTAG_36h11", tag=0, gap_m=0.012)
+ARUCOGRID = Board("arucogrid", 0.04, 4, 3, dictionary="4X4_50", tag=0, gap_m=0.012)
+BOARDS = (CHESSBOARD, CHARUCO, TAG, APRILGRID, ARUCOGRID)
+CENTRE = {
+    "chessboard": (0.12, 0.075, 0),
+    "charuco": (0.12, 0.1, 0),
+    "apriltag": (0, 0, 0),
+    "aprilgrid": (0.1, 0.07, 0),
+    "arucogrid": (0.1, 0.07, 0),
+}
+UP = ("apriltag", "aprilgrid")
+"""Boards whose y goes up in print, and whose z points towards the camera."""
 _PER_METRE = 6000
 
 
@@ -25,7 +36,8 @@ def grid(columns: int, rows: int) -> np.ndarray:
 def printed(board: Board) -> tuple[np.ndarray, np.ndarray]:
     """Return the print of a board and the (3, 3) map from metres to pixels of the print."""
     side = round(board.size_m * _PER_METRE)
-    image = board_image(board, side // 8 if board.kind == "apriltag" else side)
+    cells = {"apriltag": 8, "aprilgrid": 10, "arucogrid": 6}
+    image = board_image(board, side // cells.get(board.kind, 1))
     margin = side // 3 if board.kind == "apriltag" else side
     # The black and the white of a real print.
     image = np.pad(image, margin, constant_values=255) // 255 * 210 + 20
@@ -34,7 +46,12 @@ def printed(board: Board) -> tuple[np.ndarray, np.ndarray]:
         start += side  # the first inner corner
     elif board.kind == "apriltag":
         start, up = start + side / 2, -1
-    to_print = np.array([[_PER_METRE, 0, start], [0, up * _PER_METRE, start], [0, 0, 1.0]])
+    across, down = start, start
+    if board.is_grid:  # outside of the first marker
+        across = down = start + round(board.gap_m * _PER_METRE)
+        up = -1 if board.kind == "aprilgrid" else 1
+        down = len(image) - 1 - down if up < 0 else down
+    to_print = np.array([[_PER_METRE, 0, across], [0, up * _PER_METRE, down], [0, 0, 1.0]])
     return image.astype(np.uint8), to_print
 
 
@@ -60,7 +77,7 @@ def view_of(board: Board, seed: int) -> SE3:
     rng = np.random.default_rng(seed)
     rotation = Rotation.from_rotvec(np.array([0, 0, rng.uniform(-3, 3)]))
     rotation = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) * rotation
-    if board.kind == "apriltag":
+    if board.kind in UP:
         rotation = rotation * Rotation.from_euler("x", np.pi)  # z points towards the camera
     centre = np.array([0, 0, 0.4 if board.kind == "apriltag" else 0.55])
     centre = centre + rng.normal(0, 0.02, 3)

@@ -20,9 +20,10 @@ from benchmarks.hand_eye_boards import (
     project,
     record,
 )
+from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.board_poses import board_poses
 from evercal.calibration.boards.corners import BoardView, board_pose, calibrate_camera
-from evercal.calibration.boards.detection import Board, find_board
+from evercal.calibration.boards.detection import find_board
 from evercal.calibration.calibration import Calibration, Mount
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import BoardCorners, solve

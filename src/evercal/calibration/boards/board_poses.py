@@ -21,6 +21,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.corners import (
     BoardPose,
     BoardView,
@@ -28,7 +29,6 @@ from evercal.calibration.boards.corners import (
     pixel_sigma,
     strays,
 )
-from evercal.calibration.boards.detection import Board
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record

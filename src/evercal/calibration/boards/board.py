@@ -1,0 +1,123 @@
+"""Printed boards, and their frames in metres.
+
+- chessboard: the origin is an inner corner, x follows the columns, y the rows, and z points into
+  the board, away from the camera. If columns + rows is odd, the origin is the corner next to a
+  bright inner square, whatever the roll of the camera.
+- charuco: the frame of OpenCV's `CharucoBoard`: origin at an outer corner, z into the board.
+- apriltag: the origin is the centre of the black square, x right and y up in OpenCV's print, z
+  towards the camera.
+- aprilgrid, arucogrid: the origin is the outer corner of the first marker, x follows its row, y
+  the rows, and z is x cross y: towards the camera in Kalibr's print, whose rows go up; into the
+  board in that of OpenCV's `GridBoard`, whose rows go down.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal, Self, get_args
+
+from evercal.errors import InputError
+
+BoardKind = Literal["chessboard", "charuco", "apriltag", "aprilgrid", "arucogrid"]
+
+_LEAST_COUNT = {"chessboard": 3, "charuco": 3, "apriltag": 0, "aprilgrid": 1, "arucogrid": 1}
+_MOST_COUNT = 200
+_LEAST_M, _MOST_M = 0.0005, 2.0
+"""Smallest and largest side of a square or marker: beyond, the unit is wrong."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A printed board."""
+
+    kind: BoardKind
+    size_m: float
+    """Side of a square, or of the black square of a tag or of a marker of a grid, metres."""
+    columns: int = 0
+    """Number of inner corners of a chessboard along x, squares of a ChArUco board, markers of a
+    grid."""
+    rows: int = 0
+    """Number along y."""
+    marker_m: float = 0.0
+    """Side of a marker of a ChArUco board, metres."""
+    dictionary: str = ""
+    """Marker dictionary, OpenCV's name without DICT_: 4X4_50, APRILTAG_36h11."""
+    tag: int | None = None
+    """Number of the tag, or of the first marker of a grid; if omitted, any."""
+    gap_m: float = 0.0
+    """Distance between two markers of a grid, metres."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(BoardKind):
+            raise InputError(f"board {self.kind!r} is not known; use one of {get_args(BoardKind)}")
+        if not _LEAST_M <= self.size_m <= _MOST_M:
+            raise InputError(
+                f"the side of a square or tag is {1000 * self.size_m:g} mm; allowed are"
+                f" {1000 * _LEAST_M:g} to {1000 * _MOST_M:g} mm; give millimetres: --square-mm 25"
+            )
+        counts, least = (self.columns, self.rows), _LEAST_COUNT[self.kind]
+        if min(counts) < least or max(counts) > _MOST_COUNT:
+            raise InputError(
+                f"a {self.kind} has a size of {least}x{least} to {_MOST_COUNT}x{_MOST_COUNT}, got"
+                f" {self.columns}x{self.rows}; give for example --size 9x6: inner corners of a"
+                f" chessboard, squares of a ChArUco board, markers of a grid"
+            )
+        if self.is_grid and not 0 < self.gap_m < 10 * self.size_m:
+            raise InputError(
+                f"the gap between markers of {1000 * self.size_m:g} mm is {1000 * self.gap_m:g} mm;"
+                f" give --gap-mm: the side of a marker times Kalibr's tagSpacing, or OpenCV's"
+                f" markerSeparation"
+            )
+        if self.kind == "charuco" and not 0 < self.marker_m < self.size_m:
+            raise InputError(
+                f"markers of a ChArUco board are smaller than its squares, got"
+                f" {1000 * self.marker_m:g} mm in {1000 * self.size_m:g} mm; give --marker-mm"
+            )
+        if self.kind != "chessboard":
+            dictionary_of(self)
+
+    @property
+    def is_grid(self) -> bool:
+        """Whether the board is a grid of markers."""
+        return self.kind in ("aprilgrid", "arucogrid")
+
+    @property
+    def marker_share(self) -> float:
+        """Side of a marker, parts of the distance from one square or marker to the next."""
+        marker = self.size_m if self.is_grid else self.marker_m
+        return marker / (self.size_m + self.gap_m)
+
+    @property
+    def half_turn(self) -> bool:
+        """Whether the board looks the same after a rotation by 180 degrees."""
+        return self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0
+
+    @property
+    def quarter_turn(self) -> bool:
+        """Whether the corners look the same after a rotation by 90 degrees."""
+        return self.kind == "chessboard" and self.columns == self.rows
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON values."""
+        return dict(vars(self))
+
+    @classmethod
+    def from_dict(cls, data: object) -> Self:
+        """Create a board from the values of `to_dict`, or raise ValueError."""
+        if not isinstance(data, dict):
+            raise ValueError("'board' must be an object")
+        try:
+            return cls(**data)
+        except (TypeError, InputError) as error:
+            raise ValueError(f"'board' is invalid ({error})") from None
+
+
+def dictionary_of(board: Board) -> Any:
+    """Return the dictionary of markers of a board."""
+    import cv2
+
+    code = getattr(cv2.aruco, f"DICT_{board.dictionary}", None)
+    if code is None:
+        names = sorted(key[5:] for key in dir(cv2.aruco) if key.startswith("DICT_"))
+        raise InputError(
+            f"dictionary {board.dictionary!r} is not known; use one of {', '.join(names)}"
+        )
+    return cv2.aruco.getPredefinedDictionary(code)

@@ -1,0 +1,141 @@
+"""Corners to one or two hundredths of a pixel, by windows around them and lines along edges."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.calibration.boards.board import Board
+from evercal.calibration.boards.corners import BoardView
+
+Array = NDArray[np.floating]
+
+_SMALLEST_WINDOW_PX = 2
+_SAMPLES, _EDGE_BLUR_PX = 24, 2.0
+"""Samples along an edge, and its width in the image."""
+_LEAST_REACH_PX, _MOST_REACH_PX = 1.5, 5.0
+"""Smallest and largest distance of samples from an edge."""
+_LARGEST_MOVE_PX, _LARGEST_TAG_MOVE_PX = 0.5, 5.0
+"""Largest change of a corner by its edges; that of a tag is rounded by blur."""
+
+
+def sharpened(grey: NDArray, view: BoardView, board: Board) -> BoardView:
+    """Refine the corners of squares to one or two hundredths of a pixel.
+
+    First in windows around them, then by lines along the edges of the squares, which are longer.
+    Windows and edges keep away from markers and from the next corner.
+    """
+    import cv2
+
+    points, pixels = view.points_m[:, :2] / board.size_m, view.pixels
+    if cv2.findHomography(points, pixels)[0] is None:
+        return view
+    share = (board.size_m - board.marker_m) / (2 * board.size_m)
+    along, down, area = _steps(points, pixels)
+    longer = np.maximum(np.abs(along).sum(1), np.abs(down).sum(1))
+    pixels = _in_windows(grey, pixels, share * area / np.maximum(longer, 1e-9))
+    along, down, area = _steps(points, pixels)
+    lines = []
+    for step in (along, down):
+        free = share * area / np.maximum(np.linalg.norm(step, axis=1), 1e-9) - _EDGE_BLUR_PX
+        reach = np.where(free >= _LEAST_REACH_PX, np.minimum(free, _MOST_REACH_PX), np.nan)
+        arms = [
+            _edges(grey, pixels + sign * 0.08 * step, pixels + sign * 0.5 * step, reach)
+            for sign in (-1, 1)
+        ]
+        lines.append(_lines(np.concatenate(arms, axis=1)))
+    return BoardView(view.points_m, _crossings(pixels, *lines))
+
+
+def _in_windows(grey: NDArray, pixels: Array, free_px: Array) -> Array:
+    """Refine corners (n, 2) that have space for a window of at most `free_px` (n,) to each side."""
+    import cv2
+
+    half = np.minimum(free_px, 11).astype(int)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
+    start = np.ascontiguousarray(pixels, dtype=np.float32)
+    refined = start.copy()
+    for size in np.unique(half[half >= _SMALLEST_WINDOW_PX]):
+        window, moved = (int(size), int(size)), start[half == size, None].copy()
+        refined[half == size] = cv2.cornerSubPix(grey, moved, window, (-1, -1), stop)[:, 0]
+    lost = np.linalg.norm(refined - start, axis=1) > half
+    refined[lost] = start[lost]
+    return refined.astype(np.float64)
+
+
+def _steps(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
+    import cv2
+
+    homography = cv2.findHomography(points, pixels)[0]
+    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
+    depth = mapped[:, 2:]
+    projected = mapped[:, :2] / depth
+    along, down = ((h[:2] - projected * h[2]) / depth for h in homography.T[:2])
+    return along, down, np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
+
+
+def squares_by_their_sides(grey: NDArray, squares: Array) -> Array:
+    """Refine the corners (n, 4, 2) of dark squares by intersecting lines along their edges.
+
+    Blur moves corners inwards, but no edges. Lines end before the corners, where squares of
+    Kalibr's grids touch, and look only for edges from dark to bright.
+    """
+    refined = squares
+    for share, most, end in ((0.1, 6.0, 0.15), (0.05, 5.0, 0.1)):
+        corners = refined.reshape(-1, 2)
+        sides = (np.roll(refined, -1, axis=1) - refined).reshape(-1, 2)
+        reach = np.clip(share * np.linalg.norm(sides, axis=1), 2.0, most)
+        ends = corners + end * sides, corners + (1 - end) * sides
+        lines = _lines(_edges(grey, *ends, reach, 5 * _SAMPLES, outwards=True)).reshape(-1, 4, 3)
+        before = np.roll(lines, 1, axis=1).reshape(-1, 3)
+        most_px = _LARGEST_TAG_MOVE_PX
+        refined = _crossings(corners, before, lines.reshape(-1, 3), most_px).reshape(-1, 4, 2)
+    return refined
+
+
+def _edges(
+    grey: NDArray,
+    starts: Array,
+    ends: Array,
+    reach: Array,
+    count: int = _SAMPLES,
+    outwards: bool = False,
+) -> Array:
+    """Return points (n, count, 2) on edges up to `reach` (n,) pixels off a side, or NaN.
+
+    With `outwards`, only edges that get brighter to the left of the side count.
+    """
+    import cv2
+
+    sides = ends - starts
+    across = np.stack([sides[:, 1], -sides[:, 0]], 1)
+    across /= np.maximum(np.linalg.norm(sides, axis=1, keepdims=True), 1e-9)
+    offsets = np.linspace(-1, 1, 33) * np.nan_to_num(reach)[:, None]
+    points = starts[:, None] + np.linspace(0, 1, count)[:, None] * sides[:, None]
+    grid = points[:, :, None] + offsets[:, None, :, None] * across[:, None, None]
+    x, y = grid.reshape(len(starts), -1, 2).astype(np.float32).transpose(2, 0, 1)
+    values = cv2.remap(grey, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+    values = np.asarray(values, dtype=np.float64).reshape(grid.shape[:3])
+    slope = np.gradient(values, axis=2)
+    slope = np.maximum(slope, 0.0) if outwards else np.abs(slope)
+    # Keep the edge and remove the noise beside it.
+    slope = np.where(slope > 0.3 * slope.max(2, keepdims=True), slope, 0.0)
+    strength = slope.sum(2)
+    offset = (slope * offsets[:, None]).sum(2) / np.where(strength > 0, strength, np.nan)
+    offset[np.isnan(reach)] = np.nan
+    return points + offset[..., None] * across[:, None]
+
+
+def _lines(points: Array) -> Array:
+    middle = points.mean(1)
+    spread = np.einsum("nki,nkj->nij", points - middle[:, None], points - middle[:, None])
+    normal = np.linalg.eigh(np.nan_to_num(spread))[1][:, :, 0]
+    return np.column_stack([normal, -(normal * middle).sum(1)])
+
+
+def _crossings(
+    corners: Array, first: Array, second: Array, reach_px: float = _LARGEST_MOVE_PX
+) -> Array:
+    crossing = np.cross(first, second)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        refined = crossing[:, :2] / crossing[:, 2:]
+    moved = np.linalg.norm(refined - corners, axis=1)
+    return np.where((moved < reach_px)[:, None], refined, corners)
