@@ -133,7 +133,11 @@ class Keyframes:
         return cls(
             images=images,
             cameras=tuple(
-                Camera(*row[:6], row[6 : 6 + abs(k)], "fisheye" if k < 0 else "pinhole")
+                Camera(
+                    *row[:6],
+                    distortion=row[6 : 6 + abs(k)],
+                    model="fisheye" if k < 0 else "pinhole",
+                )
                 for row, k in cameras
             ),
             base_from_camera=SE3(poses[:, :4], poses[:, 4:]),

@@ -176,7 +176,8 @@ def _camera(data: Mapping[str, object]) -> Camera:
     cx, cy = _number(data, "cx", width / 2) - 0.5, _number(data, "cy", height / 2) - 0.5
     distortion = tuple(lens[i] for i in ((0, 1, 2, 3) if fisheye else (0, 1, 4, 5, 2)))
     size: Any = width, height  # whole numbers, checked when constructed
-    return Camera(*size, fx, fy, cx, cy, distortion, "fisheye" if fisheye else "pinhole")
+    kind = "fisheye" if fisheye else "pinhole"
+    return Camera(size[0], size[1], fx, fy, cx, cy, distortion, kind)
 
 
 def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
