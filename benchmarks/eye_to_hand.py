@@ -56,7 +56,8 @@ class Condition:
     """The first ones of the recording are used."""
     arm: tuple[float, float] = ARM
     spoiled: str = ""
-    """other, shuffled: gripper poses; focal: stated 5 % too long."""
+    """other, shuffled: gripper poses; focal: stated 5 % too long; lens: intrinsics with errors of
+    0.1 % and 0.25 px, as from a board."""
 
     def setting(self, seed: int) -> Setting:
         """The recording of a seed; recordings are rendered once, with their largest length."""
@@ -75,6 +76,7 @@ MAIN = {
     "board, arm 0.5 mm 0.1 deg": Condition({"thing": "board"}, arm=(0.5, 0.1)),
     "board, arm 2 mm 0.5 deg": Condition({"thing": "board"}, arm=(2.0, 0.5)),
     "box, hobby arm 5 mm 2 deg": Condition(arm=(5.0, 2.0)),
+    "box, intrinsics from a board": Condition(spoiled="lens"),
     "box, poses of another recording": Condition(spoiled="other"),
     "box, poses shuffled": Condition(spoiled="shuffled"),
     "box, focal length 5 % wrong": Condition(spoiled="focal"),
@@ -186,6 +188,10 @@ def _spoil(recording: Path, condition: Condition, data: Path, setting: Setting) 
     camera = json.loads((source / "recording" / "camera.json").read_text())
     if condition.spoiled == "focal":
         camera |= {"fx": 1.05 * camera["fx"], "fy": 1.05 * camera["fy"]}
+    if condition.spoiled == "lens":
+        focal, centre = 1 + 1e-3 * rng.normal(), 0.25 * rng.normal(size=2)
+        camera |= {"fx": focal * camera["fx"], "fy": focal * camera["fy"]}
+        camera |= {"cx": camera["cx"] + centre[0], "cy": camera["cy"] + centre[1]}
     write_json(recording / "camera.json", camera)
     if condition.spoiled == "other":
         others = sorted(data.glob(setting.name.removesuffix(str(setting.seed)) + "*/truth.json"))
