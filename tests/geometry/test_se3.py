@@ -186,3 +186,9 @@ def test_average_of_one_and_two_poses() -> None:
     assert pose_distance(middle, pair[0])[1] == pytest.approx(0.2, abs=1e-6)
     with pytest.raises(ValueError, match="n >= 1"):
         average_poses(SE3.stack([]))
+
+
+def test_unit_quaternions_stay_the_same_to_the_last_bit() -> None:
+    random = np.random.default_rng(0).normal(size=(1000, 4))
+    once = SE3(random, np.zeros((1000, 3)))
+    assert (SE3(once.rotation_wxyz, once.translation_m).rotation_wxyz == once.rotation_wxyz).all()

@@ -43,6 +43,8 @@ class SE3:
             raise ValueError("SE3 takes finite numbers, got inf or nan; leave untracked poses out")
         if not (length > 1e-12).all():
             raise ValueError("SE3 got a quaternion of length zero, which is no rotation")
+        # Poses that are written and read again stay the same to the last bit.
+        length = np.where(np.abs(length - 1) < 1e-15, 1.0, length)
         object.__setattr__(self, "rotation_wxyz", quaternion / length)
         object.__setattr__(self, "translation_m", translation)
 
