@@ -7,6 +7,7 @@ from pathlib import Path
 from evercal.errors import InputError
 from evercal.recordings.images import IMAGE_ENDINGS
 from evercal.recordings.poses.row_files import natural_key
+from evercal.recordings.text_files import files_in
 
 
 def image_files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
@@ -16,8 +17,7 @@ def image_files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
     files: list[Path] = []
     for path in map(Path, paths):
         if path.is_dir():
-            inside = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS]
-            inside.sort(key=lambda p: natural_key(p.name))
+            inside = sorted(files_in(path, IMAGE_ENDINGS), key=lambda p: natural_key(p.name))
             if not inside:
                 raise InputError(f"{path}: no images in this folder ({', '.join(IMAGE_ENDINGS)})")
             files += inside

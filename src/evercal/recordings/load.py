@@ -8,7 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 from evercal.errors import InputError
-from evercal.recordings.frame import Recording
+from evercal.recordings.frame import Recording, with_images
 from evercal.recordings.read_options import ReadOptions, flag
 
 
@@ -92,6 +92,7 @@ def load_recording(
                 f" {', '.join(users)}; leave it out"
             )
     recording = read(root, options) if uses else read(root)
+    recording = with_images(recording, root if root.is_dir() else root.parent)
     if (root / "masks").is_dir():
         from evercal.recordings.masks import with_masks
 

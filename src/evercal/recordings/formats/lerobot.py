@@ -41,7 +41,7 @@ from evercal.recordings.poses.conventions import (
 )
 from evercal.recordings.poses.kinematics import RobotModel, in_radians
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import named_errors, path_inside, read_json, refuse_repeated
+from evercal.recordings.text_files import files_in, named_errors, path_inside, read_json, refuse_repeated
 
 Array = NDArray[np.float64]
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
@@ -104,13 +104,22 @@ def _info(root: Path) -> dict[str, Any]:
 
 
 def _camera_key(root: Path, info: Mapping[str, Any], wanted: str | None) -> str:
-    keys = [k for k, f in info["features"].items() if f.get("dtype") in ("video", "image")]
+    pictures = {k: f for k, f in info["features"].items() if f.get("dtype") in ("video", "image")}
+    keys = [key for key, feature in pictures.items() if not _is_depth(feature)]
+    if wanted in pictures and wanted not in keys:
+        raise InputError(f"{root}: {wanted} holds depth, no picture; give {', '.join(keys)}")
     if wanted is None and len(keys) == 1:
         return keys[0]
     if wanted in keys:
         return str(wanted)
     what = f"no camera {wanted!r}" if wanted else f"{len(keys)} cameras"
     raise InputError(f"{root}: {what}; name one with --image-topic: {', '.join(keys) or 'none'}")
+
+
+def _is_depth(feature: Mapping[str, Any]) -> bool:
+    stated = [feature.get(name) or {} for name in ("info", "video_info")]
+    names = "is_depth_map", "video.is_depth_map"
+    return any(each.get(name) for each in stated for name in names)
 
 
 class _Row(NamedTuple):
@@ -127,7 +136,7 @@ class _Row(NamedTuple):
 
 
 def _rows(root: Path, column: str) -> tuple[list[_Row], Array]:
-    files = sorted((root / "data").glob("*/*.parquet"))
+    files = files_in(root / "data", (".parquet",), "*/*")
     if not files:
         raise InputError(f"{root / 'data'}: no parquet files; download the data folder too")
     rows: list[_Row] = []
@@ -183,7 +192,7 @@ def _video_starts(
     names = ["episode_index", *(f"videos/{key}/{part}" for part in parts)]
     return {
         int(episode): (video(chunk_index=chunk, file_index=number), float(start))
-        for file in sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+        for file in files_in(root / "meta" / "episodes", (".parquet",), "*/*")
         for episode, chunk, number, start in zip(*_columns(file, names), strict=True)
     }
 

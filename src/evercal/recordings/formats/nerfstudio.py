@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.recordings.frame import Frame, Recording, require_images
-from evercal.recordings.images import IMAGE_ENDINGS, image_size
+from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.images import IMAGE_ENDINGS, as_stored, first_size, is_readable, pixels_of
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
 from evercal.recordings.text_files import (
@@ -29,6 +29,7 @@ from evercal.recordings.text_files import (
     naming,
     read_json,
     refuse_repeated,
+    slashes,
 )
 
 FILE = "transforms.json"
@@ -77,11 +78,13 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
                 test |= {frame.image for frame in more if isinstance(frame.image, Path)}
     with named_errors(file, "nerfstudio file"):
         refuse_repeated((frame.name for frame in frames), "keep one entry for each image")
+    tested = [frame.image in test for frame in frames]
+    frames = _resized(file, frames)
     notes = [f"{bad} frames are marked as bad and left out"] if bad else []
     return Recording(
         (root if root.is_dir() else file.parent).resolve().name,
-        tuple(frame for frame in frames if frame.image not in test),
-        tuple(frame for frame in frames if frame.image in test),
+        tuple(frame for frame, of_test in zip(frames, tested, strict=True) if not of_test),
+        tuple(frame for frame, of_test in zip(frames, tested, strict=True) if of_test),
         bad,
         notes=(*notes, frame_note(file.name, metric)),
         metric=metric,
@@ -104,7 +107,8 @@ def _frames(file: Path) -> tuple[list[Frame], set[Path], int]:
             root = next((each for each in folders if _image(each, name).is_file()), root)
             # Without a stated image size, that of the first image is taken.
             if not {"w", "h"} & {*data, *first}:
-                width, height = image_size(_image(root, name))
+                names = [each.get("file_path") for each in entries if isinstance(each, dict)]
+                width, height = first_size([_image(root, str(each)) for each in names])
                 data |= {"w": width, "h": height}
         every, frames = [*entries, *tested], []
         bad = [isinstance(each, dict) and bool(each.get("is_bad")) for each in every]
@@ -113,8 +117,7 @@ def _frames(file: Path) -> tuple[list[Frame], set[Path], int]:
                 frames.append(_frame(root, data, entry, undo, scale))
         images = [_image(root, str(each.get("file_path"))) for each in every]
         test = _test_images(root, data, images) | {*images[len(entries) :]}
-    require_images(frames, file)
-    return _resized(file, frames), test, sum(bad)
+    return frames, test, sum(bad)
 
 
 def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
@@ -144,7 +147,7 @@ def _frame(root: Path, data: Mapping[str, object], entry: object, undo: SE3, sca
 
 
 def _image(root: Path, name: str) -> Path:
-    image = root / name
+    image = root / slashes(name)
     if image.suffix.lower() in IMAGE_ENDINGS:
         return image
     return next((f for e in IMAGE_ENDINGS if (f := Path(f"{image}{e}")).is_file()), image)
@@ -194,25 +197,32 @@ def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
 def _resized(file: Path, frames: list[Frame]) -> list[Frame]:
     """Frames with cameras of their images' size, judged by one image of every camera size.
 
-    Downscaled copies of the images get scaled cameras. Rotated and cropped images are refused.
+    Downscaled copies of the images get scaled cameras. Images are taken as they are stored, as by
+    nerfstudio, unless only their EXIF orientation gives them the stated shape. Rotated and cropped
+    images are refused.
     """
     sizes: dict[tuple[int, int], tuple[int, int]] = {}
+    turned = set()
     resized = []
     for frame in frames:
         stated = frame.camera.width, frame.camera.height
-        if stated not in sizes:
-            assert isinstance(frame.image, Path)
-            size = sizes[stated] = image_size(frame.image)
-            if abs(size[0] / size[1] / (stated[0] / stated[1]) - 1) > 0.01:
+        assert isinstance(frame.image, Path)
+        if stated not in sizes and is_readable(frame.image):
+            ways = (as_stored(frame.image), frame.image)
+            shapes = [pixels_of(way).shape[1::-1] for way in dict.fromkeys(ways)]
+            fits = [abs(w / h / (stated[0] / stated[1]) - 1) <= 0.01 for w, h in shapes]
+            size = sizes[stated] = shapes[fits.index(True) if any(fits) else 0]
+            turned |= {stated} if fits[0] is False and any(fits) else set()
+            if not any(fits):
                 rotated = "the image was rotated after the intrinsics were written"
                 raise InputError(
                     f"{frame.image}: is {size[0]}x{size[1]}, {file.name} says"
                     f" {stated[0]}x{stated[1]} ({rotated if size == stated[::-1] else 'cropped?'});"
                     f" give images of that shape"
                 )
-        if sizes[stated] != stated:
-            frame = replace(frame, camera=frame.camera.resized(*sizes[stated]))
-        resized.append(frame)
+        if stated not in turned:
+            frame = replace(frame, image=as_stored(frame.image))
+        resized.append(replace(frame, camera=frame.camera.resized(*sizes.get(stated, stated))))
     return resized
 
 

@@ -117,7 +117,8 @@ class BagImage(StoredImage):
         if self.bag.kinds[self.topic] != COMPRESSED:
             return None
         message = self.bag.message(self.topic, self.logged_ns, self.repeat)
-        return image_file(bytes(message.content.data))
+        mosaic = _pixels_in(message.content.format).startswith("bayer")
+        return None if mosaic else image_file(bytes(message.content.data))
 
 
 def _image_topic(bag: BagFile, wanted: str | None) -> str:
@@ -137,10 +138,8 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
     reasons: dict[str, str | None] = {}
     for topic in topics:
         first = bag.first(topic)
-        if bag.kinds[topic] == IMAGE:
-            reasons[topic] = unsupported(first.encoding)
-        else:
-            reasons[topic] = "holds depth" if "compressedDepth" in first.format else None
+        of_pixels = bag.kinds[topic] == IMAGE
+        reasons[topic] = unsupported(first.encoding if of_pixels else _pixels_in(first.format))
     pictures = [topic for topic, reason in reasons.items() if reason is None]
     if len(pictures) != 1:
         refused = "; ".join(f"{t}: {reason}" for t, reason in reasons.items() if reason)
@@ -233,9 +232,32 @@ def image_of(message: Any) -> NDArray[np.uint8]:
 
 def compressed_image_of(message: Any) -> NDArray[np.uint8]:
     """Decode a sensor_msgs/CompressedImage with a PNG or JPEG to (H, W, 3) uint8 RGB."""
-    if "compressedDepth" in message.format:
-        raise ValueError(f"format {message.format!r} holds depth, no picture")
+    import cv2
+
+    pixels = _pixels_in(message.format)
+    if (reason := unsupported(pixels)) is not None:
+        raise ValueError(f"format {message.format!r}: {reason}")
     image = decode_image(np.asarray(message.data, dtype=np.uint8))
     if image is None:
-        raise ValueError(f"format {message.format!r} is not supported or broken; use jpeg or png")
-    return image
+        raise ValueError(
+            f"format {message.format!r} is not supported or broken; record jpeg or png, for example"
+            " with 'image_transport republish'"
+        )
+    conversion = _ENCODINGS[pixels][2]
+    if pixels.startswith("bayer") and conversion is not None:
+        image = cv2.cvtColor(image[..., 0], getattr(cv2, f"COLOR_{conversion}"))
+    return as_rgb(image)
+
+
+def _pixels_in(form: str) -> str:
+    """Encoding of the pixels in a compressed image; rgb8 if it states none that changes them.
+
+    The format is `jpeg`, or `bayer_rggb8; jpeg compressed bgr8`: the encoding before compression
+    and, if the publisher converted it, the one after. Without the latter a mosaic is still one, in
+    JPEG of ROS 1 and PNG of both.
+    """
+    before, _, how = form.partition(";")
+    if "compressedDepth" in form:
+        return before if unsupported(before) else "16UC1"
+    plain = not unsupported(before) and not before.startswith("bayer")
+    return "rgb8" if plain or not how or how.partition("compressed")[2].strip() else before.strip()

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from evercal.errors import InputError, missing_extra
+from evercal.recordings.text_files import files_in
 
 _FILES = (".bag", ".mcap", ".db3")
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -133,14 +134,15 @@ def _parts(path: Path) -> list[Path]:
     metadata = path / "metadata.yaml"
     if metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()[:1000]:
         return [path]
-    inside = sorted(path.iterdir()) if path.is_dir() else []
-    return [part for part in inside if part.suffix in _FILES and part.is_file()]
+    return [part for part in files_in(path, _FILES) if part.is_file()]
 
 
 def _reason(error: Exception) -> str:
     text = " ".join(str(error).split())[:200] or type(error).__name__
     if "not indexed" in text:
         return f"{text}; repair it with 'rosbag reindex'"
+    if "end magic" in text:
+        return f"{text} The recorder did not end; restore it with 'mcap recover FILE -o NEW.mcap'"
     if "Profile is not ros2" in text:
         return "its messages are not ROS 2's; convert it, or record with ros2 bag"
     return text
