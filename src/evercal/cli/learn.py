@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
-from evercal.cli.console import require_writable, say, size
+from evercal.cli.console import require_writable, say, say_notes, size
 from evercal.cli.info import adjusted_row
 from evercal.errors import InputError
 from evercal.progress import Bars
@@ -132,6 +132,7 @@ class Learn(args.Verb):
         from evercal.recordings.pictures import look_at
 
         recording = self.reading.recording(path, self.name)
+        say_notes(recording.notes)
         shown = look_at(recording.train)
         for warning in shown.warnings if shown.usable else ():
             say(f"warning: {recording.name}: {warning}", sys.stderr)

@@ -1,5 +1,6 @@
 """Frames with camera and poses, in recordings with a split into training and test frames."""
 
+import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -106,7 +107,8 @@ def with_images(recording: Recording, folder: Path) -> Recording:
         return recording
     known = {*files.values()}
     unused = [f for f in files_in(folder, IMAGE_ENDINGS, "**/*") if f not in known]
-    note = lost_images([*map(str, lost.values())], len(frames), map(str, unused))
+    names = [[os.path.relpath(f, folder) for f in part] for part in (lost.values(), unused)]
+    note = lost_images(names[0], len(frames), names[1])
     train, test = (
         tuple(frame for frame in part if frame.name not in lost)
         for part in (recording.train, recording.test)

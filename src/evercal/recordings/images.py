@@ -20,12 +20,11 @@ IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _JPEG, _SCAN, _MOST_SCANS = b"\xff\xd8", b"\xff\xda", 100
 """Beginning of a JPEG file, and of a scan in it: progressive files have about ten."""
 _TURNED = re.compile(
-    rb"(?:Exif\0\0|eXIf).*?(?:\x01\x12\0\x03\0{3}\x01\0|\x12\x01\x03\0\x01\0{3})[\x02-\x08]", re.DOTALL
+    rb"(?:Exif\0\0|eXIf).*?(?:\x01\x12\0\x03\0{3}\x01\0|\x12\x01\x03\0\x01\0{3})[\x02-\x08]",
+    re.DOTALL,
 )
 """EXIF data of JPEG and PNG with an orientation other than upright."""
-_WHOLE = re.compile(
-    rb"\xff\xd8\xff.*\xff\xd9[^\xff]*|\x89PNG.*IEND.{4}", re.DOTALL
-)
+_WHOLE = re.compile(rb"\xff\xd8\xff.*\xff\xd9[^\xff]*|\x89PNG.*IEND.{4}", re.DOTALL)
 """Beginning and end of a whole image file."""
 
 
@@ -65,7 +64,13 @@ def pixels_of(image: Picture) -> NDArray[np.uint8]:
 
 def file_of(image: Picture) -> Path | None:
     """The file of which a picture is the only content, if there is one."""
-    return image.path if isinstance(image, UnturnedImage) else image if isinstance(image, Path) else None
+    return (
+        image.path
+        if isinstance(image, UnturnedImage)
+        else image
+        if isinstance(image, Path)
+        else None
+    )
 
 
 def as_stored(path: Path) -> Path | UnturnedImage:

@@ -69,6 +69,8 @@ class PosePairs:
     """(n, 6) gripper velocity in the base frame, m/s and rad/s, to estimate a time offset."""
     robot_numbers: PoseNumbers | None = None
     camera_numbers: PoseNumbers | None = None
+    notes: tuple[str, ...] = ()
+    """How robot and camera poses were paired."""
 
     def __post_init__(self) -> None:
         counts = {len(self.names), len(self.base_from_gripper), len(self.camera_from_board)}

@@ -41,7 +41,13 @@ from evercal.recordings.poses.conventions import (
 )
 from evercal.recordings.poses.kinematics import RobotModel, in_radians
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import files_in, named_errors, path_inside, read_json, refuse_repeated
+from evercal.recordings.text_files import (
+    files_in,
+    named_errors,
+    path_inside,
+    read_json,
+    refuse_repeated,
+)
 
 Array = NDArray[np.float64]
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")

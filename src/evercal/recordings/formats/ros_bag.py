@@ -26,7 +26,7 @@ from evercal.recordings.formats.bags.file import (
     stamp_ns,
 )
 from evercal.recordings.formats.bags.poses import plain_name, poses_at_images
-from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.frame import Frame, Recording, lost_images
 from evercal.recordings.images import StoredImage, as_rgb, decode_image, image_file
 from evercal.recordings.poses.camera_file import camera_from_fields, check_size, read_camera_of_size
 from evercal.recordings.poses.pose_track import MAX_GAP_S
@@ -149,12 +149,17 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
 
 
 def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
-    shots = []
+    shots, empty = [], []
     for message in bag.messages([topic]):
         header = message.content.header
         stamp, frame_id = stamp_ns(header.stamp), plain_name(header.frame_id)
+        if not len(message.content.data):
+            empty.append(str(len(shots) + len(empty)))
+            continue
         shots.append(BagImage(bag, topic, message.logged_ns, message.repeat, stamp, frame_id))
-    notes = []
+    total = len(shots) + len(empty)
+    with named_errors(f"{bag.path}: topic {topic}", "images"):
+        notes = [lost_images(empty, total)] if empty else []
     if all(shot.stamp_ns == 0 for shot in shots):
         shots = [replace(shot, stamp_ns=shot.logged_ns) for shot in shots]
         notes.append(f"images on {topic} carry no stamps; the times of recording were taken")
@@ -244,7 +249,8 @@ def compressed_image_of(message: Any) -> NDArray[np.uint8]:
             " with 'image_transport republish'"
         )
     conversion = _ENCODINGS[pixels][2]
-    if pixels.startswith("bayer") and conversion is not None:
+    # Some publishers convert a mosaic without saying so.
+    if pixels.startswith("bayer") and conversion and (image == image[..., :1]).all():
         image = cv2.cvtColor(image[..., 0], getattr(cv2, f"COLOR_{conversion}"))
     return as_rgb(image)
 

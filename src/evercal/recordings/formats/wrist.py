@@ -26,7 +26,13 @@ from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import POSE_ENDINGS, RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, number_array, read_rows
 from evercal.recordings.read_options import ReadOptions, flag
-from evercal.recordings.text_files import files_in, named_errors, read_json, refuse_repeated, slashes
+from evercal.recordings.text_files import (
+    files_in,
+    named_errors,
+    read_json,
+    refuse_repeated,
+    slashes,
+)
 
 USES = ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention")
 
