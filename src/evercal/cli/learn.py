@@ -14,6 +14,7 @@ from evercal.cli.console import require_writable, say, say_notes, size
 from evercal.cli.info import adjusted_row
 from evercal.errors import InputError
 from evercal.progress import Bars
+from evercal.recordings.text_files import few
 
 if TYPE_CHECKING:
     from evercal.learning.scene import LearnReport
@@ -293,8 +294,7 @@ def _warnings(adjusted: "Adjusted") -> Iterator[str]:
         ("warning: poses with large errors", adjusted.doubtful_poses),
     ):
         if names:
-            more = f" and {len(names) - 8} more" if len(names) > 8 else ""
-            yield f"{what}: {', '.join(names[:8])}{more}"
+            yield f"{what}: {few(names, most=8)}"
 
 
 def _few_digits(values: Iterable[float]) -> str:

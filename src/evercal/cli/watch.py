@@ -107,11 +107,10 @@ class Arrivals:
     def scan(self) -> "Iterator[tuple[Path, np.ndarray]]":
         """Path and pixels of every image that is new and complete, oldest first."""
         from evercal.recordings import read_image
-        from evercal.recordings.images import IMAGE_ENDINGS
-        from evercal.recordings.text_files import files_in
+        from evercal.recordings.images import files_in
 
         states: dict[Path, tuple[int, int]] = {}
-        for path in files_in(self._folder, IMAGE_ENDINGS):
+        for path in files_in(self._folder):
             if path not in self._done:
                 with suppress(FileNotFoundError):  # removed or renamed since it was listed
                     status = path.stat()

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from evercal.bounds import bounds
 from evercal.errors import InputError, is_plain
 from evercal.geometry import SE3, Camera
-from evercal.recordings.images import IMAGE_ENDINGS, Picture, file_of, is_readable, pixels_of
-from evercal.recordings.text_files import few, files_in
+from evercal.recordings.images import Picture, file_of, files_in, is_readable, pixels_of
+from evercal.recordings.text_files import few
 
 Mount = Literal["eye_to_hand", "eye_in_hand"]
 MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
@@ -43,9 +43,8 @@ class Frame:
         """Read the pixels, (H, W, 3) uint8 RGB; a size that is not the camera's is refused."""
         image = pixels_of(self.image)
         if image.shape[:2] != (self.camera.height, self.camera.width):
-            where = file_of(self.image) or self.name
             raise InputError(
-                f"{where}: image is {image.shape[1]}x{image.shape[0]}, its camera"
+                f"{file_of(self.image) or self.name}: image is {image.shape[1]}x{image.shape[0]}, its camera"
                 f" {self.camera.width}x{self.camera.height}; give the intrinsics of this image size"
             )
         return image
@@ -100,19 +99,15 @@ def checked_name(name: str) -> str:
 
 def with_images(recording: Recording, folder: Path) -> Recording:
     """Leave out frames without a readable image file in `folder`; more than half are refused."""
-    frames = [frame for frame in (*recording.train, *recording.test) if file_of(frame.image)]
-    files = {frame.name: file for frame in frames if (file := file_of(frame.image))}
-    lost = {name: file for name, file in files.items() if not is_readable(file)}
+    both = (*recording.train, *recording.test)
+    files = {frame.name: file for frame in both if (file := file_of(frame.image))}
+    lost = {n: os.path.relpath(f, folder) for n, f in files.items() if not is_readable(f)}
     if not lost:
         return recording
-    known = {*files.values()}
-    unused = [f for f in files_in(folder, IMAGE_ENDINGS, "**/*") if f not in known]
-    names = [[os.path.relpath(f, folder) for f in part] for part in (lost.values(), unused)]
-    note = lost_images(names[0], len(frames), names[1])
-    train, test = (
-        tuple(frame for frame in part if frame.name not in lost)
-        for part in (recording.train, recording.test)
-    )
+    unused = {*files_in(folder, glob="**/*")} - {*files.values()}
+    note = lost_images([*lost.values()], len(files), [os.path.relpath(f, folder) for f in unused])
+    parts = (recording.train, recording.test)
+    train, test = (tuple(f for f in part if f.name not in lost) for part in parts)
     return replace(recording, train=train, test=test, notes=(*recording.notes, note))
 
 

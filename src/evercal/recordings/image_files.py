@@ -5,9 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from evercal.errors import InputError
-from evercal.recordings.images import IMAGE_ENDINGS
+from evercal.recordings.images import IMAGE_ENDINGS, files_in
 from evercal.recordings.poses.row_files import natural_key
-from evercal.recordings.text_files import files_in
 
 
 def image_files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
@@ -17,7 +16,7 @@ def image_files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
     files: list[Path] = []
     for path in map(Path, paths):
         if path.is_dir():
-            inside = sorted(files_in(path, IMAGE_ENDINGS), key=lambda p: natural_key(p.name))
+            inside = sorted(files_in(path), key=lambda p: natural_key(p.name))
             if not inside:
                 raise InputError(f"{path}: no images in this folder ({', '.join(IMAGE_ENDINGS)})")
             files += inside

@@ -20,11 +20,10 @@ IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _JPEG, _SCAN, _MOST_SCANS = b"\xff\xd8", b"\xff\xda", 100
 """Beginning of a JPEG file, and of a scan in it: progressive files have about ten."""
 _TURNED = re.compile(
-    rb"(?:Exif\0\0|eXIf).*?(?:\x01\x12\0\x03\0{3}\x01\0|\x12\x01\x03\0\x01\0{3})[\x02-\x08]",
-    re.DOTALL,
+    rb"(?s)(Exif|eXIf).*?(\x01\x12\0\x03\0{3}\x01\0|\x12\x01\x03\0\x01\0{3})[\x02-\x08]"
 )
 """EXIF data of JPEG and PNG with an orientation other than upright."""
-_WHOLE = re.compile(rb"\xff\xd8\xff.*\xff\xd9[^\xff]*|\x89PNG.*IEND.{4}", re.DOTALL)
+_WHOLE = re.compile(rb"(?s)\xff\xd8\xff.*\xff\xd9[^\xff]*|\x89PNG.*IEND.{4}")
 """Beginning and end of a whole image file."""
 
 
@@ -64,33 +63,33 @@ def pixels_of(image: Picture) -> NDArray[np.uint8]:
 
 def file_of(image: Picture) -> Path | None:
     """The file of which a picture is the only content, if there is one."""
-    return (
-        image.path
-        if isinstance(image, UnturnedImage)
-        else image
-        if isinstance(image, Path)
-        else None
+    file = image.path if isinstance(image, UnturnedImage) else image
+    return file if isinstance(file, Path) else None
+
+
+def files_in(folder: Path, ends: tuple[str, ...] = IMAGE_ENDINGS, glob: str = "*") -> list[Path]:
+    """Files in a folder with one of some endings, in lower case, sorted by path.
+
+    Hidden files, such as ._a.jpg that macOS puts beside a.jpg, are no content.
+    """
+    return sorted(
+        f for f in folder.glob(glob) if f.name[0] != "." and f.name.lower().endswith(ends)
     )
 
 
 def as_stored(path: Path) -> Path | UnturnedImage:
     """An image file whose EXIF orientation is not applied; the file itself if it states none."""
-    if path.suffix.lower() in (".jpg", ".jpeg", ".png", ".bmp"):
-        head = b""
-        with suppress(OSError), path.open("rb") as file:
-            head = file.read(4096)
-        return UnturnedImage(path) if _TURNED.search(head) else path
-    return UnturnedImage(path)  # may state it anywhere
-
-
-def is_readable(path: Path) -> bool:
-    """Whether a file holds an image; one that begins and ends like a whole one is not decoded."""
     with suppress(OSError), path.open("rb") as file:
-        head = file.read(32)
-        file.seek(-min(32, file.seek(0, os.SEEK_END)), os.SEEK_END)
-        if _WHOLE.fullmatch(head + file.read()):
-            return True
-        return decode_image(np.fromfile(path, np.uint8)) is not None
+        return UnturnedImage(path) if _TURNED.search(file.read(4096)) else path
+    return path
+
+
+def is_readable(image: Path | NDArray[np.uint8]) -> bool:
+    """Whether a file, or its bytes (n,), is an image; a whole one is not decoded."""
+    with suppress(OSError, ValueError):  # ValueError: the file is empty
+        data = np.memmap(image, mode="r") if isinstance(image, Path) else image
+        ends = data[:32].tobytes() + data[-32:].tobytes()
+        return bool(_WHOLE.fullmatch(ends)) or decode_image(np.asarray(data)) is not None
     return False
 
 
@@ -206,7 +205,7 @@ def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
-def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+def image_size(image: str | os.PathLike[str] | StoredImage) -> tuple[int, int]:
     """Width and height in pixels of an image file, turned upright as by `read_image`."""
-    height, width = read_image(path).shape[:2]
+    height, width = pixels_of(image if isinstance(image, StoredImage) else Path(image)).shape[:2]
     return width, height

@@ -1,7 +1,6 @@
 """Text and JSON files that a user names, and their errors."""
 
 import json
-import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -110,28 +109,10 @@ def yaml_documents(text: str) -> list[Any]:
         raise ValueError(f"not valid YAML ({' '.join(str(error).split())})") from None
 
 
-def files_in(folder: Path, endings: Sequence[str], pattern: str = "") -> list[Path]:
-    """Files of a folder with one of some endings in lower case, sorted by name.
-
-    With a glob `pattern`, those that it matches. Hidden files, such as ._a.jpg that macOS puts
-    beside a.jpg, are no content. A missing folder is empty.
-    """
-    # Not by glob where a list is enough: it takes longer than all else for thousands of files.
-    names = os.listdir(folder) if not pattern and folder.is_dir() else []
-    files = folder.glob(pattern) if pattern else (folder / name for name in names)
-    ends = tuple(endings)
-    return sorted(f for f in files if f.name[0] != "." and f.name.lower().endswith(ends))
-
-
-def slashes(path: str) -> str:
-    """A path that another system may have written, with forward slashes."""
-    return path.replace("\\", "/")
-
-
 def few(names: Sequence[str], near: Iterable[str] = (), most: int = 3) -> str:
     """The first names, and the one of `near` that is most like the first."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
-    like = [f" (nearest: {name})" for name in get_close_matches(names[0], [*near], 1)]
+    like = [f" (nearest: {m})" for n in names[:1] for m in get_close_matches(n, sorted(near), 1)]
     return "".join([", ".join(names[:most]), more, *like])
 
 
@@ -154,7 +135,7 @@ def path_inside(path: object, what: str) -> str:
         raise ValueError(f"{what} is a path relative to the folder, got {path!r}")
     if ".." in PureWindowsPath(path).parts:
         raise ValueError(f"{what} stays inside the folder, got {path!r}")
-    return slashes(path)
+    return PureWindowsPath(path).as_posix()
 
 
 def is_real(value: object) -> bool:

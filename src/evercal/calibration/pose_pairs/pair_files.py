@@ -13,7 +13,7 @@ from evercal.calibration.pose_pairs.time_offset import CameraTrack, interpolated
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.conventions import PoseConvention
-from evercal.recordings.poses.pairing import paired_by_numbers, unpaired
+from evercal.recordings.poses.pairing import unpaired
 from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.poses.robot_poses import read_robot_poses
 from evercal.recordings.poses.row_files import (
@@ -204,7 +204,8 @@ def _rows_by_name(
         )
     rows = [row_of.get(without_ending(name)) for name in camera]
     if all(row is None for row in rows) and same_numbers(robot, camera):
-        return [*range(len(camera))], [paired_by_numbers(robot[0], camera[0])]
+        note = f"paired by numbers: {robot[0]} with {camera[0]}, and so on"
+        return [*range(len(camera))], [note]
     if all(row is None for row in rows):
         raise InputError(
             f"{files.robot}: names no image of {files.camera}; its first is {robot[0]!r}, the first"

@@ -1,11 +1,11 @@
 """COLMAP models (Schönberger and Frahm, CVPR 2016), read by pycolmap (extra `colmap`).
 
 COLMAP states camera_from_world, and its pixel (0.5, 0.5) is the centre of the top-left pixel, which
-is (0, 0) here. Images without a pose count as untracked, including files beside the images of the
-model. Of several models in one folder, the one with the most images is read.
+is (0, 0) here. It ignores the EXIF orientation. Images without a pose count as untracked, including
+files beside the images of the model. Of several models in one folder, the one with the most images
+is read.
 """
 
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,11 @@ from evercal.geometry import SE3, Camera
 from evercal.processes import status_of
 from evercal.recordings.formats.nerfstudio import frame_note
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import IMAGE_ENDINGS, as_stored
+from evercal.recordings.images import as_stored, files_in
 from evercal.recordings.poses.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import natural_key
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import files_in, named_errors, path_inside, slashes
+from evercal.recordings.text_files import named_errors, path_inside
 
 USES = ("metres",)
 
@@ -70,15 +70,10 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
         raise InputError(f"{folder}: no image has a pose; reconstruct with more overlap")
     images = _image_folder(root, folder, [image.name for image in posed])
     frames = [
-        Frame(
-            i.name,
-            as_stored(images / slashes(i.name)),  # COLMAP ignores the EXIF orientation
-            cameras[i.camera_id],
-            _base_from_camera(folder, i),
-        )
+        Frame(i.name, as_stored(images / i.name), cameras[i.camera_id], _pose(folder, i))
         for i in posed
     ]
-    files = files_in(images, IMAGE_ENDINGS, "**/*")
+    files = files_in(images, glob="**/*")
     total = max(len(model.images), len(files) if images != root else 0)
     name, lost = root.resolve().name, total - len(frames)
     return Recording(name, tuple(frames), (), lost, notes=tuple(notes), metric=metric)
@@ -113,7 +108,8 @@ def _model(folder: Path) -> Any:
         model = pycolmap.Reconstruction(str(folder))
         names = _names(folder)
         for key, image in model.images.items():
-            image.name = names.get(key, image.name)  # decodes UTF-8
+            name = names.get(key, image.name)  # decodes UTF-8
+            image.name = path_inside(name, "the name of an image")
         return model
     except Exception as error:  # pycolmap passes C++ exceptions on as several types
         text = " ".join(str(error).split())[:200]
@@ -124,10 +120,9 @@ def _names(folder: Path) -> dict[int, str]:
     """Names of the images of a text model, which pycolmap cuts at the first blank."""
     if (folder / "images.bin").is_file():
         return {}
-    with (folder / "images.txt").open(encoding="utf-8") as file:
-        lines = (line for line in file if line[:1] != "#")
-        words = [line.rstrip("\n").split(maxsplit=9) for line in islice(lines, 0, None, 2)]
-    return {int(each[0]): each[9] for each in words if each}
+    text = (folder / "images.txt").read_text("utf-8")
+    lines = [line for line in text.split("\n") if line[:1] != "#"]
+    return {int(w[0]): w[9] for line in lines[::2] if (w := line.split(maxsplit=9))}
 
 
 def _require_ends(folder: Path) -> None:
@@ -169,7 +164,7 @@ def _camera(folder: Path, camera: Any) -> Camera:
         return Camera(*size, *pinhole, coefficients, model)
 
 
-def _base_from_camera(folder: Path, image: Any) -> SE3:
+def _pose(folder: Path, image: Any) -> SE3:
     camera_from_world: Any = image.cam_from_world
     if callable(camera_from_world):  # a method since pycolmap 3.12
         camera_from_world = camera_from_world()
@@ -178,8 +173,6 @@ def _base_from_camera(folder: Path, image: Any) -> SE3:
 
 
 def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:
-    with named_errors(folder, "COLMAP model"):
-        names = [path_inside(name, "the name of an image") for name in names]
     beside = (parent / "images" for parent in folder.resolve().parents[:3])
     places = (root / "images", root, *beside)
     return max(places, key=lambda place: sum((place / name).is_file() for name in names))

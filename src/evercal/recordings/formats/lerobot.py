@@ -30,7 +30,7 @@ from evercal.errors import InputError, missing_extra
 from evercal.geometry import SE3
 from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import StoredImage, decode_image, image_file
+from evercal.recordings.images import StoredImage, decode_image, files_in, image_file
 from evercal.recordings.poses.camera_file import read_camera_of_size
 from evercal.recordings.poses.conventions import (
     ConventionError,
@@ -41,13 +41,7 @@ from evercal.recordings.poses.conventions import (
 )
 from evercal.recordings.poses.kinematics import RobotModel, in_radians
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import (
-    files_in,
-    named_errors,
-    path_inside,
-    read_json,
-    refuse_repeated,
-)
+from evercal.recordings.text_files import named_errors, path_inside, read_json, refuse_repeated
 
 Array = NDArray[np.float64]
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
@@ -110,22 +104,15 @@ def _info(root: Path) -> dict[str, Any]:
 
 
 def _camera_key(root: Path, info: Mapping[str, Any], wanted: str | None) -> str:
-    pictures = {k: f for k, f in info["features"].items() if f.get("dtype") in ("video", "image")}
-    keys = [key for key, feature in pictures.items() if not _is_depth(feature)]
-    if wanted in pictures and wanted not in keys:
-        raise InputError(f"{root}: {wanted} holds depth, no picture; give {', '.join(keys)}")
+    keys = [k for k, f in info["features"].items() if f.get("dtype") in ("video", "image")]
+    # Stated in `info`, in older versions under other names.
+    keys = [k for k in keys if not re.search(r"is_depth_map'\W+True", str(info["features"][k]))]
     if wanted is None and len(keys) == 1:
         return keys[0]
     if wanted in keys:
         return str(wanted)
-    what = f"no camera {wanted!r}" if wanted else f"{len(keys)} cameras"
+    what = f"no picture in {wanted!r}" if wanted else f"{len(keys)} cameras"
     raise InputError(f"{root}: {what}; name one with --image-topic: {', '.join(keys) or 'none'}")
-
-
-def _is_depth(feature: Mapping[str, Any]) -> bool:
-    stated = [feature.get(name) or {} for name in ("info", "video_info")]
-    names = "is_depth_map", "video.is_depth_map"
-    return any(each.get(name) for each in stated for name in names)
 
 
 class _Row(NamedTuple):

@@ -9,9 +9,9 @@ frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data conve
 """
 
 import math
-from collections.abc import Container, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import IMAGE_ENDINGS, as_stored, first_size, is_readable, pixels_of
+from evercal.recordings.images import IMAGE_ENDINGS, as_stored, first_size, image_size, is_readable
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
 from evercal.recordings.text_files import (
@@ -29,7 +29,6 @@ from evercal.recordings.text_files import (
     naming,
     read_json,
     refuse_repeated,
-    slashes,
 )
 
 FILE = "transforms.json"
@@ -75,24 +74,22 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
             if other.is_file():
                 more, _, left_out = _frames(other)
                 frames, bad = [*frames, *more], bad + left_out
-                test |= {frame.image for frame in more if isinstance(frame.image, Path)}
+                test |= {frame.name for frame in more}
     with named_errors(file, "nerfstudio file"):
         refuse_repeated((frame.name for frame in frames), "keep one entry for each image")
-    tested = [frame.image in test for frame in frames]
-    frames = _resized(file, frames)
     notes = [f"{bad} frames are marked as bad and left out"] if bad else []
     return Recording(
         (root if root.is_dir() else file.parent).resolve().name,
-        tuple(frame for frame, of_test in zip(frames, tested, strict=True) if not of_test),
-        tuple(frame for frame, of_test in zip(frames, tested, strict=True) if of_test),
+        tuple(frame for frame in frames if frame.name not in test),
+        tuple(frame for frame in frames if frame.name in test),
         bad,
         notes=(*notes, frame_note(file.name, metric)),
         metric=metric,
     )
 
 
-def _frames(file: Path) -> tuple[list[Frame], set[Path], int]:
-    """Frames of a file, images of test frames, and the number of frames that are marked as bad."""
+def _frames(file: Path) -> tuple[list[Frame], set[str], int]:
+    """Frames of a file, names of test frames, and the number of frames that are marked as bad."""
     data = read_json(file, "nerfstudio file", "export it again")
     with named_errors(file, "nerfstudio file"):
         undo, scale = _applied(data)
@@ -115,9 +112,9 @@ def _frames(file: Path) -> tuple[list[Frame], set[Path], int]:
         for i, entry in ((i, entry) for i, entry in enumerate(every) if not bad[i]):
             with naming(f"frame {i}"):
                 frames.append(_frame(root, data, entry, undo, scale))
-        images = [_image(root, str(each.get("file_path"))) for each in every]
-        test = _test_images(root, data, images) | {*images[len(entries) :]}
-    return frames, test, sum(bad)
+        names = [str(each.get("file_path")) for each in every]
+        test = _test_names(root, data, names) | {*names[len(entries) :]}
+    return _resized(file, frames), test, sum(bad)
 
 
 def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
@@ -147,7 +144,7 @@ def _frame(root: Path, data: Mapping[str, object], entry: object, undo: SE3, sca
 
 
 def _image(root: Path, name: str) -> Path:
-    image = root / slashes(name)
+    image = root / PureWindowsPath(name).as_posix()
     if image.suffix.lower() in IMAGE_ENDINGS:
         return image
     return next((f for e in IMAGE_ENDINGS if (f := Path(f"{image}{e}")).is_file()), image)
@@ -201,42 +198,39 @@ def _resized(file: Path, frames: list[Frame]) -> list[Frame]:
     nerfstudio, unless only their EXIF orientation gives them the stated shape. Rotated and cropped
     images are refused.
     """
-    sizes: dict[tuple[int, int], tuple[int, int]] = {}
-    turned = set()
+    taken: dict[tuple[int, int], tuple[tuple[int, int], Any]] = {}
     resized = []
     for frame in frames:
         stated = frame.camera.width, frame.camera.height
         assert isinstance(frame.image, Path)
-        if stated not in sizes and is_readable(frame.image):
-            ways = (as_stored(frame.image), frame.image)
-            shapes = [pixels_of(way).shape[1::-1] for way in dict.fromkeys(ways)]
-            fits = [abs(w / h / (stated[0] / stated[1]) - 1) <= 0.01 for w, h in shapes]
-            size = sizes[stated] = shapes[fits.index(True) if any(fits) else 0]
-            turned |= {stated} if fits[0] is False and any(fits) else set()
-            if not any(fits):
+        if stated not in taken and is_readable(frame.image):
+            ways = [(image_size(way(frame.image)), way) for way in (as_stored, Path)]
+            apart = [abs(w / h / (stated[0] / stated[1]) - 1) for (w, h), _ in ways]
+            size, _ = taken[stated] = ways[apart.index(min(apart))]
+            if min(apart) > 0.01:
                 rotated = "the image was rotated after the intrinsics were written"
                 raise InputError(
                     f"{frame.image}: is {size[0]}x{size[1]}, {file.name} says"
                     f" {stated[0]}x{stated[1]} ({rotated if size == stated[::-1] else 'cropped?'});"
                     f" give images of that shape"
                 )
-        if stated not in turned:
-            frame = replace(frame, image=as_stored(frame.image))
-        resized.append(replace(frame, camera=frame.camera.resized(*sizes.get(stated, stated))))
+        size, way = taken.get(stated, (stated, Path))
+        camera = frame.camera if size == stated else frame.camera.resized(*size)
+        resized.append(replace(frame, image=way(frame.image), camera=camera))
     return resized
 
 
-def _test_images(root: Path, data: Mapping[str, object], images: Container[object]) -> set[Path]:
-    test: set[Path] = set()
+def _test_names(root: Path, data: Mapping[str, object], frames: list[str]) -> set[str]:
+    name_of, test = {_image(root, name): name for name in frames}, set()
     for key in ("val_filenames", "test_filenames"):
         names = data.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"{key!r} is a list of file names")
         # A test frame under another name would be learned from.
-        other = [name for name in names if _image(root, name) not in images]
+        other = [name for name in names if _image(root, name) not in name_of]
         if other:
             raise ValueError(f"{key!r} names {other[0]!r}, which is no frame; correct the name")
-        test |= {_image(root, name) for name in names}
+        test |= {name_of[_image(root, name)] for name in names}
     return test
 
 

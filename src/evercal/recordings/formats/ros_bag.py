@@ -27,7 +27,7 @@ from evercal.recordings.formats.bags.file import (
 )
 from evercal.recordings.formats.bags.poses import plain_name, poses_at_images
 from evercal.recordings.frame import Frame, Recording, lost_images
-from evercal.recordings.images import StoredImage, as_rgb, decode_image, image_file
+from evercal.recordings.images import StoredImage, as_rgb, decode_image, image_file, is_readable
 from evercal.recordings.poses.camera_file import camera_from_fields, check_size, read_camera_of_size
 from evercal.recordings.poses.pose_track import MAX_GAP_S
 from evercal.recordings.read_options import ReadOptions
@@ -117,8 +117,8 @@ class BagImage(StoredImage):
         if self.bag.kinds[self.topic] != COMPRESSED:
             return None
         message = self.bag.message(self.topic, self.logged_ns, self.repeat)
-        mosaic = _pixels_in(message.content.format).startswith("bayer")
-        return None if mosaic else image_file(bytes(message.content.data))
+        is_mosaic = "bayer" in message.content.format
+        return None if is_mosaic else image_file(bytes(message.content.data))
 
 
 def _image_topic(bag: BagFile, wanted: str | None) -> str:
@@ -149,17 +149,17 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
 
 
 def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
-    shots, empty = [], []
+    shots, bad = [], []
     for message in bag.messages([topic]):
         header = message.content.header
         stamp, frame_id = stamp_ns(header.stamp), plain_name(header.frame_id)
-        if not len(message.content.data):
-            empty.append(str(len(shots) + len(empty)))
-            continue
+        if bag.kinds[topic] == COMPRESSED and not is_readable(message.content.data):
+            bad.append(len(shots))
         shots.append(BagImage(bag, topic, message.logged_ns, message.repeat, stamp, frame_id))
-    total = len(shots) + len(empty)
-    with named_errors(f"{bag.path}: topic {topic}", "images"):
-        notes = [lost_images(empty, total)] if empty else []
+    notes = []
+    if 0 < 2 * len(bad) <= len(shots):  # else the first one is refused with its format
+        notes = [lost_images([f"message {i}" for i in bad], len(shots))]
+        shots = [shot for i, shot in enumerate(shots) if i not in bad]
     if all(shot.stamp_ns == 0 for shot in shots):
         shots = [replace(shot, stamp_ns=shot.logged_ns) for shot in shots]
         notes.append(f"images on {topic} carry no stamps; the times of recording were taken")
@@ -214,12 +214,10 @@ def unsupported(encoding: str) -> str | None:
 
 def image_of(message: Any) -> NDArray[np.uint8]:
     """Decode a sensor_msgs/Image to (H, W, 3) uint8 RGB, 16-bit values converted as by `as_rgb`."""
-    import cv2
-
     reason = unsupported(message.encoding)
     if reason is not None:
         raise ValueError(reason)
-    size, channels, conversion = _ENCODINGS[message.encoding]
+    size, channels, _ = _ENCODINGS[message.encoding]
     height, width, step = int(message.height), int(message.width), int(message.step)
     line = width * channels * size
     data = np.asarray(message.data, dtype=np.uint8).reshape(-1)
@@ -230,40 +228,37 @@ def image_of(message: Any) -> NDArray[np.uint8]:
     if size == 2:
         pixels = pixels.view(">u2" if message.is_bigendian else "<u2").astype(np.uint16)
     pixels = pixels.reshape(height, width, channels)
-    if conversion is not None:
-        pixels = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}"))
-    return as_rgb(pixels)
+    return _rgb(pixels, message.encoding)
+
+
+def _rgb(pixels: NDArray[Any], encoding: str) -> NDArray[np.uint8]:
+    import cv2
+
+    conversion = _ENCODINGS[encoding][2]
+    code = conversion and getattr(cv2, f"COLOR_{conversion}")
+    return as_rgb(pixels if code is None else cv2.cvtColor(pixels, code))
 
 
 def compressed_image_of(message: Any) -> NDArray[np.uint8]:
     """Decode a sensor_msgs/CompressedImage with a PNG or JPEG to (H, W, 3) uint8 RGB."""
-    import cv2
-
-    pixels = _pixels_in(message.format)
-    if (reason := unsupported(pixels)) is not None:
+    encoding = _pixels_in(message.format)
+    if (reason := unsupported(encoding)) is not None:
         raise ValueError(f"format {message.format!r}: {reason}")
     image = decode_image(np.asarray(message.data, dtype=np.uint8))
     if image is None:
-        raise ValueError(
-            f"format {message.format!r} is not supported or broken; record jpeg or png, for example"
-            " with 'image_transport republish'"
-        )
-    conversion = _ENCODINGS[pixels][2]
-    # Some publishers convert a mosaic without saying so.
-    if pixels.startswith("bayer") and conversion and (image == image[..., :1]).all():
-        image = cv2.cvtColor(image[..., 0], getattr(cv2, f"COLOR_{conversion}"))
-    return as_rgb(image)
+        what = f"format {message.format!r} is not supported or broken"
+        raise ValueError(f"{what}; let 'image_transport republish' write jpeg or png")
+    # JPEG of ROS 2 is converted without saying so.
+    is_mosaic = encoding.startswith("bayer") and (image == image[..., :1]).all()
+    return _rgb(image[..., :1], encoding) if is_mosaic else image
 
 
 def _pixels_in(form: str) -> str:
-    """Encoding of the pixels in a compressed image; rgb8 if it states none that changes them.
+    """Encoding of the pixels in a compressed image; rgb8 unless it states another.
 
     The format is `jpeg`, or `bayer_rggb8; jpeg compressed bgr8`: the encoding before compression
-    and, if the publisher converted it, the one after. Without the latter a mosaic is still one, in
-    JPEG of ROS 1 and PNG of both.
+    and, if the publisher converted it, the one after. Without the latter a mosaic is still one.
     """
     before, _, how = form.partition(";")
-    if "compressedDepth" in form:
-        return before if unsupported(before) else "16UC1"
-    plain = not unsupported(before) and not before.startswith("bayer")
-    return "rgb8" if plain or not how or how.partition("compressed")[2].strip() else before.strip()
+    converted = not how or how.partition("compressed")[2].strip()
+    return "16UC1" if "compressedDepth" in form else "rgb8" if converted else before.strip()

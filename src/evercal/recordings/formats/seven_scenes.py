@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import first_size
+from evercal.recordings.images import files_in, first_size
 from evercal.recordings.poses.row_files import is_number
-from evercal.recordings.text_files import files_in, named_errors, read_text, refuse_repeated
+from evercal.recordings.text_files import named_errors, read_text, refuse_repeated
 
 _SPLITS = ("TrainSplit.txt", "TestSplit.txt")
 _FOCAL_AT_640 = 525.0
@@ -81,8 +81,7 @@ def colour_images(folder: Path) -> list[Path]:
     if not images:
         raise InputError(f"{folder}: no images; expected frame-XXXXXX.color.png or .jpg")
     with named_errors(folder, "images"):
-        names = (_frame_name(image.name) for image in images)
-        refuse_repeated(names, "keep its .png or its .jpg")
+        refuse_repeated([_frame_name(i.name) for i in images], "keep its .png or its .jpg")
     return images
 
 
@@ -114,8 +113,7 @@ def read_numbers(file: Path, count: int, what: str) -> NDArray[np.float64]:
     """Read the `count` numbers of a matrix from a small text file."""
     # float() on the words: np.loadtxt takes longer per file than reading the file.
     # Windows prints -1.#INF, 1.#QNAN and -nan(ind).
-    words = read_text(file, f"{what} matrix").split()
-    words = ["nan" if {*word} & {*"#("} else word for word in words]
+    words = ["nan" if {*w} & {*"#("} else w for w in read_text(file, f"{what} matrix").split()]
     if len(words) != count or not all(map(is_number, words)):
         raise InputError(f"{file}: expected a {what} matrix of {count} numbers, got {len(words)}")
     return np.array([float(word) for word in words])

@@ -6,7 +6,6 @@ no convention, and its cy of 483.5 is then the middle of 968 rows.
 """
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 from evercal.errors import InputError
@@ -42,7 +41,7 @@ def _test_count(root: Path, frames: int) -> int:
     return int(match[1])
 
 
-def _camera(root: Path, images: Sequence[Path]) -> Camera:
+def _camera(root: Path, images: list[Path]) -> Camera:
     file = root / "info.txt"
     text = read_text(file, "calibration", "it holds m_calibrationColorIntrinsic")
     lines = (line.partition("=") for line in text.splitlines())

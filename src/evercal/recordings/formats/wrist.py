@@ -9,7 +9,7 @@ with OpenGL's axes.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path, PurePath
+from pathlib import Path, PureWindowsPath
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.formats.seven_scenes import read_numbers
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import IMAGE_ENDINGS, first_size
+from evercal.recordings.images import IMAGE_ENDINGS, files_in, first_size
 from evercal.recordings.poses import camera_file
 from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
 from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
@@ -26,13 +26,7 @@ from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import POSE_ENDINGS, RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, number_array, read_rows
 from evercal.recordings.read_options import ReadOptions, flag
-from evercal.recordings.text_files import (
-    files_in,
-    named_errors,
-    read_json,
-    refuse_repeated,
-    slashes,
-)
+from evercal.recordings.text_files import named_errors, read_json, refuse_repeated
 
 USES = ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention")
 
@@ -202,7 +196,7 @@ def _urdf(root: Path, joints: Path) -> Path:
 
 def _images(root: Path, folders: Sequence[str]) -> list[Path]:
     for folder in folders:
-        if images := files_in(root / folder, IMAGE_ENDINGS):
+        if images := files_in(root / folder):
             return sorted(images, key=lambda image: natural_key(image.name))
     where = " or in ".join("it" if folder == "." else folder for folder in folders)
     raise InputError(f"{root}: no images ({', '.join(IMAGE_ENDINGS)}) in {where}")
@@ -229,7 +223,7 @@ def _stamps(root: Path) -> dict[str, float] | None:
     rows = read_rows(file, "a time for each image")
     if rows.names is None or rows.stamps_s is None:
         raise InputError(f"{file}: needs the columns image and stamp_s")
-    names = [PurePath(slashes(name)).name for name in rows.names]
+    names = [PureWindowsPath(name).name for name in rows.names]
     with named_errors(file, "stamps"):
         refuse_repeated(names, "give every image one time")
     return dict(zip(names, rows.stamps_s.tolist(), strict=True))

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePath
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, same_numbers, times_in_names
-from evercal.recordings.text_files import few, named_errors, refuse_repeated, slashes
+from evercal.recordings.text_files import few, named_errors, refuse_repeated
 
 Pairing = tuple[list[SE3 | None], list[str]]
 """The pose of each image, if it has one, and notes."""
@@ -58,14 +58,13 @@ def poses_of_images(
     poses, notes = pair_images(images, rows, None, file)
     missing = [image.name for image, pose in zip(images, poses, strict=True) if pose is None]
     if missing:
-        near = {*(rows.names or ())} - {image.name for image in images}
-        text = few(missing, near)
-        raise InputError(f"{file}: has no pose for {text}; add it or leave the image out")
+        alone = few(missing, {*(rows.names or ())} - {image.name for image in images})
+        raise InputError(f"{file}: has no pose for {alone}; add it or leave the image out")
     return SE3.stack([pose for pose in poses if pose is not None]), notes
 
 
 def _by_name(images: Sequence[Path], names: Sequence[str], poses: SE3, file: Path) -> Pairing:
-    keys = [PurePath(slashes(name)).name for name in names]
+    keys = [PureWindowsPath(name).name for name in names]
     with named_errors(file, "poses"):
         refuse_repeated(keys, "give every image one row")
     by_name = dict(zip(keys, poses, strict=True))
@@ -74,7 +73,7 @@ def _by_name(images: Sequence[Path], names: Sequence[str], poses: SE3, file: Pat
     if all(pose is None for pose in paired) and same_numbers(
         names, [image.name for image in images]
     ):
-        return list(poses), [paired_by_numbers(names[0], images[0].name)]
+        return list(poses), [f"paired by numbers: {names[0]} with {images[0].name}, and so on"]
     if not any(pose is not None for pose in paired):
         raise InputError(
             f"{file}: names no image of {images[0].parent}; its first is {names[0]!r}, the first"
@@ -82,11 +81,6 @@ def _by_name(images: Sequence[Path], names: Sequence[str], poses: SE3, file: Pat
         )
     alone = [i.name for i, pose in zip(images, paired, strict=True) if pose is None]
     return paired, unpaired(alone, [*by_name], file.name)
-
-
-def paired_by_numbers(row: str, image: str) -> str:
-    """A note of names that agree only in their numbers."""
-    return f"paired by numbers: {row} with {image}, and so on"
 
 
 def unpaired(images: Sequence[str], rows: Sequence[str], file: str) -> list[str]:

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from evercal.errors import InputError, missing_extra
-from evercal.recordings.text_files import files_in
+from evercal.recordings.images import files_in
+from evercal.recordings.text_files import few
 
 _FILES = (".bag", ".mcap", ".db3")
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -72,8 +73,7 @@ class BagFile:
     def contents(self) -> str:
         """List of the topics, for messages."""
         words = [f"{t} ({kind.replace('/msg', '')})" for t, kind in sorted(self.kinds.items())]
-        more = f" and {len(words) - 30} more" if len(words) > 30 else ""
-        return (", ".join(words[:30]) or "nothing") + more
+        return few(words, most=30) or "nothing"
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Iterate over the messages of some topics in recorded order."""
