@@ -43,8 +43,9 @@ class Frame:
         """Read the pixels, (H, W, 3) uint8 RGB; a size that is not the camera's is refused."""
         image = pixels_of(self.image)
         if image.shape[:2] != (self.camera.height, self.camera.width):
+            where = file_of(self.image) or self.name
             raise InputError(
-                f"{file_of(self.image) or self.name}: image is {image.shape[1]}x{image.shape[0]}, its camera"
+                f"{where}: image is {image.shape[1]}x{image.shape[0]}, its camera"
                 f" {self.camera.width}x{self.camera.height}; give the intrinsics of this image size"
             )
         return image
@@ -99,15 +100,15 @@ def checked_name(name: str) -> str:
 
 def with_images(recording: Recording, folder: Path) -> Recording:
     """Leave out frames without a readable image file in `folder`; more than half are refused."""
-    both = (*recording.train, *recording.test)
+    both = recording.train + recording.test
     files = {frame.name: file for frame in both if (file := file_of(frame.image))}
     lost = {n: os.path.relpath(f, folder) for n, f in files.items() if not is_readable(f)}
     if not lost:
         return recording
     unused = {*files_in(folder, glob="**/*")} - {*files.values()}
     note = lost_images([*lost.values()], len(files), [os.path.relpath(f, folder) for f in unused])
-    parts = (recording.train, recording.test)
-    train, test = (tuple(f for f in part if f.name not in lost) for part in parts)
+    train = tuple(frame for frame in recording.train if frame.name not in lost)
+    test = tuple(frame for frame in recording.test if frame.name not in lost)
     return replace(recording, train=train, test=test, notes=(*recording.notes, note))
 
 
@@ -115,7 +116,7 @@ def lost_images(lost: Sequence[str], total: int, unused: Iterable[str] = ()) -> 
     """A note of images that are left out, with one of `unused` files that the first may be."""
     words = f"{len(lost)} of {total} images are missing or unreadable"
     if 2 * len(lost) > total:
-        raise InputError(f"{words}: {few(lost, unused)}; restore them or take their entries out")
+        raise ValueError(f"{words}: {few(lost, unused)}; restore them or take their entries out")
     return f"{words} and left out: {few(lost, unused)}"
 
 

@@ -67,14 +67,12 @@ def file_of(image: Picture) -> Path | None:
     return file if isinstance(file, Path) else None
 
 
-def files_in(folder: Path, ends: tuple[str, ...] = IMAGE_ENDINGS, glob: str = "*") -> list[Path]:
+def files_in(folder: Path, end: tuple[str, ...] = IMAGE_ENDINGS, glob: str = "*") -> list[Path]:
     """Files in a folder with one of some endings, in lower case, sorted by path.
 
     Hidden files, such as ._a.jpg that macOS puts beside a.jpg, are no content.
     """
-    return sorted(
-        f for f in folder.glob(glob) if f.name[0] != "." and f.name.lower().endswith(ends)
-    )
+    return sorted(f for f in folder.glob(glob) if f.name[0] != "." and f.name.lower().endswith(end))
 
 
 def as_stored(path: Path) -> Path | UnturnedImage:

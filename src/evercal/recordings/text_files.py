@@ -112,8 +112,9 @@ def yaml_documents(text: str) -> list[Any]:
 def few(names: Sequence[str], near: Iterable[str] = (), most: int = 3) -> str:
     """The first names, and the one of `near` that is most like the first."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
-    like = [f" (nearest: {m})" for n in names[:1] for m in get_close_matches(n, sorted(near), 1)]
-    return "".join([", ".join(names[:most]), more, *like])
+    like = {name.lower(): f" (nearest: {name})" for name in sorted(near)}
+    best = [like[m] for n in names[:1] for m in get_close_matches(n.lower(), like, 1, 0.8)]
+    return "".join([", ".join(names[:most]), more, *best])
 
 
 def refuse_repeated(names: Iterable[str], remedy: str) -> None:

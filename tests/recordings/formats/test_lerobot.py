@@ -253,7 +253,7 @@ def test_missing_options_and_files_are_named(tmp_path: Path) -> None:
     root = make(tmp_path / "wave", "v2.1")
     for changed, message in (
         ({"image_topic": None}, r"2 cameras; name one with --image-topic: observation\.images\.w"),
-        ({"image_topic": "top"}, "no camera 'top'"),
+        ({"image_topic": "top"}, "no picture in 'top'"),
         ({"camera": None}, "hold no intrinsics; give them with --camera"),
         ({"image_topic": FRONT}, "video is missing; download it too"),
     ):

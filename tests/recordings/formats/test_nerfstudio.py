@@ -211,7 +211,7 @@ BREAKS: list[tuple[dict[str, Any], str]] = [
     ({"frames": one(2 * np.eye(4))}, "frame 0: a.png: the last row"),
     ({"frames": one(np.diag([2, 2, 2, 1.0]))}, "frame 0: a.png: .*is a rotation"),
     ({"frames": entries(ring(1)) * 2}, "'images/frame_00000.png' comes twice"),
-    ({"frames": one(np.eye(4))}, "a.png: missing; restore it"),
+    ({"frames": one(np.eye(4))}, "1 of 1 images are missing or unreadable: a.png"),
     ({"test_filenames": "all"}, "'test_filenames' is a list of file names"),
 ]
 
