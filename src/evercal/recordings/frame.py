@@ -105,7 +105,8 @@ def with_images(recording: Recording, folder: Path) -> Recording:
     lost = {n: os.path.relpath(f, folder) for n, f in files.items() if not is_readable(f)}
     if not lost:
         return recording
-    unused = {*files_in(folder, glob="**/*")} - {*files.values()}
+    is_there = files[next(iter(lost))].is_file()
+    unused = set() if is_there else {*files_in(folder, glob="**/*")} - {*files.values()}
     note = lost_images([*lost.values()], len(files), [os.path.relpath(f, folder) for f in unused])
     train = tuple(frame for frame in recording.train if frame.name not in lost)
     test = tuple(frame for frame in recording.test if frame.name not in lost)

@@ -113,7 +113,7 @@ def few(names: Sequence[str], near: Iterable[str] = (), most: int = 3) -> str:
     """The first names, and the one of `near` that is most like the first."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     like = {name.lower(): f" (nearest: {name})" for name in sorted(near)}
-    best = [like[m] for n in names[:1] for m in get_close_matches(n.lower(), like, 1, 0.8)]
+    best = [like[m] for n in names[:1] for m in get_close_matches(n.lower(), like, 1, 0.7)]
     return "".join([", ".join(names[:most]), more, *best])
 
 
