@@ -235,8 +235,9 @@ def _rgb(pixels: NDArray[Any], encoding: str) -> NDArray[np.uint8]:
     import cv2
 
     conversion = _ENCODINGS[encoding][2]
-    code = conversion and getattr(cv2, f"COLOR_{conversion}")
-    return as_rgb(pixels if code is None else cv2.cvtColor(pixels, code))
+    if conversion is not None:
+        pixels = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}"))
+    return as_rgb(pixels)
 
 
 def compressed_image_of(message: Any) -> NDArray[np.uint8]:
