@@ -174,3 +174,12 @@ def test_float32_gives_the_same_bytes_with_other_instructions(
         rows.append(row)
     assert rows[0]["status"] == "ok"
     assert rows[0] == rows[1]
+
+
+def test_an_unreadable_image_has_a_row(run: Any, hall_store: Path, images: Path) -> None:
+    (images / "0-cut.png").write_bytes((images / "1-hall.png").read_bytes()[:-200])
+    (images / "._1-hall.png").write_bytes(b"hidden")
+    ran = run("localize", hall_store, images, "--json")
+    cut, located, _ = json.loads(ran.out)["images"]
+    assert (ran.code, cut["status"], located["status"]) == (0, "failed", "ok")
+    assert "0-cut.png: not a readable image" in cut["reason"]

@@ -11,7 +11,7 @@ from evercal.calibration.calibration import read_transform
 from evercal.calibration.located import ImagePose, fuse, locate
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg
-from evercal.recordings.images import IMAGE_ENDINGS, Picture
+from evercal.recordings.images import Picture, files_in
 from evercal.recordings.load import load_recording, recognised
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def _shots(episode: Path, stated: SE3 | None, count: int) -> list[_Shot]:
             for frame in (*scene.train, *scene.test)
         ]
     else:
-        files = sorted(p for p in episode.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS)
+        files = files_in(episode, glob="**/*")
         if files and pose is None:
             raise InputError(
                 f"{episode}: states no camera pose; put a {' or '.join(POSE_FILES)} there, or give"

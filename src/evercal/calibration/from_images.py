@@ -63,6 +63,8 @@ class Images:
     """Intrinsics. None: those of the camera that recorded the scene, or of another of its model."""
     base_from_gripper: SE3 | None = None
     """(n,) gripper pose at each image."""
+    notes: tuple[str, ...] = ()
+    """How poses and images were paired."""
 
     @classmethod
     def of(
@@ -79,10 +81,10 @@ class Images:
         items: list[Any] = [source] if single else [*source]  # pyright: ignore[reportGeneralTypeIssues]
         if not items or isinstance(items[0], str | os.PathLike):
             files = image_files(items)
-            poses = robot_poses
+            poses, notes = robot_poses, []
             if isinstance(poses, str | os.PathLike):
-                poses = poses_of_images(Path(poses), files, convention)
-            return cls([(str(path), path) for path in files], camera, poses)
+                poses, notes = poses_of_images(Path(poses), files, convention)
+            return cls([(str(path), path) for path in files], camera, poses, tuple(notes))
         if isinstance(robot_poses, str | os.PathLike):
             raise InputError(
                 f"{robot_poses}: a file of robot poses is paired with image files by name, time or"
@@ -123,7 +125,7 @@ def calibrate(
         moved = in_parent_frame(located, parents)
     fused = fuse(moved)
     scene = localizer.contents.metric_scene(fused.scene)
-    first = pixels_of(given.images[0][1])
+    first = pixels_of(fused.select(given.images)[0][1])
     source = {
         "command": "calibrate",
         "scene": fused.scene,

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from evercal.calibration.calibration import ImageUse
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, average_poses, pose_distance_mm_deg
-from evercal.recordings.images import Picture, pixels_of
+from evercal.localization.learned import localize_picture
+from evercal.recordings.images import Picture
 
 if TYPE_CHECKING:
     from evercal.localization.estimate import PoseEstimate
@@ -69,7 +70,7 @@ def locate(
     """Read and locate the named images one by one; `on_image` is called after each."""
     located = []
     for name, image in images:
-        estimate = localizer.localize(pixels_of(image), camera)
+        estimate = localize_picture(localizer, image, camera)
         uncertain = estimate.uncertain_pose or UncertainPose(SE3.identity(), np.eye(6))
         located.append(ImagePose(name, estimate, uncertain.pose, uncertain.covariance))
         on_image()

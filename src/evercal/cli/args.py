@@ -140,10 +140,10 @@ def option(field: str) -> str:
 
 
 def camera_for(file: Path | None, images: Sequence[Path]) -> "Camera | None":
-    """The camera in the file of --camera, for the size of the first image."""
-    from evercal.recordings import image_size
+    """The camera in the file of --camera, for the size of the first readable image."""
+    from evercal.recordings.images import first_size
 
-    return None if file is None else stated_camera(file, image_size(images[0]))
+    return None if file is None else stated_camera(file, first_size(images))
 
 
 def stated_camera(file: Path | None, size: tuple[int, int]) -> "Camera | None":

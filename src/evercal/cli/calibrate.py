@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional
 
 from evercal.cli import args
-from evercal.cli.console import require_writable
+from evercal.cli.console import require_writable, say_notes
 from evercal.errors import InputError
 from evercal.progress import progress_bar
 
@@ -84,7 +84,9 @@ class Calibrate(args.Verb):
         from evercal.calibration.from_images import Images
 
         camera = args.camera_for(self.camera, files)
-        return Images.of(files, camera, self.robot_poses, self.convention)
+        given = Images.of(files, camera, self.robot_poses, self.convention)
+        say_notes(given.notes)
+        return given
 
     def _calibrated(
         self, localizer: "Localizer", given: "Images", mount: Mount | None

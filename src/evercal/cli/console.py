@@ -3,7 +3,8 @@
 import json
 import os
 import shlex
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -13,6 +14,12 @@ from evercal.errors import InputError, printable
 def say(text: str, file: TextIO | None = None) -> None:
     """Print text, to stdout by default, with control characters escaped."""
     print(printable(text), file=file, flush=True)
+
+
+def say_notes(notes: Iterable[str]) -> None:
+    """Print what a reader chose and left out to stderr."""
+    for note in notes:
+        say(f"note: {note}", sys.stderr)
 
 
 def print_json(record: object) -> None:

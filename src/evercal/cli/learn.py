@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
-from evercal.cli.console import require_writable, say, size
+from evercal.cli.console import require_writable, say, say_notes, size
 from evercal.cli.info import adjusted_row
 from evercal.errors import InputError
 from evercal.progress import Bars
+from evercal.recordings.text_files import few
 
 if TYPE_CHECKING:
     from evercal.learning.scene import LearnReport
@@ -132,6 +133,7 @@ class Learn(args.Verb):
         from evercal.recordings.pictures import look_at
 
         recording = self.reading.recording(path, self.name)
+        say_notes(recording.notes)
         shown = look_at(recording.train)
         for warning in shown.warnings if shown.usable else ():
             say(f"warning: {recording.name}: {warning}", sys.stderr)
@@ -292,8 +294,7 @@ def _warnings(adjusted: "Adjusted") -> Iterator[str]:
         ("warning: poses with large errors", adjusted.doubtful_poses),
     ):
         if names:
-            more = f" and {len(names) - 8} more" if len(names) > 8 else ""
-            yield f"{what}: {', '.join(names[:8])}{more}"
+            yield f"{what}: {few(names, most=8)}"
 
 
 def _few_digits(values: Iterable[float]) -> str:

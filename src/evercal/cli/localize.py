@@ -75,17 +75,18 @@ class Localize(args.Verb):
         self, localizer: "LearnedLocalizer", files: list[Path], camera: "Camera | None"
     ) -> "list[Answer]":
         """The answer for each image; times include decoding."""
+        from evercal.localization.learned import localize_picture
         from evercal.localization.parallel import in_parallel
         from evercal.recordings import read_image, write_image
         from evercal.reports.overlay import draw_landmarks
 
         def answer(number: int) -> Answer:
             path, began = files[number], time.perf_counter()
-            image = read_image(path)
-            estimate = localizer.localize(image, camera)
+            estimate = localize_picture(localizer, path, camera)
             milliseconds = 1000 * (time.perf_counter() - began)
             known = unit_known(localizer, estimate.scene)
             if self.overlay is not None and estimate.scene is not None:
+                image = read_image(path)
                 drawn = draw_landmarks(image, estimate, localizer, camera, width=image.shape[1])
                 write_image(self.overlay / _overlay_name(files, number), drawn.image)
             return Answer(path, estimate, milliseconds, known)
@@ -99,8 +100,10 @@ class Localize(args.Verb):
 
     def _animate(self, path: Path, localizer: "LearnedLocalizer", answers: list[Answer]) -> None:
         from evercal.recordings import read_image
+        from evercal.recordings.images import is_readable
         from evercal.reports.video import animate, write_video
 
+        answers = [answer for answer in answers if is_readable(answer.path)]
         with progress_bar("drawing", len(answers), "image") as bar:
 
             def read(file: Path) -> "np.ndarray":

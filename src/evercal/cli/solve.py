@@ -10,7 +10,7 @@ from tyro.conf import arg
 
 from evercal.cli import args
 from evercal.cli.calibrate import calibration_lines
-from evercal.cli.console import require_writable
+from evercal.cli.console import require_writable, say_notes
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
@@ -79,6 +79,7 @@ class Solve(args.Verb):
         if self.time_offset:
             return solve_with_offset(*read_streams(files), self.mount, scale_known)
         pairs, corners = read_pairs(files)
+        say_notes(pairs.notes)
         return solve(pairs, self.mount, scale_known, corners)
 
     def _with_image_paths(self, calibration: "Calibration") -> "Calibration":

@@ -107,11 +107,11 @@ class Arrivals:
     def scan(self) -> "Iterator[tuple[Path, np.ndarray]]":
         """Path and pixels of every image that is new and complete, oldest first."""
         from evercal.recordings import read_image
-        from evercal.recordings.images import IMAGE_ENDINGS
+        from evercal.recordings.images import files_in
 
         states: dict[Path, tuple[int, int]] = {}
-        for path in self._folder.iterdir():
-            if path.suffix.lower() in IMAGE_ENDINGS and path not in self._done:
+        for path in files_in(self._folder):
+            if path not in self._done:
                 with suppress(FileNotFoundError):  # removed or renamed since it was listed
                     status = path.stat()
                     states[path] = status.st_mtime_ns, status.st_size

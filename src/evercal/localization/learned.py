@@ -5,9 +5,11 @@ from typing import Protocol
 
 import numpy as np
 
+from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.mapping.map_frame import MapFrame
+from evercal.recordings.images import Picture, pixels_of
 
 
 class LearnedScene(Protocol):
@@ -68,3 +70,14 @@ class LearnedLocalizer(SceneLocalizer, Protocol):
     def contents(self) -> LearnedContents:
         """The scenes."""
         ...
+
+
+def localize_picture(
+    localizer: SceneLocalizer, image: Picture, camera: Camera | None = None
+) -> PoseEstimate:
+    """Locate a picture; one that cannot be read is `failed`, with the reason."""
+    try:
+        pixels = pixels_of(image)
+    except InputError as error:
+        return PoseEstimate("failed", str(error), None, None, None, 0, 0.0, 0.0)
+    return localizer.localize(pixels, camera)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, average_poses
 from evercal.localization.estimate import PoseEstimate
+from evercal.localization.learned import localize_picture
 from evercal.localization.localizer import Localizer
 from evercal.mapping.prepared_frames import WorkingSize
 from evercal.mapping.refresh import RefreshOptions, refreshed
@@ -17,7 +18,7 @@ from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import spread_poses
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame
-from evercal.recordings.images import Picture, pixels_of
+from evercal.recordings.images import Picture
 
 LEAST_IMAGES = 5
 """Located images that a refresh takes, at least."""
@@ -80,7 +81,7 @@ def refresh_scene(
     began, options = time.perf_counter(), options or RefreshOptions()
     cameras, estimates = cameras or [None] * len(images), []
     for number, ((_, image), camera) in enumerate(zip(images, cameras, strict=True)):
-        estimates.append(localizer.localize(pixels_of(image), camera))
+        estimates.append(localize_picture(localizer, image, camera))
         on_progress("locating", number + 1, len(images))
     names = [e.scene for e in estimates if e.status == "ok" and e.scene is not None]
     shown = max(sorted(set(names)), key=names.count) if names else None

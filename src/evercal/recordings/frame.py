@@ -1,7 +1,8 @@
 """Frames with camera and poses, in recordings with a split into training and test frames."""
 
+import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 from evercal.bounds import bounds
 from evercal.errors import InputError, is_plain
 from evercal.geometry import SE3, Camera
-from evercal.recordings.images import Picture, pixels_of
+from evercal.recordings.images import Picture, file_of, files_in, is_readable, pixels_of
+from evercal.recordings.text_files import few
 
 Mount = Literal["eye_to_hand", "eye_in_hand"]
 MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
@@ -41,7 +43,7 @@ class Frame:
         """Read the pixels, (H, W, 3) uint8 RGB; a size that is not the camera's is refused."""
         image = pixels_of(self.image)
         if image.shape[:2] != (self.camera.height, self.camera.width):
-            where = self.image if isinstance(self.image, Path) else self.name
+            where = file_of(self.image) or self.name
             raise InputError(
                 f"{where}: image is {image.shape[1]}x{image.shape[0]}, its camera"
                 f" {self.camera.width}x{self.camera.height}; give the intrinsics of this image size"
@@ -96,13 +98,27 @@ def checked_name(name: str) -> str:
     return name
 
 
-def require_images(frames: Iterable[Frame], file: Path) -> None:
-    """Refuse frames whose image files, named in `file`, are missing."""
-    images = [frame.image for frame in frames if isinstance(frame.image, Path)]
-    missing = [image for image in images if not image.is_file()]
-    if missing:
-        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise InputError(f"{missing[0]}{more}: missing; restore it or take it out of {file}")
+def with_images(recording: Recording, folder: Path) -> Recording:
+    """Leave out frames without a readable image file in `folder`; more than half are refused."""
+    both = recording.train + recording.test
+    files = {frame.name: file for frame in both if (file := file_of(frame.image))}
+    lost = {n: os.path.relpath(f, folder) for n, f in files.items() if not is_readable(f)}
+    if not lost:
+        return recording
+    is_there = files[next(iter(lost))].is_file()
+    unused = set() if is_there else {*files_in(folder, glob="**/*")} - {*files.values()}
+    note = lost_images([*lost.values()], len(files), [os.path.relpath(f, folder) for f in unused])
+    train = tuple(frame for frame in recording.train if frame.name not in lost)
+    test = tuple(frame for frame in recording.test if frame.name not in lost)
+    return replace(recording, train=train, test=test, notes=(*recording.notes, note))
+
+
+def lost_images(lost: Sequence[str], total: int, unused: Iterable[str] = ()) -> str:
+    """A note of images that are left out, with one of `unused` files that the first may be."""
+    words = f"{len(lost)} of {total} images are missing or unreadable"
+    if 2 * len(lost) > total:
+        raise ValueError(f"{words}: {few(lost, unused)}; restore them or take their entries out")
+    return f"{words} and left out: {few(lost, unused)}"
 
 
 def posed_recording(recording: Recording) -> Recording:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from evercal.errors import InputError
-from evercal.recordings.images import IMAGE_ENDINGS
+from evercal.recordings.images import IMAGE_ENDINGS, files_in
 from evercal.recordings.poses.row_files import natural_key
 
 
@@ -16,8 +16,7 @@ def image_files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
     files: list[Path] = []
     for path in map(Path, paths):
         if path.is_dir():
-            inside = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS]
-            inside.sort(key=lambda p: natural_key(p.name))
+            inside = sorted(files_in(path), key=lambda p: natural_key(p.name))
             if not inside:
                 raise InputError(f"{path}: no images in this folder ({', '.join(IMAGE_ENDINGS)})")
             files += inside

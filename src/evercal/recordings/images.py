@@ -1,7 +1,11 @@
 """Images on disk and in memory: (H, W, 3) uint8 in the order red, green, blue."""
 
 import os
+import re
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +19,12 @@ IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 """Endings of image files, in lower case."""
 _JPEG, _SCAN, _MOST_SCANS = b"\xff\xd8", b"\xff\xda", 100
 """Beginning of a JPEG file, and of a scan in it: progressive files have about ten."""
+_TURNED = re.compile(
+    rb"(?s)(Exif|eXIf).*?(\x01\x12\0\x03\0{3}\x01\0|\x12\x01\x03\0\x01\0{3})[\x02-\x08]"
+)
+"""EXIF data of JPEG and PNG with an orientation other than upright."""
+_WHOLE = re.compile(rb"(?s)\xff\xd8\xff.*\xff\xd9[^\xff]*|\x89PNG.*IEND.{4}")
+"""Beginning and end of a whole image file."""
 
 
 class StoredImage(ABC):
@@ -29,6 +39,17 @@ class StoredImage(ABC):
         return None
 
 
+@dataclass(frozen=True)
+class UnturnedImage(StoredImage):
+    """An image file as it is stored, for programs that ignore its EXIF orientation."""
+
+    path: Path
+
+    def read(self) -> NDArray[np.uint8]:
+        """Decode the image to (H, W, 3) uint8 RGB."""
+        return read_image(self.path, turned=False)
+
+
 Picture = Path | NDArray[np.uint8] | StoredImage
 """A file, an array that `as_rgb` accepts, or an image inside a bag or video."""
 
@@ -38,6 +59,41 @@ def pixels_of(image: Picture) -> NDArray[np.uint8]:
     if isinstance(image, Path):
         return read_image(image)
     return image.read() if isinstance(image, StoredImage) else as_rgb(image)
+
+
+def file_of(image: Picture) -> Path | None:
+    """The file of which a picture is the only content, if there is one."""
+    file = image.path if isinstance(image, UnturnedImage) else image
+    return file if isinstance(file, Path) else None
+
+
+def files_in(folder: Path, end: tuple[str, ...] = IMAGE_ENDINGS, glob: str = "*") -> list[Path]:
+    """Files in a folder with one of some endings, in lower case, sorted by path.
+
+    Hidden files, such as ._a.jpg that macOS puts beside a.jpg, are no content.
+    """
+    return sorted(f for f in folder.glob(glob) if f.name[0] != "." and f.name.lower().endswith(end))
+
+
+def as_stored(path: Path) -> Path | UnturnedImage:
+    """An image file whose EXIF orientation is not applied; the file itself if it states none."""
+    with suppress(OSError), path.open("rb") as file:
+        return UnturnedImage(path) if _TURNED.search(file.read(4096)) else path
+    return path
+
+
+def is_readable(image: Path | NDArray[np.uint8]) -> bool:
+    """Whether a file, or its bytes (n,), is an image; a whole one is not decoded."""
+    with suppress(OSError, ValueError):  # ValueError: the file is empty
+        data = np.memmap(image, mode="r") if isinstance(image, Path) else image
+        ends = data[:32].tobytes() + data[-32:].tobytes()
+        return bool(_WHOLE.fullmatch(ends)) or decode_image(np.asarray(data)) is not None
+    return False
+
+
+def first_size(paths: Sequence[Path]) -> tuple[int, int]:
+    """Width and height of the first image that can be read, turned upright as by `read_image`."""
+    return image_size(next(filter(is_readable, paths), paths[0]))
 
 
 def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
@@ -71,10 +127,11 @@ def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
     return np.ascontiguousarray(pixels[:, :, :3])
 
 
-def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
+def read_image(path: str | os.PathLike[str], turned: bool = True) -> NDArray[np.uint8]:
     """Read a grey, RGB or RGBA image file of 8 or 16 bits, converted as by `as_rgb`.
 
-    It is turned upright as its EXIF orientation states; intrinsics are those of the upright image.
+    It is turned upright as its EXIF orientation states, unless `turned` is False; intrinsics are
+    those of the upright image.
     """
     path = Path(path)
     try:
@@ -83,7 +140,7 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
         raise InputError(f"{path}: image file is missing; check the path") from None
     except OSError as error:
         raise InputError(f"{path}: image file cannot be read ({error.strerror})") from None
-    image = decode_image(data)
+    image = decode_image(data, turned)
     if image is None:
         raise InputError(
             f"{path}: not a readable image ({data.size} bytes) of at most {bounds().pixels:,}"
@@ -92,12 +149,13 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     return image
 
 
-def decode_image(data: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
+def decode_image(data: NDArray[np.uint8], turned: bool = True) -> NDArray[np.uint8] | None:
     """Decode (n,) uint8 bytes of an image file as by `read_image`; None if they are no image."""
     import cv2
 
     # IMREAD_UNCHANGED would ignore the orientation; ANYDEPTH keeps 16 bits for as_rgb to round.
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
+    flags |= 0 if turned else cv2.IMREAD_IGNORE_ORIENTATION
     if data[:2].tobytes() == _JPEG and data.tobytes().count(_SCAN) > _MOST_SCANS:
         return None  # each scan takes as long as a whole image
     try:
@@ -145,7 +203,7 @@ def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
-def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+def image_size(image: str | os.PathLike[str] | StoredImage) -> tuple[int, int]:
     """Width and height in pixels of an image file, turned upright as by `read_image`."""
-    height, width = read_image(path).shape[:2]
+    height, width = pixels_of(image if isinstance(image, StoredImage) else Path(image)).shape[:2]
     return width, height

@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -18,6 +17,7 @@ from evercal.recordings.frame import (
     Recording,
     posed_frames,
 )
+from evercal.recordings.images import file_of
 from evercal.recordings.pictures import look_at
 from evercal.recordings.poses.pose_evidence import rotation_warnings
 
@@ -184,11 +184,11 @@ def _copy_warnings(
 ) -> Iterator[str]:
     from scipy.spatial import KDTree
 
-    files = {f.image for f in train if isinstance(f.image, Path)}
+    files = {file_of(f.image) for f in train} - {None}
     close = KDTree(poses.translation_m).query_ball_point(tested.translation_m, same_m)
     copies = 0
     for i, frame in enumerate(test):
-        copied = isinstance(frame.image, Path) and frame.image in files
+        copied = file_of(frame.image) in files
         if not copied and close[i]:
             radians = pose_distance(tested[i], poses[close[i]])[1]
             copied = bool(np.rad2deg(radians.min()) < SAME_DEG)

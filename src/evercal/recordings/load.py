@@ -8,8 +8,9 @@ from pathlib import Path
 from types import ModuleType
 
 from evercal.errors import InputError
-from evercal.recordings.frame import Recording
+from evercal.recordings.frame import Recording, with_images
 from evercal.recordings.read_options import ReadOptions, flag
+from evercal.recordings.text_files import named_errors
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,8 @@ def load_recording(
                 f" {', '.join(users)}; leave it out"
             )
     recording = read(root, options) if uses else read(root)
+    with named_errors(root, "recording"):
+        recording = with_images(recording, root if root.is_dir() else root.parent)
     if (root / "masks").is_dir():
         from evercal.recordings.masks import with_masks
 

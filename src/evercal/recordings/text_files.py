@@ -2,8 +2,9 @@
 
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from difflib import get_close_matches
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -108,6 +109,14 @@ def yaml_documents(text: str) -> list[Any]:
         raise ValueError(f"not valid YAML ({' '.join(str(error).split())})") from None
 
 
+def few(names: Sequence[str], near: Iterable[str] = (), most: int = 3) -> str:
+    """The first names, and the one of `near` that is most like the first."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    like = {name.lower(): f" (nearest: {name})" for name in sorted(near)}
+    best = [like[m] for n in names[:1] for m in get_close_matches(n.lower(), like, 1, 0.7)]
+    return "".join([", ".join(names[:most]), more, *best])
+
+
 def refuse_repeated(names: Iterable[str], remedy: str) -> None:
     """Raise ValueError for the first name that came before."""
     known: set[str] = set()
@@ -118,7 +127,7 @@ def refuse_repeated(names: Iterable[str], remedy: str) -> None:
 
 
 def path_inside(path: object, what: str) -> str:
-    """Check that a path of a file with forward slashes stays inside the file's folder.
+    """Check that a path stays inside the folder of the file that states it; with forward slashes.
 
     Symbolic links are followed: download caches keep files elsewhere. `what` names the entry.
     """
@@ -127,7 +136,7 @@ def path_inside(path: object, what: str) -> str:
         raise ValueError(f"{what} is a path relative to the folder, got {path!r}")
     if ".." in PureWindowsPath(path).parts:
         raise ValueError(f"{what} stays inside the folder, got {path!r}")
-    return path
+    return PureWindowsPath(path).as_posix()
 
 
 def is_real(value: object) -> bool:

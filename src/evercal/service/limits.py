@@ -101,7 +101,7 @@ def poses_of(data: bytes, ending: str, images: list[str]) -> SE3:
     """(n,) base_from_gripper of n named images, by a pose table whose file had an ending."""
     files = [Path(name) for name in images]
     ending = ending.lower() if ending.lower() in (".csv", ".txt", ".json", ".tum") else ".csv"
-    return _from_text(data, "robot_poses", ending, lambda path: poses_of_images(path, files))
+    return _from_text(data, "robot_poses", ending, lambda path: poses_of_images(path, files)[0])
 
 
 def calibration_of(data: bytes) -> Calibration:

@@ -25,6 +25,17 @@ def test_names_are_paired_without_folder_and_suffix(tmp_path: Path) -> None:
     np.testing.assert_allclose(pairs.base_from_gripper.translation_m[:, 1], [0.02, 0, 0.01])
 
 
+def test_names_that_match_partly_are_shown(tmp_path: Path) -> None:
+    robot = write(tmp_path / "robot.csv", ["a-1.png", "a-2.png", "a-03.png", "a-04.png"])
+    camera = write(tmp_path / "camera.csv", ["a-1.png", "rgb\\a-2.png", "a-3.png"])
+    pairs, _ = read_pairs(PairFiles(robot, camera))
+    assert len(pairs.names) == 2
+    assert pairs.notes == (
+        "1 image without a row in robot.csv: a-3.png (nearest: a-03.png)",
+        "2 rows of robot.csv without an image: a-03.png, a-04.png",
+    )
+
+
 def test_names_that_differ_only_in_their_folder_are_refused(tmp_path: Path) -> None:
     robot = write(tmp_path / "robot.csv", ["left/1.png", "right/1.png"])
     camera = write(tmp_path / "camera.csv", ["1.png"])

@@ -253,7 +253,7 @@ def test_missing_options_and_files_are_named(tmp_path: Path) -> None:
     root = make(tmp_path / "wave", "v2.1")
     for changed, message in (
         ({"image_topic": None}, r"2 cameras; name one with --image-topic: observation\.images\.w"),
-        ({"image_topic": "top"}, "no camera 'top'"),
+        ({"image_topic": "top"}, "no picture in 'top'"),
         ({"camera": None}, "hold no intrinsics; give them with --camera"),
         ({"image_topic": FRONT}, "video is missing; download it too"),
     ):
@@ -320,3 +320,20 @@ def test_image_paths_outside_the_dataset_are_refused(path: str, tmp_path: Path) 
         table = table.set_column(table.schema.get_field_index(WRIST), WRIST, cells)
         pq.write_table(table, file)
     refuses(f"image '{path}': the path", root)
+
+
+@pytest.mark.parametrize("key", ["is_depth_map", "video.is_depth_map"])
+def test_depth_is_no_picture(key: str, tmp_path: Path) -> None:
+    root = make(tmp_path, "v3.0")
+    file = root / "meta/info.json"
+    info = json.loads(file.read_text())
+    cameras = [k for k, f in info["features"].items() if f["dtype"] == "video"]
+    for camera in cameras:
+        info["features"][camera]["info"] = {key: camera != cameras[0]}
+    file.write_text(json.dumps(info))
+    (tmp_path / "lens.txt").write_text("80 0 48\n0 80 32\n0 0 1\n")
+    options = ReadOptions(camera=tmp_path / "lens.txt")
+    (root / "data/chunk-000/._file-000.parquet").write_bytes(b"\0\5\x16\7")
+    assert load_recording(root, options=options).train
+    options = ReadOptions(camera=tmp_path / "lens.txt", image_topic=cameras[1])
+    refused(f"no picture in '{cameras[1]}'; .*{cameras[0]}$", load_recording, root, options=options)

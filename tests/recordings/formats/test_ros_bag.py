@@ -217,7 +217,7 @@ def test_several_image_topics_need_a_choice(tmp_path: Path) -> None:
     ("made", "message"),
     [
         ({"focal": 0.0}, "K is all zeros: the camera is not calibrated; give --camera"),
-        ({"model": "fov"}, "distortion_model 'fov' is not supported"),
+        ({"model": "fov"}, "a camera of model fov has omega"),
         ({"size": (64, 48)}, "is for images of 64x48, /cam/image_raw is 32x24"),
         ({"encoding": "nv21"}, "encoding 'nv21' is not supported; use one of rgb8, bgr8"),
     ],
@@ -234,3 +234,47 @@ def test_damaged_bags_are_refused(tmp_path: Path) -> None:
     cut.write_bytes(b"\x89MCAP0\r\n")
     for file in (path, cut):
         refused("rosbags cannot read it", load_recording, file)
+
+
+@pytest.mark.parametrize("form", ["bayer_rggb8; jpeg compressed ", "bayer_rggb8; png compressed "])
+def test_a_mosaic_in_a_compressed_image_becomes_a_picture(form: str, tmp_path: Path) -> None:
+    """The publisher of ROS 1 leaves it in both, that of ROS 2 in PNG only."""
+    ending = ".jpg" if "jpeg" in form else ".png"
+    options = [cv2.IMWRITE_JPEG_QUALITY, 100] if ending == ".jpg" else []
+    data = cv2.imencode(ending, bayer("rggb", COLOUR), options)[1].tobytes()
+    image = read_one_compressed(data, form, tmp_path)
+    off = np.abs(image[4:-4, 4:-4].astype(int) - COLOUR)
+    assert off.max() < 8
+    converted = cv2.imencode(".png", np.full((24, 32, 3), COLOUR[::-1], np.uint8))[1].tobytes()
+    for stated in (form, f"{form}bgr8"):
+        colour = read_one_compressed(converted, stated, tmp_path / stated[-5:])
+        np.testing.assert_array_equal(colour[0, 0], COLOUR)
+
+
+def read_one_compressed(data: bytes, form: str, root: Path) -> np.ndarray:
+    bag = arm(Bag("mcap"))
+    for at in SHOTS:
+        bag.compressed(at, "/cam/image_raw/compressed", data, form)
+    bag.info("/cam/camera_info")
+    root.mkdir(parents=True, exist_ok=True)
+    return load_recording(bag.write(root)).train[0].read_image()
+
+
+def test_depth_in_a_compressed_image_is_no_picture(tmp_path: Path) -> None:
+    data = cv2.imencode(".png", np.ones((24, 32), np.uint16))[1].tobytes()
+    bag = arm(Bag("mcap"))
+    bag.compressed(0.4, "/cam/image_raw/compressed", data, "16UC1; png compressed ")
+    bag.info("/cam/camera_info")
+    assert "encoding '16UC1' holds depth" in refusal(bag, tmp_path)
+
+
+def test_a_message_without_an_image_is_left_out(tmp_path: Path) -> None:
+    data = cv2.imencode(".png", picture(0))[1].tobytes()
+    bag = arm(Bag("mcap"))
+    for i, at in enumerate(SHOTS):
+        part = len(data) // 2 if i == 0 else len(data)
+        bag.compressed(at, "/cam/image_raw/compressed", data[:part], "png")
+    bag.info("/cam/camera_info")
+    read = load_recording(bag.write(tmp_path))
+    assert len(read.train) == 5  # of six with a pose
+    assert "1 of 8 images are missing or unreadable and left out: message 0" in read.notes

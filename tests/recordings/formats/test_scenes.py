@@ -158,7 +158,7 @@ SEVEN = [
     (POSE, b"x " * 16, r"frame-000002\.pose\.txt: expected"),
     (POSE, b"", r"frame-000002\.pose\.txt: expected"),
     (POSE, b"2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", r"frame-000002\.pose\.txt: the left 3x3 block"),
-    ("seq-02/frame-000000.color.png", b"no image", r"color\.png: not a readable image"),
+    ("seq-0*/*.png", b"no image", r"color\.png: not a readable image"),
     ("seq-02/frame-000000.color.jpg", b"", "'frame-000000' comes twice; keep its"),
     ("camera-intrinsics.txt", b"525 525", r"camera-intrinsics\.txt: expected a 3x3"),
     ("camera-intrinsics.txt", b"0 0 0 0 0 0 0 0 1", r"camera-intrinsics\.txt: camera fx"),

@@ -13,6 +13,7 @@ from evercal.calibration.pose_pairs.time_offset import CameraTrack, interpolated
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.conventions import PoseConvention
+from evercal.recordings.poses.pairing import unpaired
 from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.poses.robot_poses import read_robot_poses
 from evercal.recordings.poses.row_files import (
@@ -84,13 +85,15 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
     images of `evercal detect` are sorted naturally (image-2 before image-10).
     """
     robot, camera = _read(files, "robot"), _read(files, "camera")
+    notes: list[str] = []
     if robot.names is not None and camera.names is not None:
-        rows = _rows_by_name(files, robot.names, camera.names)
+        rows, notes = _rows_by_name(files, robot.names, camera.names)
     elif robot.stamps_s is not None and camera.stamps_s is not None:
         pairs, overlapping = interpolated_pairs(*_streams(robot, camera))
         return pairs, overlapping.corners
     elif len(robot.poses) == len(camera.poses):
-        rows = [*range(len(robot.poses))]
+        rows, names = [*range(len(robot.poses))], camera.row_names()
+        notes = [f"robot and camera poses were paired in order, {names[0]} to {names[-1]}"]
     else:
         raise InputError(
             f"{files.robot}: {len(robot.poses)} poses for {len(camera.poses)} images of"
@@ -107,6 +110,7 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
         camera.poses[images],
         robot_numbers=robot.numbers and robot.numbers[robots],
         camera_numbers=camera.numbers and camera.numbers[images],
+        notes=tuple(notes),
     )
     return pairs, camera.corners_of(images)
 
@@ -190,7 +194,7 @@ def _is_board_file(path: Path) -> bool:
 
 def _rows_by_name(
     files: PairFiles, robot: tuple[str, ...], camera: tuple[str, ...]
-) -> list[int | None]:
+) -> tuple[list[int | None], list[str]]:
     row_of = {without_ending(name): i for i, name in enumerate(robot)}
     repeated = [name for i, name in enumerate(robot) if row_of[without_ending(name)] != i]
     if repeated:
@@ -200,10 +204,13 @@ def _rows_by_name(
         )
     rows = [row_of.get(without_ending(name)) for name in camera]
     if all(row is None for row in rows) and same_numbers(robot, camera):
-        return [*range(len(camera))]
+        note = f"paired by numbers: {robot[0]} with {camera[0]}, and so on"
+        return [*range(len(camera))], [note]
     if all(row is None for row in rows):
         raise InputError(
             f"{files.robot}: names no image of {files.camera}; its first is {robot[0]!r}, the first"
             f" image is {camera[0]!r}"
         )
-    return rows
+    alone = [name for name, row in zip(camera, rows, strict=True) if row is None]
+    others = [name for i, name in enumerate(robot) if i not in rows]
+    return rows, unpaired(alone, others, files.robot.name)

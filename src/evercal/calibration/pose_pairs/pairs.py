@@ -69,6 +69,8 @@ class PosePairs:
     """(n, 6) gripper velocity in the base frame, m/s and rad/s, to estimate a time offset."""
     robot_numbers: PoseNumbers | None = None
     camera_numbers: PoseNumbers | None = None
+    notes: tuple[str, ...] = ()
+    """How robot and camera poses were paired."""
 
     def __post_init__(self) -> None:
         counts = {len(self.names), len(self.base_from_gripper), len(self.camera_from_board)}
@@ -83,7 +85,8 @@ class PosePairs:
     def __getitem__(self, index: NDArray[np.int64] | Mask) -> Self:
         rows = np.arange(len(self))[index]
         given = {name: value for name, value in vars(self).items() if value is not None}
-        changed = {name: value[rows] for name, value in given.items() if name != "names"}
+        each = given.keys() - {"names", "notes"}
+        changed = {name: given[name][rows] for name in each}
         return replace(self, names=tuple(self.names[row] for row in rows), **changed)
 
     def distinct(self, scale_known: bool = True) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -1,8 +1,9 @@
 """COLMAP models (Schönberger and Frahm, CVPR 2016), read by pycolmap (extra `colmap`).
 
 COLMAP states camera_from_world, and its pixel (0.5, 0.5) is the centre of the top-left pixel, which
-is (0, 0) here. Images without a pose count as untracked, including files beside the images of the
-model. Of several models in one folder, the one with the most images is read.
+is (0, 0) here. It ignores the EXIF orientation. Images without a pose count as untracked, including
+files beside the images of the model. Of several models in one folder, the one with the most images
+is read.
 """
 
 from pathlib import Path
@@ -15,7 +16,7 @@ from evercal.geometry import SE3, Camera
 from evercal.processes import status_of
 from evercal.recordings.formats.nerfstudio import frame_note
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import IMAGE_ENDINGS
+from evercal.recordings.images import as_stored, files_in
 from evercal.recordings.poses.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import natural_key
 from evercal.recordings.read_options import ReadOptions
@@ -52,7 +53,7 @@ def detect(root: Path) -> bool:
 
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
-    """Read the largest model and check that its images exist; no image is opened."""
+    """Read the largest model; no image is opened whole."""
     metric = options is not None and options.metres
     models = {folder: _model(folder) for folder in _models(root)}
     if not models:
@@ -69,10 +70,10 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
         raise InputError(f"{folder}: no image has a pose; reconstruct with more overlap")
     images = _image_folder(root, folder, [image.name for image in posed])
     frames = [
-        Frame(i.name, images / i.name, cameras[i.camera_id], _base_from_camera(folder, i))
+        Frame(i.name, as_stored(images / i.name), cameras[i.camera_id], _pose(folder, i))
         for i in posed
     ]
-    files = [p for p in images.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS]
+    files = files_in(images, glob="**/*")
     total = max(len(model.images), len(files) if images != root else 0)
     name, lost = root.resolve().name, total - len(frames)
     return Recording(name, tuple(frames), (), lost, notes=tuple(notes), metric=metric)
@@ -105,11 +106,23 @@ def _model(folder: Path) -> Any:
     _require_ends(folder)
     try:
         model = pycolmap.Reconstruction(str(folder))
-        _ = [image.name for image in model.images.values()]  # decodes UTF-8
+        names = _names(folder)
+        for key, image in model.images.items():
+            name = names.get(key, image.name)  # decodes UTF-8
+            image.name = path_inside(name, "the name of an image")
         return model
     except Exception as error:  # pycolmap passes C++ exceptions on as several types
         text = " ".join(str(error).split())[:200]
         raise InputError(f"{folder}: pycolmap cannot read the model: {text}") from None
+
+
+def _names(folder: Path) -> dict[int, str]:
+    """Names of the images of a text model, which pycolmap cuts at the first blank."""
+    if (folder / "images.bin").is_file():
+        return {}
+    text = (folder / "images.txt").read_text("utf-8")
+    lines = [line for line in text.split("\n") if line[:1] != "#"]
+    return {int(w[0]): w[9] for line in lines[::2] if (w := line.split(maxsplit=9))}
 
 
 def _require_ends(folder: Path) -> None:
@@ -151,7 +164,7 @@ def _camera(folder: Path, camera: Any) -> Camera:
         return Camera(*size, *pinhole, coefficients, model)
 
 
-def _base_from_camera(folder: Path, image: Any) -> SE3:
+def _pose(folder: Path, image: Any) -> SE3:
     camera_from_world: Any = image.cam_from_world
     if callable(camera_from_world):  # a method since pycolmap 3.12
         camera_from_world = camera_from_world()
@@ -160,12 +173,6 @@ def _base_from_camera(folder: Path, image: Any) -> SE3:
 
 
 def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:
-    with named_errors(folder, "COLMAP model"):
-        for name in names:
-            path_inside(name, "the name of an image")
     beside = (parent / "images" for parent in folder.resolve().parents[:3])
-    for candidate in (root / "images", root, *beside):
-        if all((candidate / name).is_file() for name in names):
-            return candidate
-    missing = next((n for n in names if not (root / "images" / n).is_file()), names[0])
-    raise InputError(f"{root / 'images' / missing}: missing; put the model's images there")
+    places = (root / "images", root, *beside)
+    return max(places, key=lambda place: sum((place / name).is_file() for name in names))

@@ -15,7 +15,7 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_to_dict
-from evercal.recordings.frame import Frame, Recording, require_images
+from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, write_image
 from evercal.recordings.text_files import (
     is_real,
@@ -38,7 +38,7 @@ def detect(root: Path) -> bool:
 
 
 def load(root: Path) -> Recording:
-    """Read scene.json and check that its images exist; no image is opened."""
+    """Read scene.json; no image is opened."""
     file = root / FILE
     data = read_json(file, "scene file", "convert the recording again")
     with named_errors(file, "scene file"):
@@ -49,7 +49,6 @@ def load(root: Path) -> Recording:
             with naming(f"frame {i}"):
                 frames.append(_frame(root, entry, cameras))
         refuse_repeated((frame.name for _, frame in frames), "names of frames are unique")
-    require_images([frame for _, frame in frames], file)
     name = data.get("name")
     train, test = (tuple(f for s, f in frames if s == split) for split in ("train", "test"))
     return Recording(

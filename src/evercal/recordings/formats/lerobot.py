@@ -30,7 +30,7 @@ from evercal.errors import InputError, missing_extra
 from evercal.geometry import SE3
 from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import StoredImage, decode_image, image_file
+from evercal.recordings.images import StoredImage, decode_image, files_in, image_file
 from evercal.recordings.poses.camera_file import read_camera_of_size
 from evercal.recordings.poses.conventions import (
     ConventionError,
@@ -105,11 +105,13 @@ def _info(root: Path) -> dict[str, Any]:
 
 def _camera_key(root: Path, info: Mapping[str, Any], wanted: str | None) -> str:
     keys = [k for k, f in info["features"].items() if f.get("dtype") in ("video", "image")]
+    # Stated in `info`, in older versions under other names.
+    keys = [k for k in keys if not re.search(r"is_depth_map'\W+True", str(info["features"][k]))]
     if wanted is None and len(keys) == 1:
         return keys[0]
     if wanted in keys:
         return str(wanted)
-    what = f"no camera {wanted!r}" if wanted else f"{len(keys)} cameras"
+    what = f"no picture in {wanted!r}" if wanted else f"{len(keys)} cameras"
     raise InputError(f"{root}: {what}; name one with --image-topic: {', '.join(keys) or 'none'}")
 
 
@@ -127,7 +129,7 @@ class _Row(NamedTuple):
 
 
 def _rows(root: Path, column: str) -> tuple[list[_Row], Array]:
-    files = sorted((root / "data").glob("*/*.parquet"))
+    files = files_in(root / "data", (".parquet",), "*/*")
     if not files:
         raise InputError(f"{root / 'data'}: no parquet files; download the data folder too")
     rows: list[_Row] = []
@@ -183,7 +185,7 @@ def _video_starts(
     names = ["episode_index", *(f"videos/{key}/{part}" for part in parts)]
     return {
         int(episode): (video(chunk_index=chunk, file_index=number), float(start))
-        for file in sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+        for file in files_in(root / "meta" / "episodes", (".parquet",), "*/*")
         for episode, chunk, number, start in zip(*_columns(file, names), strict=True)
     }
 

@@ -9,9 +9,9 @@ frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data conve
 """
 
 import math
-from collections.abc import Container, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.recordings.frame import Frame, Recording, require_images
-from evercal.recordings.images import IMAGE_ENDINGS, image_size
+from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.images import IMAGE_ENDINGS, as_stored, first_size, image_size, is_readable
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
 from evercal.recordings.text_files import (
@@ -74,22 +74,22 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
             if other.is_file():
                 more, _, left_out = _frames(other)
                 frames, bad = [*frames, *more], bad + left_out
-                test |= {frame.image for frame in more if isinstance(frame.image, Path)}
+                test |= {frame.name for frame in more}
     with named_errors(file, "nerfstudio file"):
         refuse_repeated((frame.name for frame in frames), "keep one entry for each image")
     notes = [f"{bad} frames are marked as bad and left out"] if bad else []
     return Recording(
         (root if root.is_dir() else file.parent).resolve().name,
-        tuple(frame for frame in frames if frame.image not in test),
-        tuple(frame for frame in frames if frame.image in test),
+        tuple(frame for frame in frames if frame.name not in test),
+        tuple(frame for frame in frames if frame.name in test),
         bad,
         notes=(*notes, frame_note(file.name, metric)),
         metric=metric,
     )
 
 
-def _frames(file: Path) -> tuple[list[Frame], set[Path], int]:
-    """Frames of a file, images of test frames, and the number of frames that are marked as bad."""
+def _frames(file: Path) -> tuple[list[Frame], set[str], int]:
+    """Frames of a file, names of test frames, and the number of frames that are marked as bad."""
     data = read_json(file, "nerfstudio file", "export it again")
     with named_errors(file, "nerfstudio file"):
         undo, scale = _applied(data)
@@ -104,16 +104,16 @@ def _frames(file: Path) -> tuple[list[Frame], set[Path], int]:
             root = next((each for each in folders if _image(each, name).is_file()), root)
             # Without a stated image size, that of the first image is taken.
             if not {"w", "h"} & {*data, *first}:
-                width, height = image_size(_image(root, name))
+                names = [each.get("file_path") for each in entries if isinstance(each, dict)]
+                width, height = first_size([_image(root, str(each)) for each in names])
                 data |= {"w": width, "h": height}
         every, frames = [*entries, *tested], []
         bad = [isinstance(each, dict) and bool(each.get("is_bad")) for each in every]
         for i, entry in ((i, entry) for i, entry in enumerate(every) if not bad[i]):
             with naming(f"frame {i}"):
                 frames.append(_frame(root, data, entry, undo, scale))
-        images = [_image(root, str(each.get("file_path"))) for each in every]
-        test = _test_images(root, data, images) | {*images[len(entries) :]}
-    require_images(frames, file)
+        names = [str(each.get("file_path")) for each in every]
+        test = _test_names(root, data, names) | {*names[len(entries) :]}
     return _resized(file, frames), test, sum(bad)
 
 
@@ -144,7 +144,7 @@ def _frame(root: Path, data: Mapping[str, object], entry: object, undo: SE3, sca
 
 
 def _image(root: Path, name: str) -> Path:
-    image = root / name
+    image = root / PureWindowsPath(name).as_posix()
     if image.suffix.lower() in IMAGE_ENDINGS:
         return image
     return next((f for e in IMAGE_ENDINGS if (f := Path(f"{image}{e}")).is_file()), image)
@@ -194,39 +194,43 @@ def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
 def _resized(file: Path, frames: list[Frame]) -> list[Frame]:
     """Frames with cameras of their images' size, judged by one image of every camera size.
 
-    Downscaled copies of the images get scaled cameras. Rotated and cropped images are refused.
+    Downscaled copies of the images get scaled cameras. Images are taken as they are stored, as by
+    nerfstudio, unless only their EXIF orientation gives them the stated shape. Rotated and cropped
+    images are refused.
     """
-    sizes: dict[tuple[int, int], tuple[int, int]] = {}
+    taken: dict[tuple[int, int], tuple[tuple[int, int], Any]] = {}
     resized = []
     for frame in frames:
         stated = frame.camera.width, frame.camera.height
-        if stated not in sizes:
-            assert isinstance(frame.image, Path)
-            size = sizes[stated] = image_size(frame.image)
-            if abs(size[0] / size[1] / (stated[0] / stated[1]) - 1) > 0.01:
+        assert isinstance(frame.image, Path)
+        if stated not in taken and is_readable(frame.image):
+            ways = [(image_size(way(frame.image)), way) for way in (as_stored, Path)]
+            apart = [abs(w / h / (stated[0] / stated[1]) - 1) for (w, h), _ in ways]
+            size, _ = taken[stated] = ways[apart.index(min(apart))]
+            if min(apart) > 0.01:
                 rotated = "the image was rotated after the intrinsics were written"
                 raise InputError(
                     f"{frame.image}: is {size[0]}x{size[1]}, {file.name} says"
                     f" {stated[0]}x{stated[1]} ({rotated if size == stated[::-1] else 'cropped?'});"
                     f" give images of that shape"
                 )
-        if sizes[stated] != stated:
-            frame = replace(frame, camera=frame.camera.resized(*sizes[stated]))
-        resized.append(frame)
+        size, way = taken.get(stated, (stated, Path))
+        camera = frame.camera if size == stated else frame.camera.resized(*size)
+        resized.append(replace(frame, image=way(frame.image), camera=camera))
     return resized
 
 
-def _test_images(root: Path, data: Mapping[str, object], images: Container[object]) -> set[Path]:
-    test: set[Path] = set()
+def _test_names(root: Path, data: Mapping[str, object], frames: list[str]) -> set[str]:
+    name_of, test = {_image(root, name): name for name in frames}, set()
     for key in ("val_filenames", "test_filenames"):
         names = data.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"{key!r} is a list of file names")
         # A test frame under another name would be learned from.
-        other = [name for name in names if _image(root, name) not in images]
+        other = [name for name in names if _image(root, name) not in name_of]
         if other:
             raise ValueError(f"{key!r} names {other[0]!r}, which is no frame; correct the name")
-        test |= {_image(root, name) for name in names}
+        test |= {name_of[_image(root, name)] for name in names}
     return test
 
 

@@ -26,8 +26,8 @@ from evercal.recordings.formats.bags.file import (
     stamp_ns,
 )
 from evercal.recordings.formats.bags.poses import plain_name, poses_at_images
-from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import StoredImage, as_rgb, decode_image, image_file
+from evercal.recordings.frame import Frame, Recording, lost_images
+from evercal.recordings.images import StoredImage, as_rgb, decode_image, image_file, is_readable
 from evercal.recordings.poses.camera_file import camera_from_fields, check_size, read_camera_of_size
 from evercal.recordings.poses.pose_track import MAX_GAP_S
 from evercal.recordings.read_options import ReadOptions
@@ -117,7 +117,8 @@ class BagImage(StoredImage):
         if self.bag.kinds[self.topic] != COMPRESSED:
             return None
         message = self.bag.message(self.topic, self.logged_ns, self.repeat)
-        return image_file(bytes(message.content.data))
+        is_mosaic = "bayer" in message.content.format
+        return None if is_mosaic else image_file(bytes(message.content.data))
 
 
 def _image_topic(bag: BagFile, wanted: str | None) -> str:
@@ -137,10 +138,8 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
     reasons: dict[str, str | None] = {}
     for topic in topics:
         first = bag.first(topic)
-        if bag.kinds[topic] == IMAGE:
-            reasons[topic] = unsupported(first.encoding)
-        else:
-            reasons[topic] = "holds depth" if "compressedDepth" in first.format else None
+        of_pixels = bag.kinds[topic] == IMAGE
+        reasons[topic] = unsupported(first.encoding if of_pixels else _pixels_in(first.format))
     pictures = [topic for topic, reason in reasons.items() if reason is None]
     if len(pictures) != 1:
         refused = "; ".join(f"{t}: {reason}" for t, reason in reasons.items() if reason)
@@ -150,12 +149,17 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
 
 
 def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
-    shots = []
+    shots, bad = [], []
     for message in bag.messages([topic]):
         header = message.content.header
         stamp, frame_id = stamp_ns(header.stamp), plain_name(header.frame_id)
+        if bag.kinds[topic] == COMPRESSED and not is_readable(message.content.data):
+            bad.append(len(shots))
         shots.append(BagImage(bag, topic, message.logged_ns, message.repeat, stamp, frame_id))
     notes = []
+    if 0 < 2 * len(bad) <= len(shots):  # else the first one is refused with its format
+        notes = [lost_images([f"message {i}" for i in bad], len(shots))]
+        shots = [shot for i, shot in enumerate(shots) if i not in bad]
     if all(shot.stamp_ns == 0 for shot in shots):
         shots = [replace(shot, stamp_ns=shot.logged_ns) for shot in shots]
         notes.append(f"images on {topic} carry no stamps; the times of recording were taken")
@@ -210,12 +214,10 @@ def unsupported(encoding: str) -> str | None:
 
 def image_of(message: Any) -> NDArray[np.uint8]:
     """Decode a sensor_msgs/Image to (H, W, 3) uint8 RGB, 16-bit values converted as by `as_rgb`."""
-    import cv2
-
     reason = unsupported(message.encoding)
     if reason is not None:
         raise ValueError(reason)
-    size, channels, conversion = _ENCODINGS[message.encoding]
+    size, channels, _ = _ENCODINGS[message.encoding]
     height, width, step = int(message.height), int(message.width), int(message.step)
     line = width * channels * size
     data = np.asarray(message.data, dtype=np.uint8).reshape(-1)
@@ -226,6 +228,13 @@ def image_of(message: Any) -> NDArray[np.uint8]:
     if size == 2:
         pixels = pixels.view(">u2" if message.is_bigendian else "<u2").astype(np.uint16)
     pixels = pixels.reshape(height, width, channels)
+    return _rgb(pixels, message.encoding)
+
+
+def _rgb(pixels: NDArray[Any], encoding: str) -> NDArray[np.uint8]:
+    import cv2
+
+    conversion = _ENCODINGS[encoding][2]
     if conversion is not None:
         pixels = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}"))
     return as_rgb(pixels)
@@ -233,9 +242,24 @@ def image_of(message: Any) -> NDArray[np.uint8]:
 
 def compressed_image_of(message: Any) -> NDArray[np.uint8]:
     """Decode a sensor_msgs/CompressedImage with a PNG or JPEG to (H, W, 3) uint8 RGB."""
-    if "compressedDepth" in message.format:
-        raise ValueError(f"format {message.format!r} holds depth, no picture")
+    encoding = _pixels_in(message.format)
+    if (reason := unsupported(encoding)) is not None:
+        raise ValueError(f"format {message.format!r}: {reason}")
     image = decode_image(np.asarray(message.data, dtype=np.uint8))
     if image is None:
-        raise ValueError(f"format {message.format!r} is not supported or broken; use jpeg or png")
-    return image
+        what = f"format {message.format!r} is not supported or broken"
+        raise ValueError(f"{what}; let 'image_transport republish' write jpeg or png")
+    # JPEG of ROS 2 is converted without saying so.
+    is_mosaic = encoding.startswith("bayer") and (image == image[..., :1]).all()
+    return _rgb(image[..., :1], encoding) if is_mosaic else image
+
+
+def _pixels_in(form: str) -> str:
+    """Encoding of the pixels in a compressed image; rgb8 unless it states another.
+
+    The format is `jpeg`, or `bayer_rggb8; jpeg compressed bgr8`: the encoding before compression
+    and, if the publisher converted it, the one after. Without the latter a mosaic is still one.
+    """
+    before, _, how = form.partition(";")
+    converted = not how or how.partition("compressed")[2].strip()
+    return "16UC1" if "compressedDepth" in form else "rgb8" if converted else before.strip()

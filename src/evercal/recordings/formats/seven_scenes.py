@@ -5,7 +5,6 @@ image size, and the principal point is the middle of the image. Poses with inf o
 frames, which are left out and counted. All sequences come from one camera.
 """
 
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import image_size
+from evercal.recordings.images import files_in, first_size
 from evercal.recordings.poses.row_files import is_number
 from evercal.recordings.text_files import named_errors, read_text, refuse_repeated
 
@@ -44,7 +43,7 @@ def load(root: Path) -> Recording:
     ]
     if not (images[0] or images[1]):
         raise InputError(f"{root}: {_SPLITS[0]} and {_SPLITS[1]} are empty; name a sequence in one")
-    camera = _camera(root, (images[0] + images[1])[0])
+    camera = _camera(root, images[0] + images[1])
     train, test = (tracked_frames(split, camera, folders=True) for split in images)
     untracked = len(images[0]) + len(images[1]) - len(train) - len(test)
     return Recording(root.resolve().name, train, test, untracked)
@@ -65,8 +64,8 @@ def _sequences(root: Path, split: str) -> list[Path]:
     return folders
 
 
-def _camera(root: Path, image: Path) -> Camera:
-    width, height = image_size(image)
+def _camera(root: Path, images: Sequence[Path]) -> Camera:
+    width, height = first_size(images)
     file = root / "camera-intrinsics.txt"
     if not file.exists():
         focal = _FOCAL_AT_640 * max(width, height) / 640.0
@@ -78,14 +77,12 @@ def _camera(root: Path, image: Path) -> Camera:
 
 def colour_images(folder: Path) -> list[Path]:
     """Colour images of a folder, sorted by name."""
-    # os.listdir and one sort: globbing a thousand files twice dominates the loading time.
-    names = os.listdir(folder) if folder.is_dir() else []
-    names = sorted(name for name in names if re.search(r"\.color\.(png|jpe?g)$", name))
-    if not names:
+    images = files_in(folder, (".color.png", ".color.jpg", ".color.jpeg"))
+    if not images:
         raise InputError(f"{folder}: no images; expected frame-XXXXXX.color.png or .jpg")
     with named_errors(folder, "images"):
-        refuse_repeated(map(_frame_name, names), "keep its .png or its .jpg")
-    return [folder / name for name in names]
+        refuse_repeated([_frame_name(i.name) for i in images], "keep its .png or its .jpg")
+    return images
 
 
 def _frame_name(image: str) -> str:
@@ -115,7 +112,8 @@ def tracked_frames(
 def read_numbers(file: Path, count: int, what: str) -> NDArray[np.float64]:
     """Read the `count` numbers of a matrix from a small text file."""
     # float() on the words: np.loadtxt takes longer per file than reading the file.
-    words = read_text(file, f"{what} matrix").split()
+    # Windows prints -1.#INF, 1.#QNAN and -nan(ind).
+    words = ["nan" if {*w} & {*"#("} else w for w in read_text(file, f"{what} matrix").split()]
     if len(words) != count or not all(map(is_number, words)):
         raise InputError(f"{file}: expected a {what} matrix of {count} numbers, got {len(words)}")
     return np.array([float(word) for word in words])

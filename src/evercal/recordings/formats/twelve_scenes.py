@@ -12,7 +12,7 @@ from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.recordings.formats.seven_scenes import colour_images, tracked_frames
 from evercal.recordings.frame import Recording
-from evercal.recordings.images import image_size
+from evercal.recordings.images import first_size
 from evercal.recordings.text_files import read_text
 
 
@@ -25,7 +25,7 @@ def load(root: Path) -> Recording:
     """Read split, calibration and poses, and the size of one image; no other image is opened."""
     images = colour_images(root / "data")
     split = _test_count(root, len(images))
-    camera = _camera(root, images[0])
+    camera = _camera(root, images)
     train, test = (tracked_frames(part, camera) for part in (images[split:], images[:split]))
     return Recording(root.resolve().name, train, test, len(images) - len(train) - len(test))
 
@@ -41,7 +41,7 @@ def _test_count(root: Path, frames: int) -> int:
     return int(match[1])
 
 
-def _camera(root: Path, image: Path) -> Camera:
+def _camera(root: Path, images: list[Path]) -> Camera:
     file = root / "info.txt"
     text = read_text(file, "calibration", "it holds m_calibrationColorIntrinsic")
     lines = (line.partition("=") for line in text.splitlines())
@@ -54,4 +54,4 @@ def _camera(root: Path, image: Path) -> Camera:
         raise InputError(
             f"{file}: needs m_colorWidth, m_colorHeight and m_calibrationColorIntrinsic ({error!r})"
         ) from None
-    return camera.resized(*image_size(image))
+    return camera.resized(*first_size(images))

@@ -7,10 +7,9 @@ that of the camera on it in sensor.yaml. Record3D lists a rotation (quaternion x
 with OpenGL's axes.
 """
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path, PurePath
+from pathlib import Path, PureWindowsPath
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.formats.seven_scenes import read_numbers
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import IMAGE_ENDINGS, image_size
+from evercal.recordings.images import IMAGE_ENDINGS, files_in, first_size
 from evercal.recordings.poses import camera_file
 from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
 from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
@@ -122,11 +121,11 @@ def _frames(
         files = _by_image(file, images)
         for image in images:
             own = files.get(image.name, file / f"{image.stem}.txt")
-            lens = camera_file.read_camera_of_size(own, image_size(image), image.name)
+            lens = camera_file.read_camera_of_size(own, first_size([image, *images]), image.name)
             lenses[image.stem] = lens
     elif options.camera is not None or not lenses:
         stated = options.camera or (file if file.is_file() else None)
-        lenses = dict.fromkeys((i.stem for i in images), _camera(root, stated, images[0]))
+        lenses = dict.fromkeys((i.stem for i in images), _camera(root, stated, images))
     owner = "base_from_gripper" if layout.poses in _POSES + _JOINTS else "base_from_camera"
     split = layout.images.rpartition("rgb")[0]
     frames = tuple(
@@ -163,7 +162,7 @@ def _matrices(folder: Path, files: Mapping[str, Path]) -> RobotPoses:
 
 def _by_image(folder: Path, images: Sequence[Path]) -> dict[str, Path]:
     """Text files by the image that has their name, up to the ending or to the first dot."""
-    files = {file.stem: file for file in folder.glob("*.txt")}
+    files = {file.stem: file for file in files_in(folder, (".txt",))}
     short = {stem.partition(".")[0]: file for stem, file in files.items()}
     files = {**short, **files} if len(short) == len(files) else files
     found = {i.name: files.get(i.stem, files.get(i.name.partition(".")[0])) for i in images}
@@ -188,7 +187,7 @@ def _rows(
 
 
 def _urdf(root: Path, joints: Path) -> Path:
-    files = sorted(root.glob("*.urdf"))
+    files = files_in(root, (".urdf",))
     if len(files) != 1:
         number = f"{len(files)} URDF files" if files else "no URDF"
         raise InputError(f"{root}: {joints.name} needs a URDF, {number} is beside it; give --urdf")
@@ -197,15 +196,13 @@ def _urdf(root: Path, joints: Path) -> Path:
 
 def _images(root: Path, folders: Sequence[str]) -> list[Path]:
     for folder in folders:
-        names = os.listdir(root / folder) if (root / folder).is_dir() else []
-        images = [name for name in names if Path(name).suffix.lower() in IMAGE_ENDINGS]
-        if images:
-            return [root / folder / name for name in sorted(images, key=natural_key)]
+        if images := files_in(root / folder):
+            return sorted(images, key=lambda image: natural_key(image.name))
     where = " or in ".join("it" if folder == "." else folder for folder in folders)
     raise InputError(f"{root}: no images ({', '.join(IMAGE_ENDINGS)}) in {where}")
 
 
-def _camera(root: Path, file: Path | None, image: Path) -> Camera:
+def _camera(root: Path, file: Path | None, images: Sequence[Path]) -> Camera:
     if file is None:
         names = [name for name in _CAMERAS if (root / name).is_file()]
         if len(names) != 1:
@@ -216,7 +213,7 @@ def _camera(root: Path, file: Path | None, image: Path) -> Camera:
                 f" .npz or .txt"
             )
         file = root / names[0]
-    return camera_file.read_camera_of_size(file, image_size(image), image.name)
+    return camera_file.read_camera_of_size(file, first_size(images), images[0].name)
 
 
 def _stamps(root: Path) -> dict[str, float] | None:
@@ -226,7 +223,7 @@ def _stamps(root: Path) -> dict[str, float] | None:
     rows = read_rows(file, "a time for each image")
     if rows.names is None or rows.stamps_s is None:
         raise InputError(f"{file}: needs the columns image and stamp_s")
-    names = [PurePath(name).name for name in rows.names]
+    names = [PureWindowsPath(name).name for name in rows.names]
     with named_errors(file, "stamps"):
         refuse_repeated(names, "give every image one time")
     return dict(zip(names, rows.stamps_s.tolist(), strict=True))

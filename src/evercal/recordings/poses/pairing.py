@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePath
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, same_numbers, times_in_names
-from evercal.recordings.text_files import named_errors, refuse_repeated
+from evercal.recordings.text_files import few, named_errors, refuse_repeated
 
 Pairing = tuple[list[SE3 | None], list[str]]
 """The pose of each image, if it has one, and notes."""
@@ -50,18 +50,21 @@ def pair_images(
     return list(rows.poses), [f"images and poses were paired in order, {first} to {last}"]
 
 
-def poses_of_images(file: Path, images: Sequence[Path], convention: str | None = None) -> SE3:
-    """Read (n,) base_from_gripper of n images, for the commands with `--convention`."""
+def poses_of_images(
+    file: Path, images: Sequence[Path], convention: str | None = None
+) -> tuple[SE3, list[str]]:
+    """Read (n,) base_from_gripper of n images, with notes, for the commands with `--convention`."""
     rows = read_robot_poses(file, convention, option="--convention")
-    poses, _ = pair_images(images, rows, None, file)
+    poses, notes = pair_images(images, rows, None, file)
     missing = [image.name for image, pose in zip(images, poses, strict=True) if pose is None]
     if missing:
-        raise InputError(f"{file}: has no pose for {_few(missing)}; add it or leave the image out")
-    return SE3.stack([pose for pose in poses if pose is not None])
+        alone = few(missing, {*(rows.names or ())} - {image.name for image in images})
+        raise InputError(f"{file}: has no pose for {alone}; add it or leave the image out")
+    return SE3.stack([pose for pose in poses if pose is not None]), notes
 
 
 def _by_name(images: Sequence[Path], names: Sequence[str], poses: SE3, file: Path) -> Pairing:
-    keys = [PurePath(name).name for name in names]
+    keys = [PureWindowsPath(name).name for name in names]
     with named_errors(file, "poses"):
         refuse_repeated(keys, "give every image one row")
     by_name = dict(zip(keys, poses, strict=True))
@@ -76,14 +79,19 @@ def _by_name(images: Sequence[Path], names: Sequence[str], poses: SE3, file: Pat
             f"{file}: names no image of {images[0].parent}; its first is {names[0]!r}, the first"
             f" image is {images[0].name!r}; correct the names, or leave them out to pair in order"
         )
+    alone = [i.name for i, pose in zip(images, paired, strict=True) if pose is None]
+    return paired, unpaired(alone, [*by_name], file.name)
+
+
+def unpaired(images: Sequence[str], rows: Sequence[str], file: str) -> list[str]:
+    """Notes of images and rows of a file whose names have no counterpart."""
     notes = []
-    if None in paired:
-        alone = [i.name for i, pose in zip(images, paired, strict=True) if pose is None]
-        notes.append(f"{_count(len(alone), 'image')} without a row in {file.name}: {_few(alone)}")
-    if by_name:
-        rows = _count(len(by_name), "row")
-        notes.append(f"{rows} of {file.name} without an image: {_few(list(by_name))}")
-    return paired, notes
+    if images:
+        count = _count(len(images), "image")
+        notes.append(f"{count} without a row in {file}: {few(images, rows)}")
+    if rows:
+        notes.append(f"{_count(len(rows), 'row')} of {file} without an image: {few(rows)}")
+    return notes
 
 
 def _by_time(times: NDArray[np.float64], track: PoseTrack, file: Path) -> Pairing:
@@ -118,8 +126,3 @@ def _image_times(
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
-def _few(names: Sequence[str], most: int = 4) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

@@ -11,7 +11,7 @@ import re
 import zipfile
 from collections.abc import Iterable, Sequence
 from itertools import chain
-from pathlib import Path, PurePath
+from pathlib import Path, PureWindowsPath
 from typing import IO, Any, NamedTuple
 
 import numpy as np
@@ -279,7 +279,7 @@ def times_in_names(names: Sequence[str]) -> Array | None:
 
 def without_ending(name: str) -> str:
     """Name of an image without folder and image ending; `12.5` stays as it is."""
-    path = PurePath(name)
+    path = PureWindowsPath(name)
     return path.stem if path.suffix.lower() in IMAGE_ENDINGS else path.name
 
 

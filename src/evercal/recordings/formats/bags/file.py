@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from evercal.errors import InputError, missing_extra
+from evercal.recordings.images import files_in
+from evercal.recordings.text_files import few
 
 _FILES = (".bag", ".mcap", ".db3")
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -71,8 +73,7 @@ class BagFile:
     def contents(self) -> str:
         """List of the topics, for messages."""
         words = [f"{t} ({kind.replace('/msg', '')})" for t, kind in sorted(self.kinds.items())]
-        more = f" and {len(words) - 30} more" if len(words) > 30 else ""
-        return (", ".join(words[:30]) or "nothing") + more
+        return few(words, most=30) or "nothing"
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Iterate over the messages of some topics in recorded order."""
@@ -133,14 +134,15 @@ def _parts(path: Path) -> list[Path]:
     metadata = path / "metadata.yaml"
     if metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()[:1000]:
         return [path]
-    inside = sorted(path.iterdir()) if path.is_dir() else []
-    return [part for part in inside if part.suffix in _FILES and part.is_file()]
+    return [part for part in files_in(path, _FILES) if part.is_file()]
 
 
 def _reason(error: Exception) -> str:
     text = " ".join(str(error).split())[:200] or type(error).__name__
     if "not indexed" in text:
         return f"{text}; repair it with 'rosbag reindex'"
+    if "end magic" in text:
+        return f"{text} The recorder did not end; restore it with 'mcap recover FILE -o NEW.mcap'"
     if "Profile is not ros2" in text:
         return "its messages are not ROS 2's; convert it, or record with ros2 bag"
     return text
