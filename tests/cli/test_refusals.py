@@ -103,7 +103,6 @@ REFUSED = {
     "learn new ROOM --strategy joint": "does not train a network scene by scene",
     "learn new ROOM --strategy nonsense": "finetune",
     "localize MAP image.png none.png": "none.png: image file is missing",
-    "localize MAP image.png broken.png": "broken.png",
     "localize MAP": "no image given",
     "localize MAP image.png --device cuda": "--device cuda: a map needs no device",
     "localize MAP image.png --camera broken.png": "broken.png",

@@ -79,8 +79,9 @@ class Solve(args.Verb):
         if self.time_offset:
             return solve_with_offset(*read_streams(files), self.mount, scale_known)
         pairs, corners = read_pairs(files)
-        say_notes(pairs.notes)
-        return solve(pairs, self.mount, scale_known, corners)
+        solved = solve(pairs, self.mount, scale_known, corners)
+        say_notes(pairs.notes)  # a refusal is one line
+        return solved
 
     def _with_image_paths(self, calibration: "Calibration") -> "Calibration":
         """Make image paths relative to the calibration, where `evercal report` looks them up."""
