@@ -158,7 +158,7 @@ def test_detect_refuses_unusable_input(run: Any, tmp_path: Path) -> None:
     bad.write_text("{}")
     small.write_text(json.dumps({**CAMERA.to_dict(), "width": 320, "height": 240}))
     for words, reason in (
-        ([paths[0], "--board", "chessboard", "--square-mm", "30"], "size of 3x3 or more"),
+        ([paths[0], "--board", "chessboard", "--square-mm", "30"], "size of 3x3 to 200x200"),
         ([paths[0], "--board", "chessboard", "--size", "9x6"], "--square-mm"),
         ([paths[0], *board[:3], "9 by 6", *board[4:]], "9x6"),
         ([tmp_path / "no.png", *board], "missing"),

@@ -303,8 +303,8 @@ def nerfstudio(export: Export) -> str:
     camera, (names, poses) = export.camera, _image_poses(export)
     matrices = pose_numbers(poses, "matrix:opengl").reshape(-1, 4, 4).tolist()
     fisheye = camera.model == "fisheye"
-    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-    if any(camera.distortion[len(names) :]):
+    terms = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    if any(camera.distortion[len(terms) :]):
         # nerfstudio's k4 is the fourth coefficient of a polynomial, not OpenCV's k4.
         raise InputError(
             "there are no terms for k4 k5 k6 of this camera; calibrate it with k1 k2 p1 p2 k3,"
@@ -315,7 +315,7 @@ def nerfstudio(export: Export) -> str:
         **{"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy},
         **{"cx": camera.cx + 0.5, "cy": camera.cy + 0.5},
         **dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0),
-        **dict(zip(names, camera.coefficients, strict=False)),
+        **dict(zip(terms, camera.coefficients, strict=False)),
         "frames": [
             {"file_path": name, "transform_matrix": matrix}
             for name, matrix in zip(names, matrices, strict=True)
