@@ -126,8 +126,9 @@ def damaged(kind: str, room: Path, folder: Path) -> Path:
     """A recording with one mistake."""
     shutil.copytree(room, folder)
     data = json.loads((folder / "scene.json").read_text())
-    if kind == "missing image":
-        (folder / "images/000003.png").unlink()
+    if kind == "missing images":
+        for file in sorted((folder / "images").iterdir())[1:]:
+            file.unlink()
     elif kind == "few frames":
         data["frames"] = data["frames"][:5]
     elif kind == "no poses":
@@ -139,7 +140,7 @@ def damaged(kind: str, room: Path, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "kind", ["missing image", "broken json", "few frames", "no poses", "escape"]
+    "kind", ["missing images", "broken json", "few frames", "no poses", "escape"]
 )
 @pytest.mark.parametrize("new", [False, True])
 def test_bad_recordings_are_one_line_and_leave_the_store(
@@ -153,17 +154,17 @@ def test_bad_recordings_are_one_line_and_leave_the_store(
     assert into.exists() is not new
 
 
-def test_a_broken_image_leaves_the_scenes_of_the_map(
-    run: Any, store: Path, rooms: Any, snapshot: Any, tmp_path: Path
+def test_a_broken_image_is_left_out_and_named(
+    run: Any, store: Path, rooms: Any, tmp_path: Path
 ) -> None:
     copy = Path(shutil.copytree(store, tmp_path / "store"))
-    before = snapshot(copy)
     shutil.copytree(rooms[1], tmp_path / "scene")
     (tmp_path / "scene/images/000003.png").write_bytes(b"no image")
     ran = run("learn", copy, tmp_path / "scene")
-    assert (ran.code, len(ran.err)) == (2, 1)
+    assert ran.code == 0, ran.err
+    assert "1 of 30 images are missing or unreadable and left out" in ran.err[0]
     assert "000003.png" in ran.err[0]
-    assert snapshot(copy) == before
+    assert Map.open(copy).scenes[:-1] == Map.open(store).scenes
 
 
 def test_other_folders_are_not_overwritten(

@@ -14,7 +14,6 @@ from evercal.cli.console import require_writable, say, say_notes, size
 from evercal.cli.info import adjusted_row
 from evercal.errors import InputError
 from evercal.progress import Bars
-from evercal.recordings.text_files import few
 
 if TYPE_CHECKING:
     from evercal.learning.scene import LearnReport
@@ -294,6 +293,8 @@ def _warnings(adjusted: "Adjusted") -> Iterator[str]:
         ("warning: poses with large errors", adjusted.doubtful_poses),
     ):
         if names:
+            from evercal.recordings.text_files import few
+
             yield f"{what}: {few(names, most=8)}"
 
 

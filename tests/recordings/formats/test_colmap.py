@@ -135,10 +135,11 @@ def test_the_orientation_is_ignored_as_by_colmap(value: int, tmp_path: Path) -> 
     make(tmp_path)
     pixels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     pixels[:, : WIDTH // 2] = 200
-    for file in sorted((tmp_path / "images/sub").glob("image-*.png")):
+    files = sorted((tmp_path / "images/sub").glob("image-*.png"))
+    for file in files:
         write_image(tmp_path / "a.jpg", pixels)
         file.write_bytes(with_orientation((tmp_path / "a.jpg").read_bytes(), value))
-    stored = pycolmap.Bitmap.read(str(file), as_rgb=True).to_array()
+    stored = pycolmap.Bitmap.read(str(files[-1]), as_rgb=True).to_array()
     frames = load_recording(tmp_path).train
     np.testing.assert_allclose(frames[0].read_image().astype(int), stored, atol=3)
     generic.write(tmp_path / "copy", load_recording(tmp_path))
