@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evercal import Map
 from evercal.calibration.calibration import read_calibration
 from evercal.mapping.store import MapStore
 from evercal.recordings.samples import CELL
