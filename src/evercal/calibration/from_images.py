@@ -31,6 +31,7 @@ from evercal.calibration.located import (
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, cross_matrix, pose_distance
+from evercal.geometry.camera import COEFFICIENTS
 from evercal.localization.estimate import Cause
 from evercal.localization.intrinsics import STATED, cameras_in_scenes
 from evercal.recordings.image_files import image_files
@@ -184,7 +185,7 @@ def estimated_camera(used: Sequence[ImagePose], stated: Camera) -> Camera:
         return stated
     rows = [[c.fx, c.fy, c.cx, c.cy, *c.coefficients] for c in cameras]
     fx, fy, cx, cy, *distortion = np.median(rows, axis=0).tolist()
-    terms = tuple(distortion[: 4 if stated.model == "fisheye" else 8])
+    terms = tuple(distortion[: len(COEFFICIENTS[stated.model])])
     median = replace(stated, fx=fx, fy=fy, cx=cx, cy=cy, distortion=terms)
     across = np.linspace(0, 1, 5)[:, None] * [stated.width - 1, stated.height - 1]
     pixels = np.stack(np.meshgrid(*across.T), -1)

@@ -218,6 +218,7 @@ class _EpipolarFit:
     ):
         self.rotation, self.spread_m = Rotation.identity(), spread_m
         self.matrices, self.pairs = poses.matrix(), pairs
+        self.ends = np.array([pair[:2] for pair in pairs])
         some = [
             np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int))
             for n in (pair.rays.shape[1] for pair in pairs)
@@ -264,8 +265,7 @@ class _EpipolarFit:
     def distances(self, x: Array) -> Array:
         """(m,) angles of matches from their epipolar planes, radians."""
         camera = self.matrices @ self.transform(x).matrix()
-        pairs = np.array([pair[:2] for pair in self.pairs])
-        second_from_first = np.linalg.inv(camera[pairs[:, 1]]) @ camera[pairs[:, 0]]
+        second_from_first = np.linalg.inv(camera[self.ends[:, 1]]) @ camera[self.ends[:, 0]]
         moved = second_from_first[:, :3, 3]
         direction = moved / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-9)
         essential = (cross_matrix(direction) @ second_from_first[:, :3, :3])[self.number]

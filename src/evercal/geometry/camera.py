@@ -23,6 +23,11 @@ Array = NDArray[np.float64]
 Model = Literal["pinhole", "fisheye"]
 FISHEYE_DEG = 85.0
 """Largest angle to the optical axis of a ray of a fisheye."""
+COEFFICIENTS: dict[str, tuple[str, ...]] = {
+    "pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+"""Names of the distortion coefficients of each model, in OpenCV's order."""
 _COEFFICIENT_COUNTS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
 _EXACT = 1e-10
 """Tolerance of undistorted points on the plane z = 1."""
@@ -74,7 +79,7 @@ class Camera:
         distortion = tuple(float(value) for value in self.distortion)
         counts = _COEFFICIENT_COUNTS[self.model]
         if len(distortion) not in counts or not all(map(math.isfinite, distortion)):
-            names = "k1 k2 k3 k4" if self.model == "fisheye" else "k1 k2 p1 p2 k3 k4 k5 k6"
+            names = " ".join(COEFFICIENTS[self.model])
             raise ValueError(
                 f"camera distortion has {', '.join(map(str, counts[:-1]))} or {counts[-1]} finite"
                 f" coefficients (OpenCV's {names}), got {distortion}"

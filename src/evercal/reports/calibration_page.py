@@ -12,6 +12,7 @@ from evercal.calibration.located import deviations, length_mm_deg
 from evercal.calibration.verdict import TIERS, expected_error, tier, verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.geometry.camera import COEFFICIENTS
 from evercal.reports.calibration_images import AnnotatedImages
 from evercal.reports.charts import Chart, Panel, Shape
 from evercal.reports.overlay import origin_in_view
@@ -253,9 +254,7 @@ def camera_table(calibration: Calibration) -> Table:
     if camera is not None:
         sigma = calibration.checks.get("camera_sigma", {})
         values = {f"{name} (px)": getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
-        names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        names = ("k1", "k2", "k3", "k4") if camera.model == "fisheye" else names
-        values |= dict(zip(names, camera.distortion, strict=False))
+        values |= dict(zip(COEFFICIENTS[camera.model], camera.distortion, strict=False))
         rows = [
             (name, f"{value:.4f}", _fixed(sigma.get(name.partition(" ")[0]), 4))
             for name, value in values.items()

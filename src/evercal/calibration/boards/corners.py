@@ -19,7 +19,7 @@ from scipy.stats import norm
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, cross_matrix
-from evercal.geometry.camera import Model
+from evercal.geometry.camera import COEFFICIENTS, Model
 
 Array = NDArray[np.floating]
 
@@ -259,8 +259,8 @@ def _apart(view: BoardView, pose: BoardPose) -> tuple[Array, float]:
     return np.linalg.norm(apart, axis=1), max(sigma, _LEAST_PX)
 
 
-LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-FISHEYE = (*LENS[:6], "k3", "k4")
+LENS = {name: ("fx", "fy", "cx", "cy", *terms) for name, terms in COEFFICIENTS.items()}
+"""Names of the intrinsics of each model."""
 MIN_VIEWS = 5
 """Minimum number of views of a flat board."""
 _USUAL_CENTRE, _USUAL_ASPECT, _ROUGH_FOCAL = 0.1, 0.02, 0.5
@@ -340,7 +340,7 @@ def lens_estimate(
 
 
 def lens_vector(camera: Camera) -> Array:
-    """Return the 9 or 12 intrinsics in the order of `LENS`, or the 8 of `FISHEYE`."""
+    """Return the intrinsics in the order of `LENS`: 9 or 12, or 8 of a fisheye."""
     distortion = np.zeros(max(4 if camera.model == "fisheye" else 5, len(camera.distortion)))
     distortion[: len(camera.distortion)] = camera.distortion
     return np.r_[camera.fx, camera.fy, camera.cx, camera.cy, distortion]

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.corners import (
     BEND,
-    FISHEYE,
     LENS,
     Bend,
     BoardPose,
@@ -228,8 +227,7 @@ class Measured(NamedTuple):
         poses = [pose for pose, use in zip(self.poses, accepted, strict=True) if use]
         change, information = lens_estimate(poses, self.sigma_px, self.camera, self.bend, prior)
         slopes = np.stack([pose.lens_slope for pose in self.poses])
-        lens = FISHEYE if self.camera.model == "fisheye" else LENS
-        names = (*lens[: len(change) - len(BEND)], *BEND)
+        names = (*LENS[self.camera.model][: len(change) - len(BEND)], *BEND)
         return Extras(names, ("intrinsics",) * len(names), slopes, information, change)
 
 

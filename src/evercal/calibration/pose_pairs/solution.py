@@ -131,7 +131,9 @@ class PairSolution:
         if self.lens is not None:
             checks["corner_sigma_px"] = self.lens.sigma_px
             checks["corners_left_out"] = list(self.corners.left_out) if self.corners else []
-            checks["camera_sigma"] = {name: sigma[name] for name in LENS if name in sigma}
+            checks["camera_sigma"] = {
+                name: sigma[name] for name in LENS[self.lens.camera.model] if name in sigma
+            }
         return checks
 
     def _by_name(self, values: Array) -> dict[str, float]:

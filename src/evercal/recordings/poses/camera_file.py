@@ -19,6 +19,7 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
+from evercal.geometry.camera import COEFFICIENTS
 from evercal.recordings.poses.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import arrays_as_lists, is_number
 from evercal.recordings.text_files import named_errors, naming, read_text, yaml_documents
@@ -37,8 +38,7 @@ _MODELS = {
 _SUPPORTED = ("brown", "none", "zero", "fisheye")
 _MODEL_KEYS = ("distortionmodel", "model", "cameramodel", "modeltype", "projectionmodel")
 _LENGTHS = (0, 4, 5, 8)
-_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_FISHEYE = ("k1", "k2", "k3", "k4")
+_COEFFICIENTS, _FISHEYE = COEFFICIENTS["pinhole"], COEFFICIENTS["fisheye"]
 _ALIASES = {
     "camera_matrix": (
         "cameramatrix", "intrinsicmatrix", "cameraintrinsics", "intrinsics", "intrinsic",
