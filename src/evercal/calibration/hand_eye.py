@@ -24,6 +24,7 @@ from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
+from evercal.mapping.arm_offsets import ArmOffsets, has_joints
 from evercal.mapping.build import Adjusted, BuiltMap, HandEyeCorrection
 from evercal.progress import OnProgress
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame, Mount, Recording, stated_grippers
@@ -125,8 +126,9 @@ def posed_by_gripper(
     require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
     if mount == "eye_to_hand":
         frames, _ = moving_parts(frames)
+    arm = recording.arm if has_joints(frames) else None
     try:
-        start = hand_eye_start(frames, mount, encoder, on_progress)
+        start = hand_eye_start(frames, mount, encoder, on_progress, arm)
     except InputError as error:
         hint = ""
         if mount == "eye_in_hand" and (still := moving_parts(frames)[1]) > STILL_SHARE:
@@ -135,6 +137,8 @@ def posed_by_gripper(
                 " calibrates a fixed camera by a thing in the gripper"
             )
         raise InputError(f"{recording.name}: {error}{hint}") from None
+    if arm is not None:
+        frames = tuple(ArmOffsets.start(arm, start.offsets).moved(frames, mount))
     poses = scene_from_parent(frames, mount) @ start.parent_from_camera
     if mount == "eye_to_hand" and (around := windows(frames, start)) is not None:
         frames = tuple(cropped(*both) for both in zip(frames, around, strict=True))

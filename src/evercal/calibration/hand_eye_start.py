@@ -9,10 +9,10 @@ A camera on the gripper moves in the base. A fixed camera moves, as the gripper 
 thing that the gripper holds, with the inverse poses.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,7 @@ from evercal.mapping.selection import spread_poses
 from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, Mount, stated_grippers
+from evercal.recordings.poses.arm import Arm
 
 Array = NDArray[np.float64]
 
@@ -44,6 +45,8 @@ LEAST_ROTATION_DEG, LEAST_PAIRS = 5.7, 6
 """Root mean square angle between frames about each of two axes, and pairs that must agree."""
 SPREAD_M: dict[Mount, float] = {"eye_in_hand": 0.2, "eye_to_hand": 2.0}
 """Standard deviation of the position of the camera before any image."""
+JOINT_SPREAD = np.deg2rad(3.0)
+"""Standard deviation of the offset of a joint, radians or metres."""
 DEPTHS_M = (0.3, 0.6, 1.2, 2.4)
 """First distances between a fixed camera and the gripper."""
 STILL_PX = 2.0
@@ -86,6 +89,21 @@ class HandEyeStart:
     """The pairs that agree."""
     distance_deg: float = 0.0
     """Median angle of matches from their epipolar planes, median of the pairs."""
+    offsets: Array = field(default_factory=lambda: np.zeros(0))
+    """(k,) first offsets of the joints of an arm."""
+
+
+class Joints(NamedTuple):
+    """Joint values of n frames."""
+
+    arm: Arm
+    values: Array
+    """(n, k)."""
+
+    def matrices(self, offsets: Array, mount: Mount) -> Array:
+        """(n, 4, 4) as `scene_from_parent`, with offsets (k,)."""
+        poses = self.arm.poses(self.values + offsets * self.arm.free())
+        return (poses if mount == "eye_in_hand" else poses.inverse()).matrix()
 
 
 def scene_from_parent(frames: Sequence[Frame], mount: Mount) -> SE3:
@@ -99,16 +117,21 @@ def hand_eye_start(
     mount: Mount,
     encoder: Encoder,
     on_progress: OnProgress = lambda *_: None,
+    arm: Arm | None = None,
 ) -> HandEyeStart:
-    """Estimate the transform of a camera from frames that all have `base_from_gripper`."""
+    """Estimate the transform of a camera from frames that all have `base_from_gripper`.
+
+    If `arm` is given, the frames state its joint values, and their offsets are estimated, too.
+    """
     poses = scene_from_parent(frames, mount)
     require_rotations(poses, LEAST_ROTATION_DEG, LEAST_ROTATION_DEG)
     if len(frames) > FRAMES:
         some = spread_poses(poses, FRAMES)
         frames, poses = [frames[i] for i in some], poses[some]
     pairs = image_pairs(frames, mount, encoder, on_progress)
+    joints = arm and Joints(arm, np.array([frame.joints_rad for frame in frames]))
     try:
-        start = solve_pairs(poses, pairs, mount)
+        start = solve_pairs(poses, pairs, mount, joints)
     except InputError:
         _refuse_other_mount(poses.inverse(), pairs, mount, None)
         raise
@@ -138,7 +161,9 @@ def _refuse_other_mount(
     )
 
 
-def solve_pairs(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> HandEyeStart:
+def solve_pairs(
+    poses: SE3, pairs: Sequence[ImagePair], mount: Mount, joints: Joints | None = None
+) -> HandEyeStart:
     """Solve for the transform from pairs between n frames with `scene_from_parent` (n,)."""
     if len(pairs) < LEAST_PAIRS:
         raise InputError(
@@ -151,6 +176,10 @@ def solve_pairs(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> HandEye
     starts, most = epipolar.starts(mount), np.deg2rad(AGREE_DEG)
     fits = [epipolar.solve(start, np.mean(starts, axis=0)) for start in starts]
     best = min(fits, key=lambda x: np.minimum(epipolar.medians(x), most).mean())
+    if joints is not None:
+        epipolar.moving = lambda offsets: joints.matrices(offsets, mount)
+        still = np.zeros(len(joints.arm.joints))
+        best = epipolar.solve(np.r_[best, still], np.r_[np.mean(starts, axis=0), still])
     distance = epipolar.medians(best)
     agree = distance < most
     _refuse_disagreement(agree)
@@ -161,6 +190,7 @@ def solve_pairs(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> HandEye
         len(pairs),
         tuple(pair for pair, good in zip(pairs, agree, strict=True) if good),
         float(np.rad2deg(np.median(distance))),
+        best[6:] if joints is None else best[6:] * joints.arm.free(),
     )
 
 
@@ -218,6 +248,7 @@ class _EpipolarFit:
     ):
         self.rotation, self.spread_m = Rotation.identity(), spread_m
         self.matrices, self.pairs = poses.matrix(), pairs
+        self.moving: Callable[[Array], Array] = lambda _: self.matrices
         self.ends = np.array([pair[:2] for pair in pairs])
         some = [
             np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int))
@@ -244,7 +275,8 @@ class _EpipolarFit:
 
         def residuals(x: Array, scale: float) -> Array:
             # The matches of a pair share the errors of its poses, so each pair counts as one match.
-            away = np.sqrt(matches) * (x - centre)[3:] / self.spread_m
+            spread = np.where(np.arange(len(x)) < 6, self.spread_m, JOINT_SPREAD)[3:]
+            away = np.sqrt(matches) * (x - centre)[3:] / spread
             # The loss of these residuals is quadratic: the prior is no outlier.
             prior = scale * np.sign(away) * np.sqrt(np.expm1(np.minimum(away**2, 500.0)))
             return np.r_[self.distances(x), prior]
@@ -256,7 +288,7 @@ class _EpipolarFit:
                 args=(scale,),
                 loss="cauchy",
                 f_scale=scale,
-                x_scale=X_SCALE,
+                x_scale=np.r_[X_SCALE, np.full(len(x) - 6, X_SCALE[0])],
                 max_nfev=50,
             ).x
             scale = min(scale, max(3 * float(np.median(np.abs(self.distances(x)))), 1e-4))
@@ -264,7 +296,7 @@ class _EpipolarFit:
 
     def distances(self, x: Array) -> Array:
         """(m,) angles of matches from their epipolar planes, radians."""
-        camera = self.matrices @ self.transform(x).matrix()
+        camera = self.moving(x[6:]) @ self.transform(x).matrix()
         second_from_first = np.linalg.inv(camera[self.ends[:, 1]]) @ camera[self.ends[:, 0]]
         moved = second_from_first[:, :3, 3]
         direction = moved / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-9)
@@ -282,7 +314,7 @@ class _EpipolarFit:
     def transform(self, x: Array) -> SE3:
         """parent_from_camera of parameters (6,)."""
         turned = Rotation.from_rotvec(x[:3]) * self.rotation
-        return SE3(turned.as_quat(canonical=True, scalar_first=True), x[3:])
+        return SE3(turned.as_quat(canonical=True, scalar_first=True), x[3:6])
 
 
 def image_pairs(

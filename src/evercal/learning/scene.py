@@ -10,6 +10,7 @@ from evercal.geometry import SE3, Camera
 from evercal.learning.stated_scatter import with_scatter
 from evercal.localization.acceptance import differ
 from evercal.localization.localizer import Localizer
+from evercal.mapping.arm_offsets import ArmOffsets
 from evercal.mapping.build import Adjusted, MapOptions, build_map
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -92,7 +93,12 @@ def learn_scene(
         from evercal.calibration.hand_eye import posed_by_gripper
 
         recording, start = posed_by_gripper(recording, mount, contents.encoder, on_progress)
-        options = options.for_hand_eye(mount)
+        arm = (
+            ArmOffsets.start(recording.arm, start.offsets)
+            if recording.arm and len(start.offsets)
+            else None
+        )
+        options = replace(options.for_hand_eye(mount), arm=arm)
         least, budget = MIN_GRIPPER_FRAMES, replace(budget, least=MIN_GRIPPER_FRAMES)
     recording = posed_recording(recording)
     require_frames(recording, least)
@@ -102,6 +108,8 @@ def learn_scene(
     options = _sized(options, budget, contents.short_side)
     options = replace(options, metric=recording.metric)
     built = build_map(recording.name, split.train, contents.encoder, options, on_progress)
+    global LAST
+    LAST = built.hand_eye and built.hand_eye.arm  # DEBUG
     if options.mount == "eye_to_hand":
         built = replace(built, scene=of_whole_images(built.scene, whole[0].camera))
     if budget.auto:

@@ -16,6 +16,7 @@ from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera
 from evercal.geometry.uncertain_pose import frame_covariance
+from evercal.mapping.arm_offsets import ArmOffsets, joint_slopes
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment, BundleOptions
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.map_frame import MapFrame, Similarity, fit_correction, shared_sigma
@@ -37,6 +38,7 @@ from evercal.mapping.tracks import (
 from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, Mount, stated_grippers, stated_poses
+from evercal.recordings.poses.arm import Arm
 
 HAND_EYE_COVARIANCE_SCALE = 2.5
 """Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
@@ -68,7 +70,8 @@ class MapOptions:
     """Adjust poses and intrinsics. False keeps them as stated."""
     rounds: int = 2
     """Rounds of tracking and adjusting; the second runs only if the first moved something."""
-
+    arm: ArmOffsets | None = None
+    """Joint offsets that the stated poses contain, in a hand-eye calibration; they are adjusted."""
     mount: Mount | None = None
     """Mount of a camera whose poses follow from those of a gripper; see `for_hand_eye`."""
 
@@ -146,6 +149,8 @@ class HandEyeCorrection:
     """(6,) deviation of each frame's gripper pose from the images, by name; gripper frame."""
     moved: dict[str, NDArray[np.float64]]
     """(6,) the same as a motion of the camera, camera frame."""
+    arm: ArmOffsets | None = None
+    """Offsets of the joints of the arm, where its joint values are stated."""
 
     @property
     def covariance(self) -> NDArray[np.float64]:
@@ -180,10 +185,12 @@ class BuiltMap:
         """Other frames of the recording, with the adjusted `gripper_from_camera`."""
         if self.hand_eye is None:
             return list(frames)
-        change = self.hand_eye.start_camera_from_camera
+        change, arm = self.hand_eye.start_camera_from_camera, self.hand_eye.arm
+        # Only the map of a wrist camera has other frames.
+        moved = frames if arm is None else arm.moved(frames, "eye_in_hand")
         return [
             replace(frame, base_from_camera=frame.base_from_camera @ change)
-            for frame in frames
+            for frame in moved
             if frame.base_from_camera is not None
         ]
 
@@ -346,19 +353,26 @@ def _adjust(
 ) -> Adjustment:
     """Alternate tracking and bundle adjustment."""
     stated_cameras = list(prepared.cameras)
-    adjustment = None
+    arm, mount, adjustment = options.arm, options.mount, None
     for number in range(options.rounds):
         on_progress("adjusting", number, options.rounds)
         tracks = bundle_tracks(prepared, keyframes)
+        joints = None
+        if arm is not None and mount is not None:
+            joints = joint_slopes(arm, prepared.frames, mount)
         problem = BundleAdjustment(
             prepared.stated,
             stated_cameras,
             velocity,
             options.bundle,
-            _gripper_from_camera(prepared, options.mount),
+            _gripper_from_camera(prepared, mount),
+            joints,
         )
         adjustment = problem.solve(tracks)
         prepared.adjust(adjustment.poses, adjustment.cameras)
+        if arm is not None and mount is not None:
+            arm = _offsets(arm.arm, adjustment)
+            prepared.frames = tuple(arm.moved(prepared.frames, mount))
         if not _moved(prepared.stated, stated_cameras[0], adjustment):
             break
         again = partial(refine_depths, prepared, again=True)
@@ -367,6 +381,11 @@ def _adjust(
     on_progress("adjusting", options.rounds, options.rounds)
     assert adjustment is not None, "at least one round"
     return adjustment
+
+
+def _offsets(arm: Arm, adjustment: Adjustment) -> ArmOffsets:
+    covariance = HAND_EYE_COVARIANCE_SCALE * adjustment.offsets_covariance
+    return ArmOffsets(arm, adjustment.offsets, covariance, adjustment.offsets_prior)
 
 
 def _gripper_from_camera(prepared: PreparedFrames, mount: Mount | None) -> SE3 | None:
@@ -426,8 +445,11 @@ def _finish(
             names = [frame.name for frame in frames.frames]
             residuals = dict(zip(names, adjustment.errors, strict=True))
             moved = dict(zip(names, adjustment.correction, strict=True))
+            arm = None
+            if options.arm is not None and len(adjustment.offsets):
+                arm = _offsets(options.arm.arm, adjustment)
             hand_eye = HandEyeCorrection(
-                common, by_noise - by_lens, by_lens, by_drift, residuals, moved
+                common, by_noise - by_lens, by_lens, by_drift, residuals, moved, arm
             )
             base = frame_covariance(frames.stated @ common, hand_eye.covariance)
             frame = replace(frame, common=SE3.identity(), base_covariance=base)

@@ -2,10 +2,11 @@
 
 Unknown are the inverse depth of every landmark, a correction of every frame's pose, one transform
 common to all frames (an error of `gripper_from_camera`), a constant time shift between poses and
-images, and the intrinsics. Gaussian priors tie them to the stated values. The variances of the
-priors are estimated from the recording (variance components: Foerstner and Wrobel, Photogrammetric
-Computer Vision, 2016, section 4.2.4; relevance of single parameters: MacKay, Bayesian
-interpolation, 1992). So parameters that the images do not constrain keep their stated values.
+images, the intrinsics, and, where the joint values of an arm are known, their offsets. Gaussian
+priors tie them to the stated values. The variances of the priors are estimated from the recording
+(variance components: Foerstner and Wrobel, Photogrammetric Computer Vision, 2016, section 4.2.4;
+relevance of single parameters: MacKay, Bayesian interpolation, 1992). So parameters that the images
+do not constrain keep their stated values.
 
 The steps are Levenberg-Marquardt. Landmarks are eliminated by the Schur complement, which leaves
 dense normal equations with six rows a frame: 8 (6 n + 12)^2 bytes, and time in proportion to n^3.
@@ -13,6 +14,7 @@ dense normal equations with six rows a frame: 8 (6 n + 12)^2 bytes, and time in 
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +36,7 @@ from evercal.mapping.bundle_equations import (
 
 Array = NDArray[np.floating]
 
-_GROUPS = ((0, 3), (3, 6), (6, 7), (7, 8), (8, 10), (10, 12))
+_GROUPS = ((0, 3), (3, 6), (6, 7), (-5, -4), (-4, -2), (-2, None))
 """Shared parameters that are relevant or not together: common translation, common rotation, time
 shift, focal length, principal point, distortion."""
 MIN_NOISE = 0.02
@@ -75,6 +77,10 @@ class BundleOptions:
     common_stated: bool = True
     """The common transform stays zero unless the images contradict. False for a rough
     `gripper_from_camera`: the common transform is estimated with its full uncertainty."""
+    joint_sigma_deg: float = 3.0
+    """Prior standard deviation of the offset of a joint, degrees, before it is estimated."""
+    joint_sigma_m: float = 0.01
+    """The same for sliding joints, metres."""
     shift_sigma_frames: float = 2.0
     """Prior standard deviation of the time shift, in frames of the recording."""
     focal_sigma: float = 0.02
@@ -134,6 +140,23 @@ class Adjustment:
     """(n, 6, 6) of the adjusted poses, camera frame."""
     inverse_depth: Array
     """(p,) per metre."""
+    offsets: Array
+    """(k,) offsets of the joints of an arm, radians, or metres of sliding joints."""
+    offsets_covariance: Array
+    """(k, k) with systematic errors."""
+    offsets_prior: Array
+    """(k,) estimated standard deviation of the offsets of this arm."""
+
+
+class JointSlopes(NamedTuple):
+    """How joints of an arm move the gripper, in n frames."""
+
+    slopes: Array
+    """(n, 6, k) see `Arm.slopes`."""
+    rotates: NDArray[np.bool_]
+    """(k,) whether a value is an angle."""
+    at: Array
+    """(k,) offsets that the stated poses contain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +168,7 @@ class Variances:
     weight: Array
     """(n,) weights of the stated poses."""
     shared: Array
-    """(12,) variances of the shared parameters."""
+    """(12 + k,) variances of the shared parameters."""
 
     def close_to(self, other: "Variances") -> bool:
         """Whether two priors are the same in all digits that matter."""
@@ -176,7 +199,8 @@ class BundleAdjustment:
     but for the principal point.
     The velocity (n, 6) is the motion from frame to frame, camera frame, metres and radians; 0 if
     unknown. With `gripper_from_camera` (n,), the errors of stated poses are those of an arm: they
-    arise at the gripper, and its rotation moves the camera on a lever.
+    arise at the gripper, and its rotation moves the camera on a lever. With `joints`, offsets of
+    its joints are estimated.
     """
 
     def __init__(
@@ -186,10 +210,24 @@ class BundleAdjustment:
         velocity: Array,
         options: BundleOptions,
         gripper_from_camera: SE3 | None = None,
+        joints: JointSlopes | None = None,
     ):
         self.options, self.n, self.velocity = options, len(stated), velocity
         at = SE3.identity((len(stated),)) if gripper_from_camera is None else gripper_from_camera
         self.gripper_from_camera, self.lever = at, at.adjoint()
+        none = np.zeros((self.n, 6, 0))
+        self.joints = joints or JointSlopes(none, np.zeros(0, dtype=bool), np.zeros(0))
+        own, still = (
+            np.linalg.solve(self.lever, self.joints.slopes),
+            np.tile(np.eye(6), (self.n, 1, 1)),
+        )
+        self.motion = np.concatenate([still, velocity[..., None], own], axis=2)
+        """(n, 6, 7 + k) motion of each camera by common transform, time shift and joints."""
+        self.size = SHARED + own.shape[2]
+        self.moving, self.offsets = (
+            slice(0, self.size - INTRINSICS),
+            slice(7, self.size - INTRINSICS),
+        )
         self.frames = StatedFrames(stated, cameras)
         self.distorted = any(cameras[0].distortion)
 
@@ -207,7 +245,9 @@ class BundleAdjustment:
 
     def start(self, tracks: BundleTracks) -> Estimate:
         """The stated values."""
-        parameters = Parameters(np.zeros((self.n, 6)), np.zeros(SHARED), tracks.inverse_depth)
+        shared = np.zeros(self.size)
+        shared[self.offsets] = self.joints.at
+        parameters = Parameters(np.zeros((self.n, 6)), shared, tracks.inverse_depth)
         return Estimate(parameters, self.frames.linearise(tracks, parameters), np.zeros((0, 0)))
 
     def start_variances(self) -> Variances:
@@ -223,8 +263,12 @@ class BundleAdjustment:
         return Variances(
             sigma=np.array([*[o.start_sigma_m] * 3, *[np.deg2rad(o.start_sigma_deg)] * 3]),
             weight=np.ones(self.n),
-            shared=np.array([*common, shift, *intrinsics]) ** 2,
+            shared=np.array([*common, shift, *self._joint_sigma(), *intrinsics]) ** 2,
         )
+
+    def _joint_sigma(self) -> Array:
+        turns = np.deg2rad(self.options.joint_sigma_deg)
+        return np.where(self.joints.rotates, turns, self.options.joint_sigma_m)
 
     @property
     def adjusts_camera(self) -> bool:
@@ -292,9 +336,10 @@ class BundleAdjustment:
         )
 
     def _deviation(self, parameters: Parameters) -> Array:
-        """(n, 6) of each correction from what common transform and time shift explain."""
-        shifted = parameters.shared[COMMON] * self.velocity
-        return parameters.correction - parameters.shared[:COMMON] - shifted
+        """(n, 6) of each correction from what the shared parameters explain."""
+        moved = parameters.shared[self.moving].copy()
+        moved[self.offsets] -= self.joints.at
+        return parameters.correction - self.motion @ moved
 
     def _errors(self, parameters: Parameters) -> Array:
         """(n, 6) the same where the errors arise: at the gripper, or at the camera."""
@@ -306,23 +351,20 @@ class BundleAdjustment:
         return self.lever.transpose(0, 2, 1) @ scaled
 
     def _prior(self, parameters: Parameters, variances: Variances) -> tuple[Array, Array]:
-        """Normal matrix (6 n + 12, 6 n + 12) of the priors, and their slope."""
+        """Normal matrix of the priors, and their slope."""
         n = self.n
-        system, slope = np.zeros((6 * n + SHARED,) * 2), np.zeros(6 * n + SHARED)
-        precision, shift, six = self._precision(variances), 6 * n + COMMON, 6 * n + np.arange(6)
+        system, slope = np.zeros((6 * n + self.size,) * 2), np.zeros(6 * n + self.size)
+        precision, shared = self._precision(variances), 6 * n + np.arange(self.motion.shape[2])
         pull = np.einsum("nij,nj->ni", precision, self._deviation(parameters))
-        drift = np.einsum("nij,nj->ni", precision, self.velocity)
+        drift = precision @ self.motion
         for i, own in enumerate(np.arange(6 * n).reshape(n, 6)):
             system[np.ix_(own, own)] = precision[i]
-            system[np.ix_(own, six)] = system[np.ix_(six, own)] = -precision[i]
-            system[own, shift] = system[shift, own] = -drift[i]
-        system[np.ix_(six, six)] = precision.sum(0)
-        system[six, shift] = system[shift, six] = drift.sum(0)
-        system[shift, shift] = (drift * self.velocity).sum()
+            system[np.ix_(own, shared)] = -drift[i]
+            system[np.ix_(shared, own)] = -drift[i].T
+        system[np.ix_(shared, shared)] = np.einsum("nij,nik->jk", self.motion, drift)
         slope[: 6 * n] = pull.ravel()
-        slope[six] = -pull.sum(0)
-        slope[shift] = -(pull * self.velocity).sum()
-        last = 6 * n + np.arange(SHARED)
+        slope[shared] = -np.einsum("nij,ni->j", self.motion, pull)
+        last = 6 * n + np.arange(self.size)
         system[last, last] += 1 / variances.shared
         slope[last] += parameters.shared / variances.shared
         return system, slope
@@ -367,6 +409,12 @@ class BundleAdjustment:
             wanted = (squares[part] - noise[part]).mean() if clear else 0.0
             wide = np.clip(wanted, prior[part] / 16, widest[part])
             variances[part] = np.maximum(wide, self.options.least_share * widest[part])
+        if (part := self.offsets).stop > part.start:
+            # One size for all joints of the arm: one that no image shows is as far off as others.
+            seen = (1 - posterior[part] / prior[part]).clip(0).sum()
+            share = float((values[part] ** 2 / widest[part]).sum() / max(seen, 1e-3))
+            least = max(float((prior[part] / widest[part])[0]) / 16, self.options.least_share)
+            variances[part] = np.clip(share, least, 1.0) * widest[part]
         return variances
 
     def _result(self, tracks: BundleTracks, estimate: Estimate, variances: Variances) -> Adjustment:
@@ -374,6 +422,8 @@ class BundleAdjustment:
         lin = estimate.linearised
         residual = np.linalg.solve(tracks.whitening, lin.residual[..., None])[lin.valid, :, 0]
         root = [estimate.root[:, 6 * i : 6 * i + 6] for i in range(n + 1)]
+        systematic, joints = self._systematic(estimate, variances), self.offsets
+        moved = estimate.root[:, 6 * n :][:, joints]
         return Adjustment(
             poses=self.frames.poses(parameters),
             cameras=self.frames.cameras(parameters) if self.adjusts_camera else None,
@@ -384,12 +434,15 @@ class BundleAdjustment:
             residual_px=float(np.median(np.linalg.norm(residual, axis=1))),
             common_covariance=root[n].T @ root[n],
             common_by_lens=self._by_lens(estimate.root),
-            common_systematic=self._systematic(estimate, variances),
+            common_systematic=systematic[:COMMON, :COMMON],
             correction=self._deviation(parameters),
             errors=self._errors(parameters),
             weight=np.minimum(variances.weight, 1.0),
             covariance=np.stack([columns.T @ columns for columns in root[:n]]),
             inverse_depth=parameters.inverse_depth,
+            offsets=parameters.shared[joints],
+            offsets_covariance=moved.T @ moved + systematic[joints, joints],
+            offsets_prior=np.sqrt(variances.shared[joints]),
         )
 
     def _by_lens(self, root: Array) -> Array:
@@ -397,7 +450,7 @@ class BundleAdjustment:
         return common.T @ lens @ np.linalg.solve(lens.T @ lens, lens.T @ common)
 
     def _systematic(self, estimate: Estimate, variances: Variances) -> Array:
-        """Covariance (6, 6) of the common transform due to systematic errors of stated poses.
+        """Covariance of common transform, time shift and joints by systematic errors of poses.
 
         The errors of a robot's joints vary slowly with the pose. They are modelled by errors that
         are linear in the rotation and position of a frame. Their variance is estimated from the
@@ -422,21 +475,19 @@ class BundleAdjustment:
             excess = (residual[:, part] ** 2 - k).sum() + SYSTEMATIC[0] * SYSTEMATIC[1]
             estimated = excess / ((k**2).sum() + SYSTEMATIC[0])
             ratio[part] = max(estimated, self.options.least_systematic)
-        common = estimate.root[:, 6 * n : 6 * n + 6].T @ estimate.root
-        # Response of the common transform to an error of each stated pose: (6, n, 6).
-        own = common[:, : 6 * n].reshape(6, n, 6) - common[:, None, 6 * n : 6 * n + 6]
-        drift = common[:, 6 * n + COMMON, None, None] * self.velocity
+        shared = estimate.root[:, 6 * n :][:, self.moving].T @ estimate.root
+        # Response of the shared parameters to an error of each stated pose: (7 + k, n, 6).
+        own = shared[:, : 6 * n].reshape(-1, n, 6)
+        own = own - np.einsum("nij,kj->kni", self.motion, shared[:, 6 * n :][:, self.moving])
         scaled = weight * self.lever / variances.sigma[:, None]
-        response = np.einsum("knj,nij,nr->kri", own - drift, scaled, basis) * np.sqrt(
-            HIDDEN * ratio
-        )
-        rows = response.reshape(6, -1)
+        response = np.einsum("knj,nij,nr->kri", own, scaled, basis) * np.sqrt(HIDDEN * ratio)
+        rows = response.reshape(len(response), -1)
         return rows @ rows.T
 
     def _error_root(self, root: Array) -> Array:
         """(k, n, 6) factor of the covariance of the errors, from that of all parameters."""
         n = self.n
-        moved = root[:, None, 6 * n : 6 * n + 6] + root[:, None, [6 * n + COMMON]] * self.velocity
+        moved = np.einsum("nij,kj->kni", self.motion, root[:, 6 * n :][:, self.moving])
         own = root[:, : 6 * n].reshape(-1, n, 6) - moved
         return np.einsum("nij,knj->kni", self.lever, own)
 

@@ -16,7 +16,7 @@ Index = NDArray[np.int64]
 COMMON, SHIFT, INTRINSICS = 6, 1, 5
 SHARED = COMMON + SHIFT + INTRINSICS
 """Shared parameters: common transform, time shift, and intrinsics (logarithm of the focal length,
-principal point in pixels, k1, k2)."""
+principal point in pixels, k1, k2). Offsets of an arm's joints come before the intrinsics."""
 MIN_DEPTH = 0.05
 """Nearer points are projected as if they were at this depth, in units of `depth_scale`."""
 MIN_DISTORTION = 1e-4
@@ -57,7 +57,7 @@ class Parameters:
     correction: Array
     """(n, 6) motion of each frame from its stated pose, camera frame, metres and radians."""
     shared: Array
-    """(12,) see `SHARED`."""
+    """(12 + k,) see `SHARED`."""
     inverse_depth: Array
     """(p,) per metre."""
 
@@ -108,7 +108,7 @@ class StatedFrames:
 
     def cameras(self, parameters: Parameters) -> list[Camera]:
         """(n,) corrected cameras, where all frames share one lens."""
-        change = parameters.shared[COMMON + SHIFT :]
+        change = parameters.shared[-INTRINSICS:]
         if not (self.same_lens and np.any(change)):
             return self._cameras
         corrected = {camera: self._changed(camera, change) for camera in set(self._cameras)}
@@ -188,7 +188,7 @@ class Solution:
     """One step."""
 
     change: Array
-    """(6 n + 12,) of corrections and shared parameters."""
+    """(6 n + 12 + k,) of corrections and shared parameters."""
     depths: Array
     """(p,) of the inverse depths."""
     root: Array
@@ -210,17 +210,17 @@ class HostBlock(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Least squares in corrections and shared parameters (6 n + 12) and inverse depths (p)."""
+    """Least squares in corrections and shared parameters (6 n + 12 + k) and inverse depths (p)."""
 
     gram: Array
-    """(6 n + 12, 6 n + 12) of the observations."""
+    """(6 n + 12 + k, 6 n + 12) of the observations."""
     prior: Array
-    """(6 n + 12, 6 n + 12) of the priors."""
+    """(6 n + 12 + k, 6 n + 12) of the priors."""
     blocks: list[HostBlock]
     depth: Array
     """(p,) diagonal of the inverse depths."""
     slope: Array
-    """(6 n + 12,) half the gradient of the cost."""
+    """(6 n + 12 + k,) half the gradient of the cost."""
     depth_slope: Array
     """(p,) the same by inverse depths."""
 

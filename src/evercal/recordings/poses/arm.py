@@ -42,6 +42,16 @@ class Arm:
         angles = {motion.value for motion in self.chain if motion.rotates}
         return np.array([i in angles for i in range(len(self.joints))])
 
+    def free(self) -> NDArray[np.bool_]:
+        """(k,) whether the offset of a value can be told from images.
+
+        That of the first joint turns base and scene together, that of the last one gripper and
+        camera.
+        """
+        moved = [motion.value for motion in self.chain]
+        ends = {value for value in (*moved[:1], *moved[-1:]) if moved.count(value) == 1}
+        return np.array([i not in ends for i in range(len(self.joints))])
+
     def poses(self, values: Array) -> SE3:
         """(n,) base_from_gripper of joint values (n, k), radians, or metres of sliding joints."""
         return SE3.from_matrix(self._frames(values)[-1])

@@ -1,0 +1,65 @@
+"""Offsets of an arm's joints in a recording: stated poses with them, and how they move frames."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.mapping.bundle_adjustment import JointSlopes
+from evercal.recordings.frame import Frame, Mount
+from evercal.recordings.poses.arm import Arm
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ArmOffsets:
+    """Estimated offsets of the k joints of an arm."""
+
+    arm: Arm
+    values: Array
+    """(k,) to be added to joint values, radians, or metres of sliding joints."""
+    covariance: Array
+    """(k, k)."""
+    prior: Array
+    """(k,) standard deviation of offsets of this arm; an offset with it is not determined."""
+
+    @classmethod
+    def start(cls, arm: Arm, values: Array) -> Self:
+        """Offsets of unknown uncertainty."""
+        unknown = np.full(len(values), np.inf)
+        return cls(arm, values, np.diag(unknown), unknown)
+
+    def moved(self, frames: Sequence[Frame], mount: Mount) -> list[Frame]:
+        """Frames whose stated poses contain the offsets; camera and gripper keep their transform.
+
+        Frames without joint values stay as they are.
+        """
+        changed = []
+        for frame in frames:
+            gripper, camera = frame.base_from_gripper, frame.base_from_camera
+            if frame.joints_rad is not None and gripper is not None:
+                after = self.arm.poses((np.array(frame.joints_rad) + self.values)[None])[0]
+                # The map of a fixed camera is in the frame of the gripper.
+                fixed = mount == "eye_to_hand"
+                change = after.inverse() @ gripper if fixed else after @ gripper.inverse()
+                frame = replace(frame, base_from_gripper=after)
+                frame = replace(frame, base_from_camera=camera and change @ camera)
+            changed.append(frame)
+        return changed
+
+
+def has_joints(frames: Sequence[Frame]) -> bool:
+    """Whether all frames state joint values."""
+    return all(frame.joints_rad is not None for frame in frames)
+
+
+def joint_slopes(offsets: ArmOffsets, frames: Sequence[Frame], mount: Mount) -> JointSlopes:
+    """How joints move the stated poses of frames, which contain `offsets`."""
+    joints, arm = np.array([frame.joints_rad for frame in frames]), offsets.arm
+    slopes = arm.slopes(joints + offsets.values) * arm.free()
+    # In the frame of the gripper, a fixed camera moves the other way.
+    sign = -1 if mount == "eye_to_hand" else 1
+    return JointSlopes(sign * slopes, arm.rotates(), offsets.values)
