@@ -2,6 +2,8 @@
 
 import os
 import re
+import struct
+import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
@@ -19,12 +21,9 @@ IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 """Endings of image files, in lower case."""
 _JPEG, _SCAN, _MOST_SCANS = b"\xff\xd8", b"\xff\xda", 100
 """Beginning of a JPEG file, and of a scan in it: progressive files have about ten."""
-_TURNED = re.compile(
-    rb"(?s)(Exif|eXIf).*?(\x01\x12\0\x03\0{3}\x01\0|\x12\x01\x03\0\x01\0{3})[\x02-\x08]"
-)
-"""EXIF data of JPEG and PNG with an orientation other than upright."""
-_WHOLE = re.compile(rb"(?s)\xff\xd8\xff.*\xff\xd9[^\xff]*|\x89PNG.*IEND.{4}")
-"""Beginning and end of a whole image file."""
+_TURNED = re.compile(rb"(\x01\x12\0\x03\0{3}\x01\0|\x12\x01\x03\0\x01\0{3})[\x02-\x08]")
+"""EXIF orientation other than upright."""
+_TIFF, _PNG = {b"II*\0": "<I", b"MM\0*": ">I"}, b"\x89PNG"
 
 
 class StoredImage(ABC):
@@ -77,18 +76,41 @@ def files_in(folder: Path, end: tuple[str, ...] = IMAGE_ENDINGS, glob: str = "*"
 
 def as_stored(path: Path) -> Path | UnturnedImage:
     """An image file whose EXIF orientation is not applied; the file itself if it states none."""
-    with suppress(OSError), path.open("rb") as file:
-        return UnturnedImage(path) if _TURNED.search(file.read(4096)) else path
+    with suppress(OSError, ValueError):  # ValueError: the file is empty
+        return UnturnedImage(path) if _orientation(np.memmap(path, mode="r")) else path
     return path
 
 
+def _orientation(data: NDArray[np.uint8]) -> int:
+    """Position of the orientation in the bytes (n,) of a file that is not upright, else 0."""
+    start, at = data[:12].tobytes(), 0
+    if start[:4] in _TIFF:
+        at = struct.unpack(_TIFF[start[:4]], start[4:8])[0]
+    elif start[8:] == b"WEBP":
+        at = max(0, data.tobytes().rfind(b"EXIF"))
+    match = _TURNED.search(data[at : at + 4096].tobytes())
+    return at + match.end() - 1 if match else 0
+
+
 def is_readable(image: Path | NDArray[np.uint8]) -> bool:
-    """Whether a file, or its bytes (n,), is an image; a whole one is not decoded."""
+    """Whether a file, or its bytes (n,), is an image that can be decoded.
+
+    A JPEG is decoded to an eighth of its size, and of a PNG the checksums are compared.
+    """
     with suppress(OSError, ValueError):  # ValueError: the file is empty
-        data = np.memmap(image, mode="r") if isinstance(image, Path) else image
-        ends = data[:32].tobytes() + data[-32:].tobytes()
-        return bool(_WHOLE.fullmatch(ends)) or decode_image(np.asarray(data)) is not None
+        data = np.asarray(np.memmap(image, mode="r") if isinstance(image, Path) else image)
+        return _is_whole_png(data) or decode_image(data, small=True) is not None
     return False
+
+
+def _is_whole_png(data: NDArray[np.uint8]) -> bool:
+    at, kind, right = 8, b"", data[:4].tobytes() == _PNG
+    while right and kind != b"IEND" and at + 12 <= len(data):
+        end = at + 8 + int.from_bytes(data[at : at + 4].tobytes(), "big")
+        kind = data[at + 4 : at + 8].tobytes()
+        right = zlib.crc32(data[at + 4 : end]) == int.from_bytes(data[end : end + 4].tobytes(), "big")
+        at = end + 4
+    return right and kind == b"IEND"
 
 
 def first_size(paths: Sequence[Path]) -> tuple[int, int]:
@@ -149,15 +171,25 @@ def read_image(path: str | os.PathLike[str], turned: bool = True) -> NDArray[np.
     return image
 
 
-def decode_image(data: NDArray[np.uint8], turned: bool = True) -> NDArray[np.uint8] | None:
-    """Decode (n,) uint8 bytes of an image file as by `read_image`; None if they are no image."""
+def decode_image(
+    data: NDArray[np.uint8], turned: bool = True, small: bool = False
+) -> NDArray[np.uint8] | None:
+    """Decode (n,) uint8 bytes of an image file as by `read_image`; None if they are no image.
+
+    `small` decodes a JPEG to grey values at an eighth of its size.
+    """
     import cv2
 
     # IMREAD_UNCHANGED would ignore the orientation; ANYDEPTH keeps 16 bits for as_rgb to round.
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
     flags |= 0 if turned else cv2.IMREAD_IGNORE_ORIENTATION
-    if data[:2].tobytes() == _JPEG and data.tobytes().count(_SCAN) > _MOST_SCANS:
-        return None  # each scan takes as long as a whole image
+    if data[:2].tobytes() == _JPEG:
+        flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 if small else flags
+        if data.tobytes().count(_SCAN) > _MOST_SCANS:
+            return None  # each scan takes as long as a whole image
+    if not turned and data[:4].tobytes() in _TIFF and (at := _orientation(data)):
+        data = data.copy()  # OpenCV turns these whatever the flags
+        data[at] = 1
     try:
         image = cv2.imdecode(data, flags) if data.size else None
     except cv2.error:
@@ -167,7 +199,7 @@ def decode_image(data: NDArray[np.uint8], turned: bool = True) -> NDArray[np.uin
 
 def image_file(data: bytes) -> tuple[str, bytes] | None:
     """Ending and bytes of a PNG or JPEG file, or None for other bytes."""
-    starts = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
+    starts = {_PNG: ".png", b"\xff\xd8\xff": ".jpg"}
     ending = next((e for start, e in starts.items() if data.startswith(start)), None)
     return None if ending is None else (ending, data)
 
