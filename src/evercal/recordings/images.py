@@ -181,7 +181,8 @@ def decode_image(
     import cv2
 
     # IMREAD_UNCHANGED would ignore the orientation; ANYDEPTH keeps 16 bits for as_rgb to round.
-    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
+    # IMREAD_COLOR_RGB leaves the pixels of a TIFF of 16 bits as they were in memory.
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
     flags |= 0 if turned else cv2.IMREAD_IGNORE_ORIENTATION
     if data[:2].tobytes() == _JPEG:
         flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 if small else flags
@@ -194,7 +195,9 @@ def decode_image(
         image = cv2.imdecode(data, flags) if data.size else None
     except cv2.error:
         return None
-    return as_rgb(image) if image is not None and image.dtype in (np.uint8, np.uint16) else None
+    if image is None or image.dtype not in (np.uint8, np.uint16):
+        return None
+    return as_rgb(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
 
 def image_file(data: bytes) -> tuple[str, bytes] | None:
