@@ -202,7 +202,13 @@ def test_poses_of_easy_handeye_before_a_fixed_camera_lead_to_it(run: Any, tmp_pa
     inverse = replace(pairs, base_from_gripper=pairs.base_from_gripper.inverse())
     words = files(tmp_path, replace(simulated, pairs=inverse))
     rows = [
-        dict(zip(("translation", "rotation"), map(axes, (p.translation_m, p.rotation_wxyz))))
+        dict(
+            zip(
+                ("translation", "rotation"),
+                map(axes, (p.translation_m, p.rotation_wxyz)),
+                strict=True,
+            )
+        )
         for p in inverse.base_from_gripper
     ]
     samples = {"parameters": {"eye_on_hand": False}, "samples": [{"robot": r} for r in rows]}

@@ -108,7 +108,9 @@ def _is_whole_png(data: NDArray[np.uint8]) -> bool:
     while right and kind != b"IEND" and at + 12 <= len(data):
         end = at + 8 + int.from_bytes(data[at : at + 4].tobytes(), "big")
         kind = data[at + 4 : at + 8].tobytes()
-        right = zlib.crc32(data[at + 4 : end]) == int.from_bytes(data[end : end + 4].tobytes(), "big")
+        right = zlib.crc32(data[at + 4 : end]) == int.from_bytes(
+            data[end : end + 4].tobytes(), "big"
+        )
         at = end + 4
     return right and kind == b"IEND"
 

@@ -39,8 +39,9 @@ def find_boards(
 ) -> tuple[Board, dict[str, BoardView | str]]:
     """Detect a board in images of one camera; return the corners in each, or a reason.
 
-    Also return the board, with its first marker. `read` may return the reason instead. Images are searched in an order that spreads. If
-    none shows the board, InputError; also after a few images that show another board.
+    `read` returns an image, or the reason why there is none. Also return the board, with its first
+    marker. Images are searched in an order that spreads. If none shows the board, InputError; also
+    after a few images that show another board.
     """
     order = sorted(range(len(names)), key=lambda i: i * (5**0.5 - 1) / 2 % 1)
     found: dict[str, BoardView | str | Markers] = {}
