@@ -1,14 +1,16 @@
 """`evercal solve` and `evercal detect`: files in, files out, exit codes."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 
 from benchmarks.hand_eye import Setting, SimulatedPairs, error, recording, rotations
+from evercal.calibration.boards.board import BoardKind
 from evercal.calibration.calibration import read_calibration
 from evercal.geometry import SE3
 from evercal.recordings import write_image
@@ -177,6 +179,19 @@ def test_detect_refuses_unusable_input(run: Any, tmp_path: Path) -> None:
         assert reason in ran.err[-1], ran.err
 
 
+def test_every_board_on_the_page_of_formats_can_be_printed(run: Any, tmp_path: Path) -> None:
+    page = Path(__file__).parents[2] / "docs" / "formats.md"
+    boards = re.findall(r"^    evercal detect images/ (--board (\w+) .*)$", page.read_text(), re.M)
+    assert {kind for _, kind in boards} == set(get_args(BoardKind))
+    for words, _ in boards:
+        board = ["--make-board", tmp_path / "board.png", "--paper", "a3"]
+        assert run("detect", *words.split(), *board).code == 0
+    other = "--board charuco --size 7,5 --square-mm 30 --marker-mm 20 --dictionary DICT_4X4_50"
+    again = run("detect", *other.split(), "--make-board", tmp_path / "board.png", "--json")
+    board = json.loads(again.out)["board"]
+    assert (board["columns"], board["rows"], board["dictionary"]) == (7, 5, "4X4_50")
+
+
 def test_report_finds_the_images_of_detect(run: Any, tmp_path: Path) -> None:
     for folder in ("images", "poses", "results"):
         (tmp_path / folder).mkdir()
@@ -217,9 +232,9 @@ def test_poses_of_easy_handeye_before_a_fixed_camera_lead_to_it(run: Any, tmp_pa
     ran = run(*words, *on_hand)
     assert "use --mount eye_to_hand and --invert robot" in ran.out
     ran = run(*words, *fixed)
-    assert "as they are read: invert them (--invert robot;" in ran.err[-1]
+    assert "look inverted (gripper_from_base): invert them (--invert robot)" in ran.err[-1]
     ran = run(*words, *fixed, "--invert", "robot", "--robot-convention", "ur:inverse")
-    assert "if it or :inverse is given, leave that out" in ran.err[-1]
+    assert "if --invert or :inverse is given, leave it out" in ran.err[-1]
     ran = run(*words, *on_hand, "--invert", "robot")
     assert "the mount looks wrong: use --mount eye_to_hand" in ran.err[-1]
     yaml = [*words[:2], tmp_path / "robot.yaml", *words[3:]]

@@ -119,7 +119,7 @@ class Detect(args.Verb):
 
         if self.square_mm is None:
             raise InputError("--square-mm: give the side of a square, or of the tag, millimetres")
-        match = re.fullmatch(r"(\d+)x(\d+)", self.size or "0x0")
+        match = re.fullmatch(r"(\d+)[xX,](\d+)", self.size or "0x0")
         if match is None:
             raise InputError(f"--size {self.size}: give two numbers such as 9x6")
         return Board(
@@ -129,7 +129,7 @@ class Detect(args.Verb):
             rows=int(match[2]),
             marker_m=self.marker_mm / 1000,
             gap_m=self.gap_mm / 1000,
-            dictionary=self.dictionary or _DICTIONARIES[self.board],
+            dictionary=(self.dictionary or _DICTIONARIES[self.board]).removeprefix("DICT_"),
             tag=self.tag,
         )
 

@@ -47,8 +47,7 @@ def find_boards(
     found: dict[str, BoardView | str | Markers] = {}
     settled, views = board, {}
     for tried, i in enumerate(order, 1):
-        image = read(names[i])
-        found[names[i]] = image if isinstance(image, str) else _look(image, board)
+        found[names[i]] = image if isinstance(image := read(names[i]), str) else _look(image, board)
         if tried == len(names) or (tried <= _MANY and tried % _FEW == 0):
             settled, views = _settled(found, board)
             if any(isinstance(view, BoardView) for view in views.values()):

@@ -93,9 +93,10 @@ def require_agreement(
         least = min(_cost(other) for other, _ in better)
         equal = [(other, r) for other, r in better if _cost(other) < 3 * least]
         corrected, likely = max(equal, key=lambda pair: _plausibility(pair[1], pair[0]))
+        given = "; if --invert or :inverse is given, leave it out" * ("--invert" in likely.message)
         raise InputError(
-            f"{likely.message}; corrected, the poses agree to {_size(corrected)}, as given to"
-            f" {_size(fit)}"
+            f"{likely.message}{given}; corrected, the poses agree to {_size(corrected)},"
+            f" as given to {_size(fit)}"
         )
     if not (_fails(fit) or own_camera):
         _require_plausible(_Reading("", pairs, mount), fit, scale_known)
@@ -176,14 +177,9 @@ _SHIFTED = (
     "rows and images are shifted by one from {} on: the {} poses have an extra pose there; pair"
     " each row with its own image"
 )
-_INVERT = "(--invert {0}; if it or :inverse is given, leave that out)"
 _WRONG_MOUNT = (
     "the mount looks wrong: use --mount {other}, or, if it is {mount}, invert the robot poses"
-    f" {_INVERT.format('robot')}"
-)
-_INVERTED = (
-    "the {0} poses look inverted ({1}) as they are read: invert them "
-    f"{_INVERT}, or, if they are {{2}}, use --mount {{{{other}}}}"
+    " (--invert robot)"
 )
 _SAME_EQUATION: dict[str, _Change] = {
     "the files look exchanged: the camera poses look like gripper poses; exchange --robot-poses"
@@ -196,18 +192,14 @@ _SAME_EQUATION: dict[str, _Change] = {
 }
 """Readings that agree as well as the given one."""
 _OTHER_ROBOT: dict[str, _Change] = {
-    _INVERTED.format("robot", "gripper_from_base", "base_from_gripper"): lambda robot, camera: (
-        robot.inverse(),
-        camera,
-    ),
+    "the robot poses look inverted (gripper_from_base): invert them (--invert robot), or, if they"
+    " are base_from_gripper, use --mount {other}": lambda robot, camera: (robot.inverse(), camera),
     _WRONG_MOUNT: lambda robot, camera: (robot, camera),
     _TRANSPOSED.format("robot"): lambda robot, camera: (_transposed(robot), camera),
 }
 _OTHER_CAMERA: dict[str, _Change] = {
-    _INVERTED.format("camera", "board_from_camera", "camera_from_board"): lambda robot, camera: (
-        robot,
-        camera.inverse(),
-    ),
+    "the camera poses look inverted (board_from_camera): invert them (--invert camera), or, if they"
+    " are camera_from_board, use --mount {other}": lambda robot, camera: (robot, camera.inverse()),
     _TRANSPOSED.format("camera"): lambda robot, camera: (robot, _transposed(camera)),
 }
 """Readings in other frames, or with the other mount."""

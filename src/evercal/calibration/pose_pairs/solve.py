@@ -215,18 +215,16 @@ def _lens_warnings(
 
 def _mount_warnings(at: Unknowns, mount: Mount) -> list[str]:
     """The other mount with inverted robot poses obeys the same equation."""
-    camera, board = (
-        float(np.linalg.norm(pose.translation_m))
-        for pose in (at.parent_from_camera, at.fixed_from_board)
-    )
-    parents, other, carried = ("gripper", "base"), "eye_to_hand", camera
+    both = np.stack([at.parent_from_camera.translation_m, at.fixed_from_board.translation_m])
+    camera, board = np.linalg.norm(both, axis=1).tolist()
+    carried, on, other = camera, ("gripper", "base"), "eye_to_hand"
     if mount == "eye_to_hand":
-        parents, other, carried = ("base", "gripper"), "eye_in_hand", board
+        carried, on, other = board, ("base", "gripper"), "eye_in_hand"
     if carried < max(_REACH_M, _OTHER_MOUNT * min(camera, board)):
         return []
     return [
-        f"the camera is {camera:.2f} m from the {parents[0]} and the board {board:.2f} m from the"
-        f" {parents[1]}: if it is the other way round, the robot poses are gripper_from_base, as"
+        f"the camera is {camera:.2f} m from the {on[0]} and the board {board:.2f} m from the"
+        f" {on[1]}: if it is the other way round, the robot poses are gripper_from_base, as"
         f" easy_handeye states for a fixed camera; use --mount {other} and --invert robot"
     ]
 

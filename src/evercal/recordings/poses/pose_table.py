@@ -163,11 +163,8 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
         raise ValueError("no line of numbers in it")
     if len(words) == rows.shape[1] and _is_header(words):
         return named_numbers(words, rows, given)
-    if len(rows) > 1:  # such as a frame
-        alike = [
-            i for i, cell in enumerate(rows[0]) if not is_number(cell) and {*rows[:, i]} == {cell}
-        ]
-        rows = np.delete(rows, alike, axis=1)
+    same = [i for i, cell in enumerate(rows[0]) if {cell} == {*rows[1:, i]} and not is_number(cell)]
+    rows = np.delete(rows, same, axis=1)  # such as a frame
     texts = [i for i, cell in enumerate(rows[0].tolist()) if not is_number(cell)]
     numbers = cell_numbers(np.delete(rows, texts[:1], axis=1))
     if texts or numbers.shape[1] != 4:
@@ -249,8 +246,9 @@ def plain_numbers(numbers: Array, given: PoseConvention | None, names: Names = N
             f" x,y,z,qw,qx,qy,qz",
             f"NAME, one of {KNOWN_CONVENTIONS}",
         )
-    if width - 2 in given.counts and _are_ros_stamps(*numbers[:, :2].T):
-        numbers, width = np.c_[numbers[:, 0] + 1e-9 * numbers[:, 1], numbers[:, 2:]], width - 1
+    ros = width - 2 in given.counts and not (numbers[:, :2] // [4e9, 1e9]).any()
+    if ros and not (numbers[:, :2] % 1).any() and numbers[:, 0].min() > 1e9:
+        numbers, width = np.c_[numbers[:, :2] @ [1, 1e-9], numbers[:, 2:]], width - 1
     count = next((count for count in given.counts if 0 <= width - count <= 1), 0)
     stamps = in_unit(numbers[:, 0]) if count and width > count else None
     # A misplaced number shows in quaternions and matrices, but not in angles.
@@ -261,12 +259,6 @@ def plain_numbers(numbers: Array, given: PoseConvention | None, names: Names = N
             f" ({given.meaning}), optionally after a name and a stamp that increases"
         )
     return PoseTable(numbers[:, width - count :], given, names, stamps)
-
-
-def _are_ros_stamps(seconds: Array, nanoseconds: Array) -> bool:
-    whole = (seconds % 1 == 0).all() and (nanoseconds % 1 == 0).all()
-    since_1970 = seconds.min() > 1e9 and seconds.max() < 4e9
-    return bool(whole and since_1970 and nanoseconds.min() >= 0 and nanoseconds.max() < 1e9)
 
 
 def _without_brackets(
@@ -325,16 +317,10 @@ def _groups(words: Sequence[str]) -> _Groups:
     names = [name_and_unit(word)[0] for word in words]
     if groups := _matched(names, words):
         return groups
-    first = HEADERS["position"].names(0)
-    starts = {name.removesuffix(x) for name in names for x in first if name.endswith(f"_{x}")}
-    found = {
-        start: groups
-        for start in sorted(starts)
-        if len(
-            groups := _matched([n.partition(start)[2] * n.startswith(start) for n in names], words)
-        )
-        > 1
-    }
+    ends = [f"_{x}" for x in HEADERS["position"].names(0)]
+    starts = {name.removesuffix(x[1:]) for name in names for x in ends if name.endswith(x)}
+    rests = {s: [n[len(s) :] if n.startswith(s) else "" for n in names] for s in sorted(starts)}
+    found = {s: groups for s in rests if len(groups := _matched(rests[s], words)) > 1}
     if len(found) > 1:
         raise ValueError(f"it holds poses of {' and '.join(found)}; keep the columns of one")
     return next(iter(found.values()), {})
@@ -363,10 +349,8 @@ def _defined(groups: _Groups, words: Sequence[str]) -> str:
     stated = {key: name_and_unit(words[groups[key][0]])[1] for key in rotations}
     sure = [k for k in rotations if not HEADERS[k].ask or (k == "roll pitch yaw" and stated[k])]
     conventions = [HEADERS[key].conventions[0] for key in sure]
-    whole = {
-        len(groups[key]) in pose_convention(HEADERS[key].conventions[0]).counts for key in sure
-    }
-    if len(sure) == 1 and ("position" in groups or whole == {True}):
+    whole = sure and len(groups[sure[0]]) in pose_convention(conventions[0]).counts
+    if len(sure) == 1 and ("position" in groups or whole):
         return conventions[0]
     if sure[1:]:
         raise ConventionError(f"the header names {' and '.join(sure)}", " or ".join(conventions))
