@@ -137,7 +137,7 @@ def test_orientation_is_applied_or_not_in_every_format(
         tags[0x112] = orientation
         image.save(file, tiffinfo=tags, compression="tiff_lzw" if order == "II" else None)
     else:
-        image.save(file, exif=exif, **({"lossless": True} if ending == ".webp" else {}))
+        image.save(file, exif=exif)
     upright = ImageOps.exif_transpose(Image.open(file))
     assert np.abs(read_image(file).astype(int) - np.asarray(upright)).max() < 9
     unturned = as_stored(file)

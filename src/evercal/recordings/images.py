@@ -106,7 +106,7 @@ def _is_whole_png(data: NDArray[np.uint8]) -> bool:
     while data[:4].tobytes() == _PNG and kind != b"IEND" and at + 12 <= len(data):
         end = at + 8 + int.from_bytes(data[at : at + 4].tobytes(), "big")
         kind = data[at + 4 : at + 8].tobytes()
-        if zlib.crc32(data[at + 4 : end]).to_bytes(4, "big") != data[end : end + 4].tobytes():
+        if zlib.crc32(data[at + 4 : end].data).to_bytes(4, "big") != data[end : end + 4].tobytes():
             return False
         at = end + 4
     return kind == b"IEND"
