@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera
 
-FINER = 2
-"""Pixels of the warped image across one of the result, which averages them."""
 _FACES = [(0.0, 0.0), (0.0, 90.0), (0.0, -90.0), (90.0, 0.0), (-90.0, 0.0)]
 """Turns of the faces about x and y, degrees."""
 
@@ -18,12 +16,13 @@ def fisheye_image(
     camera: Camera,
     base_from_camera: SE3,
     render: Callable[[Camera, SE3], NDArray[np.uint8]],
+    finer: int = 2,
 ) -> NDArray[np.uint8]:
     """An image (H, W, 3) of a fisheye; pixels without a ray are black.
 
-    `render` gives the image of an ideal pinhole at a pose.
+    `render` gives the image of an ideal pinhole at a pose. Each pixel is the mean of finer x finer.
     """
-    large = camera.resized(FINER * camera.width, FINER * camera.height)
+    large = camera.resized(finer * camera.width, finer * camera.height)
     v, u = np.mgrid[0 : large.height, 0 : large.width]
     rays = large.unproject(np.stack([u, v], -1))
     side = int(2.2 * large.fx)

@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError, missing_extra
-from evercal.geometry import SE3
 from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, decode_image, files_in, image_file
@@ -40,6 +39,7 @@ from evercal.recordings.poses.conventions import (
     poses_from_numbers,
 )
 from evercal.recordings.poses.kinematics import RobotModel, in_radians
+from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
 from evercal.recordings.text_files import named_errors, path_inside, read_json, refuse_repeated
 
@@ -78,16 +78,17 @@ def _load(root: Path, options: ReadOptions) -> Recording:
     camera = read_camera_of_size(options.camera, (width, height), key)
     column = _pose_feature(root, info, options)
     rows, values = _rows(root, column)
-    poses, notes = _feature_poses(root, info, column, values, options)
+    stated, notes = _feature_poses(root, info, column, values, options)
+    names = [f"episode_{row.episode:06d}/{row.number:06d}" for row in rows]
     frames = tuple(
-        Frame(f"episode_{row.episode:06d}/{row.number:06d}", image, camera, None, pose)
-        for row, image, pose in zip(rows, _images(root, info, key, rows), poses, strict=True)
+        Frame(name, image, camera, None, stated.poses[i], joints_rad=stated.joints_of(i))
+        for i, (name, image) in enumerate(zip(names, _images(root, info, key, rows), strict=True))
     )
     here, total = len({row.episode for row in rows}), int(info.get("total_episodes", 0))
     if here < total:
         notes.append(f"{here} of {total} episodes are in the folder")
     frames[0].read_image()
-    return Recording(root.resolve().name, frames, (), notes=tuple(notes))
+    return Recording(root.resolve().name, frames, (), notes=tuple(notes), arm=stated.arm)
 
 
 def _info(root: Path) -> dict[str, Any]:
@@ -281,7 +282,7 @@ def _pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> 
 
 def _feature_poses(
     root: Path, info: Mapping[str, Any], column: str, values: Array, options: ReadOptions
-) -> tuple[SE3, list[str]]:
+) -> tuple[RobotPoses, list[str]]:
     names = _names(info, column)
     if options.urdf is not None:
         return _joint_poses(root, names, values, options)
@@ -307,12 +308,13 @@ def _feature_poses(
         raise InputError(f"{root}: {column}: {error.naming('--pose-convention')}") from None
     except ValueError as error:
         raise InputError(f"{root}: {column}: {error}") from None
-    return poses, [f"gripper poses are {column}: {convention.meaning}", *notes]
+    notes = [f"gripper poses are {column}: {convention.meaning}", *notes]
+    return RobotPoses(None, None, poses), notes
 
 
 def _joint_poses(
     root: Path, names: list[str], stated: Array, options: ReadOptions
-) -> tuple[SE3, list[str]]:
+) -> tuple[RobotPoses, list[str]]:
     assert options.urdf is not None
     unit, count = options.pose_convention, stated.shape[1]
     source = f"{root}: {_STATE}"
