@@ -114,6 +114,7 @@ def test_version(run: Any) -> None:
         (["learn", "store"], "RECORDING"),
         (["learn", "a", "b", "--seed", "x"], "--seed"),
         (["learn", "a", "b", "--preset", "slow"], "--preset"),
+        (["detect", "x", "--board", "apriltag", "--camra", "c"], "--camera FILE"),
         (["lern"], "lern: no such verb; did you mean 'learn'?"),
         (["qqqq"], "'evercal --help' lists all verbs"),
     ],

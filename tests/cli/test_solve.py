@@ -1,13 +1,16 @@
 """`evercal solve` and `evercal detect`: files in, files out, exit codes."""
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 
 from benchmarks.hand_eye import Setting, SimulatedPairs, error, recording, rotations
+from evercal.calibration.boards.board import BoardKind
 from evercal.calibration.calibration import read_calibration
 from evercal.geometry import SE3
 from evercal.recordings import write_image
@@ -131,6 +134,7 @@ def test_from_photographs_to_a_calibration(run: Any, tmp_path: Path) -> None:
 def test_detect_reports_images_without_a_board(run: Any, tmp_path: Path) -> None:
     paths, truth, _ = photographs(tmp_path, 9)
     write_image(paths[3], np.full((480, 640, 3), 90, np.uint8))
+    paths[0].write_bytes(b"")
     board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
     out = tmp_path / "board.json"
     ran = run("detect", *paths, *board, "--out", out, "--json")
@@ -140,28 +144,31 @@ def test_detect_reports_images_without_a_board(run: Any, tmp_path: Path) -> None
     assert record["camera_from"] == "board"
     assert record["camera"]["fx"] == pytest.approx(600, abs=6)
     assert [image["camera_from_board"] is None for image in record["images"]] == [
-        i == 3 for i in range(9)
+        i in (0, 3) for i in range(9)
     ]
+    assert record["images"][0]["reason"].startswith("not a readable image (0 bytes)")
     assert "no chessboard with 9x6 inner corners" in record["images"][3]["reason"]
-    # The robot pose of that image is skipped.
+    # The robot poses of these images are skipped.
     words = ["solve", "--robot-poses", tmp_path / "robot.csv", "--camera-poses", out]
     assert run(*words, "--mount", "eye_in_hand", "--out", tmp_path / "out.json").code == 0
     calibration = read_calibration(tmp_path / "out.json")
-    assert len(calibration.images) == 8
+    assert len(calibration.images) == 7
     assert np.linalg.norm(error(calibration.parent_from_child, truth)[:3]) < 0.005
 
 
 def test_detect_refuses_unusable_input(run: Any, tmp_path: Path) -> None:
     paths, _, _ = photographs(tmp_path, 1)
     board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
-    small, bad = tmp_path / "small.json", tmp_path / "bad.json"
+    small, bad, cut = (tmp_path / name for name in ("small.json", "bad.json", "cut.png"))
     bad.write_text("{}")
+    cut.write_bytes(b"")
     small.write_text(json.dumps({**CAMERA.to_dict(), "width": 320, "height": 240}))
     for words, reason in (
         ([paths[0], "--board", "chessboard", "--square-mm", "30"], "size of 3x3 to 200x200"),
         ([paths[0], "--board", "chessboard", "--size", "9x6"], "--square-mm"),
         ([paths[0], *board[:3], "9 by 6", *board[4:]], "9x6"),
         ([tmp_path / "no.png", *board], "missing"),
+        ([cut, *board], "cut.png: not a readable image"),
         ([paths[0], *board], "intrinsics take at least 5"),
         ([paths[0], *board, "--camera", small], "320x240"),
         ([paths[0], *board, "--camera", bad], "bad.json"),
@@ -170,6 +177,19 @@ def test_detect_refuses_unusable_input(run: Any, tmp_path: Path) -> None:
         ran = run("detect", *words, "--out", tmp_path / "board.json")
         assert ran.code == 2, words
         assert reason in ran.err[-1], ran.err
+
+
+def test_every_board_on_the_page_of_formats_can_be_printed(run: Any, tmp_path: Path) -> None:
+    page = Path(__file__).parents[2] / "docs" / "formats.md"
+    boards = re.findall(r"^    evercal detect images/ (--board (\w+) .*)$", page.read_text(), re.M)
+    assert {kind for _, kind in boards} == set(get_args(BoardKind))
+    for words, _ in boards:
+        board = ["--make-board", tmp_path / "board.png", "--paper", "a3"]
+        assert run("detect", *words.split(), *board).code == 0
+    other = "--board charuco --size 7,5 --square-mm 30 --marker-mm 20 --dictionary DICT_4X4_50"
+    again = run("detect", *other.split(), "--make-board", tmp_path / "board.png", "--json")
+    board = json.loads(again.out)["board"]
+    assert (board["columns"], board["rows"], board["dictionary"]) == (7, 5, "4X4_50")
 
 
 def test_report_finds_the_images_of_detect(run: Any, tmp_path: Path) -> None:
@@ -188,3 +208,47 @@ def test_report_finds_the_images_of_detect(run: Any, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     pictures = json.loads(run("report", out, "--out", page, "--json").out)["pictures"]
     assert len(pictures) > 0
+
+
+def test_poses_of_easy_handeye_before_a_fixed_camera_lead_to_it(run: Any, tmp_path: Path) -> None:
+    """Each refusal or warning names options that bring base_from_camera at last."""
+    simulated = recording(Setting("eye_to_hand", path="table"), 1)
+    pairs = simulated.pairs
+    inverse = replace(pairs, base_from_gripper=pairs.base_from_gripper.inverse())
+    words = files(tmp_path, replace(simulated, pairs=inverse))
+    rows = [
+        dict(
+            zip(
+                ("translation", "rotation"),
+                map(axes, (p.translation_m, p.rotation_wxyz)),
+                strict=True,
+            )
+        )
+        for p in inverse.base_from_gripper
+    ]
+    samples = {"parameters": {"eye_on_hand": False}, "samples": [{"robot": r} for r in rows]}
+    (tmp_path / "robot.yaml").write_text(json.dumps(samples))
+    on_hand, fixed = ["--mount", "eye_in_hand"], ["--mount", "eye_to_hand"]
+    ran = run(*words, *on_hand)
+    assert "use --mount eye_to_hand and --invert robot" in ran.out
+    ran = run(*words, *fixed)
+    assert "look inverted (gripper_from_base): invert them (--invert robot)" in ran.err[-1]
+    ran = run(*words, *fixed, "--invert", "robot", "--robot-convention", "ur:inverse")
+    assert "if --invert or :inverse is given, leave it out" in ran.err[-1]
+    ran = run(*words, *on_hand, "--invert", "robot")
+    assert "the mount looks wrong: use --mount eye_to_hand" in ran.err[-1]
+    yaml = [*words[:2], tmp_path / "robot.yaml", *words[3:]]
+    ran = run(*yaml, *fixed, "--invert", "robot")
+    assert "(eye_to_hand); give --robot-convention wxyz:inverse in place of --invert" in ran.err[-1]
+    for done in (
+        run(*words, *fixed, "--invert", "robot"),
+        run(*yaml, *fixed, "--robot-convention", "wxyz:inverse"),
+    ):
+        assert "warning" not in done.out
+        found = read_calibration(tmp_path / "out.json")
+        assert found.parent_frame == "base"
+        assert np.linalg.norm(error(found.parent_from_child, simulated.parent_from_camera)) < 0.03
+
+
+def axes(values: np.ndarray) -> dict[str, float]:
+    return dict(zip("wxyz"[-len(values) :], values.tolist(), strict=True))

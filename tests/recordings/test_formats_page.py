@@ -50,7 +50,7 @@ POSE_FILES = {
     "poses.csv": None, "kuka.txt": "kuka", "poses.tum": None, "kitti.txt": None,
     "matrices.txt": None, "ur.script": None, "frames.dat": None, "poses.json": None,
     "arrays.json": None, "named.json": None, "echo.yaml": None, "echo.txt": None,
-    "targets.mod": None,
+    "targets.mod": None, "echo.csv": "xyzw",
 }  # fmt: skip
 """Examples with their conventions."""
 NAMED = (

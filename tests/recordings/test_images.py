@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image, ImageOps, TiffImagePlugin
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
@@ -19,6 +20,7 @@ from evercal.recordings import (
     write_image,
 )
 from evercal.recordings.frame import Recording
+from evercal.recordings.images import UnturnedImage, as_stored, pixels_of
 
 from .checks import refused
 
@@ -49,11 +51,12 @@ RGB16 = np.stack([RAMP, RAMP[::-1], RAMP.T], axis=2) + np.uint16(100)
     ],
     ids=["grey8", "grey16", "rgb8", "rgb16", "rgba8", "rgba16"],
 )
-def test_files_and_arrays_convert_alike(tmp_path: Path, image: np.ndarray) -> None:
+@pytest.mark.parametrize("ending", [".png", ".tif"])
+def test_files_and_arrays_convert_alike(tmp_path: Path, image: np.ndarray, ending: str) -> None:
     stored = image if image.ndim == 2 else image[:, :, [2, 1, 0, 3][: image.shape[2]]]
-    cv2.imwrite(str(tmp_path / "a.png"), stored)
+    cv2.imwrite(str(tmp_path / f"a{ending}"), stored)
     rgb = as_rgb(image)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), rgb)
+    np.testing.assert_array_equal(read_image(tmp_path / f"a{ending}"), rgb)
     colours = image[:, :, None] if image.ndim == 2 else image[:, :, :3]
     expected = colours / 257 if image.dtype == np.uint16 else colours
     np.testing.assert_array_equal(rgb, np.broadcast_to(np.round(expected), (16, 16, 3)))
@@ -113,6 +116,33 @@ def test_exif_orientation_is_applied(tmp_path: Path) -> None:
     frame = Frame("a", file, Camera(16, 32, 20.0, 20.0, 7.5, 15.5), SE3.identity())
     generic.write(tmp_path / "out", Recording("x", (frame,), ()))
     np.testing.assert_array_equal(load_recording(tmp_path / "out").train[0].read_image(), image)
+
+
+@pytest.mark.parametrize("order", ["II", "MM"])
+@pytest.mark.parametrize("ending", [".jpg", ".png", ".webp", ".tiff"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_orientation_is_applied_or_not_in_every_format(
+    tmp_path: Path, ending: str, orientation: int, order: str
+) -> None:
+    """Files of Pillow 13.0.0; its byte order of TIFF is that of the prefix."""
+    stored = np.full((16, 40, 3), 20, np.uint8)
+    stored[:8] += 60
+    stored[:, :20] += 120
+    file, exif = tmp_path / f"a{ending}", Image.Exif()
+    exif[0x112], exif.endian = orientation, {"II": "<", "MM": ">"}[order]
+    exif[0x10F] = 5000 * "maker "  # an entry that is long
+    image = Image.fromarray(stored)
+    if ending == ".tiff":
+        tags = TiffImagePlugin.ImageFileDirectory_v2(prefix=order.encode())
+        tags[0x112] = orientation
+        image.save(file, tiffinfo=tags, compression="tiff_lzw" if order == "II" else None)
+    else:
+        image.save(file, exif=exif)
+    upright = ImageOps.exif_transpose(Image.open(file))
+    assert np.abs(read_image(file).astype(int) - np.asarray(upright)).max() < 9
+    unturned = as_stored(file)
+    assert isinstance(unturned, UnturnedImage) == (orientation != 1)
+    assert np.abs(pixels_of(unturned).astype(int) - stored).max() < 9
 
 
 def test_broken_files_are_refused(tmp_path: Path) -> None:

@@ -32,7 +32,9 @@ def test_missing_and_unreadable_images_are_named_and_left_out(root: Path) -> Non
     images[0].unlink()
     images[1].write_bytes(b"")
     images[2].write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
-    images[3].write_bytes(images[3].read_bytes()[:-50])
+    data = bytearray(images[3].read_bytes())
+    data[len(data) // 2] ^= 255  # its ends are whole
+    images[3].write_bytes(data)
     read = load_recording(root)
     assert [frame.name for frame in read.train] == [f"shot-{i}" for i in range(4, 8)]
     assert read.notes == (
@@ -72,3 +74,13 @@ def test_files_that_are_cut_are_unreadable(ending: str, tmp_path: Path) -> None:
     for kept in (0, 20, file.stat().st_size // 2):
         file.write_bytes(file.read_bytes()[:kept])
         assert not is_readable(file)
+
+
+def test_a_jpeg_that_is_damaged_inside_is_unreadable(tmp_path: Path) -> None:
+    file = tmp_path / "a.jpg"
+    write_image(file, np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8))
+    data = bytearray(file.read_bytes())
+    table = data.index(b"\xff\xc4")  # the first table of Huffman codes
+    data[table + 5 : table + 25] = bytes(20)
+    file.write_bytes(data)
+    assert not is_readable(file)

@@ -166,6 +166,7 @@ def _wrapped(text: str) -> str:
 
 
 def _box_text(box: str) -> str:
-    """The first paragraph of tyro's framed message as one line."""
+    """The paragraphs of tyro's framed message as one line, without the last one, on --help."""
     text = " ".join(line.strip("│ ") for line in box.splitlines()[1:])
-    return " ".join(text.partition("──")[0].split()) or "unusable arguments"
+    parts = [" ".join(part.strip("─╰╯ ").split()) for part in text.split("──")]
+    return "; ".join(filter(None, parts)).partition("; For full help")[0] or "unusable arguments"

@@ -83,10 +83,10 @@ class Detect(args.Verb):
             raise InputError(str(error)) from None
         from evercal.calibration.boards.board_poses import board_poses
         from evercal.calibration.boards.corners import BoardView, calibrate_camera
-        from evercal.recordings import image_size
+        from evercal.recordings.images import first_size
         from evercal.recordings.poses.camera_file import read_camera_of_size
 
-        width, height = image_size(files[0])
+        width, height = first_size(files)
         camera, source = None, "file"
         if self.camera is not None:
             camera = read_camera_of_size(self.camera, (width, height), "the first image")
@@ -119,7 +119,7 @@ class Detect(args.Verb):
 
         if self.square_mm is None:
             raise InputError("--square-mm: give the side of a square, or of the tag, millimetres")
-        match = re.fullmatch(r"(\d+)x(\d+)", self.size or "0x0")
+        match = re.fullmatch(r"(\d+)[xX,](\d+)", self.size or "0x0")
         if match is None:
             raise InputError(f"--size {self.size}: give two numbers such as 9x6")
         return Board(
@@ -129,7 +129,7 @@ class Detect(args.Verb):
             rows=int(match[2]),
             marker_m=self.marker_mm / 1000,
             gap_m=self.gap_mm / 1000,
-            dictionary=self.dictionary or _DICTIONARIES[self.board],
+            dictionary=(self.dictionary or _DICTIONARIES[self.board]).removeprefix("DICT_"),
             tag=self.tag,
         )
 
@@ -144,9 +144,12 @@ class Detect(args.Verb):
         names = {Path(os.path.relpath(f.absolute(), folder)).as_posix(): f for f in files}
         with progress_bar("detecting", len(files), "image") as bar:
 
-            def read(name: str) -> "Image":
+            def read(name: str) -> "Image | str":
                 bar.update()
-                image = read_image(names[name])
+                try:
+                    image = read_image(names[name])
+                except InputError as error:
+                    return str(error).removeprefix(f"{names[name]}: ")
                 if image.shape[:2] != (height, width):
                     raise InputError(
                         f"{names[name]}: is {image.shape[1]}x{image.shape[0]}, the first image"

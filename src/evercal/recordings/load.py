@@ -93,13 +93,13 @@ def load_recording(
                 f" {', '.join(users)}; leave it out"
             )
     recording = read(root, options) if uses else read(root)
+    if options.every > 1:
+        train, test = (part[:: options.every] for part in (recording.train, recording.test))
+        recording = dataclasses.replace(recording, train=train, test=test)
     with named_errors(root, "recording"):
         recording = with_images(recording, root if root.is_dir() else root.parent)
     if (root / "masks").is_dir():
         from evercal.recordings.masks import with_masks
 
         recording = with_masks(recording, root)
-    if options.every > 1:
-        train, test = (part[:: options.every] for part in (recording.train, recording.test))
-        recording = dataclasses.replace(recording, train=train, test=test)
     return recording if name is None else dataclasses.replace(recording, name=name)

@@ -32,7 +32,7 @@ def named_errors(path: Path | str, what: str, remedy: str = "check the path") ->
     except OSError as error:
         raise InputError(f"{path}: {what} cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: {what} is not a text file; {remedy}") from None
+        raise InputError(f"{path}: {what} is not a text file; {remedy}, or save text") from None
     except (RecursionError, MemoryError):
         raise InputError(f"{path}: {what} is nested too deeply or too large") from None
     except (ValueError, TypeError, OverflowError, EOFError) as error:

@@ -305,7 +305,7 @@ def test_the_first_marker_of_a_grid_may_have_any_number(board: Board) -> None:
         (CHARUCO, {"marker_m": 0.02}, "markers measure 30.* mm beside squares of 40 mm, not 20"),
         (APRILGRID, {"columns": 3, "rows": 4}, "they fit 4x3 markers from --tag 0, not 3x4"),
         (ARUCOGRID, {"columns": 4, "rows": 2}, "they fit 4x3 markers from --tag 0, not 4x2"),
-        (ARUCOGRID, {"tag": 5}, "they fit 4x3 markers from --tag 0, not 4x3"),
+        (ARUCOGRID, {"tag": 5}, "they fit 4x3 .* from --tag 0, not 4x3; correct --size or --tag"),
         (APRILGRID, {"gap_m": 0.01}, "gaps measure 12.* mm beside markers of 40 mm, not 10"),
         (CHESSBOARD, {"columns": 8}, "(9x6|6x9) inner corners, not 8x6 inner corners"),
     ],

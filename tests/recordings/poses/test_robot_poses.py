@@ -59,6 +59,13 @@ HEADERS = [
     ("X,Y,Z,W,P,R", "fanuc", None),
     (",".join(f"m{i}{j}" for i in range(4) for j in range(4)), "matrix", None),
     (",".join(f"m{i}{j}" for j in range(4) for i in range(4)), "franka", None),
+    (",".join(f"O_T_EE[{i}]" for i in range(16)), "franka", None),
+    (",".join(f"O_T_EE_{i}" for i in range(16)), "franka", "franka"),
+    (",".join(f"actual_TCP_pose_{i}" for i in range(6)), "ur", None),
+    ("ee_pos_x,ee_pos_y,ee_pos_z,ee_quat_x,ee_quat_y,ee_quat_z,ee_quat_w", "xyzw", None),
+    ("p_x,p_y,p_z,q_w,q_x,q_y,q_z", "wxyz", None),
+    (",".join(f"/tcp/pose/position/{i}" for i in "xyz") + ","
+     + ",".join(f"/tcp/pose/orientation/{i}" for i in "xyzw"), "xyzw", None),
     ("x,y,z,rx,ry,rz", "ur", "ur"),
     ("x,y,z,rx,ry,rz", "yaskawa", "yaskawa"),
     ("x,y,z,rx,ry,rz", "staubli", "staubli"),
@@ -84,6 +91,19 @@ def test_headers_define_columns(
         read = read_robot_poses(file, given)
         assert same(read.poses, arm())
         assert (read.names, read.stamps_s) == (None, None)
+
+
+def test_lines_of_ros2_topic_echo_csv_are_read(tmp_path: Path) -> None:
+    """A PoseStamped: seconds, nanoseconds, frame, position and quaternion."""
+    rows = numbers_from_poses(arm(), pose_convention("xyzw")).tolist()
+    text = "".join(
+        f"{1700000000 + i},250000000,base,{str(row)[1:-1]}\n" for i, row in enumerate(rows)
+    )
+    (tmp_path / "p.csv").write_text(text)
+    read = read_robot_poses(tmp_path / "p.csv", "xyzw")
+    assert same(read.poses, arm())
+    assert read.stamps_s is not None
+    np.testing.assert_allclose(read.stamps_s - 1.7e9, np.arange(len(rows)) + 0.25)
 
 
 @given(st.permutations(range(9)), st.integers(0, 1000))
@@ -207,6 +227,21 @@ REFUSED = [
     ("x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,1,1,0,0", None, "not of length 1"),
     ("x,y,z,qw,qx,qy,qz,px,py,pz\n" + Q + ",1,2,3", None, "x and px may both be the position's"),
     ("x,y,z,qw,qx,qy,qz,qw,qx,qy,qz\n" + Q + ",1,0,0,0", None, "qw and qw may both be"),
+    (
+        ",".join(f"{arm}_pos_{i}" for arm in ("left", "right") for i in "xyz")
+        + ","
+        + ",".join(f"{arm}_quat_{i}" for arm in ("left", "right") for i in "wxyz")
+        + "\n0,0,0,0,0,0,1,0,0,0,1,0,0,0",
+        None,
+        "it holds poses of left_ and right_; keep the columns of one",
+    ),
+    (
+        "left_pos_x,left_pos_y,left_pos_z,right_quat_w,right_quat_x,right_quat_y,right_quat_z\n"
+        + Q,
+        None,
+        "name no known pose",
+    ),
+    (f"1,5,{Q}\n1,6,{Q}", "wxyz", "rows have 9 numbers"),
     ("5,1,2,0,0,1,9\n4,1,2,0,0,1,9", "ur", "rows have 7 numbers; ur takes 6 .* that increases"),
     ("# nothing\n", None, "no line of numbers"),
     (",,,\n", None, "no line of numbers"),

@@ -35,18 +35,19 @@ def find_board(image: Image, board: Board) -> BoardView | str:
 
 
 def find_boards(
-    names: Sequence[str], read: Callable[[str], Image], board: Board
+    names: Sequence[str], read: Callable[[str], Image | str], board: Board
 ) -> tuple[Board, dict[str, BoardView | str]]:
     """Detect a board in images of one camera; return the corners in each, or a reason.
 
-    Also return the board, with its first marker. Images are searched in an order that spreads. If
-    none shows the board, InputError; also after a few images that show another board.
+    `read` returns an image, or the reason why there is none. Also return the board, with its first
+    marker. Images are searched in an order that spreads. If none shows the board, InputError; also
+    after a few images that show another board.
     """
     order = sorted(range(len(names)), key=lambda i: i * (5**0.5 - 1) / 2 % 1)
     found: dict[str, BoardView | str | Markers] = {}
     settled, views = board, {}
     for tried, i in enumerate(order, 1):
-        found[names[i]] = _look(read(names[i]), board)
+        found[names[i]] = image if isinstance(image := read(names[i]), str) else _look(image, board)
         if tried == len(names) or (tried <= _MANY and tried % _FEW == 0):
             settled, views = _settled(found, board)
             if any(isinstance(view, BoardView) for view in views.values()):

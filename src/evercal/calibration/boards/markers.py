@@ -232,7 +232,7 @@ def _layout(markers: Markers, board: Board) -> tuple[Layout, str]:
             fits = f"they fit {layout.columns}x{rows} {'squares' if charuco else 'markers'}{older}"
         return layout, OtherBoard(
             f"markers {ids[0]} to {ids[-1]} are visible, {fits}, not"
-            f" {board.columns}x{board.rows}; correct --size"
+            f" {board.columns}x{board.rows}; correct --size" + " or --tag" * (board.tag is not None)
         )
     long = np.linalg.norm(np.diff(markers.corners, axis=1), axis=2)
     few = len(good) < _FEWEST_STEPS or np.median(long) < _LEAST_SIDE_PX

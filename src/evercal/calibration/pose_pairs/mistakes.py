@@ -93,9 +93,10 @@ def require_agreement(
         least = min(_cost(other) for other, _ in better)
         equal = [(other, r) for other, r in better if _cost(other) < 3 * least]
         corrected, likely = max(equal, key=lambda pair: _plausibility(pair[1], pair[0]))
+        given = "; if --invert or :inverse is given, leave it out" * ("--invert" in likely.message)
         raise InputError(
-            f"{likely.message}; corrected, the poses agree to {_size(corrected)}, as given to"
-            f" {_size(fit)}"
+            f"{likely.message}{given}; corrected, the poses agree to {_size(corrected)},"
+            f" as given to {_size(fit)}"
         )
     if not (_fails(fit) or own_camera):
         _require_plausible(_Reading("", pairs, mount), fit, scale_known)

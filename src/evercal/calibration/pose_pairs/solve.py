@@ -27,6 +27,9 @@ from evercal.geometry import SE3, cross_matrix, pose_distance
 
 Array = NDArray[np.floating]
 
+_REACH_M, _OTHER_MOUNT = 0.4, 4.0
+"""Distance from the gripper of what it carries, and its ratio to what the base carries, above which
+the mount may be the other one."""
 _SCALE_SIGMA = 0.1
 """Maximum relative standard deviation of an unknown scale."""
 _MOST_LENSES, _SAME_LENS = 8, 0.01
@@ -112,6 +115,7 @@ def solve_pairs(
             " drifts: calibrate from the poses before or after it, or fasten it and record again"
         )
     warnings += _lens_warnings(fit, equation, corners, lens)
+    warnings += _mount_warnings(fit.at, mount) if of_board else []
     _require_determined(pairs[rows[fit.inliers]], fit, equation, scale_known)
     return PairSolution(
         pairs, rows, first, equation, fit, mount, scale, tuple(warnings), corners, lens
@@ -206,6 +210,22 @@ def _lens_warnings(
     return [
         f"the stated focal length is {stated.mean[0]:.1f} px, corners and motions give {now:.1f}"
         f" px: check --camera, or omit it"
+    ]
+
+
+def _mount_warnings(at: Unknowns, mount: Mount) -> list[str]:
+    """The other mount with inverted robot poses obeys the same equation."""
+    both = np.stack([at.parent_from_camera.translation_m, at.fixed_from_board.translation_m])
+    camera, board = np.linalg.norm(both, axis=1).tolist()
+    carried, on, other = camera, ("gripper", "base"), "eye_to_hand"
+    if mount == "eye_to_hand":
+        carried, on, other = board, ("base", "gripper"), "eye_in_hand"
+    if carried < max(_REACH_M, _OTHER_MOUNT * min(camera, board)):
+        return []
+    return [
+        f"the camera is {camera:.2f} m from the {on[0]} and the board {board:.2f} m from the"
+        f" {on[1]}: if it is the other way round, the robot poses are gripper_from_base, as"
+        f" easy_handeye states for a fixed camera; use --mount {other} and --invert robot"
     ]
 
 

@@ -93,8 +93,8 @@ def _of_object(data: Columns, given: PoseConvention | None, robot: bool) -> Pose
     kind = data["parameters"] if isinstance(data.get("parameters"), Mapping) and robot else {}
     fixed = kind.get("calibration_type") == "eye_on_base" or kind.get("eye_on_hand") is False
     if fixed and not (given and given.has("inverse")):
-        problem = "easy_handeye states gripper_from_base for a fixed camera"
-        raise ConventionError(problem, "wxyz:inverse")
+        problem = "easy_handeye states gripper_from_base for a fixed camera (eye_to_hand)"
+        raise ConventionError(problem, "wxyz:inverse in place of --invert")
     columns = _of_role(data, given, robot)
     inner = [key for key in columns if key in _KEYS and len(_shape(columns[key])) < 2]
     if len(inner) == 1:

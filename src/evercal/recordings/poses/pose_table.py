@@ -84,16 +84,19 @@ class Columns(NamedTuple):
 
 
 _GRID = [f"{row}{column}" for row in range(4) for column in range(4)]
+_DOWN = [str(4 * column + row) for row in range(4) for column in range(4)]
 _GRID_3 = [f"{row}{column}" for row in range(3) for column in range(3)]
 _ANGLES = ("ur", "yaskawa", "staubli", "fanuc", "rpy")
 _ORDERS = ("abb", "wxyz", "xyzw", "tum")
 _Q, _R = "q,q_,quat,quat_,quaternion_,orientation_,rotation_,q_rs_", "r,r_,rot_,rotation_"
 HEADERS = {
-    "position": Columns(",t,t_,p,pos_,position_,translation_,tvec_,p_rs_r_", "xyz"),
+    "position": Columns(",t,t_,p,p_,pos_,position_,translation_,tvec_,p_rs_r_", "xyz"),
     "quaternion": Columns(_Q, "wxyz", ("wxyz", *_ORDERS), axes="wxyz"),
     "rotation vector": Columns("rotvec_,rvec_,rotation_vector_", "xyz", ("ur",), axes="-"),
     "matrix": Columns("m", _GRID, ("matrix", "franka")),
     "3x4 matrix": Columns("m", _GRID[:12], ("matrix", "franka")),
+    "O_T_EE": Columns("o_t_ee,o_t_ee_", _DOWN, ("matrix", "franka")),
+    "RTDE": Columns("actual_tcp_pose_", "012345", ("ur",)),
     "rotation matrix": Columns(_R, _GRID_3, ("matrix",)),
     "matrix from r11": Columns(_R, [f"{int(at) + 11}" for at in _GRID_3], ("matrix",)),
     "W P R": Columns("", "wpr", ("fanuc",)),
@@ -160,6 +163,8 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
         raise ValueError("no line of numbers in it")
     if len(words) == rows.shape[1] and _is_header(words):
         return named_numbers(words, rows, given)
+    same = [i for i, cell in enumerate(rows[0]) if {cell} == {*rows[1:, i]} and not is_number(cell)]
+    rows = np.delete(rows, same, axis=1)  # such as a frame
     texts = [i for i, cell in enumerate(rows[0].tolist()) if not is_number(cell)]
     numbers = cell_numbers(np.delete(rows, texts[:1], axis=1))
     if texts or numbers.shape[1] != 4:
@@ -241,6 +246,9 @@ def plain_numbers(numbers: Array, given: PoseConvention | None, names: Names = N
             f" x,y,z,qw,qx,qy,qz",
             f"NAME, one of {KNOWN_CONVENTIONS}",
         )
+    ros = width - 2 in given.counts and not (numbers[:, :2] // [4e9, 1e9]).any()
+    if ros and not (numbers[:, :2] % 1).any() and numbers[:, 0].min() > 1e9:
+        numbers, width = np.c_[numbers[:, :2] @ [1, 1e-9], numbers[:, 2:]], width - 1
     count = next((count for count in given.counts if 0 <= width - count <= 1), 0)
     stamps = in_unit(numbers[:, 0]) if count and width > count else None
     # A misplaced number shows in quaternions and matrices, but not in angles.
@@ -292,7 +300,7 @@ def _without_lists(lines: list[str]) -> list[str]:
     cut = next((s for s in ";,\t" if s in "".join(lines[:1])), " ")
     label = re.compile(r"^([^\s,;:=]+)\s*(?::\s|=)\s*(?=[-+.\d])")  # P1 = 412.0
     lines = [label.sub(rf"\1{cut}", line) for line in lines]
-    if not lines or not re.search(r"[\[({]\s*[-+.\d]", lines[0]):
+    if not lines or not re.search(r"((?<!\w)\[|[({])\s*[-+.\d]", lines[0]):
         return lines
     text = re.sub(r"\b\w+\(", "(", "\n".join(lines))
     text = re.sub(r"\[[^\[\]]*\]", lambda row: row[0].replace("\n", " "), text)  # wrapped by numpy
@@ -305,7 +313,20 @@ def _is_header(words: Sequence[str]) -> bool:
 
 
 def _groups(words: Sequence[str]) -> _Groups:
+    """Columns by their names, or by those after one beginning, such as `ee_`."""
     names = [name_and_unit(word)[0] for word in words]
+    if groups := _matched(names, words):
+        return groups
+    ends = [f"_{x}" for x in HEADERS["position"].names(0)]
+    starts = {name.removesuffix(x[1:]) for name in names for x in ends if name.endswith(x)}
+    rests = {s: [n[len(s) :] if n.startswith(s) else "" for n in names] for s in sorted(starts)}
+    found = {s: groups for s in rests if len(groups := _matched(rests[s], words)) > 1}
+    if len(found) > 1:
+        raise ValueError(f"it holds poses of {' and '.join(found)}; keep the columns of one")
+    return next(iter(found.values()), {})
+
+
+def _matched(names: Sequence[str], words: Sequence[str]) -> _Groups:
     groups: _Groups = {}
     for key, group in HEADERS.items():
         found = [
@@ -328,7 +349,8 @@ def _defined(groups: _Groups, words: Sequence[str]) -> str:
     stated = {key: name_and_unit(words[groups[key][0]])[1] for key in rotations}
     sure = [k for k in rotations if not HEADERS[k].ask or (k == "roll pitch yaw" and stated[k])]
     conventions = [HEADERS[key].conventions[0] for key in sure]
-    if len(sure) == 1 and ("position" in groups or conventions == ["matrix"]):
+    whole = sure and len(groups[sure[0]]) in pose_convention(conventions[0]).counts
+    if len(sure) == 1 and ("position" in groups or whole):
         return conventions[0]
     if sure[1:]:
         raise ConventionError(f"the header names {' and '.join(sure)}", " or ".join(conventions))

@@ -144,11 +144,11 @@ def cell_numbers(cells: Cells, words: Sequence[str] = ()) -> Array:
 def name_and_unit(cell: str) -> tuple[str, str | None]:
     """Split a column's name into its plain name and its unit."""
     require_at_most(len(cell), "name_characters", "characters of a name")
-    name = re.sub(r"^((pose|transform|header)[._/])+", "", cell.strip().lower())
+    name = re.sub(r"^(.*/)?((pose|transform|header)[._/])+", "", cell.strip().lower())
     match = _UNIT.search(re.sub("[°º]", " deg", name))
     unit = match.group(1) if match else None
     name = match.string[: match.start()] if match else name
-    return re.sub(r"[\s.]+", "_", name), _SHORT.get((unit or "")[:3], unit)
+    return re.sub(r"[\s./\[]+", "_", name.rstrip("]")), _SHORT.get((unit or "")[:3], unit)
 
 
 def row_labels(
@@ -233,6 +233,8 @@ def _require_few_numbers(file: IO[bytes]) -> None:
         version, np.lib.format.read_array_header_2_0
     )
     shape, _, dtype = read(file)
+    if dtype.hasobject:
+        raise ValueError("Python objects; save arrays of numbers")
     require_at_most(math.prod(shape) * max(dtype.itemsize, 8) // 8, "numbers", "numbers")
 
 

@@ -139,7 +139,7 @@ def _parts(path: Path) -> list[Path]:
 
 def _reason(error: Exception) -> str:
     text = " ".join(str(error).split())[:200] or type(error).__name__
-    if "not indexed" in text:
+    if text.startswith(("Bag is not indexed", "Bag index looks damaged")):
         return f"{text}; repair it with 'rosbag reindex'"
     if "end magic" in text:
         return f"{text} The recorder did not end; restore it with 'mcap recover FILE -o NEW.mcap'"
