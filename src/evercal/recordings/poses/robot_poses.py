@@ -42,6 +42,8 @@ _YAML = re.compile(
 """Beginning of YAML in a file with another ending."""
 _END_BYTES = 1 << 16
 """Bytes read at each end of a file that grows."""
+_UNTRACKED = re.compile(r"(?i)\b(?:nan|inf)\b|1\.?#(?:IND|INF|[QS]NAN)")
+"""A number in a file of one pose that an image lacks, also as Windows prints it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,15 +156,18 @@ def _folder(path: Path, given: PoseConvention | None, what: str, robot: bool) ->
     if len(own) != 1:
         found = " and ".join(own) or f"no file of {', '.join(POSE_ENDINGS)}"
         raise ValueError(f"the folder holds {found}; give a folder of one file for each pose")
-    tables = []
-    for name in several[own[0]]:
-        with named_errors(path / name, what):
-            tables.append(_file(path / name, given, what, robot))
-            if len(tables[-1].numbers) != 1:
+    tables: dict[str, PoseTable] = {}
+    for file in (path / name for name in several[own[0]]):
+        with named_errors(file, what):
+            if file.suffix.lower() == ".txt" and _UNTRACKED.search(read_text(file, what)):
+                continue
+            table = tables[file.stem] = _file(file, given, what, robot)
+            if len(table.numbers) != 1:
                 raise ValueError("holds several poses, in a folder of one file for each pose")
-    numbers = np.concatenate([table.numbers for table in tables])
-    stems = tuple(Path(name).stem for name in several[own[0]])
-    return PoseTable(numbers, tables[0].convention, stems)
+    if not tables:
+        raise ValueError("all poses in its files are inf or nan; give those of tracked images")
+    numbers = np.concatenate([table.numbers for table in tables.values()])
+    return PoseTable(numbers, next(iter(tables.values())).convention, tuple(tables))
 
 
 def _table(text: str, ending: str, given: PoseConvention | None, robot: bool = True) -> PoseTable:
