@@ -83,6 +83,18 @@ def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str
     return data
 
 
+def documents(text: str, is_json: bool) -> list[Any]:
+    """Values of JSON, of lines of JSON, or of YAML; ValueError for other text."""
+    if not is_json:
+        return yaml_documents(text)
+    try:
+        return [json.loads(text)]
+    except json.JSONDecodeError as error:
+        if error.msg != "Extra data":
+            raise ValueError(f"not valid JSON ({error})") from None
+    return [json.loads(line) for line in text.splitlines() if line.strip()]
+
+
 def yaml_documents(text: str) -> list[Any]:
     """The documents of a YAML text; ValueError for other text, references, tags, deep nesting.
 

@@ -4,13 +4,11 @@ A convention is required if the file does not define the meaning of its numbers.
 one such file for each pose. docs/formats.md has examples of all kinds.
 """
 
-import json
 import os
 import re
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +25,7 @@ from evercal.recordings.poses.conventions import (
 from evercal.recordings.poses.pose_data import pose_data
 from evercal.recordings.poses.pose_table import PoseTable, read_pose_table
 from evercal.recordings.poses.row_files import Names, arrays_as_lists, natural_key
-from evercal.recordings.text_files import (
-    named_errors,
-    read_text,
-    refuse_repeated,
-    yaml_documents,
-)
+from evercal.recordings.text_files import documents, named_errors, read_text, refuse_repeated
 
 POSE_ENDINGS = (".csv", ".json", ".jsonl", ".yaml", ".yml", ".npy", ".npz", ".mat", ".tum", ".txt")
 _YAML = re.compile(
@@ -171,22 +164,11 @@ def _folder(path: Path, given: PoseConvention | None, what: str, robot: bool) ->
 
 
 def _table(text: str, ending: str, given: PoseConvention | None, robot: bool = True) -> PoseTable:
-    if ending in (".json", ".jsonl"):
-        return pose_data(_json(text), given, robot)
-    if ending in (".yaml", ".yml") or _YAML.match(text):
-        documents = [each for each in yaml_documents(text) if each is not None]
-        return pose_data(documents[0] if len(documents) == 1 else documents, given, robot)
+    is_json = ending in (".json", ".jsonl")
+    if is_json or ending in (".yaml", ".yml") or _YAML.match(text):
+        data = [each for each in documents(text, is_json) if each is not None]
+        return pose_data(data[0] if len(data) == 1 else data, given, robot)
     return read_pose_table(text, given)
-
-
-def _json(text: str) -> Any:
-    """JSON, or a value in each line."""
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError as error:
-        if error.msg != "Extra data":
-            raise
-        return [json.loads(line) for line in text.splitlines() if line.strip()]
 
 
 def _poses(table: PoseTable, camera_from: bool = False) -> SE3:
