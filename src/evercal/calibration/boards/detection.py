@@ -17,6 +17,7 @@ from evercal.calibration.boards.markers import (
     grid_views,
 )
 from evercal.errors import InputError
+from evercal.geometry.camera import resize_pixels
 
 Array = NDArray[np.floating]
 Image = NDArray[np.uint8]
@@ -92,18 +93,16 @@ def _chessboard_candidates(grey: NDArray, size: tuple[int, int]) -> Iterator[Arr
     import cv2
 
     normalized = cv2.CALIB_CB_NORMALIZE_IMAGE
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | normalized
-    detected, pixels = cv2.findChessboardCorners(grey, size, flags=flags)
-    if detected:
-        yield pixels.reshape(-1, 2).astype(np.float64)
-    detected, pixels = cv2.findChessboardCornersSB(grey, size, flags=normalized)
-    if detected:
-        yield pixels.reshape(-1, 2).astype(np.float64)
-    if grey.shape[1] <= _LARGEST_DOUBLED_PX:  # for small or tilted squares
-        double = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-        detected, pixels = cv2.findChessboardCornersSB(double, size, flags=normalized)
+    searches = [
+        (cv2.findChessboardCorners, 1, cv2.CALIB_CB_ADAPTIVE_THRESH | normalized),
+        (cv2.findChessboardCornersSB, 1, normalized),
+        (cv2.findChessboardCornersSB, 2, normalized),  # for small or tilted squares
+    ]
+    for find, scale, flags in searches[: 3 if grey.shape[1] <= _LARGEST_DOUBLED_PX else 2]:
+        image = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        detected, pixels = find(image, size, flags=flags)
         if detected:
-            yield (pixels.reshape(-1, 2).astype(np.float64) - 0.5) / 2
+            yield resize_pixels(pixels.reshape(-1, 2).astype(np.float64), 1 / scale)
 
 
 def _is_even(grid: Array) -> bool:
