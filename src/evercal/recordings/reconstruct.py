@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError, missing_extra
+from evercal.errors import InputError, optional_module
 from evercal.recordings.images import write_image
 from evercal.recordings.streams import StreamFrame, stream
 
@@ -66,10 +66,7 @@ def reconstruct(
         most_frames: Maximum number of frames; of more, every n-th is used.
         on_step: Called with the current step.
     """
-    try:
-        import pycolmap
-    except ImportError:
-        raise missing_extra("reconstruction needs pycolmap", "colmap") from None
+    pycolmap = optional_module("pycolmap", "reconstruction needs pycolmap", "colmap")
     root = Path(out)
     if root.exists() and any(root.iterdir()):
         raise InputError(f"{root}: is not empty; give a new folder")

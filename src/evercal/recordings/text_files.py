@@ -40,6 +40,16 @@ def named_errors(path: Path | str, what: str, remedy: str = "check the path") ->
 
 
 @contextmanager
+def library_errors(what: str) -> Iterator[None]:
+    """Turn errors of another library into an `InputError`: damaged files make it raise any type."""
+    try:
+        yield
+    except Exception as error:
+        text = " ".join(str(error).split())[:200]
+        raise InputError(f"{what} ({type(error).__name__}: {text})") from None
+
+
+@contextmanager
 def naming(what: str) -> Iterator[None]:
     """Begin the message of a ValueError with the entry that it is about."""
     try:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from evercal.errors import InputError, missing_extra
+from evercal.errors import InputError, optional_module
 from evercal.geometry import SE3, Camera
 from evercal.geometry.camera import COEFFICIENTS
 from evercal.processes import status_of
@@ -21,7 +21,7 @@ from evercal.recordings.images import as_stored, files_in
 from evercal.recordings.poses.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import natural_key
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import named_errors, path_inside
+from evercal.recordings.text_files import library_errors, named_errors, path_inside
 
 USES = ("metres",)
 
@@ -88,22 +88,16 @@ def _models(root: Path) -> list[Path]:
 
 
 def _model(folder: Path) -> Any:
-    try:
-        import pycolmap  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        need = f"{folder}: reading a COLMAP model needs pycolmap"
-        raise missing_extra(need, "colmap") from None
+    need = f"{folder}: reading a COLMAP model needs pycolmap"
+    pycolmap = optional_module("pycolmap", need, "colmap")
     _require_ends(folder)
-    try:
+    with library_errors(f"{folder}: pycolmap cannot read the model"):
         model = pycolmap.Reconstruction(str(folder))
         names = _names(folder)
         for key, image in model.images.items():
             name = names.get(key, image.name)  # decodes UTF-8
             image.name = path_inside(name, "the name of an image")
         return model
-    except Exception as error:  # pycolmap passes C++ exceptions on as several types
-        text = " ".join(str(error).split())[:200]
-        raise InputError(f"{folder}: pycolmap cannot read the model: {text}") from None
 
 
 def _names(folder: Path) -> dict[int, str]:

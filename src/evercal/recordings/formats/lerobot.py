@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError, missing_extra
+from evercal.errors import InputError, optional_module
 from evercal.geometry import SE3
 from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
@@ -35,13 +35,19 @@ from evercal.recordings.poses.camera_file import read_camera_of_size
 from evercal.recordings.poses.conventions import (
     ConventionError,
     PoseConvention,
-    check_units,
+    checked_poses,
     pose_convention,
-    poses_from_numbers,
 )
 from evercal.recordings.poses.kinematics import RobotModel, in_radians
+from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import named_errors, path_inside, read_json, refuse_repeated
+from evercal.recordings.text_files import (
+    library_errors,
+    named_errors,
+    path_inside,
+    read_json,
+    refuse_repeated,
+)
 
 Array = NDArray[np.float64]
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
@@ -138,9 +144,8 @@ def _rows(root: Path, column: str) -> tuple[list[_Row], Array]:
         *cells, poses = _columns(file, ["episode_index", "frame_index", "timestamp", column])
         for i, (episode, number, seconds) in enumerate(zip(*cells, strict=True)):
             rows.append(_Row(episode, number, seconds, file, i))
-        values = np.empty(0)
-        with suppress(TypeError, ValueError):
-            values = np.array(poses, dtype=np.float64)
+        with named_errors(file, column):
+            values = number_array(poses, column)
         if values.ndim != 2 or not np.isfinite(values).all():
             raise InputError(f"{file}: {column} holds no rows of finite numbers")
         parts.append(values)
@@ -156,13 +161,10 @@ def _images(
         return [_Embedded(root, key, row.file, row.row) for row in rows]
     videos = Videos(float(info["fps"]))
     starts = _video_starts(root, info, key, {row.episode for row in rows})
-    images: list[StoredImage] = []
-    for row in rows:
-        if row.episode not in starts:
-            raise InputError(f"{root / 'meta' / 'episodes'}: episode {row.episode} is not listed")
-        path, start = starts[row.episode]
-        images.append(VideoFrame(videos, path, start + row.seconds))
-    return images
+    if lost := sorted({row.episode for row in rows} - starts.keys()):
+        raise InputError(f"{root / 'meta' / 'episodes'}: episode {lost[0]} is not listed")
+    places = [(row, *starts[row.episode]) for row in rows]
+    return [VideoFrame(videos, path, start + row.seconds) for row, path, start in places]
 
 
 def _video_starts(
@@ -192,31 +194,23 @@ def _video_starts(
 
 @contextmanager
 def _parquet(path: Path) -> Iterator[Any]:
-    """pyarrow.parquet, with its errors."""
-    try:
-        import pyarrow.parquet as parquet  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        need = f"{path}: LeRobot datasets need pyarrow and PyAV"
-        raise missing_extra(need, "lerobot") from None
-    try:
-        yield parquet
-    except Exception as error:  # pyarrow raises many types for damaged files
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: cannot be read: {reason}") from None
+    """An open table."""
+    need = f"{path}: LeRobot datasets need pyarrow and PyAV"
+    parquet = optional_module("pyarrow.parquet", need, "lerobot")
+    with library_errors(f"{path}: cannot be read"), parquet.ParquetFile(path) as table:
+        yield table
 
 
 def _columns(file: Path, names: list[str]) -> list[list[Any]]:
-    with _parquet(file) as parquet:
-        table = parquet.read_table(file, columns=names)
-        return [table[name].to_pylist() for name in names]
+    with _parquet(file) as table:
+        read = table.read(columns=names)
+        return [read[name].to_pylist() for name in names]
 
 
 @functools.lru_cache(maxsize=1)
 def _row_group(path: Path, group: int, key: str) -> list[Any]:
-    import pyarrow.parquet as parquet  # pyright: ignore[reportMissingImports]
-
-    with parquet.ParquetFile(path) as file:
-        return file.read_row_group(group, columns=[key])[key].to_pylist()
+    with _parquet(path) as table:
+        return table.read_row_group(group, columns=[key])[key].to_pylist()
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,9 +234,9 @@ class _Embedded(StoredImage):
         return image_file(self._content())
 
     def _content(self) -> bytes:
-        with _parquet(self.path) as parquet, parquet.ParquetFile(self.path) as file:
-            groups = range(file.num_row_groups)
-            ends = np.cumsum([file.metadata.row_group(group).num_rows for group in groups])
+        with _parquet(self.path) as table:
+            groups = range(table.num_row_groups)
+            ends = np.cumsum([table.metadata.row_group(group).num_rows for group in groups])
             group = int(np.searchsorted(ends, self.row, side="right"))
             cell = _row_group(self.path, group, self.key)[self.row - int(ends[group])]
         if cell["bytes"]:
@@ -301,8 +295,7 @@ def _feature_poses(
         else:
             convention, columns = _pose_columns(names, options.gripper_frame)
             numbers = values[:, columns]
-        poses = poses_from_numbers(numbers, convention)
-        check_units(numbers, convention)
+        poses = checked_poses(numbers, convention)
     except ConventionError as error:
         raise InputError(f"{root}: {column}: {error.naming('--pose-convention')}") from None
     except ValueError as error:

@@ -36,26 +36,15 @@ from evercal.recordings.text_files import named_errors
 # Encoding: bytes of a channel, channels, and OpenCV's COLOR_... constant if `as_rgb` needs it. ROS
 # names a Bayer pattern by its first two pixels and OpenCV by its second row.
 _ENCODINGS: dict[str, tuple[int, int, str | None]] = {
-    "rgb8": (1, 3, None),
-    "bgr8": (1, 3, "BGR2RGB"),
-    "8UC3": (1, 3, "BGR2RGB"),
-    "rgba8": (1, 4, None),
-    "bgra8": (1, 4, "BGRA2RGB"),
-    "8UC4": (1, 4, "BGRA2RGB"),
-    "mono8": (1, 1, None),
-    "8UC1": (1, 1, None),
-    "rgb16": (2, 3, None),
-    "bgr16": (2, 3, "BGR2RGB"),
-    "mono16": (2, 1, None),
-    "bayer_rggb8": (1, 1, "BayerBG2RGB"),
-    "bayer_bggr8": (1, 1, "BayerRG2RGB"),
-    "bayer_gbrg8": (1, 1, "BayerGR2RGB"),
-    "bayer_grbg8": (1, 1, "BayerGB2RGB"),
-    "yuv422": (1, 2, "YUV2RGB_UYVY"),
-    "uyvy": (1, 2, "YUV2RGB_UYVY"),
-    "yuv422_yuy2": (1, 2, "YUV2RGB_YUY2"),
-    "yuyv": (1, 2, "YUV2RGB_YUY2"),
-}
+    "rgb8": (1, 3, None), "bgr8": (1, 3, "BGR2RGB"), "8UC3": (1, 3, "BGR2RGB"),
+    "rgba8": (1, 4, None), "bgra8": (1, 4, "BGRA2RGB"), "8UC4": (1, 4, "BGRA2RGB"),
+    "rgb16": (2, 3, None), "bgr16": (2, 3, "BGR2RGB"),
+    "mono8": (1, 1, None), "8UC1": (1, 1, None), "mono16": (2, 1, None),
+    "bayer_rggb8": (1, 1, "BayerBG2RGB"), "bayer_bggr8": (1, 1, "BayerRG2RGB"),
+    "bayer_gbrg8": (1, 1, "BayerGR2RGB"), "bayer_grbg8": (1, 1, "BayerGB2RGB"),
+    "yuv422": (1, 2, "YUV2RGB_UYVY"), "uyvy": (1, 2, "YUV2RGB_UYVY"),
+    "yuv422_yuy2": (1, 2, "YUV2RGB_YUY2"), "yuyv": (1, 2, "YUV2RGB_YUY2"),
+}  # fmt: skip
 USES = ("camera", "image_topic", "pose_topic", "base_frame", "gripper_frame", "urdf")
 
 
@@ -197,10 +186,10 @@ def _camera(message: Any, image_size: tuple[int, int], rectified: bool) -> Camer
         if len(p) != 12 or not any(p):
             raise ValueError("P is missing, which rectified images need; give --camera")
         data = {"k": [*p[:3], *p[4:7], *p[8:11]], "d": [], "distortion_model": ""}
-    offsets = {name: int(getattr(message.roi, name)) for name in ("x_offset", "y_offset")}
-    size = {"width": int(message.width), "height": int(message.height)}
-    binning = {name: int(getattr(message, name)) for name in ("binning_x", "binning_y")}
-    return camera_from_fields({**data, **size, **binning, "roi": offsets}, image_size)
+    data["roi"] = {name: int(getattr(message.roi, name)) for name in ("x_offset", "y_offset")}
+    sizes = ("width", "height", "binning_x", "binning_y")
+    data |= {name: int(getattr(message, name)) for name in sizes}
+    return camera_from_fields(data, image_size)
 
 
 def unsupported(encoding: str) -> str | None:

@@ -232,8 +232,6 @@ def fields_of(path: Path, size: tuple[int, int] | None = None) -> Mapping[str, A
     if zipped:
         return arrays_as_lists(path)
     text = read_text(path, "camera file")
-    if "<opencv_storage" in text:
-        return _xml_of_opencv(text)
     words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
     if all(map(is_number, words)):
         if len(words) == 1 and size is not None:
@@ -241,6 +239,8 @@ def fields_of(path: Path, size: tuple[int, int] | None = None) -> Mapping[str, A
             words = [words[0], "0", str(cx), "0", words[0], str(cy), "0", "0", "1"]
         return {"camera_matrix": [float(word) for word in words]}
     try:
+        if "<opencv_storage" in text:
+            return _of_xml(text)
         # A printed message ends with '---', which opens a second, empty document.
         data = next(iter(documents(text, text.lstrip().startswith("{"))), None)
     except ValueError as error:
@@ -250,16 +250,15 @@ def fields_of(path: Path, size: tuple[int, int] | None = None) -> Mapping[str, A
     return data
 
 
-def _xml_of_opencv(text: str) -> dict[str, Any]:
+def _of_xml(text: str) -> dict[str, Any]:
     from xml.etree import ElementTree
 
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can expand without bound
-        raise ValueError(f"it declares XML entities; {_EXPECTED}")
+        raise ValueError("it declares XML entities")
     try:
-        root = ElementTree.fromstring(text)
+        return _xml_value(ElementTree.fromstring(text))
     except ElementTree.ParseError as error:
-        raise ValueError(f"not valid XML ({error}); {_EXPECTED}") from None
-    return _xml_value(root)
+        raise ValueError(f"not valid XML ({error})") from None
 
 
 def _xml_value(element: Any) -> Any:

@@ -172,6 +172,13 @@ def poses_from_numbers(
     return _OPENGL_FROM_OPENCV @ poses if camera_from else poses @ _OPENGL_FROM_OPENCV
 
 
+def checked_poses(numbers: Array, convention: PoseConvention, camera_from: bool = False) -> SE3:
+    """`poses_from_numbers` of (n, k) numbers of plausible size; ValueError for others."""
+    poses = poses_from_numbers(numbers, convention, camera_from)
+    check_units(numbers, convention)
+    return poses
+
+
 def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
     """Convert poses (...) to numbers (..., k), k the largest of `convention.counts`.
 

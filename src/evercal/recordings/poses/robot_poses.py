@@ -18,9 +18,8 @@ from evercal.geometry import SE3
 from evercal.recordings.poses.conventions import (
     ConventionError,
     PoseConvention,
-    check_units,
+    checked_poses,
     pose_convention,
-    poses_from_numbers,
 )
 from evercal.recordings.poses.pose_data import pose_data
 from evercal.recordings.poses.pose_table import PoseTable, read_pose_table
@@ -173,18 +172,14 @@ def _table(text: str, ending: str, given: PoseConvention | None, robot: bool = T
 
 def _poses(table: PoseTable, camera_from: bool = False) -> SE3:
     try:
-        poses = poses_from_numbers(table.numbers, table.convention, camera_from)
-        check_units(table.numbers, table.convention)
-        return poses
+        return checked_poses(table.numbers, table.convention, camera_from)
     except ValueError as error:
         problem: ValueError = error
+    with suppress(ValueError):
         if not table.convention.is_matrix:
-            with suppress(ValueError):
-                turned = np.roll(table.numbers, 3, axis=-1)
-                poses_from_numbers(turned, table.convention)
-                check_units(turned, table.convention)
-                problem = ValueError(
-                    f"the rotation is before the position; write {table.convention.meaning}, or a"
-                    f" header that names the columns"
-                )
-        raise problem from None
+            checked_poses(np.roll(table.numbers, 3, axis=-1), table.convention)
+            problem = ValueError(
+                f"the rotation is before the position; write {table.convention.meaning}, or a"
+                f" header that names the columns"
+            )
+    raise problem

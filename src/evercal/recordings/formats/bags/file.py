@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evercal.errors import InputError, missing_extra
+from evercal.errors import InputError, optional_module
 from evercal.recordings.images import files_in
 from evercal.recordings.text_files import few
 
@@ -43,19 +43,17 @@ class BagFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            from rosbags.highlevel import AnyReader
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError:
-            raise missing_extra(f"{path}: reading bags needs rosbags", "bags") from None
+        need = f"{path}: reading bags needs rosbags"
+        highlevel = optional_module("rosbags.highlevel", need, "bags")
+        typesys = optional_module("rosbags.typesys", need, "bags")
         # Bags of ROS 2 before Iron lack type definitions; the types read here never changed.
-        types = get_typestore(Stores.ROS2_HUMBLE)
+        types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         parts = _parts(path)
         ends = {part.suffix for part in parts}
         if len(ends) > 1:
             raise InputError(f"{path}: holds several kinds of bags ({', '.join(ends)}); name one")
         try:
-            self._reader = AnyReader(parts, default_typestore=types)
+            self._reader = highlevel.AnyReader(parts, default_typestore=types)
             self._reader.open()
             links = [link for link in self._reader.connections if link.msgcount]
             kinds = {str(link.topic): str(link.msgtype) for link in links}
