@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evercal.bounds import bounds
 from evercal.errors import InputError
+from evercal.recordings.text_files import named_errors
 from evercal.storage.atomic import write_bytes
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -134,12 +135,8 @@ def read_image(path: str | os.PathLike[str], turned: bool = True) -> NDArray[np.
     those of the upright image.
     """
     path = Path(path)
-    try:
+    with named_errors(path, "image file"):
         data = np.fromfile(path, dtype=np.uint8)
-    except FileNotFoundError:
-        raise InputError(f"{path}: image file is missing; check the path") from None
-    except OSError as error:
-        raise InputError(f"{path}: image file cannot be read ({error.strerror})") from None
     image = decode_image(data, turned)
     if image is None:
         raise InputError(

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from pathlib import Path, PureWindowsPath
@@ -40,13 +40,19 @@ def named_errors(path: Path | str, what: str, remedy: str = "check the path") ->
 
 
 @contextmanager
-def library_errors(what: str) -> Iterator[None]:
-    """Turn errors of another library into an `InputError`: damaged files make it raise any type."""
+def library_errors(what: str, remedies: Mapping[str, str] | None = None) -> Iterator[None]:
+    """Turn errors of another library into an `InputError`: damaged files make it raise any type.
+
+    `remedies` are of errors by words in them.
+    """
     try:
         yield
+    except InputError:
+        raise
     except Exception as error:
         text = " ".join(str(error).split())[:200]
-        raise InputError(f"{what} ({type(error).__name__}: {text})") from None
+        remedy = next((v for word, v in (remedies or {}).items() if word in text), "")
+        raise InputError(f"{what} ({type(error).__name__}: {text}){remedy}") from None
 
 
 @contextmanager

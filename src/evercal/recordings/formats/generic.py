@@ -175,13 +175,12 @@ class SceneWriter:
             self._copy(frame.image, relative)
             return relative
         stored = frame.image.file() if isinstance(frame.image, StoredImage) else None
-        image = frame.read_image() if stored is None else None
-        relative = stem + (".png" if stored is None else stored[0])
+        relative = stem + (stored[0] if stored else ".png")
         with self._new(relative) as path:
-            if image is not None:
-                write_image(path, image)
-            elif stored is not None:
+            if stored:
                 path.write_bytes(stored[1])
+            else:
+                write_image(path, frame.read_image())
         return relative
 
     def _copy(self, source: Path, relative: str) -> None:

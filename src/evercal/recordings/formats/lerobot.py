@@ -66,12 +66,9 @@ def detect(root: Path) -> bool:
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read the tables and decode one image; the others stay in their files until needed."""
-    try:
+    # Features of many kinds are described in one file that other programs write.
+    with library_errors(f"{root / INFO}: does not describe the dataset"):
         return _load(root, options or ReadOptions())
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
-        # Features of many kinds are described in one file that other programs write.
-        reason = f"{type(error).__name__}: {error}"
-        raise InputError(f"{root / INFO}: does not describe the dataset ({reason})") from error
 
 
 def _load(root: Path, options: ReadOptions) -> Recording:

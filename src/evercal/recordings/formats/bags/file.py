@@ -9,11 +9,16 @@ from typing import Any
 
 from evercal.errors import InputError, optional_module
 from evercal.recordings.images import files_in
-from evercal.recordings.text_files import few
+from evercal.recordings.text_files import few, library_errors
 
 _FILES = (".bag", ".mcap", ".db3")
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, JOINT_STATE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
+_REMEDIES = {
+    "not indexed": "; repair it with 'rosbag reindex'",
+    "end magic": "; its recorder did not end, restore it with 'mcap recover FILE -o NEW.mcap'",
+    "Profile is not ros2": "; its messages are not ROS 2's, convert it or record with ros2 bag",
+}
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
@@ -52,13 +57,11 @@ class BagFile:
         ends = {part.suffix for part in parts}
         if len(ends) > 1:
             raise InputError(f"{path}: holds several kinds of bags ({', '.join(ends)}); name one")
-        try:
+        with library_errors(f"{path}: rosbags cannot read it", _REMEDIES):
             self._reader = highlevel.AnyReader(parts, default_typestore=types)
             self._reader.open()
             links = [link for link in self._reader.connections if link.msgcount]
             kinds = {str(link.topic): str(link.msgtype) for link in links}
-        except Exception as error:  # damaged bags make rosbags raise many types
-            raise InputError(f"{path}: rosbags cannot read it: {_reason(error)}") from None
         weakref.finalize(self, self._reader.close)
         self._lock = threading.Lock()
         self.kinds = kinds
@@ -105,15 +108,13 @@ class BagFile:
         if not links:
             return
         last: dict[str, tuple[int, int]] = {}
-        try:
+        with library_errors(f"{self.path}: damaged", _REMEDIES):
             for link, stamp, data in self._reader.messages(links, start_ns, stop_ns):
                 before, repeat = last.get(link.topic, (None, -1))
                 repeat = repeat + 1 if before == stamp else 0
                 last[link.topic] = (stamp, repeat)
                 content = self._reader.deserialize(data, link.msgtype)
                 yield Message(link.topic, link.msgtype, stamp, repeat, content)
-        except Exception as error:  # damaged bags make rosbags raise many types
-            raise InputError(f"{self.path}: damaged: {_reason(error)}") from None
 
 
 def stamp_ns(stamp: Any) -> int:
@@ -133,14 +134,3 @@ def _parts(path: Path) -> list[Path]:
     if metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()[:1000]:
         return [path]
     return [part for part in files_in(path, _FILES) if part.is_file()]
-
-
-def _reason(error: Exception) -> str:
-    text = " ".join(str(error).split())[:200] or type(error).__name__
-    if "not indexed" in text:
-        return f"{text}; repair it with 'rosbag reindex'"
-    if "end magic" in text:
-        return f"{text} The recorder did not end; restore it with 'mcap recover FILE -o NEW.mcap'"
-    if "Profile is not ros2" in text:
-        return "its messages are not ROS 2's; convert it, or record with ros2 bag"
-    return text
