@@ -127,11 +127,7 @@ def _sheet(board: Board, paper: str, size_mm: NDArray) -> tuple[float, float]:
 
 def write_board(path: Path, board: Board, paper: str = "a4") -> None:
     """Write a board at true size to a PDF or PNG file; the resolution is stored in the file."""
-    kind = path.suffix.lower()
-    if kind not in FILE_KINDS:
+    if path.suffix.lower() not in FILE_KINDS:
         raise InputError(f"{path}: give a file name that ends with {' or '.join(FILE_KINDS)}")
     page, dpi = drawing(board, paper)
-    if kind == ".pdf":
-        page.save(path, resolution=dpi)
-    else:
-        page.save(path, dpi=(dpi, dpi))
+    page.save(path, dpi=(dpi, dpi))

@@ -76,15 +76,15 @@ def _models(root: Path) -> list[Path]:
         inner = sorted(parent.iterdir()) if parent.is_dir() else []
         if name == ".":  # may be a folder of models, which COLMAP numbers
             inner = [folder for folder in inner if folder.name.isdigit()]
-        kinds = [(folder, kind) for folder in (parent, *inner) for kind in ("bin", "txt")]
-        models = [
-            folder
-            for folder, kind in kinds
-            if all((folder / f"{file}.{kind}").is_file() for file in ("cameras", "images"))
-        ]
-        if models:
-            return list(dict.fromkeys(models))
+        if models := [folder for folder in (parent, *inner) if _is_model(folder)]:
+            return models
     return []
+
+
+def _is_model(folder: Path) -> bool:
+    names = ("cameras", "images")
+    kinds = [all((folder / (name + end)).is_file() for name in names) for end in (".bin", ".txt")]
+    return any(kinds)
 
 
 def _model(folder: Path) -> Any:

@@ -63,8 +63,7 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     if options.camera is not None:
         camera = read_camera_of_size(options.camera, (width, height), topic)
     else:
-        info_topic, camera = _bag_camera(bag, topic, (width, height))
-        check_size(f"{root}: {info_topic}", camera, (width, height), topic)
+        camera = _bag_camera(bag, topic, (width, height))
     stamps = np.array([shot.stamp_ns for shot in shots])
     poses = poses_at_images(bag, stamps, shots[0].frame_id, options)
     frames = []
@@ -94,12 +93,10 @@ class BagImage(StoredImage):
 
     def read(self) -> NDArray[np.uint8]:
         """Decode the message, see `StoredImage.read`."""
-        decode = image_of
-        if self.bag.kinds[self.topic] == COMPRESSED:
-            decode = compressed_image_of
+        is_compressed = self.bag.kinds[self.topic] == COMPRESSED
         message = self.bag.message(self.topic, self.logged_ns, self.repeat)
         with named_errors(f"{self.bag.path}: topic {self.topic}", "image"):
-            return decode(message.content)
+            return (compressed_image_of if is_compressed else image_of)(message.content)
 
     def file(self) -> tuple[str, bytes] | None:
         """JPEG or PNG of a compressed image; None for other messages."""
@@ -155,7 +152,7 @@ def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
     return sorted(shots, key=lambda shot: shot.stamp_ns), notes
 
 
-def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> tuple[str, Camera]:
+def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> Camera:
     """The first camera_info beside an image topic, such as `/cam/image_raw/compressed`.
 
     Rectified images take P without distortion, others K and D.
@@ -170,7 +167,9 @@ def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> tuple[
         )
     message = bag.first(beside)
     with named_errors(f"{bag.path}: {beside}", "camera_info"):
-        return beside, _camera(message, size, image.rpartition("/")[2].startswith("image_rect"))
+        camera = _camera(message, size, image.rpartition("/")[2].startswith("image_rect"))
+    check_size(f"{bag.path}: {beside}", camera, size, image_topic)
+    return camera
 
 
 def _camera(message: Any, image_size: tuple[int, int], rectified: bool) -> Camera:

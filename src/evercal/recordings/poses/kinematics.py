@@ -124,13 +124,10 @@ class RobotModel:
         for name, column in zip(names, values.T, strict=True):
             joint = self._urdf.joint_map[name]
             covered = f"joint {name} goes from {column.min():.2f} to {column.max():.2f}"
-            if joint.type == "continuous":
-                if np.ptp(column) > _LARGEST_RAD:
-                    notes.append(f"{covered}, more than two rotations; are these degrees?")
-                continue
-            lower = getattr(joint.limit, "lower", None)
-            upper = getattr(joint.limit, "upper", None)
-            if lower is None or upper is None:
+            if joint.type == "continuous" and np.ptp(column) > _LARGEST_RAD:
+                notes.append(f"{covered}, more than two rotations; are these degrees?")
+            lower, upper = (getattr(joint.limit, end, None) for end in ("lower", "upper"))
+            if joint.type == "continuous" or lower is None or upper is None:
                 continue
             if column.min() < lower - 0.1 or column.max() > upper + 0.1:
                 notes.append(
