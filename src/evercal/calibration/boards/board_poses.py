@@ -22,13 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.boards.board import Board
-from evercal.calibration.boards.corners import (
-    BoardPose,
-    BoardView,
-    board_pose,
-    pixel_sigma,
-    strays,
-)
+from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma, strays
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
@@ -111,10 +105,7 @@ def read_board_poses(path: str | os.PathLike[str]) -> BoardPoses:
 
 
 def board_poses(
-    board: Board,
-    camera: Camera,
-    views: Mapping[str, BoardView | str],
-    camera_from: str = "file",
+    board: Board, camera: Camera, views: Mapping[str, BoardView | str], camera_from: str = "file"
 ) -> BoardPoses:
     """Fit the pose of the board in every image; a view may be the reason for a missing board."""
     fits: dict[str, BoardPose] = {}

@@ -224,10 +224,7 @@ def pixel_sigma(poses: Sequence[BoardPose]) -> float:
 
 
 def strays(
-    views: Sequence[BoardView],
-    poses: Sequence[BoardPose],
-    camera: Camera,
-    bend: Bend | None = None,
+    views: Sequence[BoardView], poses: Sequence[BoardPose], camera: Camera, bend: Bend | None = None
 ) -> list[NDArray[np.bool_]]:
     """Return (k,) of every view: whether a corner leaves its neighbours by many sigma.
 

@@ -23,13 +23,7 @@ from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, as_stored, first_size, image_size, is_readable
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import (
-    is_real,
-    named_errors,
-    naming,
-    read_json,
-    refuse_repeated,
-)
+from evercal.recordings.text_files import is_real, named_errors, naming, read_json, refuse_repeated
 
 FILE = "transforms.json"
 # The first one there is read. ScanNet++ keeps undistorted images beside those of the fisheye lens.

@@ -23,12 +23,7 @@ from evercal.recordings.poses.conventions import pose_convention, poses_from_num
 from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
 from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import POSE_ENDINGS, RobotPoses, read_robot_poses
-from evercal.recordings.poses.row_files import (
-    natural_key,
-    number_array,
-    read_rows,
-    same_numbers,
-)
+from evercal.recordings.poses.row_files import natural_key, number_array, read_rows, same_numbers
 from evercal.recordings.read_options import ReadOptions, flag
 from evercal.recordings.text_files import named_errors, read_json, refuse_repeated
 
