@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,8 +62,6 @@ def find_boards(
 
 
 def _look(image: Image, board: Board) -> BoardView | str | Markers:
-    import cv2
-
     find = {"chessboard": _find_chessboard, "charuco": find_charuco, "apriltag": find_tag}
     return find.get(board.kind, find_markers)(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), board)
 
@@ -90,8 +89,6 @@ def _find_chessboard(grey: NDArray, board: Board) -> BoardView | str:
 
 def _chessboard_candidates(grey: NDArray, size: tuple[int, int]) -> Iterator[Array]:
     """Yield corners (k, 2) by OpenCV's finders, the fastest first."""
-    import cv2
-
     normalized = cv2.CALIB_CB_NORMALIZE_IMAGE
     searches = [
         (cv2.findChessboardCorners, 1, cv2.CALIB_CB_ADAPTIVE_THRESH | normalized),
@@ -115,8 +112,6 @@ def _is_even(grid: Array) -> bool:
 
 
 def _no_chessboard(grey: NDArray, board: Board) -> str:
-    import cv2
-
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
     detected, pixels, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
     wanted = f"not {board.columns}x{board.rows} inner corners"
@@ -139,8 +134,6 @@ def _no_chessboard(grey: NDArray, board: Board) -> str:
 
 
 def _first_square_is_bright(grey: NDArray, grid: Array) -> bool:
-    import cv2
-
     middle = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     small = cv2.boxFilter(grey, -1, (3, 3))
     x, y = np.round(middle).astype(int).transpose(2, 0, 1)

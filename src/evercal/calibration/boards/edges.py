@@ -1,5 +1,6 @@
 """Corners to one or two hundredths of a pixel, by windows around them and lines along edges."""
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,8 +24,6 @@ def sharpened(grey: NDArray, view: BoardView, board: Board) -> BoardView:
     First in windows around them, then by lines along the edges of the squares, which are longer.
     Windows and edges keep away from markers and from the next corner.
     """
-    import cv2
-
     points, pixels = view.points_m[:, :2] / board.size_m, view.pixels
     if cv2.findHomography(points, pixels)[0] is None:
         return view
@@ -47,8 +46,6 @@ def sharpened(grey: NDArray, view: BoardView, board: Board) -> BoardView:
 
 def _in_windows(grey: NDArray, pixels: Array, free_px: Array) -> Array:
     """Refine corners (n, 2) that have space for a window of at most `free_px` (n,) to each side."""
-    import cv2
-
     half = np.minimum(free_px, 11).astype(int)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
     start = np.ascontiguousarray(pixels, dtype=np.float32)
@@ -62,8 +59,6 @@ def _in_windows(grey: NDArray, pixels: Array, free_px: Array) -> Array:
 
 
 def _steps(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
-    import cv2
-
     homography = cv2.findHomography(points, pixels)[0]
     mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
     depth = mapped[:, 2:]
@@ -103,8 +98,6 @@ def _edges(
 
     With `outwards`, only edges that get brighter to the left of the side count.
     """
-    import cv2
-
     sides = ends - starts
     across = np.stack([sides[:, 1], -sides[:, 0]], 1)
     across /= np.maximum(np.linalg.norm(sides, axis=1, keepdims=True), 1e-9)
