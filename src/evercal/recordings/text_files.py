@@ -154,6 +154,15 @@ def refuse_repeated(names: Iterable[str], remedy: str) -> None:
         known.add(name)
 
 
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sorting key that puts `image-2` before `image-10`."""
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    return tuple(
+        (0, len(p.lstrip("0")), f"{p.lstrip('0')} {p}") if p[0] in "0123456789" else (1, 0, p)
+        for p in parts
+    )
+
+
 def path_inside(path: object, what: str) -> str:
     """Check that a path stays inside the folder of the file that states it; with forward slashes.
 

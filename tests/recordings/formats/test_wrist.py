@@ -14,7 +14,8 @@ from evercal.recordings.formats import wrist
 from evercal.recordings.image_files import image_files
 from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import RobotPoses
-from evercal.recordings.poses.row_files import natural_key, times_in_names
+from evercal.recordings.poses.row_files import times_in_names
+from evercal.recordings.text_files import natural_key
 
 from ..checks import assert_pose, refused
 
@@ -279,7 +280,7 @@ def record3d(root: Path) -> None:
     """Quaternion, then position, OpenGL's axes, and a matrix column after column."""
     make_folder(root, [f"{i}.png" for i in range(4)], None, "rgb")
     rows = quaternions(SE3.from_matrix(CAMERA_POSES.matrix() @ GL))[:, [4, 5, 6, 3, 0, 1, 2]]
-    data = {"w": 32, "h": 24, "dw": 16, "dh": 12, "fps": 60, "K": PLAIN.matrix().T.ravel().tolist(),
+    data = {"w": 32, "h": 24, "dw": 16, "dh": 12, "fps": 60, "cameraType": 1, "K": PLAIN.matrix().T.ravel().tolist(),
             "poses": rows.tolist()}  # fmt: skip
     (root / "metadata").write_text(json.dumps(data))
 
@@ -309,6 +310,8 @@ def test_cameras_of_single_images_are_read(tmp_path: Path) -> None:
     refused("lacks the file of an image", load_recording, tmp_path / "ace")
     own = ReadOptions(camera=tmp_path / "ace/train/calibration/seq-01-frame-000000.calibration.txt")
     assert load_recording(tmp_path / "ace", options=own).train[1].camera == PLAIN
+    gone = ReadOptions(camera=tmp_path / "gone.txt")
+    refused("gone.txt: camera file is missing", load_recording, tmp_path / "ace", options=gone)
     record3d(tmp_path / "phone")
     metadata = tmp_path / "phone" / "metadata"
     data = json.loads(metadata.read_text())

@@ -19,9 +19,8 @@ from evercal.recordings.formats.nerfstudio import frame_note
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import as_stored, files_in
 from evercal.recordings.poses.radial_models import RADIAL_MODELS, nearest_fisheye
-from evercal.recordings.poses.row_files import natural_key
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import library_errors, named_errors, path_inside
+from evercal.recordings.text_files import library_errors, named_errors, natural_key, path_inside
 
 USES = ("metres",)
 

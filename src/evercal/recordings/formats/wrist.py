@@ -23,7 +23,7 @@ from evercal.recordings.poses.conventions import pose_convention, poses_from_num
 from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
 from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import POSE_ENDINGS, RobotPoses, read_robot_poses
-from evercal.recordings.poses.row_files import natural_key, number_array, read_rows, same_numbers
+from evercal.recordings.poses.row_files import number_array, read_rows, same_numbers
 from evercal.recordings.read_options import ReadOptions, flag
 from evercal.recordings.text_files import named_errors, read_json, refuse_repeated
 
@@ -110,7 +110,8 @@ def _frames(
             numbers = camera_file.numbers_of(camera_file.fields_of(file).get("T_BS"), "T_BS", 16)
             body_from_camera = SE3.from_matrix(np.reshape(numbers, (4, 4)))
         poses = [pose and pose @ body_from_camera for pose in poses]
-    cameras = _cameras(root, options.camera or (file if layout.camera else None), images)
+    own = file if layout.camera and file.exists() else None
+    cameras = _cameras(root, options.camera or own, images)
     owner = "base_from_gripper" if layout.poses in _POSES + _JOINTS else "base_from_camera"
     split = layout.images.rpartition("rgb")[0]
     frames = tuple(
@@ -132,7 +133,8 @@ def _rows(
         numbers = read_json(file, "Record3D file").get("poses") or []
         with named_errors(file, "poses"):
             numbers = np.roll(number_array(numbers, "'poses'"), 3, axis=-1)
-            return RobotPoses(None, None, poses_from_numbers(numbers, _RECORD3D)), []
+            names = tuple(map(str, range(len(numbers))))
+            return RobotPoses(names, None, poses_from_numbers(numbers, _RECORD3D)), []
     unused = [n for n in ("urdf", "base_frame", "gripper_frame") if getattr(options, n) is not None]
     if unused:
         raise InputError(
@@ -154,7 +156,7 @@ def _urdf(root: Path, joints: Path) -> Path:
 def _images(root: Path, folders: Sequence[str]) -> list[Path]:
     for folder in folders:
         if images := files_in(root / folder):
-            return sorted(images, key=lambda image: natural_key(image.name))
+            return images
     where = " or in ".join("it" if folder == "." else folder for folder in folders)
     raise InputError(f"{root}: no images ({', '.join(IMAGE_ENDINGS)}) in {where}")
 
@@ -162,14 +164,14 @@ def _images(root: Path, folders: Sequence[str]) -> list[Path]:
 def _cameras(root: Path, file: Path | None, images: Sequence[Path]) -> list[Camera]:
     """Of each image, from a file for all or from a folder of one for each."""
     if file is not None and file.is_dir():
-        files = sorted(files_in(file, (".txt",)), key=lambda own: natural_key(own.name))
+        files = files_in(file, (".txt",))
         if not same_numbers([own.name for own in files], [image.name for image in images]):
             raise InputError(f"{file}: lacks the file of an image; give one for all with --camera")
         return [
             camera_file.read_camera_of_size(own, first_size([image, *images]), image.name)
             for own, image in zip(files, images, strict=True)
         ]
-    if file is None or not file.is_file():
+    if file is None:
         names = [name for name in _CAMERAS if (root / name).is_file()]
         if len(names) != 1:
             files = f"{' and '.join(names)} in it" if names else "no camera file in it"

@@ -11,8 +11,8 @@ from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
-from evercal.recordings.poses.row_files import natural_key, same_numbers, times_in_names
-from evercal.recordings.text_files import few, named_errors, refuse_repeated
+from evercal.recordings.poses.row_files import same_numbers, times_in_names
+from evercal.recordings.text_files import few, named_errors, natural_key, refuse_repeated
 
 Pairing = tuple[list[SE3 | None], list[str]]
 """The pose of each image, if it has one, and notes."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.recordings.images import files_in
 from evercal.recordings.poses.conventions import (
     ConventionError,
     PoseConvention,
@@ -23,7 +24,7 @@ from evercal.recordings.poses.conventions import (
 )
 from evercal.recordings.poses.pose_data import pose_data
 from evercal.recordings.poses.pose_table import PoseTable, read_pose_table
-from evercal.recordings.poses.row_files import Names, arrays_as_lists, natural_key
+from evercal.recordings.poses.row_files import Names, arrays_as_lists
 from evercal.recordings.text_files import documents, named_errors, read_text, refuse_repeated
 
 POSE_ENDINGS = (".csv", ".json", ".jsonl", ".yaml", ".yml", ".npy", ".npz", ".mat", ".tum", ".txt")
@@ -138,18 +139,17 @@ def _file(path: Path, given: PoseConvention | None, what: str, robot: bool) -> P
 
 def _folder(path: Path, given: PoseConvention | None, what: str, robot: bool) -> PoseTable:
     """Poses of files that are named alike, in the order of the numbers in their names."""
-    kinds: dict[str, list[str]] = {}
-    for name in sorted(os.listdir(path), key=natural_key):
-        if name[0] != "." and Path(name).suffix.lower() in POSE_ENDINGS:
-            kinds.setdefault(re.sub(r"\d+", "N", name), []).append(name)
-    several = {kind: names for kind, names in kinds.items() if len(names) > 1} or kinds
+    kinds: dict[str, list[Path]] = {}
+    for file in files_in(path, POSE_ENDINGS):
+        kinds.setdefault(re.sub(r"\d+", "N", file.name), []).append(file)
+    several = {kind: files for kind, files in kinds.items() if len(files) > 1} or kinds
     # ViSP's poses of the end effector and of the object in the camera.
     own = [kind for kind in several if ("fPe" if robot else "cPo") in kind] or [*several]
     if len(own) != 1:
         found = " and ".join(own) or f"no file of {', '.join(POSE_ENDINGS)}"
         raise ValueError(f"the folder holds {found}; give a folder of one file for each pose")
     tables: dict[str, PoseTable] = {}
-    for file in (path / name for name in several[own[0]]):
+    for file in several[own[0]]:
         with named_errors(file, what):
             if file.suffix.lower() == ".txt" and _UNTRACKED.search(read_text(file, what)):
                 continue

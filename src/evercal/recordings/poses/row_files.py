@@ -280,15 +280,6 @@ def without_ending(name: str) -> str:
     return path.stem if path.suffix.lower() in IMAGE_ENDINGS else path.name
 
 
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sorting key that puts `image-2` before `image-10`."""
-    parts = re.findall(r"[0-9]+|[^0-9]+", name)
-    return tuple(
-        (0, len(p.lstrip("0")), f"{p.lstrip('0')} {p}") if p[0] in "0123456789" else (1, 0, p)
-        for p in parts
-    )
-
-
 def same_numbers(first: Sequence[str], second: Sequence[str]) -> bool:
     """Whether names of two kinds end in the same numbers, as pose_1 and image-001.png."""
     numbers = [re.findall(r"(\d+)\D*$", without_ending(name)) for name in (*first, *second)]
