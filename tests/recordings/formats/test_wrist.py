@@ -280,8 +280,8 @@ def record3d(root: Path) -> None:
     """Quaternion, then position, OpenGL's axes, and a matrix column after column."""
     make_folder(root, [f"{i}.png" for i in range(4)], None, "rgb")
     rows = quaternions(SE3.from_matrix(CAMERA_POSES.matrix() @ GL))[:, [4, 5, 6, 3, 0, 1, 2]]
-    data = {"w": 32, "h": 24, "dw": 16, "dh": 12, "fps": 60, "cameraType": 1, "K": PLAIN.matrix().T.ravel().tolist(),
-            "poses": rows.tolist()}  # fmt: skip
+    data = {"w": 32, "h": 24, "dw": 16, "dh": 12, "fps": 60, "cameraType": 1,
+            "K": PLAIN.matrix().T.ravel().tolist(), "poses": rows.tolist()}  # fmt: skip
     (root / "metadata").write_text(json.dumps(data))
 
 

@@ -33,8 +33,8 @@ from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, decode_image, files_in, image_file
 from evercal.recordings.poses.camera_file import read_camera_of_size
 from evercal.recordings.poses.conventions import (
-    ConventionError,
     PoseConvention,
+    asking_for,
     checked_poses,
     pose_convention,
 )
@@ -279,7 +279,7 @@ def _feature_poses(
     if options.base_frame is not None:
         raise InputError(f"{root}: --base-frame goes with --urdf only; leave it out")
     count, notes = values.shape[1], []
-    try:
+    with named_errors(f"{root}: {column}", "poses"), asking_for("--pose-convention"):
         if options.pose_convention is not None:
             convention = pose_convention(options.pose_convention)
             taken = convention.counts[-1]
@@ -293,10 +293,6 @@ def _feature_poses(
             convention, columns = _pose_columns(names, options.gripper_frame)
             numbers = values[:, columns]
         poses = checked_poses(numbers, convention)
-    except ConventionError as error:
-        raise InputError(f"{root}: {column}: {error.naming('--pose-convention')}") from None
-    except ValueError as error:
-        raise InputError(f"{root}: {column}: {error}") from None
     return poses, [f"gripper poses are {column}: {convention.meaning}", *notes]
 
 

@@ -8,6 +8,8 @@ Sources: Roboception's documentation of pose formats (ABB, FANUC, KUKA, Yaskawa)
 script manual, RoboDK's converters (Staubli, Kawasaki) and libfranka's reference.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from itertools import product
@@ -76,6 +78,15 @@ class ConventionError(ValueError):
     def naming(self, option: str | None) -> str:
         """Message that names the command line option of the convention, if there is one."""
         return f"{self.problem}; give {option or 'the convention'} {self.remedy}"
+
+
+@contextmanager
+def asking_for(option: str | None) -> Iterator[None]:
+    """Name the command line option in the message of a `ConventionError`."""
+    try:
+        yield
+    except ConventionError as error:
+        raise ValueError(error.naming(option)) from None
 
 
 CONVENTIONS = {

@@ -13,12 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.images import files_in
 from evercal.recordings.poses.conventions import (
-    ConventionError,
     PoseConvention,
+    asking_for,
     checked_poses,
     pose_convention,
 )
@@ -84,13 +83,10 @@ def read_robot_poses(
         InputError: The file is missing or broken, or the numbers do not fit the convention.
     """
     path = Path(path)
-    with named_errors(path, what):
-        try:
-            given = _given(path, convention)
-            table = (_folder if path.is_dir() else _file)(path, given, what, robot)
-            poses = _poses(table, camera_from)
-        except ConventionError as error:
-            raise InputError(f"{path}: {error.naming(option)}") from None
+    with named_errors(path, what), asking_for(option):
+        given = _given(path, convention)
+        table = (_folder if path.is_dir() else _file)(path, given, what, robot)
+        poses = _poses(table, camera_from)
         refuse_repeated(table.names or (), "names are unique")
         stated = (None, None) if table.fixed else (table.numbers, table.convention)
         return RobotPoses(table.names, table.stamps_s, poses, *stated)
