@@ -109,12 +109,8 @@ class BagImage(StoredImage):
 
 def _image_topic(bag: BagFile, wanted: str | None) -> str:
     topics = bag.topics(IMAGE, COMPRESSED)
+    bag.require_topic(wanted, topics, "images")
     if wanted is not None:
-        if wanted not in topics:
-            raise InputError(
-                f"{bag.path}: no images on topic {wanted!r}; images are on"
-                f" {', '.join(topics) or 'no topic'}"
-            )
         return wanted
     if not topics:
         raise InputError(

@@ -73,20 +73,17 @@ class ConventionError(ValueError):
 
     def __init__(self, problem: str, remedy: str) -> None:
         self.problem, self.remedy = problem, remedy
-        super().__init__(self.naming(None))
-
-    def naming(self, option: str | None) -> str:
-        """Message that names the command line option of the convention, if there is one."""
-        return f"{self.problem}; give {option or 'the convention'} {self.remedy}"
+        super().__init__(f"{problem}; give the convention {remedy}")
 
 
 @contextmanager
 def asking_for(option: str | None) -> Iterator[None]:
-    """Name the command line option in the message of a `ConventionError`."""
+    """Name the command line option, if there is one, in the message of a `ConventionError`."""
     try:
         yield
     except ConventionError as error:
-        raise ValueError(error.naming(option)) from None
+        what = option or "the convention"
+        raise ValueError(f"{error.problem}; give {what} {error.remedy}") from None
 
 
 CONVENTIONS = {

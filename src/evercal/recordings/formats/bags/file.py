@@ -2,7 +2,7 @@
 
 import threading
 import weakref
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -70,6 +70,12 @@ class BagFile:
     def topics(self, *kinds: str) -> list[str]:
         """Names of the topics of some types, sorted."""
         return sorted(topic for topic, kind in self.kinds.items() if kind in kinds)
+
+    def require_topic(self, wanted: str | None, topics: Sequence[str], what: str) -> None:
+        """Refuse a topic that is none of `topics`, which hold `what`."""
+        if wanted is not None and wanted not in topics:
+            there = ", ".join(topics) or "no topic"
+            raise InputError(f"{self.path}: no {what} on topic {wanted!r}; {what} are on {there}")
 
     def contents(self) -> str:
         """List of the topics, for messages."""
