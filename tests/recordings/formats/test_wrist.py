@@ -85,6 +85,7 @@ TIMES = 1305031102.0 + SECONDS
     ("images", "names", "stamps", "message"),
     [
         (["a.png", "b.png"], ("1", "2"), None, "names no image of"),
+        (["7.25.png", "8.25.png"], ("7", "9"), None, "names no image of"),
         (["a.png", "b.png"], ("a.png", "a.png"), None, r"'a\.png' comes twice"),
         (["image-1.png", "image-10.png", "image-2.png"], None, None, "is given after image-10"),
         # Frame numbers are not times, even if the clock of the robot starts at 0.
@@ -302,6 +303,15 @@ def test_folders_of_camera_poses_are_read(tmp_path: Path, write: Callable[[Path]
 
 def test_cameras_of_single_images_are_read(tmp_path: Path) -> None:
     ace(tmp_path / "ace")
+    pose = tmp_path / "ace/train/poses/seq-01-frame-000000.pose.txt"
+    kept = pose.read_text()
+    pose.write_text("-inf " * 16)
+    recording = load_recording(tmp_path / "ace")
+    assert ([frame.name for frame in recording.train], recording.untracked) == (
+        ["train/seq-01-frame-000001.color.png"],
+        1,
+    )
+    pose.write_text(kept)
     file = tmp_path / "ace/train/calibration/seq-01-frame-000001.calibration.txt"
     file.write_text("33.5")
     cameras = [frame.camera for frame in load_recording(tmp_path / "ace").train]

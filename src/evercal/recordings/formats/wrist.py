@@ -183,7 +183,7 @@ def _cameras(root: Path, file: Path | None, images: Sequence[Path]) -> list[Came
         file = root / names[0]
     camera = camera_file.read_camera_of_size(file, first_size(images), images[0].name)
     with named_errors(file, "camera file"):
-        fields = camera_file.fields_of(file, first_size(images))
+        fields = camera_file.fields_of(file) if file.name.startswith("metadata") else {}
         each = fields.get("perFrameIntrinsicCoeffs") or []  # of Record3D
         own = [camera_file.camera_from_fields({**fields, "K": numbers}) for numbers in each]
     return own if len(own) == len(images) else [camera] * len(images)

@@ -58,7 +58,8 @@ _HARMLESS = re.compile(
     r"error|rms|repro|resid|std|dev|sigma|covar|uncert|fps|rate|freq|square|board|marker|pattern"
     r"|chess|tag|count|num|frames|images|views|points|flags|date|time|stamp|version|serial|index"
     r"|id$|baseline|depth|range|temp|apert|expos|gain|fov|angle|focal|aspect|mm$|rotation|trans"
-    r"|^[rt]vec|^d[wh]$|^cameratype$|perframe|quat|extrin|pose|position|orient|imu|noise|rgb|track|^bf$|^new|imagescale|overlaps"
+    r"|^[rt]vec|quat|extrin|pose|position|orient|imu|noise|rgb|track|^bf$|^new|imagescale|overlaps"
+    r"|^d[wh]$|^cameratype$|perframe"
 )
 """Names of numbers that do not change where a point lies in the image."""
 _EXPECTED = (

@@ -11,7 +11,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
-from evercal.recordings.poses.row_files import same_numbers, times_in_names
+from evercal.recordings.poses.row_files import is_number, same_numbers, times_in_names
 from evercal.recordings.text_files import few, named_errors, natural_key, refuse_repeated
 
 Pairing = tuple[list[SE3 | None], list[str]]
@@ -64,22 +64,25 @@ def poses_of_images(
 
 
 def _by_name(images: Sequence[Path], names: Sequence[str], poses: SE3, file: Path) -> Pairing:
-    keys = [PureWindowsPath(name).name for name in names]
+    keys, files = [PureWindowsPath(name).name for name in names], [image.name for image in images]
     with named_errors(file, "poses"):
         refuse_repeated(keys, "give every image one row")
     by_name = dict(zip(keys, poses, strict=True))
     # A table may omit the ending.
     paired = [by_name.pop(i.name, None) or by_name.pop(i.stem, None) for i in images]
-    if all(pose is None for pose in paired) and same_numbers(
-        names, [image.name for image in images]
-    ):
+    if len(by_name) == len(keys):  # such as frame-1.color.png and frame-1.pose, but not 1.5.png
+        heads = [[name.partition(".")[0] for name in part] for part in (files, keys)]
+        if all(len({*part}) == len(part) and not is_number(part[0]) for part in heads):
+            by_name = dict(zip(heads[1], poses, strict=True))
+            paired = [by_name.pop(head, None) for head in heads[0]]
+    if all(pose is None for pose in paired) and same_numbers(names, files):
         return list(poses), [f"paired by numbers: {names[0]} with {images[0].name}, and so on"]
     if not any(pose is not None for pose in paired):
         raise InputError(
             f"{file}: names no image of {images[0].parent}; its first is {names[0]!r}, the first"
             f" image is {images[0].name!r}; correct the names, or leave them out to pair in order"
         )
-    alone = [i.name for i, pose in zip(images, paired, strict=True) if pose is None]
+    alone = [name for name, pose in zip(files, paired, strict=True) if pose is None]
     return paired, unpaired(alone, [*by_name], file.name)
 
 
