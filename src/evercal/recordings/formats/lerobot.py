@@ -32,12 +32,7 @@ from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, decode_image, files_in, image_file
 from evercal.recordings.poses.camera_file import read_camera_of_size
-from evercal.recordings.poses.conventions import (
-    PoseConvention,
-    asking_for,
-    checked_poses,
-    pose_convention,
-)
+from evercal.recordings.poses.conventions import asking_for, checked_poses, pose_convention
 from evercal.recordings.poses.kinematics import RobotModel, in_radians
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
@@ -290,8 +285,8 @@ def _feature_poses(
         elif len(names) != count:
             raise ValueError(f"has {count} numbers and {len(names)} names")
         else:
-            convention, columns = _pose_columns(names, options.gripper_frame)
-            numbers = values[:, columns]
+            name, columns = _pose_columns(names, options.gripper_frame)
+            convention, numbers = pose_convention(name), values[:, columns]
         poses = checked_poses(numbers, convention)
     return poses, [f"gripper poses are {column}: {convention.meaning}", *notes]
 
@@ -311,7 +306,8 @@ def _joint_poses(
     return model.poses(names, values, options.base_frame, options.gripper_frame, source)
 
 
-def _pose_columns(names: list[str], arm: str | None) -> tuple[PoseConvention, list[int]]:
+def _pose_columns(names: list[str], arm: str | None) -> tuple[str, list[int]]:
+    """Name of the convention of a pose, and its columns."""
     arms = _arms(names)
     chosen = _of_arm(names, arm) if arm in arms else names
     convention = _convention_of(chosen)
@@ -321,7 +317,7 @@ def _pose_columns(names: list[str], arm: str | None) -> tuple[PoseConvention, li
         which = " or ".join(filter(None, arms))
         remedy = f"--gripper-frame {which}" if which else "names that tell them apart in info.json"
         raise ValueError(f"holds several poses ({', '.join(names)}); give {remedy}")
-    return pose_convention(convention), [last.index(part) for part in _PARTS[convention]]
+    return convention, [last.index(part) for part in _PARTS[convention]]
 
 
 def _convention_of(names: list[str]) -> str | None:

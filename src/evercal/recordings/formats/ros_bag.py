@@ -17,14 +17,7 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.formats.bags.file import (
-    CAMERA_INFO,
-    COMPRESSED,
-    IMAGE,
-    BagFile,
-    is_bag,
-    stamp_ns,
-)
+from evercal.recordings.formats.bags.file import CAMERA_INFO, COMPRESSED, IMAGE, BagFile, is_bag
 from evercal.recordings.formats.bags.poses import plain_name, poses_at_images
 from evercal.recordings.frame import Frame, Recording, lost_images
 from evercal.recordings.images import StoredImage, as_rgb, decode_image, image_file, is_readable
@@ -133,11 +126,12 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
 def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
     shots, bad = [], []
     for message in bag.messages([topic]):
-        header = message.content.header
-        stamp, frame_id = stamp_ns(header.stamp), plain_name(header.frame_id)
+        frame_id = plain_name(message.content.header.frame_id)
         if bag.kinds[topic] == COMPRESSED and not is_readable(message.content.data):
             bad.append(len(shots))
-        shots.append(BagImage(bag, topic, message.logged_ns, message.repeat, stamp, frame_id))
+        shots.append(
+            BagImage(bag, topic, message.logged_ns, message.repeat, message.stamp_ns, frame_id)
+        )
     notes = []
     if 0 < 2 * len(bad) <= len(shots):  # else the first one is refused with its format
         notes = [lost_images([f"message {i}" for i in bad], len(shots))]

@@ -35,9 +35,14 @@ class Message:
     content: Any
     """Fields as rosbags decodes them."""
 
+    @property
+    def stamp_ns(self) -> int:
+        """Nanoseconds of its header; 0 if they are not set."""
+        return _nanoseconds(self.content.header)
+
     def seconds(self, header: Any, zero_ns: int) -> float:
         """Time of a header after `zero_ns`; that of recording if it is not set."""
-        return ((stamp_ns(header.stamp) or self.logged_ns) - zero_ns) * 1e-9
+        return ((_nanoseconds(header) or self.logged_ns) - zero_ns) * 1e-9
 
 
 class BagFile:
@@ -123,9 +128,8 @@ class BagFile:
                 yield Message(link.topic, link.msgtype, stamp, repeat, content)
 
 
-def stamp_ns(stamp: Any) -> int:
-    """Nanoseconds of a ROS time; 0 if it is not set."""
-    return stamp.sec * 1_000_000_000 + stamp.nanosec
+def _nanoseconds(header: Any) -> int:
+    return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
 
 
 def is_bag(path: Path) -> bool:
