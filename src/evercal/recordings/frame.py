@@ -14,6 +14,7 @@ from evercal.bounds import bounds
 from evercal.errors import InputError, is_plain
 from evercal.geometry import SE3, Camera
 from evercal.recordings.images import Picture, file_of, files_in, is_readable, pixels_of
+from evercal.recordings.poses.arm import Arm
 from evercal.recordings.text_files import few
 
 Mount = Literal["eye_to_hand", "eye_in_hand"]
@@ -37,7 +38,8 @@ class Frame:
     depth: Path | None = None
     """16-bit PNG of the image's size: millimetres along the optical axis, 0 where unknown."""
     joints_rad: tuple[float, ...] | None = None
-    """Joint angles of the arm at the time of the image, if stated."""
+    """Joint values of the arm at the time of the image, if stated: radians, or metres of sliding
+    joints."""
 
     def read_image(self) -> NDArray[np.uint8]:
         """Read the pixels, (H, W, 3) uint8 RGB; a size that is not the camera's is refused."""
@@ -84,6 +86,8 @@ class Recording:
     metric: bool = True
     """Whether lengths are metres; False where their unit is unknown, as in structure from motion.
     `base_from_camera` is then in that unit."""
+    arm: Arm | None = None
+    """Kinematics that `Frame.joints_rad` are values of, where gripper poses are computed."""
 
 
 def checked_name(name: str) -> str:

@@ -9,6 +9,7 @@ from evercal.calibration.boards.corners import BoardView
 
 Array = NDArray[np.floating]
 
+_NEIGHBOURS = 8
 _SMALLEST_WINDOW_PX = 2
 _SAMPLES, _EDGE_BLUR_PX = 24, 2.0
 """Samples along an edge, and its width in the image."""
@@ -40,7 +41,7 @@ def sharpened(grey: NDArray, view: BoardView, board: Board) -> BoardView:
             _edges(grey, pixels + sign * 0.08 * step, pixels + sign * 0.5 * step, reach)
             for sign in (-1, 1)
         ]
-        lines.append(_lines(np.concatenate(arms, axis=1)))
+        lines.append(_tangents(np.concatenate(arms, axis=1), pixels))
     return BoardView(view.points_m, _crossings(pixels, *lines))
 
 
@@ -59,11 +60,16 @@ def _in_windows(grey: NDArray, pixels: Array, free_px: Array) -> Array:
 
 
 def _steps(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
-    homography = cv2.findHomography(points, pixels)[0]
-    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
-    depth = mapped[:, 2:]
-    projected = mapped[:, :2] / depth
-    along, down = ((h[:2] - projected * h[2]) / depth for h in homography.T[:2])
+    """Return pixels (n, 2) that a corner moves with a square to the right, down, and their area.
+
+    Each corner has a quadratic map by its neighbours, so that any lens will do.
+    """
+    apart = points[:, None] - points
+    near = np.argsort(np.linalg.norm(apart, axis=2), 1)[:, 1 : _NEIGHBOURS + 1]
+    rows = np.arange(len(points))[:, None]
+    x, y = np.moveaxis(points[near] - points[rows], 2, 0)
+    terms = np.stack([x, y, x * x, x * y, y * y], -1)
+    along, down, *_ = np.moveaxis(np.linalg.pinv(terms) @ (pixels[near] - pixels[rows]), 1, 0)
     return along, down, np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
 
 
@@ -79,10 +85,10 @@ def squares_by_their_sides(grey: NDArray, squares: Array) -> Array:
         sides = (np.roll(refined, -1, axis=1) - refined).reshape(-1, 2)
         reach = np.clip(share * np.linalg.norm(sides, axis=1), 2.0, most)
         ends = corners + end * sides, corners + (1 - end) * sides
-        lines = _lines(_edges(grey, *ends, reach, 5 * _SAMPLES, outwards=True)).reshape(-1, 4, 3)
-        before = np.roll(lines, 1, axis=1).reshape(-1, 3)
-        most_px = _LARGEST_TAG_MOVE_PX
-        refined = _crossings(corners, before, lines.reshape(-1, 3), most_px).reshape(-1, 4, 2)
+        edges = _edges(grey, *ends, reach, 5 * _SAMPLES, outwards=True)
+        before = np.roll(edges.reshape(-1, 4, 5 * _SAMPLES, 2), 1, axis=1).reshape(edges.shape)
+        lines = _tangents(before, corners), _tangents(edges, corners)
+        refined = _crossings(corners, *lines, _LARGEST_TAG_MOVE_PX).reshape(-1, 4, 2)
     return refined
 
 
@@ -117,11 +123,32 @@ def _edges(
     return points + offset[..., None] * across[:, None]
 
 
-def _lines(points: Array) -> Array:
-    middle = points.mean(1)
-    spread = np.einsum("nki,nkj->nij", points - middle[:, None], points - middle[:, None])
-    normal = np.linalg.eigh(np.nan_to_num(spread))[1][:, :, 0]
-    return np.column_stack([normal, -(normal * middle).sum(1)])
+def _tangents(points: Array, corners: Array) -> Array:
+    """Return lines (n, 3) along edges with points (n, k, 2), beside corners (n, 2).
+
+    Lenses bend edges, and a line is off by the sagitta: then tangents of parabolas. One degree for
+    all edges, by the Bayesian information criterion: parabolas are noisier.
+    """
+    away = np.nan_to_num(points - corners[:, None])
+    middle = away.mean(1, keepdims=True)
+    spread = np.einsum("nki,nkj->nij", away - middle, away - middle)
+    frame = np.linalg.eigh(spread)[1]  # across the edge, and along it
+    across, along = np.moveaxis(away @ frame, 2, 0)
+    unit = np.maximum(np.abs(along).max(1), 1e-9)
+    powers = (along / unit[:, None])[..., None] ** np.arange(3)
+    fits, scores = [], []
+    for degree in (1, 2):
+        terms = powers[..., : degree + 1]
+        fit = np.linalg.pinv(terms) @ across[..., None]
+        left = float(((terms @ fit)[..., 0] - across).var())
+        scores.append(across.size * np.log(left + 1e-12) + fit.size * np.log(across.size))
+        fits.append(fit[:, :2, 0].T)
+    offset, slope = fits[int(np.argmin(scores))]
+    normal = frame[..., 0] - (slope / unit)[:, None] * frame[..., 1]
+    touched = (normal * (corners + offset[:, None] * frame[..., 0])).sum(1)
+    lines = np.column_stack([normal, -touched])
+    lines[np.isnan(points).any((1, 2))] = np.nan
+    return lines
 
 
 def _crossings(

@@ -27,13 +27,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError, optional_module
-from evercal.geometry import SE3
 from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, decode_image, files_in, image_file
 from evercal.recordings.poses.camera_file import read_camera_of_size
 from evercal.recordings.poses.conventions import asking_for, checked_poses, pose_convention
 from evercal.recordings.poses.kinematics import RobotModel, in_radians
+from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
 from evercal.recordings.text_files import (
@@ -76,16 +76,17 @@ def _load(root: Path, options: ReadOptions) -> Recording:
     camera = read_camera_of_size(options.camera, (width, height), key)
     column = _pose_feature(root, info, options)
     rows, values = _rows(root, column)
-    poses, notes = _feature_poses(root, info, column, values, options)
+    stated, notes = _feature_poses(root, info, column, values, options)
+    names = [f"episode_{row.episode:06d}/{row.number:06d}" for row in rows]
     frames = tuple(
-        Frame(f"episode_{row.episode:06d}/{row.number:06d}", image, camera, None, pose)
-        for row, image, pose in zip(rows, _images(root, info, key, rows), poses, strict=True)
+        Frame(name, image, camera, None, stated.poses[i], joints_rad=stated.joints_of(i))
+        for i, (name, image) in enumerate(zip(names, _images(root, info, key, rows), strict=True))
     )
     here, total = len({row.episode for row in rows}), int(info.get("total_episodes", 0))
     if here < total:
         notes.append(f"{here} of {total} episodes are in the folder")
     frames[0].read_image()
-    return Recording(root.resolve().name, frames, (), notes=tuple(notes))
+    return Recording(root.resolve().name, frames, (), notes=tuple(notes), arm=stated.arm)
 
 
 def _info(root: Path) -> dict[str, Any]:
@@ -267,7 +268,7 @@ def _pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> 
 
 def _feature_poses(
     root: Path, info: Mapping[str, Any], column: str, values: Array, options: ReadOptions
-) -> tuple[SE3, list[str]]:
+) -> tuple[RobotPoses, list[str]]:
     names = _names(info, column)
     if options.urdf is not None:
         return _joint_poses(root, names, values, options)
@@ -288,12 +289,13 @@ def _feature_poses(
             name, columns = _pose_columns(names, options.gripper_frame)
             convention, numbers = pose_convention(name), values[:, columns]
         poses = checked_poses(numbers, convention)
-    return poses, [f"gripper poses are {column}: {convention.meaning}", *notes]
+    notes = [f"gripper poses are {column}: {convention.meaning}", *notes]
+    return RobotPoses(None, None, poses), notes
 
 
 def _joint_poses(
     root: Path, names: list[str], stated: Array, options: ReadOptions
-) -> tuple[SE3, list[str]]:
+) -> tuple[RobotPoses, list[str]]:
     assert options.urdf is not None
     unit, count = options.pose_convention, stated.shape[1]
     source = f"{root}: {_STATE}"

@@ -61,16 +61,18 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     poses = poses_at_images(bag, stamps, shots[0].frame_id, options)
     frames = []
     for i in np.flatnonzero(poses.valid).tolist():
-        pose = poses.poses[i]
+        pose, joints = poses.stated.poses[i], poses.stated.joints_of(i)
         of_camera, of_gripper = (pose, None) if poses.of_camera else (None, pose)
-        frames.append(Frame(f"{i:06d}", shots[i], camera, of_camera, of_gripper))
+        name = f"{i:06d}"
+        frames.append(Frame(name, shots[i], camera, of_camera, of_gripper, joints_rad=joints))
     lost = len(shots) - len(frames)
     if lost:
         notes.append(
             f"{lost} of {len(shots)} images were taken outside the recorded poses or in a gap of"
             f" more than {MAX_GAP_S:g} s in which the gripper moved"
         )
-    return Recording(root.resolve().stem, tuple(frames), (), lost, notes=(*notes, *poses.notes))
+    notes, arm = [*notes, *poses.notes], poses.stated.arm
+    return Recording(root.resolve().stem, tuple(frames), (), lost, notes=tuple(notes), arm=arm)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from evercal.recordings.images import IMAGE_ENDINGS, files_in, first_size
 from evercal.recordings.poses import camera_file
 from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
 from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
-from evercal.recordings.poses.pairing import pair_images
+from evercal.recordings.poses.pairing import pair_images, pair_joints
 from evercal.recordings.poses.robot_poses import POSE_ENDINGS, RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import number_array, read_rows, same_numbers
 from evercal.recordings.read_options import ReadOptions, flag
@@ -82,9 +82,11 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     test = Layout._make(path and path.replace("train/", "test/") for path in layouts[0])
     split = dict.fromkeys((layouts[0], test))
     read = [_frames(root, part, options) for part in split if (root / part.poses).exists()]
-    train, test = (*(frames for frames, _, _ in read), ())[:2]
-    lost, notes = sum(lost for _, lost, _ in read), [note for *_, more in read for note in more]
-    return Recording(root.resolve().name, train, test, lost, notes=tuple(notes))
+    train, test = (*(part.train for part in read), ())[:2]
+    notes = tuple(note for part in read for note in part.notes)
+    return replace(
+        read[0], train=train, test=test, untracked=sum(p.untracked for p in read), notes=notes
+    )
 
 
 def _layouts(root: Path) -> list[Layout]:
@@ -97,14 +99,13 @@ def _layouts(root: Path) -> list[Layout]:
     return tables or [each for each in there if (root / each.images).is_dir()]
 
 
-def _frames(
-    root: Path, layout: Layout, options: ReadOptions
-) -> tuple[tuple[Frame, ...], int, list[str]]:
-    """Frames with a pose, the number of images without, and notes."""
+def _frames(root: Path, layout: Layout, options: ReadOptions) -> Recording:
+    """A recording of the frames with a pose, all for training."""
     images = _images(root, [layout.images] if layout.images else _FOLDERS)
     source, file = root / layout.poses, root / layout.camera
     rows, notes = _rows(root, source, options, layout.convention)
     poses, more = pair_images(images, rows, _stamps(root), source)
+    joints = pair_joints(images, rows, _stamps(root), source)
     if file.name == "sensor.yaml":
         with named_errors(file, "camera file"):
             numbers = camera_file.numbers_of(camera_file.fields_of(file).get("T_BS"), "T_BS", 16)
@@ -115,11 +116,16 @@ def _frames(
     owner = "base_from_gripper" if layout.poses in _POSES + _JOINTS else "base_from_camera"
     split = layout.images.rpartition("rgb")[0]
     frames = tuple(
-        replace(Frame(split + image.name, image, camera, None), **{owner: pose})
-        for image, camera, pose in zip(images, cameras, poses, strict=True)
+        replace(
+            Frame(split + image.name, image, camera, None),
+            **{owner: pose},
+            joints_rad=None if values is None else tuple(values.tolist()),
+        )
+        for image, camera, pose, values in zip(images, cameras, poses, joints, strict=True)
         if pose is not None
     )
-    return frames, len(images) - len(frames), [*notes, *more]
+    lost, notes = len(images) - len(frames), [*notes, *more]
+    return Recording(root.resolve().name, frames, (), lost, notes=tuple(notes), arm=rows.arm)
 
 
 def _rows(

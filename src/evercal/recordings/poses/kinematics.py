@@ -1,11 +1,13 @@
-"""Gripper poses from joint angles and a URDF, by yourdfpy (extra `urdf`).
+"""Gripper poses from joint angles and a URDF, which yourdfpy reads (extra `urdf`).
 
 A CSV table has a column for each joint of the URDF; JSON has `joint_names` and `positions`. Values
 are radians, or degrees if a name ends in `_deg`, and metres for prismatic joints.
 """
 
 import os
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError, optional_module
-from evercal.geometry import SE3
+from evercal.recordings.poses.arm import Arm, Motion
 from evercal.recordings.poses.pose_track import times_around
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import Rows, read_rows, row_labels
-from evercal.recordings.text_files import library_errors, named_errors, read_json, refuse_repeated
+from evercal.recordings.text_files import (
+    library_errors,
+    named_errors,
+    read_json,
+    read_text,
+    refuse_repeated,
+)
 
 Array = NDArray[np.float64]
 _MOVING = ("revolute", "continuous", "prismatic")
@@ -25,6 +33,10 @@ _MOVING = ("revolute", "continuous", "prismatic")
 _LARGEST_RAD = 4 * np.pi
 _UNITS = ("deg", "rad", "m")
 _STILL_RAD = 0.001
+_TURNED = re.compile(
+    r"<joint[^>]*\bname=\"([^\"]*)\"(?:(?!</joint>).)*?<origin[^>]*quat_xyzw", re.S
+)
+"""Name of a joint whose origin has a quaternion, which pinocchio alone reads."""
 _JSON = "an object with 'joint_names', 'positions' and optionally 'images' or 'stamps_s'"
 
 
@@ -43,9 +55,7 @@ class RobotModel:
         with library_errors(f"{path}: no usable URDF"):
             self._urdf = yourdfpy.URDF.load(str(self.path), **dict.fromkeys(plain, False))
             self.base_link = str(self._urdf.base_link)
-            for joint in self._urdf.robot.joints:
-                if joint.type == "prismatic":  # yourdfpy scales the motion by the axis
-                    joint.axis = joint.axis / np.linalg.norm(joint.axis)
+            self._turned = set(_TURNED.findall(read_text(self.path, "URDF")))
         self.links = tuple(self._urdf.link_map)
         self._joint_above = {joint.child: joint for joint in self._urdf.robot.joints}
 
@@ -71,14 +81,15 @@ class RobotModel:
         base: str | None,
         gripper: str | None,
         source: str | os.PathLike[str] = "joints",
-    ) -> tuple[SE3, list[str]]:
+    ) -> tuple[RobotPoses, list[str]]:
         """Compute (n,) poses of the gripper, with notes about their source and joint limits.
 
         Values (n, k) of the k named joints are radians, or metres for prismatic joints. `source`
         names their origin in messages.
         """
         base, gripper = self.chosen_links(base, gripper)
-        needed = self.joints_between(base, gripper)
+        arm = self.arm(base, gripper)
+        needed = arm.joints
         missing = [name for name in needed if name not in names]
         if missing:
             raise InputError(
@@ -94,24 +105,53 @@ class RobotModel:
                     f" for radians; if these are degrees, write the column as {name}_deg or give"
                     f" --pose-convention deg"
                 )
-        matrices = np.empty((len(values), 4, 4))
-        for row, matrix in zip(values, matrices, strict=True):
-            self._urdf.update_cfg(dict(zip(needed, row.tolist(), strict=True)))
-            matrix[...] = self._urdf.get_transform(gripper, base)
         note = f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
-        return SE3.from_matrix(matrices), [note, *self._beyond_limits(needed, values)]
+        moved = RobotPoses(None, None, arm.poses(values), arm=arm, joints=values)
+        return moved, [note, *self._beyond_limits(needed, values)]
 
-    def joints_between(self, base: str, gripper: str) -> tuple[str, ...]:
-        """Moving joints between two links, from the base outwards."""
+    def arm(self, base: str, gripper: str) -> Arm:
+        """The chain between two links; its joint values are those that others do not mimic."""
         up, down = self._ancestors(base), self._ancestors(gripper)
-        joints = [j for j in down if j not in up] + [j for j in up if j not in down]
-        names = []
-        for joint in reversed(joints):
-            if joint.type in ("floating", "planar"):
-                raise InputError(f"{self.path}: joint {joint.name} is {joint.type}; not supported")
+        steps = [(joint, True) for joint in up if joint not in down]
+        steps += [(joint, False) for joint in reversed(down) if joint not in up]
+        names: list[str] = []
+        chain: list[Motion] = []
+        before = np.eye(4)
+        for joint, backwards in steps:
+            if joint.type not in (*_MOVING, "fixed") or joint.name in self._turned:
+                what = "turned by quat_xyzw, which most programs ignore; write rpy"
+                kind = what if joint.name in self._turned else f"{joint.type}; not supported"
+                raise InputError(f"{self.path}: joint {joint.name} is {kind}")
+            origin = np.eye(4) if joint.origin is None else joint.origin
+            before = before if backwards else before @ origin
             if joint.type in _MOVING:
-                names.append(joint.name if joint.mimic is None else joint.mimic.joint)
-        return tuple(dict.fromkeys(names))
+                name, factor, constant = self._driver(joint)
+                names += [] if name in names else [name]
+                length = np.linalg.norm(joint.axis)
+                if not 0 < length < np.inf:
+                    raise InputError(f"{self.path}: joint {joint.name} has the axis {joint.axis}")
+                axis = joint.axis / (-length if backwards else length)
+                rotates, value = joint.type != "prismatic", names.index(name)
+                chain.append(Motion(before, axis, rotates, value, factor, constant))
+                before = np.eye(4)
+            before = before @ np.linalg.inv(origin) if backwards else before
+        return Arm(tuple(names), tuple(chain), before)
+
+    def _driver(self, joint: Any) -> tuple[str, float, float]:
+        """Name of the value that moves a joint, and factor and constant of its motion."""
+        factor, constant, passed = 1.0, 0.0, [joint.name]
+        while joint.mimic is not None:
+            constant += factor * joint.mimic.offset
+            factor *= joint.mimic.multiplier
+            other = self._urdf.joint_map.get(joint.mimic.joint)
+            if other is None or other.name in passed:
+                raise InputError(
+                    f"{self.path}: joint {joint.name} mimics {joint.mimic.joint}, which"
+                    f" {'the URDF lacks' if other is None else 'mimics it'}; correct the URDF"
+                )
+            joint = other
+            passed.append(joint.name)
+        return joint.name, factor, constant
 
     def rotates(self, name: str) -> bool:
         """Whether a joint exists and its values are angles."""
@@ -159,7 +199,7 @@ def read_joint_poses(
     """
     rows = read_joints(path)
     base, gripper = model.chosen_links(base, gripper)
-    if not model.joints_between(base, gripper):
+    if not model.arm(base, gripper).joints:
         raise InputError(f"{model.path}: no joint moves {gripper} against {base}; name other links")
     names, units = [], []
     for column in rows.columns:
@@ -170,8 +210,8 @@ def read_joint_poses(
     with named_errors(path, "joint angles"):
         refuse_repeated(filter(model.has_joint, names), "keep one column of each joint")
     values = in_radians(model, names, rows.values, units)
-    poses, notes = model.poses(names, values, base, gripper, path)
-    return RobotPoses(rows.names, rows.stamps_s, poses), notes
+    moved, notes = model.poses(names, values, base, gripper, path)
+    return replace(moved, names=rows.names, stamps_s=rows.stamps_s), notes
 
 
 def in_radians(

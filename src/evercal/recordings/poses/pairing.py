@@ -28,7 +28,8 @@ def pair_images(
     in natural order, are paired in order, and their numbers must be equal.
     """
     if rows.names is not None:
-        return _by_name(images, rows.names, rows.poses, file)
+        which, notes = _by_name(images, rows.names, file)
+        return [None if i is None else rows.poses[i] for i in which], notes
     times = None if rows.stamps_s is None else _image_times(images, stamps_s)
     if times is not None and rows.stamps_s is not None:
         return _by_time(times, PoseTrack(rows.stamps_s, rows.poses), file)
@@ -50,6 +51,24 @@ def pair_images(
     return list(rows.poses), [f"images and poses were paired in order, {first} to {last}"]
 
 
+def pair_joints(
+    images: Sequence[Path], rows: RobotPoses, stamps_s: Mapping[str, float] | None, file: Path
+) -> list[NDArray[np.float64] | None]:
+    """Joint values (k,) of every image, paired as its pose; None without any."""
+    values, times = rows.joints, rows.stamps_s
+    if values is None:
+        return [None] * len(images)
+    if rows.names is not None:
+        which, _ = _by_name(images, rows.names, file)
+        return [None if i is None else values[i] for i in which]
+    at = None if times is None else _image_times(images, stamps_s)
+    if at is None or times is None:
+        return list(values)
+    order = np.argsort(times)
+    columns = [np.interp(at, times[order], np.unwrap(column[order])) for column in values.T]
+    return list(np.stack(columns, axis=1))
+
+
 def poses_of_images(
     file: Path, images: Sequence[Path], convention: str | None = None
 ) -> tuple[SE3, list[str]]:
@@ -63,26 +82,31 @@ def poses_of_images(
     return SE3.stack([pose for pose in poses if pose is not None]), notes
 
 
-def _by_name(images: Sequence[Path], names: Sequence[str], poses: SE3, file: Path) -> Pairing:
+def _by_name(
+    images: Sequence[Path], names: Sequence[str], file: Path
+) -> tuple[list[int | None], list[str]]:
+    """Number of each image's row, and notes."""
     keys, files = [PureWindowsPath(name).name for name in names], [image.name for image in images]
     with named_errors(file, "poses"):
         refuse_repeated(keys, "give every image one row")
-    by_name = dict(zip(keys, poses, strict=True))
+    by_name = {key: number for number, key in enumerate(keys)}
     # A table may omit the ending.
-    paired = [by_name.pop(i.name, None) or by_name.pop(i.stem, None) for i in images]
+    paired = [by_name.pop(i.name, by_name.pop(i.stem, None)) for i in images]
     if len(by_name) == len(keys):  # such as frame-1.color.png and frame-1.pose, but not 1.5.png
         heads = [[name.partition(".")[0] for name in part] for part in (files, keys)]
         if all(len({*part}) == len(part) and not is_number(part[0]) for part in heads):
-            by_name = dict(zip(heads[1], poses, strict=True))
+            by_name = {head: number for number, head in enumerate(heads[1])}
             paired = [by_name.pop(head, None) for head in heads[0]]
-    if all(pose is None for pose in paired) and same_numbers(names, files):
-        return list(poses), [f"paired by numbers: {names[0]} with {images[0].name}, and so on"]
-    if not any(pose is not None for pose in paired):
+    if all(row is None for row in paired) and same_numbers(names, files):
+        return [*range(len(images))], [
+            f"paired by numbers: {names[0]} with {images[0].name}, and so on"
+        ]
+    if all(row is None for row in paired):
         raise InputError(
             f"{file}: names no image of {images[0].parent}; its first is {names[0]!r}, the first"
             f" image is {images[0].name!r}; correct the names, or leave them out to pair in order"
         )
-    alone = [name for name, pose in zip(files, paired, strict=True) if pose is None]
+    alone = [name for name, row in zip(files, paired, strict=True) if row is None]
     return paired, unpaired(alone, [*by_name], file.name)
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from evercal.geometry import SE3
 from evercal.recordings.images import files_in
+from evercal.recordings.poses.arm import Arm
 from evercal.recordings.poses.conventions import (
     PoseConvention,
     asking_for,
@@ -52,10 +53,18 @@ class RobotPoses:
     """(n, k) numbers of the file, to be read by `poses_from_numbers`."""
     convention: PoseConvention | None = None
     """Convention of the numbers; numbers and convention are None for JSON's quaternion_wxyz."""
+    arm: Arm | None = None
+    """Arm whose joint values are stated instead of poses."""
+    joints: NDArray[np.float64] | None = None
+    """(n, k) values of its joints, radians, or metres of sliding joints."""
 
     def __len__(self) -> int:
         """Number of poses."""
         return len(self.poses)
+
+    def joints_of(self, row: int) -> tuple[float, ...] | None:
+        """Joint values of a row, if they are stated."""
+        return None if self.joints is None else tuple(self.joints[row].tolist())
 
 
 def read_robot_poses(

@@ -189,7 +189,7 @@ def add_arm(
         values = np.array([slider.value for slider in sliders])
         shown.update_cfg(values)
         if link is not None:
-            place(gripper, model.poses(tuple(limits), values[None], None, link)[0][0])
+            place(gripper, model.poses(tuple(limits), values[None], None, link)[0].poses[0])
 
     with server.gui.add_folder("Arm", expand_by_default=False):
         for name, (low, high) in limits.items():

@@ -13,6 +13,7 @@ from evercal.geometry import SE3
 from evercal.recordings.formats.bags.file import JOINT_STATE, TF, BagFile
 from evercal.recordings.poses.kinematics import RobotModel, interpolate
 from evercal.recordings.poses.pose_track import PoseTrack
+from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
 
 Array = NDArray[np.float64]
@@ -155,7 +156,7 @@ def plain_name(frame: str) -> str:
 class ImagePoses:
     """Poses at the images of a bag."""
 
-    poses: SE3
+    stated: RobotPoses
     """(n,) base_from_gripper, or base_from_camera."""
     valid: NDArray[np.bool_]
     """(n,) whether each pose was recorded close enough to the image."""
@@ -185,7 +186,7 @@ def poses_at_images(
             f"tf also has the camera ({camera_frame}), which is not used; to use it, give"
             f" --gripper-frame {camera_frame}"
         )
-    return ImagePoses(poses, valid, of_camera, notes)
+    return ImagePoses(RobotPoses(None, None, poses), valid, of_camera, notes)
 
 
 def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[_TfTree, list[float]]:
@@ -249,7 +250,7 @@ def _from_joints(
         )
     bag.require_topic(options.pose_topic, topics, "joint states")
     tracks = _joint_tracks(bag, topics, zero_ns)
-    needed = model.joints_between(base, gripper)
+    needed = model.arm(base, gripper).joints
     values, valid = np.zeros((len(stamps), len(tracks))), np.ones(len(stamps), dtype=bool)
     times: Sequence[float] = ()
     for column, (name, track) in enumerate(tracks.items()):
@@ -264,10 +265,10 @@ def _from_joints(
         times, positions = zip(*track[topic], strict=True)
         values[:, column], here = interpolate(np.array(times), np.array(positions), stamps)
         valid &= here
-    poses, notes = model.poses([*tracks], values, base, gripper, bag.path)
+    moved, notes = model.poses([*tracks], values, base, gripper, bag.path)
     if not valid.any():
         _refuse_times(bag, stamps, times, "the joint states")
-    return ImagePoses(poses, valid, False, notes)
+    return ImagePoses(moved, valid, False, notes)
 
 
 def _joint_tracks(

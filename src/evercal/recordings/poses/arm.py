@@ -1,0 +1,77 @@
+"""`Arm`: a chain of joints from the base to the gripper; poses, and how each joint moves them."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from evercal.geometry import SE3
+
+Array = NDArray[np.float64]
+
+
+class Motion(NamedTuple):
+    """One moving joint of a chain."""
+
+    before: Array
+    """(4, 4) from the frame before the joint to the frame after the last one."""
+    axis: Array
+    """(3,) unit vector; backwards where the chain goes from child to parent."""
+    rotates: bool
+    value: int
+    """Number of the joint value that moves it; several joints share one where others mimic it."""
+    factor: float = 1.0
+    """It moves by factor * value + constant, radians or metres."""
+    constant: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """Kinematics of an arm."""
+
+    joints: tuple[str, ...]
+    """Names of the k joint values, from the base outwards."""
+    chain: tuple[Motion, ...]
+    last: Array
+    """(4, 4) from the frame after the last joint to the gripper."""
+
+    def rotates(self) -> NDArray[np.bool_]:
+        """(k,) whether a value is an angle."""
+        angles = {motion.value for motion in self.chain if motion.rotates}
+        return np.array([i in angles for i in range(len(self.joints))])
+
+    def poses(self, values: Array) -> SE3:
+        """(n,) base_from_gripper of joint values (n, k), radians, or metres of sliding joints."""
+        return SE3.from_matrix(self._frames(values)[-1])
+
+    def slopes(self, values: Array) -> Array:
+        """(n, 6, k) motion of the gripper by each value: translation, rotation; gripper's axes."""
+        frames = self._frames(values)
+        from_gripper = np.linalg.inv(frames[-1])
+        slopes = np.zeros((len(values), 6, len(self.joints)))
+        for motion, frame in zip(self.chain, frames, strict=False):
+            moved = from_gripper @ frame
+            axis = motion.factor * (moved[:, :3, :3] @ motion.axis)
+            if motion.rotates:
+                slopes[:, 3:, motion.value] += axis
+                # The origin of the gripper turns about the joint, which lies at -moved.
+                slopes[:, :3, motion.value] -= np.cross(axis, moved[:, :3, 3])
+            else:
+                slopes[:, :3, motion.value] += axis
+        return slopes
+
+    def _frames(self, values: Array) -> list[Array]:
+        """(n, 4, 4) frames after each joint, and that of the gripper."""
+        frame, frames = np.tile(np.eye(4), (len(values), 1, 1)), []
+        for motion in self.chain:
+            moved = np.tile(np.eye(4), (len(values), 1, 1))
+            steps = (motion.factor * values[:, motion.value] + motion.constant)[:, None]
+            if motion.rotates:
+                moved[:, :3, :3] = Rotation.from_rotvec(steps * motion.axis).as_matrix()
+            else:
+                moved[:, :3, 3] = steps * motion.axis
+            frame = frame @ motion.before @ moved
+            frames.append(frame)
+        return [*frames, frame @ self.last]
