@@ -1,6 +1,8 @@
 """The one exception that a user is meant to read."""
 
+import importlib
 import unicodedata
+from typing import Any
 
 _LONGEST = 2_000
 """Characters of a message, which may repeat what came from outside."""
@@ -42,3 +44,11 @@ def missing_extra(need: str, extra: str) -> InputError:
     """
     command = f"python -m pip install -c constraints.txt '.[{extra}]'"
     return InputError(f"{need}; in the checkout of evercal, run: {command}")
+
+
+def optional_module(name: str, need: str, extra: str) -> Any:
+    """Import a module of an optional package, or raise the error of `missing_extra`."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise missing_extra(need, extra) from None

@@ -22,7 +22,7 @@ from evercal.errors import InputError
 from evercal.recordings import read_image, read_robot_poses, write_image
 from evercal.recordings.images import as_rgb
 from evercal.recordings.poses.camera_file import read_camera
-from evercal.recordings.poses.row_files import natural_key
+from evercal.recordings.text_files import natural_key
 
 Read = Callable[[Path], object]
 HEADER = "image,x,y,z,qw,qx,qy,qz\n"

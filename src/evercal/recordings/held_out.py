@@ -25,11 +25,10 @@ def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
         return HeldOutSplit(tuple(frames), ())
     every = min(EVERY, len(frames))
     middle = every // 2
-    held_out = [middle <= i % every < middle + BLOCK for i in range(len(frames))]
-    return HeldOutSplit(
-        tuple(f for f, out in zip(frames, held_out, strict=True) if not out),
-        tuple(f for f, out in zip(frames, held_out, strict=True) if out),
-    )
+    parts: tuple[list[Frame], list[Frame]] = ([], [])
+    for i, frame in enumerate(frames):
+        parts[middle <= i % every < middle + BLOCK].append(frame)
+    return HeldOutSplit(*map(tuple, parts))
 
 
 def named_recording(recording: Recording, name: str | None, taken: Iterable[str]) -> Recording:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.recordings.images import IMAGE_ENDINGS, files_in
-from evercal.recordings.poses.row_files import natural_key
 
 
 def image_files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
@@ -16,8 +15,7 @@ def image_files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
     files: list[Path] = []
     for path in map(Path, paths):
         if path.is_dir():
-            inside = sorted(files_in(path), key=lambda p: natural_key(p.name))
-            if not inside:
+            if not (inside := files_in(path)):
                 raise InputError(f"{path}: no images in this folder ({', '.join(IMAGE_ENDINGS)})")
             files += inside
         elif path.is_file():

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evercal.bounds import bounds
 from evercal.errors import InputError
+from evercal.recordings.text_files import named_errors, natural_key
 from evercal.storage.atomic import write_bytes
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -66,11 +67,13 @@ def file_of(image: Picture) -> Path | None:
 
 
 def files_in(folder: Path, end: tuple[str, ...] = IMAGE_ENDINGS, glob: str = "*") -> list[Path]:
-    """Files in a folder with one of some endings, in lower case, sorted by path.
+    """Files in a folder with one of some endings, in lower case; image-2 comes before image-10.
 
     Hidden files, such as ._a.jpg that macOS puts beside a.jpg, are no content.
     """
-    return sorted(f for f in folder.glob(glob) if f.name[0] != "." and f.name.lower().endswith(end))
+    files = (file for file in folder.glob(glob) if file.name[0] != ".")
+    own = (file for file in files if file.name.lower().endswith(end))
+    return sorted(own, key=lambda file: natural_key(file.as_posix()))
 
 
 def as_stored(path: Path) -> Path | UnturnedImage:
@@ -155,12 +158,8 @@ def read_image(path: str | os.PathLike[str], turned: bool = True) -> NDArray[np.
     those of the upright image.
     """
     path = Path(path)
-    try:
+    with named_errors(path, "image file"):
         data = np.fromfile(path, dtype=np.uint8)
-    except FileNotFoundError:
-        raise InputError(f"{path}: image file is missing; check the path") from None
-    except OSError as error:
-        raise InputError(f"{path}: image file cannot be read ({error.strerror})") from None
     image = decode_image(data, turned)
     if image is None:
         raise InputError(

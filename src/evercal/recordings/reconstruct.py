@@ -15,11 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError, missing_extra
+from evercal.errors import InputError, optional_module
 from evercal.recordings.images import write_image
+from evercal.recordings.pictures import is_blank
 from evercal.recordings.streams import StreamFrame, stream
 
 OnStep = Callable[[str, int, int], object]
@@ -66,10 +68,7 @@ def reconstruct(
         most_frames: Maximum number of frames; of more, every n-th is used.
         on_step: Called with the current step.
     """
-    try:
-        import pycolmap
-    except ImportError:
-        raise missing_extra("reconstruction needs pycolmap", "colmap") from None
+    pycolmap = optional_module("pycolmap", "reconstruction needs pycolmap", "colmap")
     root = Path(out)
     if root.exists() and any(root.iterdir()):
         raise InputError(f"{root}: is not empty; give a new folder")
@@ -126,10 +125,6 @@ def _chosen(source: str, images: Path, motion: float, most: int) -> list[str]:
 
 def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFrame]:
     """Yield the sharpest frame of each step of a moving camera."""
-    import cv2
-
-    from evercal.recordings.pictures import is_blank
-
     last: NDArray[np.uint8] | None = None
     best: tuple[float, StreamFrame, NDArray[np.uint8]] | None = None
     for frame in frames:
@@ -154,8 +149,6 @@ def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFram
 
 def _motion(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:
     """Median motion of corners, parts of the width; infinite if most are lost."""
-    import cv2
-
     corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 7)
     if corners is None:
         return np.inf

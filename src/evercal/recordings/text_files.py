@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from pathlib import Path, PureWindowsPath
@@ -37,6 +37,22 @@ def named_errors(path: Path | str, what: str, remedy: str = "check the path") ->
         raise InputError(f"{path}: {what} is nested too deeply or too large") from None
     except (ValueError, TypeError, OverflowError, EOFError) as error:
         raise InputError(f"{path}: {error}") from None
+
+
+@contextmanager
+def library_errors(what: str, remedies: Mapping[str, str] | None = None) -> Iterator[None]:
+    """Turn errors of another library into an `InputError`: damaged files make it raise any type.
+
+    `remedies` are of errors by words in them.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        text = " ".join(str(error).split())[:200]
+        remedy = next((v for word, v in (remedies or {}).items() if word in text), "")
+        raise InputError(f"{what} ({type(error).__name__}: {text}){remedy}") from None
 
 
 @contextmanager
@@ -83,6 +99,18 @@ def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str
     return data
 
 
+def documents(text: str, is_json: bool) -> list[Any]:
+    """Values of JSON, of lines of JSON, or of YAML; ValueError for other text."""
+    if not is_json:
+        return yaml_documents(text)
+    try:
+        return [json.loads(text)]
+    except json.JSONDecodeError as error:
+        if error.msg != "Extra data":
+            raise ValueError(f"not valid JSON ({error})") from None
+    return [json.loads(line) for line in text.splitlines() if line.strip()]
+
+
 def yaml_documents(text: str) -> list[Any]:
     """The documents of a YAML text; ValueError for other text, references, tags, deep nesting.
 
@@ -124,6 +152,15 @@ def refuse_repeated(names: Iterable[str], remedy: str) -> None:
         if name in known:
             raise ValueError(f"{name!r} comes twice; {remedy}")
         known.add(name)
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sorting key that puts `image-2` before `image-10`."""
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    return tuple(
+        (0, len(p.lstrip("0")), f"{p.lstrip('0')} {p}") if p[0] in "0123456789" else (1, 0, p)
+        for p in parts
+    )
 
 
 def path_inside(path: object, what: str) -> str:

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.boards.board import Board
+from evercal.calibration.boards.board import Board, dictionary_of
+from evercal.calibration.boards.markers import STYLES
 from evercal.calibration.boards.printing import board_image
 from evercal.geometry import SE3, Camera
 
@@ -24,6 +25,7 @@ CENTRE = {
 }
 UP = ("apriltag", "aprilgrid")
 """Boards whose y goes up in print, and whose z points towards the camera."""
+CELLS = {"chessboard": 1, "charuco": 1, "apriltag": 8, "aprilgrid": 10, "arucogrid": 6}
 _PER_METRE = 6000
 
 
@@ -33,11 +35,31 @@ def grid(columns: int, rows: int) -> np.ndarray:
     return 0.03 * np.stack([x, y, 0 * x], -1).reshape(-1, 3).astype(float)
 
 
+def grid_image(board: Board, unit_px: int) -> np.ndarray:
+    """Draw a grid of markers as Kalibr and OpenCV print it."""
+    turn, up = STYLES[board.kind]
+    side, dictionary = unit_px * CELLS[board.kind], dictionary_of(board)
+    pitch = side / board.marker_share
+    gap = round(pitch - side)
+    counts = np.array([board.rows, board.columns])
+    image = np.full(np.round((counts - 1) * pitch).astype(int) + side + 2 * gap, 255, np.uint8)
+    for k, (row, column) in enumerate(np.ndindex(*counts)):
+        y, x = round((counts[0] - 1 - row if up else row) * pitch), round(column * pitch)
+        for i, j in np.ndindex(2, 2) if up else ():  # Kalibr's squares at the corners
+            at_y, at_x = y + i * (gap + side), x + j * (gap + side)
+            image[at_y : at_y + gap, at_x : at_x + gap] = 0
+        tag = cv2.aruco.generateImageMarker(
+            dictionary, (board.tag or 0) + k, side, borderBits=2 if up else 1
+        )
+        image[y + gap : y + gap + side, x + gap : x + gap + side] = np.rot90(tag, turn)
+    return image
+
+
 def printed(board: Board) -> tuple[np.ndarray, np.ndarray]:
     """Return the print of a board and the (3, 3) map from metres to pixels of the print."""
     side = round(board.size_m * _PER_METRE)
-    cells = {"apriltag": 8, "aprilgrid": 10, "arucogrid": 6}
-    image = board_image(board, side // cells.get(board.kind, 1))
+    draw = grid_image if board.is_grid else board_image
+    image = draw(board, side // CELLS[board.kind])
     margin = side // 3 if board.kind == "apriltag" else side
     # The black and the white of a real print.
     image = np.pad(image, margin, constant_values=255) // 255 * 210 + 20

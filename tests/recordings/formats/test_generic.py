@@ -154,7 +154,7 @@ def test_unknown_keys_are_ignored(tmp_path: Path) -> None:
 FIRST = ("frames", 0)
 BREAKS = [
     (("format",), "other", "'format' is not 'evercal-scene'"),
-    (("version",), 2, "version 2, this evercal reads 1"),
+    (("version",), 2, "version 2; this evercal reads 1"),
     (("frames",), [], "at least one frame"),
     (("frames",), {}, "'frames' is a list"),
     (("cameras",), [], "'cameras' is an object"),

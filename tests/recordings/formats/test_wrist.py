@@ -14,7 +14,8 @@ from evercal.recordings.formats import wrist
 from evercal.recordings.image_files import image_files
 from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import RobotPoses
-from evercal.recordings.poses.row_files import natural_key, times_in_names
+from evercal.recordings.poses.row_files import times_in_names
+from evercal.recordings.text_files import natural_key
 
 from ..checks import assert_pose, refused
 
@@ -84,6 +85,7 @@ TIMES = 1305031102.0 + SECONDS
     ("images", "names", "stamps", "message"),
     [
         (["a.png", "b.png"], ("1", "2"), None, "names no image of"),
+        (["7.25.png", "8.25.png"], ("7", "9"), None, "names no image of"),
         (["a.png", "b.png"], ("a.png", "a.png"), None, r"'a\.png' comes twice"),
         (["image-1.png", "image-10.png", "image-2.png"], None, None, "is given after image-10"),
         # Frame numbers are not times, even if the clock of the robot starts at 0.
@@ -279,8 +281,8 @@ def record3d(root: Path) -> None:
     """Quaternion, then position, OpenGL's axes, and a matrix column after column."""
     make_folder(root, [f"{i}.png" for i in range(4)], None, "rgb")
     rows = quaternions(SE3.from_matrix(CAMERA_POSES.matrix() @ GL))[:, [4, 5, 6, 3, 0, 1, 2]]
-    data = {"w": 32, "h": 24, "dw": 16, "dh": 12, "fps": 60, "K": PLAIN.matrix().T.ravel().tolist(),
-            "poses": rows.tolist()}  # fmt: skip
+    data = {"w": 32, "h": 24, "dw": 16, "dh": 12, "fps": 60, "cameraType": 1,
+            "K": PLAIN.matrix().T.ravel().tolist(), "poses": rows.tolist()}  # fmt: skip
     (root / "metadata").write_text(json.dumps(data))
 
 
@@ -301,14 +303,25 @@ def test_folders_of_camera_poses_are_read(tmp_path: Path, write: Callable[[Path]
 
 def test_cameras_of_single_images_are_read(tmp_path: Path) -> None:
     ace(tmp_path / "ace")
+    pose = tmp_path / "ace/train/poses/seq-01-frame-000000.pose.txt"
+    kept = pose.read_text()
+    pose.write_text("-inf " * 16)
+    recording = load_recording(tmp_path / "ace")
+    assert ([frame.name for frame in recording.train], recording.untracked) == (
+        ["train/seq-01-frame-000001.color.png"],
+        1,
+    )
+    pose.write_text(kept)
     file = tmp_path / "ace/train/calibration/seq-01-frame-000001.calibration.txt"
     file.write_text("33.5")
     cameras = [frame.camera for frame in load_recording(tmp_path / "ace").train]
     assert cameras == [PLAIN, Camera(32, 24, 33.5, 33.5, 15.5, 11.5)]
     file.unlink()
-    refused("camera file is missing", load_recording, tmp_path / "ace")
+    refused("lacks the file of an image", load_recording, tmp_path / "ace")
     own = ReadOptions(camera=tmp_path / "ace/train/calibration/seq-01-frame-000000.calibration.txt")
     assert load_recording(tmp_path / "ace", options=own).train[1].camera == PLAIN
+    gone = ReadOptions(camera=tmp_path / "gone.txt")
+    refused("gone.txt: camera file is missing", load_recording, tmp_path / "ace", options=gone)
     record3d(tmp_path / "phone")
     metadata = tmp_path / "phone" / "metadata"
     data = json.loads(metadata.read_text())
@@ -325,7 +338,7 @@ def test_broken_camera_poses_are_refused(tmp_path: Path) -> None:
     refused("pose: .*rotation", load_recording, tmp_path / "scannet")
     for file in (tmp_path / "scannet" / "pose").glob("*.txt"):
         file.write_text("-inf " * 16)
-    refused("holds no pose of an image", load_recording, tmp_path / "scannet")
+    refused("all poses in its files are inf or nan", load_recording, tmp_path / "scannet")
     sensor = tmp_path / "euroc/mav0/cam0/sensor.yaml"
     text = sensor.read_text()
     sensor.write_text(text.replace("T_BS", "T_CB"))
@@ -334,8 +347,8 @@ def test_broken_camera_poses_are_refused(tmp_path: Path) -> None:
     refused(r"sensor\.yaml: camera file is missing", load_recording, tmp_path / "euroc")
     metadata = tmp_path / "record3d" / "metadata"
     for change, message in (
-        ({"poses": None}, "'poses' is a list of qx"),
-        ({"poses": [[1, 0, 0, 0]]}, "'poses' is a list of qx"),
+        ({"poses": None}, "has 7 numbers .* got 0"),
+        ({"poses": [[1, 0, 0, 0]]}, "has 7 numbers .* got 4"),
         ({"K": None}, "camera_matrix"),
         ({"w": None}, "camera width is"),
     ):

@@ -15,20 +15,14 @@ neighbours.
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.boards.board import Board
-from evercal.calibration.boards.corners import (
-    BoardPose,
-    BoardView,
-    board_pose,
-    pixel_sigma,
-    strays,
-)
+from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma, strays
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
@@ -111,39 +105,32 @@ def read_board_poses(path: str | os.PathLike[str]) -> BoardPoses:
 
 
 def board_poses(
-    board: Board,
-    camera: Camera,
-    views: Mapping[str, BoardView | str],
-    camera_from: str = "file",
+    board: Board, camera: Camera, views: Mapping[str, BoardView | str], camera_from: str = "file"
 ) -> BoardPoses:
     """Fit the pose of the board in every image; a view may be the reason for a missing board."""
+    seen = {name: view for name, view in views.items() if isinstance(view, BoardView)}
     fits: dict[str, BoardPose] = {}
-    seen: dict[str, BoardView] = {}
-    images: dict[str, BoardImage] = {}
-    for name, view in views.items():
-        reason = view if isinstance(view, str) else "the detected corners fit no pose of the board"
-        images[name] = BoardImage(name, reason=reason)
+    for name, view in seen.items():
         with suppress(ValueError):
-            if isinstance(view, BoardView):
-                fits[name], seen[name] = board_pose(view, camera), view
+            fits[name] = board_pose(view, camera)
+    seen = {name: seen[name] for name in fits}
     stray = dict(zip(seen, strays([*seen.values()], [*fits.values()], camera), strict=True))
-    for name, mask in stray.items():
-        if mask.any():
-            left_out = tuple((float(x), float(y)) for x, y in seen[name].pixels[mask])
-            images[name] = replace(images[name], left_out=left_out)
-            seen[name] = seen[name][~mask]
-            fits[name] = board_pose(seen[name], camera, fits[name].camera_from_board)
+    left_out = {name: seen[name].pixels[mask].tolist() for name, mask in stray.items()}
+    for name in (name for name, mask in stray.items() if mask.any()):
+        seen[name] = seen[name][~stray[name]]
+        fits[name] = board_pose(seen[name], camera, fits[name].camera_from_board)
     sigma = pixel_sigma([*fits.values()]) if fits else 0.0
-    for name, fit in fits.items():
-        images[name] = replace(
-            images[name],
-            view=seen[name],
-            camera_from_board=fit.camera_from_board,
-            covariance=sigma**2 * fit.unit_covariance,
-            rms_px=fit.rms_px,
-            reason="",
-        )
-    return BoardPoses(board, camera, tuple(images.values()), sigma, camera_from)
+    images: list[BoardImage] = []
+    for name, view in views.items():
+        if fit := fits.get(name):
+            pose, covariance = fit.camera_from_board, sigma**2 * fit.unit_covariance
+            corners = tuple((x, y) for x, y in left_out[name])
+            image = BoardImage(name, seen[name], pose, covariance, fit.rms_px, left_out=corners)
+        else:
+            reason = "the detected corners fit no pose of the board"
+            image = BoardImage(name, reason=view if isinstance(view, str) else reason)
+        images.append(image)
+    return BoardPoses(board, camera, tuple(images), sigma, camera_from)
 
 
 def _image_to_dict(image: BoardImage) -> dict[str, Any]:

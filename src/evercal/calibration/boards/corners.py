@@ -224,10 +224,7 @@ def pixel_sigma(poses: Sequence[BoardPose]) -> float:
 
 
 def strays(
-    views: Sequence[BoardView],
-    poses: Sequence[BoardPose],
-    camera: Camera,
-    bend: Bend | None = None,
+    views: Sequence[BoardView], poses: Sequence[BoardPose], camera: Camera, bend: Bend | None = None
 ) -> list[NDArray[np.bool_]]:
     """Return (k,) of every view: whether a corner leaves its neighbours by many sigma.
 
@@ -293,13 +290,8 @@ class LensPrior(NamedTuple):
     @classmethod
     def stated(cls, camera: Camera) -> "LensPrior":
         """Prior of intrinsics from the maker or from another calibration."""
-        mean = lens_vector(camera)
         terms = _STATED_FISHEYE if camera.model == "fisheye" else _STATED_DISTORTION
-        sigma = np.r_[np.full(4, _STATED * camera.fx), terms][: len(mean)]
-        return cls(
-            np.r_[mean, np.zeros(len(BEND))],
-            np.diag(np.r_[sigma, [_USUAL_BEND] * len(BEND)] ** -2.0),
-        )
+        return cls._around(lens_vector(camera), _STATED * camera.fx, terms)
 
     @classmethod
     def usual(cls, camera: Camera) -> "LensPrior":
@@ -308,11 +300,16 @@ class LensPrior(NamedTuple):
         mean[:2] = camera.fx
         mean[2:4] = (camera.width - 1) / 2, (camera.height - 1) / 2
         terms = _USUAL_FISHEYE if camera.model == "fisheye" else _USUAL_DISTORTION
-        sigma = np.r_[np.full(4, _USUAL_CENTRE * camera.width), terms][: len(mean)]
-        information = np.diag(np.r_[sigma, [_USUAL_BEND] * len(BEND)] ** -2.0)
+        prior = cls._around(mean, _USUAL_CENTRE * camera.width, terms)
         aspect = np.array([[1.0, -1.0], [-1.0, 1.0]]) / (_USUAL_ASPECT * camera.fx) ** 2
-        information[:2, :2] = aspect + np.eye(2) / (_ROUGH_FOCAL * camera.fx) ** 2
-        return cls(np.r_[mean, np.zeros(len(BEND))], information)
+        prior.information[:2, :2] = aspect + np.eye(2) / (_ROUGH_FOCAL * camera.fx) ** 2
+        return prior
+
+    @classmethod
+    def _around(cls, mean: Array, sigma_px: float, sigma_terms: Sequence[float]) -> "LensPrior":
+        sigma = np.r_[np.full(4, sigma_px), sigma_terms][: len(mean)]
+        sigma = np.r_[sigma, np.full(len(BEND), _USUAL_BEND)]
+        return cls(np.r_[mean, np.zeros(len(BEND))], np.diag(sigma**-2.0))
 
 
 class Intrinsics(NamedTuple):
@@ -408,21 +405,18 @@ def calibrate_camera(
 
 
 def _consistent(views: Sequence[BoardView], camera: Camera) -> list[BoardView]:
-    rms = np.full(len(views), np.inf)
-    for i, view in enumerate(views):
-        with suppress(ValueError):
-            rms[i] = board_pose(view, camera).rms_px
+    rms = _misfits(views, camera)
     most = _FALSE * np.median(rms)
     return [view for view, error in zip(views, rms, strict=True) if error <= most < np.inf]
 
 
-def _misfit(views: Sequence[BoardView], camera: Camera) -> float:
-    """Median of the views' root mean square residuals, pixels."""
-    rms = []
-    for view in views:
+def _misfits(views: Sequence[BoardView], camera: Camera) -> Array:
+    """Root mean square residuals of (n,) views, pixels; inf without a pose."""
+    rms = np.full(len(views), np.inf)
+    for i, view in enumerate(views):
         with suppress(ValueError):
-            rms.append(board_pose(view, camera).rms_px)
-    return float(np.median(rms)) if 2 * len(rms) > len(views) else np.inf
+            rms[i] = board_pose(view, camera).rms_px
+    return rms
 
 
 def _rough(views: Sequence[BoardView], width: int, height: int, model: Model) -> Camera:
@@ -433,7 +427,7 @@ def _rough(views: Sequence[BoardView], width: int, height: int, model: Model) ->
         centre = (width - 1) / 2, (height - 1) / 2
         focals = [width / 2 / np.deg2rad(half) for half in _HALF_ANGLES_DEG]
         fits = [Camera(width, height, f, f, *centre, model=model) for f in focals]
-        return min(fits, key=lambda camera: _misfit(views, camera))
+        return min(fits, key=lambda camera: np.median(_misfits(views, camera)))
     middle = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
     points = [view.points_m.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]

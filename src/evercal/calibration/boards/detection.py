@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +18,7 @@ from evercal.calibration.boards.markers import (
     grid_views,
 )
 from evercal.errors import InputError
+from evercal.geometry.camera import resize_pixels
 
 Array = NDArray[np.floating]
 Image = NDArray[np.uint8]
@@ -61,8 +63,6 @@ def find_boards(
 
 
 def _look(image: Image, board: Board) -> BoardView | str | Markers:
-    import cv2
-
     find = {"chessboard": _find_chessboard, "charuco": find_charuco, "apriltag": find_tag}
     return find.get(board.kind, find_markers)(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), board)
 
@@ -90,21 +90,17 @@ def _find_chessboard(grey: NDArray, board: Board) -> BoardView | str:
 
 def _chessboard_candidates(grey: NDArray, size: tuple[int, int]) -> Iterator[Array]:
     """Yield corners (k, 2) by OpenCV's finders, the fastest first."""
-    import cv2
-
     normalized = cv2.CALIB_CB_NORMALIZE_IMAGE
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | normalized
-    detected, pixels = cv2.findChessboardCorners(grey, size, flags=flags)
-    if detected:
-        yield pixels.reshape(-1, 2).astype(np.float64)
-    detected, pixels = cv2.findChessboardCornersSB(grey, size, flags=normalized)
-    if detected:
-        yield pixels.reshape(-1, 2).astype(np.float64)
-    if grey.shape[1] <= _LARGEST_DOUBLED_PX:  # for small or tilted squares
-        double = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-        detected, pixels = cv2.findChessboardCornersSB(double, size, flags=normalized)
+    searches = [
+        (cv2.findChessboardCorners, 1, cv2.CALIB_CB_ADAPTIVE_THRESH | normalized),
+        (cv2.findChessboardCornersSB, 1, normalized),
+        (cv2.findChessboardCornersSB, 2, normalized),  # for small or tilted squares
+    ]
+    for find, scale, flags in searches[: 3 if grey.shape[1] <= _LARGEST_DOUBLED_PX else 2]:
+        image = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        detected, pixels = find(image, size, flags=flags)
         if detected:
-            yield (pixels.reshape(-1, 2).astype(np.float64) - 0.5) / 2
+            yield resize_pixels(pixels.reshape(-1, 2).astype(np.float64), 1 / scale)
 
 
 def _is_even(grid: Array) -> bool:
@@ -117,8 +113,6 @@ def _is_even(grid: Array) -> bool:
 
 
 def _no_chessboard(grey: NDArray, board: Board) -> str:
-    import cv2
-
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
     detected, pixels, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
     wanted = f"not {board.columns}x{board.rows} inner corners"
@@ -141,8 +135,6 @@ def _no_chessboard(grey: NDArray, board: Board) -> str:
 
 
 def _first_square_is_bright(grey: NDArray, grid: Array) -> bool:
-    import cv2
-
     middle = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     small = cv2.boxFilter(grey, -1, (3, 3))
     x, y = np.round(middle).astype(int).transpose(2, 0, 1)

@@ -1,5 +1,6 @@
 """Corners to one or two hundredths of a pixel, by windows around them and lines along edges."""
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,8 +25,6 @@ def sharpened(grey: NDArray, view: BoardView, board: Board) -> BoardView:
     First in windows around them, then by lines along the edges of the squares, which are longer.
     Windows and edges keep away from markers and from the next corner.
     """
-    import cv2
-
     points, pixels = view.points_m[:, :2] / board.size_m, view.pixels
     if cv2.findHomography(points, pixels)[0] is None:
         return view
@@ -48,8 +47,6 @@ def sharpened(grey: NDArray, view: BoardView, board: Board) -> BoardView:
 
 def _in_windows(grey: NDArray, pixels: Array, free_px: Array) -> Array:
     """Refine corners (n, 2) that have space for a window of at most `free_px` (n,) to each side."""
-    import cv2
-
     half = np.minimum(free_px, 11).astype(int)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
     start = np.ascontiguousarray(pixels, dtype=np.float32)
@@ -107,8 +104,6 @@ def _edges(
 
     With `outwards`, only edges that get brighter to the left of the side count.
     """
-    import cv2
-
     sides = ends - starts
     across = np.stack([sides[:, 1], -sides[:, 0]], 1)
     across /= np.maximum(np.linalg.norm(sides, axis=1, keepdims=True), 1e-9)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -105,8 +106,6 @@ class Layout(NamedTuple):
 
 def find_markers(grey: NDArray, board: Board) -> Markers:
     """Detect the markers of a board's dictionary, to hundredths of a pixel."""
-    import cv2
-
     dictionary, parameters = dictionary_of(board), cv2.aruco.DetectorParameters()
     count = board.columns * board.rows if board.is_grid else 1
     found: dict[int, Array] = {}
@@ -134,8 +133,6 @@ def find_markers(grey: NDArray, board: Board) -> Markers:
 
 
 def _steps(ids: Ids, corners: Array) -> tuple[Ids, Ids, Plane]:
-    import cv2
-
     n, near = len(ids), min(_NEAREST, max(len(ids) - 1, 0))
     ends = np.pad(corners, ((0, 0), (0, 0), (0, 1)), constant_values=1)
     middle = np.cross(np.cross(ends[:, 0], ends[:, 2]), np.cross(ends[:, 1], ends[:, 3]))
@@ -169,8 +166,6 @@ def _in_space(plane: Plane) -> Array:
 
 def find_charuco(grey: NDArray, board: Board) -> BoardView | str:
     """Detect the corners of squares of a ChArUco board, or return a reason."""
-    import cv2
-
     markers = find_markers(grey, board)
     layout, wrong = _layout(markers, board)
     if wrong:

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.boards.board import Board, dictionary_of
-from evercal.calibration.boards.markers import STYLES
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -39,10 +38,13 @@ def board_image(board: Board, unit_px: int) -> NDArray[np.uint8]:
         # The square between the first four inner corners is bright.
         bright = np.where((i + j) % 2 == 0, 255, 0).astype(np.uint8)
         return bright.repeat(unit_px, 0).repeat(unit_px, 1)
-    dictionary = dictionary_of(board)
-    size = (board.columns, board.rows)
+    if board.is_grid:
+        raise InputError(
+            f"an {board.kind} is not printed; take the print of Kalibr or OpenCV, or print"
+            f" --board charuco"
+        )
+    dictionary, size = dictionary_of(board), (board.columns, board.rows)
     last = size[0] * size[1] // 2 - 1 if board.kind == "charuco" else board.tag or 0
-    last += board.is_grid * (size[0] * size[1] - 1)
     if not 0 <= last < len(dictionary.bytesList):
         raise InputError(
             f"{board.dictionary} has no marker {last}; its numbers are 0 to"
@@ -51,56 +53,24 @@ def board_image(board: Board, unit_px: int) -> NDArray[np.uint8]:
     if board.kind == "charuco":
         page = cv2.aruco.CharucoBoard(size, board.size_m, board.marker_m, dictionary)
         drawn = page.generateImage((size[0] * unit_px, size[1] * unit_px))
-    elif board.is_grid:
-        drawn = _grid_image(board, unit_px)
     else:
         drawn = cv2.aruco.generateImageMarker(dictionary, last, _cells(board) * unit_px)
     return np.asarray(drawn, dtype=np.uint8)
 
 
-def _grid_image(board: Board, unit_px: int) -> NDArray[np.uint8]:
-    import cv2
-
-    turn, up = STYLES[board.kind]
-    side, dictionary = unit_px * _cells(board), dictionary_of(board)
-    pitch = side / board.marker_share
-    gap = round(pitch - side)
-    counts = np.array([board.rows, board.columns])
-    image = np.full(np.round((counts - 1) * pitch).astype(int) + side + 2 * gap, 255, np.uint8)
-    for k, (row, column) in enumerate(np.ndindex(*counts)):
-        y, x = round((counts[0] - 1 - row if up else row) * pitch), round(column * pitch)
-        for i, j in np.ndindex(2, 2) if up else ():  # Kalibr's squares at the corners
-            at_y, at_x = y + i * (gap + side), x + j * (gap + side)
-            image[at_y : at_y + gap, at_x : at_x + gap] = 0
-        tag = cv2.aruco.generateImageMarker(
-            dictionary, (board.tag or 0) + k, side, borderBits=2 if up else 1
-        )
-        image[y + gap : y + gap + side, x + gap : x + gap + side] = np.rot90(tag, turn)
-    return image
-
-
 def _cells(board: Board) -> int:
-    if board.kind in ("chessboard", "charuco"):
-        return 1
-    return dictionary_of(board).markerSize + (4 if board.kind == "aprilgrid" else 2)
+    return dictionary_of(board).markerSize + 2 if board.kind == "apriltag" else 1
 
 
 def drawing(board: Board, paper: str = "a4") -> "tuple[Image, float]":
     """Draw a board on a sheet, with a ruler; also return the resolution in pixels per inch."""
     from PIL import Image, ImageDraw, ImageFont
 
-    counts = {
-        "chessboard": (board.columns + 1, board.rows + 1),
-        "apriltag": (1, 1),
-    }
-    size_mm = 1000 * board.size_m * np.array(counts.get(board.kind, (board.columns, board.rows)))
-    if board.is_grid:
-        size_mm = size_mm / board.marker_share + 1000 * board.gap_m
-    width, height = _sheet(board, paper, size_mm)
     unit_mm = 1000 * board.size_m / _cells(board)
     unit_px = max(1, round(unit_mm * _DPI / 25.4))
     per_mm = unit_px / unit_mm
     picture = board_image(board, unit_px)
+    width, height = _sheet(board, paper, np.array(picture.shape[::-1]) / per_mm)
     page = Image.new("1", (round(width * per_mm), round(height * per_mm)), 1)
     left = (page.width - picture.shape[1]) // 2
     top = (page.height - round(_FOOTER_MM * per_mm) - picture.shape[0]) // 2
@@ -126,11 +96,6 @@ def label(board: Board) -> str:
         words = (
             f"ChArUco, {board.columns}x{board.rows} squares of {side}, markers of"
             f" {1000 * board.marker_m:g} mm, {board.dictionary}"
-        )
-    elif board.is_grid:
-        words = (
-            f"{board.kind}, {board.columns}x{board.rows} markers of {side}, gaps of"
-            f" {1000 * board.gap_m:g} mm, {board.dictionary} from {board.tag or 0}"
         )
     else:
         words = f"tag {board.tag or 0} of {board.dictionary}, black square of {side}"
@@ -162,11 +127,7 @@ def _sheet(board: Board, paper: str, size_mm: NDArray) -> tuple[float, float]:
 
 def write_board(path: Path, board: Board, paper: str = "a4") -> None:
     """Write a board at true size to a PDF or PNG file; the resolution is stored in the file."""
-    kind = path.suffix.lower()
-    if kind not in FILE_KINDS:
+    if path.suffix.lower() not in FILE_KINDS:
         raise InputError(f"{path}: give a file name that ends with {' or '.join(FILE_KINDS)}")
     page, dpi = drawing(board, paper)
-    if kind == ".pdf":
-        page.save(path, resolution=dpi)
-    else:
-        page.save(path, dpi=(dpi, dpi))
+    page.save(path, dpi=(dpi, dpi))

@@ -16,13 +16,8 @@ from evercal.recordings.poses.conventions import PoseConvention
 from evercal.recordings.poses.pairing import unpaired
 from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.poses.robot_poses import read_robot_poses
-from evercal.recordings.poses.row_files import (
-    natural_key,
-    same_numbers,
-    times_in_names,
-    without_ending,
-)
-from evercal.recordings.text_files import read_json
+from evercal.recordings.poses.row_files import same_numbers, times_in_names, without_ending
+from evercal.recordings.text_files import natural_key, read_json
 
 Inverted = Literal["robot", "camera", "both"]
 

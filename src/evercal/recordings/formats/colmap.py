@@ -11,37 +11,26 @@ from typing import Any
 
 import numpy as np
 
-from evercal.errors import InputError, missing_extra
+from evercal.errors import InputError, optional_module
 from evercal.geometry import SE3, Camera
+from evercal.geometry.camera import COEFFICIENTS
 from evercal.processes import status_of
 from evercal.recordings.formats.nerfstudio import frame_note
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import as_stored, files_in
 from evercal.recordings.poses.radial_models import RADIAL_MODELS, nearest_fisheye
-from evercal.recordings.poses.row_files import natural_key
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import named_errors, path_inside
+from evercal.recordings.text_files import library_errors, named_errors, natural_key, path_inside
 
 USES = ("metres",)
 
 _MODEL_FOLDERS = (".", "sparse", "colmap/sparse", "distorted/sparse")
-# Indices of fx, fy, cx, cy and OpenCV's distortion in COLMAP's parameters; None for 0. Those of
-# FOV and EUCM are parameters of `RADIAL_MODELS`.
-_PARAMETERS: dict[str, tuple[int, int, int, int, tuple[int | None, ...]]] = {
-    "SIMPLE_PINHOLE": (0, 0, 1, 2, ()),
-    "PINHOLE": (0, 1, 2, 3, ()),
-    "SIMPLE_RADIAL": (0, 0, 1, 2, (3, None, None, None)),
-    "RADIAL": (0, 0, 1, 2, (3, 4, None, None)),
-    "OPENCV": (0, 1, 2, 3, (4, 5, 6, 7)),
-    "FULL_OPENCV": (0, 1, 2, 3, (4, 5, 6, 7, 8, 9, 10, 11)),
-    "SIMPLE_FISHEYE": (0, 0, 1, 2, ()),
-    "FISHEYE": (0, 1, 2, 3, ()),
-    "SIMPLE_RADIAL_FISHEYE": (0, 0, 1, 2, (3, None, None, None)),
-    "RADIAL_FISHEYE": (0, 0, 1, 2, (3, 4, None, None)),
-    "OPENCV_FISHEYE": (0, 1, 2, 3, (4, 5, 6, 7)),
-    "FOV": (0, 1, 2, 3, (4,)),
-    "EUCM": (0, 1, 2, 3, (4, 5)),
-}
+# Models of which each parameter is OpenCV's, or one of `RADIAL_MODELS`.
+_SUPPORTED = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
+    "SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE",
+    "FOV", "EUCM",
+)  # fmt: skip
 _READ = "import pycolmap, sys; print(flush=True); pycolmap.Reconstruction(sys.argv[1])"
 _LEAST_S, _SLOWEST_BYTES_PER_S = 1.0, 5e6
 """Time for reading a binary model."""
@@ -86,34 +75,28 @@ def _models(root: Path) -> list[Path]:
         inner = sorted(parent.iterdir()) if parent.is_dir() else []
         if name == ".":  # may be a folder of models, which COLMAP numbers
             inner = [folder for folder in inner if folder.name.isdigit()]
-        kinds = [(folder, kind) for folder in (parent, *inner) for kind in ("bin", "txt")]
-        models = [
-            folder
-            for folder, kind in kinds
-            if all((folder / f"{file}.{kind}").is_file() for file in ("cameras", "images"))
-        ]
-        if models:
-            return list(dict.fromkeys(models))
+        if models := [folder for folder in (parent, *inner) if _is_model(folder)]:
+            return models
     return []
 
 
+def _is_model(folder: Path) -> bool:
+    names = ("cameras", "images")
+    kinds = [all((folder / (name + end)).is_file() for name in names) for end in (".bin", ".txt")]
+    return any(kinds)
+
+
 def _model(folder: Path) -> Any:
-    try:
-        import pycolmap  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        need = f"{folder}: reading a COLMAP model needs pycolmap"
-        raise missing_extra(need, "colmap") from None
+    need = f"{folder}: reading a COLMAP model needs pycolmap"
+    pycolmap = optional_module("pycolmap", need, "colmap")
     _require_ends(folder)
-    try:
+    with library_errors(f"{folder}: pycolmap cannot read the model"):
         model = pycolmap.Reconstruction(str(folder))
         names = _names(folder)
         for key, image in model.images.items():
             name = names.get(key, image.name)  # decodes UTF-8
             image.name = path_inside(name, "the name of an image")
         return model
-    except Exception as error:  # pycolmap passes C++ exceptions on as several types
-        text = " ".join(str(error).split())[:200]
-        raise InputError(f"{folder}: pycolmap cannot read the model: {text}") from None
 
 
 def _names(folder: Path) -> dict[int, str]:
@@ -146,22 +129,25 @@ def _require_ends(folder: Path) -> None:
 
 def _camera(folder: Path, camera: Any) -> Camera:
     name = camera.model.name
-    if name not in _PARAMETERS:
+    if name not in _SUPPORTED:
         raise InputError(
-            f"{folder}: camera model {name} is not supported, only {', '.join(_PARAMETERS)};"
+            f"{folder}: camera model {name} is not supported, only {', '.join(_SUPPORTED)};"
             f" undistort the images with 'colmap image_undistorter' and read its result"
         )
-    fx, fy, cx, cy, distortion = _PARAMETERS[name]
-    p = np.asarray(camera.params, dtype=np.float64)
-    # Half a pixel: COLMAP counts from the image's corner.
-    pinhole = p[fx], p[fy], p[cx] - 0.5, p[cy] - 0.5
-    coefficients = tuple(0.0 if i is None else float(p[i]) for i in distortion)
+    names = camera.params_info.split(", ")  # the only coefficient is called k
+    names = ["k1" if name == "k" else name for name in names]
+    named = dict(zip(names, map(float, camera.params), strict=True))
+    focal = named.get("fx", named.get("f", 0.0)), named.get("fy", named.get("f", 0.0))
+    centre = named["cx"] - 0.5, named["cy"] - 0.5  # COLMAP counts from the image's corner
     size, kind = (int(camera.width), int(camera.height)), name.lower()
     with named_errors(folder, "COLMAP model"):
         if kind in RADIAL_MODELS:
-            return nearest_fisheye(kind, coefficients, size, pinhole[:2], pinhole[2:])[0]
+            own = [named[key] for key in RADIAL_MODELS[kind].parameters]
+            return nearest_fisheye(kind, own, size, focal, centre)[0]
         model = "fisheye" if kind.endswith("fisheye") else "pinhole"
-        return Camera(*size, *pinhole, coefficients, model)
+        count = 8 if "k6" in named else 4 if "k1" in named else 0
+        distortion = tuple(named.get(key, 0.0) for key in COEFFICIENTS[model][:count])
+        return Camera(*size, *focal, *centre, distortion, model)
 
 
 def _pose(folder: Path, image: Any) -> SE3:

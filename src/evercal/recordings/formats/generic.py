@@ -8,6 +8,7 @@ import contextlib
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -26,6 +27,7 @@ from evercal.recordings.text_files import (
     refuse_repeated,
 )
 from evercal.storage import write_json
+from evercal.storage.records import of_format
 
 FILE = "scene.json"
 _FORMAT = "evercal-scene"
@@ -42,13 +44,7 @@ def load(root: Path) -> Recording:
     file = root / FILE
     data = read_json(file, "scene file", "convert the recording again")
     with named_errors(file, "scene file"):
-        _check(data)
-        cameras = _cameras(data.get("cameras"))
-        frames = []
-        for i, entry in enumerate(data["frames"]):
-            with naming(f"frame {i}"):
-                frames.append(_frame(root, entry, cameras))
-        refuse_repeated((frame.name for _, frame in frames), "names of frames are unique")
+        frames = of_format(data, _FORMAT, _VERSION, partial(_frames, root))
     name = data.get("name")
     train, test = (tuple(f for s, f in frames if s == split) for split in ("train", "test"))
     return Recording(
@@ -61,16 +57,9 @@ def load(root: Path) -> Recording:
     )
 
 
-def _check(data: Mapping[str, Any]) -> None:
-    if data.get("format") != _FORMAT:
-        raise ValueError(f"'format' is not '{_FORMAT}'; this is another program's file")
-    if data.get("version") != _VERSION:
-        raise ValueError(
-            f"version {data.get('version')!r}, this evercal reads {_VERSION}; update evercal or"
-            f" convert the scene"
-        )
-    frames, notes = data.get("frames"), data.get("notes", [])
-    if not isinstance(frames, list) or not frames:
+def _frames(root: Path, data: Mapping[str, Any]) -> list[tuple[Literal["train", "test"], Frame]]:
+    entries, notes = data.get("frames"), data.get("notes", [])
+    if not isinstance(entries, list) or not entries:
         raise ValueError("'frames' is a list with at least one frame")
     if not isinstance(data.get("untracked", 0), int):
         raise ValueError(f"'untracked' is a count, got {data['untracked']!r}")
@@ -78,6 +67,12 @@ def _check(data: Mapping[str, Any]) -> None:
         raise ValueError(f"'unit' is 'metres' or 'unknown', got {data['unit']!r}")
     if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
         raise ValueError(f"'notes' is a list of sentences, got {notes!r}")
+    cameras, frames = _cameras(data.get("cameras")), []
+    for i, entry in enumerate(entries):
+        with naming(f"frame {i}"):
+            frames.append(_frame(root, entry, cameras))
+    refuse_repeated((frame.name for _, frame in frames), "names of frames are unique")
+    return frames
 
 
 def write(
@@ -175,13 +170,12 @@ class SceneWriter:
             self._copy(frame.image, relative)
             return relative
         stored = frame.image.file() if isinstance(frame.image, StoredImage) else None
-        image = frame.read_image() if stored is None else None
-        relative = stem + (".png" if stored is None else stored[0])
+        relative = stem + (stored[0] if stored else ".png")
         with self._new(relative) as path:
-            if image is not None:
-                write_image(path, image)
-            elif stored is not None:
+            if stored:
                 path.write_bytes(stored[1])
+            else:
+                write_image(path, frame.read_image())
         return relative
 
     def _copy(self, source: Path, relative: str) -> None:

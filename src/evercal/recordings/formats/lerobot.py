@@ -26,22 +26,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError, missing_extra
+from evercal.errors import InputError, optional_module
 from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, decode_image, files_in, image_file
 from evercal.recordings.poses.camera_file import read_camera_of_size
-from evercal.recordings.poses.conventions import (
-    ConventionError,
-    PoseConvention,
-    check_units,
-    pose_convention,
-    poses_from_numbers,
-)
+from evercal.recordings.poses.conventions import asking_for, checked_poses, pose_convention
 from evercal.recordings.poses.kinematics import RobotModel, in_radians
 from evercal.recordings.poses.robot_poses import RobotPoses
+from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import named_errors, path_inside, read_json, refuse_repeated
+from evercal.recordings.text_files import (
+    library_errors,
+    named_errors,
+    path_inside,
+    read_json,
+    refuse_repeated,
+)
 
 Array = NDArray[np.float64]
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
@@ -60,12 +61,9 @@ def detect(root: Path) -> bool:
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read the tables and decode one image; the others stay in their files until needed."""
-    try:
+    # Features of many kinds are described in one file that other programs write.
+    with library_errors(f"{root / INFO}: does not describe the dataset"):
         return _load(root, options or ReadOptions())
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
-        # Features of many kinds are described in one file that other programs write.
-        reason = f"{type(error).__name__}: {error}"
-        raise InputError(f"{root / INFO}: does not describe the dataset ({reason})") from error
 
 
 def _load(root: Path, options: ReadOptions) -> Recording:
@@ -139,9 +137,8 @@ def _rows(root: Path, column: str) -> tuple[list[_Row], Array]:
         *cells, poses = _columns(file, ["episode_index", "frame_index", "timestamp", column])
         for i, (episode, number, seconds) in enumerate(zip(*cells, strict=True)):
             rows.append(_Row(episode, number, seconds, file, i))
-        values = np.empty(0)
-        with suppress(TypeError, ValueError):
-            values = np.array(poses, dtype=np.float64)
+        with named_errors(file, column):
+            values = number_array(poses, column)
         if values.ndim != 2 or not np.isfinite(values).all():
             raise InputError(f"{file}: {column} holds no rows of finite numbers")
         parts.append(values)
@@ -157,13 +154,10 @@ def _images(
         return [_Embedded(root, key, row.file, row.row) for row in rows]
     videos = Videos(float(info["fps"]))
     starts = _video_starts(root, info, key, {row.episode for row in rows})
-    images: list[StoredImage] = []
-    for row in rows:
-        if row.episode not in starts:
-            raise InputError(f"{root / 'meta' / 'episodes'}: episode {row.episode} is not listed")
-        path, start = starts[row.episode]
-        images.append(VideoFrame(videos, path, start + row.seconds))
-    return images
+    if lost := sorted({row.episode for row in rows} - starts.keys()):
+        raise InputError(f"{root / 'meta' / 'episodes'}: episode {lost[0]} is not listed")
+    places = [(row, *starts[row.episode]) for row in rows]
+    return [VideoFrame(videos, path, start + row.seconds) for row, path, start in places]
 
 
 def _video_starts(
@@ -193,31 +187,23 @@ def _video_starts(
 
 @contextmanager
 def _parquet(path: Path) -> Iterator[Any]:
-    """pyarrow.parquet, with its errors."""
-    try:
-        import pyarrow.parquet as parquet  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        need = f"{path}: LeRobot datasets need pyarrow and PyAV"
-        raise missing_extra(need, "lerobot") from None
-    try:
-        yield parquet
-    except Exception as error:  # pyarrow raises many types for damaged files
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: cannot be read: {reason}") from None
+    """An open table."""
+    need = f"{path}: LeRobot datasets need pyarrow and PyAV"
+    parquet = optional_module("pyarrow.parquet", need, "lerobot")
+    with library_errors(f"{path}: cannot be read"), parquet.ParquetFile(path) as table:
+        yield table
 
 
 def _columns(file: Path, names: list[str]) -> list[list[Any]]:
-    with _parquet(file) as parquet:
-        table = parquet.read_table(file, columns=names)
-        return [table[name].to_pylist() for name in names]
+    with _parquet(file) as table:
+        read = table.read(columns=names)
+        return [read[name].to_pylist() for name in names]
 
 
 @functools.lru_cache(maxsize=1)
 def _row_group(path: Path, group: int, key: str) -> list[Any]:
-    import pyarrow.parquet as parquet  # pyright: ignore[reportMissingImports]
-
-    with parquet.ParquetFile(path) as file:
-        return file.read_row_group(group, columns=[key])[key].to_pylist()
+    with _parquet(path) as table:
+        return table.read_row_group(group, columns=[key])[key].to_pylist()
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,9 +227,9 @@ class _Embedded(StoredImage):
         return image_file(self._content())
 
     def _content(self) -> bytes:
-        with _parquet(self.path) as parquet, parquet.ParquetFile(self.path) as file:
-            groups = range(file.num_row_groups)
-            ends = np.cumsum([file.metadata.row_group(group).num_rows for group in groups])
+        with _parquet(self.path) as table:
+            groups = range(table.num_row_groups)
+            ends = np.cumsum([table.metadata.row_group(group).num_rows for group in groups])
             group = int(np.searchsorted(ends, self.row, side="right"))
             cell = _row_group(self.path, group, self.key)[self.row - int(ends[group])]
         if cell["bytes"]:
@@ -289,7 +275,7 @@ def _feature_poses(
     if options.base_frame is not None:
         raise InputError(f"{root}: --base-frame goes with --urdf only; leave it out")
     count, notes = values.shape[1], []
-    try:
+    with named_errors(f"{root}: {column}", "poses"), asking_for("--pose-convention"):
         if options.pose_convention is not None:
             convention = pose_convention(options.pose_convention)
             taken = convention.counts[-1]
@@ -300,14 +286,9 @@ def _feature_poses(
         elif len(names) != count:
             raise ValueError(f"has {count} numbers and {len(names)} names")
         else:
-            convention, columns = _pose_columns(names, options.gripper_frame)
-            numbers = values[:, columns]
-        poses = poses_from_numbers(numbers, convention)
-        check_units(numbers, convention)
-    except ConventionError as error:
-        raise InputError(f"{root}: {column}: {error.naming('--pose-convention')}") from None
-    except ValueError as error:
-        raise InputError(f"{root}: {column}: {error}") from None
+            name, columns = _pose_columns(names, options.gripper_frame)
+            convention, numbers = pose_convention(name), values[:, columns]
+        poses = checked_poses(numbers, convention)
     notes = [f"gripper poses are {column}: {convention.meaning}", *notes]
     return RobotPoses(None, None, poses), notes
 
@@ -327,7 +308,8 @@ def _joint_poses(
     return model.poses(names, values, options.base_frame, options.gripper_frame, source)
 
 
-def _pose_columns(names: list[str], arm: str | None) -> tuple[PoseConvention, list[int]]:
+def _pose_columns(names: list[str], arm: str | None) -> tuple[str, list[int]]:
+    """Name of the convention of a pose, and its columns."""
     arms = _arms(names)
     chosen = _of_arm(names, arm) if arm in arms else names
     convention = _convention_of(chosen)
@@ -337,7 +319,7 @@ def _pose_columns(names: list[str], arm: str | None) -> tuple[PoseConvention, li
         which = " or ".join(filter(None, arms))
         remedy = f"--gripper-frame {which}" if which else "names that tell them apart in info.json"
         raise ValueError(f"holds several poses ({', '.join(names)}); give {remedy}")
-    return pose_convention(convention), [last.index(part) for part in _PARTS[convention]]
+    return convention, [last.index(part) for part in _PARTS[convention]]
 
 
 def _convention_of(names: list[str]) -> str | None:

@@ -23,13 +23,7 @@ from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, as_stored, first_size, image_size, is_readable
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import (
-    is_real,
-    named_errors,
-    naming,
-    read_json,
-    refuse_repeated,
-)
+from evercal.recordings.text_files import is_real, named_errors, naming, read_json, refuse_repeated
 
 FILE = "transforms.json"
 # The first one there is read. ScanNet++ keeps undistorted images beside those of the fisheye lens.
@@ -69,12 +63,11 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     files = [root / name for name in _FILES if (root / name).is_file()] or [root / FILE]
     file = root if root.is_file() else files[0]
     frames, test, bad = _frames(file)
-    if file.name == "transforms_train.json" and not root.is_file():
-        for other in (root / f"transforms_{split}.json" for split in ("val", "test")):
-            if other.is_file():
-                more, _, left_out = _frames(other)
-                frames, bad = [*frames, *more], bad + left_out
-                test |= {frame.name for frame in more}
+    splits = ("val", "test") if file.name == "transforms_train.json" and root.is_dir() else ()
+    for other in filter(Path.is_file, (root / f"transforms_{split}.json" for split in splits)):
+        more, _, left_out = _frames(other)
+        frames, bad = [*frames, *more], bad + left_out
+        test |= {frame.name for frame in more}
     with named_errors(file, "nerfstudio file"):
         refuse_repeated((frame.name for frame in frames), "keep one entry for each image")
     notes = [f"{bad} frames are marked as bad and left out"] if bad else []

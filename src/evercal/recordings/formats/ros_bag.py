@@ -17,14 +17,7 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.formats.bags.file import (
-    CAMERA_INFO,
-    COMPRESSED,
-    IMAGE,
-    BagFile,
-    is_bag,
-    stamp_ns,
-)
+from evercal.recordings.formats.bags.file import CAMERA_INFO, COMPRESSED, IMAGE, BagFile, is_bag
 from evercal.recordings.formats.bags.poses import plain_name, poses_at_images
 from evercal.recordings.frame import Frame, Recording, lost_images
 from evercal.recordings.images import StoredImage, as_rgb, decode_image, image_file, is_readable
@@ -36,26 +29,15 @@ from evercal.recordings.text_files import named_errors
 # Encoding: bytes of a channel, channels, and OpenCV's COLOR_... constant if `as_rgb` needs it. ROS
 # names a Bayer pattern by its first two pixels and OpenCV by its second row.
 _ENCODINGS: dict[str, tuple[int, int, str | None]] = {
-    "rgb8": (1, 3, None),
-    "bgr8": (1, 3, "BGR2RGB"),
-    "8UC3": (1, 3, "BGR2RGB"),
-    "rgba8": (1, 4, None),
-    "bgra8": (1, 4, "BGRA2RGB"),
-    "8UC4": (1, 4, "BGRA2RGB"),
-    "mono8": (1, 1, None),
-    "8UC1": (1, 1, None),
-    "rgb16": (2, 3, None),
-    "bgr16": (2, 3, "BGR2RGB"),
-    "mono16": (2, 1, None),
-    "bayer_rggb8": (1, 1, "BayerBG2RGB"),
-    "bayer_bggr8": (1, 1, "BayerRG2RGB"),
-    "bayer_gbrg8": (1, 1, "BayerGR2RGB"),
-    "bayer_grbg8": (1, 1, "BayerGB2RGB"),
-    "yuv422": (1, 2, "YUV2RGB_UYVY"),
-    "uyvy": (1, 2, "YUV2RGB_UYVY"),
-    "yuv422_yuy2": (1, 2, "YUV2RGB_YUY2"),
-    "yuyv": (1, 2, "YUV2RGB_YUY2"),
-}
+    "rgb8": (1, 3, None), "bgr8": (1, 3, "BGR2RGB"), "8UC3": (1, 3, "BGR2RGB"),
+    "rgba8": (1, 4, None), "bgra8": (1, 4, "BGRA2RGB"), "8UC4": (1, 4, "BGRA2RGB"),
+    "rgb16": (2, 3, None), "bgr16": (2, 3, "BGR2RGB"),
+    "mono8": (1, 1, None), "8UC1": (1, 1, None), "mono16": (2, 1, None),
+    "bayer_rggb8": (1, 1, "BayerBG2RGB"), "bayer_bggr8": (1, 1, "BayerRG2RGB"),
+    "bayer_gbrg8": (1, 1, "BayerGR2RGB"), "bayer_grbg8": (1, 1, "BayerGB2RGB"),
+    "yuv422": (1, 2, "YUV2RGB_UYVY"), "uyvy": (1, 2, "YUV2RGB_UYVY"),
+    "yuv422_yuy2": (1, 2, "YUV2RGB_YUY2"), "yuyv": (1, 2, "YUV2RGB_YUY2"),
+}  # fmt: skip
 USES = ("camera", "image_topic", "pose_topic", "base_frame", "gripper_frame", "urdf")
 
 
@@ -74,8 +56,7 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     if options.camera is not None:
         camera = read_camera_of_size(options.camera, (width, height), topic)
     else:
-        info_topic, camera = _bag_camera(bag, topic, (width, height))
-        check_size(f"{root}: {info_topic}", camera, (width, height), topic)
+        camera = _bag_camera(bag, topic, (width, height))
     stamps = np.array([shot.stamp_ns for shot in shots])
     poses = poses_at_images(bag, stamps, shots[0].frame_id, options)
     frames = []
@@ -107,12 +88,10 @@ class BagImage(StoredImage):
 
     def read(self) -> NDArray[np.uint8]:
         """Decode the message, see `StoredImage.read`."""
-        decode = image_of
-        if self.bag.kinds[self.topic] == COMPRESSED:
-            decode = compressed_image_of
+        is_compressed = self.bag.kinds[self.topic] == COMPRESSED
         message = self.bag.message(self.topic, self.logged_ns, self.repeat)
         with named_errors(f"{self.bag.path}: topic {self.topic}", "image"):
-            return decode(message.content)
+            return (compressed_image_of if is_compressed else image_of)(message.content)
 
     def file(self) -> tuple[str, bytes] | None:
         """JPEG or PNG of a compressed image; None for other messages."""
@@ -125,12 +104,8 @@ class BagImage(StoredImage):
 
 def _image_topic(bag: BagFile, wanted: str | None) -> str:
     topics = bag.topics(IMAGE, COMPRESSED)
+    bag.require_topic(wanted, topics, "images")
     if wanted is not None:
-        if wanted not in topics:
-            raise InputError(
-                f"{bag.path}: no images on topic {wanted!r}; images are on"
-                f" {', '.join(topics) or 'no topic'}"
-            )
         return wanted
     if not topics:
         raise InputError(
@@ -153,11 +128,12 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
 def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
     shots, bad = [], []
     for message in bag.messages([topic]):
-        header = message.content.header
-        stamp, frame_id = stamp_ns(header.stamp), plain_name(header.frame_id)
+        frame_id = plain_name(message.content.header.frame_id)
         if bag.kinds[topic] == COMPRESSED and not is_readable(message.content.data):
             bad.append(len(shots))
-        shots.append(BagImage(bag, topic, message.logged_ns, message.repeat, stamp, frame_id))
+        shots.append(
+            BagImage(bag, topic, message.logged_ns, message.repeat, message.stamp_ns, frame_id)
+        )
     notes = []
     if 0 < 2 * len(bad) <= len(shots):  # else the first one is refused with its format
         notes = [lost_images([f"message {i}" for i in bad], len(shots))]
@@ -168,7 +144,7 @@ def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
     return sorted(shots, key=lambda shot: shot.stamp_ns), notes
 
 
-def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> tuple[str, Camera]:
+def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> Camera:
     """The first camera_info beside an image topic, such as `/cam/image_raw/compressed`.
 
     Rectified images take P without distortion, others K and D.
@@ -183,7 +159,9 @@ def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> tuple[
         )
     message = bag.first(beside)
     with named_errors(f"{bag.path}: {beside}", "camera_info"):
-        return beside, _camera(message, size, image.rpartition("/")[2].startswith("image_rect"))
+        camera = _camera(message, size, image.rpartition("/")[2].startswith("image_rect"))
+    check_size(f"{bag.path}: {beside}", camera, size, image_topic)
+    return camera
 
 
 def _camera(message: Any, image_size: tuple[int, int], rectified: bool) -> Camera:
@@ -199,10 +177,10 @@ def _camera(message: Any, image_size: tuple[int, int], rectified: bool) -> Camer
         if len(p) != 12 or not any(p):
             raise ValueError("P is missing, which rectified images need; give --camera")
         data = {"k": [*p[:3], *p[4:7], *p[8:11]], "d": [], "distortion_model": ""}
-    offsets = {name: int(getattr(message.roi, name)) for name in ("x_offset", "y_offset")}
-    size = {"width": int(message.width), "height": int(message.height)}
-    binning = {name: int(getattr(message, name)) for name in ("binning_x", "binning_y")}
-    return camera_from_fields({**data, **size, **binning, "roi": offsets}, image_size)
+    data["roi"] = {name: int(getattr(message.roi, name)) for name in ("x_offset", "y_offset")}
+    sizes = ("width", "height", "binning_x", "binning_y")
+    data |= {name: int(getattr(message, name)) for name in sizes}
+    return camera_from_fields(data, image_size)
 
 
 def unsupported(encoding: str) -> str | None:

@@ -13,7 +13,7 @@ from evercal.geometry import Camera
 from evercal.recordings.formats.seven_scenes import colour_images, tracked_frames
 from evercal.recordings.frame import Recording
 from evercal.recordings.images import first_size
-from evercal.recordings.text_files import read_text
+from evercal.recordings.text_files import library_errors, read_text
 
 
 def detect(root: Path) -> bool:
@@ -46,12 +46,9 @@ def _camera(root: Path, images: list[Path]) -> Camera:
     text = read_text(file, "calibration", "it holds m_calibrationColorIntrinsic")
     lines = (line.partition("=") for line in text.splitlines())
     values = {name.strip(): value for name, _, value in lines}
-    try:
-        numbers = [float(word) for word in values["m_calibrationColorIntrinsic"].split()]
-        size = int(values["m_colorWidth"]), int(values["m_colorHeight"])
-        camera = Camera(*size, fx=numbers[0], fy=numbers[5], cx=numbers[2], cy=numbers[6])
-    except (KeyError, ValueError, IndexError) as error:
-        raise InputError(
-            f"{file}: needs m_colorWidth, m_colorHeight and m_calibrationColorIntrinsic ({error!r})"
-        ) from None
+    keys = ("m_colorWidth", "m_colorHeight", "m_calibrationColorIntrinsic")
+    with library_errors(f"{file}: needs {', '.join(keys)}"):
+        width, height, matrix = (values[key].split() for key in keys)
+        fx, _, cx, _, _, fy, cy, *_ = map(float, matrix)
+        camera = Camera(int(*width), int(*height), fx, fy, cx, cy)
     return camera.resized(*first_size(images))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError, missing_extra
+from evercal.errors import InputError, optional_module
 from evercal.recordings.images import StoredImage
 
 _MOST_OPEN = 4
@@ -55,12 +55,7 @@ class Videos:
     """Cache of open videos with `fps` frames per second; threads may share it."""
 
     def __init__(self, fps: float) -> None:
-        try:
-            import av  # pyright: ignore[reportMissingImports]
-        except ImportError:
-            need = "reading videos of datasets needs PyAV"
-            raise missing_extra(need, "lerobot") from None
-        self._av: Any = av
+        self._av = optional_module("av", "reading videos of datasets needs PyAV", "lerobot")
         self._half = 0.5 / fps
         self._open: OrderedDict[Path, _Open] = OrderedDict()
         self._lock = threading.Lock()

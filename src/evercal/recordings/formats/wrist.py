@@ -7,7 +7,7 @@ that of the camera on it in sensor.yaml. Record3D lists a rotation (quaternion x
 with OpenGL's axes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 from typing import NamedTuple
@@ -16,7 +16,6 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.recordings.formats.seven_scenes import read_numbers
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, files_in, first_size
 from evercal.recordings.poses import camera_file
@@ -24,7 +23,7 @@ from evercal.recordings.poses.conventions import pose_convention, poses_from_num
 from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
 from evercal.recordings.poses.pairing import pair_images, pair_joints
 from evercal.recordings.poses.robot_poses import POSE_ENDINGS, RobotPoses, read_robot_poses
-from evercal.recordings.poses.row_files import natural_key, number_array, read_rows
+from evercal.recordings.poses.row_files import number_array, read_rows, same_numbers
 from evercal.recordings.read_options import ReadOptions, flag
 from evercal.recordings.text_files import named_errors, read_json, refuse_repeated
 
@@ -35,19 +34,20 @@ class Layout(NamedTuple):
     """Paths in a recording of camera poses."""
 
     poses: str
-    """Table, or folder with a 4x4 matrix for each image; those with inf or nan are left out."""
+    """Table, or folder with a file for each image."""
     images: str = ""
     """Folder of images; empty for `_FOLDERS`."""
     camera: str = ""
     """Camera file, or folder of one for each image; where it is missing, one of `_CAMERAS`."""
     convention: str | None = None
-    """Convention of the table, if it does not define it."""
+    """Convention of the poses, if they do not define it."""
 
 
 LAYOUTS = (
     Layout("groundtruth.txt", "rgb", convention="tum:m"),  # TUM RGB-D
-    Layout("pose", "color", "intrinsic/intrinsic_color.txt"),  # ScanNet's SensReader
-    Layout("train/poses", "train/rgb", "train/calibration"),  # ACE, with the same in test
+    # ScanNet's SensReader, and ACE with the same in test.
+    Layout("pose", "color", "intrinsic/intrinsic_color.txt", "matrix:m"),
+    Layout("train/poses", "train/rgb", "train/calibration", "matrix:m"),
     Layout("metadata", "rgb", "metadata"),  # Record3D
     Layout("metadata.json", "rgb", "metadata.json"),
     Layout("state_groundtruth_estimate0/data.csv", "cam0/data", "cam0/sensor.yaml"),  # EuRoC
@@ -62,6 +62,7 @@ _CAMERAS = tuple(
     for ending in ("json", "yaml", "yml", "xml", "npz", "txt")
 )
 _FOLDERS = (".", "images", "rgb")
+_RECORD3D = pose_convention("xyzw:opengl")
 
 
 def detect(root: Path) -> bool:
@@ -78,9 +79,8 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     if len(layouts) > 1:
         names = " and ".join(layout.poses for layout in layouts)
         raise InputError(f"{root}: holds {names}; keep the one with the poses of the images")
-    first = layouts[0]
-    paths = {key: getattr(first, key).replace("train/", "test/") for key in first._fields[:3]}
-    split = dict.fromkeys((first, first._replace(**paths)))
+    test = Layout._make(path and path.replace("train/", "test/") for path in layouts[0])
+    split = dict.fromkeys((layouts[0], test))
     read = [_frames(root, part, options) for part in split if (root / part.poses).exists()]
     train, test = (*(part.train for part in read), ())[:2]
     notes = tuple(note for part in read for note in part.notes)
@@ -103,14 +103,7 @@ def _frames(root: Path, layout: Layout, options: ReadOptions) -> Recording:
     """A recording of the frames with a pose, all for training."""
     images = _images(root, [layout.images] if layout.images else _FOLDERS)
     source, file = root / layout.poses, root / layout.camera
-    lenses: dict[str, Camera] = {}
-    notes: list[str] = []
-    if source.is_dir():
-        rows = _matrices(source, _by_image(source, images))
-    elif source == file:
-        rows, lenses = _record3d(file)
-    else:
-        rows, notes = _rows(root, source, options, layout.convention)
+    rows, notes = _rows(root, source, options, layout.convention)
     poses, more = pair_images(images, rows, _stamps(root), source)
     joints = pair_joints(images, rows, _stamps(root), source)
     if file.name == "sensor.yaml":
@@ -118,61 +111,21 @@ def _frames(root: Path, layout: Layout, options: ReadOptions) -> Recording:
             numbers = camera_file.numbers_of(camera_file.fields_of(file).get("T_BS"), "T_BS", 16)
             body_from_camera = SE3.from_matrix(np.reshape(numbers, (4, 4)))
         poses = [pose and pose @ body_from_camera for pose in poses]
-    if options.camera is None and layout.camera and file.is_dir():
-        files = _by_image(file, images)
-        for image in images:
-            own = files.get(image.name, file / f"{image.stem}.txt")
-            lens = camera_file.read_camera_of_size(own, first_size([image, *images]), image.name)
-            lenses[image.stem] = lens
-    elif options.camera is not None or not lenses:
-        stated = options.camera or (file if file.is_file() else None)
-        lenses = dict.fromkeys((i.stem for i in images), _camera(root, stated, images))
+    own = file if layout.camera and file.exists() else None
+    cameras = _cameras(root, options.camera or own, images)
     owner = "base_from_gripper" if layout.poses in _POSES + _JOINTS else "base_from_camera"
     split = layout.images.rpartition("rgb")[0]
     frames = tuple(
         replace(
-            Frame(split + image.name, image, lenses[image.stem], None),
+            Frame(split + image.name, image, camera, None),
             **{owner: pose},
             joints_rad=None if values is None else tuple(values.tolist()),
         )
-        for image, pose, values in zip(images, poses, joints, strict=True)
+        for image, camera, pose, values in zip(images, cameras, poses, joints, strict=True)
         if pose is not None
     )
     lost, notes = len(images) - len(frames), [*notes, *more]
     return Recording(root.resolve().name, frames, (), lost, notes=tuple(notes), arm=rows.arm)
-
-
-def _record3d(file: Path) -> tuple[RobotPoses, dict[str, Camera]]:
-    data = read_json(file, "Record3D file", "export the recording again")
-    with named_errors(file, "Record3D file"):
-        numbers = number_array(data.get("poses"), "'poses'")
-        if numbers.ndim != 2 or numbers.shape[1] != 7:
-            raise ValueError("'poses' is a list of qx qy qz qw x y z of each image")
-        names = tuple(map(str, range(len(numbers))))
-        poses = poses_from_numbers(np.roll(numbers, 3, axis=1), pose_convention("xyzw:opengl"))
-        size = {"width": data.get("w"), "height": data.get("h")}
-        each = data.get("perFrameIntrinsicCoeffs") or [data.get("K")] * len(names)
-        lenses = [camera_file.camera_from_fields({"K": numbers, **size}) for numbers in each]
-        return RobotPoses(names, None, poses), dict(zip(names, lenses, strict=True))
-
-
-def _matrices(folder: Path, files: Mapping[str, Path]) -> RobotPoses:
-    read = {name: read_numbers(file, 16, "4x4 base_from_camera") for name, file in files.items()}
-    tracked = {name: numbers for name, numbers in read.items() if np.isfinite(numbers).all()}
-    with named_errors(folder, "camera poses"):
-        if not tracked:
-            raise ValueError("holds no pose of an image; call the files as the images, with .txt")
-        matrices = np.stack([*tracked.values()]).reshape(-1, 4, 4)
-        return RobotPoses(tuple(tracked), None, SE3.from_matrix(matrices, 1e-2))
-
-
-def _by_image(folder: Path, images: Sequence[Path]) -> dict[str, Path]:
-    """Text files by the image that has their name, up to the ending or to the first dot."""
-    files = {file.stem: file for file in files_in(folder, (".txt",))}
-    short = {stem.partition(".")[0]: file for stem, file in files.items()}
-    files = {**short, **files} if len(short) == len(files) else files
-    found = {i.name: files.get(i.stem, files.get(i.name.partition(".")[0])) for i in images}
-    return {name: file for name, file in found.items() if file is not None}
 
 
 def _rows(
@@ -182,6 +135,12 @@ def _rows(
         model = RobotModel(options.urdf or _urdf(root, file))
         links = options.base_frame, options.gripper_frame
         return read_joint_poses(file, model, *links, options.pose_convention)
+    if file.name.startswith("metadata"):
+        numbers = read_json(file, "Record3D file").get("poses") or []
+        with named_errors(file, "poses"):
+            numbers = np.roll(number_array(numbers, "'poses'"), 3, axis=-1)
+            names = tuple(map(str, range(len(numbers))))
+            return RobotPoses(names, None, poses_from_numbers(numbers, _RECORD3D)), []
     unused = [n for n in ("urdf", "base_frame", "gripper_frame") if getattr(options, n) is not None]
     if unused:
         raise InputError(
@@ -203,12 +162,21 @@ def _urdf(root: Path, joints: Path) -> Path:
 def _images(root: Path, folders: Sequence[str]) -> list[Path]:
     for folder in folders:
         if images := files_in(root / folder):
-            return sorted(images, key=lambda image: natural_key(image.name))
+            return images
     where = " or in ".join("it" if folder == "." else folder for folder in folders)
     raise InputError(f"{root}: no images ({', '.join(IMAGE_ENDINGS)}) in {where}")
 
 
-def _camera(root: Path, file: Path | None, images: Sequence[Path]) -> Camera:
+def _cameras(root: Path, file: Path | None, images: Sequence[Path]) -> list[Camera]:
+    """Of each image, from a file for all or from a folder of one for each."""
+    if file is not None and file.is_dir():
+        files = files_in(file, (".txt",))
+        if not same_numbers([own.name for own in files], [image.name for image in images]):
+            raise InputError(f"{file}: lacks the file of an image; give one for all with --camera")
+        return [
+            camera_file.read_camera_of_size(own, first_size([image, *images]), image.name)
+            for own, image in zip(files, images, strict=True)
+        ]
     if file is None:
         names = [name for name in _CAMERAS if (root / name).is_file()]
         if len(names) != 1:
@@ -219,7 +187,12 @@ def _camera(root: Path, file: Path | None, images: Sequence[Path]) -> Camera:
                 f" .npz or .txt"
             )
         file = root / names[0]
-    return camera_file.read_camera_of_size(file, first_size(images), images[0].name)
+    camera = camera_file.read_camera_of_size(file, first_size(images), images[0].name)
+    with named_errors(file, "camera file"):
+        fields = camera_file.fields_of(file) if file.name.startswith("metadata") else {}
+        each = fields.get("perFrameIntrinsicCoeffs") or []  # of Record3D
+        own = [camera_file.camera_from_fields({**fields, "K": numbers}) for numbers in each]
+    return own if len(own) == len(images) else [camera] * len(images)
 
 
 def _stamps(root: Path) -> dict[str, float] | None:

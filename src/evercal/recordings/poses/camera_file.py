@@ -6,7 +6,6 @@ A camera may stand inside other entries, such as `cam0` of a Kalibr chain. In al
 (0, 0) is the centre of the top-left pixel, and images are upright.
 """
 
-import json
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -22,7 +21,7 @@ from evercal.geometry import Camera
 from evercal.geometry.camera import COEFFICIENTS
 from evercal.recordings.poses.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import arrays_as_lists, is_number
-from evercal.recordings.text_files import named_errors, naming, read_text, yaml_documents
+from evercal.recordings.text_files import documents, named_errors, naming, read_text
 
 # Kinds of models by name, and names of fields, in lower case without spaces, dashes, underscores.
 _MODELS = {
@@ -60,6 +59,7 @@ _HARMLESS = re.compile(
     r"|chess|tag|count|num|frames|images|views|points|flags|date|time|stamp|version|serial|index"
     r"|id$|baseline|depth|range|temp|apert|expos|gain|fov|angle|focal|aspect|mm$|rotation|trans"
     r"|^[rt]vec|quat|extrin|pose|position|orient|imu|noise|rgb|track|^bf$|^new|imagescale|overlaps"
+    r"|^d[wh]$|^cameratype$|perframe"
 )
 """Names of numbers that do not change where a point lies in the image."""
 _EXPECTED = (
@@ -233,8 +233,6 @@ def fields_of(path: Path, size: tuple[int, int] | None = None) -> Mapping[str, A
     if zipped:
         return arrays_as_lists(path)
     text = read_text(path, "camera file")
-    if "<opencv_storage" in text:
-        return _xml_of_opencv(text)
     words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
     if all(map(is_number, words)):
         if len(words) == 1 and size is not None:
@@ -242,14 +240,10 @@ def fields_of(path: Path, size: tuple[int, int] | None = None) -> Mapping[str, A
             words = [words[0], "0", str(cx), "0", words[0], str(cy), "0", "0", "1"]
         return {"camera_matrix": [float(word) for word in words]}
     try:
-        if text.lstrip().startswith("{"):
-            return json.loads(text)
-        # OpenCV's %YAML:1.0 is not valid YAML. cv2.FileStorage can end the process on such files.
-        plain = re.sub(r"^%.*$|!!opencv-[a-z-]+", "", text, flags=re.MULTILINE)
+        if "<opencv_storage" in text:
+            return _of_xml(text)
         # A printed message ends with '---', which opens a second, empty document.
-        data = next(iter(yaml_documents(plain)), None)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"not valid JSON ({error}); {_EXPECTED}") from None
+        data = next(iter(documents(text, text.lstrip().startswith("{"))), None)
     except ValueError as error:
         raise ValueError(f"{error}; {_EXPECTED}") from None
     if not isinstance(data, dict):
@@ -257,16 +251,15 @@ def fields_of(path: Path, size: tuple[int, int] | None = None) -> Mapping[str, A
     return data
 
 
-def _xml_of_opencv(text: str) -> dict[str, Any]:
+def _of_xml(text: str) -> dict[str, Any]:
     from xml.etree import ElementTree
 
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can expand without bound
-        raise ValueError(f"it declares XML entities; {_EXPECTED}")
+        raise ValueError("it declares XML entities")
     try:
-        root = ElementTree.fromstring(text)
+        return _xml_value(ElementTree.fromstring(text))
     except ElementTree.ParseError as error:
-        raise ValueError(f"not valid XML ({error}); {_EXPECTED}") from None
-    return _xml_value(root)
+        raise ValueError(f"not valid XML ({error})") from None
 
 
 def _xml_value(element: Any) -> Any:
@@ -301,17 +294,17 @@ def _fields(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _matrix(fields: Mapping[str, Any], data: Mapping[str, Any]) -> np.ndarray:
+    names = ("fx", "fy", "cx", "cy")
     if "camera_matrix" in fields:
         numbers = numbers_of(fields["camera_matrix"], "camera_matrix")
+        # As Kalibr writes it; other orders differ in the first two.
         if len(numbers) == 4 and 0.8 * numbers[1] < numbers[0] < 1.25 * numbers[1]:
-            fx, fy, cx, cy = numbers  # as Kalibr writes it; other orders differ in the first two
-            return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+            return _matrix(dict(zip(names, numbers, strict=True)), data)
         if len(numbers) == 16 and numbers[3::4] == numbers[12:] == [0, 0, 0, 1]:
             numbers = np.reshape(numbers, (4, 4))[:3, :3].ravel().tolist()
         matrix = np.reshape(numbers_of(numbers, "camera_matrix", 9), (3, 3))
         # Open3D writes it column after column.
         return matrix.T if not matrix[:2, 2].any() and matrix[2, :2].any() else matrix
-    names = ("fx", "fy", "cx", "cy")
     missing = [name for name in names if name not in fields]
     if missing:
         what = f"camera {missing[0]!r}" if len(missing) < 4 else "'camera_matrix'"
@@ -327,10 +320,10 @@ def _distortion(
     stated = [key for key in names if key in fields]
     if other := [key for key in _COEFFICIENTS if fields.get(key) and key not in names]:
         raise ValueError(f"a fisheye has {_listed(names)}, got {_listed(other)}; leave others out")
-    if str(fields.get(name, "")).lower() in ("none", "null"):
-        numbers = []
-    elif name in fields:
-        numbers = numbers_of(fields[name], name)
+    numbers: list[float] = []
+    if name in fields:
+        nothing = str(fields[name]).lower() in ("none", "null")
+        numbers = numbers if nothing else numbers_of(fields[name], name)
     elif stated:
         numbers = numbers_of([fields.get(key, 0.0) for key in names], stated[0])
         numbers = numbers if any(numbers[5:]) else numbers[:5]
@@ -339,8 +332,6 @@ def _distortion(
             f"{name!r} is missing, there is {_listed(data)}; write four zeros if images have no"
             f" lens distortion"
         )
-    else:
-        numbers = []
     # Longer models add terms that are mostly zero and can then be dropped.
     while len(numbers) not in (_LENGTHS if len(names) > 4 else (0, 4)) and numbers[-1] == 0:
         numbers.pop()

@@ -8,6 +8,8 @@ Sources: Roboception's documentation of pose formats (ABB, FANUC, KUKA, Yaskawa)
 script manual, RoboDK's converters (Staubli, Kawasaki) and libfranka's reference.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from itertools import product
@@ -71,11 +73,17 @@ class ConventionError(ValueError):
 
     def __init__(self, problem: str, remedy: str) -> None:
         self.problem, self.remedy = problem, remedy
-        super().__init__(self.naming(None))
+        super().__init__(f"{problem}; give the convention {remedy}")
 
-    def naming(self, option: str | None) -> str:
-        """Message that names the command line option of the convention, if there is one."""
-        return f"{self.problem}; give {option or 'the convention'} {self.remedy}"
+
+@contextmanager
+def asking_for(option: str | None) -> Iterator[None]:
+    """Name the command line option, if there is one, in the message of a `ConventionError`."""
+    try:
+        yield
+    except ConventionError as error:
+        what = option or "the convention"
+        raise ValueError(f"{error.problem}; give {what} {error.remedy}") from None
 
 
 CONVENTIONS = {
@@ -170,6 +178,13 @@ def poses_from_numbers(
     if not convention.has("opengl"):
         return poses
     return _OPENGL_FROM_OPENCV @ poses if camera_from else poses @ _OPENGL_FROM_OPENCV
+
+
+def checked_poses(numbers: Array, convention: PoseConvention, camera_from: bool = False) -> SE3:
+    """`poses_from_numbers` of (n, k) numbers of plausible size; ValueError for others."""
+    poses = poses_from_numbers(numbers, convention, camera_from)
+    check_units(numbers, convention)
+    return poses
 
 
 def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:

@@ -14,12 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError, missing_extra
+from evercal.errors import InputError, optional_module
 from evercal.recordings.poses.arm import Arm, Motion
 from evercal.recordings.poses.pose_track import times_around
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import Rows, read_rows, row_labels
-from evercal.recordings.text_files import named_errors, read_json, read_text, refuse_repeated
+from evercal.recordings.text_files import (
+    library_errors,
+    named_errors,
+    read_json,
+    read_text,
+    refuse_repeated,
+)
 
 Array = NDArray[np.float64]
 _MOVING = ("revolute", "continuous", "prismatic")
@@ -39,26 +45,17 @@ class RobotModel:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        try:
-            import yourdfpy  # pyright: ignore[reportMissingImports]
-        except ImportError:
-            raise missing_extra(f"{path}: reading a URDF needs yourdfpy", "urdf") from None
+        need = f"{path}: reading a URDF needs yourdfpy"
+        yourdfpy = optional_module("yourdfpy", need, "urdf")
         if not self.path.is_file():
             raise InputError(f"{path}: no such URDF file")
         if self.path.suffix == ".xacro":
             raise InputError(f"{path}: is a macro file; make a URDF of it with 'xacro' first")
-        try:
-            self._urdf: Any = yourdfpy.URDF.load(
-                str(self.path),
-                load_meshes=False,
-                load_collision_meshes=False,
-                build_collision_scene_graph=False,
-            )
+        plain = ("load_meshes", "load_collision_meshes", "build_collision_scene_graph")
+        with library_errors(f"{path}: no usable URDF"):
+            self._urdf = yourdfpy.URDF.load(str(self.path), **dict.fromkeys(plain, False))
             self.base_link = str(self._urdf.base_link)
             self._turned = set(_TURNED.findall(read_text(self.path, "URDF")))
-        except Exception as error:  # lxml, yourdfpy and numpy raise many types for broken files
-            text = " ".join(str(error).split())[:200]
-            raise InputError(f"{path}: no usable URDF ({type(error).__name__}: {text})") from None
         self.links = tuple(self._urdf.link_map)
         self._joint_above = {joint.child: joint for joint in self._urdf.robot.joints}
 
@@ -167,13 +164,10 @@ class RobotModel:
         for name, column in zip(names, values.T, strict=True):
             joint = self._urdf.joint_map[name]
             covered = f"joint {name} goes from {column.min():.2f} to {column.max():.2f}"
-            if joint.type == "continuous":
-                if np.ptp(column) > _LARGEST_RAD:
-                    notes.append(f"{covered}, more than two rotations; are these degrees?")
-                continue
-            lower = getattr(joint.limit, "lower", None)
-            upper = getattr(joint.limit, "upper", None)
-            if lower is None or upper is None:
+            if joint.type == "continuous" and np.ptp(column) > _LARGEST_RAD:
+                notes.append(f"{covered}, more than two rotations; are these degrees?")
+            lower, upper = (getattr(joint.limit, end, None) for end in ("lower", "upper"))
+            if joint.type == "continuous" or lower is None or upper is None:
                 continue
             if column.min() < lower - 0.1 or column.max() > upper + 0.1:
                 notes.append(
@@ -251,14 +245,12 @@ def read_joints(path: Path) -> Rows:
     """Read a table of joint values."""
     if path.suffix.lower() == ".csv":
         return read_rows(path, "joint angles")
-    data: dict[str, Any] = read_json(path, "file of joint angles", f"give {_JSON}")
-    try:
+    data = read_json(path, "file of joint angles", f"give {_JSON}")
+    with library_errors(f"{path}: give {_JSON}"):
         columns = tuple(str(name) for name in data["joint_names"])
         values = np.array(data["positions"], dtype=np.float64)
         lists = {key: value for key, value in data.items() if isinstance(value, list)}
         names, times, _ = row_labels([*lists], [*lists.values()], len(values), plural=True)
         if values.shape != (len(values), len(columns)) or not np.isfinite(values).all():
             raise ValueError("'positions' are rows of finite numbers, one for each joint")
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: {type(error).__name__} {error}; give {_JSON}") from None
-    return Rows(names, times, columns, values)
+        return Rows(names, times, columns, values)

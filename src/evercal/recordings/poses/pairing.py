@@ -11,8 +11,8 @@ from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
-from evercal.recordings.poses.row_files import natural_key, same_numbers, times_in_names
-from evercal.recordings.text_files import few, named_errors, refuse_repeated
+from evercal.recordings.poses.row_files import is_number, same_numbers, times_in_names
+from evercal.recordings.text_files import few, named_errors, natural_key, refuse_repeated
 
 Pairing = tuple[list[SE3 | None], list[str]]
 """The pose of each image, if it has one, and notes."""
@@ -86,13 +86,18 @@ def _by_name(
     images: Sequence[Path], names: Sequence[str], file: Path
 ) -> tuple[list[int | None], list[str]]:
     """Number of each image's row, and notes."""
-    keys = [PureWindowsPath(name).name for name in names]
+    keys, files = [PureWindowsPath(name).name for name in names], [image.name for image in images]
     with named_errors(file, "poses"):
         refuse_repeated(keys, "give every image one row")
     by_name = {key: number for number, key in enumerate(keys)}
     # A table may omit the ending.
     paired = [by_name.pop(i.name, by_name.pop(i.stem, None)) for i in images]
-    if all(row is None for row in paired) and same_numbers(names, [i.name for i in images]):
+    if len(by_name) == len(keys):  # such as frame-1.color.png and frame-1.pose, but not 1.5.png
+        heads = [[name.partition(".")[0] for name in part] for part in (files, keys)]
+        if all(len({*part}) == len(part) and not is_number(part[0]) for part in heads):
+            by_name = {head: number for number, head in enumerate(heads[1])}
+            paired = [by_name.pop(head, None) for head in heads[0]]
+    if all(row is None for row in paired) and same_numbers(names, files):
         return [*range(len(images))], [
             f"paired by numbers: {names[0]} with {images[0].name}, and so on"
         ]
@@ -101,7 +106,7 @@ def _by_name(
             f"{file}: names no image of {images[0].parent}; its first is {names[0]!r}, the first"
             f" image is {images[0].name!r}; correct the names, or leave them out to pair in order"
         )
-    alone = [i.name for i, row in zip(images, paired, strict=True) if row is None]
+    alone = [name for name, row in zip(files, paired, strict=True) if row is None]
     return paired, unpaired(alone, [*by_name], file.name)
 
 

@@ -16,6 +16,7 @@ from evercal.bounds import require_at_most
 from evercal.recordings.images import IMAGE_ENDINGS
 from evercal.recordings.poses.conventions import ConventionError, PoseConvention, pose_convention
 from evercal.recordings.poses.pose_table import (
+    HEADERS,
     PoseTable,
     has_position,
     named_numbers,
@@ -163,11 +164,9 @@ def _composed(
     second = _rows(number_array(columns[translation], repr(translation)), 3)
     first = _first(number_array(columns[rotation], repr(rotation)), ((3, 3),))
     width = first.size // max(len(second), 1)
-    if width == 9:
-        matrices = np.concatenate([first.reshape(-1, 3, 3), second[..., None]], -1)
-        return plain_numbers(matrices, given or pose_convention(f"matrix:{unit}"))
-    ends = "1234" if width == 4 else [f"vec_{i}" if "vec" in rotation else i for i in "xyz"]
-    words = [f"{axis}_{unit}" for axis in "xyz"] + [f"{'rq'[width == 4]}{end}" for end in ends]
+    kinds = {9: ("r", HEADERS["rotation matrix"].ends), 4: ("q", "1234")}
+    prefix, ends = kinds.get(width, ("rotvec_" if "vec" in rotation else "r", "xyz"))
+    words = [f"{axis}_{unit}" for axis in "xyz"] + [prefix + end for end in ends]
     numbers = np.concatenate([second, _rows(first, width)], -1)
     return named_numbers(words, text_cells([map(repr, row) for row in numbers.tolist()]), given)
 

@@ -8,6 +8,7 @@ camera. Inverted poses rotate about other axes.
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -99,8 +100,6 @@ def measured_pairs(frames: Sequence[Frame], poses: SE3) -> tuple[NDArray[np.intp
 
 def measured_rotation(first: Frame, second: Frame) -> Array | None:
     """(3,) rotation vector first_from_second in radians; None if there are too few matches."""
-    import cv2
-
     features = [_features(frame) for frame in (first, second)]
     if min(len(rays) for rays, _ in features) < LEAST_MATCHES:
         return None
@@ -121,8 +120,6 @@ def measured_rotation(first: Frame, second: Frame) -> Array | None:
 
 def _features(frame: Frame) -> tuple[Array, NDArray[np.float32]]:
     """(n, 2) points of the plane z = 1, and their SIFT descriptors."""
-    import cv2
-
     image = cv2.cvtColor(frame.read_image(), cv2.COLOR_RGB2GRAY)
     camera = frame.camera
     scale = LONG_SIDE / max(camera.width, camera.height)

@@ -4,36 +4,28 @@ A convention is required if the file does not define the meaning of its numbers.
 one such file for each pose. docs/formats.md has examples of all kinds.
 """
 
-import json
 import os
 import re
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.recordings.images import files_in
 from evercal.recordings.poses.arm import Arm
 from evercal.recordings.poses.conventions import (
-    ConventionError,
     PoseConvention,
-    check_units,
+    asking_for,
+    checked_poses,
     pose_convention,
-    poses_from_numbers,
 )
 from evercal.recordings.poses.pose_data import pose_data
 from evercal.recordings.poses.pose_table import PoseTable, read_pose_table
-from evercal.recordings.poses.row_files import Names, arrays_as_lists, natural_key
-from evercal.recordings.text_files import (
-    named_errors,
-    read_text,
-    refuse_repeated,
-    yaml_documents,
-)
+from evercal.recordings.poses.row_files import Names, arrays_as_lists
+from evercal.recordings.text_files import documents, named_errors, read_text, refuse_repeated
 
 POSE_ENDINGS = (".csv", ".json", ".jsonl", ".yaml", ".yml", ".npy", ".npz", ".mat", ".tum", ".txt")
 _YAML = re.compile(
@@ -43,6 +35,8 @@ _YAML = re.compile(
 """Beginning of YAML in a file with another ending."""
 _END_BYTES = 1 << 16
 """Bytes read at each end of a file that grows."""
+_UNTRACKED = re.compile(r"(?i)\b(?:nan|inf)\b|1\.?#(?:IND|INF|[QS]NAN)")
+"""A number in a file of one pose that an image lacks, also as Windows prints it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,13 +92,10 @@ def read_robot_poses(
         InputError: The file is missing or broken, or the numbers do not fit the convention.
     """
     path = Path(path)
-    with named_errors(path, what):
-        try:
-            given = _given(path, convention)
-            table = (_folder if path.is_dir() else _file)(path, given, what, robot)
-            poses = _poses(table, camera_from)
-        except ConventionError as error:
-            raise InputError(f"{path}: {error.naming(option)}") from None
+    with named_errors(path, what), asking_for(option):
+        given = _given(path, convention)
+        table = (_folder if path.is_dir() else _file)(path, given, what, robot)
+        poses = _poses(table, camera_from)
         refuse_repeated(table.names or (), "names are unique")
         stated = (None, None) if table.fixed else (table.numbers, table.convention)
         return RobotPoses(table.names, table.stamps_s, poses, *stated)
@@ -153,60 +144,47 @@ def _file(path: Path, given: PoseConvention | None, what: str, robot: bool) -> P
 
 def _folder(path: Path, given: PoseConvention | None, what: str, robot: bool) -> PoseTable:
     """Poses of files that are named alike, in the order of the numbers in their names."""
-    kinds: dict[str, list[str]] = {}
-    for name in sorted(os.listdir(path), key=natural_key):
-        if name[0] != "." and Path(name).suffix.lower() in POSE_ENDINGS:
-            kinds.setdefault(re.sub(r"\d+", "N", name), []).append(name)
-    several = {kind: names for kind, names in kinds.items() if len(names) > 1} or kinds
+    kinds: dict[str, list[Path]] = {}
+    for file in files_in(path, POSE_ENDINGS):
+        kinds.setdefault(re.sub(r"\d+", "N", file.name), []).append(file)
+    several = {kind: files for kind, files in kinds.items() if len(files) > 1} or kinds
     # ViSP's poses of the end effector and of the object in the camera.
     own = [kind for kind in several if ("fPe" if robot else "cPo") in kind] or [*several]
     if len(own) != 1:
         found = " and ".join(own) or f"no file of {', '.join(POSE_ENDINGS)}"
         raise ValueError(f"the folder holds {found}; give a folder of one file for each pose")
-    tables = []
-    for name in several[own[0]]:
-        with named_errors(path / name, what):
-            tables.append(_file(path / name, given, what, robot))
-            if len(tables[-1].numbers) != 1:
+    tables: dict[str, PoseTable] = {}
+    for file in several[own[0]]:
+        with named_errors(file, what):
+            if file.suffix.lower() == ".txt" and _UNTRACKED.search(read_text(file, what)):
+                continue
+            table = tables[file.stem] = _file(file, given, what, robot)
+            if len(table.numbers) != 1:
                 raise ValueError("holds several poses, in a folder of one file for each pose")
-    numbers = np.concatenate([table.numbers for table in tables])
-    stems = tuple(Path(name).stem for name in several[own[0]])
-    return PoseTable(numbers, tables[0].convention, stems)
+    if not tables:
+        raise ValueError("all poses in its files are inf or nan; give those of tracked images")
+    numbers = np.concatenate([table.numbers for table in tables.values()])
+    return PoseTable(numbers, next(iter(tables.values())).convention, tuple(tables))
 
 
 def _table(text: str, ending: str, given: PoseConvention | None, robot: bool = True) -> PoseTable:
-    if ending in (".json", ".jsonl"):
-        return pose_data(_json(text), given, robot)
-    if ending in (".yaml", ".yml") or _YAML.match(text):
-        documents = [each for each in yaml_documents(text) if each is not None]
-        return pose_data(documents[0] if len(documents) == 1 else documents, given, robot)
+    is_json = ending in (".json", ".jsonl")
+    if is_json or ending in (".yaml", ".yml") or _YAML.match(text):
+        data = [each for each in documents(text, is_json) if each is not None]
+        return pose_data(data[0] if len(data) == 1 else data, given, robot)
     return read_pose_table(text, given)
-
-
-def _json(text: str) -> Any:
-    """JSON, or a value in each line."""
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError as error:
-        if error.msg != "Extra data":
-            raise
-        return [json.loads(line) for line in text.splitlines() if line.strip()]
 
 
 def _poses(table: PoseTable, camera_from: bool = False) -> SE3:
     try:
-        poses = poses_from_numbers(table.numbers, table.convention, camera_from)
-        check_units(table.numbers, table.convention)
-        return poses
+        return checked_poses(table.numbers, table.convention, camera_from)
     except ValueError as error:
         problem: ValueError = error
+    with suppress(ValueError):
         if not table.convention.is_matrix:
-            with suppress(ValueError):
-                turned = np.roll(table.numbers, 3, axis=-1)
-                poses_from_numbers(turned, table.convention)
-                check_units(turned, table.convention)
-                problem = ValueError(
-                    f"the rotation is before the position; write {table.convention.meaning}, or a"
-                    f" header that names the columns"
-                )
-        raise problem from None
+            checked_poses(np.roll(table.numbers, 3, axis=-1), table.convention)
+            problem = ValueError(
+                f"the rotation is before the position; write {table.convention.meaning}, or a"
+                f" header that names the columns"
+            )
+    raise problem

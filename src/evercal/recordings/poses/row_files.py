@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from evercal.bounds import bounds, require_at_most
 from evercal.recordings.images import IMAGE_ENDINGS
-from evercal.recordings.text_files import named_errors, read_text
+from evercal.recordings.text_files import library_errors, named_errors, read_text
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.object_]
@@ -193,26 +193,23 @@ def number_array(values: object, what: str) -> Array:
 
 
 def arrays_as_lists(path: Path) -> Any:
-    """An array of NPY as lists, or arrays of NPZ or MAT by name; ValueError for damaged files."""
-    with path.open("rb") as file:
-        try:
-            if path.suffix.lower() == ".mat":
-                return _matlab(file)
-            if zipfile.is_zipfile(file):
-                with zipfile.ZipFile(file) as archive:
-                    for entry in archive.infolist():
-                        with archive.open(entry) as member:
-                            _require_few_numbers(member)
-            else:
-                file.seek(0)
-                _require_few_numbers(file)
+    """An array of NPY as lists, or arrays of NPZ or MAT by name; InputError for damaged files."""
+    with path.open("rb") as file, library_errors(f"{path}: no readable arrays"):
+        if path.suffix.lower() == ".mat":
+            return _matlab(file)
+        if zipfile.is_zipfile(file):
+            with zipfile.ZipFile(file) as archive:
+                for entry in archive.infolist():
+                    with archive.open(entry) as member:
+                        _require_few_numbers(member)
+        else:
             file.seek(0)
-            loaded = np.load(file, allow_pickle=False)
-            if isinstance(loaded, np.ndarray):
-                return loaded.tolist()
-            return {key: loaded[key].tolist() for key in loaded.files}
-        except Exception as error:  # numpy raises many types for damaged files
-            raise ValueError(f"no readable arrays ({' '.join(str(error).split())[:200]})") from None
+            _require_few_numbers(file)
+        file.seek(0)
+        loaded = np.load(file, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return loaded.tolist()
+        return {key: loaded[key].tolist() for key in loaded.files}
 
 
 def _matlab(file: IO[bytes]) -> dict[str, Any]:
@@ -283,15 +280,6 @@ def without_ending(name: str) -> str:
     """Name of an image without folder and image ending; `12.5` stays as it is."""
     path = PureWindowsPath(name)
     return path.stem if path.suffix.lower() in IMAGE_ENDINGS else path.name
-
-
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sorting key that puts `image-2` before `image-10`."""
-    parts = re.findall(r"[0-9]+|[^0-9]+", name)
-    return tuple(
-        (0, len(p.lstrip("0")), f"{p.lstrip('0')} {p}") if p[0] in "0123456789" else (1, 0, p)
-        for p in parts
-    )
 
 
 def same_numbers(first: Sequence[str], second: Sequence[str]) -> bool:

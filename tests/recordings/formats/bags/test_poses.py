@@ -107,7 +107,9 @@ def test_joint_on_several_topics_needs_a_pose_topic(tmp_path: Path) -> None:
     recording = load_recording(path, options=ReadOptions(urdf=urdf, pose_topic="/joint_states"))
     pose = recording.train[0].base_from_gripper
     assert_pose(pose, SE3.exp([1, 0, 0, 0, 0, 0]) @ SE3.exp([0] * 5 + [1.0]), 1e-7)
-    with pytest.raises(InputError, match="no joint states on --pose-topic /tf; it is on /hand/"):
+    with pytest.raises(
+        InputError, match="no joint states on topic '/tf'; joint states are on /hand/"
+    ):
         load_recording(path, options=ReadOptions(urdf=urdf, pose_topic="/tf"))
 
 
@@ -127,7 +129,7 @@ def test_frame_on_several_topics_needs_a_pose_topic(tmp_path: Path) -> None:
         recording = load_recording(tmp_path / "moving/wave", options=ReadOptions(pose_topic=topic))
         pose = recording.train[0].base_from_gripper
         assert_pose(pose, BASE_FROM_SHOULDER @ shoulder_from_tool(late), 1e-7)
-    expected_message = "no tf on --pose-topic /right/tf; it is on /left/tf, /tf"
+    expected_message = "no transforms on topic '/right/tf'; transforms are on /left/tf, /tf"
     assert expected_message in refusal_of(tmp_path / "moving/wave", pose_topic="/right/tf")
 
 

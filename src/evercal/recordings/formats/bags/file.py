@@ -2,18 +2,25 @@
 
 import threading
 import weakref
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evercal.errors import InputError, missing_extra
+from evercal.errors import InputError, optional_module
 from evercal.recordings.images import files_in
-from evercal.recordings.text_files import few
+from evercal.recordings.text_files import few, library_errors
 
 _FILES = (".bag", ".mcap", ".db3")
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, JOINT_STATE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
+_REMEDIES = {
+    "not indexed": "; repair it with 'rosbag reindex'",
+    "end magic": "; its recorder did not end, restore it with 'mcap recover FILE -o NEW.mcap'",
+    "Bag is not indexed": "; repair it with 'rosbag reindex'",
+    "Bag index looks damaged": "; repair it with 'rosbag reindex'",
+    "Profile is not ros2": "; its messages are not ROS 2's, convert it or record with ros2 bag",
+}
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
@@ -30,9 +37,14 @@ class Message:
     content: Any
     """Fields as rosbags decodes them."""
 
+    @property
+    def stamp_ns(self) -> int:
+        """Nanoseconds of its header; 0 if they are not set."""
+        return _nanoseconds(self.content.header)
+
     def seconds(self, header: Any, zero_ns: int) -> float:
         """Time of a header after `zero_ns`; that of recording if it is not set."""
-        return ((stamp_ns(header.stamp) or self.logged_ns) - zero_ns) * 1e-9
+        return ((_nanoseconds(header) or self.logged_ns) - zero_ns) * 1e-9
 
 
 class BagFile:
@@ -43,24 +55,20 @@ class BagFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            from rosbags.highlevel import AnyReader
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError:
-            raise missing_extra(f"{path}: reading bags needs rosbags", "bags") from None
+        need = f"{path}: reading bags needs rosbags"
+        highlevel = optional_module("rosbags.highlevel", need, "bags")
+        typesys = optional_module("rosbags.typesys", need, "bags")
         # Bags of ROS 2 before Iron lack type definitions; the types read here never changed.
-        types = get_typestore(Stores.ROS2_HUMBLE)
+        types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         parts = _parts(path)
         ends = {part.suffix for part in parts}
         if len(ends) > 1:
             raise InputError(f"{path}: holds several kinds of bags ({', '.join(ends)}); name one")
-        try:
-            self._reader = AnyReader(parts, default_typestore=types)
+        with library_errors(f"{path}: rosbags cannot read it", _REMEDIES):
+            self._reader = highlevel.AnyReader(parts, default_typestore=types)
             self._reader.open()
             links = [link for link in self._reader.connections if link.msgcount]
             kinds = {str(link.topic): str(link.msgtype) for link in links}
-        except Exception as error:  # damaged bags make rosbags raise many types
-            raise InputError(f"{path}: rosbags cannot read it: {_reason(error)}") from None
         weakref.finalize(self, self._reader.close)
         self._lock = threading.Lock()
         self.kinds = kinds
@@ -69,6 +77,12 @@ class BagFile:
     def topics(self, *kinds: str) -> list[str]:
         """Names of the topics of some types, sorted."""
         return sorted(topic for topic, kind in self.kinds.items() if kind in kinds)
+
+    def require_topic(self, wanted: str | None, topics: Sequence[str], what: str) -> None:
+        """Refuse a topic that is none of `topics`, which hold `what`."""
+        if wanted is not None and wanted not in topics:
+            there = ", ".join(topics) or "no topic"
+            raise InputError(f"{self.path}: no {what} on topic {wanted!r}; {what} are on {there}")
 
     def contents(self) -> str:
         """List of the topics, for messages."""
@@ -107,20 +121,17 @@ class BagFile:
         if not links:
             return
         last: dict[str, tuple[int, int]] = {}
-        try:
+        with library_errors(f"{self.path}: damaged", _REMEDIES):
             for link, stamp, data in self._reader.messages(links, start_ns, stop_ns):
                 before, repeat = last.get(link.topic, (None, -1))
                 repeat = repeat + 1 if before == stamp else 0
                 last[link.topic] = (stamp, repeat)
                 content = self._reader.deserialize(data, link.msgtype)
                 yield Message(link.topic, link.msgtype, stamp, repeat, content)
-        except Exception as error:  # damaged bags make rosbags raise many types
-            raise InputError(f"{self.path}: damaged: {_reason(error)}") from None
 
 
-def stamp_ns(stamp: Any) -> int:
-    """Nanoseconds of a ROS time; 0 if it is not set."""
-    return stamp.sec * 1_000_000_000 + stamp.nanosec
+def _nanoseconds(header: Any) -> int:
+    return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
 
 
 def is_bag(path: Path) -> bool:
@@ -135,14 +146,3 @@ def _parts(path: Path) -> list[Path]:
     if metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()[:1000]:
         return [path]
     return [part for part in files_in(path, _FILES) if part.is_file()]
-
-
-def _reason(error: Exception) -> str:
-    text = " ".join(str(error).split())[:200] or type(error).__name__
-    if text.startswith(("Bag is not indexed", "Bag index looks damaged")):
-        return f"{text}; repair it with 'rosbag reindex'"
-    if "end magic" in text:
-        return f"{text} The recorder did not end; restore it with 'mcap recover FILE -o NEW.mcap'"
-    if "Profile is not ros2" in text:
-        return "its messages are not ROS 2's; convert it, or record with ros2 bag"
-    return text

@@ -198,7 +198,7 @@ def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[_TfTree, list[f
             f"{bag.path}: no tf in it, so there are no gripper poses; record /tf and"
             f" /tf_static{instead}. It holds {bag.contents()}"
         )
-    _check_topic(bag, wanted, [t for t in topics if not t.endswith("tf_static")], "tf")
+    bag.require_topic(wanted, [t for t in topics if not t.endswith("tf_static")], "transforms")
     tree, times = _TfTree(str(bag.path), wanted), []
     for message in bag.messages(topics):
         for entry in message.content.transforms:
@@ -211,14 +211,6 @@ def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[_TfTree, list[f
             link = _Transform(*frames, stamp, (q.w, q.x, q.y, q.z), (t.x, t.y, t.z))
             tree.add(link, message.topic.removesuffix("_static"))
     return tree, times
-
-
-def _check_topic(bag: BagFile, wanted: str | None, topics: Sequence[str], what: str) -> None:
-    if wanted is not None and wanted not in topics:
-        raise InputError(
-            f"{bag.path}: no {what} on --pose-topic {wanted}; it is on"
-            f" {', '.join(topics) or 'no topic'}"
-        )
 
 
 def _frame(
@@ -256,7 +248,7 @@ def _from_joints(
             f"{bag.path}: no joint states in it for --urdf {options.urdf}; it holds"
             f" {bag.contents()}"
         )
-    _check_topic(bag, options.pose_topic, topics, "joint states")
+    bag.require_topic(options.pose_topic, topics, "joint states")
     tracks = _joint_tracks(bag, topics, zero_ns)
     needed = model.arm(base, gripper).joints
     values, valid = np.zeros((len(stamps), len(tracks))), np.ones(len(stamps), dtype=bool)
