@@ -2,14 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evercal.mapping.bundle_adjustment import JointSlopes
 from evercal.recordings.frame import Frame, Mount
-from evercal.recordings.poses.arm import Arm
+
+if TYPE_CHECKING:
+    from evercal.recordings.poses.arm import Arm
 
 Array = NDArray[np.float64]
 
@@ -18,7 +20,7 @@ Array = NDArray[np.float64]
 class ArmOffsets:
     """Estimated offsets of the k joints of an arm."""
 
-    arm: Arm
+    arm: "Arm"
     values: Array
     """(k,) to be added to joint values, radians, or metres of sliding joints."""
     covariance: Array
@@ -27,7 +29,7 @@ class ArmOffsets:
     """(k,) standard deviation of offsets of this arm; an offset with it is not determined."""
 
     @classmethod
-    def start(cls, arm: Arm, values: Array) -> Self:
+    def start(cls, arm: "Arm", values: Array) -> Self:
         """Offsets of unknown uncertainty."""
         unknown = np.full(len(values), np.inf)
         return cls(arm, values, np.diag(unknown), unknown)

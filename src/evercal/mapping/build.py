@@ -38,7 +38,6 @@ from evercal.mapping.tracks import (
 from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, Mount, stated_grippers, stated_poses
-from evercal.recordings.poses.arm import Arm
 
 HAND_EYE_COVARIANCE_SCALE = 2.5
 """Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
@@ -371,7 +370,7 @@ def _adjust(
         adjustment = problem.solve(tracks)
         prepared.adjust(adjustment.poses, adjustment.cameras)
         if arm is not None and mount is not None:
-            arm = _offsets(arm.arm, adjustment)
+            arm = _offsets(arm, adjustment)
             prepared.frames = tuple(arm.moved(prepared.frames, mount))
         if not _moved(prepared.stated, stated_cameras[0], adjustment):
             break
@@ -383,9 +382,10 @@ def _adjust(
     return adjustment
 
 
-def _offsets(arm: Arm, adjustment: Adjustment) -> ArmOffsets:
+def _offsets(start: ArmOffsets, adjustment: Adjustment) -> ArmOffsets:
     covariance = HAND_EYE_COVARIANCE_SCALE * adjustment.offsets_covariance
-    return ArmOffsets(arm, adjustment.offsets, covariance, adjustment.offsets_prior)
+    values, prior = adjustment.offsets, adjustment.offsets_prior
+    return replace(start, values=values, covariance=covariance, prior=prior)
 
 
 def _gripper_from_camera(prepared: PreparedFrames, mount: Mount | None) -> SE3 | None:
@@ -447,7 +447,7 @@ def _finish(
             moved = dict(zip(names, adjustment.correction, strict=True))
             arm = None
             if options.arm is not None and len(adjustment.offsets):
-                arm = _offsets(options.arm.arm, adjustment)
+                arm = _offsets(options.arm, adjustment)
             hand_eye = HandEyeCorrection(
                 common, by_noise - by_lens, by_lens, by_drift, residuals, moved, arm
             )

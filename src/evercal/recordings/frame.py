@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,10 @@ from evercal.bounds import bounds
 from evercal.errors import InputError, is_plain
 from evercal.geometry import SE3, Camera
 from evercal.recordings.images import Picture, file_of, files_in, is_readable, pixels_of
-from evercal.recordings.poses.arm import Arm
 from evercal.recordings.text_files import few
+
+if TYPE_CHECKING:
+    from evercal.recordings.poses.arm import Arm
 
 Mount = Literal["eye_to_hand", "eye_in_hand"]
 MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
@@ -86,7 +88,7 @@ class Recording:
     metric: bool = True
     """Whether lengths are metres; False where their unit is unknown, as in structure from motion.
     `base_from_camera` is then in that unit."""
-    arm: Arm | None = None
+    arm: "Arm | None" = None
     """Kinematics that `Frame.joints_rad` are values of, where gripper poses are computed."""
 
 

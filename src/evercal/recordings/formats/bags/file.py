@@ -17,7 +17,6 @@ CAMERA_INFO, JOINT_STATE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointS
 _REMEDIES = {
     "not indexed": "; repair it with 'rosbag reindex'",
     "end magic": "; its recorder did not end, restore it with 'mcap recover FILE -o NEW.mcap'",
-    "Bag is not indexed": "; repair it with 'rosbag reindex'",
     "Bag index looks damaged": "; repair it with 'rosbag reindex'",
     "Profile is not ros2": "; its messages are not ROS 2's, convert it or record with ros2 bag",
 }
