@@ -5,7 +5,8 @@
      "meaning": "pose of camera in base: takes points from camera to base",
      "translation_m": [3], "quaternion_wxyz": [4], "matrix": [4][4],
      "covariance": [6][6], "sigma_mm": x, "sigma_deg": x, "camera": {...}, "images": [...],
-     "error_terms": [...], "checks": {...}, "verdict": "...", "source": {...}, "created": "..."}
+     "error_terms": [...], "checks": {...}, "joints": [...], "joint_covariance": [k][k],
+     "verdict": "...", "source": {...}, "created": "..."}
 
 Metres, radians, quaternions w, x, y, z, OpenCV camera axes. `matrix`, `meaning` and the sigmas
 repeat other values for their readers.
@@ -59,6 +60,21 @@ class ErrorTerm:
         return cls(name, *axis_deviation(np.diag(variance)))
 
 
+@dataclass(frozen=True)
+class JointOffset:
+    """Offset of a joint of the arm, which is to be added to the values that the robot reports."""
+
+    name: str
+    """Name of the joint in the URDF."""
+    offset: float
+    """Radians, or metres of a sliding joint."""
+    sigma: float
+    """Standard deviation; that before any image where the offset is not determined."""
+    is_angle: bool = True
+    open: str = ""
+    """Why it is not determined, and what would; empty if it is."""
+
+
 def position_shares(terms: Sequence[ErrorTerm]) -> list[float]:
     """Share of each term in the variance of the position, 0 to 1."""
     variances = [term.translation_mm**2 for term in terms]
@@ -93,6 +109,11 @@ class Calibration:
     """Parts of the covariance by cause; from images, those of `CovarianceTerm` and the scatter."""
     checks: Mapping[str, Any] = field(default_factory=dict)
     """Results of the checks, JSON values: `held_out_mm`, `repeatability_mm`, ..."""
+    joints: tuple[JointOffset, ...] = ()
+    """Offsets of the k joints of the arm, if its joint values were stated. The transform is that of
+    an arm that moves with them."""
+    joint_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    """(k, k) of the offsets."""
     verdict: str = ""
     """Uses that it serves, one or two sentences."""
     source: Mapping[str, Any] = field(default_factory=dict)
@@ -152,6 +173,8 @@ class Calibration:
             "images": [vars(image) for image in self.images],
             "error_terms": [vars(term) for term in self.error_terms],
             "checks": dict(self.checks),
+            "joints": [vars(joint) for joint in self.joints],
+            "joint_covariance": self.joint_covariance.tolist(),
             "verdict": self.verdict,
             "source": dict(self.source),
             "created": self.created,
@@ -185,6 +208,8 @@ class Calibration:
             images=tuple(ImageUse(**row) for row in data.get("images", [])),
             error_terms=tuple(ErrorTerm(**row) for row in data.get("error_terms", [])),
             checks=data.get("checks", {}),
+            joints=tuple(JointOffset(**row) for row in data.get("joints", [])),
+            joint_covariance=np.array(data.get("joint_covariance", []), np.float64),
             verdict=str(data.get("verdict", "")),
             source=data.get("source", {}),
             created=str(data.get("created", "")),

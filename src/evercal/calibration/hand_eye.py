@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
+from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, JointOffset
 from evercal.calibration.hand_eye_start import HandEyeStart, hand_eye_start, scene_from_parent
 from evercal.calibration.held_thing import cropped, moving_parts, windows
 from evercal.calibration.located import deviations, length_mm_deg
@@ -76,6 +76,10 @@ class HandEyeReport:
     error_terms: tuple[ErrorTerm, ...] = ()
     images: tuple[ImageUse, ...] = ()
     """Use of each frame; residuals are those of its gripper pose."""
+    joints: tuple[JointOffset, ...] = ()
+    """Offsets of the k joints of the arm, where its joint values are stated."""
+    joint_covariance: tuple[tuple[float, ...], ...] = ()
+    """(k, k) of the offsets."""
 
     @property
     def parent_from_camera(self) -> UncertainPose:
@@ -96,6 +100,8 @@ class HandEyeReport:
             camera=camera,
             images=self.images,
             error_terms=self.error_terms,
+            joints=self.joints,
+            joint_covariance=np.array(self.joint_covariance),
             checks=checks,
             source={
                 "command": "eye-to-hand" if fixed else "learn",
@@ -188,6 +194,10 @@ def hand_eye_report(
             ErrorTerm.of("slowly varying errors of gripper poses", correction.by_drift),
         ),
         images=tuple(use for frame in frames if (use := _use(frame, built)) is not None),
+        joints=() if correction.arm is None else _joint_offsets(correction.arm),
+        joint_covariance=()
+        if correction.arm is None
+        else tuple(tuple(row) for row in correction.arm.covariance.tolist()),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
 
@@ -276,6 +286,21 @@ def _use(frame: Frame, built: BuiltMap) -> ImageUse | None:
         return ImageUse(name, False, "it could not be tracked in other images")
     residual = built.hand_eye.residuals.get(frame.name)
     return None if residual is None else ImageUse(name, True, "", *length_mm_deg(residual))
+
+
+def _joint_offsets(arm: ArmOffsets) -> tuple[JointOffset, ...]:
+    """The offsets, and why some are not determined."""
+    free, rotates, rows = arm.arm.free(), arm.arm.rotates(), []
+    for i, name in enumerate(arm.arm.joints):
+        why = ""
+        if not free[i]:
+            what = "base" if i == 0 else "gripper"
+            why = f"its offset turns the frame of the {what}: a mark at its zero shows it"
+        elif not arm.determined[i]:
+            why = f"move {name} more between the images"
+        sigma = arm.prior[i] if why else np.sqrt(arm.covariance[i, i])
+        rows.append(JointOffset(name, float(arm.values[i]), float(sigma), bool(rotates[i]), why))
+    return tuple(rows)
 
 
 def _warnings(adjusted: Adjusted) -> tuple[str, ...]:

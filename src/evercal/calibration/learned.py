@@ -3,7 +3,13 @@
 import os
 from pathlib import Path
 
-from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, read_calibration
+from evercal.calibration.calibration import (
+    Calibration,
+    ErrorTerm,
+    ImageUse,
+    JointOffset,
+    read_calibration,
+)
 from evercal.errors import InputError
 from evercal.storage.stages import is_store
 
@@ -40,6 +46,10 @@ def learned_calibration(root: Path, scene: str | None = None) -> Calibration:
         )
     camera, report = stored[name]
     hand_eye = dict(report["hand_eye"])
-    for field, kind in (("error_terms", ErrorTerm), ("images", ImageUse)):
+    for field, kind in (
+        ("error_terms", ErrorTerm),
+        ("images", ImageUse),
+        ("joints", JointOffset),
+    ):
         hand_eye[field] = tuple(kind(**row) for row in hand_eye.get(field, ()))
     return HandEyeReport(**hand_eye).calibration(camera, name, int(report["train_frames"]))

@@ -26,13 +26,15 @@ class ArmOffsets:
     covariance: Array
     """(k, k)."""
     prior: Array
-    """(k,) standard deviation of offsets of this arm; an offset with it is not determined."""
+    """(k,) standard deviation of offsets of this arm before the images."""
+    determined: NDArray[np.bool_]
+    """(k,) whether the images tell the offset."""
 
     @classmethod
     def start(cls, arm: "Arm", values: Array) -> Self:
         """Offsets of unknown uncertainty."""
         unknown = np.full(len(values), np.inf)
-        return cls(arm, values, np.diag(unknown), unknown)
+        return cls(arm, values, np.diag(unknown), unknown, np.isfinite(unknown))
 
     def moved(self, frames: Sequence[Frame], mount: Mount) -> list[Frame]:
         """Frames whose stated poses contain the offsets; camera and gripper keep their transform.
