@@ -42,8 +42,6 @@ from evercal.recordings.frame import Frame, Mount, stated_grippers, stated_poses
 HAND_EYE_COVARIANCE_SCALE = 2.5
 """Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
 over many frames, which residuals do not show (research/handeye.md)."""
-DETERMINED = 0.25
-"""Variance of a joint offset that the images determine, as a share of its prior."""
 GAP, MOST_PARTS = 10, 12
 """Frames without keyframes before and after a part that is left out, and number of parts at most.
 Frames between similar keyframes are located more exactly than new images are."""

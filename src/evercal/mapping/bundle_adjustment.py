@@ -51,6 +51,10 @@ SYSTEMATIC, HIDDEN = (1.0, 1.0), 4.0
 """Prior of the variance of systematic errors: its weight in observed directions, and its size in
 variances of the noise. Directions that the images hide vary by this factor more: a real arm that
 orbits one place moves its mount by 19 mm along the axis (research/trust.md)."""
+DETERMINED = 0.05
+"""Variance of a joint offset by the images alone, as a share of its first prior."""
+USUAL_OFFSET = 0.05 / 3
+"""Offset of a joint of a good arm, in `BundleOptions.joint_sigma_deg`; it weighs as one joint."""
 CONVERGED = 1e-9
 """Adjustment ends when a step is this small, in standard deviations, and variances change by less
 than this share."""
@@ -146,6 +150,8 @@ class Adjustment:
     """(k, k) with systematic errors."""
     offsets_prior: Array
     """(k,) estimated standard deviation of the offsets of this arm."""
+    offsets_known: NDArray[np.bool_]
+    """(k,) whether the images tell an offset better than the first prior."""
 
 
 class JointSlopes(NamedTuple):
@@ -410,11 +416,11 @@ class BundleAdjustment:
             wide = np.clip(wanted, prior[part] / 16, widest[part])
             variances[part] = np.maximum(wide, self.options.least_share * widest[part])
         if (part := self.offsets).stop > part.start:
-            # One size for all joints of the arm: one that no image shows is as far off as others.
+            # One size for all joints: one that no image shows is as far off as the others.
             seen = (1 - posterior[part] / prior[part]).clip(0).sum()
-            share = float((values[part] ** 2 / widest[part]).sum() / max(seen, 1e-3))
-            least = max(float((prior[part] / widest[part])[0]) / 16, self.options.least_share)
-            variances[part] = np.clip(share, least, 1.0) * widest[part]
+            squares = float((values[part] ** 2 / widest[part]).sum()) + USUAL_OFFSET**2
+            size = min(squares / (seen + 1), 1.0)
+            variances[part] = max(size, float((prior[part] / widest[part])[0]) / 16) * widest[part]
         return variances
 
     def _result(self, tracks: BundleTracks, estimate: Estimate, variances: Variances) -> Adjustment:
@@ -424,6 +430,8 @@ class BundleAdjustment:
         root = [estimate.root[:, 6 * i : 6 * i + 6] for i in range(n + 1)]
         systematic, joints = self._systematic(estimate, variances), self.offsets
         moved = estimate.root[:, 6 * n :][:, joints]
+        information = 1 / np.diag(moved.T @ moved) - 1 / variances.shared[joints]
+        by_images = 1 / np.maximum(information, 1e-9)
         return Adjustment(
             poses=self.frames.poses(parameters),
             cameras=self.frames.cameras(parameters) if self.adjusts_camera else None,
@@ -443,6 +451,7 @@ class BundleAdjustment:
             offsets=parameters.shared[joints],
             offsets_covariance=moved.T @ moved + systematic[joints, joints],
             offsets_prior=np.sqrt(variances.shared[joints]),
+            offsets_known=by_images < DETERMINED * self.start_variances().shared[joints],
         )
 
     def _by_lens(self, root: Array) -> Array:
