@@ -385,8 +385,8 @@ def _adjust(
 def _offsets(start: ArmOffsets, adjustment: Adjustment) -> ArmOffsets:
     covariance = HAND_EYE_COVARIANCE_SCALE * adjustment.offsets_covariance
     values, prior = adjustment.offsets, adjustment.offsets_prior
-    determined = np.diag(adjustment.offsets_covariance) < DETERMINED * prior**2
-    return replace(start, values=values, covariance=covariance, prior=prior, determined=determined)
+    known = adjustment.offsets_known
+    return replace(start, values=values, covariance=covariance, prior=prior, determined=known)
 
 
 def _gripper_from_camera(prepared: PreparedFrames, mount: Mount | None) -> SE3 | None:
