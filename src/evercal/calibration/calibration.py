@@ -74,6 +74,16 @@ class JointOffset:
     open: str = ""
     """Why it is not determined, and what would; empty if it is."""
 
+    @property
+    def unit(self) -> tuple[str, float]:
+        """Unit for people, deg or mm, and how many of it make a radian or a metre."""
+        return ("deg", 180 / np.pi) if self.is_angle else ("mm", 1000.0)
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is determined and at least two standard deviations."""
+        return not self.open and abs(self.offset) >= 2 * self.sigma
+
 
 def position_shares(terms: Sequence[ErrorTerm]) -> list[float]:
     """Share of each term in the variance of the position, 0 to 1."""
@@ -109,17 +119,17 @@ class Calibration:
     """Parts of the covariance by cause; from images, those of `CovarianceTerm` and the scatter."""
     checks: Mapping[str, Any] = field(default_factory=dict)
     """Results of the checks, JSON values: `held_out_mm`, `repeatability_mm`, ..."""
-    joints: tuple[JointOffset, ...] = ()
-    """Offsets of the k joints of the arm, if its joint values were stated. The transform is that of
-    an arm that moves with them."""
-    joint_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
-    """(k, k) of the offsets."""
     verdict: str = ""
     """Uses that it serves, one or two sentences."""
     source: Mapping[str, Any] = field(default_factory=dict)
     """Command, store, scene and options, JSON values."""
     created: str = ""
     """ISO 8601 time with zone."""
+    joints: tuple[JointOffset, ...] = ()
+    """Offsets of the k joints of the arm, if its joint values were stated. The transform is that of
+    an arm that moves with them."""
+    joint_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    """(k, k) of the offsets."""
 
     def __post_init__(self) -> None:
         covariance = np.array(self.covariance, dtype=np.float64)
@@ -132,6 +142,10 @@ class Calibration:
         if self.parent_frame == self.child_frame:
             raise ValueError(f"parent and child frame are both called {self.parent_frame!r}")
         object.__setattr__(self, "covariance", covariance)
+        of_joints, k = np.array(self.joint_covariance, dtype=np.float64), len(self.joints)
+        if of_joints.size != k * k or (k and of_joints.shape != (k, k)):
+            raise ValueError(f"the covariance of {k} joints is ({k}, {k}), got {of_joints.shape}")
+        object.__setattr__(self, "joint_covariance", of_joints.reshape(k, k))
 
     @property
     def meaning(self) -> str:

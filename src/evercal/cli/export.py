@@ -3,7 +3,7 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional
 
@@ -51,6 +51,12 @@ class Export(args.Verb):
     """Board pose in the camera for every image, for moveit_samples."""
     convention: args.Name = None
     """Pose convention of --robot-poses if its header does not state it: ur, kuka, fanuc, ..."""
+    urdf: args.File = None
+    """For corrected_urdf: URDF of the arm that was recorded."""
+    lerobot_calibration: args.File = None
+    """For lerobot: the calibration file of the arm."""
+    lerobot_motors: Literal["feetech", "dynamixel"] | None = None
+    """For lerobot: feetech (SO-100, SO-101) or dynamixel (Koch, OMX)."""
 
     def run(self) -> int:
         from evercal.calibration.export.formats import FORMATS, export_files

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias, Unpack
 
+from evercal.calibration.export import joints as arm
 from evercal.calibration.export import writers as to
 from evercal.calibration.export.request import Export, ExportOptions, prepare_export
 from evercal.errors import InputError
@@ -59,6 +60,9 @@ FORMATS = {
     "yaskawa": Format("any", to.yaskawa, ".txt", "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"),
     "staubli": Format("any", to.staubli, ".txt", "Staubli: X Y Z RX RY RZ, mm and degrees"),
     "franka": Format("any", to.franka, ".txt", "Franka: 16 numbers by column, metres"),
+    "joint_offsets": Format("any", arm.joint_offsets, ".json", "offsets of the arm's joints"),
+    "corrected_urdf": Format("any", arm.corrected_urdf, ".urdf", "--urdf with these offsets"),
+    "lerobot": Format("any", arm.lerobot, ".json", "--lerobot-calibration with these offsets"),
 }
 """All formats by name."""
 

@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,12 @@ class ExportOptions(TypedDict, total=False):
     """camera_from_target of every image, or a file of them."""
     convention: str | None
     """Pose convention of the file of robot poses."""
+    urdf: str | os.PathLike[str] | None
+    """URDF of the arm, for `corrected_urdf`."""
+    lerobot_calibration: str | os.PathLike[str] | None
+    """Calibration file of a LeRobot arm, for `lerobot`."""
+    lerobot_motors: Literal["feetech", "dynamixel"] | None
+    """Motors of that arm, which subtract the homing offset or add it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +73,7 @@ class Export:
     robot_frame: str | None
     robot_poses: RobotPoses | None
     target_poses: RobotPoses | None
+    options: ExportOptions
 
     @property
     def parent(self) -> str:
@@ -137,7 +144,7 @@ def prepare_export(
         robot = read_robot_poses(robot, convention, what=what, option="--convention")
     if target is not None and not isinstance(target, RobotPoses):
         target = read_robot_poses(target, what="file of target poses", option=None)
-    return Export(calibration, name, other, robot, target)
+    return Export(calibration, name, other, robot, target, options)
 
 
 def _link_from_optical(optical: str, options: ExportOptions) -> SE3:

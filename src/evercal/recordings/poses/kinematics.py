@@ -6,13 +6,14 @@ are radians, or degrees if a name ends in `_deg`, and metres for prismatic joint
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError, optional_module
 from evercal.recordings.poses.arm import Arm, Motion
@@ -118,24 +119,52 @@ class RobotModel:
         chain: list[Motion] = []
         before = np.eye(4)
         for joint, backwards in steps:
-            if joint.type not in (*_MOVING, "fixed") or joint.name in self._turned:
-                what = "turned by quat_xyzw, which most programs ignore; write rpy"
-                kind = what if joint.name in self._turned else f"{joint.type}; not supported"
-                raise InputError(f"{self.path}: joint {joint.name} is {kind}")
-            origin = np.eye(4) if joint.origin is None else joint.origin
+            if joint.type not in (*_MOVING, "fixed"):
+                raise InputError(f"{self.path}: joint {joint.name} is {joint.type}; not supported")
+            origin = self._origin(joint)
             before = before if backwards else before @ origin
             if joint.type in _MOVING:
                 name, factor, constant = self._driver(joint)
                 names += [] if name in names else [name]
-                length = np.linalg.norm(joint.axis)
-                if not 0 < length < np.inf:
-                    raise InputError(f"{self.path}: joint {joint.name} has the axis {joint.axis}")
-                axis = joint.axis / (-length if backwards else length)
+                axis = -self._axis(joint) if backwards else self._axis(joint)
                 rotates, value = joint.type != "prismatic", names.index(name)
                 chain.append(Motion(before, axis, rotates, value, factor, constant))
                 before = np.eye(4)
             before = before @ np.linalg.inv(origin) if backwards else before
         return Arm(tuple(names), tuple(chain), before)
+
+    def origins_with(self, offsets: Mapping[str, float]) -> dict[str, tuple[Array, bool]]:
+        """Origins of the joints that move by some values, with offsets of these values.
+
+        Returns (4, 4) and whether the joint rotates, by name; joints that mimic one of them are
+        among them. A program that gets the values without offsets then computes the poses of
+        those with them.
+        """
+        moved = {}
+        for joint in self._urdf.robot.joints:
+            if joint.type in _MOVING and (driver := self._driver(joint))[0] in offsets:
+                motion, step = np.eye(4), driver[1] * offsets[driver[0]] * self._axis(joint)
+                if rotates := joint.type != "prismatic":
+                    motion[:3, :3] = Rotation.from_rotvec(step).as_matrix()
+                else:
+                    motion[:3, 3] = step
+                moved[joint.name] = self._origin(joint) @ motion, rotates
+        return moved
+
+    def _origin(self, joint: Any) -> Array:
+        if joint.name in self._turned:
+            raise InputError(
+                f"{self.path}: joint {joint.name} is turned by quat_xyzw, which most programs"
+                " ignore; write rpy"
+            )
+        return np.eye(4) if joint.origin is None else joint.origin
+
+    def _axis(self, joint: Any) -> Array:
+        """(3,) unit vector."""
+        length = np.linalg.norm(joint.axis)
+        if not 0 < length < np.inf:
+            raise InputError(f"{self.path}: joint {joint.name} has the axis {joint.axis}")
+        return joint.axis / length
 
     def _driver(self, joint: Any) -> tuple[str, float, float]:
         """Name of the value that moves a joint, and factor and constant of its motion."""
