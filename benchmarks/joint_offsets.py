@@ -273,9 +273,10 @@ def summary(rows: list[Row]) -> list[Row]:
             line["gripper_after_mm"] = median("gripper_after_mm")
             line["gripper_after_max_mm"] = max(float(row["gripper_after_mm"]) for row in solved)
             line |= {name: median(name) for name in ("offset_deg", "offset_sigma_deg")}
-            line["offset_inside_95"] = 100 * float(
-                np.mean([row["offset_inside"] for row in solved])
+            inside, squared = (
+                [float(row[name]) for row in solved] for name in ("offset_inside", "offset_squared")
             )
-            line["offset_squared"] = float(np.mean([row["offset_squared"] for row in solved]))
+            line["offset_inside_95"] = 100 * float(np.mean(inside))
+            line["offset_squared"] = float(np.mean(squared))
         lines.append(line)
     return lines
