@@ -8,6 +8,7 @@ import tyro
 VERBS = {
     "maps": ("maps", "accuracy of maps: degraded images, fixed cameras, wrong poses, many scenes"),
     "calibration": ("calibration", "cameras calibrated from images, beside the simulator's truth"),
+    "joint-offsets": ("joint_offsets", "offsets of an arm's joints from wrist recordings"),
     "eye-to-hand": ("eye_to_hand", "a fixed camera and a textured thing in the gripper"),
     "trust": ("trust", "other cameras, few images, an inaccurate arm: errors and deviations"),
     "fisheye": ("fisheye", "rooms through lenses of 150 and 180 degrees, beside a pinhole"),

@@ -297,7 +297,7 @@ def _joint_offsets(arm: ArmOffsets) -> tuple[JointOffset, ...]:
             what = "base" if i == 0 else "gripper"
             why = f"its offset turns the frame of the {what}: a mark at its zero shows it"
         elif not arm.determined[i]:
-            why = f"move {name} more between the images"
+            why = f"move {name} and the joints after it more between the images"
         sigma = arm.prior[i] if why else np.sqrt(arm.covariance[i, i])
         rows.append(JointOffset(name, float(arm.values[i]), float(sigma), bool(rotates[i]), why))
     return tuple(rows)
