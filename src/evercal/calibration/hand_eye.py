@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +80,8 @@ class HandEyeReport:
     """Offsets of the k joints of the arm, where its joint values are stated."""
     joint_covariance: tuple[tuple[float, ...], ...] = ()
     """(k, k) of the offsets."""
+    joints_move_mm: tuple[float, ...] = ()
+    """Mean and largest way of the gripper by the offsets, over all frames with joint values."""
 
     @property
     def parent_from_camera(self) -> UncertainPose:
@@ -91,7 +93,10 @@ class HandEyeReport:
         """Return the estimate as a calibration with the intrinsics that the map adjusted."""
         estimate, fixed = self.parent_from_camera, self.mount == "eye_to_hand"
         scatter = [list(row) for row in self.image_scatter]
-        checks = {"images_used": self.images_located, "image_scatter": scatter} if scatter else {}
+        located = {"images_used": self.images_located, "image_scatter": scatter}
+        checks: dict[str, Any] = located if scatter else {}
+        if self.joints_move_mm:
+            checks["joints_move_mm"] = list(self.joints_move_mm)
         calibration = Calibration(
             self.mount,
             estimate.pose,
@@ -198,6 +203,7 @@ def hand_eye_report(
         joint_covariance=()
         if correction.arm is None
         else tuple(tuple(row) for row in correction.arm.covariance.tolist()),
+        joints_move_mm=() if correction.arm is None else _moved_mm(correction.arm, frames),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
 
@@ -301,6 +307,14 @@ def _joint_offsets(arm: ArmOffsets) -> tuple[JointOffset, ...]:
         sigma = arm.prior[i] if why else np.sqrt(arm.covariance[i, i])
         rows.append(JointOffset(name, float(arm.values[i]), float(sigma), bool(rotates[i]), why))
     return tuple(rows)
+
+
+def _moved_mm(offsets: ArmOffsets, frames: Sequence[Frame]) -> tuple[float, ...]:
+    """Mean and largest way of the gripper by the offsets."""
+    values = np.array([f.joints_rad for f in frames if f.joints_rad is not None])
+    before, after = (offsets.arm.poses(values + added) for added in (0.0, offsets.values))
+    ways = 1000 * np.linalg.norm(after.translation_m - before.translation_m, axis=1)
+    return float(ways.mean()), float(ways.max())
 
 
 def _warnings(adjusted: Adjusted) -> tuple[str, ...]:

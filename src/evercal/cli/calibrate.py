@@ -1,6 +1,6 @@
 """`evercal calibrate`."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -13,7 +13,7 @@ from evercal.errors import InputError
 from evercal.progress import progress_bar
 
 if TYPE_CHECKING:
-    from evercal.calibration.calibration import Calibration, Rig
+    from evercal.calibration.calibration import Calibration, JointOffset, Rig
     from evercal.calibration.from_images import Images
     from evercal.localization.localizer import Localizer
 
@@ -146,6 +146,28 @@ def calibration_lines(calibration: "Calibration", point: args.Point | None = Non
         yield f"  images       {used} of {len(calibration.images)} used"
     yield from (f"    rejected   {i.name}: {i.reason}" for i in calibration.images if not i.used)
     yield f"  verdict      {calibration.verdict}"
+
+
+def joint_lines(joints: Sequence["JointOffset"], file: object) -> Iterator[str]:
+    """The offsets of an arm's joints in lines; `file` holds the calibration."""
+    most: dict[str, float] = {}
+    for joint in joints:
+        unit, times = joint.unit
+        offset, sigma = times * joint.offset, times * joint.sigma
+        if joint.open:
+            yield f"joint {joint.name}: not determined; {joint.open}"
+        else:
+            most[unit] = max(most.get(unit, 0.0), abs(offset) + 2 * sigma)
+        if joint.significant:
+            yield f"joint {joint.name}: add {offset:+.2f} {unit} (standard deviation {sigma:.2f})"
+    if any(joint.significant for joint in joints):
+        yield (
+            "joints: the camera is that of the corrected arm; correct its URDF: evercal export"
+            f" {file} --format corrected_urdf --urdf ROBOT.urdf"
+        )
+    elif most:
+        least = " or ".join(f"{value:.2f} {unit}" for unit, value in most.items())
+        yield f"joints: no offset above {least}"
 
 
 def _rig_lines(rig: "Rig", point: args.Point | None) -> Iterator[str]:

@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
-from evercal.cli.calibrate import at_record, calibration_lines
+from evercal.cli.calibrate import at_record, calibration_lines, joint_lines
 from evercal.cli.console import require_writable
 from evercal.progress import Bars
 
@@ -51,6 +51,7 @@ class EyeToHand(args.Verb):
         self.answer(
             {**calibration.to_dict(), **at_record(calibration, point)},
             *calibration_lines(calibration, point),
+            *joint_lines(calibration.joints, self.out),
             then=("export", self.out, "--format", "easy_handeye2"),
         )
         return 0 if tier(calibration) else 1

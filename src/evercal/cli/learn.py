@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
+from evercal.cli.calibrate import joint_lines
 from evercal.cli.console import require_writable, say, say_notes, size
 from evercal.cli.info import adjusted_row
 from evercal.errors import InputError
@@ -120,7 +121,7 @@ class Learn(args.Verb):
                 read=self._recording,
                 workers=self.workers,
                 memory=self.memory,
-                on_scene=lambda report: bars.write("\n".join(summary(report))),
+                on_scene=lambda report: bars.write("\n".join(summary(report, self.store))),
                 on_progress=bars.step,
             )
         record = {"scenes": [dataclasses.asdict(report) for report in reports]}
@@ -150,7 +151,7 @@ class Learn(args.Verb):
         except KeyboardInterrupt:
             print("stopped; the same command starts again", file=sys.stderr)
             return 130
-        lines = list(summary(report))
+        lines = list(summary(report, self.calibration or self.store))
         if self.calibration is not None:
             lines.append(f"wrote {self.calibration}")
         then = self._next(recording, report, path)
@@ -227,8 +228,8 @@ def learn_into_networks(
     return learn_networks(given.store, recording, options, show)
 
 
-def summary(report: "LearnReport") -> Iterator[str]:
-    """The outcome in lines."""
+def summary(report: "LearnReport", file: Path) -> Iterator[str]:
+    """The outcome in lines; `file` holds the calibration, if there is one."""
     kept = f"{report.scene}: {report.train_frames} images, {report.frames_kept} keyframes"
     memory = size(report.memory_bytes)
     if report.iterations:
@@ -258,6 +259,7 @@ def summary(report: "LearnReport") -> Iterator[str]:
         if found.given_mm is not None:
             far = f"{found.given_mm:.1f} mm and {found.given_deg:.1f} deg"
             yield f"distance from the given one: {far}"
+        yield from joint_lines(found.joints, file)
     if report.adjusted is not None:
         row = adjusted_row(report.scene, dataclasses.asdict(report.adjusted))
         yield "; ".join(f"{what} {value}" for what, value in row.items())

@@ -55,8 +55,8 @@ def corrected_urdf(export: Export) -> str:
         if turning.get(joint.name, (None, None))[1] is not joint.is_angle:
             kind = "revolute" if joint.is_angle else "prismatic"
             raise InputError(
-                f"{file}: has no {kind} joint {joint.name} with a value of its own; give the URDF of"
-                " the recording"
+                f"{file}: has no {kind} joint {joint.name} with a value of its own; give the URDF"
+                " of the recording"
             )
     changed = {}
     for name, (origin, rotates) in moved.items():
@@ -78,11 +78,10 @@ def _with_origins(data: bytes, changed: Mapping[str, tuple[bytes, bytes]]) -> by
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
         path.append((tag, attributes.get("name", "")))
-        if len(path) > 1 and path[1][0] == "joint" and (name := path[1][1]) in changed:
-            if len(path) == 2 or (
-                len(path) == 3 and tag == "origin" and places[name][1] == "joint"
-            ):
-                places[name] = parser.CurrentByteIndex, tag
+        name = path[1][1] if len(path) in (2, 3) and path[1][0] == "joint" else None
+        first = tag == "origin" and places.get(name or "", (0, ""))[1] == "joint"
+        if name in changed and (len(path) == 2 or first):
+            places[name] = parser.CurrentByteIndex, tag
 
     def end_of(_: str) -> None:
         path.pop()

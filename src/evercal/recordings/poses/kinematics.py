@@ -56,6 +56,8 @@ class RobotModel:
         with library_errors(f"{path}: no usable URDF"):
             self._urdf = yourdfpy.URDF.load(str(self.path), **dict.fromkeys(plain, False))
             self.base_link = str(self._urdf.base_link)
+            named = [joint.name for joint in self._urdf.robot.joints]
+            refuse_repeated(named, "rename one of the joints")
             self._turned = set(_TURNED.findall(read_text(self.path, "URDF")))
         self.links = tuple(self._urdf.link_map)
         self._joint_above = {joint.child: joint for joint in self._urdf.robot.joints}
