@@ -50,9 +50,9 @@ def corrected_urdf(export: Export) -> str:
         raise InputError("give the URDF of the arm that was recorded with --urdf")
     model = RobotModel(file)
     moved = model.origins_with({j.name: j.offset for j in _determined(export)})
-    turning = model.origins_with({joint.name: 0.0 for joint in joints})
     for joint in joints:
-        if turning.get(joint.name, (None, None))[1] is not joint.is_angle:
+        own = model.origins_with({joint.name: 0.0}).get(joint.name)
+        if own is None or own[1] != joint.is_angle:
             kind = "revolute" if joint.is_angle else "prismatic"
             raise InputError(
                 f"{file}: has no {kind} joint {joint.name} with a value of its own; give the URDF"
