@@ -7,7 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, read_calibration
+from evercal.calibration.calibration import (
+    Calibration,
+    ErrorTerm,
+    ImageUse,
+    JointOffset,
+    read_calibration,
+)
 from evercal.calibration.verdict import TIERS, expected_error, tier, verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
@@ -27,6 +33,8 @@ def example() -> Calibration:
         "good for bin picking",
         {"command": "solve"},
         "2026-01-01T00:00:00+00:00",
+        (JointOffset("lift", 0.01, 0.002), JointOffset("rail", 0.0, 0.1, False, "move it")),
+        np.array([[4e-6, 1e-6], [1e-6, 1e-2]]),
     )
 
 
@@ -37,6 +45,10 @@ def test_round_trip(tmp_path: Path) -> None:
     assert max(pose_distance(read.parent_from_child, calibration.parent_from_child)) < 1e-12
     assert read.to_dict() == calibration.to_dict()
     assert read.images == calibration.images
+    assert read.joints == calibration.joints
+    np.testing.assert_array_equal(read.joint_covariance, calibration.joint_covariance)
+    old = {key: value for key, value in calibration.to_dict().items() if "joint" not in key}
+    assert Calibration.from_dict(old).joint_covariance.shape == (0, 0)
     assert read.meaning.startswith("pose of camera_color_optical_frame in panda_hand")
 
 
@@ -58,6 +70,9 @@ def test_sigmas_are_root_mean_squares_over_the_axes() -> None:
         ({"images": [{"nam": 1}]}, "wrong kind"),
         ({"child_frame": "panda_hand"}, "both called"),
         ({"source": 5}, "'source' is an object"),
+        ({"joint_covariance": []}, "the covariance of 2 joints is"),
+        ({"joint_covariance": [[1, 0, 0, 1]]}, "the covariance of 2 joints is"),
+        ({"joints": [{"name": "lift"}]}, "wrong kind"),
         ({"checks": [7]}, "'checks' is an object"),
     ],
 )

@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 import yaml
 
-from evercal.calibration.calibration import Calibration, ImageUse, Mount, read_calibration
+from evercal.calibration.calibration import (
+    Calibration,
+    ImageUse,
+    JointOffset,
+    Mount,
+    read_calibration,
+)
 from evercal.calibration.export.formats import FORMATS
 from evercal.calibration.export.request import (
     read_link_from_optical,
@@ -131,3 +137,28 @@ def test_a_camera_on_the_arm_gets_a_pose_per_robot_pose(
     assert len(read_robot_poses(tmp_path / "c.tum")) == 2
     refused = run(*words, "--robot-poses", gripper, "--convention", "xyzw")
     assert "look like millimetres; give --convention xyzw:mm" in refused.err[0]
+
+
+def test_the_arm_is_exported_with_the_offsets_of_its_joints(
+    run: Any, make: Any, tmp_path: Path
+) -> None:
+    file = make("eye_in_hand")
+    refused = run("export", file, "--format", "corrected_urdf", "--urdf", tmp_path / "arm.urdf")
+    assert "record joints.csv with a URDF instead of gripper poses" in refused.err[0]
+    joints, covariance = (JointOffset("lift", 0.02, 0.001),), np.array([[1e-6]])
+    replace(read_calibration(file), joints=joints, joint_covariance=covariance).write(file)
+    (tmp_path / "arm.urdf").write_text(
+        '<robot name="r"><link name="a"/><link name="b"/><joint name="lift" type="continuous">'
+        '<parent link="a"/><child link="b"/><origin rpy="0 0 0"/><axis xyz="1 0 0"/></joint>'
+        "</robot>"
+    )
+    (tmp_path / "so101.json").write_text('{"lift": {"id": 1, "homing_offset": 5}}')
+    of_lerobot = ("--lerobot-calibration", tmp_path / "so101.json", "--lerobot-motors", "feetech")
+    for name, words, expected in (
+        ("joint-offsets", (), '"offset_rad": 0.02,'),
+        ("corrected-urdf", ("--urdf", tmp_path / "arm.urdf"), '<origin rpy="0.02 0.0 0.0"/>'),
+        ("lerobot", of_lerobot, '"homing_offset": -8'),
+    ):
+        ran = run("export", file, "--format", name, *words)
+        assert (ran.code, ran.err) == (0, [])
+        assert expected in ran.out

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
+from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, JointOffset
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.reports.calibration_images import AnnotatedImages
@@ -304,3 +304,21 @@ def test_boards_show_what_each_image_contributes() -> None:
     assert reader.row("fx (px)") == ["fx (px)", "150.0000", "0.5000"]
     [row] = [row for row in reader.rows if row[1:2] == ["a.png"]]
     assert row[-2:] == ["30.0", "0.200"]
+
+
+def test_joints_of_the_arm_are_listed_with_what_would_close_them() -> None:
+    joints = (
+        JointOffset("pan", 0.0, 0.02, open="its offset turns the frame of the base"),
+        JointOffset("lift", np.deg2rad(1.25), np.deg2rad(0.2)),
+        JointOffset("rail", -0.0031, 0.0004, is_angle=False),
+    )
+    checks = {"joints_move_mm": [4.5, 6.25]}
+    own = full(joints=joints, joint_covariance=np.eye(3), checks=checks)
+    reader, page = read(own)
+    assert ["pan (deg)", "-", "-", "its offset turns the frame of the base"] in reader.rows
+    assert ["lift (deg)", "+1.250", "0.200", ""] in reader.rows
+    assert ["rail (mm)", "-3.100", "0.400", ""] in reader.rows
+    assert "They move the gripper by 4.50 mm, at most 6.25 mm." in page.html
+    assert "joints move mm" not in page.html
+    assert "Joints of the arm" in page.html
+    assert "Joints of the arm" not in read(full())[1].html

@@ -66,6 +66,7 @@ def corrected_urdf(export: Export) -> str:
     text = read_text(Path(file), "URDF")
     other = r"""(<\?xml[^>]*encoding\s*=\s*)["'](?!utf-8["'])[^"']*["']"""
     text = re.sub(other, r'\1"utf-8"', text, count=1, flags=re.IGNORECASE)
+    text = text.replace("\n", "\r\n") if b"\r\n" in Path(file).read_bytes() else text
     with library_errors(f"{file}: no usable URDF"):
         return _with_origins(text.encode(), changed).decode()
 

@@ -1,0 +1,57 @@
+"""Offsets of joints in the output of `learn` and `eye-to-hand`."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evercal.calibration.calibration import Calibration, JointOffset
+from evercal.cli.calibrate import joint_lines
+from evercal.geometry import SE3
+from evercal.map import Map
+from evercal.recordings import Recording
+
+PAN = JointOffset("pan", 0.0, 0.02, open="its offset turns the frame of the base")
+LIFT = JointOffset("lift", np.deg2rad(1.25), np.deg2rad(0.2))
+SMALL = JointOffset("elbow", np.deg2rad(-0.1), np.deg2rad(0.06))
+RAIL = JointOffset("rail", 0.0001, 0.0002, is_angle=False)
+
+
+def test_significant_offsets_and_their_use_are_named() -> None:
+    lines = [*joint_lines((PAN, LIFT, SMALL), "wrist.json")]
+    assert lines[:2] == [
+        "joint pan: not determined; its offset turns the frame of the base",
+        "joint lift: add +1.25 deg (standard deviation 0.20)",
+    ]
+    assert lines[2].endswith("evercal export wrist.json --format corrected_urdf --urdf ROBOT.urdf")
+    assert len(lines) == 3
+
+
+@pytest.mark.parametrize(
+    ("joints", "last"),
+    [
+        ((PAN, SMALL), ["joints: no offset above 0.22 deg"]),
+        ((SMALL, RAIL), ["joints: no offset above 0.22 deg or 0.50 mm"]),
+        ((), []),
+    ],
+)
+def test_insignificant_offsets_have_a_bound(joints: Any, last: list[str]) -> None:
+    lines = [*joint_lines(joints, "wrist.json")]
+    assert lines[len(joints) and PAN in joints :] == last
+
+
+def test_eye_to_hand_prints_them(
+    run: Any, rooms: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def made(cell: Map, recording: Recording, **_: Any) -> Calibration:
+        small, joints = 1e-8 * np.eye(6), (LIFT,)
+        return Calibration(
+            "eye_to_hand", SE3.identity(), small, joints=joints, joint_covariance=np.eye(1)
+        )
+
+    monkeypatch.setattr(Map, "eye_to_hand", made)
+    ran = run("eye-to-hand", rooms[0], "--out", tmp_path / "c.json")
+    assert ran.code == 0
+    assert "joint lift: add +1.25 deg (standard deviation 0.20)" in ran.out
+    assert f"evercal export {tmp_path / 'c.json'} --format corrected_urdf" in ran.out
