@@ -71,7 +71,6 @@ def test_sigmas_are_root_mean_squares_over_the_axes() -> None:
         ({"child_frame": "panda_hand"}, "both called"),
         ({"source": 5}, "'source' is an object"),
         ({"joint_covariance": []}, "the covariance of 2 joints is"),
-        ({"joint_covariance": [[1, 0, 0, 1]]}, "the covariance of 2 joints is"),
         ({"joints": [{"name": "lift"}]}, "wrong kind"),
         ({"checks": [7]}, "'checks' is an object"),
     ],

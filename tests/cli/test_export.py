@@ -144,7 +144,7 @@ def test_the_arm_is_exported_with_the_offsets_of_its_joints(
 ) -> None:
     file = make("eye_in_hand")
     refused = run("export", file, "--format", "corrected_urdf", "--urdf", tmp_path / "arm.urdf")
-    assert "record joints.csv with a URDF instead of gripper poses" in refused.err[0]
+    assert "record joints.csv and a URDF, not gripper poses" in refused.err[0]
     joints, covariance = (JointOffset("lift", 0.02, 0.001),), np.array([[1e-6]])
     replace(read_calibration(file), joints=joints, joint_covariance=covariance).write(file)
     (tmp_path / "arm.urdf").write_text(
@@ -159,6 +159,6 @@ def test_the_arm_is_exported_with_the_offsets_of_its_joints(
         ("corrected-urdf", ("--urdf", tmp_path / "arm.urdf"), '<origin rpy="0.02 0.0 0.0"/>'),
         ("lerobot", of_lerobot, '"homing_offset": -8'),
     ):
-        ran = run("export", file, "--format", name, *words)
+        ran = run("export", file, "--format", name, *words, "--out", tmp_path / "out")
         assert (ran.code, ran.err) == (0, [])
-        assert expected in ran.out
+        assert expected in (tmp_path / "out").read_text()

@@ -79,11 +79,6 @@ class JointOffset:
         """Unit for people, deg or mm, and how many of it make a radian or a metre."""
         return ("deg", 180 / np.pi) if self.is_angle else ("mm", 1000.0)
 
-    @property
-    def significant(self) -> bool:
-        """Whether it is determined and at least two standard deviations."""
-        return not self.open and abs(self.offset) >= 2 * self.sigma
-
 
 def position_shares(terms: Sequence[ErrorTerm]) -> list[float]:
     """Share of each term in the variance of the position, 0 to 1."""
@@ -142,8 +137,8 @@ class Calibration:
         if self.parent_frame == self.child_frame:
             raise ValueError(f"parent and child frame are both called {self.parent_frame!r}")
         object.__setattr__(self, "covariance", covariance)
-        of_joints, k = np.array(self.joint_covariance, dtype=np.float64), len(self.joints)
-        if of_joints.size != k * k or (k and of_joints.shape != (k, k)):
+        k, of_joints = len(self.joints), np.array(self.joint_covariance, dtype=np.float64)
+        if of_joints.size != k * k:
             raise ValueError(f"the covariance of {k} joints is ({k}, {k}), got {of_joints.shape}")
         object.__setattr__(self, "joint_covariance", of_joints.reshape(k, k))
 

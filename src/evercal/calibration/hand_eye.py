@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,10 +93,8 @@ class HandEyeReport:
         """Return the estimate as a calibration with the intrinsics that the map adjusted."""
         estimate, fixed = self.parent_from_camera, self.mount == "eye_to_hand"
         scatter = [list(row) for row in self.image_scatter]
-        located = {"images_used": self.images_located, "image_scatter": scatter}
-        checks: dict[str, Any] = located if scatter else {}
-        if self.joints_move_mm:
-            checks["joints_move_mm"] = list(self.joints_move_mm)
+        checks = {"images_used": self.images_located, "image_scatter": scatter} if scatter else {}
+        checks |= {"joints_move_mm": [*self.joints_move_mm]} if self.joints_move_mm else {}
         calibration = Calibration(
             self.mount,
             estimate.pose,

@@ -150,24 +150,19 @@ def calibration_lines(calibration: "Calibration", point: args.Point | None = Non
 
 def joint_lines(joints: Sequence["JointOffset"], file: object) -> Iterator[str]:
     """The offsets of an arm's joints in lines; `file` holds the calibration."""
-    most: dict[str, float] = {}
-    for joint in joints:
-        unit, times = joint.unit
-        offset, sigma = times * joint.offset, times * joint.sigma
-        if joint.open:
-            yield f"joint {joint.name}: not determined; {joint.open}"
-        else:
-            most[unit] = max(most.get(unit, 0.0), abs(offset) + 2 * sigma)
-        if joint.significant:
-            yield f"joint {joint.name}: add {offset:+.2f} {unit} (standard deviation {sigma:.2f})"
-    if any(joint.significant for joint in joints):
-        yield (
-            "joints: the camera is that of the corrected arm; correct its URDF: evercal export"
-            f" {file} --format corrected_urdf --urdf ROBOT.urdf"
-        )
-    elif most:
-        least = " or ".join(f"{value:.2f} {unit}" for unit, value in most.items())
-        yield f"joints: no offset above {least}"
+    rows = [(joint, *joint.unit) for joint in joints if not joint.open]
+    large = [row for row in rows if abs(row[0].offset) >= 2 * row[0].sigma]
+    for joint, unit, times in large:
+        sigma = f"standard deviation {times * joint.sigma:.2f}"
+        yield f"joint {joint.name}: add {times * joint.offset:+.2f} {unit} ({sigma})"
+    if large:
+        words = f"export {file} --format corrected_urdf --urdf ROBOT.urdf --out NEW.urdf"
+        yield f"joints: the camera is that of the corrected arm; correct its URDF: evercal {words}"
+    elif rows:
+        bounds = ((j.name, times * (abs(j.offset) + 2 * j.sigma), unit) for j, unit, times in rows)
+        most = ", ".join(f"{value:.2f} {unit} ({name})" for name, value, unit in bounds)
+        yield f"joints: no offset above {most}"
+    yield from (f"joint {j.name}: not determined; {j.open}" for j in joints if j.open)
 
 
 def _rig_lines(rig: "Rig", point: args.Point | None) -> Iterator[str]:

@@ -116,7 +116,6 @@ def calibration_page(
         camera_views=camera_views(calibration, images.surroundings) if uncertain else None,
         budget=error_budget(calibration),
         camera=camera_table(calibration),
-        joints=joint_table(calibration),
         residuals=residual_chart(calibration),
         uses=use_table(calibration),
         checks=check_table(calibration),
@@ -262,21 +261,6 @@ def camera_table(calibration: Calibration) -> Table:
         ]
         rows.insert(0, ("image size (px)", f"{camera.width}x{camera.height}", "-"))
     return Table(("intrinsics", "value", "standard deviation"), rows)
-
-
-def joint_table(calibration: Calibration) -> Table:
-    """The offsets of the arm's joints, and what would determine the others."""
-    rows = []
-    for joint in calibration.joints:
-        unit, times = joint.unit
-        numbers = f"{times * joint.offset:+.3f}", f"{times * joint.sigma:.3f}"
-        rows.append(
-            (f"{joint.name} ({unit})", *(("-", "-") if joint.open else numbers), joint.open)
-        )
-    caption = "Offsets, to be added to the values that the robot reports."
-    if moved := calibration.checks.get("joints_move_mm"):
-        caption += f" They move the gripper by {moved[0]:.2f} mm, at most {moved[1]:.2f} mm."
-    return Table(("joint", "offset", "standard deviation", "not determined"), rows, caption)
 
 
 def check_table(calibration: Calibration) -> Table:

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError, optional_module
+from evercal.geometry import SE3
 from evercal.recordings.poses.arm import Arm, Motion
 from evercal.recordings.poses.pose_track import times_around
 from evercal.recordings.poses.robot_poses import RobotPoses
@@ -56,8 +56,7 @@ class RobotModel:
         with library_errors(f"{path}: no usable URDF"):
             self._urdf = yourdfpy.URDF.load(str(self.path), **dict.fromkeys(plain, False))
             self.base_link = str(self._urdf.base_link)
-            named = [joint.name for joint in self._urdf.robot.joints]
-            refuse_repeated(named, "rename one of the joints")
+            refuse_repeated((joint.name for joint in self._urdf.robot.joints), "rename a joint")
             self._turned = set(_TURNED.findall(read_text(self.path, "URDF")))
         self.links = tuple(self._urdf.link_map)
         self._joint_above = {joint.child: joint for joint in self._urdf.robot.joints}
@@ -135,30 +134,26 @@ class RobotModel:
             before = before @ np.linalg.inv(origin) if backwards else before
         return Arm(tuple(names), tuple(chain), before)
 
-    def origins_with(self, offsets: Mapping[str, float]) -> dict[str, tuple[Array, bool]]:
+    def origins_with(self, offsets: Mapping[str, float]) -> dict[str, tuple[SE3, bool]]:
         """Origins of the joints that move by some values, with offsets of these values.
 
-        Returns (4, 4) and whether the joint rotates, by name; joints that mimic one of them are
-        among them. A program that gets the values without offsets then computes the poses of
+        Returns each origin and whether the joint rotates, by name; joints that mimic one of them
+        are among them. A program that gets the values without offsets then computes the poses of
         those with them.
         """
         moved = {}
         for joint in self._urdf.robot.joints:
-            if joint.type in _MOVING and (driver := self._driver(joint))[0] in offsets:
-                motion, step = np.eye(4), driver[1] * offsets[driver[0]] * self._axis(joint)
-                if rotates := joint.type != "prismatic":
-                    motion[:3, :3] = Rotation.from_rotvec(step).as_matrix()
-                else:
-                    motion[:3, 3] = step
-                moved[joint.name] = self._origin(joint) @ motion, rotates
+            name, factor, _ = self._driver(joint)
+            if joint.type in _MOVING and name in offsets:
+                step, rotates = factor * offsets[name], joint.type != "prismatic"
+                motion = np.kron((0, step) if rotates else (step, 0), self._axis(joint))
+                moved[joint.name] = SE3.from_matrix(self._origin(joint)) @ SE3.exp(motion), rotates
         return moved
 
     def _origin(self, joint: Any) -> Array:
         if joint.name in self._turned:
-            raise InputError(
-                f"{self.path}: joint {joint.name} is turned by quat_xyzw, which most programs"
-                " ignore; write rpy"
-            )
+            what = "turned by quat_xyzw, which most programs ignore; write rpy"
+            raise InputError(f"{self.path}: joint {joint.name} is {what}")
         return np.eye(4) if joint.origin is None else joint.origin
 
     def _axis(self, joint: Any) -> Array:
