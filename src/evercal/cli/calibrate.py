@@ -153,15 +153,14 @@ def joint_lines(joints: Sequence["JointOffset"], file: object) -> Iterator[str]:
     rows = [(joint, *joint.unit) for joint in joints if not joint.open]
     large = [row for row in rows if abs(row[0].offset) >= 2 * row[0].sigma]
     for joint, unit, times in large:
-        sigma = f"standard deviation {times * joint.sigma:.2f}"
-        yield f"joint {joint.name}: add {times * joint.offset:+.2f} {unit} ({sigma})"
+        offset, sigma = times * joint.offset, times * joint.sigma
+        yield f"joint {joint.name}: add {offset:+.2f} {unit} (standard deviation {sigma:.2f})"
     if large:
         words = f"export {file} --format corrected_urdf --urdf ROBOT.urdf --out NEW.urdf"
         yield f"joints: the camera is that of the corrected arm; correct its URDF: evercal {words}"
     elif rows:
-        bounds = ((j.name, times * (abs(j.offset) + 2 * j.sigma), unit) for j, unit, times in rows)
-        most = ", ".join(f"{value:.2f} {unit} ({name})" for name, value, unit in bounds)
-        yield f"joints: no offset above {most}"
+        bounds = [(times * (abs(j.offset) + 2 * j.sigma), unit, j.name) for j, unit, times in rows]
+        yield f"joints: no offset above {', '.join('%.2f %s (%s)' % row for row in bounds)}"
     yield from (f"joint {j.name}: not determined; {j.open}" for j in joints if j.open)
 
 

@@ -207,7 +207,7 @@ def test_lerobot_reports_corrected_degrees(tmp_path: Path, motors: Any) -> None:
     [
         ((JOINTS[2],), 100, "arm.json: has no homing_offset of a joint rail"),
         ((replace(JOINTS[2], name="wrist"),), 100, "of a joint wrist that turns"),
-        ((JOINTS[3],), 2040, "joint wrist has no room for its offset"),
+        ((JOINTS[3],), 2040, "offset of wrist would exceed 2047"),
         ((JOINTS[3],), "100", "has no homing_offset of a joint wrist"),
     ],
 )  # fmt: skip

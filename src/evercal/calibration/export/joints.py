@@ -22,10 +22,10 @@ _TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")
 
 def joint_offsets(export: Export) -> str:
     """Write offset, standard deviation and covariance; null where it is not determined."""
-    rows, _ = {}, _determined(export)
-    for joint in export.calibration.joints:
+    rows: dict[str, dict[str, object]] = {}
+    for joint in _determined(export) and export.calibration.joints:
         units = {"rad": 1.0, "deg": joint.unit[1]} if joint.is_angle else {"m": 1.0}
-        rows[joint.name] = row = {"open": joint.open}
+        row = rows.setdefault(joint.name, {"open": joint.open})
         for unit, times in units.items():
             row[f"offset_{unit}"] = None if joint.open else times * joint.offset
             row[f"sigma_{unit}"] = times * joint.sigma
@@ -98,8 +98,8 @@ def lerobot(export: Export) -> str:
             raise InputError(f"{file}: has no homing_offset of a joint {joint.name} that turns")
         row["homing_offset"] += sign * round(joint.unit[1] * joint.offset * _LEROBOT_TICKS)
         if sign < 0 and abs(row["homing_offset"]) > _FEETECH_MOST:
-            why = f"{joint.name} has no room for its offset: move its middle in LeRobot"
-            raise InputError(f"{file}: joint {why}, then record again")
+            what = f"the homing offset of {joint.name} would exceed {_FEETECH_MOST}"
+            raise InputError(f"{file}: {what}; calibrate it in LeRobot with another middle first")
     return json.dumps(record, indent=4) + "\n"
 
 
