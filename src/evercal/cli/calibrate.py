@@ -159,8 +159,9 @@ def joint_lines(joints: Sequence["JointOffset"], file: object) -> Iterator[str]:
         words = f"export {file} --format corrected_urdf --urdf ROBOT.urdf --out NEW.urdf"
         yield f"joints: the camera is that of the corrected arm; correct its URDF: evercal {words}"
     elif rows:
-        bounds = [(times * (abs(j.offset) + 2 * j.sigma), unit, j.name) for j, unit, times in rows]
-        yield f"joints: no offset above {', '.join('%.2f %s (%s)' % row for row in bounds)}"
+        most = [(times * (abs(j.offset) + 2 * j.sigma), unit, j.name) for j, unit, times in rows]
+        bounds = ", ".join(f"{value:.2f} {unit} ({name})" for value, unit, name in most)
+        yield f"joints: no offset above {bounds}"
     yield from (f"joint {j.name}: not determined; {j.open}" for j in joints if j.open)
 
 
