@@ -6,9 +6,11 @@ and gripper, and no image shows them. Every recording is also solved without joi
 """
 
 import tempfile
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -26,6 +28,7 @@ from evercal.recordings.poses.arm import Arm, Motion
 from evercal.simulation import panda_arm
 from evercal.simulation.box_room import look_at
 from evercal.simulation.cell_room import WORK_AREA_M, cell_room
+from evercal.simulation.virtual_cell import CellOptions, VirtualCell
 
 FIRST_SEED = 310
 """Seeds below it are for development."""
@@ -60,6 +63,8 @@ class Condition:
     """Play of each joint: it lags by half of it."""
     sag_deg: float = 0.0
     """Deflection of the second joint of a level arm by its weight."""
+    fixed: bool = False
+    """Whether a fixed camera sees a box in the gripper of the Panda, instead of a wrist camera."""
 
 
 CONDITIONS = {
@@ -73,6 +78,10 @@ CONDITIONS = {
     "six, 1 deg, backlash 0.5 deg": Condition("six", backlash_deg=0.5),
     "six, 1 deg, sag 0.5 deg": Condition("six", sag_deg=0.5),
     "five, 1 deg, backlash 0.5 deg": Condition("five", backlash_deg=0.5),
+    **{
+        f"panda, {offset:g} deg, fixed camera": Condition("panda", offset, fixed=True)
+        for offset in (0.0, 1.0, 3.0)
+    },
 }
 
 
@@ -169,52 +178,100 @@ def _joints(of: Robot, mount: SE3, count: int, rng: np.random.Generator) -> np.n
     return np.array(tour)
 
 
-def _measured(name: str, seed: int) -> list[Row]:
-    condition = CONDITIONS[name]
+class Recorded(NamedTuple):
+    """A recording of an arm with errors, and its truth."""
+
+    recording: Recording
+    parent_from_camera: SE3
+    offsets: np.ndarray
+    held_out: np.ndarray
+    """(HELD_OUT, k) true joint values of other poses."""
+    stated: np.ndarray
+    """(HELD_OUT, k) values that the robot reports there."""
+
+
+def record(condition: Condition, seed: int) -> Recorded:
+    """Draw a recording."""
     of, rng = robot(condition.robot), np.random.default_rng([seed, 5])
     arm, room, mount = of.arm, cell_room(seed), _mount(of, rng)
-    joints = _joints(of, mount, condition.images, rng)
-    held_out = _joints(of, mount, HELD_OUT, rng)
+    camera, cell = CAMERA, VirtualCell(seed, CellOptions())
+    cell.hold(True)
+    if condition.fixed:
+        camera, mount = cell.intrinsics, cell.truth.base_from_tripod
+        joints, held_out = (_near(cell.holding_poses(n, n)) for n in (condition.images, HELD_OUT))
+    else:
+        joints = _joints(of, mount, condition.images, rng)
+        held_out = _joints(of, mount, HELD_OUT, rng)
     offsets = np.deg2rad(condition.offset_deg) * rng.normal(size=len(arm.joints))
     offsets[[0, -1]] = 0
     stated, stated_out = (_stated(condition, v, offsets, rng) for v in (joints, held_out))
-
-    def image(pose: SE3) -> np.ndarray:
-        plain = room.render(CAMERA, pose)
-        return np.clip(plain + rng.normal(0, NOISE, plain.shape), 0, 255).astype(np.uint8)
-
     frames = []
-    for i, (pose, gripper) in enumerate(
-        zip(arm.poses(joints) @ mount, arm.poses(stated), strict=True)
-    ):
+    for i, (true, gripper) in enumerate(zip(arm.poses(joints), arm.poses(stated), strict=True)):
+        if condition.fixed:
+            plain = cell.render(mount, joints[i])
+        else:
+            plain = room.render(CAMERA, true @ mount)
         values = tuple(stated[i].tolist())
-        frames.append(Frame(f"{i:03d}", image(pose), CAMERA, None, gripper, joints_rad=values))
+        frames.append(
+            Frame(f"{i:03d}", _noisy(plain, rng), camera, None, gripper, joints_rad=values)
+        )
     recording = Recording("cell", tuple(frames), (), arm=arm)
-    fixed = look_at(WORK_AREA_M + np.array([0.1, -0.45, 0.5]), WORK_AREA_M, 0.05)
-    views = [image(fixed) for _ in range(FIXED_IMAGES)]
+    return Recorded(recording, mount, offsets, held_out, stated_out)
+
+
+def _near(poses: SE3) -> np.ndarray:
+    """Joint values of the Panda (n, 7) at poses (n,), each near the one before."""
+    values = [panda_arm.HOME_RAD]
+    for pose in poses:
+        values.append(panda_arm.joints_for(pose, values[-1]))
+    return np.array(values[1:])
+
+
+def _noisy(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return np.clip(image + rng.normal(0, NOISE, image.shape), 0, 255).astype(np.uint8)
+
+
+def _measured(name: str, seed: int) -> list[Row]:
+    condition = CONDITIONS[name]
+    drawn = record(condition, seed)
     rows: list[Row] = []
     for method in ("joint offsets", "poses only"):
         row: Row = {"condition": name, "seed": seed, "method": method}
-        row["gripper_before_mm"] = _gripper_mm(arm, held_out, stated_out)
+        arm = robot(condition.robot).arm
+        row["gripper_before_mm"] = _gripper_mm(arm, drawn.held_out, drawn.stated)
         rows.append(row)
-        given = recording if method == "joint offsets" else replace(recording, arm=None)
+        recording = drawn.recording
+        recording = recording if method == "joint offsets" else replace(recording, arm=None)
+        began = time.process_time()
         with tempfile.TemporaryDirectory() as folder:
             cell = Map.open(Path(folder) / "map")
             try:
-                learned = cell.learn(given, on_progress=lambda *_: None)
-                camera = cell.calibrate(views, camera=CAMERA).uncertain_pose
+                if condition.fixed:
+                    answer = cell.eye_to_hand(recording, on_progress=lambda *_: None)
+                else:
+                    cell.learn(recording, on_progress=lambda *_: None)
+                    answer = cell.calibration()
+                    row |= _of_another_camera(cell, seed)
             except InputError as error:
                 row["refused"] = str(error)
                 continue
-        assert learned.hand_eye is not None
-        row |= pose_error(learned.hand_eye.parent_from_camera, mount)
-        row |= {f"fixed_{key}": value for key, value in pose_error(camera, fixed).items()}
-        row["seconds"] = learned.seconds
+        row |= pose_error(answer.uncertain_pose, drawn.parent_from_camera)
+        row["seconds"] = time.process_time() - began
         if method == "joint offsets":
-            row |= _offset_error(learned.hand_eye.calibration(CAMERA, "cell", 0), offsets)
-            corrected = stated_out + [joint.offset for joint in learned.hand_eye.joints]
-            row["gripper_after_mm"] = _gripper_mm(arm, held_out, corrected)
+            row |= _offset_error(answer, drawn.offsets)
+            corrected = drawn.stated + [joint.offset for joint in answer.joints]
+            row["gripper_after_mm"] = _gripper_mm(arm, drawn.held_out, corrected)
     return rows
+
+
+def _of_another_camera(cell: Map, seed: int) -> Row:
+    """Error of a fixed camera in the learned map."""
+    rng = np.random.default_rng([seed, 6])
+    truth = look_at(WORK_AREA_M + np.array([0.1, -0.45, 0.5]), WORK_AREA_M, 0.05)
+    plain = cell_room(seed).render(CAMERA, truth)
+    views = [_noisy(plain, rng) for _ in range(FIXED_IMAGES)]
+    error = pose_error(cell.calibrate(views, camera=CAMERA).uncertain_pose, truth)
+    return {f"fixed_{key}": value for key, value in error.items()}
 
 
 def _stated(
@@ -262,8 +319,9 @@ def summary(rows: list[Row]) -> list[Row]:
             return float(np.median([float(row[name]) for row in of if name in row]))
 
         line |= {name: median(name) for name in ("gripper_before_mm", "mm", "deg", "sigma_mm")}
-        line |= {name: median(name) for name in ("fixed_mm", "fixed_deg")}
-        for prefix in ("", "fixed_"):
+        another = any("fixed_mm" in row for row in solved)
+        line |= {name: median(name) for name in ("fixed_mm", "fixed_deg") if another}
+        for prefix in ("", "fixed_")[: 1 + another]:
             squared = [float(row[f"{prefix}squared_mahalanobis"]) for row in solved]
             line |= {
                 f"{prefix}inside_95": share_inside(squared),

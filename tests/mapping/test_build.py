@@ -180,6 +180,10 @@ def test_landmarks_are_tracked_again_after_noticeable_changes(
         weight=np.ones(10),
         covariance=zero,
         inverse_depth=np.full(7, 0.5),
+        offsets=np.zeros(0),
+        offsets_covariance=np.zeros((0, 0)),
+        offsets_prior=np.zeros(0),
+        offsets_known=np.zeros(0, dtype=bool),
     )
     assert _moved(stated, CAMERA, adjustment) == noticeable
 

@@ -146,8 +146,10 @@ def learn_scene(
         hand_eye = hand_eye_report(start, built, used, gripper_from_camera)
         if mount == "eye_to_hand":
             others = [frame for frame in whole if frame.name not in built.keyframe_names]
-            localizer = Localizer(contents.empty().with_scene(scene))
-            hand_eye = with_image_scatter(hand_eye, localizer, others or whole)
+            localizer, shown = Localizer(contents.empty().with_scene(scene)), others or whole
+            if built.hand_eye is not None and built.hand_eye.arm is not None:
+                shown = built.hand_eye.arm.moved(shown, mount)
+            hand_eye = with_image_scatter(hand_eye, localizer, shown)
         report = replace(report, hand_eye=hand_eye)
     return scene, report
 
