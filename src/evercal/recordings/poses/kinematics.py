@@ -60,18 +60,13 @@ class RobotModel:
             for names in (self.links, [joint.name for joint in joints]):
                 refuse_repeated(names, "give each link and each joint its own name")
             refuse_repeated((joint.child for joint in joints), "a link is below one joint at most")
-            used = {link for joint in joints for link in (joint.parent, joint.child)}
-            if unknown := used - {*self.links}:
-                raise ValueError(f"joints name links that are not in it: {', '.join(unknown)}")
             roots = [link for link in self.links if link not in self._joint_above]
-            if not roots:
-                raise ValueError("no link is the root")
-            self.base_link = roots[0]
+            self.base_link = [*roots, *self.links][0]
             # Of the readers pinocchio alone heeds quat_xyzw, and yourdfpy does not keep it.
             tree = etree.parse(str(self.path), etree.XMLParser(recover=True))
-            for numbers in tree.xpath("/robot/joint/*/@xyz | /robot/joint/*/@rpy"):
-                if len(numbers.split()) != 3:
-                    raise ValueError(f"'{numbers}' are not three numbers")
+            for text in tree.xpath("/robot/joint/*/@xyz | /robot/joint/*/@rpy"):
+                if np.isfinite(list(map(float, text.split()))).sum() != 3:
+                    raise ValueError(f"'{text}' are not three finite numbers")
             self._turned = set(tree.xpath("/robot/joint[origin/@quat_xyzw]/@name"))
 
     def has_joint(self, name: str) -> bool:
@@ -140,8 +135,6 @@ class RobotModel:
                 kind = what if joint.name in self._turned else f"{joint.type}; not supported"
                 raise InputError(f"{self.path}: joint {joint.name} is {kind}")
             origin = np.eye(4) if joint.origin is None else joint.origin
-            if not np.isfinite(origin).all():
-                raise InputError(f"{self.path}: the origin of joint {joint.name} is not finite")
             before = before if backwards else before @ origin
             if joint.type in _MOVING:
                 name, factor, constant = self._driver(joint)
@@ -173,8 +166,6 @@ class RobotModel:
                 )
             joint = other
             passed.append(joint.name)
-        if not np.isfinite([factor, constant]).all():
-            raise InputError(f"{self.path}: joint {passed[0]} mimics by numbers not finite")
         return joint.name, factor, constant
 
     def rotates(self, name: str) -> bool:
