@@ -81,7 +81,7 @@ class Check(args.Verb):
         from evercal.calibration.drift import shift_of
         from evercal.map import Map
 
-        if len(self.images) > 1 or self.robot_poses is not None:
+        if len(self.images) != 1 or self.robot_poses is not None:
             raise InputError("to check an arm, give one recording with joint values and no poses")
         reading = args.Reading(None, self.camera, gripper_frame=self.gripper_frame, urdf=self.urdf)
         recording = replace(reading, pose_convention=self.convention).recording(self.images[0])

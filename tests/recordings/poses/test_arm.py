@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.arm import Arm
@@ -39,9 +40,9 @@ def robot(folder: Path, *parts: str, links: str = "abcd") -> RobotModel:
     return RobotModel(file)
 
 
-def turned(*, by: float, about: tuple[float, float, float] = (0, 0, 1)) -> SE3:
+def turned(*, by: float, about: ArrayLike = (0, 0, 1)) -> SE3:
     """A rotation."""
-    return SE3.exp([0, 0, 0, *(by * np.array(about))])
+    return SE3.exp([0, 0, 0, *(by * np.asarray(about))])
 
 
 def along() -> SE3:
@@ -85,7 +86,7 @@ def test_length_of_an_axis_is_no_scale(tmp_path: Path, length: float) -> None:
     axis = f"0 {0.6 * length} {0.8 * length}"
     way = np.array([0, 0.6, 0.8]) * np.sign(length)
     turn = robot(tmp_path, joint("j", "ab", axis=axis)).arm("a", "b")
-    assert_pose(turn, [0.7], along() @ turned(by=0.7, about=tuple(way)))
+    assert_pose(turn, [0.7], along() @ turned(by=0.7, about=way))
     slide = robot(tmp_path, joint("j", "ab", axis=axis, kind="prismatic")).arm("a", "b")
     assert_pose(slide, [0.7], along() @ SE3.exp([*(0.7 * way), 0, 0, 0]))
 

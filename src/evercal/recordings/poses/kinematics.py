@@ -157,9 +157,7 @@ class RobotModel:
             factor *= joint.mimic.multiplier
             other = self._urdf.joint_map.get(joint.mimic.joint)
             if other is None or other.name in passed or other.type not in _MOVING:
-                why = (
-                    "mimics it" if joint.mimic.joint in passed else "is no moving joint of the URDF"
-                )
+                why = "mimics it" if joint.mimic.joint in passed else "is no moving joint of it"
                 raise InputError(
                     f"{self.path}: joint {joint.name} mimics {joint.mimic.joint}, which {why};"
                     " correct the URDF"
