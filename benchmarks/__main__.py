@@ -17,6 +17,7 @@ VERBS = {
     "handeye": ("hand_eye", "pose pairs: errors, ellipsoids, outliers, scale, time"),
     "boards": ("boards", "detection of rendered boards, beside the finders of OpenCV"),
     "handeye-boards": ("hand_eye_boards", "boards and intrinsics from the same images"),
+    "kinematics": ("kinematics", "poses of links of URDFs, beside pin and urchin"),
     "next-views": ("next_views", "poses of a wrist recording until a stated accuracy"),
     "virtual-cell": ("virtual_cell", "record, learn and calibrate virtual cells"),
     "mistakes": ("mistakes", "mistakes in pose files, and clean recordings"),

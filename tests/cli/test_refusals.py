@@ -49,7 +49,7 @@ REFUSED = {
     "calibrate MAP black.png": "0 of 1 images were located",
     "calibrate NETWORKS image.png": STRANGER,
     "check MAP image.png --reference none.json": "calibration file is missing",
-    "check MAP empty --reference none.json": "no images in this folder",
+    "check MAP empty --reference none.json": "calibration file is missing",
     "evaluate MAP": "no scene given",
     "evaluate MAP none": "none: no such folder",
     "evaluate MAP ROOM": "scene 'box-room-42' is not in the store",

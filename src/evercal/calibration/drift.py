@@ -79,13 +79,14 @@ def check(
     base_from_gripper: SE3 | None = None,
 ) -> Shift:
     """Test whether a camera has moved since its calibration, see `Map.check`."""
+    _require_fixed(reference)
     located = locate(localizer, images, camera or reference.camera, on_image)
     if shows_held_thing(localizer, located, base_from_gripper) and base_from_gripper is not None:
         if (another := held_again(located, base_from_gripper)) is not None:
             calibration = another.solution.calibration()
             now, uses = calibration.uncertain_pose, calibration.images
             covariance = now.covariance + reference.covariance
-            return _shift(reference, now.pose, covariance, CONFIDENCE, uses, another.sentence)
+            return shift_of(reference, now.pose, covariance, CONFIDENCE, uses, another.sentence)
         # The lens errs now as it did then. The map does not: the thing is seen from another side.
         located = in_parent_frame(of_cause(located, lens=False), base_from_gripper)
         shift = shift_between(reference, fuse(located), located, localizer)
@@ -102,6 +103,7 @@ def shift_between(
     confidence: float = CONFIDENCE,
 ) -> Shift:
     """Compare `fused`, the pose of a camera now from `located` images, with its calibration."""
+    _require_fixed(reference)
     scene = localizer.contents.metric_scene(fused.scene)
     same = reference.source.get("map") == scene.digest
     count = int(fused.used.sum())
@@ -119,25 +121,29 @@ def shift_between(
         used = [item.covariance for item in fused.select(located)]
         covariance = _scatter(measured) / count + floor
         covariance = covariance + reference.covariance + np.mean(used, axis=0)
-    return _shift(reference, fused.pose, covariance, confidence, fused.uses, same_map=same)
+    return shift_of(reference, fused.pose, covariance, confidence, fused.uses, same_map=same)
 
 
-def _shift(
-    reference: Calibration,
-    pose: SE3,
-    covariance: Array,
-    confidence: float,
-    images: tuple[ImageUse, ...],
-    note: str = "",
-    same_map: bool = False,
-) -> Shift:
-    from scipy import stats
-
+def _require_fixed(reference: Calibration) -> None:
     if reference.mount != "eye_to_hand":
         raise InputError(
             "the reference is a camera on the gripper, whose pose in the base changes with every"
-            " move; give the calibration of a camera that stands still"
+            " move; give the calibration of a camera that stands still, or one with joint offsets"
         )
+
+
+def shift_of(
+    reference: Calibration,
+    pose: SE3,
+    covariance: Array,
+    confidence: float = CONFIDENCE,
+    images: tuple[ImageUse, ...] = (),
+    note: str = "",
+    same_map: bool = False,
+) -> Shift:
+    """The shift of a camera that is now at `pose`; covariance (6, 6) is of their difference."""
+    from scipy import stats
+
     off = deviations(SE3.stack([pose]), reference.parent_from_child)[0]
     probability = float(stats.chi2.cdf(off @ np.linalg.solve(covariance, off), 6))
     millimetres, degrees = length_mm_deg(off)

@@ -1,16 +1,20 @@
 """`evercal check`."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
 from evercal.cli import args
+from evercal.errors import InputError
 from evercal.progress import progress_bar
-from evercal.reports.answers import check_record
+from evercal.reports.answers import check_record, shift_dict
 
 if TYPE_CHECKING:
+    from evercal.calibration.calibration import Calibration
     from evercal.calibration.drift import Shift
 
 Reference = Annotated[
@@ -22,19 +26,28 @@ Reference = Annotated[
 class Check(args.Verb):
     """Test whether a fixed camera has moved since it was calibrated; exit code 1 if it has.
 
+    A reference with joint offsets and a new recording of the arm, with joint values: test which
+    joints have changed. The recording is learned apart; the map stays as it is.
+
     Example: evercal check cell.evercal now.png --reference tripod.json
     """
 
     store: args.Store
     images: args.ImageFiles
-    """New images of one camera, or a folder of them; five or more reveal smaller shifts."""
+    """New images of one camera, or a folder of them; five or more reveal smaller shifts. Of an arm,
+    a recording."""
     reference: Reference
     robot_poses: args.File = None
     """base_from_gripper of every image, where the scene is a thing in the gripper."""
     convention: args.Name = None
     """Format of the robot poses, if the file does not state it."""
     camera: args.File = None
-    """Intrinsics. Default: those of the reference."""
+    """Intrinsics. Default: those of the reference, or of the recording."""
+    urdf: args.File = None
+    """URDF of the arm, for recordings without one. Before a fixed camera it asks for a check of the
+    arm that holds the thing."""
+    gripper_frame: args.Frame = None
+    """Link of the URDF that is the gripper. Default: its only end."""
 
     def run(self) -> int:
         from evercal.calibration.calibration import read_calibration
@@ -42,8 +55,11 @@ class Check(args.Verb):
         from evercal.calibration.from_images import Images
         from evercal.recordings.image_files import image_files
 
-        files = image_files(self.images)
         reference = read_calibration(self.reference)
+        on_arm = reference.mount == "eye_in_hand" and reference.joints
+        if on_arm or self.urdf is not None or self.gripper_frame is not None:
+            return self._check_arm(reference)
+        files = image_files(self.images)
         camera = args.camera_for(self.camera, files)
         given = Images.of(files, camera, self.robot_poses, self.convention)
         images, poses = given.images, given.base_from_gripper
@@ -59,6 +75,31 @@ class Check(args.Verb):
             then=("calibrate", self.store, *self.images[:1]) if shift.moved else (),
         )
         return 1 if shift.moved else 0
+
+    def _check_arm(self, reference: "Calibration") -> int:
+        from evercal.calibration.arm_change import arm_change
+        from evercal.calibration.drift import shift_of
+        from evercal.map import Map
+
+        if len(self.images) != 1 or self.robot_poses is not None:
+            raise InputError("to check an arm, give one recording with joint values and no poses")
+        reading = args.Reading(None, self.camera, gripper_frame=self.gripper_frame, urdf=self.urdf)
+        recording = replace(reading, pose_convention=self.convention).recording(self.images[0])
+        with TemporaryDirectory() as folder:
+            new = Map.open(Path(folder) / "map")
+            (new.learn if reference.mount == "eye_in_hand" else new.eye_to_hand)(recording)
+            now = new.calibration()
+        confidence, changed, joints = arm_change(reference, now)
+        shift = shift_of(reference, now.parent_from_child, reference.covariance + now.covariance)
+        moved = f"Changed joints: {', '.join(changed)} (confidence {100 * confidence:.1f} %)."
+        lines = [moved if changed else "No joint has changed.", shift_line(shift)]
+        for joint in joints:
+            size, unit = (180 / math.pi, "deg") if joint.is_angle else (1000, "mm")
+            sigma = joint.open or f"standard deviation {size * joint.sigma:.3f} {unit}"
+            lines.append(f"  {joint.name}  {size * joint.offset:+.3f} {unit}: {sigma}")
+        record = {"confidence": confidence, "changed": changed, "joints": [*map(vars, joints)]}
+        self.answer({**record, "camera": shift_dict(shift)}, *lines)
+        return 1 if changed or shift.moved else 0
 
 
 def shift_line(shift: "Shift") -> str:

@@ -5,7 +5,6 @@ are radians, or degrees if a name ends in `_deg`, and metres for prismatic joint
 """
 
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -34,10 +33,6 @@ _MOVING = ("revolute", "continuous", "prismatic")
 _LARGEST_RAD = 4 * np.pi
 _UNITS = ("deg", "rad", "m")
 _STILL_RAD = 0.001
-_TURNED = re.compile(
-    r"<joint[^>]*\bname=\"([^\"]*)\"(?:(?!</joint>).)*?<origin[^>]*quat_xyzw", re.S
-)
-"""Name of a joint whose origin has a quaternion, which pinocchio alone reads."""
 _JSON = "an object with 'joint_names', 'positions' and optionally 'images' or 'stamps_s'"
 
 
@@ -48,18 +43,32 @@ class RobotModel:
         self.path = Path(path)
         need = f"{path}: reading a URDF needs yourdfpy"
         yourdfpy = optional_module("yourdfpy", need, "urdf")
+        etree = optional_module("lxml.etree", need, "urdf")
         if not self.path.is_file():
             raise InputError(f"{path}: no such URDF file")
         if self.path.suffix == ".xacro":
             raise InputError(f"{path}: is a macro file; make a URDF of it with 'xacro' first")
-        plain = ("load_meshes", "load_collision_meshes", "build_collision_scene_graph")
+        # Its scene graph fails where a part of no interest is wrong.
+        plain = ("load_meshes", "load_collision_meshes", "build_scene_graph")
         with library_errors(f"{path}: no usable URDF"):
+            if "</robot" not in read_text(self.path, "URDF"):
+                # Else the parts before a cut would be read as the whole.
+                raise ValueError("it does not end with </robot>, so a part is missing")
             self._urdf = yourdfpy.URDF.load(str(self.path), **dict.fromkeys(plain, False))
-            self.base_link = str(self._urdf.base_link)
-            refuse_repeated((joint.name for joint in self._urdf.robot.joints), "rename a joint")
-            self._turned = set(_TURNED.findall(read_text(self.path, "URDF")))
-        self.links = tuple(self._urdf.link_map)
-        self._joint_above = {joint.child: joint for joint in self._urdf.robot.joints}
+            self.links = tuple(link.name for link in self._urdf.robot.links)
+            joints = self._urdf.robot.joints
+            self._joint_above = {joint.child: joint for joint in joints}
+            for names in (self.links, [joint.name for joint in joints]):
+                refuse_repeated(names, "give each link and each joint its own name")
+            refuse_repeated((joint.child for joint in joints), "a link is below one joint at most")
+            roots = [link for link in self.links if link not in self._joint_above]
+            self.base_link = [*roots, *self.links][0]
+            # Of the readers pinocchio alone heeds quat_xyzw, and yourdfpy does not keep it.
+            tree = etree.parse(str(self.path), etree.XMLParser(recover=True))
+            for text in tree.xpath("/robot/joint/*/@xyz | /robot/joint/*/@rpy"):
+                if np.isfinite(list(map(float, text.split()))).sum() != 3:
+                    raise ValueError(f"'{text}' are not three finite numbers")
+            self._turned = set(tree.xpath("/robot/joint[origin/@quat_xyzw]/@name"))
 
     def has_joint(self, name: str) -> bool:
         """Whether the URDF has a joint of this name."""
@@ -114,6 +123,8 @@ class RobotModel:
     def arm(self, base: str, gripper: str) -> Arm:
         """The chain between two links; its joint values are those that others do not mimic."""
         up, down = self._ancestors(base), self._ancestors(gripper)
+        if (up[-1].parent if up else base) != (down[-1].parent if down else gripper):
+            raise InputError(f"{self.path}: no joints connect {base} and {gripper}; name others")
         steps = [(joint, True) for joint in up if joint not in down]
         steps += [(joint, False) for joint in reversed(down) if joint not in up]
         names: list[str] = []
@@ -170,10 +181,11 @@ class RobotModel:
             constant += factor * joint.mimic.offset
             factor *= joint.mimic.multiplier
             other = self._urdf.joint_map.get(joint.mimic.joint)
-            if other is None or other.name in passed:
+            if other is None or other.name in passed or other.type not in _MOVING:
+                why = "mimics it" if joint.mimic.joint in passed else "is no moving joint of it"
                 raise InputError(
-                    f"{self.path}: joint {joint.name} mimics {joint.mimic.joint}, which"
-                    f" {'the URDF lacks' if other is None else 'mimics it'}; correct the URDF"
+                    f"{self.path}: joint {joint.name} mimics {joint.mimic.joint}, which {why};"
+                    " correct the URDF"
                 )
             joint = other
             passed.append(joint.name)
@@ -209,6 +221,8 @@ class RobotModel:
         while link in self._joint_above:
             joints.append(self._joint_above[link])
             link = joints[-1].parent
+            if len(joints) > len(self.links):
+                raise InputError(f"{self.path}: the joints above link {link} form a circle")
         return joints
 
 
