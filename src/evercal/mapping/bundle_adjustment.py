@@ -2,7 +2,7 @@
 
 Unknown are the inverse depth of every landmark, a correction of every frame's pose, one transform
 common to all frames (an error of `gripper_from_camera`), a constant time shift between poses and
-images, the intrinsics, and, where the joint values of an arm are known, their offsets. Gaussian
+images, and the intrinsics. Where joint values of an arm are stated, so are their offsets. Gaussian
 priors tie them to the stated values. The variances of the priors are estimated from the recording
 (variance components: Foerstner and Wrobel, Photogrammetric Computer Vision, 2016, section 4.2.4;
 relevance of single parameters: MacKay, Bayesian interpolation, 1992). So parameters that the images
