@@ -59,7 +59,7 @@ def run(
     out: Path = Path("runs/fisheye"),
     rooms: int = 6,
     lenses: tuple[str, ...] = ("pinhole", "150", "180"),
-    furnished: bool = False,
+    furnished: int = 0,
 ) -> None:
     """Learn rooms through each lens, and ask for images of every lens.
 
@@ -67,10 +67,10 @@ def run(
         out: Folder of the rows; complete rooms are not repeated.
         rooms: Number of box rooms.
         lenses: pinhole, or the angle that a fisheye covers along the width, degrees.
-        furnished: Whether three furnished rooms are rendered as well.
+        furnished: Number of furnished rooms, which are rendered as well.
     """
     rows: list[Row] = []
-    places = [("box", FIRST_SEED + i) for i in range(rooms)] + [*FURNISHED] * furnished
+    places = [("box", FIRST_SEED + i) for i in range(rooms)] + [*FURNISHED[:furnished]]
     for kind, seed in tqdm(places, unit="room"):
         for name in lenses:
             file = out / f"{kind}-{seed}-{name}.json"
