@@ -246,6 +246,14 @@ TABLES: dict[str, Callable[[], Table]] = {
     "boards: detection": _rows("board,tilt_deg,finder,found,any_of_opencv,rms_px,ms", "boards"),
     "results: cameras from images": _trials,
     "handeye: bumps": _bump,
+    "joints: arms": _rows(
+        "condition,method,draws,refused,gripper_before_mm,gripper_after_mm,mm,deg,sigma_mm,"
+        "inside_95,fixed_mm,fixed_deg,fixed_inside_95,offset_deg,offset_inside_95,offset_squared",
+        "joint-offsets",
+    ),
+    "fisheye: lenses": _rows(
+        "answer,rooms,map,asked,number,located,mm,mm_90,inside_95,wrong", "fisheye"
+    ),
     "intrinsics: another camera of the model": _rows(
         "answer,camera,stated,answers,located,median_mm,95_%_mm,sigma_mm,inside_95_%,wrong",
         "same-model",
