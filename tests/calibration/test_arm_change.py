@@ -70,7 +70,7 @@ def test_other_arms_and_open_offsets_are_refused() -> None:
     with pytest.raises(InputError, match=r"\[pan, lift, elbow, wrist\], the recording of \[a, b"):
         arm_change(one, calibration([0, 0, 0, 0], ("a", "b", "c", "d")))
     with pytest.raises(InputError, match=r"recording of \[\]: give a recording of the same arm"):
-        arm_change(one, replace(one, joints=()))
+        arm_change(one, replace(one, joints=(), joint_covariance=np.zeros((0, 0))))
     still = replace(one, joints=tuple(replace(joint, open="x") for joint in one.joints))
     with pytest.raises(InputError, match="no joint's offset is determined in both"):
         arm_change(one, still)

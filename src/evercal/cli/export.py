@@ -55,7 +55,9 @@ class Export(args.Verb):
     """For corrected_urdf: URDF of the arm that was recorded."""
     lerobot_calibration: args.File = None
     """For lerobot: the calibration file of the arm."""
-    lerobot_motors: Literal["feetech", "dynamixel"] | None = None
+    lerobot_motors: Annotated[
+        Literal["feetech", "dynamixel"] | None, args.shown("feetech|dynamixel")
+    ] = None
     """For lerobot: feetech (SO-100, SO-101) or dynamixel (Koch, OMX)."""
 
     def run(self) -> int:

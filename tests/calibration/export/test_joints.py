@@ -130,7 +130,7 @@ def test_offsets_of_zero_leave_the_poses(tmp_path: Path) -> None:
         (('"wrist" type="continuous"', '"wrist" type="fixed"'), "has no revolute joint wrist"),
         (('"pan" type="revolute"', '"p" type="revolute"'), "has no revolute joint pan"),
         (('<axis xyz="0 1 0"/>', '<mimic joint="pan"/>'), "has no revolute joint wrist"),
-        (('name="flange"', 'name="wrist"'), "'wrist' comes twice; rename a joint"),
+        (('name="flange"', 'name="wrist"'), "'wrist' comes twice; give each link and each joint"),
         (('xyz="0.1 0 0"', 'quat_xyzw="0 0 0 1"'), "joint rail is turned by quat_xyzw"),
     ],
 )  # fmt: skip
