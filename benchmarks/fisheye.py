@@ -134,9 +134,8 @@ def _room(kind: str, seed: int, name: str, lenses: tuple[str, ...]) -> list[Row]
         for asked in lenses:
             shown = _test_images(kind, seed, asked)
             for i, (image, at) in enumerate(zip(shown, tests, strict=True)):
-                found = cell.localize(noisy(image), lens(asked))
-                answer = found.uncertain_pose if found.status == "ok" else None
-                add("image", asked, {} if answer is None else pose_error(answer, at))
+                found = cell.localize(noisy(image), lens(asked)).uncertain_pose
+                add("image", asked, {} if found is None else pose_error(found, at))
                 if asked == name and i % 5 == 0:
                     again = [noisy(image) for _ in range(REPEATS)]
                     error: Row = {}
