@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3
-from evercal.mapping.arm_offsets import ArmOffsets, joint_slopes
+from evercal.mapping.arm_offsets import ArmOffsets
 from evercal.mapping.build import MapOptions
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment
 from evercal.recordings.frame import Frame, Mount
@@ -51,7 +51,7 @@ def adjusted(offsets_deg: tuple[float, ...], mount: Mount, moving: int = 5) -> A
         Frame(str(i), np.zeros((1, 1, 3), np.uint8), CAMERA, pose, gripper, joints_rad=tuple(q))
         for i, (pose, gripper, q) in enumerate(zip(restated, stated, joints - offsets, strict=True))
     ]
-    begun = ArmOffsets.start(ARM, np.zeros(5))
+    begun = ArmOffsets.start(ARM, mount, np.zeros(5))
     options = replace(MapOptions().for_hand_eye(mount).bundle, intrinsics=False)
     return BundleAdjustment(
         restated,
@@ -59,7 +59,7 @@ def adjusted(offsets_deg: tuple[float, ...], mount: Mount, moving: int = 5) -> A
         np.zeros((FRAMES, 6)),
         options,
         SE3.stack([camera] * FRAMES) if wrist else restated,
-        joint_slopes(begun, frames, mount),
+        begun.slopes(frames),
     ).solve(made.tracks)
 
 
@@ -90,13 +90,28 @@ def test_an_offset_that_no_image_shows_is_as_uncertain_as_that_of_others() -> No
 def test_frames_keep_the_transform_of_gripper_and_camera() -> None:
     joints = np.array([0.1, 0.2, -0.3, 0.4, 0.5])
     gripper = ARM.poses(joints[None])[0]
-    offsets = ArmOffsets.start(ARM, np.full(5, 0.02))
+    offsets = ArmOffsets.start(ARM, "eye_in_hand", np.full(5, 0.02))
     frame = Frame("a", np.zeros((1, 1, 3), np.uint8), CAMERA, gripper @ MOUNT, gripper)
-    (same,) = offsets.moved([frame], "eye_in_hand")
+    (same,) = offsets.moved([frame])
     assert same is frame
-    (moved,) = offsets.moved([replace(frame, joints_rad=tuple(joints))], "eye_in_hand")
+    (moved,) = offsets.moved([replace(frame, joints_rad=tuple(joints))])
     assert moved.base_from_gripper is not None
     assert moved.base_from_camera is not None
     change = moved.base_from_gripper.inverse() @ moved.base_from_camera
     assert np.allclose(change.matrix(), MOUNT.matrix())
     assert np.allclose(moved.base_from_gripper.matrix(), ARM.poses(joints[None] + 0.02)[0].matrix())
+
+
+def test_a_fixed_camera_keeps_its_place_in_the_base() -> None:
+    joints = np.array([0.1, 0.2, -0.3, 0.4, 0.5])
+    gripper, camera = ARM.poses(joints[None])[0], SE3.from_translation((1.0, 0.2, 0.5))
+    offsets = ArmOffsets.start(ARM, "eye_to_hand", np.full(5, 0.02))
+    pose = gripper.inverse() @ camera
+    image = np.zeros((1, 1, 3), np.uint8)
+    (moved,) = offsets.moved(
+        [Frame("a", image, CAMERA, pose, gripper, joints_rad=tuple(joints.tolist()))]
+    )
+    assert moved.base_from_gripper is not None
+    assert moved.base_from_camera is not None
+    place = moved.base_from_gripper @ moved.base_from_camera
+    assert np.allclose(place.matrix(), camera.matrix())

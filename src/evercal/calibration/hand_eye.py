@@ -146,8 +146,8 @@ def posed_by_gripper(
                 " calibrates a fixed camera by a thing in the gripper"
             )
         raise InputError(f"{recording.name}: {error}{hint}") from None
-    if arm is not None:
-        frames = tuple(ArmOffsets.start(arm, start.offsets).moved(frames, mount))
+    if start.arm is not None:
+        frames = tuple(start.arm.moved(frames))
     poses = scene_from_parent(frames, mount) @ start.parent_from_camera
     if mount == "eye_to_hand" and (around := windows(frames, start)) is not None:
         frames = tuple(cropped(*both) for both in zip(frames, around, strict=True))

@@ -12,7 +12,7 @@ thing that the gripper holds, with the inverse poses.
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +27,8 @@ from evercal.features.sift import epipolar_pair, sift_features
 from evercal.features.views import working_image
 from evercal.features.vlad import similar_pairs
 from evercal.geometry import SE3, Camera, cross_matrix
+from evercal.mapping.arm_offsets import ArmOffsets
+from evercal.mapping.bundle_adjustment import BundleOptions
 from evercal.mapping.selection import spread_poses
 from evercal.processes import cores
 from evercal.progress import OnProgress
@@ -45,7 +47,7 @@ LEAST_ROTATION_DEG, LEAST_PAIRS = 5.7, 6
 """Root mean square angle between frames about each of two axes, and pairs that must agree."""
 SPREAD_M: dict[Mount, float] = {"eye_in_hand": 0.2, "eye_to_hand": 2.0}
 """Standard deviation of the position of the camera before any image."""
-JOINT_SPREAD = np.deg2rad(3.0)
+JOINT_SPREAD = np.deg2rad(BundleOptions().joint_sigma_deg)
 """Standard deviation of the offset of a joint, radians or metres."""
 DEPTHS_M = (0.3, 0.6, 1.2, 2.4)
 """First distances between a fixed camera and the gripper."""
@@ -89,8 +91,8 @@ class HandEyeStart:
     """The pairs that agree."""
     distance_deg: float = 0.0
     """Median angle of matches from their epipolar planes, median of the pairs."""
-    offsets: Array = field(default_factory=lambda: np.zeros(0))
-    """(k,) first offsets of the joints of an arm."""
+    arm: ArmOffsets | None = None
+    """First offsets of the joints, where joint values are stated."""
 
 
 class Joints(NamedTuple):
@@ -190,7 +192,7 @@ def solve_pairs(
         len(pairs),
         tuple(pair for pair, good in zip(pairs, agree, strict=True) if good),
         float(np.rad2deg(np.median(distance))),
-        best[6:] if joints is None else best[6:] * joints.arm.free(),
+        joints and ArmOffsets.start(joints.arm, mount, best[6:] * joints.arm.free()),
     )
 
 

@@ -10,7 +10,6 @@ from evercal.geometry import SE3, Camera
 from evercal.learning.stated_scatter import with_scatter
 from evercal.localization.acceptance import differ
 from evercal.localization.localizer import Localizer
-from evercal.mapping.arm_offsets import ArmOffsets
 from evercal.mapping.build import Adjusted, MapOptions, build_map
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -93,12 +92,7 @@ def learn_scene(
         from evercal.calibration.hand_eye import posed_by_gripper
 
         recording, start = posed_by_gripper(recording, mount, contents.encoder, on_progress)
-        arm = (
-            ArmOffsets.start(recording.arm, start.offsets)
-            if recording.arm and len(start.offsets)
-            else None
-        )
-        options = replace(options.for_hand_eye(mount), arm=arm)
+        options = replace(options.for_hand_eye(mount), arm=start.arm)
         least, budget = MIN_GRIPPER_FRAMES, replace(budget, least=MIN_GRIPPER_FRAMES)
     recording = posed_recording(recording)
     require_frames(recording, least)
@@ -148,7 +142,7 @@ def learn_scene(
             others = [frame for frame in whole if frame.name not in built.keyframe_names]
             localizer, shown = Localizer(contents.empty().with_scene(scene)), others or whole
             if built.hand_eye is not None and built.hand_eye.arm is not None:
-                shown = built.hand_eye.arm.moved(shown, mount)
+                shown = built.hand_eye.arm.moved(shown)
             hand_eye = with_image_scatter(hand_eye, localizer, shown)
         report = replace(report, hand_eye=hand_eye)
     return scene, report

@@ -16,7 +16,7 @@ from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera
 from evercal.geometry.uncertain_pose import frame_covariance
-from evercal.mapping.arm_offsets import ArmOffsets, joint_slopes
+from evercal.mapping.arm_offsets import ArmOffsets
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment, BundleOptions
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.map_frame import MapFrame, Similarity, fit_correction, shared_sigma
@@ -185,8 +185,7 @@ class BuiltMap:
         if self.hand_eye is None:
             return list(frames)
         change, arm = self.hand_eye.start_camera_from_camera, self.hand_eye.arm
-        # Only the map of a wrist camera has other frames.
-        moved = frames if arm is None else arm.moved(frames, "eye_in_hand")
+        moved = frames if arm is None else arm.moved(frames)
         return [
             replace(frame, base_from_camera=frame.base_from_camera @ change)
             for frame in moved
@@ -352,26 +351,23 @@ def _adjust(
 ) -> Adjustment:
     """Alternate tracking and bundle adjustment."""
     stated_cameras = list(prepared.cameras)
-    arm, mount, adjustment = options.arm, options.mount, None
+    arm, adjustment = options.arm, None
     for number in range(options.rounds):
         on_progress("adjusting", number, options.rounds)
         tracks = bundle_tracks(prepared, keyframes)
-        joints = None
-        if arm is not None and mount is not None:
-            joints = joint_slopes(arm, prepared.frames, mount)
         problem = BundleAdjustment(
             prepared.stated,
             stated_cameras,
             velocity,
             options.bundle,
-            _gripper_from_camera(prepared, mount),
-            joints,
+            _gripper_from_camera(prepared, options.mount),
+            None if arm is None else arm.slopes(prepared.frames),
         )
         adjustment = problem.solve(tracks)
         prepared.adjust(adjustment.poses, adjustment.cameras)
-        if arm is not None and mount is not None:
+        if arm is not None:
             arm = _offsets(arm, adjustment)
-            prepared.frames = tuple(arm.moved(prepared.frames, mount))
+            prepared.frames = tuple(arm.moved(prepared.frames))
         if not _moved(prepared.stated, stated_cameras[0], adjustment):
             break
         again = partial(refine_depths, prepared, again=True)

@@ -26,6 +26,7 @@ from evercal.mapping.bundle_equations import (
     COMMON,
     INTRINSICS,
     SHARED,
+    SHIFT,
     BundleTracks,
     Linearised,
     NormalEquations,
@@ -223,17 +224,13 @@ class BundleAdjustment:
         self.gripper_from_camera, self.lever = at, at.adjoint()
         none = np.zeros((self.n, 6, 0))
         self.joints = joints or JointSlopes(none, np.zeros(0, dtype=bool), np.zeros(0))
-        own, still = (
-            np.linalg.solve(self.lever, self.joints.slopes),
-            np.tile(np.eye(6), (self.n, 1, 1)),
-        )
+        own = np.linalg.solve(self.lever, self.joints.slopes)
+        still = np.tile(np.eye(6), (self.n, 1, 1))
         self.motion = np.concatenate([still, velocity[..., None], own], axis=2)
         """(n, 6, 7 + k) motion of each camera by common transform, time shift and joints."""
         self.size = SHARED + own.shape[2]
-        self.moving, self.offsets = (
-            slice(0, self.size - INTRINSICS),
-            slice(7, self.size - INTRINSICS),
-        )
+        last = self.size - INTRINSICS
+        self.moving, self.offsets = slice(0, last), slice(COMMON + SHIFT, last)
         self.frames = StatedFrames(stated, cameras)
         self.distorted = any(cameras[0].distortion)
 
@@ -486,15 +483,16 @@ class BundleAdjustment:
             ratio[part] = max(estimated, self.options.least_systematic)
         shared = estimate.root[:, 6 * n :][:, self.moving].T @ estimate.root
         # Response of the shared parameters to an error of each stated pose: (7 + k, n, 6).
-        own = shared[:, : 6 * n].reshape(-1, n, 6)
-        own = own - np.einsum("nij,kj->kni", self.motion, shared[:, 6 * n :][:, self.moving])
-        scaled = weight * self.lever / variances.sigma[:, None]
-        response = np.einsum("knj,nij,nr->kri", own, scaled, basis) * np.sqrt(HIDDEN * ratio)
+        own = weight[:, 0] * self._error_root(shared) / variances.sigma
+        response = np.einsum("kni,nr->kri", own, basis) * np.sqrt(HIDDEN * ratio)
         rows = response.reshape(len(response), -1)
         return rows @ rows.T
 
     def _error_root(self, root: Array) -> Array:
-        """(k, n, 6) factor of the covariance of the errors, from that of all parameters."""
+        """(k, n, 6) errors of stated poses by rows (k, 6 n + 12 + k) of all parameters.
+
+        Of the factor of their covariance, that of the errors.
+        """
         n = self.n
         moved = np.einsum("nij,kj->kni", self.motion, root[:, 6 * n :][:, self.moving])
         own = root[:, : 6 * n].reshape(-1, n, 6) - moved

@@ -213,9 +213,9 @@ class NormalEquations:
     """Least squares in corrections and shared parameters (6 n + 12 + k) and inverse depths (p)."""
 
     gram: Array
-    """(6 n + 12 + k, 6 n + 12) of the observations."""
+    """(6 n + 12 + k, 6 n + 12 + k) of the observations."""
     prior: Array
-    """(6 n + 12 + k, 6 n + 12) of the priors."""
+    """(6 n + 12 + k, 6 n + 12 + k) of the priors."""
     blocks: list[HostBlock]
     depth: Array
     """(p,) diagonal of the inverse depths."""

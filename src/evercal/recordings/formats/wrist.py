@@ -104,8 +104,9 @@ def _frames(root: Path, layout: Layout, options: ReadOptions) -> Recording:
     images = _images(root, [layout.images] if layout.images else _FOLDERS)
     source, file = root / layout.poses, root / layout.camera
     rows, notes = _rows(root, source, options, layout.convention)
-    poses, more = pair_images(images, rows, _stamps(root), source)
-    joints = pair_joints(images, rows, _stamps(root), source)
+    stamps = _stamps(root)
+    poses, more = pair_images(images, rows, stamps, source)
+    joints = pair_joints(images, rows, stamps, source)
     if file.name == "sensor.yaml":
         with named_errors(file, "camera file"):
             numbers = camera_file.numbers_of(camera_file.fields_of(file).get("T_BS"), "T_BS", 16)

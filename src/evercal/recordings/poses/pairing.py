@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.recordings.poses.kinematics import interpolate
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import is_number, same_numbers, times_in_names
@@ -64,9 +65,7 @@ def pair_joints(
     at = None if times is None else _image_times(images, stamps_s)
     if at is None or times is None:
         return list(values)
-    order = np.argsort(times)
-    columns = [np.interp(at, times[order], np.unwrap(column[order])) for column in values.T]
-    return list(np.stack(columns, axis=1))
+    return list(np.stack([interpolate(times, column, at)[0] for column in values.T], axis=1))
 
 
 def poses_of_images(
