@@ -102,8 +102,6 @@ def learn_scene(
     options = _sized(options, budget, contents.short_side)
     options = replace(options, metric=recording.metric)
     built = build_map(recording.name, split.train, contents.encoder, options, on_progress)
-    global LAST
-    LAST = built.hand_eye and built.hand_eye.arm  # DEBUG
     if options.mount == "eye_to_hand":
         built = replace(built, scene=of_whole_images(built.scene, whole[0].camera))
     if budget.auto:
