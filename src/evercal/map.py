@@ -197,6 +197,8 @@ class Map:
         *,
         read: Callable[[Path], Recording] | None = None,
         workers: int = 2,
+        ray: str | None = None,
+        results: PathLike | None = None,
         memory: str | int | None = None,
         options: MapOptions | None = None,
         on_scene: Callable[[LearnReport], object] = lambda _: None,
@@ -208,9 +210,14 @@ class Map:
         stop the others.
 
         Args:
-            recordings: Recordings or their paths.
+            recordings: Recordings, their paths, or addresses such as `s3://bucket/folder`, which
+                the workers copy.
             read: Reads the recording at a path. Default: `load_recording`.
             workers: Processes; they share the threads of this machine.
+            ray: Address of a Ray cluster, whose workers learn instead: `auto`, `HOST:PORT` or
+                `ray://HOST:PORT`. All its machines reach the paths.
+            results: Folder or address where every learned scene is kept, so that the same call
+                goes on where another one was stopped.
             memory: Keyframes of each scene, as for `learn`.
             options: Sizes and priors of the map.
             on_scene: Called after each scene was added.
@@ -221,32 +228,38 @@ class Map:
             InputError: A name that is taken, before anything is learned; or, after the others were
                 learned, recordings that cannot be used.
         """
-        from evercal.learning.many import LearnTask, learn_scenes
+        from evercal.learning.many import LearnTask, Source, learn_scenes
         from evercal.mapping.memory_budget import MemoryBudget
         from evercal.progress import shown
         from evercal.recordings import load_recording
+        from evercal.recordings.addresses import RecordingAt, is_address
         from evercal.recordings.held_out import named_recording
 
         MemoryBudget.parse(memory)
-        loaded: list[Recording] = []
+        read, loaded = read or load_recording, list[Source]()
         failed: list[str] = []
         for item in recordings:
+            taken = {*self.scenes, *(other.name for other in loaded)}
+            if isinstance(item, str) and is_address(item):
+                loaded.append(named_recording(RecordingAt.of(item), None, taken))
+                continue
             try:
-                known = isinstance(item, Recording)
-                recording = item if known else (read or load_recording)(Path(item))
+                # Workers of a cluster begin in another folder.
+                place = os.path.abspath if ray is not None else os.fspath
+                recording = item if isinstance(item, Recording) else read(Path(place(item)))
             except InputError as error:
                 failed.append(str(error))
                 continue
-            taken = {*self.scenes, *(other.name for other in loaded)}
             loaded.append(named_recording(recording, None, taken))
         reports: list[LearnReport] = []
         given = len(loaded) + len(failed)
         with self._store.writing(), shown(on_progress) as step:
-            task = LearnTask(self._store.contents.empty(), memory, options)
+            kept = None if results is None else os.fspath(results)
+            task = LearnTask(self._store.contents.empty(), memory, options, read, kept)
             ready: dict[int, Learned] = {}
             following = 0
             step("learning", 0, len(loaded))
-            for done, outcome in enumerate(learn_scenes(task, loaded, workers), 1):
+            for done, outcome in enumerate(learn_scenes(task, loaded, workers, ray), 1):
                 step("learning", done, len(loaded))
                 ready[outcome.number] = outcome
                 while (learned := ready.pop(following, None)) is not None:

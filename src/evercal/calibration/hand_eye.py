@@ -6,11 +6,11 @@ frame of the gripper. `hand_eye_start` estimates a first transform from pairs of
 bundle adjustment refines it together with all poses and landmarks.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +82,13 @@ class HandEyeReport:
     """(k, k) of the offsets."""
     joints_move_mm: tuple[float, ...] = ()
     """Mean and largest way of the gripper by the offsets, over all frames with joint values."""
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """The inverse of `asdict`."""
+        kinds = {"error_terms": ErrorTerm, "images": ImageUse, "joints": JointOffset}
+        rows = {key: tuple(of(**row) for row in values.get(key, ())) for key, of in kinds.items()}
+        return cls(**{**values, **rows})
 
     @property
     def parent_from_camera(self) -> UncertainPose:

@@ -3,13 +3,7 @@
 import os
 from pathlib import Path
 
-from evercal.calibration.calibration import (
-    Calibration,
-    ErrorTerm,
-    ImageUse,
-    JointOffset,
-    read_calibration,
-)
+from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.errors import InputError
 from evercal.storage.stages import is_store
 
@@ -45,11 +39,5 @@ def learned_calibration(root: Path, scene: str | None = None) -> Calibration:
             " it has no gripper_from_camera; run 'evercal calibrate' and give its file"
         )
     camera, report = stored[name]
-    hand_eye = dict(report["hand_eye"])
-    for field, kind in (
-        ("error_terms", ErrorTerm),
-        ("images", ImageUse),
-        ("joints", JointOffset),
-    ):
-        hand_eye[field] = tuple(kind(**row) for row in hand_eye.get(field, ()))
-    return HandEyeReport(**hand_eye).calibration(camera, name, int(report["train_frames"]))
+    hand_eye = HandEyeReport.from_dict(report["hand_eye"])
+    return hand_eye.calibration(camera, name, int(report["train_frames"]))

@@ -15,6 +15,7 @@ from evercal.cli.console import require_writable, say, say_notes, size
 from evercal.cli.info import adjusted_row
 from evercal.errors import InputError
 from evercal.progress import Bars
+from evercal.recordings.addresses import is_address
 
 if TYPE_CHECKING:
     from evercal.learning.scene import LearnReport
@@ -61,8 +62,8 @@ class Learn(args.Verb):
     """
 
     store: args.Store
-    recordings: Annotated[Positional[tuple[Path, ...]], args.shown("RECORDING...")] = ()
-    """Folders of recordings, or files of bags."""
+    recordings: Annotated[Positional[tuple[str, ...]], args.shown("RECORDING...")] = ()
+    """Folders of recordings, files of bags, or addresses such as s3://bucket/folder."""
     name: args.Name = None
     """Name of the scene. Default: the recording's own name."""
     memory: Annotated[str | None, args.shown("SHARE|BYTES|auto")] = None
@@ -80,11 +81,17 @@ class Learn(args.Verb):
     networks: Annotated[NetworkOptions, arg(name="")] = field(default_factory=NetworkOptions)
     workers: args.Number = 1
     """Recordings to learn in parallel."""
+    ray: Annotated[str | None, args.shown("ADDRESS")] = None
+    """Learn on a Ray cluster: auto, HOST:PORT or ray://HOST:PORT. All its machines reach the
+    recordings."""
+    results: Annotated[str | None, args.shown("DIR|ADDRESS")] = None
+    """Keep every learned scene there, so that the same command goes on after a stop."""
 
     def run(self) -> int:
         if not self.recordings:
             raise InputError("no RECORDING given; name the folder of one or more")
-        single = len(self.recordings) == 1
+        single = len(self.recordings) == 1 and not (self.ray or self.results)
+        single = single and not is_address(self.recordings[0])
         if self.workers < 1 or (single and self.workers > 1):
             raise InputError(f"--workers {self.workers}: give 1 to the number of recordings")
         require_writable(self.calibration, "--calibration")
@@ -105,7 +112,11 @@ class Learn(args.Verb):
             )
         if strategy == args.MAP:
             self.networks.refuse()
-        return self._run_one(self.recordings[0], strategy) if single else self._run_many(strategy)
+        return (
+            self._run_one(Path(self.recordings[0]), strategy)
+            if single
+            else self._run_many(strategy)
+        )
 
     def _run_many(self, strategy: str) -> int:
         why = "several recordings are learned; omit the option or give one recording"
@@ -115,11 +126,14 @@ class Learn(args.Verb):
         from evercal.map import Map
 
         cell = Map.open(self.store, encoder=self.encoder)
-        with self._bars(f"{len(self.recordings)} recordings, {self.workers} at once") as bars:
+        where = f"{self.workers} at once" if self.ray is None else f"on Ray at {self.ray}"
+        with self._bars(f"{len(self.recordings)} recordings, {where}") as bars:
             reports = cell.learn_many(
                 self.recordings,
                 read=self._recording,
                 workers=self.workers,
+                ray=self.ray,
+                results=self.results,
                 memory=self.memory,
                 on_scene=lambda report: bars.write("\n".join(summary(report, self.store))),
                 on_progress=bars.step,

@@ -1,9 +1,9 @@
 """A scene of a map from a recording: keyframes, landmarks, poses and their scatter."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
@@ -57,6 +57,20 @@ class LearnReport:
     """Training steps; 0 for a map."""
     head_bytes: int = 0
     """Size of the networks; 0 for a map."""
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """The inverse of `asdict`."""
+        from evercal.calibration.hand_eye import HandEyeReport
+
+        adjusted, hand_eye = values["adjusted"], values["hand_eye"]
+        return cls(
+            **{
+                **values,
+                "adjusted": adjusted and Adjusted(**adjusted),
+                "hand_eye": hand_eye and HandEyeReport.from_dict(hand_eye),
+            }
+        )
 
 
 @one_product_thread()

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder, Features, load_encoder
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -267,10 +267,10 @@ def frame_to_dict(frame: MapFrame) -> dict[str, object]:
     """A map's frame as JSON values, without its slowly varying corrections."""
     similarity, covariance = frame.similarity, frame.base_covariance
     return {
-        "stated_camera_from_camera": frame.common.matrix().tolist(),
+        "stated_camera_from_camera": pose_to_dict(frame.common),
         "pose_sigma": list(frame.pose_sigma),
         "frame_sigma": list(frame.frame_sigma),
-        "base_from_map": None if similarity is None else similarity.base_from_map.matrix().tolist(),
+        "base_from_map": pose_to_dict(similarity.base_from_map if similarity else None),
         "scale": 1.0 if similarity is None else similarity.scale,
         "unit_known": similarity is None or similarity.known,
         "base_covariance": None if covariance is None else covariance.tolist(),
@@ -284,15 +284,22 @@ def frame_of(content: Mapping[str, object], correction: FrameCorrection | None) 
     similarity = None
     if base is not None:
         known, scale = bool(content.get("unit_known", True)), float(str(content["scale"]))
-        similarity = Similarity(SE3.from_matrix(np.asarray(base)), scale, known)
+        similarity = Similarity(_pose_of(base), scale, known)
     return MapFrame(
-        common=SE3.from_matrix(np.asarray(content["stated_camera_from_camera"])),
+        common=_pose_of(content["stated_camera_from_camera"]),
         correction=correction,
         pose_sigma=(float(pose[0]), float(pose[1])),
         frame_sigma=(float(shared[0]), float(shared[1])),
         similarity=similarity,
         base_covariance=None if covariance is None else np.asarray(covariance, np.float64),
     )
+
+
+def _pose_of(values: Any) -> SE3:
+    """A pose to its last bit; maps of before hold a matrix, which rounds it."""
+    if isinstance(values, list):
+        return SE3.from_matrix(np.asarray(values))
+    return SE3(values["quaternion_wxyz"], values["translation_m"])
 
 
 def correction_tensors(correction: FrameCorrection) -> dict[str, NDArray[Any]]:

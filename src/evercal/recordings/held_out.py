@@ -2,11 +2,14 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 from evercal.errors import InputError
+from evercal.recordings.addresses import RecordingAt
 from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording, checked_name
 
 EVERY, BLOCK = 100, 4
+Named = TypeVar("Named", Recording, RecordingAt)
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
     return HeldOutSplit(*map(tuple, parts))
 
 
-def named_recording(recording: Recording, name: str | None, taken: Iterable[str]) -> Recording:
+def named_recording(recording: Named, name: str | None, taken: Iterable[str]) -> Named:
     """A recording under the name that its scene will have; its own name by default."""
     name = checked_name(recording.name if name is None else name)
     if name in taken:
