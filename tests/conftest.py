@@ -344,3 +344,14 @@ def browser() -> Iterator[Any]:
         pytest.skip("there is no Chromium")
     with chromium() as started:
         yield started
+
+
+@pytest.fixture(scope="session")
+def cluster() -> Iterator[Any]:
+    """A Ray cluster of two nodes with a core each."""
+    from ray.cluster_utils import Cluster
+
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    made.add_node(num_cpus=1)
+    yield made
+    made.shutdown()

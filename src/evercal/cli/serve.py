@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass
+from typing import Annotated
 
 from evercal.cli import args
 from evercal.errors import InputError, missing_extra
@@ -26,9 +27,14 @@ class Serve(args.Verb):
     token_file: args.File = None
     """File of the bearer token that requests must have, readable by you alone. Default: the
     variable EVERCAL_TOKEN."""
+    ray: Annotated[str | None, args.shown("ADDRESS")] = None
+    """Serve from a Ray cluster (auto, HOST:PORT or ray://HOST:PORT); its head listens."""
+    replicas: args.Number = 1
+    """Processes that answer in the cluster, each with one core."""
 
     def run(self) -> int:
         try:
+            from evercal.service.on_ray import serve_on_ray
             from evercal.service.server import ServeOptions, serve
         except ImportError as error:
             raise missing_extra(f"the service needs {error.name}", "serve") from None
@@ -39,7 +45,13 @@ class Serve(args.Verb):
                 token = self.token_file.read_text(encoding="utf-8").strip()
             except (OSError, ValueError) as error:
                 raise InputError(f"--token-file {self.token_file}: {error}") from None
-        serve(ServeOptions(self.store, self.host, self.port, token), self._ready)
+        options = ServeOptions(self.store, self.host, self.port, token)
+        if self.ray is not None:
+            serve_on_ray(options, self.ray, self.replicas, self._ready)
+        elif self.replicas != 1:
+            raise InputError(f"--replicas {self.replicas}: give --ray, too")
+        else:
+            serve(options, self._ready)
         return 0
 
     def _ready(self, url: str, scenes: tuple[str, ...]) -> None:

@@ -1,24 +1,15 @@
-"""Recordings learned by the workers of a Ray cluster (Moritz et al., OSDI 2018)."""
+"""Recordings learned by the workers of a Ray cluster."""
 
-import logging
-import os
-import socket
-import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
+from typing import Any
 
 import evercal
-from evercal.bounds import VARIABLE
-from evercal.errors import InputError, optional_module
+from evercal.cluster import connected
 from evercal.learning.many import Item, Learned, LearnTask
 
 TRIES = 20
 """Attempts for a recording: machines of a cluster come and go, and a task that runs out of memory
 is tried again without being counted."""
-WAIT_S = 10.0
-"""Time for a cluster to accept a connection."""
 AHEAD = 4
 """Recordings that wait for each core, so that an autoscaler has a reason to add machines."""
 
@@ -61,50 +52,3 @@ def _learned(task: LearnTask, version: str, number: int, source: Any) -> Learned
         here = f"the worker has evercal {evercal.__version__}, this program {version}"
         return Learned(number, error=f"{here}; install the same on all machines")
     return task.learn(number, source)
-
-
-@contextmanager
-def connected(address: str) -> Iterator[Any]:
-    """The module `ray`, connected to a cluster; an existing connection is used and kept."""
-    ray = optional_module("ray", "learning on a cluster needs Ray", "ray")
-    if TYPE_CHECKING:
-        import ray
-    if ray.is_initialized():
-        yield ray
-        return
-    _require_listener(address)
-    given = {name: os.environ[name] for name in _INHERITED if name in os.environ}
-    # Workers import from the folder that the program was started in, where a recording may lie that
-    # holds any file; with a folder of their own they do not.
-    with tempfile.TemporaryDirectory(prefix="evercal-") as empty:
-        environment = {"env_vars": given, "working_dir": empty}
-        try:
-            ray.init(
-                address, runtime_env=environment, log_to_driver=False, logging_level=logging.ERROR
-            )
-        except (ConnectionError, TimeoutError, ValueError, RuntimeError) as error:
-            reason = str(error).strip().partition("\n")[0]
-            raise InputError(
-                f"--ray {address}: {reason[:300]}; start a cluster with 'ray start --head', or"
-                " give HOST:PORT of one"
-            ) from None
-    try:
-        yield ray
-    finally:
-        ray.shutdown()
-
-
-def _require_listener(address: str) -> None:
-    """Refuse an address where nothing listens; Ray would wait for minutes."""
-    url = urlsplit(address if "://" in address else f"//{address}")
-    if address not in ("auto", "local"):
-        try:
-            socket.create_connection((url.hostname or "", url.port or 0), WAIT_S).close()
-        except (OSError, ValueError) as error:
-            raise InputError(
-                f"--ray {address}: nothing answers ({error}); give auto, or HOST:PORT or"
-                " ray://HOST:PORT of a cluster"
-            ) from None
-
-
-_INHERITED = (VARIABLE, "OPENCV_IO_MAX_IMAGE_PIXELS")

@@ -130,9 +130,15 @@ def bound_socket(options: ServeOptions) -> socket.socket:
             f"--host {options.host}: other machines could use the map; give --token-file, or set"
             " EVERCAL_TOKEN"
         )
-    if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or " " in token):
-        raise InputError(f"token: give at least {LEAST_TOKEN} ASCII characters without spaces")
+    if token is not None:
+        require_token(token)
     return hosts.listening_socket(options.host, options.port)
+
+
+def require_token(token: str) -> None:
+    """Refuse a token that is easily guessed, or that a header cannot hold."""
+    if len(token) < LEAST_TOKEN or not token.isascii() or " " in token:
+        raise InputError(f"token: give at least {LEAST_TOKEN} ASCII characters without spaces")
 
 
 def url_of(listener: socket.socket) -> str:

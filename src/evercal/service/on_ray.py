@@ -1,0 +1,100 @@
+"""The HTTP service as a deployment of Ray Serve: replicas on the machines of a cluster."""
+
+import logging
+import signal
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from evercal.cluster import connected
+from evercal.errors import InputError
+from evercal.map import Map
+from evercal.service.client import Client
+from evercal.service.hosts import url_of
+from evercal.service.server import DRAIN_S, ServeOptions, make_app, require_token
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
+
+NAME = "evercal"
+"""Of the application in the cluster."""
+
+
+def deployment(options: ServeOptions, replicas: int) -> Any:
+    """The service as an application of Ray Serve; every replica has one core and opens the map.
+
+    The token and the limits are those of `evercal serve`, except for what only the server of a
+    connection can bound: the proxies of the cluster accept connections.
+    """
+    from ray import serve
+
+    def build() -> "FastAPI":
+        return make_app(options)
+
+    limits = options.limits
+    how = serve.deployment(
+        name="map",
+        num_replicas=replicas,
+        ray_actor_options={"num_cpus": 1},
+        max_ongoing_requests=limits.requests + limits.streams,
+        max_queued_requests=limits.connections,
+        graceful_shutdown_timeout_s=DRAIN_S,
+        logging_config={"enable_access_log": False, "log_level": "ERROR"},
+    )
+    return how(serve.ingress(build)()).bind()
+
+
+def serve_on_ray(
+    options: ServeOptions,
+    address: str,
+    replicas: int,
+    on_ready: Callable[[str, tuple[str, ...]], object],
+) -> None:
+    """Serve a map on a cluster until SIGTERM or SIGINT; see `server.serve`.
+
+    Args:
+        options: Its `host` and `port` are those of the cluster's head.
+        address: Of the cluster, see `cluster.connected`.
+        replicas: Processes that answer; all their machines reach the map.
+        on_ready: Gets the address and the names of the scenes.
+    """
+    if options.token is None:
+        raise InputError(
+            "--ray: other machines could use the map; give --token-file, or set EVERCAL_TOKEN"
+        )
+    require_token(options.token)
+    if not 1 <= options.port <= 65_535:
+        raise InputError(f"--port {options.port}: give 1 to 65535")
+    if replicas < 1:
+        raise InputError(f"--replicas {replicas}: give a number >= 1")
+    options = replace(options, map=options.map.absolute())
+    scenes, stop = Map.open(options.map).scenes, threading.Event()
+    with connected(address) as ray:
+        from ray import serve
+
+        logging.getLogger("ray.serve").setLevel(logging.ERROR)
+        serve.start(
+            http_options={"host": options.host, "port": options.port},
+            logging_config={"log_level": "ERROR"},
+        )
+        if NAME in serve.status().applications:
+            raise InputError(f"--ray {address}: serves a map already; stop that first")
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: stop.set())
+        try:
+            serve.run(deployment(options, replicas), name=NAME)
+            head = next(
+                node["NodeManagerAddress"]
+                for node in ray.nodes()
+                if "node:__internal_head__" in node["Resources"]
+            )
+            host = head if options.host in ("0.0.0.0", "::") else options.host
+            url = url_of(host, options.port)
+            _ = Client(url, options.token).scenes  # options of a Serve that ran before are kept
+            on_ready(url, scenes)
+            stop.wait()
+        except RuntimeError as error:
+            raise InputError(f"--ray {address}: {error}") from None
+        finally:
+            serve.delete(NAME)
