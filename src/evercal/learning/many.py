@@ -8,8 +8,10 @@ import hashlib
 import pickle
 import tempfile
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from evercal.errors import InputError
 from evercal.learning.scene import LearnReport, learn_scene
@@ -99,7 +101,9 @@ def _kept(file: str) -> tuple[SceneMap, LearnReport]:
     with addresses.local_copy(file) as packed, tempfile.TemporaryDirectory() as folder:
         unpack_map(packed, Path(folder, "map"))
         store = MapStore.open(Path(folder, "map"))
-        return store.contents.scenes[0], LearnReport.from_dict(store.reports()[0])
+        scene, report = store.contents.scenes[0], LearnReport.from_dict(store.reports()[0])
+        every = np.arange(len(scene.keyframes))  # taken out of the file, which goes
+        return replace(scene, keyframes=scene.keyframes.take(every)), report
 
 
 Item = tuple[int, Source]

@@ -5,9 +5,10 @@ its 1,200 features of 128 half floats 307 kB. The frozen encoder computes the sa
 image in milliseconds. A map adds depths, landmarks and a descriptor to each.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from evercal.recordings.frame import Frame
 from evercal.recordings.images import encode_jpeg
 
 JPEG_QUALITY = 95
+Part = TypeVar("Part")
 _LANDMARK_FIELDS = {
     "pixels": np.int16,
     "inverse_depth": np.float32,
@@ -33,20 +35,20 @@ _LANDMARK_FIELDS = {
 class Keyframes:
     """The stored frames of one scene."""
 
-    images: tuple[bytes, ...]
+    images: Sequence[bytes]
     """Grey JPEG files at working size."""
     cameras: tuple[Camera, ...]
     """Intrinsics at working size, one per image."""
     base_from_camera: SE3
     """(n,) poses in the scene's base frame."""
-    inverse_depth: tuple[NDArray[np.float16], ...] = ()
+    inverse_depth: Sequence[NDArray[np.float16]] = ()
     """(cells,) half floats of each image, per metre along the optical axis; empty without a map."""
-    landmarks: tuple[Landmarks, ...] = ()
+    landmarks: Sequence[Landmarks] = ()
     """Of each image; empty without a map."""
     descriptors: NDArray[np.float16] | None = None
     """(n, width) VLAD of each image, half floats; None without a map."""
 
-    @property
+    @cached_property
     def bytes(self) -> int:
         """Size of `to_tensors`."""
         return sum(tensor.nbytes for tensor in self.to_tensors().values())
@@ -118,50 +120,65 @@ class Keyframes:
         return tensors
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> "Keyframes":
-        """The inverse of `to_tensors`."""
-        joined = tensors["images"].tobytes()
-        ends = np.cumsum(tensors["lengths"])
-        images = tuple(
-            joined[end - n : end] for end, n in zip(ends, tensors["lengths"].tolist(), strict=True)
-        )
-        cameras = zip(tensors["cameras"].tolist(), tensors["distortion"].tolist(), strict=True)
-        poses = tensors["poses"]
-        depths: tuple[NDArray[np.float16], ...] = ()
+    def from_tensors(cls, tensors: Mapping[str, Any]) -> "Keyframes":
+        """The inverse of `to_tensors`.
+
+        Arrays of `storage.tensors.open_tensors` stay in their file: images, depths and landmarks
+        are read when they are used, so that processes share the memory.
+        """
+        lengths, cameras, poses = (tensors[key][:] for key in ("lengths", "cameras", "poses"))
+        rows = zip(cameras.tolist(), tensors["distortion"][:].tolist(), strict=True)
+        depths: Sequence[NDArray[np.float16]] = ()
+        landmarks: Sequence[Landmarks] = ()
         if "cells" in tensors:
-            depths = _split(tensors["inverse_depth"], tensors["cells"])
-        return cls(
-            images=images,
+            depths = _Parts(tensors["cells"][:], tensors["inverse_depth"].__getitem__)
+        if "landmark_counts" in tensors:
+            stored = [tensors[f"landmark_{name}"] for name in _LANDMARK_FIELDS]
+            landmarks = _Parts(
+                tensors["landmark_counts"][:],
+                lambda part: Landmarks(*(field[part].astype(np.float64) for field in stored)),
+            )
+        descriptors = tensors.get("descriptors")
+        made = cls(
+            images=_Parts(lengths, lambda part: tensors["images"][part].tobytes()),
             cameras=tuple(
                 Camera(
                     *row[:6],
                     distortion=row[6 : 6 + abs(k)],
                     model="fisheye" if k < 0 else "pinhole",
                 )
-                for row, k in cameras
+                for row, k in rows
             ),
             base_from_camera=SE3(poses[:, :4], poses[:, 4:]),
             inverse_depth=depths,
-            landmarks=_landmarks_of(tensors) if "landmark_counts" in tensors else (),
-            descriptors=tensors.get("descriptors"),
+            landmarks=landmarks,
+            descriptors=None if descriptors is None else descriptors[:],
         )
+        for parts in (made.images, depths, landmarks):
+            _ = parts[len(parts) - 1 :]  # a part beyond its array is an error here, not later
+        return made
 
 
-def _landmarks_of(tensors: Mapping[str, NDArray[Any]]) -> tuple[Landmarks, ...]:
-    counts = tensors["landmark_counts"]
-    columns = [
-        [part.astype(np.float64) for part in _split(tensors[f"landmark_{name}"], counts)]
-        for name in _LANDMARK_FIELDS
-    ]
-    return tuple(Landmarks(*fields) for fields in zip(*columns, strict=True))
+class _Parts(Sequence[Part]):
+    """Parts of stored arrays, one for each keyframe."""
+
+    def __init__(self, counts: NDArray[np.int64], read: Callable[[slice], Part]):
+        if (counts < 0).any():
+            raise ValueError(f"a part has {counts.min()} entries")
+        self._ends, self._read = [0, *np.cumsum(counts).tolist()], read
+
+    def __len__(self) -> int:
+        return len(self._ends) - 1
+
+    def __getitem__(self, i: Any) -> Any:
+        if isinstance(i, slice):
+            return tuple(self[k] for k in range(*i.indices(len(self))))
+        i = range(len(self))[i]
+        return self._read(slice(self._ends[i], self._ends[i + 1]))
 
 
 def _signed_count(camera: Camera) -> int:
     return len(camera.distortion) * (-1 if camera.model == "fisheye" else 1)
-
-
-def _split(joined: NDArray[Any], counts: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    return tuple(np.split(joined, np.cumsum(counts)[:-1])) if len(counts) else ()
 
 
 def store_keyframes(frames: Sequence[Frame], short_side: int) -> Keyframes:

@@ -35,7 +35,7 @@ from evercal.storage.stages import (
     require_free,
     write_report,
 )
-from evercal.storage.tensors import load_tensors, save_tensors
+from evercal.storage.tensors import load_tensors, open_tensors, save_tensors
 
 KIND, STRATEGY = "map", "evercal"
 """Kind of store in its manifest, and its name among the strategies of `evercal learn`."""
@@ -257,7 +257,7 @@ def _read_scene(folder: Path) -> SceneMap:
         values[name] = Camera.from_dict(values[name])
     checked_name(values["name"])
     return SceneMap(
-        keyframes=Keyframes.from_tensors(load_tensors(folder / KEYFRAMES)),
+        keyframes=Keyframes.from_tensors(open_tensors(folder / KEYFRAMES)),
         frame=frame_of(content["frame"], correction),
         **values,
     )

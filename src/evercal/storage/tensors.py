@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,5 +29,16 @@ def load_tensors(path: Path) -> dict[str, NDArray[np.generic]]:
 
     try:
         return load(path.read_bytes())
+    except (OSError, SafetensorError) as error:
+        raise InputError(f"{path}: not readable ({error}); run 'evercal info --check'") from None
+
+
+def open_tensors(path: Path) -> dict[str, Any]:
+    """The named arrays of a file that stays mapped into memory: slices of them are copied."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        file = safe_open(path, "np")
+        return {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError) as error:
         raise InputError(f"{path}: not readable ({error}); run 'evercal info --check'") from None
