@@ -36,10 +36,24 @@ def test_retrieval_ranks_the_keyframes_of_all_scenes(several: MapContents) -> No
         query = features(seed, several)
         vlad = several.encoder.vlad()(query)
         similarity = [float(row.astype(np.float32) @ vlad) for row in descriptors] * 3
-        ranked = bank.retrieve(query).tolist()
+        (mine,) = bank.similarity(vlad)
+        np.testing.assert_allclose(mine, similarity, atol=1e-6)
+        ranked = bank.ranked(mine, 21).tolist()
         assert sorted(ranked) == list(range(21))
         values = [similarity[i] for i in ranked]
         np.testing.assert_allclose(values, sorted(values, reverse=True), atol=1e-6)
+        for most in (1, 5, 30):
+            assert bank.ranked(mine, most).tolist() == ranked[:most]
+        of_second = [i for i in ranked if 7 <= i < 14]
+        assert bank.ranked_of(1, mine).tolist() == of_second
+
+
+def test_keyframes_that_are_not_in_use_are_not_ranked(several: MapContents) -> None:
+    part = KeyframeBank(several, 9).only(np.array([3, 8, 20]))
+    query = features(0, several)
+    (similarity,) = part.similarity(several.encoder.vlad()(query))
+    assert sorted(part.ranked(similarity, 12).tolist()) == [3, 8, 20]
+    assert part.ranked_of(1, similarity).tolist() == [8]
 
 
 @pytest.mark.parametrize("most", [1, 3, 7])

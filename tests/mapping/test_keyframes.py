@@ -45,7 +45,7 @@ def test_poses_and_cameras_are_stored_exactly() -> None:
         frames.append(Frame(str(i), np.zeros((height, width, 3), np.uint8), camera, pose))
     keyframes = store_keyframes(frames, 48)
     for again in (keyframes, through_a_file(keyframes)):
-        assert again.images == keyframes.images
+        assert tuple(again.images) == keyframes.images
         for frame, stored in zip(frames, again.frames(), strict=True):
             assert stored.camera == frame.camera.short_side_resized(48)
             assert min(stored.read_image().shape[:2]) == 48

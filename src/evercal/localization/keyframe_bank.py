@@ -133,14 +133,27 @@ class KeyframeBank:
         """The encoder of the map."""
         return self._contents.encoder
 
-    def retrieve(self, features: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Rank the keyframes by the similarity of their descriptors to features (cells, channels).
+    def similarity(self, *descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(images, keyframes) similarity to the descriptors (width,) of images.
 
-        One matrix-vector product takes 3 ms for 10,000 keyframes, so no index is needed.
+        Keyframes that are not in use get -inf. The product takes 20 ms for 100,000 keyframes, and
+        little more for several images, so no index is needed.
         """
-        similarity = self._descriptors @ self._contents.encoder.vlad()(features)
-        order = np.argsort(-similarity, kind="stable")
+        similarity = (self._descriptors @ np.stack(descriptors, 1)).T
+        similarity[:, ~self._used] = -np.inf
+        return similarity
+
+    def ranked(self, similarity: NDArray[np.float32], most: int) -> NDArray[np.int64]:
+        """The `most` keyframes in use with the greatest similarity (keyframes,), best first."""
+        first = min(most, len(similarity)) - 1
+        best = np.flatnonzero(similarity >= -np.partition(-similarity, first)[first])
+        order = best[np.argsort(-similarity[best], kind="stable")][:most]
         return order[self._used[order]]
+
+    def ranked_of(self, scene: int, similarity: NDArray[np.float32]) -> NDArray[np.int64]:
+        """The keyframes of a scene in use, best first."""
+        own = np.flatnonzero((self.scene == scene) & self._used)
+        return own[np.argsort(-similarity[own], kind="stable")]
 
     def seen(self, scene: int, pose: SE3, camera: Camera) -> NDArray[np.int64]:
         """Rank the keyframes of a scene by their landmarks that a pose map_from_camera shows."""

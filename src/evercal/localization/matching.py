@@ -24,8 +24,10 @@ class Matcher:
         scene is tried with the keyframes that got most votes. If these are too few, its next
         keyframes in the ranking are added.
         """
-        ranked = self._bank.retrieve(_rows(query.features))
-        proposed, rest = ranked[: attempt.retrieved], ranked[attempt.retrieved :]
+        if not query.descriptor:
+            query.descriptor.append(self._similarity(query.features)[0])
+        similarity = query.descriptor[0]
+        proposed = self._bank.ranked(similarity, attempt.retrieved)
         stride = self._options.retrieval_stride
         best = [self._most_similar(query, stride, int(index))[1] for index in proposed]
         votes = np.bincount(np.argmax(best, 0), minlength=len(proposed))
@@ -39,7 +41,8 @@ class Matcher:
             if total[s] < enough:
                 continue
             voted = proposed[order[scene[order] == s]]
-            others = rest[self._bank.scene[rest] == s]
+            own = self._bank.ranked_of(s, similarity)
+            others = own[~np.isin(own, voted)]
             keyframes = np.concatenate([voted, others])[: self._options.keyframes]
             repeated = len(self._bank.pattern(keyframes)) > 0
             candidates.append(Candidate(s, keyframes, 1 if repeated else attempt.stride))
@@ -55,24 +58,32 @@ class Matcher:
         # Side by side, the other turns take two thirds of the time.
         others = encoder(np.concatenate([turned(middle, turns) for turns in (1, 2, 3)], 1))
         views = query.features[top : top + side, left : left + side], *np.split(others, 3, 1)
-        similar = [self._similarity(view) for view in views]
+        similarity = self._similarity(*views)
+        similar = [self._mean_similarity(*each) for each in zip(views, similarity, strict=True)]
         turns = int(np.argmax(similar))
         if similar[turns] <= similar[0] + self._options.clear_turn:
             return query
         features = encoder(turned(grey, turns))
-        return replace(query, features=features, turns=turns, similar={})
+        return replace(query, features=features, turns=turns, similar={}, descriptor=[])
 
     def magnified(self, query: Query, scale: float) -> Query:
         """The image encoded at another size."""
         features = self._bank.encoder.encode(query.image, round(scale * self._short_side))
-        return replace(query, features=features, scale=scale, turns=0, similar={})
+        return replace(query, features=features, scale=scale, turns=0, similar={}, descriptor=[])
 
-    def _similarity(self, features: NDArray[np.float32]) -> float:
+    def _similarity(self, *views: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(views, keyframes) similarity of whole images by their features."""
+        vlad = self._bank.encoder.vlad()
+        return self._bank.similarity(*(vlad(_rows(features)) for features in views))
+
+    def _mean_similarity(
+        self, features: NDArray[np.float32], similarity: NDArray[np.float32]
+    ) -> float:
         """Mean similarity of every second row and column of features (rows, columns, channels).
 
         Each is compared to its most similar cell in the keyframes that match best.
         """
-        proposed = self._bank.retrieve(_rows(features))[: self._options.keyframes]
+        proposed = self._bank.ranked(similarity, self._options.keyframes)
         rows = _rows(features[::2, ::2])
         best = [(rows @ self._bank.load(int(k)).cells.features.T).max(1) for k in proposed]
         return float(np.max(best, 0).mean())

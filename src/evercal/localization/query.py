@@ -92,6 +92,8 @@ class Query:
         default_factory=dict
     )
     """Most similar cells of keyframes, see `Matcher`."""
+    descriptor: list[NDArray[np.float32]] = field(default_factory=list)
+    """Similarity (keyframes,) of the whole image, once it is known."""
     scale: float = 1.0
     """Of the encoded image, relative to the encoder's working size."""
     turns: int = 0
