@@ -25,6 +25,8 @@ VERBS = {
     "refresh": ("changing_room", "a map in a rendered room that changes in ten rounds"),
     "speed": ("speed", "time of learning, localization and SARS"),
     "serve": ("serve", "latency of the HTTP service"),
+    "retrieval": ("retrieval", "the right scene among 100,000 keyframes, milliseconds and bytes"),
+    "cluster": ("cluster", "learning and serving on a Ray cluster, beside one process"),
     "networks": ("networks", "the experiments on networks; the paper's table on a GPU"),
     "tables": ("tables", "print the tables of the docs from results/"),
 }

@@ -1,15 +1,26 @@
 """Retrieval in a map of many scenes: the right scene, milliseconds and bytes.
 
 Scenes are box rooms with 50 keyframes each. Queries are images between the keyframes of the first
-rooms, and test images of the packaged rooms among all of them.
+hundred rooms. The packaged rooms are queried as well, by every tenth of their test images. One more
+row is the ranking of before: a product for each image, and a whole sort.
 """
 
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.rows import Row, save
 from evercal.features.encoder import Encoder, load_encoder
+from evercal.geometry import SE3
+from evercal.localization.keyframe_bank import KeyframeBank
+from evercal.localization.query import LocalizeOptions
+from evercal.mapping.keyframes import Keyframes
+from evercal.mapping.map_frame import MapFrame
+from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.recordings.samples import sample_rooms
 from evercal.simulation.box_room import BoxRoom, default_camera
 
 FIRST_SEED = 30_000
@@ -19,6 +30,90 @@ TEXTURE_PX = 192
 SIDE = 240
 AT_ONCE = 25
 """Scenes in a file."""
+ATTEMPT = LocalizeOptions().attempts[0]
+
+
+def run(out: Path = Path("runs/retrieval"), scenes: int = 2000) -> None:
+    """Rank the keyframes of up to 100,000 in scenes that no image shows.
+
+    Args:
+        out: Folder of the descriptors; complete files are not repeated.
+        scenes: Box rooms, 100 or more.
+    """
+    files = [np.load(file) for file in descriptors(out, scenes)]
+    keys = np.concatenate([file["keyframes"] for file in files])
+    asked = np.concatenate([f["queries"] for f in files if f["queries"].size])
+    packed, their = _packaged(load_encoder())
+    rows: list[Row] = []
+    for count in (100, 200, 1000, 2000):
+        if count > len(keys):
+            continue
+        every = np.concatenate([packed, keys[: count - len(packed)]])
+        bank = _bank(every)
+        rooms = {
+            "box rooms": [(len(packed) + n, q) for n, room in enumerate(asked[:97]) for q in room],
+            "packaged rooms": [(n, q) for n, room in enumerate(their) for q in room],
+        }
+        for name, queries in rooms.items():
+            rows.append({"queries": name, "keyframes": bank.scene.size, **_right(bank, queries)})
+        some = [q.astype(np.float32) for _, q in rooms["box rooms"][:4]]
+        rows[-2] |= {
+            "one_image_ms": _milliseconds(lambda b=bank, q=some: _ranked(b, q[:1])),
+            "four_turns_ms": _milliseconds(lambda b=bank, q=some: _ranked(b, q)),
+            "before_ms": _milliseconds(lambda b=bank, q=some: _before(b, q)),
+            "megabytes": every.size * 4 / 1e6,
+        }
+    save(out / "retrieval.csv", rows, {"scenes": scenes, "attempt": str(ATTEMPT)})
+
+
+def _right(bank: KeyframeBank, queries: list[tuple[int, np.ndarray]]) -> Row:
+    first, among = 0, 0
+    for scene, query in queries:
+        (similarity,) = bank.similarity(query.astype(np.float32))
+        proposed = bank.scene[bank.ranked(similarity, ATTEMPT.retrieved)]
+        first, among = first + (proposed[0] == scene), among + (scene in proposed)
+    count = len(queries)
+    return {"images": count, "first": 100 * first / count, "proposed": 100 * among / count}
+
+
+def _ranked(bank: KeyframeBank, queries: list[np.ndarray]) -> None:
+    for similarity in bank.similarity(*queries):
+        bank.ranked(similarity, ATTEMPT.retrieved)
+
+
+def _before(bank: KeyframeBank, queries: list[np.ndarray]) -> None:
+    for query in queries:
+        np.argsort(-(bank._descriptors @ query), kind="stable")
+
+
+def _milliseconds(work: Callable[[], None], times: int = 10) -> float:
+    spent = []
+    for _ in range(times):
+        began = time.perf_counter()
+        work()
+        spent.append(1000 * (time.perf_counter() - began))
+    return float(np.median(spent))
+
+
+def _bank(keys: np.ndarray) -> KeyframeBank:
+    """A bank of descriptors (scenes, keyframes, width) alone; nothing can be loaded from it."""
+    camera, empty = default_camera(), (b"",) * keys.shape[1]
+    poses = SE3.identity((keys.shape[1],))
+    made = [Keyframes(empty, (camera,) * len(empty), poses, descriptors=each) for each in keys]
+    frame = MapFrame()
+    scenes = [SceneMap(str(n), camera, camera, k, frame, 0) for n, k in enumerate(made)]
+    return KeyframeBank(MapContents(load_encoder(), SIDE, scenes), 1)
+
+
+def _packaged(encoder: Encoder) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Descriptors of 50 training images of each packaged room, and of its queries."""
+    keys, queries = [], []
+    for room in sample_rooms():
+        train, test = room.scene.train, room.scene.test
+        few = np.linspace(0, len(train) - 1, KEYFRAMES).astype(int)
+        keys.append([_described(encoder, train[i].read_image()) for i in few])
+        queries.append(np.array([_described(encoder, f.read_image()) for f in test[::10]]))
+    return np.array(keys, np.float16), queries
 
 
 def descriptors(out: Path, scenes: int) -> list[Path]:
@@ -40,12 +135,17 @@ def descriptors(out: Path, scenes: int) -> list[Path]:
 def _room(encoder: Encoder, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Descriptors (50, width) of the keyframes of a room, and (0 or 5, width) of queries."""
     room, camera = BoxRoom(FIRST_SEED + number, texture_px=TEXTURE_PX), default_camera()
-    path, vlad = room.path(2 * KEYFRAMES, number), encoder.vlad()
+    path = room.path(2 * KEYFRAMES, number)
     queries = QUERIES if number < QUERIED else 0
     numbers = [*range(0, 2 * KEYFRAMES, 2), *range(1, 2 * KEYFRAMES, 2 * KEYFRAMES // QUERIES)]
     vectors = []
     for i in numbers[: KEYFRAMES + queries]:
         image = room.render(camera, path[i])
-        vectors.append(vlad(encoder.encode(image, SIDE).reshape(-1, encoder.width)))
+        vectors.append(_described(encoder, image))
     both = np.array(vectors, np.float16)
     return both[:KEYFRAMES], both[KEYFRAMES:]
+
+
+def _described(encoder: Encoder, image: np.ndarray) -> np.ndarray:
+    features = encoder.encode(image, SIDE).reshape(-1, encoder.width)
+    return encoder.vlad()(features).astype(np.float16)

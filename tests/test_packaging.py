@@ -86,6 +86,6 @@ def test_every_version_that_an_installation_brings_is_pinned() -> None:
 def test_the_licence_of_every_package_is_listed() -> None:
     page = (ROOT / "docs" / "licences.md").read_text(encoding="utf-8")
     listed = {canonicalize_name(name) for name in re.findall(r"^\| ([\w.-]+) \|", page, re.M)}
-    for extras in ((), ("serve", "bags", "colmap", "lerobot", "networks", "urdf", "view")):
+    for extras in ((), ("serve", "bags", "colmap", "lerobot", "networks", "ray", "urdf", "view")):
         everything = brought("evercal", frozenset(extras), {})
         assert everything.keys() - {"evercal"} <= listed

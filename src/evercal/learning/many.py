@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+import evercal
 from evercal.errors import InputError
 from evercal.learning.scene import LearnReport, learn_scene
 from evercal.mapping.build import MapOptions
@@ -81,11 +82,11 @@ class LearnTask:
             return self._learn(named_recording(self.read(copy), source.name, ()))
 
     def _file(self, source: Source) -> str | None:
-        """Address of the result: another recording, encoder or option gets another one."""
+        """Address of the result: another recording, option or version gets another one."""
         if self.results is None:
             return None
         what = source if isinstance(source, Recording) else addresses.stamps(source.address)
-        of = pickle.dumps((self.contents, self.memory, self.options, what))
+        of = pickle.dumps((evercal.__version__, self.contents, self.memory, self.options, what))
         return f"{self.results}/{source.name}-{hashlib.sha256(of).hexdigest()[:16]}.zip"
 
 
