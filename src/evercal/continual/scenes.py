@@ -92,6 +92,12 @@ class LearnedScenes:
             value.nbytes for state in self.method_states for value in state.values()
         )
 
+    @property
+    def frames_kept(self) -> int:
+        """Keyframes of the newest scene."""
+        newest = self.keyframes[-1]
+        return 0 if newest is None else len(newest)
+
     def atlas(self, grid_scenes: int = 0) -> Atlas:
         """Cells of the scenes learned so far; `grid_scenes` of the paper's layout, 0: open."""
         atlas = Atlas("paper", grid_scenes) if grid_scenes else Atlas()

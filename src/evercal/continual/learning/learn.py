@@ -1,25 +1,31 @@
 """`learn`: one more scene; `learn_jointly`: all frames of all scenes at once, as a reference."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from evercal.continual.learning.finish_scene import correct_lens, finished_stage, trained_record
-from evercal.continual.learning.stage import OnEvent, Stage, StageOptions, unobserved
-from evercal.continual.learning.stage_rows import remembered, scene_rows
+from evercal.continual.learning.stage import OnEvent, StageOptions, unobserved
+from evercal.continual.learning.stage_rows import keyframe_rows, remembered, scene_rows
 from evercal.continual.learning.surfaces import shared_depths, surface_points
-from evercal.continual.methods.method import Method, StageStart
+from evercal.continual.methods.method import FinishedScene, Method, StageStart
 from evercal.continual.networks.atlas import Atlas, Cell, camera_clusters
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.head import Head, fresh_head
 from evercal.continual.networks.trainer import HeadTrainer
-from evercal.continual.scenes import LearnedScenes
-from evercal.recordings.frame import Recording, stated_poses
+from evercal.continual.scenes import (
+    LearnedScenes,
+    SceneRecord,
+    corrected_camera,
+    correction_between,
+    prototypes,
+)
+from evercal.continual.selection.frame_statistics import FrameStatistics
+from evercal.mapping.keyframes import Keyframes, store_keyframes
+from evercal.recordings.frame import Frame, Recording, stated_poses
 
 WHITENING_ROWS = 20_000
 
@@ -30,8 +36,11 @@ def learn(
     recording: Recording,
     options: StageOptions,
     on_event: OnEvent = unobserved,
-) -> Stage:
-    """Learn one more scene from the training frames of a recording; `scenes` is not changed."""
+) -> LearnedScenes:
+    """Learn one more scene from the training frames of a recording; `scenes` is not changed.
+
+    Thresholds are not fitted yet.
+    """
     after = scenes.copy_for_training()
     teacher = copy.deepcopy(after.heads[-1]).eval() if after.heads else None
     atlas = after.atlas(options.grid_scenes)
@@ -47,7 +56,8 @@ def learn(
         on_event(progress)
     after.scenes.append(trained_record(recording, cell, trainer, 0))
     correct_lens(buffer, after.scenes[-1])
-    return finished_stage(after, method, recording.train, lambda: buffer, options)
+    finish_scene(after, method, recording.train, lambda: buffer, options)
+    return after
 
 
 def learn_jointly(
@@ -55,7 +65,7 @@ def learn_jointly(
     recordings: Sequence[Recording],
     options: StageOptions,
     on_event: OnEvent = unobserved,
-) -> Stage:
+) -> LearnedScenes:
     """Train one head on several scenes, with the steps and rows of the same number of stages.
 
     A step has the rows of one that learns a scene and replays others. `start` has no scenes and is
@@ -72,11 +82,11 @@ def learn_jointly(
     trainer = HeadTrainer(head, buffers, whole, options.seed)
     for progress in trainer.run():
         on_event(progress)
-    for number, recording in enumerate(recordings):
-        after.scenes.append(trained_record(recording, begun[number][0], trainer, number))
-        rows_of = partial(buffers.__getitem__, number)
-        finished_stage(after, Method(), recording.train, rows_of, options)
-    return Stage(after, whole.iterations, 0)
+    for number, (recording, (cell, _)) in enumerate(zip(recordings, begun, strict=True)):
+        after.scenes.append(trained_record(recording, cell, trainer, number))
+        after.keyframes.append(None)
+        after.method_states.append({})
+    return after
 
 
 def _begun(
@@ -128,3 +138,58 @@ def _whiten(head: Head, buffers: Sequence[FeatureBuffer], seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     drawn = [buffer.draw(WHITENING_ROWS // len(buffers), generator) for buffer in buffers]
     head.whiten(torch.cat([rows.features for rows in drawn]))
+
+
+def finish_scene(
+    scenes: LearnedScenes,
+    method: Method,
+    frames: Sequence[Frame],
+    rows: Callable[[], FeatureBuffer],
+    options: StageOptions,
+) -> None:
+    """Select what is stored of the newest scene and add it to `scenes`, which has its record.
+
+    `rows` returns the rows of its frames with the intrinsics of the training; the first views are
+    not augmented.
+    """
+    newest = len(scenes.scenes) - 1
+    head, local = scenes.head_for(newest)
+    statistics = FrameStatistics(frames, head, rows, options.seed, newest)
+    selected = method.select(statistics, options.memory.capacity(frames, scenes.short_side))
+    keyframes = None
+    if selected is not None:
+        keyframes = _keyframes(scenes, [frames[i] for i in selected], options)
+    scenes.keyframes.append(keyframes)
+
+    def remembered() -> FeatureBuffer:
+        assert keyframes is not None, "a method whose state is about keyframes selects some"
+        return keyframe_rows(scenes, newest, keyframes, options)
+
+    diffusion = options.fit.diffusion if head.options.condition == "descriptor" else 0.0
+    finished = FinishedScene(head.eval(), local, rows, remembered, diffusion)
+    scenes.method_states.append(method.after_scene(finished))
+
+
+def _keyframes(scenes: LearnedScenes, frames: Sequence[Frame], options: StageOptions) -> Keyframes:
+    # Replay uses the camera as training corrected it.
+    refined = scenes.scenes[-1].refined_camera
+    if refined is not None:
+        frames = [replace(frame, camera=refined) for frame in frames]
+    keyframes = store_keyframes(frames, scenes.short_side)
+    return keyframes.take(options.memory.fitting(keyframes))
+
+
+def trained_record(scene: Recording, cell: Cell, trainer: HeadTrainer, number: int) -> SceneRecord:
+    """The record of a scene after training; its rows are in the trainer's buffer `number`."""
+    buffer, options = trainer.buffers[number], trainer.options
+    camera, refined = scene.train[0].camera, None
+    if options.intrinsics_rate > 0 and options.iterations > 0 and buffer.correctable:
+        refined = corrected_camera(camera, trainer.correction[number].detach())
+    spread = prototypes(buffer.tensors["descriptors"][: len(scene.train)])
+    return SceneRecord(scene.name, camera, cell, spread, len(scene.train), refined)
+
+
+def correct_lens(rows: FeatureBuffer, record: SceneRecord) -> None:
+    """Apply the intrinsics of the training to a scene's rows."""
+    if record.refined_camera is not None:
+        rows.correct_lens(correction_between(record.camera, record.refined_camera))

@@ -93,20 +93,19 @@ def learn_networks(
             contents.cache = options.cache
         split = split_held_out(recording.train)
         train = replace(recording, train=split.train)
-        done = learn(contents, strategy.method, train, stage, on_event)
-        record = fit_threshold(done.scenes, split.held_out)
-        done.scenes.scenes[-1] = record
+        learned = learn(contents, strategy.method, train, stage, on_event)
+        learned.scenes[-1] = fit_threshold(learned, split.held_out)
         report = LearnReport(
             scene=recording.name,
             seconds=time.perf_counter() - began,
-            memory_bytes=done.scenes.memory_bytes,
-            frames_kept=done.frames_kept,
+            memory_bytes=learned.memory_bytes,
+            frames_kept=learned.frames_kept,
             train_frames=len(split.train),
             held_out_frames=len(split.held_out),
-            iterations=done.iterations,
-            head_bytes=sum(head_bytes(head) for head in done.scenes.heads),
+            iterations=stage.fit.iterations,
+            head_bytes=sum(head_bytes(head) for head in learned.heads),
         )
-        opened.commit(done.scenes, asdict(report))
+        opened.commit(learned, asdict(report))
     return report
 
 
