@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from evercal.continual.networks.atlas import Atlas, Cell
+from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.descriptor import Descriptor
 from evercal.continual.networks.device import device_of_network
 from evercal.continual.networks.head import Head
@@ -45,6 +46,14 @@ class SceneRecord:
     def adjusted_camera(self) -> Camera:
         """Intrinsics for images of the camera that recorded the scene."""
         return self.refined_camera or self.camera
+
+    def correct_lens(self, rows: FeatureBuffer) -> None:
+        """Apply the intrinsics of the training to the scene's rows; see `corrected_camera`."""
+        nominal, refined = self.camera, self.refined_camera
+        if refined is not None:
+            k1, k2 = refined.distortion[:2] or (0.0, 0.0)
+            shift = (refined.cx - nominal.cx) / nominal.fx, (refined.cy - nominal.cy) / nominal.fy
+            rows.correct_lens(torch.tensor([refined.fx / nominal.fx - 1, *shift, k1, k2]))
 
     @property
     def frame(self) -> MapFrame:
@@ -133,13 +142,6 @@ def corrected_camera(camera: Camera, correction: Tensor) -> Camera:
         camera.cy + dy * camera.fy,
         (k1, k2, 0.0, 0.0),
     )
-
-
-def correction_between(nominal: Camera, refined: Camera) -> Tensor:
-    """(5,) the correction from a nominal to a refined camera: inverse of `corrected_camera`."""
-    k1, k2 = refined.distortion[:2] or (0.0, 0.0)
-    shift = (refined.cx - nominal.cx) / nominal.fx, (refined.cy - nominal.cy) / nominal.fy
-    return torch.tensor([refined.fx / nominal.fx - 1, *shift, k1, k2])
 
 
 def prototypes(descriptors: Tensor) -> Tensor:

@@ -46,18 +46,8 @@ HEAD, RECORD = "head.safetensors", "network.json"
 PROTOTYPES, STATE = "prototypes.safetensors", "state.safetensors"
 
 
-class NetworkStore(StageStore):
+class NetworkStore(StageStore[LearnedScenes]):
     """A store of networks on disk and in memory; its networks are encoder and descriptor."""
-
-    def __init__(
-        self,
-        root: Path,
-        scenes: LearnedScenes,
-        stages: list[str] | None = None,
-        networks: tuple[str, ...] = (),
-    ):
-        super().__init__(root, stages or [], networks)
-        self.contents = scenes
 
     @classmethod
     def create(

@@ -19,7 +19,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from filelock import FileLock, Timeout
 
@@ -36,7 +36,8 @@ _NETWORKS = ("encoder-", "vlad-", "descriptor-")
 """Beginnings of the names of network files."""
 _MADE = "made"
 """Key of the payload: the stages ever added. No name is used again after its stage was removed."""
-Result = TypeVar("Result")
+Result, Contents = TypeVar("Result"), TypeVar("Contents")
+Names = Sequence[str]
 Write = Callable[[Path], None]
 """Writes the files of a stage into a folder."""
 
@@ -114,14 +115,15 @@ def _listed(root: Path, manifest: Manifest, key: str) -> list[object]:
     return names
 
 
-class StageStore:
-    """Stages on disk.
+class StageStore(Generic[Contents]):
+    """Stages on disk, and their contents in memory.
 
     Nothing is written before the first stage is added. All stages share the networks.
     """
 
-    def __init__(self, root: Path, stages: Sequence[str], networks: Sequence[str]):
-        self.root, self.stages, self.networks = root, list(stages), tuple(networks)
+    def __init__(self, root: Path, contents: Contents, stages: Names = (), networks: Names = ()):
+        self.root, self.contents = root, contents
+        self.stages, self.networks = list(stages), tuple(networks)
         resolved = root.resolve()  # one lock, whichever name the store is opened by
         self._lock = FileLock(resolved.parent / f".{resolved.name}.lock")
 
@@ -170,7 +172,7 @@ class StageStore:
 
     def change(
         self,
-        kept: Sequence[str],
+        kept: Names,
         added: Sequence[tuple[str, Write]],
         payload: Mapping[str, object],
         superseded: Callable[[str], bool] = lambda _: False,

@@ -18,10 +18,10 @@ from evercal.continual.benchmark.results import (
     record_environment,
     scene_row,
 )
-from evercal.continual.learning.learn import correct_lens, finish_scene, learn_jointly
+from evercal.continual.learning.learn import finish_scene, learn_jointly
 from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
 from evercal.continual.learning.stage import StageOptions
-from evercal.continual.learning.stage_rows import scene_rows
+from evercal.continual.learning.stage_rows import StageRows
 from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer
 from evercal.continual.networks.atlas import combined_centres
 from evercal.continual.networks.buffer import FeatureBuffer
@@ -37,7 +37,7 @@ from evercal.localization.learned import LearnedLocalizer
 from evercal.localization.localizer import Localizer
 from evercal.localization.query import LocalizeOptions
 from evercal.mapping.store import MapStore
-from evercal.recordings import Frame, Recording, stated_poses
+from evercal.recordings import Recording, stated_poses
 from evercal.recordings.held_out import split_held_out
 from evercal.storage.stages import is_store
 
@@ -106,10 +106,7 @@ class _Run:
         self.store.with_name(f".{self.store.name}.lock").unlink(missing_ok=True)
 
     def _evaluated(
-        self,
-        localizers: Mapping[str, LearnedLocalizer],
-        number: int,
-        costs: Mapping[str, object],
+        self, localizers: Mapping[str, LearnedLocalizer], number: int, costs: Mapping[str, object]
     ) -> StageResults:
         """Evaluate all scenes learned so far by localizers, by the names of their results."""
         results, frames = [], []
@@ -225,20 +222,19 @@ class _NetworkRun(_Run):
         scenes = self._prepared(first.contents.copy_for_training())
         scenes.strategy, scenes.keyframes, scenes.method_states = self.strategy.name, [], []
         train = split_held_out(scene.train).train
-        finish_scene(scenes, method, train, self._rows(scenes, train), self.stage)
+
+        @cache
+        def rows() -> FeatureBuffer:
+            [record] = scenes.scenes
+            buffer = StageRows(scenes, self.stage).of_scene(0, record.cell, train)
+            record.correct_lens(buffer)
+            return buffer
+
+        finish_scene(scenes, method, train, rows, self.stage)
         report = first.reports()[-1]
         report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
         report["frames_kept"] = scenes.frames_kept
         self._new_store().commit(scenes, report)
-
-    def _rows(self, scenes: LearnedScenes, train: Sequence[Frame]) -> Callable[[], FeatureBuffer]:
-        @cache
-        def rows() -> FeatureBuffer:
-            buffer = scene_rows(scenes, 0, scenes.scenes[0].cell, train, self.stage)
-            correct_lens(buffer, scenes.scenes[0])
-            return buffer
-
-        return rows
 
     def _located(self, scenes: LearnedScenes, number: int, seconds: float) -> StageResults:
         costs = {
@@ -247,8 +243,7 @@ class _NetworkRun(_Run):
             "head_bytes": sum(head_bytes(head) for head in scenes.heads),
             "frames_kept": scenes.frames_kept,
         }
-        localizer = NetworkLocalizer(scenes, NETWORK_LOCALIZE)
-        named = {self.strategy.name: localizer}
+        named = {self.strategy.name: NetworkLocalizer(scenes, NETWORK_LOCALIZE)}
         return self._evaluated(named, number, costs)
 
 

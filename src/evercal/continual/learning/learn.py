@@ -3,28 +3,23 @@
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from evercal.continual.learning.stage import OnEvent, StageOptions, unobserved
-from evercal.continual.learning.stage_rows import keyframe_rows, remembered, scene_rows
+from evercal.continual.learning.stage_rows import StageRows
 from evercal.continual.learning.surfaces import shared_depths, surface_points
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
 from evercal.continual.networks.atlas import Atlas, Cell, camera_clusters
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.head import Head, fresh_head
 from evercal.continual.networks.trainer import HeadTrainer
-from evercal.continual.scenes import (
-    LearnedScenes,
-    SceneRecord,
-    corrected_camera,
-    correction_between,
-    prototypes,
-)
+from evercal.continual.scenes import LearnedScenes, SceneRecord, corrected_camera, prototypes
 from evercal.continual.selection.frame_statistics import FrameStatistics
-from evercal.mapping.keyframes import Keyframes, store_keyframes
+from evercal.mapping.keyframes import store_keyframes
 from evercal.recordings.frame import Frame, Recording, stated_poses
 
 WHITENING_ROWS = 20_000
@@ -43,19 +38,19 @@ def learn(
     """
     after = scenes.copy_for_training()
     teacher = copy.deepcopy(after.heads[-1]).eval() if after.heads else None
-    atlas = after.atlas(options.grid_scenes)
-    cell, buffer = _begun(after, atlas, recording, options, method.head_per_scene, on_event)
+    rows, atlas = StageRows(after, options, on_event), after.atlas(options.grid_scenes)
+    cell, buffer = _begun(rows, atlas, recording, method.head_per_scene)
     head = after.heads[-1]
     if teacher is None:
         _whiten(head, [buffer], options.seed)
-    memories = remembered(scenes, options, on_event) if method.replays else []
-    rows, states = options.fit.replay_batch, scenes.method_states
-    hooks = method.begin(StageStart(head, teacher, memories, states, rows, options.seed))
+    memories = rows.remembered() if method.replays else []
+    states, replayed = scenes.method_states, options.fit.replay_batch
+    hooks = method.begin(StageStart(head, teacher, memories, states, replayed, options.seed))
     trainer = HeadTrainer(head, [buffer], options.fit, options.seed, hooks)
     for progress in trainer.run():
         on_event(progress)
     after.scenes.append(trained_record(recording, cell, trainer, 0))
-    correct_lens(buffer, after.scenes[-1])
+    after.scenes[-1].correct_lens(buffer)
     finish_scene(after, method, recording.train, lambda: buffer, options)
     return after
 
@@ -72,8 +67,8 @@ def learn_jointly(
     not changed.
     """
     after, fit = start.copy_for_training(), options.fit
-    atlas = after.atlas(options.grid_scenes)
-    begun = [_begun(after, atlas, scene, options, False, on_event) for scene in recordings]
+    encoder, atlas = StageRows(after, options, on_event), after.atlas(options.grid_scenes)
+    begun = [_begun(encoder, atlas, scene) for scene in recordings]
     buffers = [buffer for _, buffer in begun]
     (head,) = after.heads
     _whiten(head, buffers, options.seed)
@@ -90,14 +85,10 @@ def learn_jointly(
 
 
 def _begun(
-    after: LearnedScenes,
-    atlas: Atlas,
-    recording: Recording,
-    options: StageOptions,
-    own: bool,
-    on_event: OnEvent,
+    rows: StageRows, atlas: Atlas, recording: Recording, own: bool = False
 ) -> tuple[Cell, FeatureBuffer]:
     """Place a scene in the atlas, grow a head by it, and encode its frames."""
+    after, options = rows.scenes, rows.options
     frames, number = recording.train, len(atlas.cells)
     positions = stated_poses(frames).translation_m
     cell = atlas.place(positions)
@@ -106,7 +97,7 @@ def _begun(
     centres = _new_centres(head, options, cell.atlas_from_base.apply(positions))
     head.grow(centres, options.seed + number)
     after.heads.append(head)
-    buffer = scene_rows(after, local, cell, frames, options, on_event)
+    buffer = rows.of_scene(local, cell, frames)
     if options.fit.surface_weight > 0:
         depths = shared_depths(after.cache, frames, after.encoder, after.short_side)
         points = surface_points(buffer, frames, depths, after.encoder.stride)
@@ -158,25 +149,16 @@ def finish_scene(
     selected = method.select(statistics, options.memory.capacity(frames, scenes.short_side))
     keyframes = None
     if selected is not None:
-        keyframes = _keyframes(scenes, [frames[i] for i in selected], options)
+        chosen, refined = [frames[i] for i in selected], scenes.scenes[-1].refined_camera
+        if refined is not None:  # replay uses the camera as training corrected it
+            chosen = [replace(frame, camera=refined) for frame in chosen]
+        keyframes = store_keyframes(chosen, scenes.short_side)
+        keyframes = keyframes.take(options.memory.fitting(keyframes))
     scenes.keyframes.append(keyframes)
-
-    def remembered() -> FeatureBuffer:
-        assert keyframes is not None, "a method whose state is about keyframes selects some"
-        return keyframe_rows(scenes, newest, keyframes, options)
-
     diffusion = options.fit.diffusion if head.options.condition == "descriptor" else 0.0
+    remembered = partial(StageRows(scenes, options).of_keyframes, newest)
     finished = FinishedScene(head.eval(), local, rows, remembered, diffusion)
     scenes.method_states.append(method.after_scene(finished))
-
-
-def _keyframes(scenes: LearnedScenes, frames: Sequence[Frame], options: StageOptions) -> Keyframes:
-    # Replay uses the camera as training corrected it.
-    refined = scenes.scenes[-1].refined_camera
-    if refined is not None:
-        frames = [replace(frame, camera=refined) for frame in frames]
-    keyframes = store_keyframes(frames, scenes.short_side)
-    return keyframes.take(options.memory.fitting(keyframes))
 
 
 def trained_record(scene: Recording, cell: Cell, trainer: HeadTrainer, number: int) -> SceneRecord:
@@ -187,9 +169,3 @@ def trained_record(scene: Recording, cell: Cell, trainer: HeadTrainer, number: i
         refined = corrected_camera(camera, trainer.correction[number].detach())
     spread = prototypes(buffer.tensors["descriptors"][: len(scene.train)])
     return SceneRecord(scene.name, camera, cell, spread, len(scene.train), refined)
-
-
-def correct_lens(rows: FeatureBuffer, record: SceneRecord) -> None:
-    """Apply the intrinsics of the training to a scene's rows."""
-    if record.refined_camera is not None:
-        rows.correct_lens(correction_between(record.camera, record.refined_camera))

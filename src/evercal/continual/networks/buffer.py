@@ -110,6 +110,14 @@ class FeatureBuffer:
     def __len__(self) -> int:
         return len(self.tensors["features"])
 
+    @property
+    def starts(self) -> Tensor:
+        """(views + 1,) first row of every view, and the number of rows; on the CPU."""
+        view = self.tensors["view"].cpu()
+        return torch.searchsorted(
+            view, torch.arange(self.views + 1, dtype=view.dtype, device="cpu")
+        )
+
     def correct_lens(self, correction: Tensor) -> None:
         """Undistort the pixels and correct the intrinsics; see `reprojection_error`."""
         t, view = self.tensors, self.tensors["view"].long()
