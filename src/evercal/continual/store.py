@@ -22,13 +22,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from evercal.continual.networks import descriptor
 from evercal.continual.networks.atlas import Cell
-from evercal.continual.networks.descriptor import (
-    DESCRIBED_ENCODER,
-    descriptor_bytes,
-    descriptor_for,
-    load_descriptor,
-)
 from evercal.continual.networks.head import Head, HeadOptions
 from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.errors import InputError
@@ -59,12 +54,10 @@ class NetworkStore(StageStore[LearnedScenes]):
         encoder's ONNX file is used, if it fits.
         """
         require_free(root)
-        if encoder is None:
-            networks = load_encoder(DESCRIBED_ENCODER), load_descriptor()
-        else:
-            local = load_encoder(encoder)
-            networks = local, descriptor_for(encoder, local.width)
-        return cls(root, LearnedScenes(*networks, strategy, short_side))
+        file = encoder or descriptor.DESCRIBED_ENCODER
+        local = load_encoder(file)
+        described = descriptor.descriptor_for(file, local.width)
+        return cls(root, LearnedScenes(local, described, strategy, short_side))
 
     @classmethod
     def open(cls, root: Path) -> Self:
@@ -78,7 +71,7 @@ class NetworkStore(StageStore[LearnedScenes]):
                 encoder.centroids = load_tensors(root / name)["centroids"].astype(np.float32)
             scenes = LearnedScenes(
                 encoder,
-                load_descriptor(root / networks[-1]),
+                descriptor.load_descriptor(root / networks[-1]),
                 str(payload["strategy"]),
                 int(payload["short_side"]),
             )
@@ -127,7 +120,7 @@ class NetworkStore(StageStore[LearnedScenes]):
         self.contents = scenes
 
     def _write_networks(self, scenes: LearnedScenes) -> tuple[str, ...]:
-        data = descriptor_bytes(scenes.descriptor)
+        data = descriptor.descriptor_bytes(scenes.descriptor)
         name = f"descriptor-{hashlib.sha256(data).hexdigest()[:12]}.safetensors"
         write_bytes(self.root / name, data)
         return (*scenes.encoder.write(self.root), name)

@@ -36,7 +36,8 @@ _NETWORKS = ("encoder-", "vlad-", "descriptor-")
 """Beginnings of the names of network files."""
 _MADE = "made"
 """Key of the payload: the stages ever added. No name is used again after its stage was removed."""
-Result, Contents = TypeVar("Result"), TypeVar("Contents")
+Result = TypeVar("Result")
+Contents = TypeVar("Contents")
 Names = Sequence[str]
 Write = Callable[[Path], None]
 """Writes the files of a stage into a folder."""

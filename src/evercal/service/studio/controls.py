@@ -14,11 +14,7 @@ from evercal.errors import InputError
 from evercal.live.coverage import POSITION_MM, ROTATION_DEG
 from evercal.service.studio.devices import Which
 from evercal.service.studio.studio import FIXED_IMAGES, STEPS, Studio
-from evercal.service.viewer.html import (
-    calibration_rows,
-    chip_html,
-    rows_html,
-)
+from evercal.service.viewer.html import calibration_rows, chip_html, rows_html
 
 _CAMERAS: dict[str, Which] = {"camera on the gripper": "wrist", "fixed camera": "fixed"}
 
