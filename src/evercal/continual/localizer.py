@@ -70,12 +70,8 @@ class NetworkLocalizer:
         cameras = _fitting_cameras(camera, image, scenes.scenes)
         features = scenes.encoder.encode(image, scenes.short_side)
         query = Query(image, features, self.options.patches_short_side)
-        best: Hypothesis | None = None
-        for scene in self._candidates(query, cameras):
-            trial = self._hypothesis(query, scene, cameras)
-            if best is None or _support(trial) > _support(best):
-                best = trial
-        assert best is not None, "at least one scene is tried"
+        tried = [self._hypothesis(query, i, cameras) for i in self._candidates(query, cameras)]
+        best = max(tried, key=_support)
         return self._answer(best, 1000 * (time.perf_counter() - began))
 
     @property
@@ -115,13 +111,8 @@ class NetworkLocalizer:
                 matches = Matches(matches.pixels, across.apply(matches.points_m))
                 scene = other
         pixels, points = (values[rough.inliers] for values in matches)
-        return Hypothesis(
-            scene,
-            uncertain(pixels, points, small, rough.pose),
-            pixels=pixels,
-            points_m=points,
-            expected=patches,
-        )
+        pose = uncertain(pixels, points, small, rough.pose)
+        return Hypothesis(scene, pose, pixels=pixels, points_m=points, expected=patches)
 
     @torch.inference_mode()
     def _predicted(self, query: Query, scene: int, camera: Camera) -> tuple[Matches, int]:
@@ -146,12 +137,12 @@ class NetworkLocalizer:
     def _answer(self, best: Hypothesis, milliseconds: float) -> PoseEstimate:
         record = self.contents.scenes[best.scene]
         status, reason = self._status(best, record)
-        rejected = without_pose(best, _support(best), milliseconds)
-        rejected = replace(rejected, status=status, reason=reason)
+        estimate = without_pose(best, _support(best), milliseconds)
+        estimate = replace(estimate, status=status, reason=reason)
         if status != "ok" or best.pose is None:
-            return rejected
+            return estimate
         return replace(
-            rejected,
+            estimate,
             scene=record.name,
             base_from_camera=best.pose.pose,
             covariance=record.covariance_scale * best.pose.covariance,
@@ -178,7 +169,8 @@ def _fitting_cameras(
     """Intrinsics of an image in each scene, never guessed; None where its shape does not fit."""
     height, width = image.shape[:2]
     recorded = [scene.adjusted_camera for scene in scenes]
-    if camera is None and not any(own.fits(width, height) for own in recorded):
+    fits = [camera is not None or own.fits(width, height) for own in recorded]
+    if not any(fits):
         sizes = ", ".join(
             f"{scene.name} {own.width}x{own.height}"
             for scene, own in zip(scenes, recorded, strict=True)
@@ -188,12 +180,7 @@ def _fitting_cameras(
             " give the image's intrinsics with --camera"
         )
     asked = cameras_in_scenes(camera, image, scenes)
-    if camera is not None:
-        return list(asked)
-    return [
-        own if stated.fits(width, height) else None
-        for own, stated in zip(asked, recorded, strict=True)
-    ]
+    return [own if fit else None for own, fit in zip(asked, fits, strict=True)]
 
 
 def _support(hypothesis: Hypothesis) -> float:

@@ -97,9 +97,8 @@ class LearnedScenes:
     def memory_bytes(self) -> int:
         """Size of the memory for later stages: keyframes and method states."""
         frames = sum(keyframes.bytes for keyframes in self.keyframes if keyframes is not None)
-        return frames + sum(
-            value.nbytes for state in self.method_states for value in state.values()
-        )
+        states = (value for state in self.method_states for value in state.values())
+        return frames + sum(value.nbytes for value in states)
 
     @property
     def frames_kept(self) -> int:
@@ -109,9 +108,7 @@ class LearnedScenes:
 
     def atlas(self, grid_scenes: int = 0) -> Atlas:
         """Cells of the scenes learned so far; `grid_scenes` of the paper's layout, 0: open."""
-        atlas = Atlas("paper", grid_scenes) if grid_scenes else Atlas()
-        atlas.cells = [record.cell for record in self.scenes]
-        return atlas
+        return Atlas(grid_scenes, [record.cell for record in self.scenes])
 
     def head_for(self, scene: int) -> tuple[Head, int]:
         """The head of a scene and the scene's index in that head."""
@@ -133,15 +130,9 @@ class LearnedScenes:
 def corrected_camera(camera: Camera, correction: Tensor) -> Camera:
     """A nominal pinhole with the correction (5,) of training (see `reprojection_error`)."""
     focal, dx, dy, k1, k2 = (float(value) for value in correction)
-    return Camera(
-        camera.width,
-        camera.height,
-        camera.fx * (1 + focal),
-        camera.fy * (1 + focal),
-        camera.cx + dx * camera.fx,
-        camera.cy + dy * camera.fy,
-        (k1, k2, 0.0, 0.0),
-    )
+    fx, fy = camera.fx * (1 + focal), camera.fy * (1 + focal)
+    cx, cy = camera.cx + dx * camera.fx, camera.cy + dy * camera.fy
+    return Camera(camera.width, camera.height, fx, fy, cx, cy, (k1, k2, 0.0, 0.0))
 
 
 def prototypes(descriptors: Tensor) -> Tensor:

@@ -69,12 +69,9 @@ class NetworkStore(StageStore[LearnedScenes]):
             encoder = load_encoder(root / networks[0])
             for name in networks[1:-1]:
                 encoder.centroids = load_tensors(root / name)["centroids"].astype(np.float32)
-            scenes = LearnedScenes(
-                encoder,
-                descriptor.load_descriptor(root / networks[-1]),
-                str(payload["strategy"]),
-                int(payload["short_side"]),
-            )
+            described = descriptor.load_descriptor(root / networks[-1])
+            strategy, short_side = str(payload["strategy"]), int(payload["short_side"])
+            scenes = LearnedScenes(encoder, described, strategy, short_side)
             stages = [str(name) for name in payload["stages"]]
             store = cls(root, scenes, stages, networks)
             for name in stages:
@@ -131,10 +128,9 @@ def describe(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]
     store = NetworkStore.open(path)
     contents = store.contents
     scenes = []
-    for record, keyframes in zip(contents.scenes, contents.keyframes, strict=True):
-        memory = (keyframes.bytes, len(keyframes)) if keyframes is not None else (0, 0)
-        sizes = dict(zip(("memory_bytes", "keyframes"), memory, strict=True))
-        scenes.append(_plain(record) | sizes)
+    for record, kept in zip(contents.scenes, contents.keyframes, strict=True):
+        size, count = (kept.bytes, len(kept)) if kept is not None else (0, 0)
+        scenes.append(_plain(record) | {"memory_bytes": size, "keyframes": count})
     heads = sum(head_bytes(head) for head in contents.heads)
     return scenes, contents.short_side, heads, store.size_bytes()
 

@@ -42,9 +42,7 @@ def run_scores(results: Table) -> Table:
     Forgetting and memory of joint training are NaN.
     """
     scores = {key: _scores(run) for key, run in _runs(complete_runs(results)).items()}
-    table = pd.DataFrame.from_dict(scores, orient="index")
-    table.index = pd.MultiIndex.from_tuples(list(scores), names=["strategy", "seed"])
-    return table
+    return pd.DataFrame.from_dict(scores, orient="index").rename_axis(["strategy", "seed"])
 
 
 def _runs(results: Table) -> dict[tuple[str, int], Table]:

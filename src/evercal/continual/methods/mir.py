@@ -56,9 +56,8 @@ class MaximallyInterferedRetrieval(Replay):
         moved = copy.deepcopy(head)
         before = self._view_losses(head, rows)
         parameters = list(moved.parameters())
-        gradients = torch.autograd.grad(
-            self._losses(moved, fresh).mean(), parameters, materialize_grads=True
-        )
+        cost = self._losses(moved, fresh).mean()
+        gradients = torch.autograd.grad(cost, parameters, materialize_grads=True)
         with torch.no_grad():
             for parameter, gradient in zip(parameters, gradients, strict=True):
                 size = gradient.square().mean().sqrt().clamp(min=1e-12)

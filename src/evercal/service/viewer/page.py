@@ -76,12 +76,7 @@ class Page:
         centre_m, width_m, height_m = backdrop(view)
         with client.atomic():
             client.scene.add_image(
-                _THROUGH,
-                view.image,
-                width_m,
-                height_m,
-                wxyz=pose.rotation_wxyz,
-                position=centre_m,
+                _THROUGH, view.image, width_m, height_m, wxyz=pose.rotation_wxyz, position=centre_m
             )
             client.camera.position, client.camera.wxyz = pose.translation_m, pose.rotation_wxyz
             client.camera.fov = view.frustum.fov_rad
