@@ -96,8 +96,7 @@ def _check(root: Path, manifest: Manifest) -> None:
         )
     if schema != SCHEMA:
         raise InputError(f"store {root}: schema {schema!r} is not {SCHEMA}; update evercal")
-    problems = manifest.problems(root)
-    if problems:
+    if problems := manifest.problems(root):
         raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
     if not isinstance(manifest.payload.get(_MADE, 0), int):
         raise InputError(f"store {root}: {_MADE!r} in the manifest is not a number; restore it")
@@ -140,9 +139,8 @@ class StageStore(Generic[Contents]):
             The manifest that will be replaced; None for a new store.
         """
         # The lock file is never removed: a process that waits for it would lock a deleted file.
-        lock = Path(self._lock.lock_file)
         try:
-            lock.parent.mkdir(parents=True, exist_ok=True)
+            Path(self._lock.lock_file).parent.mkdir(parents=True, exist_ok=True)
             self._lock.acquire(timeout=0)
         except Timeout:
             raise InputError(
@@ -320,9 +318,9 @@ def _names(folder: Path) -> set[str]:
 
 
 def _made(manifest: Manifest | None) -> int:
-    return (
-        0 if manifest is None else int(manifest.payload.get(_MADE, len(manifest.payload["stages"])))
-    )
+    if manifest is None:
+        return 0
+    return int(manifest.payload.get(_MADE, len(manifest.payload["stages"])))
 
 
 def write_report(folder: Path, report: Mapping[str, object]) -> None:

@@ -25,7 +25,7 @@ class StageOptions:
     fixed_centres_m: tuple[tuple[float, float, float], ...] = ()
     """Atlas coordinates of all centres, for HeadOptions.centres `fixed`."""
     grid_scenes: int = 0
-    """Scenes of `Atlas` layout `paper`; 0 gives each scene the next free cell."""
+    """Scenes of the paper's layout, see `Atlas`; 0 gives each scene the next free cell."""
     seed: int = 0
 
     def with_memory(self, memory: str | int) -> "StageOptions":
