@@ -14,7 +14,7 @@ from evercal.continual.networks.precision import autocast
 from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.continual.store import NetworkStore
 from evercal.errors import InputError
-from evercal.geometry import Camera
+from evercal.geometry import SE3, Camera
 from evercal.localization.acceptance import without_pose
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import cameras_in_scenes
@@ -100,7 +100,8 @@ class NetworkLocalizer:
         if rough is None:
             return Hypothesis(scene)
         if self._decides_scene and not moved:
-            other = self._scene_of(rough, scene)
+            inside = self._scene_at(rough.pose, scene)
+            other = scene if inside is None else inside
             if cameras[other] not in (None, camera):
                 # The pose lies in the cell of a scene with another camera: solve once more.
                 return self._hypothesis(query, other, cameras, moved=True)
@@ -128,11 +129,10 @@ class NetworkLocalizer:
         valid = np.isfinite(points).all(1)
         return Matches(pixels[valid], points[valid]), len(patches)
 
-    def _scene_of(self, rough: PnpResult, scene: int) -> int:
+    def _scene_at(self, base_from_camera: SE3, scene: int) -> int | None:
+        """The scene in whose cell a pose of one scene lies."""
         atlas_from_base = self.contents.scenes[scene].cell.atlas_from_base
-        position = atlas_from_base.apply(rough.pose.translation_m)
-        inside = self.contents.atlas().scene_at(position)
-        return scene if inside is None else inside
+        return self.contents.atlas().scene_at(atlas_from_base.apply(base_from_camera.translation_m))
 
     def _answer(self, best: Hypothesis, milliseconds: float) -> PoseEstimate:
         record = self.contents.scenes[best.scene]
@@ -153,8 +153,7 @@ class NetworkLocalizer:
     def _status(self, best: Hypothesis, record: SceneRecord):
         if best.pose is None:
             return "failed", "fewer than 6 inliers"
-        position = record.cell.atlas_from_base.apply(best.pose.pose.translation_m)
-        if self.contents.atlas().scene_at(position) != best.scene:
+        if self._scene_at(best.pose.pose, best.scene) != best.scene:
             return "failed", "the pose lies outside the cell of its scene"
         if self.options.refuses and best.inlier_ratio < record.inlier_threshold:
             share, need = 100 * best.inlier_ratio, 100 * record.inlier_threshold

@@ -116,8 +116,7 @@ def scene_table(results: Table) -> Table:
     rows = []
     for (name, _), run in _runs(complete_runs(results)).items():
         accuracies = matrix(run)
-        learned = np.diag(accuracies)
-        ends = zip(accuracies.columns, learned, accuracies.iloc[-1], strict=True)
+        ends = zip(accuracies.columns, np.diag(accuracies), accuracies.iloc[-1], strict=True)
         rows += [(name, scene, first, end) for scene, first, end in ends]
     cells = pd.DataFrame(rows, columns=["strategy", "scene", "learned", "end"])
     means = cells.groupby(["strategy", "scene"], sort=False)[["learned", "end"]].mean()

@@ -107,8 +107,7 @@ def learn_networks(
     opened = options.opened(store, strategy, stage, recording.train)
     with opened.writing():
         contents = opened.contents.to(device_of(options.device))
-        names = [record.name for record in contents.scenes]
-        recording = named_recording(recording, None, names)
+        recording = named_recording(recording, None, [record.name for record in contents.scenes])
         if lacks_camera_poses(recording):
             raise InputError(
                 f"scene {recording.name!r}: only gripper poses are stated, and strategy"

@@ -43,7 +43,9 @@ class _PreconditionedHooks(ReplayHooks):
         self._fixed = owned_rows(start.head, start.memories)
         moments = input_moments(start.head, start.memories, start.seed)
         self._damping = {
-            name: torch.linalg.inv(torch.eye(len(m)).to(m) + method.strength * m).float()
+            name: torch.linalg.inv(
+                torch.eye(len(m), dtype=m.dtype, device=m.device) + method.strength * m
+            ).float()
             for name, m in moments.items()
         }
 
