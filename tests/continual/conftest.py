@@ -59,7 +59,7 @@ def first_stages(
     from .stages import learn
 
     return {
-        name: learn(empty_scenes(name), strategy, rooms[0], quick).scenes
+        name: learn(empty_scenes(name), strategy, rooms[0], quick)
         for name, strategy in STRATEGIES.items()
         if strategy.method is not None and not strategy.jointly
     }
@@ -78,7 +78,7 @@ def three_stages(
     for name in ("evercal_network", "isolation"):
         stages[name] = [first_stages[name].copy_for_training()]
         for room in rooms[1:]:
-            stages[name].append(learn(stages[name][-1], STRATEGIES[name], room, quick).scenes)
+            stages[name].append(learn(stages[name][-1], STRATEGIES[name], room, quick))
         for after in stages[name]:
             after.scenes = [
                 replace(record, inlier_threshold=0.01 * (i + 1), covariance_scale=1.5)
@@ -120,7 +120,7 @@ def arc_scenes(
         options = replace(arc_stage, fit=replace(arc_stage.fit, iterations=450))
         encoder = load_encoder(DESCRIBED_ENCODER)
         empty = LearnedScenes(encoder, load_descriptor(), strategy.name, 120)
-        one = learn(empty, strategy, arcs[0], options).scenes
-        return one, learn(one, strategy, arcs[1], options).scenes
+        one = learn(empty, strategy, arcs[0], options)
+        return one, learn(one, strategy, arcs[1], options)
 
     return shared("arc_scenes", train)

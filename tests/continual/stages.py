@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from evercal.continual.learning.learn import learn as learn_by_method
-from evercal.continual.learning.stage import OnEvent, Stage, StageOptions, unobserved
+from evercal.continual.learning.stage import OnEvent, StageOptions, unobserved
 from evercal.continual.networks.head import Head
 from evercal.continual.scenes import LearnedScenes
 from evercal.continual.store import NetworkStore
@@ -26,7 +26,7 @@ def learn(
     recording: Recording,
     options: StageOptions,
     on_event: OnEvent = unobserved,
-) -> Stage:
+) -> LearnedScenes:
     """Learn a scene by the method of a strategy."""
     assert strategy.method is not None
     return learn_by_method(scenes, strategy.method, recording, options, on_event)
@@ -34,7 +34,7 @@ def learn(
 
 def second_stage(
     scenes: LearnedScenes, rooms: Rooms, options: StageOptions, on_event: OnEvent = unobserved
-) -> Stage:
+) -> LearnedScenes:
     """Learn the second room with the strategy of the first."""
     return learn(scenes, STRATEGIES[scenes.strategy], rooms[1], options, on_event)
 

@@ -24,15 +24,15 @@ Tree = Callable[[Path], dict[str, str]]
 PAYLOAD = {"kind": "test"}
 
 
-def opened(root: Path) -> StageStore:
+def opened(root: Path) -> StageStore[None]:
     """The store at a path, or a new one."""
     if not is_store(root):
-        return StageStore(root, [], ())
+        return StageStore(root, None)
     payload = read_store(root, lambda manifest: manifest.payload)
-    return StageStore(root, payload["stages"], payload["networks"])
+    return StageStore(root, None, payload["stages"], payload["networks"])
 
 
-def add(store: StageStore, name: str, text: str = "") -> None:
+def add(store: StageStore[None], name: str, text: str = "") -> None:
     def write(folder: Path) -> None:
         if not store.networks:
             write_bytes(store.root / "encoder-1.bin", b"weights")
@@ -164,7 +164,7 @@ def test_writer_killed_at_any_step(
 Everything = Callable[[Path], dict[str, "bytes | None"]]
 
 
-def change_by(action: str, store: StageStore) -> None:
+def change_by(action: str, store: StageStore[None]) -> None:
     if action == "replace":
         store.replace(0, lambda folder: write_bytes(folder / "scene.json", b'"new"'), PAYLOAD)
     elif action == "remove":
@@ -285,7 +285,7 @@ LOCKED = """
 import sys, time
 from pathlib import Path
 from evercal.storage.stages import StageStore
-store = StageStore(Path(sys.argv[1]), ["0001-kitchen", "0002-hall"], ())
+store = StageStore(Path(sys.argv[1]), None, ["0001-kitchen", "0002-hall"])
 with store.writing():
     print("locked", flush=True)
     time.sleep(60)
@@ -388,10 +388,10 @@ def test_damaged_files_are_named(root: Path, file: str) -> None:
     with pytest.raises(InputError, match=rf"{file}: checksum does not match.*; restore it"):
         texts(root)
     # The damage is still reported after another stage is added.
-    add(StageStore(root, ["0001-kitchen", "0002-hall"], ("encoder-1.bin",)), "attic")
+    add(StageStore(root, None, ["0001-kitchen", "0002-hall"], ("encoder-1.bin",)), "attic")
     assert verify(root) == [f"{path}: checksum does not match, its content was changed"]
     with pytest.raises(InputError, match="checksum"):
-        StageStore(root, ["0001-kitchen", "0002-hall", "0003-attic"], ()).replace(
+        StageStore(root, None, ["0001-kitchen", "0002-hall", "0003-attic"]).replace(
             0, lambda folder: None, PAYLOAD
         )
     path.unlink()
@@ -444,7 +444,7 @@ def test_other_schemas_are_refused(root: Path, schema: int, message: str) -> Non
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
-        add(StageStore(tmp_path / "file" / "store", [], ()), "kitchen")
+        add(StageStore(tmp_path / "file" / "store", None), "kitchen")
 
 
 @pytest.mark.parametrize("linked", ["stages", "stages/0002-hall"])

@@ -14,7 +14,7 @@ from evercal.continual.networks.precision import autocast
 from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.continual.store import NetworkStore
 from evercal.errors import InputError
-from evercal.geometry import Camera
+from evercal.geometry import SE3, Camera
 from evercal.localization.acceptance import without_pose
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import cameras_in_scenes
@@ -70,12 +70,8 @@ class NetworkLocalizer:
         cameras = _fitting_cameras(camera, image, scenes.scenes)
         features = scenes.encoder.encode(image, scenes.short_side)
         query = Query(image, features, self.options.patches_short_side)
-        best: Hypothesis | None = None
-        for scene in self._candidates(query, cameras):
-            trial = self._hypothesis(query, scene, cameras)
-            if best is None or _support(trial) > _support(best):
-                best = trial
-        assert best is not None, "at least one scene is tried"
+        tried = [self._hypothesis(query, i, cameras) for i in self._candidates(query, cameras)]
+        best = max(tried, key=_support)
         return self._answer(best, 1000 * (time.perf_counter() - began))
 
     @property
@@ -104,7 +100,8 @@ class NetworkLocalizer:
         if rough is None:
             return Hypothesis(scene)
         if self._decides_scene and not moved:
-            other = self._scene_of(rough, scene)
+            inside = self._scene_at(rough.pose, scene)
+            other = scene if inside is None else inside
             if cameras[other] not in (None, camera):
                 # The pose lies in the cell of a scene with another camera: solve once more.
                 return self._hypothesis(query, other, cameras, moved=True)
@@ -115,13 +112,8 @@ class NetworkLocalizer:
                 matches = Matches(matches.pixels, across.apply(matches.points_m))
                 scene = other
         pixels, points = (values[rough.inliers] for values in matches)
-        return Hypothesis(
-            scene,
-            uncertain(pixels, points, small, rough.pose),
-            pixels=pixels,
-            points_m=points,
-            expected=patches,
-        )
+        pose = uncertain(pixels, points, small, rough.pose)
+        return Hypothesis(scene, pose, pixels=pixels, points_m=points, expected=patches)
 
     @torch.inference_mode()
     def _predicted(self, query: Query, scene: int, camera: Camera) -> tuple[Matches, int]:
@@ -137,21 +129,20 @@ class NetworkLocalizer:
         valid = np.isfinite(points).all(1)
         return Matches(pixels[valid], points[valid]), len(patches)
 
-    def _scene_of(self, rough: PnpResult, scene: int) -> int:
+    def _scene_at(self, base_from_camera: SE3, scene: int) -> int | None:
+        """The scene in whose cell a pose of one scene lies."""
         atlas_from_base = self.contents.scenes[scene].cell.atlas_from_base
-        position = atlas_from_base.apply(rough.pose.translation_m)
-        inside = self.contents.atlas().scene_at(position)
-        return scene if inside is None else inside
+        return self.contents.atlas().scene_at(atlas_from_base.apply(base_from_camera.translation_m))
 
     def _answer(self, best: Hypothesis, milliseconds: float) -> PoseEstimate:
         record = self.contents.scenes[best.scene]
         status, reason = self._status(best, record)
-        rejected = without_pose(best, _support(best), milliseconds)
-        rejected = replace(rejected, status=status, reason=reason)
+        estimate = without_pose(best, _support(best), milliseconds)
+        estimate = replace(estimate, status=status, reason=reason)
         if status != "ok" or best.pose is None:
-            return rejected
+            return estimate
         return replace(
-            rejected,
+            estimate,
             scene=record.name,
             base_from_camera=best.pose.pose,
             covariance=record.covariance_scale * best.pose.covariance,
@@ -162,8 +153,7 @@ class NetworkLocalizer:
     def _status(self, best: Hypothesis, record: SceneRecord):
         if best.pose is None:
             return "failed", "fewer than 6 inliers"
-        position = record.cell.atlas_from_base.apply(best.pose.pose.translation_m)
-        if self.contents.atlas().scene_at(position) != best.scene:
+        if self._scene_at(best.pose.pose, best.scene) != best.scene:
             return "failed", "the pose lies outside the cell of its scene"
         if self.options.refuses and best.inlier_ratio < record.inlier_threshold:
             share, need = 100 * best.inlier_ratio, 100 * record.inlier_threshold
@@ -178,7 +168,8 @@ def _fitting_cameras(
     """Intrinsics of an image in each scene, never guessed; None where its shape does not fit."""
     height, width = image.shape[:2]
     recorded = [scene.adjusted_camera for scene in scenes]
-    if camera is None and not any(own.fits(width, height) for own in recorded):
+    fits = [camera is not None or own.fits(width, height) for own in recorded]
+    if not any(fits):
         sizes = ", ".join(
             f"{scene.name} {own.width}x{own.height}"
             for scene, own in zip(scenes, recorded, strict=True)
@@ -188,12 +179,7 @@ def _fitting_cameras(
             " give the image's intrinsics with --camera"
         )
     asked = cameras_in_scenes(camera, image, scenes)
-    if camera is not None:
-        return list(asked)
-    return [
-        own if stated.fits(width, height) else None
-        for own, stated in zip(asked, recorded, strict=True)
-    ]
+    return [own if fit else None for own, fit in zip(asked, fits, strict=True)]
 
 
 def _support(hypothesis: Hypothesis) -> float:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from evercal.continual.networks.atlas import Atlas, Cell
+from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.descriptor import Descriptor
 from evercal.continual.networks.device import device_of_network
 from evercal.continual.networks.head import Head
@@ -45,6 +46,14 @@ class SceneRecord:
     def adjusted_camera(self) -> Camera:
         """Intrinsics for images of the camera that recorded the scene."""
         return self.refined_camera or self.camera
+
+    def correct_lens(self, rows: FeatureBuffer) -> None:
+        """Apply the intrinsics of the training to the scene's rows; see `corrected_camera`."""
+        nominal, refined = self.camera, self.refined_camera
+        if refined is not None:
+            k1, k2 = refined.distortion[:2] or (0.0, 0.0)
+            shift = (refined.cx - nominal.cx) / nominal.fx, (refined.cy - nominal.cy) / nominal.fy
+            rows.correct_lens(torch.tensor([refined.fx / nominal.fx - 1, *shift, k1, k2]))
 
     @property
     def frame(self) -> MapFrame:
@@ -88,15 +97,18 @@ class LearnedScenes:
     def memory_bytes(self) -> int:
         """Size of the memory for later stages: keyframes and method states."""
         frames = sum(keyframes.bytes for keyframes in self.keyframes if keyframes is not None)
-        return frames + sum(
-            value.nbytes for state in self.method_states for value in state.values()
-        )
+        states = (value for state in self.method_states for value in state.values())
+        return frames + sum(value.nbytes for value in states)
+
+    @property
+    def frames_kept(self) -> int:
+        """Keyframes of the newest scene."""
+        newest = self.keyframes[-1]
+        return 0 if newest is None else len(newest)
 
     def atlas(self, grid_scenes: int = 0) -> Atlas:
         """Cells of the scenes learned so far; `grid_scenes` of the paper's layout, 0: open."""
-        atlas = Atlas("paper", grid_scenes) if grid_scenes else Atlas()
-        atlas.cells = [record.cell for record in self.scenes]
-        return atlas
+        return Atlas(grid_scenes, [record.cell for record in self.scenes])
 
     def head_for(self, scene: int) -> tuple[Head, int]:
         """The head of a scene and the scene's index in that head."""
@@ -118,22 +130,9 @@ class LearnedScenes:
 def corrected_camera(camera: Camera, correction: Tensor) -> Camera:
     """A nominal pinhole with the correction (5,) of training (see `reprojection_error`)."""
     focal, dx, dy, k1, k2 = (float(value) for value in correction)
-    return Camera(
-        camera.width,
-        camera.height,
-        camera.fx * (1 + focal),
-        camera.fy * (1 + focal),
-        camera.cx + dx * camera.fx,
-        camera.cy + dy * camera.fy,
-        (k1, k2, 0.0, 0.0),
-    )
-
-
-def correction_between(nominal: Camera, refined: Camera) -> Tensor:
-    """(5,) the correction from a nominal to a refined camera: inverse of `corrected_camera`."""
-    k1, k2 = refined.distortion[:2] or (0.0, 0.0)
-    shift = (refined.cx - nominal.cx) / nominal.fx, (refined.cy - nominal.cy) / nominal.fy
-    return torch.tensor([refined.fx / nominal.fx - 1, *shift, k1, k2])
+    fx, fy = camera.fx * (1 + focal), camera.fy * (1 + focal)
+    cx, cy = camera.cx + dx * camera.fx, camera.cy + dy * camera.fy
+    return Camera(camera.width, camera.height, fx, fy, cx, cy, (k1, k2, 0.0, 0.0))
 
 
 def prototypes(descriptors: Tensor) -> Tensor:

@@ -22,13 +22,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from evercal.continual.networks import descriptor
 from evercal.continual.networks.atlas import Cell
-from evercal.continual.networks.descriptor import (
-    DESCRIBED_ENCODER,
-    descriptor_bytes,
-    descriptor_for,
-    load_descriptor,
-)
 from evercal.continual.networks.head import Head, HeadOptions
 from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.errors import InputError
@@ -46,18 +41,8 @@ HEAD, RECORD = "head.safetensors", "network.json"
 PROTOTYPES, STATE = "prototypes.safetensors", "state.safetensors"
 
 
-class NetworkStore(StageStore):
+class NetworkStore(StageStore[LearnedScenes]):
     """A store of networks on disk and in memory; its networks are encoder and descriptor."""
-
-    def __init__(
-        self,
-        root: Path,
-        scenes: LearnedScenes,
-        stages: list[str] | None = None,
-        networks: tuple[str, ...] = (),
-    ):
-        super().__init__(root, stages or [], networks)
-        self.contents = scenes
 
     @classmethod
     def create(
@@ -69,12 +54,10 @@ class NetworkStore(StageStore):
         encoder's ONNX file is used, if it fits.
         """
         require_free(root)
-        if encoder is None:
-            networks = load_encoder(DESCRIBED_ENCODER), load_descriptor()
-        else:
-            local = load_encoder(encoder)
-            networks = local, descriptor_for(encoder, local.width)
-        return cls(root, LearnedScenes(*networks, strategy, short_side))
+        file = encoder or descriptor.DESCRIBED_ENCODER
+        local = load_encoder(file)
+        described = descriptor.descriptor_for(file, local.width)
+        return cls(root, LearnedScenes(local, described, strategy, short_side))
 
     @classmethod
     def open(cls, root: Path) -> Self:
@@ -86,12 +69,9 @@ class NetworkStore(StageStore):
             encoder = load_encoder(root / networks[0])
             for name in networks[1:-1]:
                 encoder.centroids = load_tensors(root / name)["centroids"].astype(np.float32)
-            scenes = LearnedScenes(
-                encoder,
-                load_descriptor(root / networks[-1]),
-                str(payload["strategy"]),
-                int(payload["short_side"]),
-            )
+            described = descriptor.load_descriptor(root / networks[-1])
+            strategy, short_side = str(payload["strategy"]), int(payload["short_side"])
+            scenes = LearnedScenes(encoder, described, strategy, short_side)
             stages = [str(name) for name in payload["stages"]]
             store = cls(root, scenes, stages, networks)
             for name in stages:
@@ -137,7 +117,7 @@ class NetworkStore(StageStore):
         self.contents = scenes
 
     def _write_networks(self, scenes: LearnedScenes) -> tuple[str, ...]:
-        data = descriptor_bytes(scenes.descriptor)
+        data = descriptor.descriptor_bytes(scenes.descriptor)
         name = f"descriptor-{hashlib.sha256(data).hexdigest()[:12]}.safetensors"
         write_bytes(self.root / name, data)
         return (*scenes.encoder.write(self.root), name)
@@ -148,10 +128,9 @@ def describe(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]
     store = NetworkStore.open(path)
     contents = store.contents
     scenes = []
-    for record, keyframes in zip(contents.scenes, contents.keyframes, strict=True):
-        memory = (keyframes.bytes, len(keyframes)) if keyframes is not None else (0, 0)
-        sizes = dict(zip(("memory_bytes", "keyframes"), memory, strict=True))
-        scenes.append(_plain(record) | sizes)
+    for record, kept in zip(contents.scenes, contents.keyframes, strict=True):
+        size, count = (kept.bytes, len(kept)) if kept is not None else (0, 0)
+        scenes.append(_plain(record) | {"memory_bytes": size, "keyframes": count})
     heads = sum(head_bytes(head) for head in contents.heads)
     return scenes, contents.short_side, heads, store.size_bytes()
 

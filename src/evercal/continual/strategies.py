@@ -42,77 +42,49 @@ class Strategy:
 
 
 # Settings with the best mean over the suites of `benchmarks tune`; see docs/methods.md.
-_ALL = (
-    Strategy(
-        "evercal",
-        source="this project: a map of keyframes and sub-pixel landmarks, nothing trained",
-    ),
-    Strategy("evercal_network", PreconditionedReplay()),
-    Strategy("finetune", FineTuning()),
-    Strategy("er", Replay(weight=0.3)),
-    Strategy(
-        "icarl",
-        Replay("herding", OldOutput()),
-        source="Rebuffi et al., iCaRL, CVPR 2017, ported to points",
-    ),
-    Strategy(
-        "buff_cs",
-        Replay("coverage", BoundedByTeacher()),
-        source="Wang et al., Continual Learning for Image-Based Camera Localization, ICCV 2021",
-    ),
-    Strategy(
-        "gdr",
-        Replay("leverage"),
-        source="Qi et al., FedCBDR's global-perspective data replay, NeurIPS 2025",
-    ),
-    Strategy(
-        "gss",
-        Replay("gradients", weight=0.3),
-        source="Aljundi et al., Gradient based sample selection, NeurIPS 2019",
-    ),
-    Strategy("mir", MaximallyInterferedRetrieval(weight=0.3)),
-    Strategy(
-        "co2l",
-        Replay("reservoir", Relations()),
-        source="Cha et al., Co2L's relation distillation, ICCV 2021, ported to points",
-    ),
-    Strategy("gec", EpisodicConstraint()),
-    Strategy("ewc", ElasticWeightConsolidation()),
-    Strategy("lwf", LearningWithoutForgetting()),
-    Strategy(
-        "sars_spdd",
-        Replay("sars", Distillation()),
-        source="Li et al., Continual Hand-Eye Calibration, arXiv 2604.15814, Algorithms 1 and 2",
-    ),
-    Strategy(
-        "sars_spdd_every_scene",
-        Replay("sars", Distillation(), every_scene=True),
-        source="the same with SPDD's weight multiplied by the number of old scenes",
-    ),
-    Strategy(
-        "sars_spdd_filled",
-        Replay("sars_filled", Distillation()),
-        source="the same with the largest radius that fills the memory",
-    ),
-    Strategy(
-        "reservoir_spdd",
-        Replay("reservoir", Distillation()),
-        source="Li et al., SPDD on a reservoir of frames",
-    ),
-    Strategy(
-        "sars_old_output",
-        Replay("sars", OldOutput()),
-        source="Li et al., SARS with the distillation of iCaRL",
-    ),
-    Strategy(
-        "sars_reprojection",
-        Replay("sars", weight=0.3),
-        source="Li et al., SARS with reprojection alone",
-    ),
-    Strategy("isolation", Isolation()),
-    Strategy("joint", FineTuning(), jointly=True, source="all frames of all scenes at once"),
-)
-STRATEGIES: dict[str, Strategy] = {strategy.name: strategy for strategy in _ALL}
+_METHODS: dict[str, Method | None] = {
+    "evercal": None,
+    "evercal_network": PreconditionedReplay(),
+    "finetune": FineTuning(),
+    "er": Replay(weight=0.3),
+    "icarl": Replay("herding", OldOutput()),
+    "buff_cs": Replay("coverage", BoundedByTeacher()),
+    "gdr": Replay("leverage"),
+    "gss": Replay("gradients", weight=0.3),
+    "mir": MaximallyInterferedRetrieval(weight=0.3),
+    "co2l": Replay("reservoir", Relations()),
+    "gec": EpisodicConstraint(),
+    "ewc": ElasticWeightConsolidation(),
+    "lwf": LearningWithoutForgetting(),
+    "sars_spdd": Replay("sars", Distillation()),
+    "sars_spdd_every_scene": Replay("sars", Distillation(), every_scene=True),
+    "sars_spdd_filled": Replay("sars_filled", Distillation()),
+    "reservoir_spdd": Replay("reservoir", Distillation()),
+    "sars_old_output": Replay("sars", OldOutput()),
+    "sars_reprojection": Replay("sars", weight=0.3),
+    "isolation": Isolation(),
+    "joint": FineTuning(),
+}
+_SOURCES = {
+    "evercal": "this project: a map of keyframes and sub-pixel landmarks, nothing trained",
+    "icarl": "Rebuffi et al., iCaRL, CVPR 2017, ported to points",
+    "buff_cs": "Wang et al., Continual Learning for Image-Based Camera Localization, ICCV 2021",
+    "gdr": "Qi et al., FedCBDR's global-perspective data replay, NeurIPS 2025",
+    "gss": "Aljundi et al., Gradient based sample selection, NeurIPS 2019",
+    "co2l": "Cha et al., Co2L's relation distillation, ICCV 2021, ported to points",
+    "sars_spdd": "Li et al., Continual Hand-Eye Calibration, arXiv 2604.15814, Algorithms 1 and 2",
+    "sars_spdd_every_scene": "the same with SPDD's weight multiplied by the number of old scenes",
+    "sars_spdd_filled": "the same with the largest radius that fills the memory",
+    "reservoir_spdd": "Li et al., SPDD on a reservoir of frames",
+    "sars_old_output": "Li et al., SARS with the distillation of iCaRL",
+    "sars_reprojection": "Li et al., SARS with reprojection alone",
+    "joint": "all frames of all scenes at once",
+}
+"""Of strategies whose source is not that of their method."""
+STRATEGIES: dict[str, Strategy] = {
+    name: Strategy(name, method, name == "joint", _SOURCES.get(name, ""))
+    for name, method in _METHODS.items()
+}
 
 
 def strategy_named(name: str) -> Strategy:

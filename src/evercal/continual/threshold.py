@@ -42,10 +42,8 @@ def fit_threshold(scenes: LearnedScenes, held_out: Sequence[Frame], index: int =
         if metres < 0.25 and radians < np.deg2rad(15):
             squared.append(pose.squared_mahalanobis(frame.base_from_camera))
     small = records[index].camera.short_side_resized(scenes.short_side)
-    negatives = [
-        localizer.localize(image).inlier_ratio
-        for image in _negative_views(small.width, small.height)
-    ]
+    others = _negative_views(small.width, small.height)
+    negatives = [localizer.localize(image).inlier_ratio for image in others]
     top = float(np.quantile(negatives, 0.95))
     low = float(np.quantile(ratios, 0.05)) if ratios else 1.0
     threshold = top + ACCEPTANCE_FRACTION * max(0.0, low - top)

@@ -165,7 +165,7 @@ def unpack_map(file: Path, folder: Path, limits: ArchiveLimits | None = None) ->
         raise InputError(f"{file}: no {MANIFEST} in it; give an archive of 'evercal map pack'")
     resolved = folder.resolve()
     temporary = resolved.with_name(f".{resolved.name}.unpacking")
-    with StageStore(folder, [], ()).writing():
+    with StageStore(folder, None).writing():
         shutil.rmtree(temporary, ignore_errors=True)  # left by a process that was killed
         try:
             extract_archive(file, temporary, limits)

@@ -48,21 +48,11 @@ _FIELDS = ("name", "camera", "adjusted_camera", "train_frames", "metric", "paren
 """Fields of `SceneMap` in scene.json, beside `frame`."""
 
 
-class MapStore(StageStore):
+class MapStore(StageStore[MapContents]):
     """A map on disk and in memory.
 
     The networks are the files of the encoder and, if it is not shipped, of its centroids.
     """
-
-    def __init__(
-        self,
-        root: Path,
-        contents: MapContents,
-        stages: list[str] | None = None,
-        networks: tuple[str, ...] = (),
-    ):
-        super().__init__(root, stages or [], networks)
-        self.contents = contents
 
     @classmethod
     def open(cls, root: Path, encoder: Features | Encoder | None = None) -> Self:

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 Part = tuple[str, bytes]
 """File name and content."""
+Parts = list[tuple[str, Part | str]]
+"""Parts of a request by name."""
 
 
 class Client:
@@ -63,7 +65,7 @@ class Client:
 
         Inlier pixels, the estimated intrinsics and the terms of the covariance are not sent.
         """
-        parts = [("image", _image_part(image, "image.png")), *_camera_part(camera)]
+        parts: Parts = [("image", _image_part(image, "image.png")), *_json_part("camera", camera)]
         return _estimate(self._ask("POST", "/localize", parts))
 
     def calibrate(
@@ -75,7 +77,7 @@ class Client:
         mount: Mount | None = None,
     ) -> Calibration:
         """Calibrate a camera from its images, see `Map.calibrate`."""
-        parts: list[tuple[str, Part | str]] = [*_image_parts(images), *_camera_part(camera)]
+        parts = [*_image_parts(images), *_json_part("camera", camera)]
         if robot_poses is not None:
             parts.append(("robot_poses", _poses_part(robot_poses)))
         if mount is not None:
@@ -83,11 +85,7 @@ class Client:
         return Calibration.from_dict(self._ask("POST", "/calibrations", parts))
 
     def check(
-        self,
-        images: "ImageSource",
-        calibration: Calibration,
-        *,
-        camera: Camera | None = None,
+        self, images: "ImageSource", calibration: Calibration, *, camera: Camera | None = None
     ) -> "Shift":
         """Test whether a fixed camera has moved, see `Map.check`.
 
@@ -95,25 +93,19 @@ class Client:
         """
         from evercal.calibration.drift import Shift
 
-        reference = json.dumps(calibration.to_dict()).encode()
-        parts = [*_image_parts(images), *_camera_part(camera)]
-        record = self._ask(
-            "POST", "/check", [*parts, ("calibration", ("calibration.json", reference))]
-        )
+        parts = [*_image_parts(images), *_json_part("camera", camera)]
+        record = self._ask("POST", "/check", [*parts, *_json_part("calibration", calibration)])
         record.pop("images")
         left_out = tuple(ImageUse(**use) for use in record.pop("left_out"))
         pose = SE3.from_matrix(record.pop("reference_from_now"))
         return Shift(reference_from_now=pose, images=left_out, **record)
 
-    def _ask(
-        self, method: str, path: str, parts: Sequence[tuple[str, Part | str]] | None = None
-    ) -> Any:
+    def _ask(self, method: str, path: str, parts: Parts | None = None) -> Any:
         """The JSON value that the service answers a request with."""
         import urllib3
 
-        fields = None if parts is None else list(parts)
         try:
-            answer = self._pool.request(method, self._url + path, fields=fields)
+            answer = self._pool.request(method, self._url + path, fields=parts)
         except urllib3.exceptions.HTTPError as error:
             reason = " ".join(str(getattr(error, "reason", None) or error).split())[:200]
             raise InputError(f"{self._url}: no answer ({reason})") from None
@@ -138,7 +130,7 @@ def _image_part(image: np.ndarray | str | os.PathLike[str], name: str) -> Part:
     return name, data.tobytes()
 
 
-def _image_parts(source: "ImageSource") -> list[tuple[str, Part | str]]:
+def _image_parts(source: "ImageSource") -> Parts:
     single = isinstance(source, str | os.PathLike) or (
         isinstance(source, np.ndarray) and source.ndim < 4
     )
@@ -148,10 +140,10 @@ def _image_parts(source: "ImageSource") -> list[tuple[str, Part | str]]:
     return [("images", _image_part(item, f"image {i}")) for i, item in enumerate(items)]
 
 
-def _camera_part(camera: Camera | None) -> list[tuple[str, Part | str]]:
-    if camera is None:
+def _json_part(name: str, record: Camera | Calibration | None) -> Parts:
+    if record is None:
         return []
-    return [("camera", ("camera.json", json.dumps(camera.to_dict()).encode()))]
+    return [(name, (f"{name}.json", json.dumps(record.to_dict()).encode()))]
 
 
 def _poses_part(poses: str | os.PathLike[str] | SE3) -> Part:

@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any, TypeVar
 
 from evercal.processes import cores
@@ -22,8 +21,7 @@ class Desk:
         """The result of a function, called in a thread."""
         self.waiting += 1
         try:
-            loop = asyncio.get_running_loop()
-            return await loop.run_in_executor(self._pool, partial(work, *args))
+            return await asyncio.get_running_loop().run_in_executor(self._pool, work, *args)
         finally:
             self.waiting -= 1
 

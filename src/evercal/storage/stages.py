@@ -19,7 +19,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from filelock import FileLock, Timeout
 
@@ -37,6 +37,8 @@ _NETWORKS = ("encoder-", "vlad-", "descriptor-")
 _MADE = "made"
 """Key of the payload: the stages ever added. No name is used again after its stage was removed."""
 Result = TypeVar("Result")
+Contents = TypeVar("Contents")
+Names = Sequence[str]
 Write = Callable[[Path], None]
 """Writes the files of a stage into a folder."""
 
@@ -94,8 +96,7 @@ def _check(root: Path, manifest: Manifest) -> None:
         )
     if schema != SCHEMA:
         raise InputError(f"store {root}: schema {schema!r} is not {SCHEMA}; update evercal")
-    problems = manifest.problems(root)
-    if problems:
+    if problems := manifest.problems(root):
         raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
     if not isinstance(manifest.payload.get(_MADE, 0), int):
         raise InputError(f"store {root}: {_MADE!r} in the manifest is not a number; restore it")
@@ -114,14 +115,15 @@ def _listed(root: Path, manifest: Manifest, key: str) -> list[object]:
     return names
 
 
-class StageStore:
-    """Stages on disk.
+class StageStore(Generic[Contents]):
+    """Stages on disk, and their contents in memory.
 
     Nothing is written before the first stage is added. All stages share the networks.
     """
 
-    def __init__(self, root: Path, stages: Sequence[str], networks: Sequence[str]):
-        self.root, self.stages, self.networks = root, list(stages), tuple(networks)
+    def __init__(self, root: Path, contents: Contents, stages: Names = (), networks: Names = ()):
+        self.root, self.contents = root, contents
+        self.stages, self.networks = list(stages), tuple(networks)
         resolved = root.resolve()  # one lock, whichever name the store is opened by
         self._lock = FileLock(resolved.parent / f".{resolved.name}.lock")
 
@@ -137,9 +139,8 @@ class StageStore:
             The manifest that will be replaced; None for a new store.
         """
         # The lock file is never removed: a process that waits for it would lock a deleted file.
-        lock = Path(self._lock.lock_file)
         try:
-            lock.parent.mkdir(parents=True, exist_ok=True)
+            Path(self._lock.lock_file).parent.mkdir(parents=True, exist_ok=True)
             self._lock.acquire(timeout=0)
         except Timeout:
             raise InputError(
@@ -170,7 +171,7 @@ class StageStore:
 
     def change(
         self,
-        kept: Sequence[str],
+        kept: Names,
         added: Sequence[tuple[str, Write]],
         payload: Mapping[str, object],
         superseded: Callable[[str], bool] = lambda _: False,
@@ -317,9 +318,9 @@ def _names(folder: Path) -> set[str]:
 
 
 def _made(manifest: Manifest | None) -> int:
-    return (
-        0 if manifest is None else int(manifest.payload.get(_MADE, len(manifest.payload["stages"])))
-    )
+    if manifest is None:
+        return 0
+    return int(manifest.payload.get(_MADE, len(manifest.payload["stages"])))
 
 
 def write_report(folder: Path, report: Mapping[str, object]) -> None:

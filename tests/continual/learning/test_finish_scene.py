@@ -53,7 +53,7 @@ def test_arguments_of_a_method(
     scenes, strategy = empty_scenes("recording"), Strategy("recording", method)
     heads = []
     for room in rooms:
-        scenes = learn(scenes, strategy, room, quick).scenes
+        scenes = learn(scenes, strategy, room, quick)
         heads.append(copy.deepcopy(scenes.heads[0]))
     for number, (start, end) in enumerate(zip(method.starts, method.ends, strict=True)):
         assert (start.replay_rows, start.seed) == (32, 0)
@@ -90,7 +90,7 @@ def test_states_are_stored_and_count_as_memory(
     tmp_path: Path,
 ) -> None:
     first = first_stages[name]
-    second = second_stage(first, rooms, quick).scenes
+    second = second_stage(first, rooms, quick)
     states = [value for state in second.method_states for value in state.values()]
     assert len(second.method_states) == 2
     assert all(bool(value.isfinite().all()) for value in states)

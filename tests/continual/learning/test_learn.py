@@ -69,7 +69,7 @@ def test_stage_leaves_its_input_unchanged(
     scenes = first_stages[name]
     before = [weights(head) for head in scenes.heads]
     records, keyframes = list(scenes.scenes), list(scenes.keyframes)
-    after = second_stage(scenes, rooms, quick).scenes
+    after = second_stage(scenes, rooms, quick)
     for head, state in zip(scenes.heads, before, strict=True):
         assert_same(weights(head), state)
     assert all(a is b for a, b in zip(scenes.scenes, records, strict=True))
@@ -86,10 +86,10 @@ def test_a_tenth_of_the_frames_is_kept(
     count: int, empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions
 ) -> None:
     scene = replace(rooms[0], train=rooms[0].train[:count])
-    stage = learn(empty_scenes(NETWORK.name), NETWORK, scene, shortest(quick))
-    keyframes = stage.scenes.keyframes[0]
+    after = learn(empty_scenes(NETWORK.name), NETWORK, scene, shortest(quick))
+    keyframes = after.keyframes[0]
     assert keyframes is not None
-    assert len(keyframes) == stage.frames_kept == count // 10
+    assert len(keyframes) == after.frames_kept == count // 10
 
 
 def test_memory_in_bytes_is_respected_and_used(
@@ -98,11 +98,11 @@ def test_memory_in_bytes_is_respected_and_used(
     sizes = []
     for budget in (20_000, 60_000, 10**9):
         options = replace(shortest(quick), memory=MemoryBudget(bytes=budget))
-        stage = learn(empty_scenes("er"), STRATEGIES["er"], rooms[0], options)
-        keyframes = stage.scenes.keyframes[0]
+        after = learn(empty_scenes("er"), STRATEGIES["er"], rooms[0], options)
+        keyframes = after.keyframes[0]
         assert keyframes is not None
         assert 0.6 * budget < keyframes.bytes <= budget or len(keyframes) == 30
-        assert len(keyframes) == stage.frames_kept
+        assert len(keyframes) == after.frames_kept
         sizes.append(len(keyframes))
     assert sizes[0] < sizes[1] < sizes[2] == 30
 
@@ -113,7 +113,7 @@ def test_whitening_is_fitted_to_the_first_scene_only(
 ) -> None:
     before = first_stages[name].heads[0]
     assert not torch.equal(before.feature_map, torch.eye(before.features))
-    after = second_stage(first_stages[name], rooms, quick).scenes.heads[-1]
+    after = second_stage(first_stages[name], rooms, quick).heads[-1]
     assert torch.equal(after.feature_map, before.feature_map)
     assert torch.equal(after.feature_mean, before.feature_mean)
 
@@ -121,7 +121,7 @@ def test_whitening_is_fitted_to_the_first_scene_only(
 def test_centres_lie_in_the_cell_of_their_scene(
     first_stages: dict[str, LearnedScenes], rooms: Rooms, quick: StageOptions
 ) -> None:
-    after = second_stage(first_stages["evercal_network"], rooms, quick).scenes
+    after = second_stage(first_stages["evercal_network"], rooms, quick)
     head = after.heads[0]
     for i, scene in enumerate(rooms[:2]):
         centres = head.centres[head.centre_scene == i].double().numpy()
@@ -182,9 +182,9 @@ def test_training_depends_on_the_seed_only(
 ) -> None:
     scenes = first_stages["evercal_network"]
     torch.manual_seed(12345)
-    again = second_stage(scenes, rooms, quick).scenes
-    same = second_stage(scenes, rooms, quick).scenes
-    other = second_stage(scenes, rooms, replace(quick, seed=1)).scenes
+    again = second_stage(scenes, rooms, quick)
+    same = second_stage(scenes, rooms, quick)
+    other = second_stage(scenes, rooms, replace(quick, seed=1))
     assert_same(weights(again.heads[0]), weights(same.heads[0]))
     for name in ("code", "first.1.weight"):
         assert not torch.equal(weights(other.heads[0])[name], weights(same.heads[0])[name])
@@ -202,7 +202,7 @@ def test_camera_that_only_rotates(
         for i, frame in enumerate(rooms[0].train)
     )
     recording = replace(rooms[0], train=frames)
-    head = learn(empty_scenes(NETWORK.name), NETWORK, recording, quick).scenes.heads[0]
+    head = learn(empty_scenes(NETWORK.name), NETWORK, recording, quick).heads[0]
     assert len(head.centres) == positions
     assert all(bool(torch.isfinite(value).all()) for value in head.state_dict().values())
 
@@ -228,7 +228,7 @@ def test_replay_prevents_forgetting(
     assert median_error_m(both, arcs[1]) < 0.15
     control = replace(one, strategy="finetune", keyframes=[None])
     short = replace(arc_stage, fit=replace(arc_stage.fit, iterations=200))
-    finetuned = learn(control, STRATEGIES["finetune"], arcs[1], short).scenes
+    finetuned = learn(control, STRATEGIES["finetune"], arcs[1], short)
     replayed = median_error_m(both, arcs[0])
     assert replayed < 0.15
     assert replayed < median_error_m(finetuned, arcs[0]) / 3

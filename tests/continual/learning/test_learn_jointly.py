@@ -22,13 +22,13 @@ from ..stages import EmptyScenes, Rooms, weights
 def scenes(empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions) -> LearnedScenes:
     """Three rooms, learned with the steps of three stages."""
     events: list[Encoding | Progress] = []
-    stage = learn_jointly(empty_scenes("joint"), rooms, quick, events.append)
+    after = learn_jointly(empty_scenes("joint"), rooms, quick, events.append)
     kinds = [kind for kind, _ in groupby(type(event) for event in events)]
     assert kinds == [Encoding, Progress]
     steps = [event.step for event in events if isinstance(event, Progress)]
     assert steps == list(range(1, 3 * 8 + 1))
-    assert (stage.iterations, stage.frames_kept) == (24, 0)
-    return stage.scenes
+    assert after.frames_kept == 0
+    return after
 
 
 @pytest.mark.parametrize(("count", "rows"), [(1, 64), (2, 96), (3, 96)])
@@ -80,12 +80,12 @@ def test_every_scene_is_trained(
 ) -> None:
     empty = empty_scenes("joint")
     untrained = replace(quick, fit=replace(quick.fit, iterations=0))
-    start = learn_jointly(empty, rooms, untrained).scenes
+    start = learn_jointly(empty, rooms, untrained)
     assert empty.scenes == empty.heads == []
     change = scenes.heads[0].code - start.heads[0].code
     assert bool((change.abs().amax((1, 2)) > 1e-4).all())
     # The whitening is fitted to the rows of all scenes before the first step.
     for name in ("feature_mean", "feature_map"):
         assert torch.equal(weights(start.heads[0])[name], weights(scenes.heads[0])[name])
-    one = learn_jointly(empty_scenes("joint"), rooms[:1], untrained).scenes
+    one = learn_jointly(empty_scenes("joint"), rooms[:1], untrained)
     assert not torch.equal(one.heads[0].feature_mean, start.heads[0].feature_mean)

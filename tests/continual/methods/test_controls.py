@@ -38,16 +38,16 @@ def test_new_head_starts_from_the_shared_weights_of_the_last(
     shape = replace(quick.head, offsets=offsets, condition=condition)  # pyright: ignore
     options = replace(quick, head=shape)
     untrained = replace(options, fit=replace(quick.fit, iterations=0))
-    first = learn(empty_scenes("isolation"), isolation, rooms[0], options).scenes
+    first = learn(empty_scenes("isolation"), isolation, rooms[0], options)
     before = weights(first.heads[0])
     own = {"code", "logit", "logit_bias", "centres"}
     own |= {"offset", "offset_bias"} if offsets == "per_centre" else set()
-    same = learn(first, isolation, rooms[1], untrained).scenes
+    same = learn(first, isolation, rooms[1], untrained)
     for name, value in weights(same.heads[1]).items():
         if name != "centre_scene":
             assert torch.equal(value, before[name]) != (name in own), name
     assert (same.heads[1].scenes, len(same.heads[1].centres)) == (1, 3)
-    trained = learn(first, isolation, rooms[1], options).scenes
+    trained = learn(first, isolation, rooms[1], options)
     for scenes in (same, trained):
         after = weights(scenes.heads[0])
         assert all(torch.equal(value, before[name]) for name, value in after.items())

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.methods.mir import MaximallyInterferedRetrieval, interfered_views
+from evercal.continual.methods.mir import MaximallyInterferedRetrieval
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import TrainingHooks
@@ -41,9 +41,7 @@ def test_views_contradicted_by_new_rows_are_selected(
     rows = buffer.rows(torch.nonzero(buffer.tensors["view"] == harmed)[:, 0])
     rows.target.pixels = rows.target.pixels + torch.tensor([6.0, 0.0])
     actual = [
-        interfered_views(
-            MIR, head, rows, buffer, 5e-4, torch.Generator().manual_seed(seed)
-        ).tolist()
+        MIR.interfered_views(head, rows, buffer, 5e-4, torch.Generator().manual_seed(seed)).tolist()
         for seed in range(5)
     ]
     assert all(len(set(views)) == MIR.chosen for views in actual)

@@ -99,7 +99,7 @@ def test_paper_grid_follows_glace(count: int) -> None:
     grid = paper_grid(count)
     assert [tuple(row) for row in grid] == expected
     assert len(set(expected)) == count
-    atlas = Atlas("paper", count)
+    atlas = Atlas(count)
     for i in range(count):
         cell = atlas.place(np.array([[0.0, 0, 0], [3, 3, 3]]))
         assert cell.centre_m == expected[i]
@@ -115,7 +115,7 @@ def test_combined_centres_lie_among_the_cameras(seed: int) -> None:
     centres = np.array(combined_centres(scenes, 15, seed))
     assert len(centres) == 15
     assert combined_centres(scenes, 15, seed) == tuple(map(tuple, centres))
-    atlas = Atlas("paper", len(scenes))
+    atlas = Atlas(len(scenes))
     shares = []
     for positions in scenes:
         in_atlas = atlas.place(positions).atlas_from_base.apply(positions)

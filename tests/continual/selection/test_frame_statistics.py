@@ -23,7 +23,7 @@ def captured(
 ) -> tuple[FrameStatistics, Head, FeatureBuffer]:
     """Frames of `alpha` after some training, with two views of each in the buffer."""
     options = replace(quick, fit=replace(quick.fit, iterations=60))
-    scenes = learn(empty_scenes("finetune"), STRATEGIES["finetune"], rooms[0], options).scenes
+    scenes = learn(empty_scenes("finetune"), STRATEGIES["finetune"], rooms[0], options)
     buffer = FeatureBuffer(0, scenes.scenes[0].cell.atlas_from_base)
     list(encode_frames(buffer, rooms[0].train, quick.encode, scenes.encoder, scenes.descriptor))
     head = scenes.heads[0].eval()

@@ -42,9 +42,7 @@ def run_scores(results: Table) -> Table:
     Forgetting and memory of joint training are NaN.
     """
     scores = {key: _scores(run) for key, run in _runs(complete_runs(results)).items()}
-    table = pd.DataFrame.from_dict(scores, orient="index")
-    table.index = pd.MultiIndex.from_tuples(list(scores), names=["strategy", "seed"])
-    return table
+    return pd.DataFrame.from_dict(scores, orient="index").rename_axis(["strategy", "seed"])
 
 
 def _runs(results: Table) -> dict[tuple[str, int], Table]:
@@ -118,8 +116,7 @@ def scene_table(results: Table) -> Table:
     rows = []
     for (name, _), run in _runs(complete_runs(results)).items():
         accuracies = matrix(run)
-        learned = np.diag(accuracies)
-        ends = zip(accuracies.columns, learned, accuracies.iloc[-1], strict=True)
+        ends = zip(accuracies.columns, np.diag(accuracies), accuracies.iloc[-1], strict=True)
         rows += [(name, scene, first, end) for scene, first, end in ends]
     cells = pd.DataFrame(rows, columns=["strategy", "scene", "learned", "end"])
     means = cells.groupby(["strategy", "scene"], sort=False)[["learned", "end"]].mean()

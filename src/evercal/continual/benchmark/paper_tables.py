@@ -8,14 +8,7 @@ from collections.abc import Mapping
 
 import pandas as pd
 
-from evercal.continual.benchmark.comparison import (
-    COARSE_COLUMN,
-    FINAL,
-    FINE_COLUMN,
-    complete_runs,
-    contrast_table,
-    run_scores,
-)
+from evercal.continual.benchmark import comparison
 from evercal.continual.benchmark.results import Table
 
 ABLATIONS: Mapping[str, tuple[tuple[str, str], ...]] = {
@@ -73,9 +66,9 @@ def paper_table(results: Table, suite: str = "") -> Table:
     Accuracy is at 1 cm and 1 deg for simulated suites, as in the paper, and at 5 cm and 5 deg for
     others. Published numbers of the suite are added if there are any.
     """
-    results = complete_runs(results)
+    results = comparison.complete_runs(results)
     last = results[results["stage"] == results["stage"].max()]
-    within = FINE_COLUMN if suite.startswith("sim") else COARSE_COLUMN
+    within = comparison.FINE_COLUMN if suite.startswith("sim") else comparison.COARSE_COLUMN
     cells: Table = pd.DataFrame(
         {
             "t, cm": last["median_mm"] / 10,
@@ -87,7 +80,8 @@ def paper_table(results: Table, suite: str = "") -> Table:
     table = means.unstack(sort=False).swaplevel(axis=1)
     names = list(last["strategy"].unique())
     table = table.reindex(columns=pd.MultiIndex.from_product([names, cells.columns]))
-    forgetting = run_scores(results)["TFR"].groupby("strategy").agg(lambda c: c.mean(skipna=False))
+    by_strategy = comparison.run_scores(results)["TFR"].groupby("strategy")
+    forgetting = by_strategy.agg(lambda values: values.mean(skipna=False))
     totals = {"Mean": dict(table.xs("Acc, %", axis=1, level=1).mean()), "TFR": dict(forgetting)}
     if suite in PUBLISHED:
         totals["Mean, published"] = {name: pair[0] for name, pair in PUBLISHED[suite].items()}
@@ -106,7 +100,7 @@ def ablation_table(scores: Table, suite: str = "") -> Table:
     Steps that were not run are left out, and ablations with fewer than two. Published numbers of
     the suite are added if there are any.
     """
-    final = scores[FINAL].groupby("strategy").mean()
+    final = scores[comparison.FINAL].groupby("strategy").mean()
     rows, published = [], PUBLISHED.get(suite)
     for title, steps in ABLATIONS.items():
         if sum(name in final for _, name in steps) < 2:
@@ -115,9 +109,9 @@ def ablation_table(scores: Table, suite: str = "") -> Table:
             if name not in final:
                 continue
             before = steps[i - 1][1] if i else ""
-            step = contrast_table(scores, [(name, before)]).iloc[0]
-            row = {"ablation": title, "": label, FINAL: f"{final[name]:.1f}"}
-            row |= {"step": step[FINAL], "95 %": step["bounds"].iloc[0]}
+            step = comparison.contrast_table(scores, [(name, before)]).iloc[0]
+            row = {"ablation": title, "": label, comparison.FINAL: f"{final[name]:.1f}"}
+            row |= {"step": step[comparison.FINAL], "95 %": step["bounds"].iloc[0]}
             if published:
                 row["published %"] = f"{published[name][0]:.1f}" if title == "as printed" else ""
             rows.append(row)

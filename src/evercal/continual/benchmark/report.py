@@ -9,16 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from evercal.continual.benchmark import comparison
 from evercal.continual.benchmark import results as stored
-from evercal.continual.benchmark.comparison import (
-    LEGEND,
-    complete_runs,
-    contrast_table,
-    matrix,
-    method_table,
-    run_scores,
-    scene_table,
-)
 from evercal.continual.benchmark.figures import line_style, new_figure, tidy
 from evercal.continual.benchmark.paper_tables import ablation_table, latex, paper_table
 from evercal.continual.benchmark.results import Table
@@ -40,12 +32,12 @@ def write_report(folder: Path, reference: str) -> str:
     if results.empty:
         raise InputError(f"{folder}: no results here; make some with 'evercal bench'")
     suite = str(read_settings(folder / stored.SETTINGS).get("suite"))
-    results = complete_runs(results)
-    scores = run_scores(results)
-    scenes = scene_table(results).reset_index()
-    methods, ablation = method_table(scores), ablation_table(scores, suite)
+    results = comparison.complete_runs(results)
+    scores = comparison.run_scores(results)
+    scenes = comparison.scene_table(results).reset_index()
+    methods, ablation = comparison.method_table(scores), ablation_table(scores, suite)
     others = methods.index.drop(reference, errors="ignore")
-    contrasts = contrast_table(scores, [(reference, name) for name in others])
+    contrasts = comparison.contrast_table(scores, [(reference, name) for name in others])
     tables = {
         "Strategies, means over runs": methods.reset_index(),
         "Accuracy of each scene: just after learning it -> at the end": scenes,
@@ -57,7 +49,8 @@ def write_report(folder: Path, reference: str) -> str:
         for title, table in tables.items()
         if len(table)
     )
-    write_bytes(folder / TABLES, f"{text}\n\n{LEGEND}\n\n![accuracy]({FIGURE})\n".encode())
+    page = f"{text}\n\n{comparison.LEGEND}\n\n![accuracy]({FIGURE})\n"
+    write_bytes(folder / TABLES, page.encode())
     paper = latex(paper_table(results, suite))
     if len(ablation):
         paper += f"\n{latex(ablation, index=False)}"
@@ -68,8 +61,9 @@ def write_report(folder: Path, reference: str) -> str:
 
 def _figure(results: Table, strategies: Table, path: Path) -> None:
     """Plot the accuracy on each scene while later ones are learned, means over runs."""
+    by_strategy = results.groupby("strategy")
     runs = {
-        name: [matrix(run) for _, run in results[results["strategy"] == name].groupby("seed")]
+        name: [comparison.matrix(run) for _, run in by_strategy.get_group(name).groupby("seed")]
         for name in strategies
     }
     # With several orders, a panel is the place of a scene in the order.

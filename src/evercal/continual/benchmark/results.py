@@ -22,15 +22,7 @@ from filelock import FileLock
 
 from evercal.continual.benchmark.environment import environment
 from evercal.errors import InputError
-from evercal.evaluation.metrics import (
-    CHI2_6,
-    COARSE,
-    FINE,
-    FINEST,
-    MIDDLE,
-    FrameResult,
-    recall_area,
-)
+from evercal.evaluation import metrics
 from evercal.storage import write_json
 from evercal.storage.settings import read_settings
 
@@ -43,10 +35,10 @@ UNALIGNED = ":unaligned"
 """Suffix of a strategy for results by the first pose, before landmarks are aligned."""
 WITHIN = {
     "within_10cm_10deg": (0.10, math.radians(10.0)),
-    "within_5cm_5deg": COARSE,
-    "within_2cm_2deg": MIDDLE,
-    "within_1cm_1deg": FINE,
-    "within_5mm_05deg": FINEST,
+    "within_5cm_5deg": metrics.COARSE,
+    "within_2cm_2deg": metrics.MIDDLE,
+    "within_1cm_1deg": metrics.FINE,
+    "within_5mm_05deg": metrics.FINEST,
 }
 """Columns that count correct frames: metres and radians, both errors strictly below."""
 KEY = ["strategy", "seed", "stage", "scene"]
@@ -67,7 +59,7 @@ class StageResults:
     """Rows of frames.csv; empty before the last stage."""
 
 
-def scene_row(frames: Sequence[FrameResult]) -> dict[str, object]:
+def scene_row(frames: Sequence[metrics.FrameResult]) -> dict[str, object]:
     """Summarize the test frames of one scene: columns of results.csv that depend on them."""
     metres = np.array([frame.translation_error_m for frame in frames])
     radians = np.array([frame.rotation_error_rad for frame in frames])
@@ -80,17 +72,17 @@ def scene_row(frames: Sequence[FrameResult]) -> dict[str, object]:
         **{name: int(((metres < m) & (radians < r)).sum()) for name, (m, r) in WITHIN.items()},
         "median_mm": round(1000 * float(np.sort(metres)[middle]), 3),
         "median_deg": round(math.degrees(np.sort(radians)[middle]), 4),
-        "area_20cm": round(recall_area(metres), 4),
+        "area_20cm": round(metrics.recall_area(metres), 4),
         "wrong_scene": int(wrong.sum()),
         "refused": int((~np.isfinite(metres) & ~wrong).sum()),
         "with_covariance": int((~np.isnan(squared)).sum()),
-        "inside_95": int((squared < CHI2_6).sum()),
+        "inside_95": int((squared < metrics.CHI2_6).sum()),
     }
 
 
-def frame_row(frame: FrameResult) -> dict[str, object]:
+def frame_row(frame: metrics.FrameResult) -> dict[str, object]:
     """Columns of frames.csv that depend on the frame."""
-    outcome = "inside" if frame.squared_mahalanobis < CHI2_6 else "outside"
+    outcome = "inside" if frame.squared_mahalanobis < metrics.CHI2_6 else "outside"
     if frame.wrong_scene:
         outcome = "wrong scene"
     elif not math.isfinite(frame.translation_error_m):

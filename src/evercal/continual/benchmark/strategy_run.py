@@ -18,11 +18,10 @@ from evercal.continual.benchmark.results import (
     record_environment,
     scene_row,
 )
-from evercal.continual.learning.finish_scene import correct_lens, finished_stage
-from evercal.continual.learning.learn import learn_jointly
+from evercal.continual.learning.learn import finish_scene, learn_jointly
 from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
-from evercal.continual.learning.stage import StageOptions, unobserved
-from evercal.continual.learning.stage_rows import scene_rows
+from evercal.continual.learning.stage import StageOptions
+from evercal.continual.learning.stage_rows import StageRows
 from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer
 from evercal.continual.networks.atlas import combined_centres
 from evercal.continual.networks.buffer import FeatureBuffer
@@ -37,9 +36,8 @@ from evercal.learning.scene import learn_scene
 from evercal.localization.learned import LearnedLocalizer
 from evercal.localization.localizer import Localizer
 from evercal.localization.query import LocalizeOptions
-from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.store import MapStore
-from evercal.recordings import Frame, Recording, stated_poses
+from evercal.recordings import Recording, stated_poses
 from evercal.recordings.held_out import split_held_out
 from evercal.storage.stages import is_store
 
@@ -108,16 +106,11 @@ class _Run:
         self.store.with_name(f".{self.store.name}.lock").unlink(missing_ok=True)
 
     def _evaluated(
-        self,
-        localizers: Mapping[str, LearnedLocalizer],
-        number: int,
-        newest: Keyframes | None,
-        costs: Mapping[str, object],
+        self, localizers: Mapping[str, LearnedLocalizer], number: int, costs: Mapping[str, object]
     ) -> StageResults:
         """Evaluate all scenes learned so far by localizers, by the names of their results."""
         results, frames = [], []
         environment = record_environment(self.out)
-        costs = {**costs, "frames_kept": len(newest.images) if newest else 0}
         for name, localizer in localizers.items():
             run = {"strategy": name, "seed": self.stage.seed, "stage": number}
             evaluated = evaluate(localizer, {s.name: s for s in self.scenes[: number + 1]})
@@ -147,9 +140,13 @@ class _MapRun(_Run):
                 opened.commit(scene, asdict(report))
             name, unaligned = self.strategy.name, LocalizeOptions(align=False)
             named = {name: Localizer(contents), name + UNALIGNED: Localizer(contents, unaligned)}
-            seconds = float(opened.reports()[-1]["seconds"])
-            costs = {"seconds": seconds, "memory_bytes": contents.memory_bytes, "head_bytes": 0}
-            yield self._evaluated(named, number, contents.scenes[-1].keyframes, costs)
+            costs = {
+                "seconds": float(opened.reports()[-1]["seconds"]),
+                "memory_bytes": contents.memory_bytes,
+                "head_bytes": 0,
+                "frames_kept": len(contents.scenes[-1].keyframes),
+            }
+            yield self._evaluated(named, number, costs)
         self._remove()
 
     def _opened(self) -> MapStore:
@@ -177,7 +174,7 @@ class _NetworkRun(_Run):
         splits = [split_held_out(scene.train) for scene in self.scenes]
         train = [replace(s, train=t.train) for s, t in zip(self.scenes, splits, strict=True)]
         began = time.perf_counter()
-        learned = learn_jointly(empty, train, self.stage, unobserved).scenes
+        learned = learn_jointly(empty, train, self.stage)
         for number, split in enumerate(splits):
             learned.scenes[number] = fit_threshold(learned, split.held_out, number)
         seconds = time.perf_counter() - began
@@ -194,7 +191,7 @@ class _NetworkRun(_Run):
             device=str(self.device),
             cache=self.features,
         )
-        learn_networks(store, scene, options, unobserved)
+        learn_networks(store, scene, options)
 
     def _new_store(self) -> NetworkStore:
         return NetworkStore.create(self.store, self.strategy.name, self.short_side)
@@ -225,30 +222,29 @@ class _NetworkRun(_Run):
         scenes = self._prepared(first.contents.copy_for_training())
         scenes.strategy, scenes.keyframes, scenes.method_states = self.strategy.name, [], []
         train = split_held_out(scene.train).train
-        stage = finished_stage(scenes, method, train, self._rows(scenes, train), self.stage)
-        report = first.reports()[-1]
-        report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
-        report["frames_kept"] = stage.frames_kept
-        self._new_store().commit(scenes, report)
 
-    def _rows(self, scenes: LearnedScenes, train: Sequence[Frame]) -> Callable[[], FeatureBuffer]:
         @cache
         def rows() -> FeatureBuffer:
-            buffer = scene_rows(scenes, 0, scenes.scenes[0].cell, train, self.stage)
-            correct_lens(buffer, scenes.scenes[0])
+            [record] = scenes.scenes
+            buffer = StageRows(scenes, self.stage).of_scene(0, record.cell, train)
+            record.correct_lens(buffer)
             return buffer
 
-        return rows
+        finish_scene(scenes, method, train, rows, self.stage)
+        report = first.reports()[-1]
+        report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
+        report["frames_kept"] = scenes.frames_kept
+        self._new_store().commit(scenes, report)
 
     def _located(self, scenes: LearnedScenes, number: int, seconds: float) -> StageResults:
         costs = {
             "seconds": seconds,
             "memory_bytes": scenes.memory_bytes,
             "head_bytes": sum(head_bytes(head) for head in scenes.heads),
+            "frames_kept": scenes.frames_kept,
         }
-        localizer = NetworkLocalizer(scenes, NETWORK_LOCALIZE)
-        named = {self.strategy.name: localizer}
-        return self._evaluated(named, number, scenes.keyframes[number], costs)
+        named = {self.strategy.name: NetworkLocalizer(scenes, NETWORK_LOCALIZE)}
+        return self._evaluated(named, number, costs)
 
 
 def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOptions:

@@ -55,6 +55,35 @@ class NetworkLearnOptions:
             raise InputError(f"--centres {self.centres}: give a number >= 1")
         return replace(stage, head=replace(stage.head, centres_per_scene=self.centres))
 
+    def opened(
+        self, store: Path, strategy: Strategy, stage: StageOptions, frames: Sequence[Frame]
+    ) -> NetworkStore:
+        """Open the store of a strategy or make it; `frames` are those of the scene to learn."""
+        if stage.memory.auto:
+            raise InputError("memory auto: only a map selects its keyframes; give a share or bytes")
+        if not is_store(store):
+            side = self.short_side or short_side(self.preset, frames)
+            return NetworkStore.create(store, strategy.name, side, self.encoder)
+        if self.encoder is not None:
+            raise InputError(
+                f"encoder {self.encoder}: store {store} keeps the encoder it was made with"
+            )
+        opened = NetworkStore.open(store)
+        if opened.contents.strategy != strategy.name:
+            raise InputError(
+                f"strategy {strategy.name!r}: the store was made with {opened.contents.strategy!r};"
+                " use that one or start a new store"
+            )
+        heads, method = opened.contents.heads, strategy.method
+        shared = method is not None and not method.head_per_scene and heads
+        if shared and self.centres not in (None, heads[-1].options.centres_per_scene):
+            raise InputError(
+                f"--centres {self.centres}: {store} was made with"
+                f" {heads[-1].options.centres_per_scene} per scene; leave the option out or start a"
+                " new store"
+            )
+        return opened
+
 
 def learn_networks(
     store: Path, recording: Recording, options: NetworkLearnOptions, on_event: OnEvent = unobserved
@@ -75,11 +104,10 @@ def learn_networks(
             f"strategy {strategy.name!r}: does not train a network scene by scene; use another"
             " strategy, or compare it with 'evercal bench'"
         )
-    opened = _opened(store, strategy, stage, options, recording.train)
+    opened = options.opened(store, strategy, stage, recording.train)
     with opened.writing():
         contents = opened.contents.to(device_of(options.device))
-        names = [record.name for record in contents.scenes]
-        recording = named_recording(recording, None, names)
+        recording = named_recording(recording, None, [record.name for record in contents.scenes])
         if lacks_camera_poses(recording):
             raise InputError(
                 f"scene {recording.name!r}: only gripper poses are stated, and strategy"
@@ -93,51 +121,17 @@ def learn_networks(
             contents.cache = options.cache
         split = split_held_out(recording.train)
         train = replace(recording, train=split.train)
-        done = learn(contents, strategy.method, train, stage, on_event)
-        record = fit_threshold(done.scenes, split.held_out)
-        done.scenes.scenes[-1] = record
+        learned = learn(contents, strategy.method, train, stage, on_event)
+        learned.scenes[-1] = fit_threshold(learned, split.held_out)
         report = LearnReport(
             scene=recording.name,
             seconds=time.perf_counter() - began,
-            memory_bytes=done.scenes.memory_bytes,
-            frames_kept=done.frames_kept,
+            memory_bytes=learned.memory_bytes,
+            frames_kept=learned.frames_kept,
             train_frames=len(split.train),
             held_out_frames=len(split.held_out),
-            iterations=done.iterations,
-            head_bytes=sum(head_bytes(head) for head in done.scenes.heads),
+            iterations=stage.fit.iterations,
+            head_bytes=sum(head_bytes(head) for head in learned.heads),
         )
-        opened.commit(done.scenes, asdict(report))
+        opened.commit(learned, asdict(report))
     return report
-
-
-def _opened(
-    store: Path,
-    strategy: Strategy,
-    stage: StageOptions,
-    options: NetworkLearnOptions,
-    frames: Sequence[Frame],
-) -> NetworkStore:
-    if stage.memory.auto:
-        raise InputError("memory auto: only a map selects its keyframes; give a share or bytes")
-    if not is_store(store):
-        side = options.short_side or short_side(options.preset, frames)
-        return NetworkStore.create(store, strategy.name, side, options.encoder)
-    if options.encoder is not None:
-        raise InputError(
-            f"encoder {options.encoder}: store {store} keeps the encoder it was made with"
-        )
-    opened = NetworkStore.open(store)
-    if opened.contents.strategy != strategy.name:
-        raise InputError(
-            f"strategy {strategy.name!r}: the store was made with {opened.contents.strategy!r};"
-            " use that one or start a new store"
-        )
-    heads, method = opened.contents.heads, strategy.method
-    shared = method is not None and not method.head_per_scene and heads
-    if shared and options.centres not in (None, heads[-1].options.centres_per_scene):
-        raise InputError(
-            f"--centres {options.centres}: {store} was made with"
-            f" {heads[-1].options.centres_per_scene} per scene; leave the option out or start a new"
-            " store"
-        )
-    return opened

@@ -10,34 +10,27 @@ from evercal.continual.networks.loss import LossOptions
 from evercal.continual.networks.trainer import FitOptions
 from evercal.recordings import Frame
 
+
+def _ours(width: int, steps: int, rows: int, views: int, replay_views: int = 4) -> StageOptions:
+    """Our network; `rows` are new in a step, and half as many are replayed."""
+    return StageOptions(
+        head=HeadOptions(width),
+        fit=FitOptions(steps, rows, rows // 2, surface_weight=2.0),
+        encode=EncodePlan(views),
+        replay_views_per_frame=replay_views,
+    )
+
+
 PRESETS: dict[str, StageOptions] = {
     # At most 240 s per scene on two cores.
-    "fast": StageOptions(
-        head=HeadOptions(width=384),
-        fit=FitOptions(iterations=2400, batch=2048, replay_batch=1024, surface_weight=2.0),
-        encode=EncodePlan(views_per_frame=4),
-    ),
+    "fast": _ours(width=384, steps=2400, rows=2048, views=4),
     # At most 45 s per scene of about 100 frames.
-    "demo": StageOptions(
-        head=HeadOptions(width=256),
-        fit=FitOptions(iterations=1000, batch=2048, replay_batch=1024, surface_weight=2.0),
-        encode=EncodePlan(views_per_frame=3),
-        replay_views_per_frame=4,
-    ),
+    "demo": _ours(width=256, steps=1000, rows=2048, views=3),
     # For quick trials: 600 steps are too few to converge, see `converged`.
-    "bench": StageOptions(
-        head=HeadOptions(width=256),
-        fit=FitOptions(iterations=600, batch=512, replay_batch=256, surface_weight=2.0),
-        encode=EncodePlan(views_per_frame=1),
-        replay_views_per_frame=2,
-    ),
+    "bench": _ours(width=256, steps=600, rows=512, views=1, replay_views=2),
     # Chosen on held-out frames of `sim-tune`; joint training still gains from more steps
     # (research/protocol.md).
-    "converged": StageOptions(
-        head=HeadOptions(width=256),
-        fit=FitOptions(iterations=1200, batch=1536, replay_batch=768, surface_weight=2.0),
-        encode=EncodePlan(views_per_frame=4),
-    ),
+    "converged": _ours(width=256, steps=1200, rows=1536, views=4),
     # The paper's settings, for a GPU: AdamW at 0.005 and 15,000 steps per scene. The rows of a step
     # are GLACE's. The paper does not state the number of replayed rows; here it is the same. The
     # stated intrinsics are not corrected.

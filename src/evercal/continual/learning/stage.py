@@ -1,4 +1,4 @@
-"""Options of one stage (learning one scene), its events, and its outcome."""
+"""Options of one stage (learning one scene), and its events."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from evercal.continual.networks.buffer import EncodePlan
 from evercal.continual.networks.head import HeadOptions
 from evercal.continual.networks.trainer import FitOptions, Progress
-from evercal.continual.scenes import LearnedScenes
 from evercal.mapping.memory_budget import MemoryBudget
 
 
@@ -26,7 +25,7 @@ class StageOptions:
     fixed_centres_m: tuple[tuple[float, float, float], ...] = ()
     """Atlas coordinates of all centres, for HeadOptions.centres `fixed`."""
     grid_scenes: int = 0
-    """Scenes of `Atlas` layout `paper`; 0 gives each scene the next free cell."""
+    """Scenes of the paper's layout, see `Atlas`; 0 gives each scene the next free cell."""
     seed: int = 0
 
     def with_memory(self, memory: str | int) -> "StageOptions":
@@ -47,13 +46,3 @@ OnEvent = Callable[[Encoding | Progress], object]
 
 def unobserved(event: Encoding | Progress) -> None:
     """Ignore an event."""
-
-
-@dataclass
-class Stage:
-    """A finished stage."""
-
-    scenes: LearnedScenes
-    """Everything learned so far; thresholds are not fitted yet."""
-    iterations: int
-    frames_kept: int

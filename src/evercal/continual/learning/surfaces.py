@@ -56,15 +56,22 @@ def _agreed(
     for j in near:
         other = prepared.posed_cells(j)
         within = other.base_from_camera.inverse().apply(points)
-        pixels = other.camera.project(np.where(within[:, 2:] > 0.05, within, [0, 0, 1]))
-        rows, columns = other.grid
-        cell = np.nan_to_num((pixels - (other.stride - 1) / 2) / other.stride, nan=-9.0).round()
-        column, row = cell.astype(int).T
-        inside = (within[:, 2] > 0.05) & (cell >= 0).all(1) & (column < columns) & (row < rows)
-        seen = np.full(len(points), np.nan)
-        seen[inside] = swept[j][row[inside] * columns + column[inside]]
+        pixels = other.camera.project(np.where(within[:, 2:] > 0.05, within, np.nan))
+        seen = _at_pixels(swept[j].reshape(other.grid), pixels, other.stride)
         votes += np.abs(seen - within[:, 2]) < TOLERANCE * within[:, 2]
     return np.where(votes >= AGREEING, swept[i], np.nan).reshape(view.grid)
+
+
+def _at_pixels(
+    depths: NDArray[np.float64], pixels: NDArray[np.float64], stride: int
+) -> NDArray[np.float64]:
+    """Depths (n,) of the cells nearest to pixels (n, 2); NaN outside the grid."""
+    cell = np.nan_to_num((pixels - (stride - 1) / 2) / stride, nan=-9.0).round().astype(int)
+    inside = ((cell >= 0) & (cell < depths.shape[::-1])).all(1)
+    column, row = cell[inside].T
+    known = np.full(len(pixels), np.nan)
+    known[inside] = depths[row, column]
+    return known
 
 
 def shared_depths(
@@ -102,21 +109,15 @@ def surface_points(
     its frame, along its own ray; the point is NaN where the depth is unknown.
     """
     tensors = {name: value.cpu() for name, value in buffer.tensors.items()}
-    view, points = tensors["view"].long().numpy(), np.full((len(buffer), 3), np.nan)
-    atlas_from_base = buffer.atlas_from_base
-    first = np.searchsorted(view, np.arange(buffer.views + 1))  # rows are ordered by view
+    starts, points = buffer.starts.tolist(), np.full((len(buffer), 3), np.nan)
     for number, four in enumerate(tensors["intrinsics"].numpy()):
         frame, depth = frames[number % len(frames)], depths[number % len(frames)]
         assert frame.base_from_camera is not None, "training frames are posed"
-        where = slice(first[number], first[number + 1])
+        where = slice(*starts[number : number + 2])
         pixels = tensors["pixels"][where].double().numpy()
         ray = np.concatenate([(pixels - four[2:]) / four[:2], np.ones((len(pixels), 1))], 1)
         camera = frame.camera.short_side_resized(stride * min(depth.shape))
-        cell = ((camera.project(ray) - (stride - 1) / 2) / stride).round()
-        column, row = np.nan_to_num(cell, nan=-1).astype(int).T
-        inside = (row >= 0) & (column >= 0) & (row < depth.shape[0]) & (column < depth.shape[1])
-        known = np.full(len(pixels), np.nan)
-        known[inside] = depth[row[inside], column[inside]]
-        pose: SE3 = atlas_from_base @ frame.base_from_camera
+        known = _at_pixels(depth, camera.project(ray), stride)
+        pose: SE3 = buffer.atlas_from_base @ frame.base_from_camera
         points[where] = pose.apply(ray * known[:, None])
     return torch.from_numpy(points).float()

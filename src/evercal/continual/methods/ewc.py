@@ -68,19 +68,17 @@ def fisher_information(scene: FinishedScene, images: int) -> dict[str, Tensor]:
     """Average the squared gradients of the losses of some images, by parameter name."""
     buffer = scene.rows()
     generator = torch.Generator().manual_seed(buffer.scene)
-    parameters = dict(scene.head.named_parameters())
-    total = {name: torch.zeros_like(p) for name, p in parameters.items()}
-    view = buffer.tensors["view"].cpu()
+    names, values = zip(*scene.head.named_parameters(), strict=True)
+    total = dict(zip(names, map(torch.zeros_like, values), strict=True))
+    starts = buffer.starts.tolist()
     drawn = torch.randperm(buffer.views, generator=generator, device="cpu")[:images]
     for number in drawn.tolist():
-        index = torch.nonzero(view == number)[:, 0]
-        some = torch.randint(len(index), (IMAGE_ROWS,), generator=generator, device="cpu")
-        rows = buffer.rows(index[some])
+        start, end = starts[number : number + 2]
+        some = torch.randint(end - start, (IMAGE_ROWS,), generator=generator, device="cpu")
+        rows = buffer.rows(start + some)
         loss, _ = fixed_clamp_loss(scene.output(rows).points, rows.target)
-        gradients = torch.autograd.grad(
-            loss.mean(), list(parameters.values()), materialize_grads=True
-        )
-        for name, gradient in zip(parameters, gradients, strict=True):
+        gradients = torch.autograd.grad(loss.mean(), values, materialize_grads=True)
+        for name, gradient in zip(names, gradients, strict=True):
             total[name] += gradient.square() / len(drawn)
     return total
 

@@ -45,11 +45,9 @@ class _DistillationHooks(TrainingHooks):
         self, fresh: Rows, step: int, rate: float, generator: torch.Generator
     ) -> list[Rows]:
         # New rows once more, one part with the index of each earlier scene.
-        parts = []
+        parts, count = [], len(fresh.scene)
         for scene in range(self._teacher.scenes):
-            drawn = torch.randint(
-                len(fresh.scene), (self._each,), generator=generator, device="cpu"
-            )
+            drawn = torch.randint(count, (self._each,), generator=generator, device="cpu")
             part = fresh.part(drawn.to(fresh.scene.device))
             part.scene = torch.full_like(part.scene, scene)
             parts.append(part)

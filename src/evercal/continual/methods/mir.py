@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from evercal.continual.methods.method import StageStart
 from evercal.continual.methods.replay import Replay, ReplayHooks
@@ -40,18 +40,49 @@ class MaximallyInterferedRetrieval(Replay):
         """Replay the selected views, from the second scene on."""
         return _MirHooks(self, start) if start.memories else TrainingHooks()
 
+    def interfered_views(
+        self, head: Head, fresh: Rows, memory: FeatureBuffer, rate: float, generator: Generator
+    ) -> Tensor:
+        """Select the views (k,) of a remembered scene that a step on new rows harms most.
+
+        The head is not changed. `rate` is the root mean square change of each parameter in the
+        virtual step.
+        """
+        drawn = torch.randperm(memory.views, generator=generator, device="cpu")[: self.candidates]
+        start, sizes = memory.starts[drawn, None], memory.starts.diff()[drawn, None]
+        offsets = torch.rand(len(drawn), self.view_rows, generator=generator, device="cpu")
+        index = (start + offsets * sizes).long()
+        rows = memory.rows(index.clamp(max=len(memory) - 1).flatten())
+        moved = copy.deepcopy(head)
+        before = self._view_losses(head, rows)
+        parameters = list(moved.parameters())
+        cost = self._losses(moved, fresh).mean()
+        gradients = torch.autograd.grad(cost, parameters, materialize_grads=True)
+        with torch.no_grad():
+            for parameter, gradient in zip(parameters, gradients, strict=True):
+                size = gradient.square().mean().sqrt().clamp(min=1e-12)
+                parameter.sub_(rate * gradient / size)
+        harm = self._view_losses(moved, rows) - before
+        return drawn[harm.topk(min(self.chosen, len(drawn))).indices.cpu()]
+
+    def _losses(self, head: Head, rows: Rows) -> Tensor:
+        points = head(rows.features.float(), rows.scene, rows.descriptor).points
+        return fixed_clamp_loss(points, rows.target, self.clamp_px)[0]
+
+    @torch.no_grad()
+    def _view_losses(self, head: Head, rows: Rows) -> Tensor:
+        return self._losses(head, rows).view(-1, self.view_rows).mean(1)
+
 
 class _MirHooks(ReplayHooks):
     def __init__(self, method: MaximallyInterferedRetrieval, start: StageStart):
         super().__init__(method, start)
         self._options, self._head, self._views = method, start.head, list[Tensor]()
 
-    def replayed(
-        self, fresh: Rows, step: int, rate: float, generator: torch.Generator
-    ) -> list[Rows]:
+    def replayed(self, fresh: Rows, step: int, rate: float, generator: Generator) -> list[Rows]:
         if step % self._options.every_steps == 0 or not self._views:
             self._views = [
-                interfered_views(self._options, self._head, fresh, memory, rate, generator)
+                self._options.interfered_views(self._head, fresh, memory, rate, generator)
                 for memory in self.memories
             ]
         rows = []
@@ -61,44 +92,3 @@ class _MirHooks(ReplayHooks):
             drawn = torch.randint(len(where), (self.each,), generator=generator, device="cpu")
             rows.append(memory.rows(where[drawn.to(where.device)]))
         return rows
-
-
-def interfered_views(
-    method: MaximallyInterferedRetrieval,
-    head: Head,
-    fresh: Rows,
-    memory: FeatureBuffer,
-    rate: float,
-    generator: torch.Generator,
-) -> Tensor:
-    """Select the views (k,) of a remembered scene that a step on new rows harms most.
-
-    The head is not changed. `rate` is the root mean square change of each parameter in the virtual
-    step.
-    """
-    drawn = torch.randperm(memory.views, generator=generator, device="cpu")[: method.candidates]
-    view = memory.tensors["view"].cpu()
-    starts = torch.searchsorted(view, drawn.to(view.dtype))
-    ends = torch.searchsorted(view, drawn.to(view.dtype), right=True)
-    offsets = torch.rand(len(drawn), method.view_rows, generator=generator, device="cpu")
-    index = (starts[:, None] + offsets * (ends - starts)[:, None]).long()
-    rows = memory.rows(index.clamp(max=len(memory) - 1).flatten())
-    moved = copy.deepcopy(head)
-    before = _losses(method, head, rows, len(drawn))
-    points = moved(fresh.features.float(), fresh.scene, fresh.descriptor).points
-    cost, _ = fixed_clamp_loss(points, fresh.target, method.clamp_px)
-    parameters = list(moved.parameters())
-    gradients = torch.autograd.grad(cost.mean(), parameters, materialize_grads=True)
-    with torch.no_grad():
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            size = gradient.square().mean().sqrt().clamp(min=1e-12)
-            parameter.sub_(rate * gradient / size)
-    harm = _losses(method, moved, rows, len(drawn)) - before
-    return drawn[harm.topk(min(method.chosen, len(drawn))).indices.cpu()]
-
-
-@torch.no_grad()
-def _losses(method: MaximallyInterferedRetrieval, head: Head, rows: Rows, views: int) -> Tensor:
-    points = head(rows.features.float(), rows.scene, rows.descriptor).points
-    loss, _ = fixed_clamp_loss(points, rows.target, method.clamp_px)
-    return loss.view(views, -1).mean(1)

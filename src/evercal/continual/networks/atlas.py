@@ -5,8 +5,7 @@ Every scene keeps its own base frame; `atlas_from_base` only shifts it into the 
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -34,23 +33,24 @@ class Cell:
         return SE3(np.array([1.0, 0.0, 0.0, 0.0]), shift)
 
 
+@dataclass
 class Atlas:
     """Cells in the order of their scenes.
 
-    The layout `open` assigns the first free position of a square spiral that is large enough, so
-    scenes need not be known in advance. `paper` is GLACE's grid for n expected scenes: with
+    The open layout assigns the first free position of a square spiral that is large enough, so
+    scenes need not be known in advance. The paper's is GLACE's grid for n expected scenes: with
     ceil(sqrt(n)) columns, the cell of scene i lies at 5 m (-row, -column, 0).
     """
 
-    def __init__(self, layout: Literal["open", "paper"] = "open", expected: int = 0):
-        self.layout, self.expected = layout, expected
-        self.cells: list[Cell] = []
+    expected: int = 0
+    """Scenes of the paper's layout; 0 for the open one."""
+    cells: list[Cell] = field(default_factory=list)
 
     def place(self, positions_m: np.ndarray) -> Cell:
         """Assign a cell to a new scene with (n, 3) camera positions in its base frame."""
         origin = positions_m.mean(axis=0)
         side = max(MIN_CELL_M, 2.0 * float(np.ptp(positions_m, axis=0).max()))
-        if self.layout == "paper":
+        if self.expected:
             if len(self.cells) >= self.expected:
                 raise InputError(
                     f"atlas: the paper layout is full with {self.expected} scenes; expect more"
@@ -96,7 +96,7 @@ def combined_centres(
     As in GLACE, k-means runs on the camera positions of all scenes together. These are (n, 3) in
     each scene's base frame; `count` is K of the paper.
     """
-    atlas = Atlas("paper", len(positions_m))
+    atlas = Atlas(len(positions_m))
     in_atlas = [atlas.place(scene).atlas_from_base.apply(scene) for scene in positions_m]
     means = camera_clusters(np.concatenate(in_atlas), count, seed)
     return tuple((x, y, z) for x, y, z in means.tolist())

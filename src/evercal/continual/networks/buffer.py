@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from operator import attrgetter
 
 import numpy as np
@@ -110,6 +111,14 @@ class FeatureBuffer:
     def __len__(self) -> int:
         return len(self.tensors["features"])
 
+    @property
+    def starts(self) -> Tensor:
+        """(views + 1,) first row of every view, and the number of rows; on the CPU."""
+        view = self.tensors["view"].cpu()
+        return torch.searchsorted(
+            view, torch.arange(self.views + 1, dtype=view.dtype, device="cpu")
+        )
+
     def correct_lens(self, correction: Tensor) -> None:
         """Undistort the pixels and correct the intrinsics; see `reprojection_error`."""
         t, view = self.tensors, self.tensors["view"].long()
@@ -188,22 +197,15 @@ def encode_frames(
     Pass 0 shows the frames unchanged, later passes augmented. A view and its cells depend only on
     (seed, pass, frame).
     """
-    for number in range(plan.views_per_frame * len(frames)):
-        view, keep = _view(frames, number, plan, encoder.stride)
-        buffer.append(view, described(encoder(view.grey), descriptor), keep)
+    for visit, (position, frame) in product(range(plan.views_per_frame), enumerate(frames)):
+        rng = np.random.default_rng([plan.seed, visit, position])
+        if visit == 0:
+            view = frame_view(frame, encoder.stride, plan.view)
+        else:
+            view = augmented_view(frame, encoder.stride, plan.view, rng)
+        some = rng.permutation(np.flatnonzero(view.valid))[: plan.cells if visit else None]
+        keep = np.zeros(len(view.valid), bool)
+        keep[some] = True
+        encoded = described(encoder(view.grey), descriptor)
+        buffer.append(view, encoded, torch.from_numpy(keep))
         yield buffer.views
-
-
-def _view(
-    frames: Sequence[Frame], number: int, plan: EncodePlan, stride: int
-) -> tuple[View, Tensor]:
-    visit, position = divmod(number, len(frames))
-    rng = np.random.default_rng([plan.seed, visit, position])
-    if visit == 0:
-        view = frame_view(frames[position], stride, plan.view)
-    else:
-        view = augmented_view(frames[position], stride, plan.view, rng)
-    keep = rng.permutation(np.flatnonzero(view.valid))[: plan.cells if visit else None]
-    mask = np.zeros(len(view.valid), bool)
-    mask[keep] = True
-    return view, torch.from_numpy(mask)

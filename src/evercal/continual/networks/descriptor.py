@@ -69,11 +69,10 @@ class PooledDescriptor(nn.Module):
 Descriptor = GlobalDescriptor | PooledDescriptor
 
 
-def load_descriptor(path: Path | None = None) -> Descriptor:
+def load_descriptor(path: Path = DESCRIPTOR_FILE) -> Descriptor:
     """Load a descriptor for inference, by default the shipped one."""
     from safetensors import SafetensorError, safe_open
 
-    path = DESCRIPTOR_FILE if path is None else path
     if not path.is_file():
         raise InputError(f"descriptor {path}: no such file")
     try:

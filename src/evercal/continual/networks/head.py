@@ -240,22 +240,16 @@ class Head(nn.Module):
         number = iter(range(self.layers))
         activation = F.gelu if self.options.activation == "gelu" else F.relu
 
-        def layer(linear: nn.Module, y: Tensor) -> Tensor:
-            z, i = linear(y), next(number)
-            return activation(z if add_code is None else add_code(z, i))
+        def through(layers: nn.Module, y: Tensor) -> Tensor:
+            for linear in layers.children():
+                z, i = linear(y), next(number)
+                y = activation(z if add_code is None else add_code(z, i))
+            return y
 
-        y = x
-        for linear in self.first:
-            y = layer(linear, y)
-        hidden = self.skip(x) + y
+        hidden = self.skip(x) + through(self.first, x)
         for block in self.blocks:
-            y = hidden
-            for linear in block:  # pyright: ignore[reportGeneralTypeIssues]
-                y = layer(linear, y)
-            hidden = hidden + y
-        for linear in self.last:
-            hidden = layer(linear, hidden)
-        return hidden
+            hidden = hidden + through(block, hidden)
+        return through(self.last, hidden)
 
     def decode(self, hidden: Tensor, scene: Tensor | int) -> HeadOutput:
         """Compute the output from (n, width) activations of the last hidden layer, fp32."""

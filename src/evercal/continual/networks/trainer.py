@@ -150,9 +150,8 @@ class HeadTrainer:
             correction = (self.correction * self._correctable).repeat_interleave(share, 0)
         costs, errors = reprojection_loss(points, rows.target, tau_px, options.loss, correction)
         if rows.known is not None:
-            costs = costs + options.surface_weight * surface_loss(
-                points, rows.known, rows.target, tau_px
-            )
+            surface = surface_loss(points, rows.known, rows.target, tau_px)
+            costs = costs + options.surface_weight * surface
         return costs, errors
 
     def _gradients(self, loss: Tensor) -> dict[str, Tensor]:
@@ -163,10 +162,8 @@ class HeadTrainer:
     def _take_step(
         self, losses: Sequence[Tensor], constraints: list[dict[str, Tensor]], schedule: float
     ) -> None:
-        named = dict(self.head.named_parameters())
-        before = {}
-        if self.hooks.edits_steps:
-            before = {name: value.detach().clone() for name, value in named.items()}
+        named = dict(self.head.named_parameters()) if self.hooks.edits_steps else {}
+        before = {name: value.detach().clone() for name, value in named.items()}
         for optimiser in self._optimisers:
             optimiser.step()
         if not before:

@@ -56,12 +56,11 @@ class FrameStatistics:
         return self._rows()
 
     @cached_property
-    def _first_rows(self) -> Tensor:
-        view = self._buffer.tensors["view"].cpu()
-        return torch.searchsorted(view, torch.arange(len(self) + 1, device="cpu").to(view.dtype))
+    def _starts(self) -> list[int]:
+        return self._buffer.starts.tolist()
 
     def _rows_of(self, frame: int) -> Rows:
-        start, end = self._first_rows[frame : frame + 2].tolist()
+        start, end = self._starts[frame : frame + 2]
         return self._buffer.rows(torch.arange(start, end, device="cpu"))
 
     def _hidden(self, rows: Rows) -> Tensor:
@@ -108,7 +107,7 @@ class FrameStatistics:
         own = torch.nonzero(shared_centres | (head.centre_scene == self._buffer.scene))[:, 0]
         gradients = []
         for i in range(len(self)):
-            start, end = self._first_rows[i : i + 2].tolist()
+            start, end = self._starts[i : i + 2]
             drawn = torch.randint(start, end, (GRADIENT_ROWS,), generator=generator, device="cpu")
             rows = self._buffer.rows(drawn)
             with torch.no_grad():

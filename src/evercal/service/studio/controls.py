@@ -14,11 +14,7 @@ from evercal.errors import InputError
 from evercal.live.coverage import POSITION_MM, ROTATION_DEG
 from evercal.service.studio.devices import Which
 from evercal.service.studio.studio import FIXED_IMAGES, STEPS, Studio
-from evercal.service.viewer.html import (
-    calibration_rows,
-    chip_html,
-    rows_html,
-)
+from evercal.service.viewer.html import calibration_rows, chip_html, rows_html
 
 _CAMERAS: dict[str, Which] = {"camera on the gripper": "wrist", "fixed camera": "fixed"}
 
@@ -81,15 +77,8 @@ class Controls:
         bar = gui.add_progress_bar(0.0, animated=True)
         self._keep(bar, visible=lambda: tasks.busy, value=lambda: 100 * tasks.progress)
         tabs = gui.add_tab_group()
-        contents = (
-            self._connect,
-            self._samples,
-            self._learn,
-            self._fixed,
-            self._hold,
-            self._export,
-        )
-        for (title, state), add in zip(STEPS.items(), contents, strict=True):
+        steps = self._connect, self._samples, self._learn, self._fixed, self._hold, self._export
+        for (title, state), add in zip(STEPS.items(), steps, strict=True):
             with tabs.add_tab(title):
                 self._keep(gui.add_html(""), content=lambda state=state: chip_html(*state(studio)))
                 add()
@@ -142,8 +131,7 @@ class Controls:
         self._updates.append(show_names)
         self._button("Remove", lambda: studio.remove(sample.value, which=which))
         self._button(
-            "Remove the bad ones",
-            lambda: studio.remove(*studio.bad_samples(which), which=which),
+            "Remove the bad ones", lambda: studio.remove(*studio.bad_samples(which), which=which)
         )
         self._button("Remove all", lambda: studio.remove(*names(), which=which))
 

@@ -180,10 +180,7 @@ class Studio:
         return "There is no next view." if pose is None else self.move_to(pose)
 
     def record(
-        self,
-        on_step: OnStep,
-        stopping: Callable[[], bool] = lambda: False,
-        which: Which = "wrist",
+        self, on_step: OnStep, stopping: Callable[[], bool] = lambda: False, which: Which = "wrist"
     ) -> str:
         """Move from one best view to the next and take samples until nothing is missing."""
         if which == "wrist" and not self.recorders[which].frames:
@@ -251,11 +248,7 @@ class Studio:
         if not files:
             raise InputError("no image of the fixed camera yet; take one first")
         on_step("locating images", 0, len(files))
-        found = self.cell.calibrate(
-            files,
-            camera=self._fixed_intrinsics(),
-            mount="eye_to_hand",
-        )
+        found = self.cell.calibrate(files, camera=self._fixed_intrinsics(), mount="eye_to_hand")
         self._keep("fixed", replace(found, source={**found.source, "store": str(self.cell.path)}))
         return f"Calibrated the fixed camera; wrote {self.calibration_file('fixed')}."
 

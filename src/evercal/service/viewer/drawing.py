@@ -147,9 +147,8 @@ def add_calibrations(
     scale = readable_scale([Ellipsoid.of(c.uncertain_pose) for c in calibrations.values()])
     for name, found in calibrations.items():
         ellipsoid = Ellipsoid.of(found.uncertain_pose)
-        on_gripper = found.mount == "eye_in_hand"
         base = drawn.node(found.source.get("scene")) if drawn else "/base"
-        parent = GRIPPER if on_gripper else base
+        parent = GRIPPER if found.mount == "eye_in_hand" else base
         node = f"{parent}/{name.replace('/', '_')}"
         frustum = Frustum.of(found.parent_from_child, found.camera or default)
         add_frustum(server, node, frustum, size_m, MAGENTA)

@@ -22,14 +22,7 @@ from evercal.reports.answers import unit_known
 from evercal.reports.overlay import resized
 from evercal.reports.scene import THUMBNAIL_PX, ColourBy, Frustum, KeyframeView
 from evercal.service.hosts import is_local, listening_socket, url_of
-from evercal.service.viewer.drawing import (
-    DrawnMap,
-    add_arm,
-    add_base,
-    add_calibrations,
-    add_frustum,
-    place,
-)
+from evercal.service.viewer import drawing
 from evercal.service.viewer.gate import gated
 from evercal.service.viewer.html import GREEN, calibration_rows, chip_html, rows_html
 
@@ -51,15 +44,15 @@ class Page:
         self.server = start_server(*address, "evercal view")
         try:
             scenes, server = localizer.contents.scenes, self.server
-            self.map = DrawnMap(server, scenes, self.look_through)
-            gripper = add_base(server, 2.5 * self.map.extent_m)
+            self.map = drawing.DrawnMap(server, scenes, self.look_through)
+            gripper = drawing.add_base(server, 2.5 * self.map.extent_m)
             default, size_m = scenes[0].adjusted_camera, self.map.frustum_m
-            add_calibrations(server, given, self.map, default, size_m)
+            drawing.add_calibrations(server, given, self.map, default, size_m)
             self._begin_behind(scenes[0].name)
             self._add_controls(given)
             if urdf is not None:
                 hands = [c.parent_frame for c in given.values() if c.mount == "eye_in_hand"]
-                add_arm(server, urdf, gripper, hands)
+                drawing.add_arm(server, urdf, gripper, hands)
         except BaseException:
             self.close()
             raise
@@ -83,12 +76,7 @@ class Page:
         centre_m, width_m, height_m = backdrop(view)
         with client.atomic():
             client.scene.add_image(
-                _THROUGH,
-                view.image,
-                width_m,
-                height_m,
-                wxyz=pose.rotation_wxyz,
-                position=centre_m,
+                _THROUGH, view.image, width_m, height_m, wxyz=pose.rotation_wxyz, position=centre_m
             )
             client.camera.position, client.camera.wxyz = pose.translation_m, pose.rotation_wxyz
             client.camera.fov = view.frustum.fov_rad
@@ -131,8 +119,8 @@ class Page:
         """Show where a camera is, while the page is open somewhere."""
         server, scenes = self.server, self._localizer.contents.scenes
         frustum = Frustum.of(SE3.identity(), tracker.camera or scenes[0].adjusted_camera)
-        node = add_frustum(server, "/live", frustum, 1.3 * self.map.frustum_m, GREEN)
-        place(node, None)
+        node = drawing.add_frustum(server, "/live", frustum, 1.3 * self.map.frustum_m, GREEN)
+        drawing.place(node, None)
         with server.gui.add_folder("Live"):
             text = server.gui.add_html("")
         shown: str | None = None
@@ -148,7 +136,7 @@ class Page:
                 break
             estimate = tracked.estimate
             pose = estimate.uncertain_pose if estimate.status == "ok" else None
-            place(node, pose and pose.pose)
+            drawing.place(node, pose and pose.pose)
             rows = [("time", f"{estimate.milliseconds:.0f} ms")]
             if pose is not None:
                 if estimate.scene != shown:  # else the visitor's choice stays
