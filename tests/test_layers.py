@@ -37,7 +37,7 @@ ORDER = (
     "cli",
 )
 """Folders, and the module map.py."""
-FOR_ALL = ("bounds", "errors", "processes", "progress")
+FOR_ALL = ("bounds", "cluster", "errors", "processes", "progress")
 FACES = ("__init__", "__main__")
 """Modules of the root that may import everything."""
 PRODUCT = ORDER[: ORDER.index("simulation")]

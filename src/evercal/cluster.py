@@ -36,8 +36,7 @@ def connected(address: str) -> Iterator[Any]:
         except (ConnectionError, TimeoutError, ValueError, RuntimeError) as error:
             reason = str(error).strip().partition("\n")[0]
             raise InputError(
-                f"--ray {address}: {reason[:300]}; start a cluster with 'ray start --head', or"
-                " give HOST:PORT of one"
+                f"--ray {address}: {reason[:300]}; start a cluster, or give HOST:PORT of one"
             ) from None
     # Ray prints messages of its machines to stdout, whatever `log_to_driver` is; --json is there.
     ray._private.worker._worker_logs_enabled = False

@@ -15,7 +15,6 @@ from evercal.cli.console import require_writable, say, say_notes, size
 from evercal.cli.info import adjusted_row
 from evercal.errors import InputError
 from evercal.progress import Bars
-from evercal.recordings.addresses import is_address
 
 if TYPE_CHECKING:
     from evercal.learning.scene import LearnReport
@@ -90,8 +89,10 @@ class Learn(args.Verb):
     def run(self) -> int:
         if not self.recordings:
             raise InputError("no RECORDING given; name the folder of one or more")
-        single = len(self.recordings) == 1 and not (self.ray or self.results)
-        single = single and not is_address(self.recordings[0])
+        from evercal.recordings.addresses import is_address
+
+        single = len(self.recordings) == 1 and not is_address(self.recordings[0])
+        single = single and not (self.ray or self.results)
         if self.workers < 1 or (single and self.workers > 1):
             raise InputError(f"--workers {self.workers}: give 1 to the number of recordings")
         require_writable(self.calibration, "--calibration")

@@ -2,14 +2,16 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from evercal.errors import InputError
-from evercal.recordings.addresses import RecordingAt
 from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording, checked_name
 
+if TYPE_CHECKING:
+    from evercal.recordings.addresses import RecordingAt
+
 EVERY, BLOCK = 100, 4
-Named = TypeVar("Named", Recording, RecordingAt)
+Named = TypeVar("Named", Recording, "RecordingAt")
 
 
 @dataclass(frozen=True)
