@@ -49,7 +49,7 @@ def run(out: Path = Path("runs/cluster"), recordings: int = 24, requests: int = 
         "Ray, 2 workers": lambda: _learned(out, paths, "two", (1, 1)),
         "Ray, 4 workers": lambda: _learned(out, paths, "four", (2, 2)),
         "Ray, 2 workers, a kill every 10 s": lambda: _learned(out, paths, "kill", (1, 1), True),
-        "Ray, 2 workers, a node removed": lambda: _learned(
+        "Ray, 3 workers, a node removed": lambda: _learned(
             out, paths, "gone", (1, 1, 1), gone=True
         ),
         "evercal serve": lambda: _served(out / "one", paths, requests, ()),
@@ -140,7 +140,7 @@ def _cluster(*nodes: int) -> Iterator[Any]:
 
 
 def _processes(begin: bytes) -> Iterator[Path]:
-    """Folders in /proc of the processes of workers; of learning processes without `begin`."""
+    """Folders in /proc of processes whose command begins so; of local workers without."""
     for file in Path("/proc").glob("[0-9]*/cmdline"):
         with suppress(OSError):
             command = file.read_bytes()
@@ -204,18 +204,23 @@ def _served(store: Path, paths: list[Path], requests: int, words: tuple[object, 
             times.append(1000 * (time.perf_counter() - began))
             return estimate
 
-        with ThreadPoolExecutor(CLIENTS) as pool:
+        begin = b"ray::" if words else b"\0".join(word.encode() for word in command)
+        with ThreadPoolExecutor(CLIENTS) as pool, _processor_time(begin) as spent:
             answers = list(pool.map(ask, images))  # not counted: keyframes are decoded
             times.clear()
-            began = time.perf_counter()
+            time.sleep(1.0)
+            before, began = spent(), time.perf_counter()
             _ = list(pool.map(ask, asked))
             seconds = time.perf_counter() - began
+            time.sleep(1.0)
+            worked = spent() - before
         process.send_signal(signal.SIGTERM)
         process.wait(90)
     same = [_same(opened.localize(i), answer) for i, answer in zip(images, answers, strict=True)]
     return {
         "images_per_s": requests / seconds,
         "median_ms": float(np.median(times)),
+        "processor_ms": 1000 * worked / requests,
         "same_answers": float(np.mean(same)),
     }
 

@@ -3,8 +3,14 @@
 Scenes are box rooms with 50 keyframes each. Queries are images between the keyframes of the first
 hundred rooms. The packaged rooms are queried as well, by every tenth of their test images. One more
 row is the ranking of before: a product for each image, and a whole sort.
+
+Maps are opened and asked, too. They hold the packaged rooms among copies of one box room, whose
+descriptors are those of the others.
 """
 
+import json
+import shutil
+import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.rows import Row, save
+from evercal import Map
 from evercal.features.encoder import Encoder, load_encoder
 from evercal.geometry import SE3
 from evercal.localization.keyframe_bank import KeyframeBank
@@ -20,8 +27,15 @@ from evercal.localization.query import LocalizeOptions
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.mapping.store import KEYFRAMES as KEYFRAMES_FILE
+from evercal.mapping.store import SCENE
+from evercal.processes import python_command
+from evercal.recordings import Frame, Recording
 from evercal.recordings.samples import sample_rooms
 from evercal.simulation.box_room import BoxRoom, default_camera
+from evercal.storage.manifest import Manifest, write_manifest
+from evercal.storage.stages import STAGES
+from evercal.storage.tensors import load_tensors, save_tensors
 
 FIRST_SEED = 30_000
 KEYFRAMES, QUERIES, QUERIED = 50, 5, 100
@@ -64,6 +78,94 @@ def run(out: Path = Path("runs/retrieval"), scenes: int = 2000) -> None:
             "megabytes": every.size * 4 / 1e6,
         }
     save(out / "retrieval.csv", rows, {"scenes": scenes, "attempt": str(ATTEMPT)})
+    learned = _learned(out / "learned")
+    maps = []
+    for count in (10, 100, 1000, 2000):
+        if count <= len(keys) + len(packed):
+            root = _large_map(learned, out / f"map-{count}", keys[: count - len(packed)])
+            maps.append({"scenes": count, **_asked(root)})
+    save(out / "large-maps.csv", maps, {"keyframes": KEYFRAMES})
+
+
+def _learned(root: Path) -> Path:
+    """A map of the packaged rooms and a box room."""
+    opened = Map.open(root)
+    for room in sample_rooms():
+        if room.scene.name not in opened.scenes:
+            opened.learn(room.scene)
+    if "room" not in opened.scenes:
+        room, camera = BoxRoom(FIRST_SEED - 1, texture_px=TEXTURE_PX), default_camera()
+        path = room.path(2 * KEYFRAMES, 0)
+        views = [(f"{i:03d}", room.render(camera, path[i]), path[i]) for i in range(len(path))]
+        frames = tuple(Frame(name, image, camera, pose) for name, image, pose in views)
+        opened.learn(Recording("room", frames, ()), memory="50%")
+    return root
+
+
+def _large_map(learned: Path, root: Path, keys: np.ndarray) -> Path:
+    """A map of the packaged rooms and of copies of the box room, one for each of `keys`."""
+    if root.exists():
+        return root
+    part = root.with_name(f".{root.name}")
+    shutil.rmtree(part, ignore_errors=True)
+    payload = Manifest.read(learned).payload
+    *packaged, room = (str(stage) for stage in payload["stages"])
+    networks = [str(name) for name in payload["networks"]]
+    stages = [*packaged, *(f"{n:04d}-copy" for n in range(4, 4 + len(keys)))]
+    part.mkdir(parents=True)
+    for name in networks:
+        shutil.copy(learned / name, part / name)
+    stored = load_tensors(learned / STAGES / room / KEYFRAMES_FILE)
+    scene = json.loads((learned / STAGES / room / SCENE).read_text())
+    for number, stage in enumerate(tqdm(stages, unit="scene")):
+        folder = part / STAGES / stage
+        if number < len(packaged):
+            shutil.copytree(learned / STAGES / stage, folder)
+            continue
+        shutil.copytree(learned / STAGES / room, folder)
+        count = len(stored["lengths"])
+        descriptors = np.resize(keys[number - len(packaged)], (count, keys.shape[-1]))
+        save_tensors(folder / KEYFRAMES_FILE, {**stored, "descriptors": descriptors})
+        (folder / SCENE).write_text(json.dumps({**scene, "name": stage}))
+    files = [str(path.relative_to(part)) for path in part.rglob("*") if path.is_file()]
+    write_manifest(part, {**payload, "stages": stages}, files)
+    part.rename(root)
+    return root
+
+
+def _asked(root: Path) -> Row:
+    """Time to open a map, memory, and time of its images, in a process of its own."""
+    command = python_command("-c", _ASK, str(root))
+    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+_ASK = """
+import json, re, sys, time
+from pathlib import Path
+import numpy as np
+from evercal import Map
+from evercal.recordings.samples import sample_rooms
+
+def memory():
+    text = Path("/proc/self/smaps_rollup").read_text()
+    parts = {k: int(v) for k, v in re.findall(r"^(\\w+): +(\\d+) kB", text, re.M)}
+    return parts["Private_Dirty"] / 1000
+
+images = [(r.scene.name, f.read_image()) for r in sample_rooms() for f in r.scene.test[::10]]
+before, began = memory(), time.perf_counter()
+opened = Map.open(sys.argv[1])
+opened.localizer
+seconds, own = time.perf_counter() - began, memory() - before
+times, right = [], 0
+for turn in range(2):
+    for name, image in images:
+        began = time.perf_counter()
+        estimate = opened.localize(image)
+        times.append(1000 * (time.perf_counter() - began))
+        right += turn * (estimate.scene == name)
+row = {"open_s": seconds, "own_mb": own, "images": len(images), "right_scene": right}
+print(json.dumps({**row, "median_ms": float(np.median(times[len(images):]))}))
+"""
 
 
 def _right(bank: KeyframeBank, queries: list[tuple[int, np.ndarray]]) -> Row:

@@ -7,9 +7,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import cv2
+
 from evercal.cluster import connected
 from evercal.errors import InputError
 from evercal.map import Map
+from evercal.processes import cores
 from evercal.service.client import Client
 from evercal.service.hosts import url_of
 from evercal.service.server import DRAIN_S, ServeOptions, make_app, require_token
@@ -30,6 +33,7 @@ def deployment(options: ServeOptions, replicas: int) -> Any:
     from ray import serve
 
     def build() -> "FastAPI":
+        cv2.setNumThreads(cores())  # those of the replica, not of its machine
         return make_app(options)
 
     limits = options.limits
