@@ -1,17 +1,22 @@
 """Keyframes survive a file: images nearly, all else exactly."""
 
+import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from evercal.errors import InputError
 from evercal.features.views import working_image
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.mapping.keyframes import Keyframes, store_keyframes
 from evercal.mapping.landmarks import Landmarks
 from evercal.recordings.frame import Frame, Recording
+from evercal.storage.tensors import open_tensors, save_tensors
 
 DISTORTIONS = ((), (0.1, -0.05, 0.001, 0.002), (0.1, -0.05, 0.001, 0.002, 0.01),
                (0.1, -0.05, 0.001, 0.002, 0.01, 0.02, -0.03, 0.004))  # fmt: skip
@@ -136,3 +141,37 @@ def test_pixels_need_two_bytes(rooms: tuple[Recording, ...]) -> None:
     far = replace(keyframes.landmarks[0], pixels=np.array([[32767.0, 0], [1919, 1079]]))
     back = through_a_file(replace(keyframes, landmarks=(far,)))
     np.testing.assert_array_equal(back.landmarks[0].pixels, far.pixels)
+
+
+def test_keyframes_stay_in_their_file_until_they_are_used(
+    rooms: tuple[Recording, ...], tmp_path: Path
+) -> None:
+    keyframes, file = mapped(rooms[0].train, (7, 0, 12)), tmp_path / "a.safetensors"
+    save_tensors(file, keyframes.to_tensors())
+    back = Keyframes.from_tensors(open_tensors(file))
+    file.unlink()  # as when another process replaces a scene
+    assert tuple(back.images) == tuple(keyframes.images)
+    assert back.bytes == keyframes.bytes
+    assert back.landmarks[-1].sigma.tolist() == keyframes.landmarks[2].sigma.tolist()
+    taken = pickle.loads(pickle.dumps(back.take(np.arange(3))))
+    np.testing.assert_array_equal(taken.inverse_depth[1], keyframes.inverse_depth[1])
+
+
+@pytest.mark.parametrize("name", ["lengths", "cells", "landmark_counts"])
+def test_parts_beyond_their_arrays_are_errors_at_once(
+    name: str, rooms: tuple[Recording, ...], tmp_path: Path
+) -> None:
+    tensors, file = mapped(rooms[0].train, (7, 3)).to_tensors(), tmp_path / "a.safetensors"
+    for change in (+1, -tensors[name][-1] - 1):
+        counts = tensors[name].copy()
+        counts[-1] += change
+        save_tensors(file, {**tensors, name: counts})
+        with pytest.raises((ValueError, SafetensorError)):
+            Keyframes.from_tensors(open_tensors(file))
+
+
+def test_a_damaged_file_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "a.safetensors"
+    file.write_bytes(b"\x08" + bytes(15))
+    with pytest.raises(InputError, match=r"a\.safetensors: not readable"):
+        open_tensors(file)

@@ -9,11 +9,11 @@ import pickle
 import tempfile
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
-import evercal
 from evercal.errors import InputError
 from evercal.learning.scene import LearnReport, learn_scene
 from evercal.mapping.build import MapOptions
@@ -86,7 +86,7 @@ class LearnTask:
         if self.results is None:
             return None
         what = source if isinstance(source, Recording) else addresses.stamps(source.address)
-        of = pickle.dumps((evercal.__version__, self.contents, self.memory, self.options, what))
+        of = pickle.dumps((version("evercal"), self.contents, self.memory, self.options, what))
         return f"{self.results}/{source.name}-{hashlib.sha256(of).hexdigest()[:16]}.zip"
 
 

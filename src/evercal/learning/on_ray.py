@@ -1,15 +1,14 @@
 """Recordings learned by the workers of a Ray cluster."""
 
 from collections.abc import Iterator, Sequence
+from importlib.metadata import version
 from typing import Any
 
-import evercal
 from evercal.cluster import connected
 from evercal.learning.many import Item, Learned, LearnTask
 
 TRIES = 20
-"""Attempts for a recording: machines of a cluster come and go, and a task that runs out of memory
-is tried again without being counted."""
+"""Attempts for a recording: machines of a cluster come and go."""
 AHEAD = 4
 """Recordings that wait for each core, so that an autoscaler has a reason to add machines."""
 
@@ -30,7 +29,7 @@ def learn_on_ray(task: LearnTask, items: Sequence[Item], address: str) -> Iterat
                 most = AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
                 while waiting and len(running) < most:
                     item = waiting.pop()
-                    running[learn.remote(shared, evercal.__version__, *item)] = item
+                    running[learn.remote(shared, version("evercal"), *item)] = item
                 for done in ray.wait([*running], num_returns=1)[0]:
                     number = running.pop(done)[0]
                     try:
@@ -44,11 +43,11 @@ def learn_on_ray(task: LearnTask, items: Sequence[Item], address: str) -> Iterat
                 ray.cancel(reference, force=True)
 
 
-def _learned(task: LearnTask, version: str, number: int, source: Any) -> Learned:
+def _learned(task: LearnTask, wanted: str, number: int, source: Any) -> Learned:
     import cv2
 
     cv2.setNumThreads(1)
-    if version != evercal.__version__:
-        here = f"the worker has evercal {evercal.__version__}, this program {version}"
-        return Learned(number, error=f"{here}; install the same on all machines")
+    if (here := version("evercal")) != wanted:
+        error = f"the worker has evercal {here}, this program {wanted}; install the same"
+        return Learned(number, error=f"{error} on all machines")
     return task.learn(number, source)
