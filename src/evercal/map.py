@@ -255,6 +255,8 @@ class Map:
         given = len(loaded) + len(failed)
         with self._store.writing(), shown(on_progress) as step:
             kept = None if results is None else os.fspath(results)
+            if kept is not None and not is_address(kept):
+                kept = os.path.abspath(kept)
             task = LearnTask(self._store.contents.empty(), memory, options, read, kept)
             ready: dict[int, Learned] = {}
             following = 0

@@ -93,6 +93,8 @@ class Learn(args.Verb):
 
         single = len(self.recordings) == 1 and not is_address(self.recordings[0])
         single = single and not (self.ray or self.results)
+        if self.ray is not None and self.workers != 1:
+            raise InputError(f"--workers {self.workers}: --ray has its own; omit one of them")
         if self.workers < 1 or (single and self.workers > 1):
             raise InputError(f"--workers {self.workers}: give 1 to the number of recordings")
         require_writable(self.calibration, "--calibration")
@@ -113,17 +115,15 @@ class Learn(args.Verb):
             )
         if strategy == args.MAP:
             self.networks.refuse()
-        return (
-            self._run_one(Path(self.recordings[0]), strategy)
-            if single
-            else self._run_many(strategy)
-        )
+        if single:
+            return self._run_one(Path(self.recordings[0]), strategy)
+        return self._run_many(strategy)
 
     def _run_many(self, strategy: str) -> int:
-        why = "several recordings are learned; omit the option or give one recording"
+        why = "is for one recording, without --ray, --results and addresses; omit one of them"
         self._refuse(why, "name", "calibration", "gripper_from_camera")
         if strategy != args.MAP:
-            raise InputError("several recordings: a network learns one at a time; give one")
+            raise InputError("a network learns one recording of this machine; give one folder")
         from evercal.map import Map
 
         cell = Map.open(self.store, encoder=self.encoder)

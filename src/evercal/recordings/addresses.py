@@ -36,16 +36,17 @@ def local_copy(address: str) -> Iterator[Path]:
     Raises:
         InputError: There is nothing, or it cannot be read.
     """
-    with tempfile.TemporaryDirectory(prefix="evercal-") as folder, _named(address):
-        store, root = _store(address)
-        target = Path(folder, PurePosixPath(root).name or "root")
-        for file in _files(store, root):
-            inside = file.removeprefix(root).strip("/")
-            if ".." in inside.split("/"):
-                raise InputError(f"{address}: its file {inside!r} leads out of it; rename it")
-            to = target / inside if inside else target
-            to.parent.mkdir(parents=True, exist_ok=True)
-            store.get_file(file, str(to))
+    with tempfile.TemporaryDirectory(prefix="evercal-") as folder:
+        with _named(address):
+            store, root = _store(address)
+            target = Path(folder, PurePosixPath(root).name or "root")
+            for file in _files(store, root):
+                inside = file.removeprefix(root).strip("/")
+                if ".." in inside.split("/"):
+                    raise InputError(f"{address}: its file {inside!r} leads out of it; rename it")
+                to = target / inside if inside else target
+                to.parent.mkdir(parents=True, exist_ok=True)
+                store.get_file(file, str(to))
         yield target
 
 

@@ -95,7 +95,9 @@ def serve_on_ray(
             )
             host = head if options.host in ("0.0.0.0", "::") else options.host
             url = url_of(host, options.port)
-            _ = Client(url, options.token).scenes  # options of a Serve that ran before are kept
+            # It fails where a Serve that ran before listens elsewhere.
+            if Client(url, options.token).scenes != scenes:
+                raise InputError(f"{options.map}: machines of the cluster do not reach this folder")
             on_ready(url, scenes)
             stop.wait()
         except RuntimeError as error:
