@@ -95,8 +95,6 @@ REFUSED = {
     "learn MAP ROOM --gripper-from-camera c.json": "states camera poses",
     "learn MAP ROOM --ray auto --workers 3": "--workers 3: --ray has its own",
     "learn MAP s3://bucket/room --name x": "--name x: is for one recording, without --ray",
-    "learn MAP file:///nowhere/room": "room (file:///nowhere/room: no such folder or file)",
-    "learn MAP nothing://bucket/room": "room (nothing://bucket/room: Protocol not known",
     "learn MAP ROOM ROOM --name x": "--name x: is for one recording, without --ray",
     "learn NETWORKS ROOM --strategy er": "was made with finetune",
     "learn NETWORKS ROOM --centres 7": "was made with 5",

@@ -128,7 +128,8 @@ class Learn(args.Verb):
 
         cell = Map.open(self.store, encoder=self.encoder)
         where = f"{self.workers} at once" if self.ray is None else f"on Ray at {self.ray}"
-        with self._bars(f"{len(self.recordings)} recordings, {where}") as bars:
+        many = "s" if len(self.recordings) > 1 else ""
+        with self._bars(f"{len(self.recordings)} recording{many}, {where}") as bars:
             reports = cell.learn_many(
                 self.recordings,
                 read=self._recording,
