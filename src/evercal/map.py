@@ -244,8 +244,8 @@ class Map:
                 loaded.append(named_recording(RecordingAt.of(item), None, taken))
                 continue
             try:
-                # Workers of a cluster begin in another folder.
-                place = os.path.abspath if ray is not None else os.fspath
+                # Workers of a cluster begin in another folder, and results are kept by path.
+                place = os.fspath if ray is results is None else os.path.abspath
                 recording = item if isinstance(item, Recording) else read(Path(place(item)))
             except InputError as error:
                 failed.append(str(error))
