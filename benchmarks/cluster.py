@@ -206,7 +206,8 @@ def _served(store: Path, paths: list[Path], requests: int, words: tuple[object, 
 
         begin = b"ray::" if words else b"\0".join(word.encode() for word in command)
         with ThreadPoolExecutor(CLIENTS) as pool, _processor_time(begin) as spent:
-            answers = list(pool.map(ask, images))  # not counted: keyframes are decoded
+            # Not counted: every replica decodes the keyframes.
+            answers = list(pool.map(ask, images * 4))[: len(images)]
             times.clear()
             time.sleep(1.0)
             before, began = spent(), time.perf_counter()

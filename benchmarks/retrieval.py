@@ -156,14 +156,15 @@ before, began = memory(), time.perf_counter()
 opened = Map.open(sys.argv[1])
 opened.localizer
 seconds, own = time.perf_counter() - began, memory() - before
-times, right = [], 0
+times, right, wrong = [], 0, 0
 for turn in range(2):
     for name, image in images:
         began = time.perf_counter()
         estimate = opened.localize(image)
         times.append(1000 * (time.perf_counter() - began))
-        right += turn * (estimate.scene == name)
-row = {"open_s": seconds, "own_mb": own, "images": len(images), "right_scene": right}
+        right += turn * (estimate.status == "ok" and estimate.scene == name)
+        wrong += turn * (estimate.status == "ok" and estimate.scene != name)
+row = {"open_s": seconds, "own_mb": own, "images": len(images), "right": right, "wrong": wrong}
 print(json.dumps({**row, "median_ms": float(np.median(times[len(images):]))}))
 """
 

@@ -251,6 +251,15 @@ TABLES: dict[str, Callable[[], Table]] = {
         "inside_95,fixed_mm,fixed_deg,fixed_inside_95,offset_deg,offset_inside_95,offset_squared",
         "joint-offsets",
     ),
+    "scale: retrieval": _rows(
+        "queries,keyframes,images,first,proposed,one_image_ms,four_turns_ms,before_ms,megabytes",
+        "retrieval",
+    ),
+    "scale: maps": _rows("scenes,open_s,own_mb,images,right,wrong,median_ms", "large-maps"),
+    "scale: cluster": _rows(
+        "way,wall_s,processor_s,killed,same_map,images_per_s,median_ms,processor_ms,same_answers",
+        "cluster",
+    ),
     "fisheye: lenses": _rows(
         "answer,rooms,map,asked,number,located,mm,mm_90,inside_95,wrong", "fisheye"
     ),

@@ -15,7 +15,7 @@ def cells(line: str) -> list[str]:
 @pytest.mark.parametrize("name", TABLES)
 def test_pages_have_the_numbers_of_the_data(name: str) -> None:
     page = name.partition(":")[0]
-    folder = FOLDER.parent / ("docs" if page == "results" else "research")
+    folder = FOLDER.parent / ("docs" if page in ("results", "scale") else "research")
     text = (folder / f"{page}.md").read_text()
     lines = [cells(line) for line in text.splitlines() if line.startswith("|")]
     header, _, *rows = (cells(line) for line in markdown(TABLES[name]()).splitlines())
