@@ -131,16 +131,18 @@ class Keyframes:
         depths: Sequence[NDArray[np.float16]] = ()
         landmarks: Sequence[Landmarks] = ()
         if "cells" in tensors:
-            depths = _Parts(tensors["cells"][:], tensors["inverse_depth"].__getitem__)
+            inverse = tensors["inverse_depth"]
+            depths = _Parts(tensors["cells"][:], (inverse,), lambda part: inverse[part])
         if "landmark_counts" in tensors:
             stored = [tensors[f"landmark_{name}"] for name in _LANDMARK_FIELDS]
             landmarks = _Parts(
                 tensors["landmark_counts"][:],
+                stored,
                 lambda part: Landmarks(*(field[part].astype(np.float64) for field in stored)),
             )
-        descriptors = tensors.get("descriptors")
-        made = cls(
-            images=_Parts(lengths, lambda part: tensors["images"][part].tobytes()),
+        images, descriptors = tensors["images"], tensors.get("descriptors")
+        return cls(
+            images=_Parts(lengths, (images,), lambda part: images[part].tobytes()),
             cameras=tuple(
                 Camera(
                     *row[:6],
@@ -154,17 +156,16 @@ class Keyframes:
             landmarks=landmarks,
             descriptors=None if descriptors is None else descriptors[:],
         )
-        for parts in (made.images, depths, landmarks):
-            _ = parts[len(parts) - 1 :]  # a part beyond its array is an error here, not later
-        return made
 
 
 class _Parts(Sequence[Part]):
     """Parts of stored arrays, one for each keyframe."""
 
-    def __init__(self, counts: NDArray[np.int64], read: Callable[[slice], Part]):
-        if (counts < 0).any():
-            raise ValueError(f"a part has {counts.min()} entries")
+    def __init__(
+        self, counts: NDArray[np.int64], stored: Sequence[Any], read: Callable[[slice], Part]
+    ):
+        if (counts < 0).any() or any(len(array) != counts.sum() for array in stored):
+            raise ValueError(f"parts of {counts.tolist()[:9]} rows do not make up their arrays")
         self._ends, self._read = [0, *np.cumsum(counts).tolist()], read
 
     def __len__(self) -> int:

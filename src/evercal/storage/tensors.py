@@ -33,12 +33,31 @@ def load_tensors(path: Path) -> dict[str, NDArray[np.generic]]:
         raise InputError(f"{path}: not readable ({error}); run 'evercal info --check'") from None
 
 
-def open_tensors(path: Path) -> dict[str, Any]:
-    """The named arrays of a file that stays mapped into memory: slices of them are copied."""
+class StoredRows:
+    """The rows of an array in a mapped file: a slice of them is copied.
+
+    Unlike those of the library, slices may be empty everywhere.
+    """
+
+    def __init__(self, file: Any, name: str):
+        part = file.get_slice(name)
+        shape = part.get_shape()
+        self._count, self._rows = shape[0], file.get_tensor(name) if 0 in shape else part
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        start, stop, _ = rows.indices(self._count)
+        return self._rows[start:stop] if start < stop else self._rows[:0]
+
+
+def open_tensors(path: Path) -> dict[str, StoredRows]:
+    """The named arrays of a file, one or more dimensions each, which stays mapped into memory."""
     from safetensors import SafetensorError, safe_open
 
     try:
         file = safe_open(path, "np")
-        return {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
+        return {name: StoredRows(file, name) for name in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError) as error:
         raise InputError(f"{path}: not readable ({error}); run 'evercal info --check'") from None
