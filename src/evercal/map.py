@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from evercal.evaluation import Scores
     from evercal.features.encoder import Features
     from evercal.geometry import SE3, Camera
-    from evercal.learning.many import Learned
     from evercal.learning.scene import LearnReport
+    from evercal.learning.task import Learned
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
     from evercal.localization.query import LocalizeOptions
@@ -228,7 +228,8 @@ class Map:
             InputError: A name that is taken, before anything is learned; or, after the others were
                 learned, recordings that cannot be used.
         """
-        from evercal.learning.many import LearnTask, Source, learn_scenes
+        from evercal.learning.many import learn_scenes
+        from evercal.learning.task import LearnTask, Source
         from evercal.mapping.memory_budget import MemoryBudget
         from evercal.progress import shown
         from evercal.recordings import load_recording

@@ -17,7 +17,8 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.features.encoder import ENCODER_FILE, load_encoder
-from evercal.learning.many import LearnTask, learn_scenes
+from evercal.learning.many import learn_scenes
+from evercal.learning.task import LearnTask
 from evercal.map import Map
 from evercal.mapping.build import MapOptions
 from evercal.mapping.scene_map import MapContents

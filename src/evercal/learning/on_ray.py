@@ -5,7 +5,7 @@ from importlib.metadata import version
 from typing import Any
 
 from evercal.cluster import connected
-from evercal.learning.many import Item, Learned, LearnTask
+from evercal.learning.task import Item, Learned, LearnTask
 
 TRIES = 20
 """Attempts for a recording: machines of a cluster come and go."""
