@@ -7,16 +7,23 @@ import signal
 import threading
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from evercal.cli.args import Reading
+from evercal.cli.learn import read_recording
 from evercal.errors import InputError
+from evercal.features.encoder import load_encoder
+from evercal.learning.task import LearnTask
 from evercal.map import Map
 from evercal.mapping.build import MapOptions
+from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
 from evercal.recordings import Recording
+from evercal.recordings.addresses import RecordingAt
 from evercal.recordings.formats import generic
 
 QUICK = MapOptions(adjust=False)
@@ -115,6 +122,17 @@ def test_bad_recordings_and_kept_results(
     before = MapStore.open(tmp_path / "one").reports()
     assert [report.seconds for report in reports] == [report["seconds"] for report in before]
     assert len(list((tmp_path / "kept").iterdir())) == 2
+
+
+def test_another_way_of_reading_gets_another_result(folders: list[Path]) -> None:
+    source, contents = RecordingAt.of(f"file://{folders[0]}"), MapContents(load_encoder(), 64)
+    files = [
+        LearnTask(
+            contents, read=partial(read_recording, Reading(every=every)), results="kept"
+        ).result_of(source)
+        for every in (1, 1, 2)
+    ]
+    assert files[0] == files[1] != files[2]
 
 
 def test_what_does_not_answer_is_named(folders: list[Path], tmp_path: Path) -> None:

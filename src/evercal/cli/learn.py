@@ -4,6 +4,7 @@ import dataclasses
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -132,7 +133,7 @@ class Learn(args.Verb):
         with self._bars(f"{len(self.recordings)} recording{many}, {where}") as bars:
             reports = cell.learn_many(
                 self.recordings,
-                read=self._recording,
+                read=partial(read_recording, self.reading),
                 workers=self.workers,
                 ray=self.ray,
                 results=self.results,
@@ -144,21 +145,10 @@ class Learn(args.Verb):
         self.answer(record, then=("localize", self.store, "IMAGE"))
         return 0
 
-    def _recording(self, path: Path) -> "Recording":
-        """Read a recording and say what its images lack, before the work."""
-        from evercal.recordings.pictures import look_at
-
-        recording = self.reading.recording(path, self.name)
-        say_notes(recording.notes)
-        shown = look_at(recording.train)
-        for warning in shown.warnings if shown.usable else ():
-            say(f"warning: {recording.name}: {warning}", sys.stderr)
-        return recording
-
     def _run_one(self, path: Path, strategy: str) -> int:
         from evercal.recordings.frame import lacks_camera_poses
 
-        recording = self._recording(path)
+        recording = read_recording(self.reading, path, self.name)
         if not lacks_camera_poses(recording):
             why = "states camera poses, so gripper_from_camera is not estimated; omit the option"
             self._refuse(f"{recording.name} {why}", "gripper_from_camera", "calibration")
@@ -208,6 +198,18 @@ class Learn(args.Verb):
         for name in names:
             if (value := getattr(self, name)) is not None:
                 raise InputError(f"{args.option(name)} {value}: {why}")
+
+
+def read_recording(reading: args.Reading, path: Path, name: str | None = None) -> "Recording":
+    """Read a recording and say what its images lack, before the work."""
+    from evercal.recordings.pictures import look_at
+
+    recording = reading.recording(path, name)
+    say_notes(recording.notes)
+    shown = look_at(recording.train)
+    for warning in shown.warnings if shown.usable else ():
+        say(f"warning: {recording.name}: {warning}", sys.stderr)
+    return recording
 
 
 def learn_into_networks(

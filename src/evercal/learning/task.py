@@ -56,7 +56,7 @@ class LearnTask:
     def learn(self, number: int, source: Source) -> Learned:
         """Learn one recording; an unusable one becomes an outcome."""
         try:
-            file = self._file(source)
+            file = self.result_of(source)
             if file is None or not addresses.exists(file):
                 learned = self._learn(source)
                 if file is not None:
@@ -73,11 +73,13 @@ class LearnTask:
         with addresses.local_copy(source.address) as copy:
             return self._learn(named_recording(self.read(copy), source.name, ()))
 
-    def _file(self, source: Source) -> str | None:
+    def result_of(self, source: Source) -> str | None:
         """Address of the result: another recording, option or version gets another one."""
         if self.results is None:
             return None
-        what = source if isinstance(source, Recording) else addresses.stamps(source.address)
+        what = source
+        if isinstance(source, RecordingAt):
+            what = self.read, addresses.stamps(source.address)
         of = pickle.dumps((version("evercal"), self.contents, self.memory, self.options, what))
         return f"{self.results}/{source.name}-{hashlib.sha256(of).hexdigest()[:16]}.zip"
 
