@@ -14,6 +14,8 @@ from evercal.errors import InputError, optional_module
 
 WAIT_S = 10.0
 """Time for a cluster to accept a connection."""
+_INHERITED = (VARIABLE, "OPENCV_IO_MAX_IMAGE_PIXELS")
+"""Variables that bound what is read; workers get them, too."""
 
 
 @contextmanager
@@ -57,6 +59,3 @@ def _require_listener(address: str) -> None:
                 f"--ray {address}: nothing answers ({error}); give auto, or HOST:PORT or"
                 " ray://HOST:PORT of a cluster"
             ) from None
-
-
-_INHERITED = (VARIABLE, "OPENCV_IO_MAX_IMAGE_PIXELS")

@@ -239,25 +239,27 @@ class Map:
         MemoryBudget.parse(memory)
         read, loaded = read or load_recording, list[Source]()
         failed: list[str] = []
+        taken = {*self.scenes}
+        # Workers of a cluster begin in another folder, and results are kept by path.
+        place = os.fspath if ray is results is None else os.path.abspath
         for item in recordings:
-            taken = {*self.scenes, *(other.name for other in loaded)}
-            if isinstance(item, str) and is_address(item):
-                loaded.append(named_recording(RecordingAt.of(item), None, taken))
-                continue
             try:
-                # Workers of a cluster begin in another folder, and results are kept by path.
-                place = os.fspath if ray is results is None else os.path.abspath
-                recording = item if isinstance(item, Recording) else read(Path(place(item)))
+                if isinstance(item, Recording):
+                    source = item
+                elif is_address(item):
+                    source = RecordingAt.of(str(item))
+                else:
+                    source = read(Path(place(item)))
             except InputError as error:
                 failed.append(str(error))
                 continue
-            loaded.append(named_recording(recording, None, taken))
+            loaded.append(named_recording(source, None, taken))
+            taken.add(loaded[-1].name)
         reports: list[LearnReport] = []
         given = len(loaded) + len(failed)
         with self._store.writing(), shown(on_progress) as step:
-            kept = None if results is None else os.fspath(results)
-            if kept is not None and not is_address(kept):
-                kept = os.path.abspath(kept)
+            where = os.fspath if is_address(results) else os.path.abspath
+            kept = None if results is None else where(results)
             task = LearnTask(self._store.contents.empty(), memory, options, read, kept)
             ready: dict[int, Learned] = {}
             following = 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -61,17 +62,18 @@ def kill_workers(stop: threading.Event, killed: list[int]) -> None:
                     break
 
 
-def contents(root: Path) -> dict[str, bytes]:
-    """All files of a map but those that state how long it took."""
-    files = (path for path in root.rglob("*") if path.is_file())
+@pytest.fixture
+def contents(tree: Callable[[Path], dict[str, str]]) -> Callable[[Path], dict[str, str]]:
+    """Checksums of all files of a map but those that state how long it took."""
     varying = ("report.json", "manifest.json")
-    return {str(f.relative_to(root)): f.read_bytes() for f in files if f.name not in varying}
+    return lambda root: {k: v for k, v in tree(root).items() if Path(k).name not in varying}
 
 
 def test_the_map_is_the_same_though_workers_and_a_node_go(
     folders: list[Path],
     tmp_path: Path,
     cluster: Any,
+    contents: Any,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
@@ -104,7 +106,11 @@ def test_the_map_is_the_same_though_workers_and_a_node_go(
 
 
 def test_bad_recordings_and_kept_results(
-    folders: list[Path], tmp_path: Path, cluster: Any, monkeypatch: pytest.MonkeyPatch
+    folders: list[Path],
+    tmp_path: Path,
+    cluster: Any,
+    contents: Any,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     address, kept = f"file://{folders[1]}", f"file://{tmp_path}/kept"
     with pytest.raises(InputError, match=r"1 of 3 .* missing \(file:///nowhere/missing: no such"):
@@ -126,12 +132,8 @@ def test_bad_recordings_and_kept_results(
 
 def test_another_way_of_reading_gets_another_result(folders: list[Path]) -> None:
     source, contents = RecordingAt.of(f"file://{folders[0]}"), MapContents(load_encoder(), 64)
-    files = [
-        LearnTask(
-            contents, read=partial(read_recording, Reading(every=every)), results="kept"
-        ).result_of(source)
-        for every in (1, 1, 2)
-    ]
+    ways = [partial(read_recording, Reading(every=every)) for every in (1, 1, 2)]
+    files = [LearnTask(contents, read=way, results="kept").result_of(source) for way in ways]
     assert files[0] == files[1] != files[2]
 
 

@@ -36,6 +36,8 @@ class Learned:
 
 
 Source = Recording | RecordingAt
+Item = tuple[int, Source]
+"""A recording with its place among those given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +59,11 @@ class LearnTask:
         """Learn one recording; an unusable one becomes an outcome."""
         try:
             file = self.result_of(source)
-            if file is None or not addresses.exists(file):
-                learned = self._learn(source)
-                if file is not None:
-                    _keep(file, self.contents, *learned)
-            else:
-                learned = _kept(file)
+            if file is not None and addresses.exists(file):
+                return Learned(number, *_kept(file))
+            learned = self._learn(source)
+            if file is not None:
+                _keep(file, self.contents, *learned)
         except InputError as error:
             return Learned(number, error=str(error))
         return Learned(number, *learned)
@@ -99,6 +100,3 @@ def _kept(file: str) -> tuple[SceneMap, LearnReport]:
         scene, report = store.contents.scenes[0], LearnReport.from_dict(store.reports()[0])
         every = np.arange(len(scene.keyframes))  # taken out of the file, which goes
         return replace(scene, keyframes=scene.keyframes.take(every)), report
-
-
-Item = tuple[int, Source]

@@ -9,6 +9,7 @@ from typing import Any, Self
 from uuid import uuid4
 
 from evercal.errors import InputError, optional_module
+from evercal.recordings.text_files import library_errors
 
 
 def is_address(text: object) -> bool:
@@ -37,10 +38,9 @@ def local_copy(address: str) -> Iterator[Path]:
         InputError: There is nothing, or it cannot be read.
     """
     with tempfile.TemporaryDirectory(prefix="evercal-") as folder:
-        with _named(address):
-            store, root = _store(address)
+        with _store(address) as (store, root):
             target = Path(folder, PurePosixPath(root).name or "root")
-            for file in _files(store, root):
+            for file in _files(store, root, address):
                 inside = file.removeprefix(root).strip("/")
                 if ".." in inside.split("/"):
                     raise InputError(f"{address}: its file {inside!r} leads out of it; rename it")
@@ -52,22 +52,19 @@ def local_copy(address: str) -> Iterator[Path]:
 
 def stamps(address: str) -> list[tuple[str, ...]]:
     """Name and version of every file at an address; a file that changes gets another version."""
-    with _named(address):
-        store, root = _store(address)
-        return [(file, str(store.ukey(file))) for file in _files(store, root)]
+    with _store(address) as (store, root):
+        return [(file, str(store.ukey(file))) for file in _files(store, root, address)]
 
 
 def exists(address: str) -> bool:
     """Whether there is a file."""
-    with _named(address):
-        store, path = _store(address)
+    with _store(address) as (store, path):
         return store.exists(path)
 
 
 def put(file: Path, address: str) -> None:
     """Copy a file to an address: whole, or not at all."""
-    with _named(address):
-        store, path = _store(address)
+    with _store(address) as (store, path):
         part = f"{path}.{uuid4().hex}.part"
         store.makedirs(path.rpartition("/")[0], exist_ok=True)
         try:
@@ -78,24 +75,18 @@ def put(file: Path, address: str) -> None:
                 store.rm_file(part)
 
 
-def _store(address: str) -> tuple[Any, str]:
+@contextmanager
+def _store(address: str) -> Iterator[tuple[Any, str]]:
+    """The file system of an address, and the path in it; its errors name the address."""
     need = f"{address[:200]}: reading and writing it needs fsspec"
-    return optional_module("fsspec.core", need, "ray").url_to_fs(address)
+    fsspec = optional_module("fsspec.core", need, "ray")
+    with library_errors(f"{address}: cannot be read or written"):
+        yield fsspec.url_to_fs(address)
 
 
-def _files(store: Any, root: str) -> list[str]:
+def _files(store: Any, root: str, address: str) -> list[str]:
     store.invalidate_cache()  # other machines write, too
     files = sorted(store.find(root))
     if not files:
-        raise FileNotFoundError("no such folder or file")
+        raise InputError(f"{address}: no such folder or file")
     return files
-
-
-@contextmanager
-def _named(address: str) -> Iterator[None]:
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:  # every store raises errors of its own
-        raise InputError(f"{address}: {str(error)[:300] or type(error).__name__}") from None

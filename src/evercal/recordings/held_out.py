@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from evercal.recordings.addresses import RecordingAt
 
 EVERY, BLOCK = 100, 4
-Named = TypeVar("Named", Recording, "RecordingAt")
+Named = TypeVar("Named", bound="Recording | RecordingAt")
 
 
 @dataclass(frozen=True)
