@@ -6,12 +6,30 @@ import sys
 import tyro
 
 VERBS = {
-    "maps": ("maps", "accuracy of maps: degraded images, fixed cameras, wrong poses, many scenes"),
-    "calibration": ("calibration", "cameras calibrated from images, beside the simulator's truth"),
-    "joint-offsets": ("joint_offsets", "offsets of an arm's joints from wrist recordings"),
-    "eye-to-hand": ("eye_to_hand", "a fixed camera and a textured thing in the gripper"),
-    "trust": ("trust", "other cameras, few images, an inaccurate arm: errors and deviations"),
-    "fisheye": ("fisheye", "rooms through lenses of 150 and 180 degrees, beside a pinhole"),
+    "maps": (
+        "maps",
+        "accuracy of maps: degraded images, fixed cameras, wrong poses, many scenes",
+    ),
+    "calibration": (
+        "calibration",
+        "cameras calibrated from images, beside the simulator's truth",
+    ),
+    "joint-offsets": (
+        "joint_offsets",
+        "offsets of an arm's joints from wrist recordings",
+    ),
+    "eye-to-hand": (
+        "eye_to_hand",
+        "a fixed camera and a textured thing in the gripper",
+    ),
+    "trust": (
+        "trust",
+        "other cameras, few images, an inaccurate arm: errors and deviations",
+    ),
+    "fisheye": (
+        "fisheye",
+        "rooms through lenses of 150 and 180 degrees, beside a pinhole",
+    ),
     "same-model": ("same_model", "images of other cameras of the recording's model"),
     "repeat": ("repeat", "a wrist camera before a chessboard, in three folds"),
     "handeye": ("hand_eye", "pose pairs: errors, ellipsoids, outliers, scale, time"),
@@ -21,11 +39,17 @@ VERBS = {
     "next-views": ("next_views", "poses of a wrist recording until a stated accuracy"),
     "virtual-cell": ("virtual_cell", "record, learn and calibrate virtual cells"),
     "mistakes": ("mistakes", "mistakes in pose files, and clean recordings"),
-    "tracking": ("tracking", "a stream with holes, beside the location of single frames"),
+    "tracking": (
+        "tracking",
+        "a stream with holes, beside the location of single frames",
+    ),
     "refresh": ("changing_room", "a map in a rendered room that changes in ten rounds"),
     "speed": ("speed", "time of learning, localization and SARS"),
     "serve": ("serve", "latency of the HTTP service"),
-    "retrieval": ("retrieval", "the right scene among 100,000 keyframes, milliseconds and bytes"),
+    "retrieval": (
+        "retrieval",
+        "the right scene among 100,000 keyframes, milliseconds and bytes",
+    ),
     "cluster": ("cluster", "learning and serving on a Ray cluster, beside one process"),
     "networks": ("networks", "the experiments on networks; the paper's table on a GPU"),
     "tables": ("tables", "print the tables of the docs from results/"),
@@ -40,7 +64,9 @@ def main(args: list[str]) -> int:
     verb, *rest = args or ["--help"]
     if verb not in VERBS:
         print("usage: python -m benchmarks VERB [--help]\n")
-        print("\n".join(f"  {name:15} {summary}" for name, (_, summary) in VERBS.items()))
+        print(
+            "\n".join(f"  {name:15} {summary}" for name, (_, summary) in VERBS.items())
+        )
         return 0 if verb in ("-h", "--help") else 2
     module = importlib.import_module(f"benchmarks.{VERBS[verb][0]}")
     try:

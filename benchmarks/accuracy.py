@@ -16,7 +16,12 @@ from evercal.evaluation.metrics import (
 )
 from evercal.geometry import SE3, UncertainPose, pose_distance_mm_deg
 
-BOUNDS = {"5 cm/5 deg": COARSE, "2 cm/2 deg": MIDDLE, "1 cm/1 deg": FINE, "0.5 cm/0.5 deg": FINEST}
+BOUNDS = {
+    "5 cm/5 deg": COARSE,
+    "2 cm/2 deg": MIDDLE,
+    "1 cm/1 deg": FINE,
+    "0.5 cm/0.5 deg": FINEST,
+}
 """Thresholds in metres and radians, by the name of their column."""
 
 WRONG_MM, WRONG_SIGMAS = 10.0, 5.0
@@ -29,13 +34,18 @@ def accuracy_row(name: str, results: Sequence[FrameResult]) -> Row:
     The share inside the 95 % ellipsoids is over all poses in the right scene, including poses with
     large errors.
     """
-    flags = {key: np.concatenate([*correct(results, b).values()]) for key, b in BOUNDS.items()}
+    flags = {
+        key: np.concatenate([*correct(results, b).values()])
+        for key, b in BOUNDS.items()
+    }
     return {
         "scene": name,
         "frames": len(results),
         **{bound: 100 * float(of.mean()) for bound, of in flags.items()},
         "median_mm": 1000 * float(np.median([r.translation_error_m for r in results])),
-        "median_deg": float(np.rad2deg(np.median([r.rotation_error_rad for r in results]))),
+        "median_deg": float(
+            np.rad2deg(np.median([r.rotation_error_rad for r in results]))
+        ),
         "wrong_scene": sum(r.wrong_scene for r in results),
         "refused": sum(r.status != "ok" for r in results),
         "inside_95": share_inside([r.squared_mahalanobis for r in results]),

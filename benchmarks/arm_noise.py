@@ -35,7 +35,8 @@ def arm_errors(poses: SE3, rng: np.random.Generator) -> np.ndarray:
     turns = (rotations[1:] * rotations[:-1].inv()).as_rotvec()
     signs = np.sign(np.c_[np.diff(poses.translation_m, axis=0), turns])
     backlash = np.r_[signs[:1], signs]
-    periods, phases = rng.uniform(1, 2, 6), rng.uniform(0, 2 * np.pi, 6)
+    periods = rng.uniform(1, 2, 6)
+    phases = rng.uniform(0, 2 * np.pi, 6)
     along = np.linspace(0, 1, len(poses))[:, None]
     drift = np.sqrt(2) * np.sin(2 * np.pi * along / periods + phases)
     return sigma * (noise + backlash + drift) / np.sqrt(3)

@@ -48,7 +48,11 @@ def render(board: Board, photo: Photo, seed: int) -> tuple[np.ndarray, BoardView
     rng = np.random.default_rng(seed)
     pose = _pose(board, photo, rng)
     image = _photograph(board, photo, pose, rng)
-    return np.repeat(image[..., None], 3, 2), true_corners(board, photo.camera, pose), pose
+    return (
+        np.repeat(image[..., None], 3, 2),
+        true_corners(board, photo.camera, pose),
+        pose,
+    )
 
 
 def true_corners(board: Board, camera: Camera, pose: SE3) -> BoardView:
@@ -63,7 +67,9 @@ def corner_points(board: Board) -> np.ndarray:
     """Return the (k, 3) corners of a board in its frame, metres."""
     if board.kind == "apriltag":
         half = board.size_m / 2
-        return np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
+        return np.array(
+            [[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]]
+        )
     first = 0 if board.kind == "chessboard" else 1
     x, y = np.meshgrid(np.arange(first, board.columns), np.arange(first, board.rows))
     return board.size_m * np.stack([x, y, 0 * x], -1).reshape(-1, 3).astype(float)
@@ -71,25 +77,32 @@ def corner_points(board: Board) -> np.ndarray:
 
 def _pose(board: Board, photo: Photo, rng: np.random.Generator) -> SE3:
     low, high = _extent(board)
-    camera, size = photo.camera, high - low + 0.5 * board.size_m
+    camera = photo.camera
+    size = high - low + 0.5 * board.size_m
     fills = max(size[0] * camera.fx / camera.width, size[1] * camera.fy / camera.height)
-    turn, roll = rng.uniform(0, 2 * np.pi), np.deg2rad(photo.roll_deg * rng.uniform(-1, 1))
+    turn = rng.uniform(0, 2 * np.pi)
+    roll = np.deg2rad(photo.roll_deg * rng.uniform(-1, 1))
     axis = np.array([np.cos(turn), np.sin(turn), 0])
     rotation = Rotation.from_rotvec(np.deg2rad(photo.tilt_deg) * axis)
     rotation = rotation * Rotation.from_rotvec([0, 0, roll])
     aim = (low + high) / 2 + photo.aside * (high - low) * rng.uniform(-1, 1, 2)
     centre = np.array([*aim, 0.0])
     if board.kind == "apriltag":  # y is up and z towards the camera
-        rotation, centre = rotation * Rotation.from_euler("x", np.pi), centre * (1, -1, 1)
+        rotation = rotation * Rotation.from_euler("x", np.pi)
+        centre = centre * (1, -1, 1)
     translation = np.array([0, 0, photo.distance * fills]) - rotation.apply(centre)
     return SE3(rotation.as_quat(scalar_first=True), translation)
 
 
-def _photograph(board: Board, photo: Photo, pose: SE3, rng: np.random.Generator) -> np.ndarray:
+def _photograph(
+    board: Board, photo: Photo, pose: SE3, rng: np.random.Generator
+) -> np.ndarray:
     camera = photo.camera
     texture, per_m, start = _texture(board)
     v, u = np.mgrid[: camera.height, : camera.width].astype(float)
-    rays = camera.unproject(np.stack([u, v], -1).reshape(-1, 2)) @ pose.rotation_matrix()
+    rays = (
+        camera.unproject(np.stack([u, v], -1).reshape(-1, 2)) @ pose.rotation_matrix()
+    )
     origin = pose.inverse().translation_m
     down = rays[:, 2] if board.kind != "apriltag" else -rays[:, 2]
     hit = origin[:2] - rays[:, :2] * (origin[2] / rays[:, 2])[:, None]
@@ -99,20 +112,27 @@ def _photograph(board: Board, photo: Photo, pose: SE3, rng: np.random.Generator)
     where = ((hit - start) * per_m - 0.5).reshape(camera.height, camera.width, 2)
     fine = (camera.width * _FINER, camera.height * _FINER)
     x, y = (cv2.resize(where[..., k].astype(np.float32), fine) for k in (0, 1))
-    sampled = cv2.remap(texture, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, [90.0])
-    small = cv2.resize(sampled, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    blurred = cv2.GaussianBlur(small, (0, 0), photo.blur_px).astype(float)
-    ramp = (u / camera.width - 0.5) * rng.uniform(-1, 1) + (v / camera.height - 0.5) * rng.uniform(
-        -1, 1
+    sampled = cv2.remap(
+        texture, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, [90.0]
     )
-    noisy = blurred * (1 + photo.light * ramp) + rng.normal(0, photo.noise, blurred.shape)
+    small = cv2.resize(
+        sampled, (camera.width, camera.height), interpolation=cv2.INTER_AREA
+    )
+    blurred = cv2.GaussianBlur(small, (0, 0), photo.blur_px).astype(float)
+    ramp = (u / camera.width - 0.5) * rng.uniform(-1, 1) + (
+        v / camera.height - 0.5
+    ) * rng.uniform(-1, 1)
+    noisy = blurred * (1 + photo.light * ramp) + rng.normal(
+        0, photo.noise, blurred.shape
+    )
     return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
 
 
 def _texture(board: Board) -> tuple[np.ndarray, float, np.ndarray]:
     image = board_image(board, _TEXELS // 2 if board.kind == "apriltag" else _TEXELS)
     low, high = _extent(board)
-    per_m, margin = image.shape[1] / (high - low)[0], round(0.8 * _TEXELS)
+    per_m = image.shape[1] / (high - low)[0]
+    margin = round(0.8 * _TEXELS)
     bright = np.pad(image, margin, constant_values=255) / 255
     return (25 + 200 * bright).astype(np.float32), per_m, low - margin / per_m
 
@@ -122,4 +142,6 @@ def _extent(board: Board) -> tuple[np.ndarray, np.ndarray]:
     if board.kind == "apriltag":
         return np.full(2, -board.size_m / 2), np.full(2, board.size_m / 2)
     size = board.size_m * np.array([board.columns, board.rows], dtype=float)
-    return (np.full(2, -board.size_m) if board.kind == "chessboard" else np.zeros(2)), size
+    return (
+        np.full(2, -board.size_m) if board.kind == "chessboard" else np.zeros(2)
+    ), size

@@ -9,7 +9,15 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.board_images import CAMERA, CHARUCO, CHESSBOARD, LARGE, TAG, Photo, render
+from benchmarks.board_images import (
+    CAMERA,
+    CHARUCO,
+    CHESSBOARD,
+    LARGE,
+    TAG,
+    Photo,
+    render,
+)
 from benchmarks.rows import save
 from evercal.calibration.boards.board import Board, dictionary_of
 from evercal.calibration.boards.corners import BoardView
@@ -44,13 +52,17 @@ def detectors(board: Board) -> dict[str, Callable[[np.ndarray], np.ndarray | Non
             "sectors": lambda i: corners(cv2.findChessboardCornersSB(grey(i), size)),
         }
     if board.kind == "charuco":
-        printed = cv2.aruco.CharucoBoard(size, board.size_m, board.marker_m, dictionary_of(board))
+        printed = cv2.aruco.CharucoBoard(
+            size, board.size_m, board.marker_m, dictionary_of(board)
+        )
         detector = cv2.aruco.CharucoDetector(printed)
 
         def opencv(image: np.ndarray) -> np.ndarray | None:
             pixels, ids, _, _ = detector.detectBoard(grey(image))
             whole = (board.columns - 1) * (board.rows - 1)
-            return None if ids is None or len(ids) < whole else np.reshape(pixels, (-1, 2))
+            return (
+                None if ids is None or len(ids) < whole else np.reshape(pixels, (-1, 2))
+            )
 
         return {"evercal": ours, "opencv": opencv}
     tags = cv2.aruco.ArucoDetector(dictionary_of(board))
@@ -65,13 +77,17 @@ def detectors(board: Board) -> dict[str, Callable[[np.ndarray], np.ndarray | Non
 def measure(board: Board, tilt_deg: float, count: int) -> list[dict[str, object]]:
     """Detect a board in rendered images that show it whole; one row for each finder."""
     camera = WIDE if board is LARGE else CAMERA
-    finders, seed, images = detectors(board), FIRST_SEED, 0
+    finders = detectors(board)
+    seed = FIRST_SEED
+    images = 0
     found: dict[str, list[float]] = {name: [] for name in finders}
     seconds: dict[str, list[float]] = {name: [] for name in finders}
     any_of_opencv = 0
     while images < count:
         seed += 1
-        photo = Photo(camera, tilt_deg, 1.25 + 0.3 * (seed % 3), roll_deg=25, aside=0.05)
+        photo = Photo(
+            camera, tilt_deg, 1.25 + 0.3 * (seed % 3), roll_deg=25, aside=0.05
+        )
         image, truth, _ = render(board, photo, seed)
         limit = np.array([camera.width, camera.height]) - 1 - _BORDER_PX
         inside = (truth.pixels > _BORDER_PX) & (truth.pixels < limit)
@@ -97,7 +113,9 @@ def measure(board: Board, tilt_deg: float, count: int) -> list[dict[str, object]
             "images": count,
             "found": len(found[name]),
             "any_of_opencv": any_of_opencv,
-            "rms_px": float(np.sqrt(np.mean(found[name]))) if found[name] else float("nan"),
+            "rms_px": float(np.sqrt(np.mean(found[name])))
+            if found[name]
+            else float("nan"),
             "ms": 1000 * float(np.median(seconds[name])),
         }
         for name in finders
@@ -124,7 +142,11 @@ def run(images: int = 30, out: Path = Path("runs/boards.csv")) -> None:
         out: File of the rows.
     """
     cv2.setNumThreads(1)
-    cases = [(b, t) for b in (LARGE, CHESSBOARD, CHARUCO, TAG) for t in (0.0, 30.0, 45.0, 60.0)]
+    cases = [
+        (b, t)
+        for b in (LARGE, CHESSBOARD, CHARUCO, TAG)
+        for t in (0.0, 30.0, 45.0, 60.0)
+    ]
     rows: list[dict[str, object]] = []
     for board, tilt in tqdm(cases, unit="case"):
         rows += measure(board, tilt, images)

@@ -26,7 +26,8 @@ from evercal.map import Map
 from evercal.recordings import Recording, load_recording
 from evercal.recordings.samples import FOLDER, ROOMS
 
-ROBOT_NOISE_M, ROBOT_NOISE_DEG = 2e-4, 0.02
+ROBOT_NOISE_M = 2e-4
+ROBOT_NOISE_DEG = 0.02
 PACKAGED = tuple(FOLDER / name for name in ROOMS)
 """Folders of the packaged rooms."""
 
@@ -66,7 +67,9 @@ def wrist(rooms: Sequence[Path], out: Path, draws: int) -> list[Row]:
         scene = load_recording(room)
         for draw in tqdm(range(draws), room.name, unit="draw"):
             path = out / f"wrist-{room.name}-{draw}.json"
-            measure = partial(_wrist_draw, scene, room, path.with_suffix(".evercal"), draw)
+            measure = partial(
+                _wrist_draw, scene, room, path.with_suffix(".evercal"), draw
+            )
             rows.append(once(path, measure))
     return rows
 
@@ -86,7 +89,9 @@ def as_wrist_recording(scene: Recording, draw: int) -> tuple[Recording, SE3]:
     return replace(scene, train=tuple(train), test=()), truth
 
 
-def learned_mount(recording: Recording, truth: SE3, store: Path) -> tuple[Row, LearnReport]:
+def learned_mount(
+    recording: Recording, truth: SE3, store: Path
+) -> tuple[Row, LearnReport]:
     """Learn a wrist recording and compare its `gripper_from_camera` with the true one."""
     report = Map.open(store).learn(recording)
     assert report.hand_eye is not None
@@ -113,12 +118,17 @@ def fixed(rooms: Sequence[Path], localizer: Localizer, draws: int) -> list[Row]:
     for room in tqdm(rooms, "rooms"):
         for recording in ("fixed", "bumped"):
             images, truth = fixed_images(room / "calibration" / recording)
-            rng, count = np.random.default_rng(0), len(images.images)
+            rng = np.random.default_rng(0)
+            count = len(images.images)
             five = [rng.choice(count, 5, replace=False).tolist() for _ in range(draws)]
             for some in (images, *(_take(images, chosen) for chosen in five)):
                 calibration = calibrate(localizer, some)
                 error = pose_error(calibration.uncertain_pose, truth)
-                camera: Row = {"room": room.name, "camera": recording, "images": len(some.images)}
+                camera: Row = {
+                    "room": room.name,
+                    "camera": recording,
+                    "images": len(some.images),
+                }
                 rows.append(camera | error)
     return rows
 
@@ -148,7 +158,12 @@ def bumps(rooms: Sequence[Path], localizer: Localizer, draws: int) -> list[Row]:
 
 
 def _moved(reference: Calibration, rng: np.random.Generator) -> dict[str, Calibration]:
-    sizes = {"none": (0.0, 0.0), "2 mm": (2e-3, 0.0), "0.1 deg": (0.0, 0.1), "both": (2e-3, 0.1)}
+    sizes = {
+        "none": (0.0, 0.0),
+        "2 mm": (2e-3, 0.0),
+        "0.1 deg": (0.0, 0.1),
+        "both": (2e-3, 0.1),
+    }
     moved = {}
     for kind, (metres, degrees) in sizes.items():
         direction, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
@@ -163,7 +178,9 @@ def learned(rooms: Sequence[Path], store: Path) -> Path:
     """Learn the rooms that a store lacks, and return the store."""
     cell = Map.open(store)
     scenes = [load_recording(room) for room in rooms]
-    for scene in tqdm([scene for scene in scenes if scene.name not in cell.scenes], "learning"):
+    for scene in tqdm(
+        [scene for scene in scenes if scene.name not in cell.scenes], "learning"
+    ):
         cell.learn(scene)
     return store
 
@@ -186,8 +203,18 @@ def summary(rows: Sequence[Row]) -> str:
     """Summarize trials: the share reported as moved, or errors and the share inside ellipsoids."""
     frame = pd.DataFrame(list(rows))
     if "kind" in frame:
-        return frame.groupby("kind", sort=False)["moved"].agg(["mean", "size"]).to_string()
-    groups = frame.groupby("images" if "images" in frame else lambda _: "wrist", sort=False)
-    errors = groups[list(frame.filter(regex="^(fixed_)?(mm|deg)$"))].agg(["median", "max"])
-    inside = groups[list(frame.filter(like="mahalanobis"))].agg(lambda of: (of < CHI2_6).mean())
-    return f"{errors.to_string()}\n\nshare inside the 95 % ellipsoid\n{inside.to_string()}"
+        return (
+            frame.groupby("kind", sort=False)["moved"].agg(["mean", "size"]).to_string()
+        )
+    groups = frame.groupby(
+        "images" if "images" in frame else lambda _: "wrist", sort=False
+    )
+    errors = groups[list(frame.filter(regex="^(fixed_)?(mm|deg)$"))].agg(
+        ["median", "max"]
+    )
+    inside = groups[list(frame.filter(like="mahalanobis"))].agg(
+        lambda of: (of < CHI2_6).mean()
+    )
+    return (
+        f"{errors.to_string()}\n\nshare inside the 95 % ellipsoid\n{inside.to_string()}"
+    )

@@ -50,7 +50,8 @@ def states(kind: str, seed: int, rounds: int) -> list[Room]:
 
 def _refurnished(before: Room, seed: int) -> Room:
     """Move furniture that carries nothing; what has no other place is removed."""
-    rng, items = np.random.default_rng(seed), list(before.items)
+    rng = np.random.default_rng(seed)
+    items = list(before.items)
     for item in [i for i in before.items if i.kind in MOVABLE and not i.tops]:
         rest = [other for other in items if other is not item]
         moved = moved_item(item, before, rest, rng)
@@ -78,14 +79,18 @@ def render(
         frames: Frames of each round, 70 % of them for training.
         samples: Light paths per pixel.
     """
-    camera, done = default_camera(320, 240), []
+    camera = default_camera(320, 240)
+    done = []
     plans = [(state, sweep_shots(state, frames if i else first, 20 + i))
              for i, state in enumerate(states(kind, seed, rounds))]  # fmt: skip
     with tqdm(total=sum(len(shots) for _, shots in plans), unit="frame") as bar:
         for number, (state, shots) in enumerate(plans):
-            root, renderer = out / f"round-{number:02d}", None
+            root = out / f"round-{number:02d}"
+            renderer = None
             light = float(np.random.default_rng([seed, number, 3]).uniform(-0.7, 0.7))
-            options = RenderOptions(samples=samples, exposure_ev=light if number else 0.0)
+            options = RenderOptions(
+                samples=samples, exposure_ev=light if number else 0.0
+            )
             done = []
             for i, shot in enumerate(shots):
                 file = root / f"images/{i:06d}.jpg"
@@ -96,9 +101,13 @@ def render(
                     renderer.move({mesh.name: mesh for mesh, _ in arm})
                     origin = np.random.default_rng([seed, number, i])
                     noise = int(origin.integers(2**31))
-                    image = renderer.render(camera, shot.base_from_camera, options, noise)
+                    image = renderer.render(
+                        camera, shot.base_from_camera, options, noise
+                    )
                     write_jpeg(file, image, 90)
-                done.append((Frame(shot.name, file, camera, shot.base_from_camera), shot.split))
+                done.append(
+                    (Frame(shot.name, file, camera, shot.base_from_camera), shot.split)
+                )
                 bar.update()
             if not (root / generic.FILE).exists():
                 with generic.SceneWriter(root, f"round-{number:02d}") as writer:
@@ -135,23 +144,32 @@ def run(
 
 
 def _rounds(root: Path, keyframes: int) -> list[dict[str, object]]:
-    encoder, recordings = load_encoder(), [load_recording(p) for p in sorted(root.iterdir())]
+    encoder = load_encoder()
+    recordings = [load_recording(p) for p in sorted(root.iterdir())]
     wrong = [f.read_image() for f in sample_rooms()[1].scene.train[::8]]
     first = _learned(recordings[0], encoder, keyframes)
     scenes = dict.fromkeys(VARIANTS[:3], first)
-    bounds, rows = dict.fromkeys(VARIANTS, 0.0), []
+    bounds = dict.fromkeys(VARIANTS, 0.0)
+    rows = []
     for number, recording in enumerate(recordings):
         images = [(frame.name, frame.read_image()) for frame in recording.train]
-        mixed = [*images, *((f"wrong-{i}", w) for i, w in enumerate(wrong[: len(images) // 4]))]
+        mixed = [
+            *images,
+            *((f"wrong-{i}", w) for i, w in enumerate(wrong[: len(images) // 4])),
+        ]
         seconds = dict.fromkeys(VARIANTS, 0.0)
         if number:
             for variant, given in zip(VARIANTS[1:3], (images, mixed), strict=True):
                 localizer = Localizer(MapContents(encoder, 240, [scenes[variant]]))
                 scenes[variant], report = refresh_scene(localizer, given)
-                bounds[variant] = float(np.hypot(bounds[variant], report.shift_sigma_mm or 0))
+                bounds[variant] = float(
+                    np.hypot(bounds[variant], report.shift_sigma_mm or 0)
+                )
                 seconds[variant] = report.seconds
             scenes[VARIANTS[3]] = _learned(recording, encoder, keyframes)
-        answers = {v: _answers(scene, recording, encoder) for v, scene in scenes.items()}
+        answers = {
+            v: _answers(scene, recording, encoder) for v, scene in scenes.items()
+        }
         for variant, estimates in answers.items():
             drift = _drift(estimates, answers[VARIANTS[0]])
             rows.append({
@@ -167,7 +185,8 @@ def _rounds(root: Path, keyframes: int) -> list[dict[str, object]]:
 
 
 def _learned(recording: Recording, encoder: Encoder, keyframes: int) -> SceneMap:
-    split, options = split_held_out(recording.train), MapOptions()
+    split = split_held_out(recording.train)
+    options = MapOptions()
     budget = MemoryBudget(share=0.0, least=keyframes)
     options = replace(options, memory=budget, size=replace(options.size, cells=240))
     built = build_map(recording.name, split.train, encoder, options)
@@ -179,16 +198,20 @@ def _learned(recording: Recording, encoder: Encoder, keyframes: int) -> SceneMap
     )
 
 
-def _answers(scene: SceneMap, recording: Recording, encoder: Encoder) -> list[PoseEstimate]:
+def _answers(
+    scene: SceneMap, recording: Recording, encoder: Encoder
+) -> list[PoseEstimate]:
     localizer = Localizer(MapContents(encoder, 240, [scene]))
     return [localizer.localize(frame.read_image()) for frame in recording.test]
 
 
 def _scores(estimates: list[PoseEstimate], recording: Recording) -> dict[str, object]:
     """Return accuracy and coverage of the answers to test frames."""
-    errors, squared = [], []
+    errors = []
+    squared = []
     for estimate, frame in zip(estimates, recording.test, strict=True):
-        pose, true = estimate.uncertain_pose, frame.base_from_camera
+        pose = estimate.uncertain_pose
+        true = frame.base_from_camera
         assert true is not None
         if estimate.status != "ok" or pose is None:
             errors.append(np.inf)
@@ -210,4 +233,8 @@ def _drift(estimates: list[PoseEstimate], fixed: list[PoseEstimate]) -> float:
         for a, b in zip(estimates, fixed, strict=True)
         if a.status == b.status == "ok" and a.base_from_camera and b.base_from_camera
     ]
-    return 1000 * float(np.linalg.norm(np.median(pairs, axis=0))) if pairs else float("nan")
+    return (
+        1000 * float(np.linalg.norm(np.median(pairs, axis=0)))
+        if pairs
+        else float("nan")
+    )

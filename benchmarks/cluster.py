@@ -29,13 +29,16 @@ from evercal.recordings.formats import generic
 from evercal.service.hosts import listening_socket
 from evercal.simulation.box_room import BoxRoom, default_camera
 
-FIRST_SEED, FRAMES = 40_000, 60
+FIRST_SEED = 40_000
+FRAMES = 60
 KILL_S = 10.0
 TOKEN = "the-token-of-a-benchmark"
 CLIENTS = 4
 
 
-def run(out: Path = Path("runs/cluster"), recordings: int = 24, requests: int = 200) -> None:
+def run(
+    out: Path = Path("runs/cluster"), recordings: int = 24, requests: int = 200
+) -> None:
     """Learn drawn recordings and serve their map, with and without Ray.
 
     Args:
@@ -48,7 +51,9 @@ def run(out: Path = Path("runs/cluster"), recordings: int = 24, requests: int = 
         "one process": lambda: _learned(out, paths, "one", None),
         "Ray, 2 workers": lambda: _learned(out, paths, "two", (1, 1)),
         "Ray, 4 workers": lambda: _learned(out, paths, "four", (2, 2)),
-        "Ray, 2 workers, a kill every 10 s": lambda: _learned(out, paths, "kill", (1, 1), True),
+        "Ray, 2 workers, a kill every 10 s": lambda: _learned(
+            out, paths, "kill", (1, 1), True
+        ),
         "Ray, 3 workers, a node removed": lambda: _learned(
             out, paths, "gone", (1, 1, 1), gone=True
         ),
@@ -66,7 +71,8 @@ def run(out: Path = Path("runs/cluster"), recordings: int = 24, requests: int = 
 def _drawn(root: Path, number: int) -> Path:
     path = root / f"room-{number:02d}"
     if not path.exists():
-        room, camera = BoxRoom(FIRST_SEED + number), default_camera()
+        room = BoxRoom(FIRST_SEED + number)
+        camera = default_camera()
         poses = room.path(FRAMES, number)
         frames = [
             Frame(f"{i:03d}", room.render(camera, poses[i]), camera, poses[i])
@@ -97,7 +103,8 @@ def _learned(
             opened.learn_many(paths, workers=1)
             return {"wall_s": time.perf_counter() - began, "processor_s": spent()}
     with _cluster(*nodes) as made, _processor_time(b"ray::") as spent:
-        stop, killed = threading.Event(), list[int]()
+        stop = threading.Event()
+        killed = list[int]()
         threads = []
         if kill:
             threads.append(threading.Thread(target=_kill, args=(stop, killed)))
@@ -122,7 +129,9 @@ def _contents(root: Path) -> dict[str, bytes]:
     """All files of a map but those that state how long it took."""
     files = (path for path in root.rglob("*") if path.is_file())
     varying = ("report.json", "manifest.json")
-    return {str(f.relative_to(root)): f.read_bytes() for f in files if f.name not in varying}
+    return {
+        str(f.relative_to(root)): f.read_bytes() for f in files if f.name not in varying
+    }
 
 
 @contextmanager
@@ -151,7 +160,8 @@ def _processes(begin: bytes) -> Iterator[Path]:
 @contextmanager
 def _processor_time(begin: bytes) -> Iterator[Callable[[], float]]:
     """Seconds of processor time that processes spend meanwhile."""
-    spent, stop = dict[str, int](), threading.Event()
+    spent = dict[str, int]()
+    stop = threading.Event()
 
     def watch() -> None:
         while not stop.wait(0.2):
@@ -183,15 +193,21 @@ def _on_ray(store: Path, paths: list[Path], requests: int, replicas: int) -> Row
         return _served(store, paths, requests, words)
 
 
-def _served(store: Path, paths: list[Path], requests: int, words: tuple[object, ...]) -> Row:
+def _served(
+    store: Path, paths: list[Path], requests: int, words: tuple[object, ...]
+) -> Row:
     """Images a second, and whether answers are those of the map."""
     with listening_socket("127.0.0.1", 0) as listener:
         port = listener.getsockname()[1]
-    command = python_command("-m", "evercal", "serve", *map(str, (store, "--port", port, *words)))
+    command = python_command(
+        "-m", "evercal", "serve", *map(str, (store, "--port", port, *words))
+    )
     environment = {**os.environ, "EVERCAL_TOKEN": TOKEN}
     opened = Map.open(store)
     images = [generic.load(path).test[2].read_image() for path in paths]
-    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None, "it is a pipe"
         process.stdout.readline()
         client = Client(f"http://127.0.0.1:{port}", TOKEN)
@@ -210,14 +226,18 @@ def _served(store: Path, paths: list[Path], requests: int, words: tuple[object, 
             answers = list(pool.map(ask, images * 4))[: len(images)]
             times.clear()
             time.sleep(1.0)
-            before, began = spent(), time.perf_counter()
+            before = spent()
+            began = time.perf_counter()
             _ = list(pool.map(ask, asked))
             seconds = time.perf_counter() - began
             time.sleep(1.0)
             worked = spent() - before
         process.send_signal(signal.SIGTERM)
         process.wait(90)
-    same = [_same(opened.localize(i), answer) for i, answer in zip(images, answers, strict=True)]
+    same = [
+        _same(opened.localize(i), answer)
+        for i, answer in zip(images, answers, strict=True)
+    ]
     return {
         "images_per_s": requests / seconds,
         "median_ms": float(np.median(times)),

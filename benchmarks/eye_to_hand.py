@@ -83,10 +83,15 @@ MAIN = {
     **{f"box, {px} px": Condition({"px": px}) for px in (60, 100, 300)},
     "box, 40 images": Condition({"images": 40}, 40),
     "box, 1280x720": Condition({"size": (1280, 720)}),
-    **{f"board, {px} px": Condition({"thing": "board", "px": px}) for px in (60, 100, 300)},
+    **{
+        f"board, {px} px": Condition({"thing": "board", "px": px})
+        for px in (60, 100, 300)
+    },
 }
 FAILING = {
-    f"small images, {fault or 'nothing wrong'}": Condition({**SMALL, "fault": fault}, 20)
+    f"small images, {fault or 'nothing wrong'}": Condition(
+        {**SMALL, "fault": fault}, 20
+    )
     for fault in ("", *FAULTS)
 }
 CONDITIONS = {**MAIN, **FAILING}
@@ -138,7 +143,9 @@ def _rendered(condition: Condition, data: Path) -> Iterator[Setting]:
     for seed in itertools.count(FIRST_SEED):
         setting = condition.setting(seed)
         try:
-            for _ in tqdm(render(setting, data), setting.name, leave=False, unit="image"):
+            for _ in tqdm(
+                render(setting, data), setting.name, leave=False, unit="image"
+            ):
                 pass
         except InputError as error:
             tqdm.write(str(error))
@@ -169,16 +176,21 @@ def _measured(method: str, condition: Condition, data: Path, setting: Setting) -
     if isinstance(answer, dict):  # one pose by each closed-form solver
         row: Row = {"seconds": seconds}
         for name, found in answer.items():
-            row[f"{name}_mm"], row[f"{name}_deg"] = pose_distance_mm_deg(found, true_cameras[0])
+            row[f"{name}_mm"], row[f"{name}_deg"] = pose_distance_mm_deg(
+                found, true_cameras[0]
+            )
         return row
-    errors = [pose_error(answer.uncertain_pose, true_camera) for true_camera in true_cameras]
+    errors = [
+        pose_error(answer.uncertain_pose, true_camera) for true_camera in true_cameras
+    ]
     nearest = min(errors, key=lambda error: float(error["mm"]))
     return {**nearest, "verdict": answer.verdict, "seconds": seconds}
 
 
 def _spoil(recording: Path, condition: Condition, data: Path, setting: Setting) -> None:
     """Write the recording that a condition makes of a rendered one."""
-    source, n = data / setting.name, condition.images
+    source = data / setting.name
+    n = condition.images
     truth = json.loads((source / "truth.json").read_text())
     rng = np.random.default_rng([setting.seed, 31])
     recording.mkdir()
@@ -189,12 +201,15 @@ def _spoil(recording: Path, condition: Condition, data: Path, setting: Setting) 
     if condition.spoiled == "focal":
         camera |= {"fx": 1.05 * camera["fx"], "fy": 1.05 * camera["fy"]}
     if condition.spoiled == "lens":
-        focal, centre = 1 + 1e-3 * rng.normal(), 0.25 * rng.normal(size=2)
+        focal = 1 + 1e-3 * rng.normal()
+        centre = 0.25 * rng.normal(size=2)
         camera |= {"fx": focal * camera["fx"], "fy": focal * camera["fy"]}
         camera |= {"cx": camera["cx"] + centre[0], "cy": camera["cy"] + centre[1]}
     write_json(recording / "camera.json", camera)
     if condition.spoiled == "other":
-        others = sorted(data.glob(setting.name.removesuffix(str(setting.seed)) + "*/truth.json"))
+        others = sorted(
+            data.glob(setting.name.removesuffix(str(setting.seed)) + "*/truth.json")
+        )
         other = others[(others.index(source / "truth.json") + 1) % len(others)]
         truth = json.loads(other.read_text())
     poses = _poses(truth["base_from_gripper"])[:n]
@@ -205,33 +220,49 @@ def _spoil(recording: Path, condition: Condition, data: Path, setting: Setting) 
 
 
 def _poses(rows: Sequence[Mapping[str, Any]]) -> SE3:
-    return SE3.stack([SE3(row["quaternion_wxyz"], row["translation_m"]) for row in rows])
+    return SE3.stack(
+        [SE3(row["quaternion_wxyz"], row["translation_m"]) for row in rows]
+    )
 
 
-def _from_board(method: str, recording: Path, scale: float) -> Calibration | dict[str, SE3]:
+def _from_board(
+    method: str, recording: Path, scale: float
+) -> Calibration | dict[str, SE3]:
     """`evercal detect` and `solve`, or OpenCV's detection, solvePnP and closed-form solvers."""
-    board = replace(SQUARES, size_m=SQUARES.size_m * scale, marker_m=SQUARES.marker_m * scale)
+    board = replace(
+        SQUARES, size_m=SQUARES.size_m * scale, marker_m=SQUARES.marker_m * scale
+    )
     loaded = load_recording(recording)
-    names, robot = [frame.name for frame in loaded.train], grippers(loaded)
-    camera, images = loaded.train[0].camera, [frame.read_image() for frame in loaded.train]
+    names = [frame.name for frame in loaded.train]
+    robot = grippers(loaded)
+    camera = loaded.train[0].camera
+    images = [frame.read_image() for frame in loaded.train]
     found: list[tuple[int, SE3, BoardView | None]] = []
     if method == SOLVED:
         views = [find_board(image, board) for image in images]
         fits = board_poses(board, camera, dict(zip(names, views, strict=True))).images
         for i, fit in enumerate(fits):
-            found += [] if fit.camera_from_board is None else [(i, fit.camera_from_board, fit.view)]
+            found += (
+                []
+                if fit.camera_from_board is None
+                else [(i, fit.camera_from_board, fit.view)]
+            )
     else:
         for i, image in enumerate(images):
             seen = _opencv_board(image, board, camera)
             found += [] if seen is None else [(i, seen, None)]
     if len(found) < 3:
-        raise InputError(f"the board is detected in {len(found)} of {len(images)} images")
+        raise InputError(
+            f"the board is detected in {len(found)} of {len(images)} images"
+        )
     rows = [i for i, _, _ in found]
     poses = SE3.stack([camera_from_board for _, camera_from_board, _ in found])
     pairs = PosePairs(tuple(names[i] for i in rows), robot[rows], poses)
     if method == CLOSED:
         return {"Shah": shah(pairs), **opencv_solvers(pairs, "eye_to_hand")}
-    corners = BoardCorners(camera, tuple(v for _, _, v in found if v is not None), stated=True)
+    corners = BoardCorners(
+        camera, tuple(v for _, _, v in found if v is not None), stated=True
+    )
     return solve(pairs, "eye_to_hand", corners=corners)
 
 
@@ -244,23 +275,32 @@ def _opencv_board(image: np.ndarray, board: Board, camera: Camera) -> SE3 | None
     pixels, ids, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(grey)
     if ids is None or len(ids) < 6:
         return None
-    points = np.asarray(printed.getChessboardCorners(), float)[np.ravel(ids).astype(int)]
+    points = np.asarray(printed.getChessboardCorners(), float)[
+        np.ravel(ids).astype(int)
+    ]
     if np.linalg.matrix_rank(points - points.mean(0), tol=0.5 * board.size_m) < 2:
         return None
-    ok, rotvec, shift = cv2.solvePnP(points, np.reshape(pixels, (-1, 1, 2)), camera.matrix(), None)
+    ok, rotvec, shift = cv2.solvePnP(
+        points, np.reshape(pixels, (-1, 1, 2)), camera.matrix(), None
+    )
     return pose(Rotation.from_rotvec(rotvec.ravel()), shift.ravel()) if ok else None
 
 
 def shah(pairs: PosePairs) -> SE3:
     """base_from_camera X with G Y = X B, by Shah (ASME J. Mechanisms and Robotics 2013)."""
-    robot, board = pairs.base_from_gripper, pairs.camera_from_board
+    robot = pairs.base_from_gripper
+    board = pairs.camera_from_board
     turned = robot.rotation_matrix()
-    products = [np.kron(b, g) for g, b in zip(turned, board.rotation_matrix(), strict=True)]
+    products = [
+        np.kron(b, g) for g, b in zip(turned, board.rotation_matrix(), strict=True)
+    ]
     left, _, _ = np.linalg.svd(np.sum(products, 0))
     raw = left[:, 0].reshape(3, 3).T
     u, _, vt = np.linalg.svd(raw * np.sign(np.linalg.det(raw)))
     moved = board.translation_m @ (u @ vt).T - robot.translation_m
-    matrix = np.concatenate([turned, -np.broadcast_to(np.eye(3), turned.shape)], 2).reshape(-1, 6)
+    matrix = np.concatenate(
+        [turned, -np.broadcast_to(np.eye(3), turned.shape)], 2
+    ).reshape(-1, 6)
     shifts = np.linalg.lstsq(matrix, moved.ravel(), rcond=None)[0]
     return pose(Rotation.from_matrix(u @ vt), shifts[3:])
 
@@ -275,25 +315,44 @@ def summary(rows: Sequence[Row]) -> list[Row]:
 
 def _summary(name: str, method: str, group: list[Row]) -> Row:
     condition = CONDITIONS[name]
-    setting, answers = condition.setting(FIRST_SEED), [row for row in group if "refused" not in row]
+    setting = condition.setting(FIRST_SEED)
+    answers = [row for row in group if "refused" not in row]
 
     def column(key: str) -> np.ndarray:
         return np.array([float(row[key]) for row in answers])
 
-    row: Row = {"condition": name, "method": method, "thing": setting.thing, "px": setting.px}
+    row: Row = {
+        "condition": name,
+        "method": method,
+        "thing": setting.thing,
+        "px": setting.px,
+    }
     row |= {"size": "x".join(map(str, setting.size)), "images": condition.images}
     row |= {"draws": len(group), "refused": len(group) - len(answers)}
     if not answers:
         return row
-    solvers = [key[:-3] for key in answers[0] if key.endswith("_mm") and method == CLOSED]
-    best = min(solvers, key=lambda solver: float(np.median(column(f"{solver}_mm"))), default="")
+    solvers = [
+        key[:-3] for key in answers[0] if key.endswith("_mm") and method == CLOSED
+    ]
+    best = min(
+        solvers, key=lambda solver: float(np.median(column(f"{solver}_mm"))), default=""
+    )
     for unit in ("mm", "deg"):
         errors = column(f"{best}_{unit}" if best else unit)
-        row |= {unit: float(np.median(errors)), f"{unit}_90": float(np.quantile(errors, 0.9))}
+        row |= {
+            unit: float(np.median(errors)),
+            f"{unit}_90": float(np.quantile(errors, 0.9)),
+        }
     if best:
         return row | {"solver": best}
     squared = column("squared_mahalanobis")
-    row |= {f"sigma_{unit}": float(np.median(column(f"sigma_{unit}"))) for unit in ("mm", "deg")}
-    row |= {"inside_95": share_inside(squared), "squared_mahalanobis": float(squared.mean())}
+    row |= {
+        f"sigma_{unit}": float(np.median(column(f"sigma_{unit}")))
+        for unit in ("mm", "deg")
+    }
+    row |= {
+        "inside_95": share_inside(squared),
+        "squared_mahalanobis": float(squared.mean()),
+    }
     row["wrong"] = int(wrong(column("mm"), squared).sum())
     return row | {"seconds": float(np.median(column("seconds")))}

@@ -77,12 +77,16 @@ def run(
             rows += once(file, lambda k=kind, s=seed, n=name: _room(k, s, n, lenses))
     for name in lenses:
         for seed in tqdm(range(BOARDS), f"board, {name}", unit="recording"):
-            rows += once(out / f"board-{seed}-{name}.json", lambda s=seed, n=name: _board(s, n))
+            rows += once(
+                out / f"board-{seed}-{name}.json", lambda s=seed, n=name: _board(s, n)
+            )
     save(out / "fisheye.csv", summary(rows))
 
 
 @lru_cache(maxsize=1)
-def _place(kind: str, seed: int) -> tuple[Callable[[Camera, SE3], np.ndarray], SE3, SE3]:
+def _place(
+    kind: str, seed: int
+) -> tuple[Callable[[Camera, SE3], np.ndarray], SE3, SE3]:
     """Renderer of a pinhole, poses (FRAMES,) of a recording, and test poses (TESTS,)."""
     if kind == "box":
         box = BoxRoom(seed)
@@ -90,10 +94,13 @@ def _place(kind: str, seed: int) -> tuple[Callable[[Camera, SE3], np.ndarray], S
     cell = furnished_room(kind, seed)
     shots = sweep_shots(cell, round(FRAMES / 0.7), seed)
     poses = {
-        split: SE3.stack([shot.base_from_camera for shot in shots if shot.split == split])
+        split: SE3.stack(
+            [shot.base_from_camera for shot in shots if shot.split == split]
+        )
         for split in ("train", "test")
     }
-    renderer, options = Renderer(cell.meshes()), RenderOptions()
+    renderer = Renderer(cell.meshes())
+    options = RenderOptions()
     rest = np.linspace(0, len(poses["test"]) - 1, TESTS).astype(int)
     render = lambda camera, at: renderer.render(camera, at, options)  # noqa: E731
     return render, poses["train"], poses["test"][rest]
@@ -117,7 +124,9 @@ def _room(kind: str, seed: int, name: str, lenses: tuple[str, ...]) -> list[Row]
     rng = np.random.default_rng(seed)
 
     def noisy(image: np.ndarray) -> np.ndarray:
-        return np.clip(image + rng.normal(0, NOISE, image.shape), 0, 255).astype(np.uint8)
+        return np.clip(image + rng.normal(0, NOISE, image.shape), 0, 255).astype(
+            np.uint8
+        )
 
     camera = lens(name)
     images = [noisy(_image(kind, seed, name, at)) for at in path]
@@ -129,7 +138,9 @@ def _room(kind: str, seed: int, name: str, lenses: tuple[str, ...]) -> list[Row]
         cell.learn(recording, on_progress=lambda *_: None)
 
         def add(answer: str, asked: str, error: Row) -> None:
-            rows.append({"room": kind, "map": name, "asked": asked, "answer": answer, **error})
+            rows.append(
+                {"room": kind, "map": name, "asked": asked, "answer": answer, **error}
+            )
 
         for asked in lenses:
             shown = _test_images(kind, seed, asked)
@@ -140,7 +151,9 @@ def _room(kind: str, seed: int, name: str, lenses: tuple[str, ...]) -> list[Row]
                     again = [noisy(image) for _ in range(REPEATS)]
                     error: Row = {}
                     with suppress(InputError):
-                        error = pose_error(cell.calibrate(again, camera=camera).uncertain_pose, at)
+                        error = pose_error(
+                            cell.calibrate(again, camera=camera).uncertain_pose, at
+                        )
                     add("fixed camera", name, error)
         wrist, truth = as_wrist_recording(recording, seed)
         error, _ = learned_mount(wrist, truth, Path(folder) / "wrist")
@@ -150,13 +163,18 @@ def _room(kind: str, seed: int, name: str, lenses: tuple[str, ...]) -> list[Row]
 
 def _board(seed: int, name: str) -> list[Row]:
     """A camera on the arm, from photographs of a ChArUco board; intrinsics from the same images."""
-    small, rng = lens(name), np.random.default_rng([seed, 7])
+    small = lens(name)
+    rng = np.random.default_rng([seed, 7])
     camera = small.resized(3 * small.width, 3 * small.height)
     views: dict[str, BoardView | str] = {}
     boards: list[SE3] = []
     while len(views) < VIEWS:
-        photo = Photo(camera, rng.uniform(0, 40), rng.uniform(0.9, 1.6), roll_deg=60, aside=0.4)
-        image, _, camera_from_board = board_photo(CHARUCO, photo, 1000 * seed + len(boards))
+        photo = Photo(
+            camera, rng.uniform(0, 40), rng.uniform(0.9, 1.6), roll_deg=60, aside=0.4
+        )
+        image, _, camera_from_board = board_photo(
+            CHARUCO, photo, 1000 * seed + len(boards)
+        )
         views[f"{len(views)}.png"] = find_board(image, CHARUCO)
         boards.append(camera_from_board)
     seen = [view for view in views.values() if isinstance(view, BoardView)]
@@ -164,11 +182,15 @@ def _board(seed: int, name: str) -> list[Row]:
     fits = board_poses(CHARUCO, estimate, views, "board").detected
     use = [int(fit.name.removesuffix(".png")) for fit in fits]
     truth = pose(Rotation.random(rng=rng), rng.uniform(-0.1, 0.1, 3))
-    base_from_board = pose(Rotation.from_rotvec([0, 0, 0.4]), np.array([0.5, 0.1, 0.02]))
+    base_from_board = pose(
+        Rotation.from_rotvec([0, 0, 0.4]), np.array([0.5, 0.1, 0.02])
+    )
     arm = base_from_board @ SE3.stack(boards)[use].inverse() @ truth.inverse()
     sigma = np.repeat([ARM[0] / 1000, np.deg2rad(ARM[1])], 3)
     stated = arm @ SE3.exp(rng.normal(0, sigma, (len(use), 6)))
-    measured = SE3.stack([fit.camera_from_board for fit in fits if fit.camera_from_board])
+    measured = SE3.stack(
+        [fit.camera_from_board for fit in fits if fit.camera_from_board]
+    )
     pairs = PosePairs(tuple(fit.name for fit in fits), stated, measured)
     corners = BoardCorners(estimate, tuple(fit.view for fit in fits if fit.view))
     answer = solve(pairs, "eye_in_hand", corners=corners)
@@ -180,14 +202,21 @@ def summary(rows: list[Row]) -> list[Row]:
     """One row for each kind of answer, map and lens."""
     groups: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
-        kind = "box" if row["room"] == "box" else "furnished" if row["answer"] != "board" else ""
+        kind = (
+            "box"
+            if row["room"] == "box"
+            else "furnished"
+            if row["answer"] != "board"
+            else ""
+        )
         key = str(row["answer"]), kind, str(row["map"]), str(row["asked"])
         groups.setdefault(key, []).append(row)
     lines: list[Row] = []
     for (answer, kind, learned, asked), group in groups.items():
         located = [row for row in group if "mm" in row]
         mm, squared = (
-            np.array([float(row[key]) for row in located]) for key in ("mm", "squared_mahalanobis")
+            np.array([float(row[key]) for row in located])
+            for key in ("mm", "squared_mahalanobis")
         )
         line: Row = {
             "answer": answer,
@@ -197,6 +226,9 @@ def summary(rows: list[Row]) -> list[Row]:
             "number": len(group),
         }
         line |= {"located": len(located), "mm": float(np.median(mm))}
-        line |= {"mm_90": float(np.quantile(mm, 0.9)), "inside_95": share_inside(squared)}
+        line |= {
+            "mm_90": float(np.quantile(mm, 0.9)),
+            "inside_95": share_inside(squared),
+        }
         lines.append(line | {"wrong": int(wrong(mm, squared).sum())})
     return lines

@@ -59,16 +59,23 @@ class SimulatedPairs:
 
 def recording(setting: Setting, seed: int) -> SimulatedPairs:
     """Draw one recording."""
-    rng, n = np.random.default_rng(seed), setting.poses
+    rng = np.random.default_rng(seed)
+    n = setting.poses
     on_arm = setting.mount == "eye_in_hand"
     if setting.path == "table":
         tilt = Rotation.from_rotvec(rng.normal(0, 0.5, (n, 3)))
         rotation = tilt * Rotation.from_euler("x", np.pi)
-        position = np.array([0.5, 0.0, 0.5]) + rng.uniform(-1, 1, (n, 3)) * (0.2, 0.2, 0.12)
+        position = np.array([0.5, 0.0, 0.5]) + rng.uniform(-1, 1, (n, 3)) * (
+            0.2,
+            0.2,
+            0.12,
+        )
     else:
-        rotation, position = Rotation.random(n, rng=rng), rng.uniform(-0.5, 0.5, (n, 3))
+        rotation = Rotation.random(n, rng=rng)
+        position = rng.uniform(-0.5, 0.5, (n, 3))
     robot = pose(rotation, position)
-    near, far = rng.normal(0, 0.07, 3), rng.normal(0, 0.4, 3)
+    near = rng.normal(0, 0.07, 3)
+    far = rng.normal(0, 0.4, 3)
     shifts = (near, far) if on_arm else (far, near)
     camera_in, board_in = (pose(Rotation.random(rng=rng), shift) for shift in shifts)
     fixed_from_parent = robot if on_arm else robot.inverse()
@@ -76,13 +83,15 @@ def recording(setting: Setting, seed: int) -> SimulatedPairs:
     if setting.path == "table" or not on_arm:  # the camera looks at the board
         middle = camera.translation_m.mean(0)
         turn = pose(Rotation.align_vectors([[0, 0, 1]], [middle])[0], np.zeros(3))
-        camera, camera_in = turn @ camera, camera_in @ turn.inverse()
+        camera = turn @ camera
+        camera_in = camera_in @ turn.inverse()
     if setting.noisy in ("robot", "both"):
         robot = shaken(robot, setting, rng)
     if setting.noisy in ("camera", "both"):
         camera = shaken(camera, setting, rng)
     spoiled = np.sort(rng.choice(n, setting.outliers, replace=False))
-    quaternion, translation = camera.rotation_wxyz.copy(), camera.translation_m.copy()
+    quaternion = camera.rotation_wxyz.copy()
+    translation = camera.translation_m.copy()
     for i in spoiled:
         axis, direction = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
         rotated = rotations(camera[i]) * Rotation.from_rotvec(np.deg2rad(20) * axis)
@@ -106,7 +115,9 @@ def rotations(poses: SE3) -> Rotation:
 def shaken(poses: SE3, setting: Setting, rng: np.random.Generator) -> SE3:
     """Add noise to poses."""
     n = len(poses)
-    rotation = Rotation.from_rotvec(rng.normal(0, np.deg2rad(setting.noise_deg), (n, 3)))
+    rotation = Rotation.from_rotvec(
+        rng.normal(0, np.deg2rad(setting.noise_deg), (n, 3))
+    )
     shift = rng.normal(0, setting.noise_mm / 1000, (n, 3))
     if setting.at == "far":
         return pose(rotation, shift) @ poses
@@ -116,12 +127,19 @@ def shaken(poses: SE3, setting: Setting, rng: np.random.Generator) -> SE3:
 def error(estimate: SE3, truth: SE3) -> np.ndarray:
     """Return translation in the parent's axes and rotation about the child's, shape (6,)."""
     rotation = rotations(truth).inv() * rotations(estimate)
-    return np.concatenate([estimate.translation_m - truth.translation_m, rotation.as_rotvec()])
+    return np.concatenate(
+        [estimate.translation_m - truth.translation_m, rotation.as_rotvec()]
+    )
 
 
 def trials(setting: Setting, count: int, first_seed: int = 0) -> dict[str, float]:
     """Solve many recordings of one setting, and summarize errors and times."""
-    mm, deg, squared, named, ms, scale = [], [], [], [], [], []
+    mm = []
+    deg = []
+    squared = []
+    named = []
+    ms = []
+    scale = []
     for seed in range(first_seed, first_seed + count):
         drawn = recording(setting, seed)
         began = time.process_time()
@@ -130,7 +148,9 @@ def trials(setting: Setting, count: int, first_seed: int = 0) -> dict[str, float
         off = error(result.parent_from_child, drawn.parent_from_camera)
         mm.append(1000 * np.linalg.norm(off[:3]))
         deg.append(np.rad2deg(np.linalg.norm(off[3:])))
-        squared.append(result.uncertain_pose.squared_mahalanobis(drawn.parent_from_camera))
+        squared.append(
+            result.uncertain_pose.squared_mahalanobis(drawn.parent_from_camera)
+        )
         left_out = tuple(i for i, image in enumerate(result.images) if not image.used)
         named.append(left_out == drawn.spoiled)
         if setting.scale is not None:
@@ -165,11 +185,16 @@ def run(
         for mount in ("eye_in_hand", "eye_to_hand")
         for outliers in (0, 3)
     ]
-    settings += [replace(settings[0], scale=0.37), replace(settings[2], scale=0.37, outliers=3)]
+    settings += [
+        replace(settings[0], scale=0.37),
+        replace(settings[2], scale=0.37, outliers=3),
+    ]
     if thorough:
         some = [settings[0], settings[3], settings[5], settings[6]]
         settings += [replace(s, noisy="both") for s in some]
-        settings += [replace(s, noisy=who, at="far") for s in some for who in ("camera", "robot")]
+        settings += [
+            replace(s, noisy=who, at="far") for s in some for who in ("camera", "robot")
+        ]
     rows = []
     for setting in tqdm(settings, unit="setting"):
         row = {

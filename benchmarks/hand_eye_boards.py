@@ -96,7 +96,9 @@ class BoardRecording:
 def board_points(setting: BoardSetting, stated: bool = True) -> Array:
     """Return corners (k, 3) with the stated or the true size of a square."""
     size = setting.square_m * (1 + setting.square_error if stated else 1)
-    x, y = np.meshgrid(np.arange(float(setting.columns)), np.arange(float(setting.rows)))
+    x, y = np.meshgrid(
+        np.arange(float(setting.columns)), np.arange(float(setting.rows))
+    )
     return size * np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
 
 
@@ -104,7 +106,9 @@ def project(points: Array, camera_from_board: SE3, camera: Camera) -> Array:
     """Return pixels (k, 2)."""
     import cv2
 
-    rotvec = Rotation.from_quat(camera_from_board.rotation_wxyz, scalar_first=True).as_rotvec()
+    rotvec = Rotation.from_quat(
+        camera_from_board.rotation_wxyz, scalar_first=True
+    ).as_rotvec()
     lens = np.array(camera.distortion) if camera.distortion else None
     args = (rotvec, camera_from_board.translation_m, camera.matrix(), lens)
     return cv2.projectPoints(points, *args)[0].reshape(-1, 2)
@@ -115,7 +119,8 @@ def record(setting: BoardSetting, seed: int, session: int = 0) -> BoardRecording
     rng = np.random.default_rng(seed)
     camera = _camera(rng)
     parent_from_camera, fixed_from_board = _places(setting, rng)
-    true, stated = board_points(setting, stated=False), board_points(setting)
+    true = board_points(setting, stated=False)
+    stated = board_points(setting)
     if setting.bend_mm or setting.dents_mm:
         true = _bent(true, setting, rng)
     if session:
@@ -125,7 +130,11 @@ def record(setting: BoardSetting, seed: int, session: int = 0) -> BoardRecording
     fixed_from_parent = (
         fixed_from_board @ camera_from_board.inverse() @ parent_from_camera.inverse()
     )
-    robot = fixed_from_parent if setting.mount == "eye_in_hand" else fixed_from_parent.inverse()
+    robot = (
+        fixed_from_parent
+        if setting.mount == "eye_in_hand"
+        else fixed_from_parent.inverse()
+    )
 
     def noise(*shape: int) -> Array:
         if setting.tails:
@@ -133,14 +142,19 @@ def record(setting: BoardSetting, seed: int, session: int = 0) -> BoardRecording
         return rng.normal(size=shape)
 
     views = tuple(
-        BoardView(stated, project(true, p, camera) + setting.noise_px * noise(len(true), 2))
+        BoardView(
+            stated, project(true, p, camera) + setting.noise_px * noise(len(true), 2)
+        )
         for p in camera_from_board
     )
     n = setting.views
-    turned = rotations(robot) * Rotation.from_rotvec(np.deg2rad(setting.arm_deg) * noise(n, 3))
+    turned = rotations(robot) * Rotation.from_rotvec(
+        np.deg2rad(setting.arm_deg) * noise(n, 3)
+    )
     robot = pose(turned, robot.translation_m + 1e-3 * setting.arm_mm * noise(n, 3))
     spoiled = np.sort(rng.choice(n, setting.outliers, replace=False))
-    quaternion, translation = robot.rotation_wxyz.copy(), robot.translation_m.copy()
+    quaternion = robot.rotation_wxyz.copy()
+    translation = robot.translation_m.copy()
     for i in spoiled:
         axis, direction = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
         other = rotations(robot[i]) * Rotation.from_rotvec(np.deg2rad(20) * axis)
@@ -159,7 +173,8 @@ def record(setting: BoardSetting, seed: int, session: int = 0) -> BoardRecording
 
 
 def _camera(rng: np.random.Generator) -> Camera:
-    focal, wobble = rng.uniform(560, 680), 1 + rng.uniform(-0.1, 0.1)
+    focal = rng.uniform(560, 680)
+    wobble = 1 + rng.uniform(-0.1, 0.1)
     ratio, (dx, dy) = rng.uniform(0.998, 1.002), rng.normal(0, 8, 2)
     lens = tuple(wobble * k for k in LENS)
     return Camera(640, 480, focal, focal * ratio, 319.5 + dx, 239.5 + dy, lens)
@@ -167,7 +182,8 @@ def _camera(rng: np.random.Generator) -> Camera:
 
 def _bent(points: Array, setting: BoardSetting, rng: np.random.Generator) -> Array:
     """Bend a board in any direction, and across it by up to half as much; dent two corners."""
-    turn, angle = points.max(0) / 2, rng.uniform(0, np.pi)
+    turn = points.max(0) / 2
+    angle = rng.uniform(0, np.pi)
     axes = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     curved = (((points - turn)[:, :2] @ axes) / 0.15) ** 2 @ [1, rng.uniform(-0.5, 0.5)]
     height = setting.bend_mm * rng.choice([-1, 1]) * curved
@@ -181,14 +197,21 @@ def _bent(points: Array, setting: BoardSetting, rng: np.random.Generator) -> Arr
 def _places(setting: BoardSetting, rng: np.random.Generator) -> tuple[SE3, SE3]:
     near = pose(Rotation.random(rng=rng), rng.uniform(-0.12, 0.12, 3))
     if setting.mount == "eye_in_hand":
-        return near, pose(Rotation.from_rotvec(rng.normal(0, 0.3, 3)), np.array([0.5, 0.1, 0.02]))
-    look = Rotation.from_euler("x", np.pi / 2 + 0.6) * Rotation.from_rotvec(rng.normal(0, 0.2, 3))
+        return near, pose(
+            Rotation.from_rotvec(rng.normal(0, 0.3, 3)), np.array([0.5, 0.1, 0.02])
+        )
+    look = Rotation.from_euler("x", np.pi / 2 + 0.6) * Rotation.from_rotvec(
+        rng.normal(0, 0.2, 3)
+    )
     return pose(look, max(1.0, setting.size / 3) * np.array([1.1, 0.2, 0.7])), near
 
 
-def _board_poses(setting: BoardSetting, camera: Camera, rng: np.random.Generator) -> SE3:
+def _board_poses(
+    setting: BoardSetting, camera: Camera, rng: np.random.Generator
+) -> SE3:
     """Return (n,) camera_from_board that show the whole board."""
-    points, poses = board_points(setting, stated=False), []
+    points = board_points(setting, stated=False)
+    poses = []
     while len(poses) < setting.views:
         axis = rng.normal(size=3)
         angle = rng.uniform(0, 1.5) * np.deg2rad(setting.tilt_deg)
@@ -205,9 +228,15 @@ def _board_poses(setting: BoardSetting, camera: Camera, rng: np.random.Generator
 
 def pose_pairs(recording: BoardRecording, seed: int) -> PosePairs:
     """Return pairs of poses without corners: lateral, depth and rotation noise of each image."""
-    setting, rng, n = recording.setting, np.random.default_rng(10000 + seed), len(recording.views)
+    setting = recording.setting
+    rng = np.random.default_rng(10000 + seed)
+    n = len(recording.views)
     board = recording.camera_from_board
-    noise = rng.standard_t(setting.tails, (n, 7)) if setting.tails else rng.normal(size=(n, 7))
+    noise = (
+        rng.standard_t(setting.tails, (n, 7))
+        if setting.tails
+        else rng.normal(size=(n, 7))
+    )
     moved = board.translation_m + 3e-4 * noise[:, :3]
     moved = moved * (1 + max(setting.depth_noise, 0.003) * noise[:, 3:4])
     moved[:, 2] *= 1 + setting.depth_error
@@ -232,14 +261,20 @@ def opencv_solvers(pairs: PosePairs, mount: Mount) -> dict[str, SE3]:
     import cv2
 
     found: dict[str, SE3] = {}
-    robot = pairs.base_from_gripper if mount == "eye_in_hand" else pairs.base_from_gripper.inverse()
+    robot = (
+        pairs.base_from_gripper
+        if mount == "eye_in_hand"
+        else pairs.base_from_gripper.inverse()
+    )
     arrays = [list(part) for p in (robot, pairs.camera_from_board)
               for part in (p.rotation_matrix(), p.translation_m)]  # fmt: skip
     solve_hand_eye = getattr(cv2, "calibrateHandEye", None)
     if solve_hand_eye is None:
         return found
     for name in ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS"):
-        rotation, shift = solve_hand_eye(*arrays, method=getattr(cv2, f"CALIB_HAND_EYE_{name}"))
+        rotation, shift = solve_hand_eye(
+            *arrays, method=getattr(cv2, f"CALIB_HAND_EYE_{name}")
+        )
         if np.isfinite(rotation).all() and abs(np.linalg.det(rotation) - 1) < 1e-3:
             found[name.title()] = pose(Rotation.from_matrix(rotation), np.ravel(shift))
     return found
@@ -255,17 +290,21 @@ def reprojection(
     robot = recording.base_from_gripper
     robot = robot if recording.setting.mount == "eye_in_hand" else robot.inverse()
     board = (robot @ start @ pairs.camera_from_board)[0]
-    points, pixels = recording.views[0].points_m, np.stack([v.pixels for v in recording.views])
+    points = recording.views[0].points_m
+    pixels = np.stack([v.pixels for v in recording.views])
     lens = lens_vector(corners.camera)
     scale = np.maximum(np.abs(lens), 0.1)
 
     def residual(step: Array) -> Array:
-        x, z = start @ SE3.exp(step[:6]), board @ SE3.exp(step[6:12])
+        x = start @ SE3.exp(step[:6])
+        z = board @ SE3.exp(step[6:12])
         camera = moved_camera(corners.camera, step[12:] * scale)
         seen = (robot @ x).inverse() @ z
         return (np.stack([project(points, p, camera) for p in seen]) - pixels).ravel()
 
-    step = least_squares(residual, np.zeros(12 + len(lens)), loss="soft_l1", f_scale=0.3).x
+    step = least_squares(
+        residual, np.zeros(12 + len(lens)), loss="soft_l1", f_scale=0.3
+    ).x
     return start @ SE3.exp(step[:6])
 
 
@@ -297,45 +336,76 @@ SESSIONS = {
     f"two sessions, bend {bend:g} mm, dents {dents:g} mm": replace(
         BENT, bend_mm=bend, dents_mm=dents
     )
-    for bend, dents in ((0, 0), (0.5, 0), (1, 0), (3, 0), (0, 0.5), (0, 1), (1, 1), (3, 3))
+    for bend, dents in (
+        (0, 0),
+        (0.5, 0),
+        (1, 0),
+        (3, 0),
+        (0, 0.5),
+        (0, 1),
+        (1, 1),
+        (3, 3),
+    )
 }
 """Settings of two sessions of one camera before one board."""
 
 
 def measure_sessions(name: str, count: int) -> Row:
     """Solve two sessions of one camera; compare their answers, and their intrinsics."""
-    answers, lenses, squared, mm, refused = [], [], [], [], 0
+    answers = []
+    lenses = []
+    squared = []
+    mm = []
+    refused = 0
     for seed in range(count):
-        setting = replace(SESSIONS[name], mount=("eye_in_hand", "eye_to_hand")[seed % 2])
+        setting = replace(
+            SESSIONS[name], mount=("eye_in_hand", "eye_to_hand")[seed % 2]
+        )
         drawn = [record(setting, seed, session) for session in range(2)]
         try:
-            fits = [solve_pairs(p, setting.mount, corners=c) for p, c in map(corner_pairs, drawn)]
+            fits = [
+                solve_pairs(p, setting.mount, corners=c)
+                for p, c in map(corner_pairs, drawn)
+            ]
         except InputError:
             refused += 1
             continue
-        both, truth = [fit.calibration() for fit in fits], drawn[0].parent_from_camera
+        both = [fit.calibration() for fit in fits]
+        truth = drawn[0].parent_from_camera
         squared += [b.uncertain_pose.squared_mahalanobis(truth) for b in both]
         mm += [1000 * float(pose_distance(b.parent_from_child, truth)[0]) for b in both]
         step = error(both[0].parent_from_child, both[1].parent_from_child)
-        answers.append(step @ np.linalg.solve(both[0].covariance + both[1].covariance, step))
-        change = np.diff([lens_vector(fit.camera) for fit in fits if fit.camera], axis=0)[0]
+        answers.append(
+            step @ np.linalg.solve(both[0].covariance + both[1].covariance, step)
+        )
+        change = np.diff(
+            [lens_vector(fit.camera) for fit in fits if fit.camera], axis=0
+        )[0]
         own = slice(12, 12 + len(change))
         spread = sum(f.fit.factor * f.fit.covariance[own, own] for f in fits)
         lenses.append(change @ np.linalg.solve(spread, change))
     row: Row = {"condition": name, "trials": count, "refused": refused}
     row |= {"median_mm": float(np.median(mm)), "p95_mm": float(np.quantile(mm, 0.95))}
     row |= {"inside_95": share_inside(squared), "truth_d2": float(np.mean(squared))}
-    return row | {"answers_d2": float(np.mean(answers)), "lens_d2": float(np.mean(lenses))}
+    return row | {
+        "answers_d2": float(np.mean(answers)),
+        "lens_d2": float(np.mean(lenses)),
+    }
 
 
 def measure(name: str, count: int, references: int) -> Row:
     """Solve many recordings of one condition; the first `references` also by other solvers."""
     setting, with_corners = CONDITIONS[name]
-    squared, flagged, ms, refused = [], [], [], 0
+    squared = []
+    flagged = []
+    ms = []
+    refused = 0
     mm: dict[str, list[float]] = {"evercal": []}
     for seed in range(count):
         drawn = record(setting, seed)
-        pairs, corners = corner_pairs(drawn) if with_corners else (pose_pairs(drawn, seed), None)
+        pairs, corners = (
+            corner_pairs(drawn) if with_corners else (pose_pairs(drawn, seed), None)
+        )
         began = time.process_time()
         try:
             result = solve(pairs, setting.mount, corners=corners)
@@ -354,15 +424,24 @@ def measure(name: str, count: int, references: int) -> Row:
                 start = result.parent_from_child
                 estimates["reprojection"] = reprojection(drawn, pairs, corners, start)
         for solver, estimate in estimates.items():
-            mm.setdefault(solver, []).append(1000 * float(pose_distance(estimate, truth)[0]))
+            mm.setdefault(solver, []).append(
+                1000 * float(pose_distance(estimate, truth)[0])
+            )
     row: Row = {"condition": name, "trials": count, "refused": refused}
     row |= {
         "median_mm": float(np.median(mm["evercal"])),
         "p95_mm": float(np.quantile(mm["evercal"], 0.95)),
     }
-    row |= {"inside_95": share_inside(squared), "size_flagged": 100 * float(np.mean(flagged))}
+    row |= {
+        "inside_95": share_inside(squared),
+        "size_flagged": 100 * float(np.mean(flagged)),
+    }
     row |= {"ms": float(np.median(ms))}
-    rest = {name: float(np.median(values)) for name, values in mm.items() if name != "evercal"}
+    rest = {
+        name: float(np.median(values))
+        for name, values in mm.items()
+        if name != "evercal"
+    }
     return row | {f"{name}_mm": value for name, value in rest.items()}
 
 

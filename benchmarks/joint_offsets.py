@@ -109,13 +109,20 @@ def robot(name: str) -> Robot:
         chain = [(*link, i) for i, link in enumerate(panda_arm.LINKS)]
         before = []
         for a, d, alpha, _ in chain:
-            c, s = np.cos(alpha), np.sin(alpha)
+            c = np.cos(alpha)
+            s = np.sin(alpha)
             before.append(
-                np.array([[1, 0, 0, a], [0, c, -s, -d * s], [0, s, c, d * c], [0, 0, 0, 1]])
+                np.array(
+                    [[1, 0, 0, a], [0, c, -s, -d * s], [0, s, c, d * c], [0, 0, 0, 1]]
+                )
             )
-        motions = tuple(Motion(b, np.array([0, 0, 1.0]), True, i) for i, b in enumerate(before[:7]))
+        motions = tuple(
+            Motion(b, np.array([0, 0, 1.0]), True, i) for i, b in enumerate(before[:7])
+        )
         spread = np.array([0.9, 0.4, 0.5, 0.4, 0.6, 0.5, 0.9])
-        return Robot(Arm(_names(7), motions, before[7]), panda_arm.HOME_RAD, spread, np.eye(3))
+        return Robot(
+            Arm(_names(7), motions, before[7]), panda_arm.HOME_RAD, spread, np.eye(3)
+        )
     forward = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
     x, y, z = np.eye(3)
     if name == "six":
@@ -127,7 +134,8 @@ def robot(name: str) -> Robot:
             (0.04 * x, y),
             (0.06 * x, x),
         ]
-        middle, spread = (0, -0.2, 0.3, 0, 1.2, 0), (0.8, 0.35, 0.4, 0.5, 0.4, 0.8)
+        middle = (0, -0.2, 0.3, 0, 1.2, 0)
+        spread = (0.8, 0.35, 0.4, 0.5, 0.4, 0.8)
     else:
         steps = [
             (0.15 * z, z),
@@ -136,7 +144,8 @@ def robot(name: str) -> Robot:
             (0.27 * x, y),
             (0.06 * x, x),
         ]
-        middle, spread = (0, -0.1, 0.2, 1.1, 0), (0.8, 0.4, 0.5, 0.5, 0.9)
+        middle = (0, -0.1, 0.2, 1.1, 0)
+        spread = (0.8, 0.4, 0.5, 0.5, 0.9)
     motions = tuple(
         Motion(SE3.from_translation(at).matrix(), axis, True, i)
         for i, (at, axis) in enumerate(steps)
@@ -151,7 +160,8 @@ def _names(count: int) -> tuple[str, ...]:
 
 def _mount(of: Robot, rng: np.random.Generator) -> SE3:
     nominal = np.eye(4)
-    nominal[:3, :3], nominal[:3, 3] = of.forward, of.forward @ (0.06, 0.0, 0.02)
+    nominal[:3, :3] = of.forward
+    nominal[:3, 3] = of.forward @ (0.06, 0.0, 0.02)
     tangent = np.r_[rng.uniform(-0.01, 0.01, 3), rng.uniform(-0.12, 0.12, 3)]
     return SE3.from_matrix(nominal) @ SE3.exp(tangent)
 
@@ -192,28 +202,41 @@ class Recorded(NamedTuple):
 
 def record(condition: Condition, seed: int) -> Recorded:
     """Draw a recording."""
-    of, rng = robot(condition.robot), np.random.default_rng([seed, 5])
-    arm, room, mount = of.arm, cell_room(seed), _mount(of, rng)
-    camera, cell = CAMERA, VirtualCell(seed, CellOptions())
+    of = robot(condition.robot)
+    rng = np.random.default_rng([seed, 5])
+    arm = of.arm
+    room = cell_room(seed)
+    mount = _mount(of, rng)
+    camera = CAMERA
+    cell = VirtualCell(seed, CellOptions())
     cell.hold(True)
     if condition.fixed:
-        camera, mount = cell.intrinsics, cell.truth.base_from_tripod
-        joints, held_out = (_near(cell.holding_poses(n, n)) for n in (condition.images, HELD_OUT))
+        camera = cell.intrinsics
+        mount = cell.truth.base_from_tripod
+        joints, held_out = (
+            _near(cell.holding_poses(n, n)) for n in (condition.images, HELD_OUT)
+        )
     else:
         joints = _joints(of, mount, condition.images, rng)
         held_out = _joints(of, mount, HELD_OUT, rng)
     offsets = np.deg2rad(condition.offset_deg) * rng.normal(size=len(arm.joints))
     offsets[[0, -1]] = 0
-    stated, stated_out = (_stated(condition, v, offsets, rng) for v in (joints, held_out))
+    stated, stated_out = (
+        _stated(condition, v, offsets, rng) for v in (joints, held_out)
+    )
     frames = []
-    for i, (true, gripper) in enumerate(zip(arm.poses(joints), arm.poses(stated), strict=True)):
+    for i, (true, gripper) in enumerate(
+        zip(arm.poses(joints), arm.poses(stated), strict=True)
+    ):
         if condition.fixed:
             plain = cell.render(mount, joints[i])
         else:
             plain = room.render(CAMERA, true @ mount)
         values = tuple(stated[i].tolist())
         frames.append(
-            Frame(f"{i:03d}", _noisy(plain, rng), camera, None, gripper, joints_rad=values)
+            Frame(
+                f"{i:03d}", _noisy(plain, rng), camera, None, gripper, joints_rad=values
+            )
         )
     recording = Recording("cell", tuple(frames), (), arm=arm)
     return Recorded(recording, mount, offsets, held_out, stated_out)
@@ -241,7 +264,9 @@ def _measured(name: str, seed: int) -> list[Row]:
         row["gripper_before_mm"] = _gripper_mm(arm, drawn.held_out, drawn.stated)
         rows.append(row)
         recording = drawn.recording
-        recording = recording if method == "joint offsets" else replace(recording, arm=None)
+        recording = (
+            recording if method == "joint offsets" else replace(recording, arm=None)
+        )
         began = time.process_time()
         with tempfile.TemporaryDirectory() as folder:
             cell = Map.open(Path(folder) / "map")
@@ -275,11 +300,16 @@ def _of_another_camera(cell: Map, seed: int) -> Row:
 
 
 def _stated(
-    condition: Condition, joints: np.ndarray, offsets: np.ndarray, rng: np.random.Generator
+    condition: Condition,
+    joints: np.ndarray,
+    offsets: np.ndarray,
+    rng: np.random.Generator,
 ) -> np.ndarray:
     """Joint values that the robot reports at true ones."""
     noise = np.deg2rad(condition.encoder_deg) * rng.normal(size=joints.shape)
-    steps = np.diff(joints, axis=0, prepend=joints[:1] - rng.normal(size=joints[:1].shape))
+    steps = np.diff(
+        joints, axis=0, prepend=joints[:1] - rng.normal(size=joints[:1].shape)
+    )
     lag = np.deg2rad(condition.backlash_deg) / 2 * np.sign(steps)
     sag = np.zeros_like(joints)
     sag[:, 1] = np.deg2rad(condition.sag_deg) * np.cos(joints[:, 1])
@@ -309,7 +339,9 @@ def _offset_error(calibration: Calibration, offsets: np.ndarray) -> Row:
 def summary(rows: list[Row]) -> list[Row]:
     """One row for each condition and method."""
     lines: list[Row] = []
-    for key in dict.fromkeys((str(row["condition"]), str(row["method"])) for row in rows):
+    for key in dict.fromkeys(
+        (str(row["condition"]), str(row["method"])) for row in rows
+    ):
         group = [row for row in rows if (row["condition"], row["method"]) == key]
         solved = [row for row in group if "mm" in row]
         line: Row = {"condition": key[0], "method": key[1], "draws": len(group)}
@@ -318,7 +350,10 @@ def summary(rows: list[Row]) -> list[Row]:
         def median(name: str, of: list[Row] = solved) -> float:
             return float(np.median([float(row[name]) for row in of if name in row]))
 
-        line |= {name: median(name) for name in ("gripper_before_mm", "mm", "deg", "sigma_mm")}
+        line |= {
+            name: median(name)
+            for name in ("gripper_before_mm", "mm", "deg", "sigma_mm")
+        }
         another = any("fixed_mm" in row for row in solved)
         line |= {name: median(name) for name in ("fixed_mm", "fixed_deg") if another}
         for prefix in ("", "fixed_")[: 1 + another]:
@@ -329,10 +364,13 @@ def summary(rows: list[Row]) -> list[Row]:
             }
         if key[1] == "joint offsets":
             line["gripper_after_mm"] = median("gripper_after_mm")
-            line["gripper_after_max_mm"] = max(float(row["gripper_after_mm"]) for row in solved)
+            line["gripper_after_max_mm"] = max(
+                float(row["gripper_after_mm"]) for row in solved
+            )
             line |= {name: median(name) for name in ("offset_deg", "offset_sigma_deg")}
             inside, squared = (
-                [float(row[name]) for row in solved] for name in ("offset_inside", "offset_squared")
+                [float(row[name]) for row in solved]
+                for name in ("offset_inside", "offset_squared")
             )
             line["offset_inside_95"] = 100 * float(np.mean(inside))
             line["offset_squared"] = float(np.mean(squared))

@@ -61,11 +61,20 @@ class View:
         for step in product(steps, steps):
             where = self.where(grid + step, own)
             # NaN, beyond the range of a distortion, is outside.
-            if not ((where >= -0.5) & (where <= (own.width - 0.5, own.height - 0.5))).all():
-                raise InputError(f"{self.camera}: wider than the image that it is drawn from")
+            if not (
+                (where >= -0.5) & (where <= (own.width - 0.5, own.height - 0.5))
+            ).all():
+                raise InputError(
+                    f"{self.camera}: wider than the image that it is drawn from"
+                )
             x, y = np.moveaxis(where.astype(np.float32), -1, 0)
             total += cv2.remap(
-                image.astype(np.float32), x, y, cv2.INTER_CUBIC, None, cv2.BORDER_REPLICATE
+                image.astype(np.float32),
+                x,
+                y,
+                cv2.INTER_CUBIC,
+                None,
+                cv2.BORDER_REPLICATE,
             )
         return np.clip(np.rint(total / across**2), 0, 255).astype(np.uint8)
 
@@ -82,7 +91,8 @@ def rolled(own: Camera, roll_deg: float) -> View:
     """
     quarters = roll_deg / QUARTER_DEG
     if quarters == round(quarters):
-        sides, focal = (own.width, own.height), (own.fx, own.fy)
+        sides = (own.width, own.height)
+        focal = (own.fx, own.fy)
         order = slice(None, None, -1 if round(quarters) % 2 else 1)
         (width, height), (fx, fy) = sides[order], focal[order]
     else:
@@ -92,8 +102,11 @@ def rolled(own: Camera, roll_deg: float) -> View:
         divisor = math.gcd(own.width, own.height)
         parts = int(divisor * min(own.width / across, own.height / down))
         width, height = (side * parts // divisor for side in (own.width, own.height))
-        fx, fy = own.fx, own.fy
-    return View(Camera(width, height, fx, fy, (width - 1) / 2, (height - 1) / 2), roll_deg)
+        fx = own.fx
+        fy = own.fy
+    return View(
+        Camera(width, height, fx, fy, (width - 1) / 2, (height - 1) / 2), roll_deg
+    )
 
 
 def _resized(own: Camera, scale: float) -> View:

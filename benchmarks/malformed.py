@@ -13,7 +13,12 @@ PATHS = ("/localize", "/calibrations", "/check", "/nowhere")
 
 
 def _request(
-    method: str, path: str, body: bytes, kind: str, more: str = "", length: int | None = None
+    method: str,
+    path: str,
+    body: bytes,
+    kind: str,
+    more: str = "",
+    length: int | None = None,
 ) -> bytes:
     head = f"{method} {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n"
     head += f"Content-Type: {kind}\r\nContent-Length: {len(body) if length is None else length}\r\n"
@@ -24,7 +29,9 @@ def _form(*parts: tuple[str, str, bytes], boundary: bytes = b"edge") -> bytes:
     body = b""
     for name, file, data in parts:
         body += b"--" + boundary + b"\r\nContent-Disposition: form-data; "
-        body += f'name="{name}"; filename="{file}"'.encode() + b"\r\n\r\n" + data + b"\r\n"
+        body += (
+            f'name="{name}"; filename="{file}"'.encode() + b"\r\n\r\n" + data + b"\r\n"
+        )
     return body + b"--" + boundary + b"--\r\n"
 
 
@@ -38,10 +45,16 @@ def png(side: int, kind: int = 0, size: int | None = None) -> bytes:
 
     def chunk(name: bytes, data: bytes) -> bytes:
         checked = name + data
-        return struct.pack(">I", len(data)) + checked + struct.pack(">I", zlib.crc32(checked))
+        return (
+            struct.pack(">I", len(data))
+            + checked
+            + struct.pack(">I", zlib.crc32(checked))
+        )
 
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, kind, 0, 0, 0))
-    data = chunk(b"IDAT", zlib.compress(bytes((side + 1) * side if size is None else size)))
+    data = chunk(
+        b"IDAT", zlib.compress(bytes((side + 1) * side if size is None else size))
+    )
     return b"\x89PNG\r\n\x1a\n" + header + data + chunk(b"IEND", b"")
 
 
@@ -54,8 +67,17 @@ def _bomb_png(rng: random.Random) -> bytes:
 
 
 def _deep(rng: random.Random) -> bytes:
-    values: list[bytes] = [b"[" * 50_000, b'{"a":' * 20_000, b"1e999", b"\xff\xfe", b"null", b"{}"]
-    values += [json.dumps({"path": "../" * rng.randrange(1, 50) + "etc/passwd"}).encode()]
+    values: list[bytes] = [
+        b"[" * 50_000,
+        b'{"a":' * 20_000,
+        b"1e999",
+        b"\xff\xfe",
+        b"null",
+        b"{}",
+    ]
+    values += [
+        json.dumps({"path": "../" * rng.randrange(1, 50) + "etc/passwd"}).encode()
+    ]
     return rng.choice(values)
 
 
@@ -80,23 +102,33 @@ def _table(rng: random.Random) -> bytes:
 def _text(rng: random.Random) -> bytes:
     """Intrinsics, poses or a calibration beside an image that is none."""
     name = rng.choice(["camera", "calibration", "robot_poses"])
-    path = {"calibration": "/check", "robot_poses": "/calibrations"}.get(name, "/localize")
+    path = {"calibration": "/check", "robot_poses": "/calibrations"}.get(
+        name, "/localize"
+    )
     image = "image" if path == "/localize" else "images"
     body = _form(
-        (name, rng.choice(["a.csv", "a.json", "a.yaml", ""]), _table(rng)), (image, "a", PNG)
+        (name, rng.choice(["a.csv", "a.json", "a.yaml", ""]), _table(rng)),
+        (image, "a", PNG),
     )
     return _request("POST", path, body, "multipart/form-data; boundary=edge")
 
 
 def _wrong_length(rng: random.Random) -> bytes:
     length = rng.choice([10**12, 10**30])
-    return _request("POST", rng.choice(PATHS[:3]), b"x", "application/octet-stream", length=length)
+    return _request(
+        "POST", rng.choice(PATHS[:3]), b"x", "application/octet-stream", length=length
+    )
 
 
 def _images(rng: random.Random) -> bytes:
     data = rng.choice([_garbage, _bomb_png, _deep])(rng)
-    name = rng.choice(["image", "images", "camera", "calibration", "robot_poses", "x" * 500])
-    body = _form((name, rng.choice(["a.png", "../../a", "a\0b", ""]), data), ("images", "b", data))
+    name = rng.choice(
+        ["image", "images", "camera", "calibration", "robot_poses", "x" * 500]
+    )
+    body = _form(
+        (name, rng.choice(["a.png", "../../a", "a\0b", ""]), data),
+        ("images", "b", data),
+    )
     cut = rng.randrange(len(body)) if rng.random() < 0.3 else len(body)
     kind = rng.choice(
         ["multipart/form-data; boundary=edge", "multipart/form-data", "a/b; charset=x"]
@@ -105,7 +137,9 @@ def _images(rng: random.Random) -> bytes:
 
 
 def _traversal(rng: random.Random) -> bytes:
-    up = rng.choice(["..%2F", "%2e%2e/", "../", "..\\", "%c0%ae%c0%ae/"]) * rng.randrange(1, 9)
+    up = rng.choice(
+        ["..%2F", "%2e%2e/", "../", "..\\", "%c0%ae%c0%ae/"]
+    ) * rng.randrange(1, 9)
     method = rng.choice(["GET", "DELETE", "PUT"])
     return _request(method, f"/scenes/{up}etc/passwd", b"", "text/plain")
 

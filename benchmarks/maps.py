@@ -63,20 +63,26 @@ def run(
     elif what == "ablation":
         rows = ablation(out, recordings, memory)
     else:
-        rows = {"mini": mini, "fixed": fixed, "badposes": wrong_poses}[what](out, memory)
+        rows = {"mini": mini, "fixed": fixed, "badposes": wrong_poses}[what](
+            out, memory
+        )
     options = MapOptions(MemoryBudget(memory))
     settings = {"map": asdict(options), "localize": asdict(LocalizeOptions())}
     save(out / f"{what}.csv", rows, settings)
 
 
-def learned(store: Path, scenes: Sequence[Recording], memory: float) -> list[LearnReport]:
+def learned(
+    store: Path, scenes: Sequence[Recording], memory: float
+) -> list[LearnReport]:
     """Learn scenes in turn."""
     cell = Map.open(store)
     return [cell.learn(scene, memory=f"{100 * memory:g}%") for scene in scenes]
 
 
 def measured(
-    localizer: Localizer, scene: Recording, change: Callable[[Image], Image] | None = None
+    localizer: Localizer,
+    scene: Recording,
+    change: Callable[[Image], Image] | None = None,
 ) -> Row:
     """Localize the test frames of a scene.
 
@@ -89,20 +95,28 @@ def measured(
     if change is not None:
         test = tuple(replace(frame, image=change(frame.read_image())) for frame in test)
     return accuracy_row(
-        scene.name, evaluate(localizer, {scene.name: replace(scene, test=test, base=None)})
+        scene.name,
+        evaluate(localizer, {scene.name: replace(scene, test=test, base=None)}),
     )
 
 
 def sequence(scenes: Sequence[Recording], out: Path, memory: float) -> list[Row]:
     """Measure scenes just after learning and after learning all of them."""
-    store, first, before = out / "store.evercal", {}, 0
+    store = out / "store.evercal"
+    first = {}
+    before = 0
     for scene in tqdm(scenes, "learning", unit="scene"):
         (report,) = learned(store, [scene], memory)
         accuracy = measured(Localizer.open(store), scene)["1 cm/1 deg"]
         # A report counts the bytes of all scenes.
-        first[scene.name] = float(accuracy), report.seconds, report.memory_bytes - before
+        first[scene.name] = (
+            float(accuracy),
+            report.seconds,
+            report.memory_bytes - before,
+        )
         before = report.memory_bytes
-    localizer, rows = Localizer.open(store), []
+    localizer = Localizer.open(store)
+    rows = []
     for scene in tqdm(scenes, "evaluating", unit="scene"):
         accuracy, seconds, memory_bytes = first[scene.name]
         row = measured(localizer, scene)
@@ -138,7 +152,8 @@ def _jpeg(image: Image, quality: int) -> Image:
 
 def mini(out: Path, memory: float) -> list[Row]:
     """Measure the packaged rooms, with degraded images and after a change in the room."""
-    rooms, store = sample_rooms(), out / "store.evercal"
+    rooms = sample_rooms()
+    store = out / "store.evercal"
     learned(store, [room.scene for room in rooms], memory)
     localizer = Localizer.open(store)
     rows = [measured(localizer, room.scene) for room in rooms]
@@ -155,18 +170,23 @@ def mini(out: Path, memory: float) -> list[Row]:
 
 def fixed(out: Path, memory: float) -> list[Row]:
     """Calibrate the fixed cameras of the packaged rooms, before and after a bump."""
-    rooms, store, rows = sample_rooms(), out / "store.evercal", []
+    rooms = sample_rooms()
+    store = out / "store.evercal"
+    rows = []
     learned(store, [room.scene for room in rooms], memory)
     localizer = Localizer.open(store)
     for room in rooms:
         assert room.fixed is not None
         assert room.bumped is not None
-        before, after = (_fixed_pose(localizer, s.test) for s in (room.fixed, room.bumped))
+        before, after = (
+            _fixed_pose(localizer, s.test) for s in (room.fixed, room.bumped)
+        )
         true_before = room.fixed.test[0].base_from_camera
         true_after = room.bumped.test[0].base_from_camera
         assert true_before is not None
         assert true_after is not None
-        bump, true_bump = before.inverse() @ after, true_before.inverse() @ true_after
+        bump = before.inverse() @ after
+        true_bump = true_before.inverse() @ true_after
         rows.append(
             {
                 "scene": room.scene.name,
@@ -185,7 +205,10 @@ def _fixed_pose(localizer: Localizer, frames: Sequence[Frame]) -> SE3:
 
 def _distance(name: str, a: SE3, b: SE3) -> Row:
     metres, radians = pose_distance(a, b)
-    return {f"{name}_mm": 1000 * float(metres), f"{name}_deg": float(np.rad2deg(radians))}
+    return {
+        f"{name}_mm": 1000 * float(metres),
+        f"{name}_deg": float(np.rad2deg(radians)),
+    }
 
 
 OFFSET = SE3.exp(np.array([0.004, -0.003, 0.002, *np.deg2rad([0.4, -0.3, 0.2])]))
@@ -193,7 +216,9 @@ PoseError = Literal["none", "noise", "offset", "focal", "gross"]
 POSE_ERRORS: tuple[PoseError, ...] = ("none", "noise", "offset", "focal", "gross")
 
 
-def with_pose_errors(frames: Sequence[Frame], kind: PoseError, seed: int) -> tuple[Frame, ...]:
+def with_pose_errors(
+    frames: Sequence[Frame], kind: PoseError, seed: int
+) -> tuple[Frame, ...]:
     """Add errors to stated poses or intrinsics.
 
     Args:
@@ -202,13 +227,17 @@ def with_pose_errors(frames: Sequence[Frame], kind: PoseError, seed: int) -> tup
             gross (every twentieth pose off by 30 cm).
         seed: Seed of the noise.
     """
-    rng, changed = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    changed = []
     outliers = set(rng.permutation(len(frames))[: max(1, len(frames) // 20)].tolist())
     for i, frame in enumerate(frames):
-        pose, camera = frame.base_from_camera, frame.camera
+        pose = frame.base_from_camera
+        camera = frame.camera
         assert pose is not None
         if kind == "noise":
-            rotation = Rotation.from_rotvec(np.deg2rad(0.2) * rng.standard_normal(3)).as_rotvec()
+            rotation = Rotation.from_rotvec(
+                np.deg2rad(0.2) * rng.standard_normal(3)
+            ).as_rotvec()
             shift = pose.rotation_matrix().T @ (0.002 * rng.standard_normal(3))
             pose = pose @ SE3.exp(np.concatenate([shift, rotation]))
         elif kind == "offset":
@@ -223,18 +252,24 @@ def with_pose_errors(frames: Sequence[Frame], kind: PoseError, seed: int) -> tup
     return tuple(changed)
 
 
-def wrong_poses(out: Path, memory: float, seeds: Sequence[int] = (0, 1, 2)) -> list[Row]:
+def wrong_poses(
+    out: Path, memory: float, seeds: Sequence[int] = (0, 1, 2)
+) -> list[Row]:
     """Learn the packaged bedroom with errors in its training poses."""
-    scene, rows = sample_rooms()[0].scene, []
+    scene = sample_rooms()[0].scene
+    rows = []
     for kind in POSE_ERRORS:
         for seed in seeds if kind in ("noise", "gross") else (0,):
             store = out / f"{kind}-{seed}.evercal"
             train = with_pose_errors(scene.train, kind, seed)
             # A common offset belongs to the frame that the recording states.
             test = with_pose_errors(posed_frames(scene.test), "offset", 0)
-            spoiled = replace(scene, train=train, test=test if kind == "offset" else scene.test)
+            spoiled = replace(
+                scene, train=train, test=test if kind == "offset" else scene.test
+            )
             (report,) = learned(store, [spoiled], memory)
-            localizer, adjusted = Localizer.open(store), report.adjusted
+            localizer = Localizer.open(store)
+            adjusted = report.adjusted
             assert adjusted is not None
             true_common = OFFSET.inverse() if kind == "offset" else SE3.identity()
             planted = {
@@ -246,7 +281,11 @@ def wrong_poses(out: Path, memory: float, seeds: Sequence[int] = (0, 1, 2)) -> l
             rows.append(
                 measured(localizer, spoiled)
                 | {"scene": f"{kind} {seed}"}
-                | _distance("common_error", true_common, localizer.contents.scenes[0].frame.common)
+                | _distance(
+                    "common_error",
+                    true_common,
+                    localizer.contents.scenes[0].frame.common,
+                )
                 | {
                     "focal_percent": adjusted.focal_percent,
                     "pose_sigma_mm": adjusted.pose_sigma_mm,
@@ -268,21 +307,27 @@ def unknown_images(out: Path, scenes: Sequence[Recording], memory: float) -> lis
     """Count the images of other scenes, and hard ones, that get a pose in the first scene's map."""
     store = out / "store.evercal"
     learned(store, scenes[:1], memory)
-    localizer, rows = Localizer.open(store), []
+    localizer = Localizer.open(store)
+    rows = []
     for scene in scenes[1:]:
         images = ((frame.read_image(), frame.camera) for frame in scene.test)
         rows.append(_accepted(localizer, scene.name, images))
-    rng, camera = np.random.default_rng(0), localizer.contents.scenes[0].camera
+    rng = np.random.default_rng(0)
+    camera = localizer.contents.scenes[0].camera
     shape = (camera.height, camera.width, 3)
     hand = cv2.GaussianBlur(rng.integers(90, 160, shape).astype(np.uint8), (0, 0), 25)
-    rows.append(_accepted(localizer, "blank", [(np.full(shape, 128, np.uint8), camera)]))
+    rows.append(
+        _accepted(localizer, "blank", [(np.full(shape, 128, np.uint8), camera)])
+    )
     noise = [(rng.integers(0, 255, shape).astype(np.uint8), camera) for _ in range(10)]
     rows.append(_accepted(localizer, "noise", noise))
     rows.append(_accepted(localizer, "hand in front of the camera", [(hand, camera)]))
     return rows
 
 
-def _accepted(localizer: Localizer, name: str, images: Iterable[tuple[Image, Camera]]) -> Row:
+def _accepted(
+    localizer: Localizer, name: str, images: Iterable[tuple[Image, Camera]]
+) -> Row:
     estimates = [localizer.localize(image, camera) for image, camera in images]
     return {
         "images": name,
@@ -297,7 +342,9 @@ def ablation(out: Path, scenes: Sequence[Recording], memory: float) -> list[Row]
     store = out / "store.evercal"
     learned(store, scenes, memory)
     return [
-        mean_row(title, [measured(Localizer.open(store, options), scene) for scene in scenes])
+        mean_row(
+            title, [measured(Localizer.open(store, options), scene) for scene in scenes]
+        )
         for title, options in (
             ("map", LocalizeOptions()),
             ("matched patches, no alignment", LocalizeOptions(align=False)),

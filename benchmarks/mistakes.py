@@ -80,7 +80,9 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     "board behind the camera (OpenGL axes)": (_camera(lambda c: _FLIP @ c), ":opengl"),
     "files exchanged": (
         lambda p: replace(
-            p, base_from_gripper=p.camera_from_board, camera_from_board=p.base_from_gripper
+            p,
+            base_from_gripper=p.camera_from_board,
+            camera_from_board=p.base_from_gripper,
         ),
         "exchange --robot-poses and --camera-poses",
     ),
@@ -131,27 +133,37 @@ class Case(NamedTuple):
     corners: BoardCorners | None = None
 
 
-def drawn(seed: int, squares_m: tuple[float, ...], poses: int | None = None) -> BoardRecording:
+def drawn(
+    seed: int, squares_m: tuple[float, ...], poses: int | None = None
+) -> BoardRecording:
     """Draw a recording of small or large motions before a small or large board."""
     rng = np.random.default_rng([seed, 1])
-    tilt, square = 35 * rng.choice((0.25, 0.5, 1.0, 1.6)), float(rng.choice(squares_m))
+    tilt = 35 * rng.choice((0.25, 0.5, 1.0, 1.6))
+    square = float(rng.choice(squares_m))
     views = poses or int(rng.integers(12, 30))
     mount: Mount = ("eye_in_hand", "eye_to_hand")[seed // 2 % 2]
-    return record(BoardSetting(mount=mount, views=views, tilt_deg=tilt, square_m=square), seed)
+    return record(
+        BoardSetting(mount=mount, views=views, tilt_deg=tilt, square_m=square), seed
+    )
 
 
 def _misread(name: str, seed: int) -> Case:
     made = drawn(seed, SMALL)
     mistake, pattern = MISTAKES[name]
     mount = OTHER[made.setting.mount] if name == "other mount" else made.setting.mount
-    return Case(mistake(pose_pairs(made, seed)), mount, (made.parent_from_camera,), pattern)
+    return Case(
+        mistake(pose_pairs(made, seed)), mount, (made.parent_from_camera,), pattern
+    )
 
 
 def _order(side: str, seed: int) -> Case:
-    rng, made = np.random.default_rng([seed, 2]), drawn(seed, SMALL)
+    rng = np.random.default_rng([seed, 2])
+    made = drawn(seed, SMALL)
     written = f"{ORDERS[seed % len(ORDERS)]}:mm:deg"
     others = [
-        r for r in ("kuka", "yaskawa", "staubli", "ur:mm:deg") if order_of(r) != order_of(written)
+        r
+        for r in ("kuka", "yaskawa", "staubli", "ur:mm:deg")
+        if order_of(r) != order_of(written)
     ]
     mistake, pattern = misread(side, written, str(rng.choice(others)))
     pairs = mistake(pose_pairs(made, seed))
@@ -159,7 +171,8 @@ def _order(side: str, seed: int) -> Case:
 
 
 def _shifted(seed: int) -> Case:
-    rng, made = np.random.default_rng([seed, 3]), drawn(seed, SMALL)
+    rng = np.random.default_rng([seed, 3])
+    made = drawn(seed, SMALL)
     rows = np.arange(len(made.views))
     rows = np.minimum(rows + (rows >= rng.integers(1, len(rows) - 2)), len(rows) - 1)
     pairs, corners = _pairs(made, seed)
@@ -172,7 +185,8 @@ def _shifted(seed: int) -> Case:
 
 
 def _one_list(seed: int) -> Case:
-    rng, made = np.random.default_rng([seed, 4]), drawn(seed, SMALL)
+    rng = np.random.default_rng([seed, 4])
+    made = drawn(seed, SMALL)
     pairs = pose_pairs(made, seed)
     listed = pairs.camera_from_board if seed % 2 else pairs.camera_from_board.inverse()
     listed = (listed, _FLIP @ listed, listed @ _FLIP)[rng.integers(3)]
@@ -180,23 +194,33 @@ def _one_list(seed: int) -> Case:
     robot = shaken(listed, noise, rng)
     unit = float(rng.choice([0.001, 1.0, 1000.0]))
     robot = SE3(robot.rotation_wxyz, unit * robot.translation_m)
-    return Case(replace(pairs, base_from_gripper=robot), made.setting.mount, (), "one list")
+    return Case(
+        replace(pairs, base_from_gripper=robot), made.setting.mount, (), "one list"
+    )
 
 
 def _pan_tilt(seed: int) -> Case:
     """Turn the gripper on the spot by up to 15 degrees; the board stays in view."""
-    rng, made = np.random.default_rng([seed, 5]), drawn(seed, SMALL)
-    x, first = made.parent_from_camera, made.camera_from_board[0]
-    poses, fixed = list[SE3](), list[SE3]()
+    rng = np.random.default_rng([seed, 5])
+    made = drawn(seed, SMALL)
+    x = made.parent_from_camera
+    first = made.camera_from_board[0]
+    poses = list[SE3]()
+    fixed = list[SE3]()
     while len(poses) < len(made.views):
         turned = x @ SE3.exp(np.r_[0, 0, 0, np.deg2rad(rng.uniform(-15, 15, 2)), 0])
         parent = SE3((turned @ x.inverse()).rotation_wxyz, np.zeros(3))
         seen = (parent @ x).inverse() @ x @ first
         pixels = project(board_points(made.setting), seen, made.camera)
         if ((pixels > 8) & (pixels < (632, 472))).all():
-            poses, fixed = [*poses, seen], [*fixed, parent]
+            poses = [*poses, seen]
+            fixed = [*fixed, parent]
     made = seen_from(made, SE3.stack(poses))
-    robot = SE3.stack(fixed) if made.setting.mount == "eye_in_hand" else SE3.stack(fixed).inverse()
+    robot = (
+        SE3.stack(fixed)
+        if made.setting.mount == "eye_in_hand"
+        else SE3.stack(fixed).inverse()
+    )
     pairs, corners = _pairs(replace(made, base_from_gripper=robot), seed)
     return Case(pairs, made.setting.mount, (x,), "", corners)
 
@@ -205,7 +229,9 @@ def seen_from(made: BoardRecording, camera_from_board: SE3) -> BoardRecording:
     """Move the board in the images; their noise stays."""
     moved = zip(made.views, made.camera_from_board, camera_from_board, strict=True)
     views = tuple(
-        replace(view, pixels=view.pixels + _seen(view, new, made) - _seen(view, old, made))
+        replace(
+            view, pixels=view.pixels + _seen(view, new, made) - _seen(view, old, made)
+        )
         for view, old, new in moved
     )
     return replace(made, views=views, camera_from_board=camera_from_board)
@@ -217,8 +243,10 @@ def _seen(view: BoardView, pose: SE3, made: BoardRecording) -> np.ndarray:
 
 def _slipped(what: str, squares_m: tuple[float, ...], seed: int) -> Case:
     """Move the camera or the board by 1 to 10 mm and up to 1 degree before a row."""
-    rng, made = np.random.default_rng([seed, 6]), drawn(seed, squares_m)
-    row, poses = int(rng.integers(1, len(made.views))), made.camera_from_board
+    rng = np.random.default_rng([seed, 6])
+    made = drawn(seed, squares_m)
+    row = int(rng.integers(1, len(made.views)))
+    poses = made.camera_from_board
     axes = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     size = rng.uniform(1e-3, 1e-2), np.deg2rad(rng.uniform(0, 1))
     slip = SE3.exp(np.concatenate([s * a for s, a in zip(size, axes, strict=True)]))
@@ -226,7 +254,12 @@ def _slipped(what: str, squares_m: tuple[float, ...], seed: int) -> Case:
     late = np.arange(len(made.views)) >= row
     made = seen_from(
         made,
-        SE3.stack([m if is_late else p for p, m, is_late in zip(poses, moved, late, strict=True)]),
+        SE3.stack(
+            [
+                m if is_late else p
+                for p, m, is_late in zip(poses, moved, late, strict=True)
+            ]
+        ),
     )
     pairs, corners = _pairs(made, seed)
     x = made.parent_from_camera
@@ -235,31 +268,47 @@ def _slipped(what: str, squares_m: tuple[float, ...], seed: int) -> Case:
     if alone:  # an outlier
         pattern += f"|left out: {pairs.names[alone[0]]};"
     return Case(
-        pairs, made.setting.mount, (x, x @ slip if what == "camera" else x), pattern, corners
+        pairs,
+        made.setting.mount,
+        (x, x @ slip if what == "camera" else x),
+        pattern,
+        corners,
     )
 
 
 def _wrong_corners(count: int, seed: int) -> Case:
     """Move corners of one or two images by 1.5 to 20 pixels."""
-    rng, made = np.random.default_rng([seed, 7]), drawn(seed, SMALL)
-    views, wrong = list(made.views), set[tuple[int, int]]()
+    rng = np.random.default_rng([seed, 7])
+    made = drawn(seed, SMALL)
+    views = list(made.views)
+    wrong = set[tuple[int, int]]()
     while len(wrong) < count:
         wrong.add((int(rng.integers(len(views))), int(rng.integers(54))))
     for image, corner in wrong:
-        way, pixels = rng.normal(size=2), views[image].pixels.copy()
-        pixels[corner] += np.exp(rng.uniform(np.log(1.5), np.log(20))) * way / np.linalg.norm(way)
+        way = rng.normal(size=2)
+        pixels = views[image].pixels.copy()
+        pixels[corner] += (
+            np.exp(rng.uniform(np.log(1.5), np.log(20))) * way / np.linalg.norm(way)
+        )
         views[image] = replace(views[image], pixels=pixels)
     pairs, corners = corner_pairs(replace(made, views=tuple(views)))
-    names = [f"{i}.png {x:.0f} {y:.0f}" for i, k in sorted(wrong) for x, y in [views[i].pixels[k]]]
+    names = [
+        f"{i}.png {x:.0f} {y:.0f}"
+        for i, k in sorted(wrong)
+        for x, y in [views[i].pixels[k]]
+    ]
     pattern = f"corners: {re.escape(', '.join(names))};"
     return Case(pairs, made.setting.mount, (made.parent_from_camera,), pattern, corners)
 
 
 def _clean(what: str, seed: int) -> Case:
-    rng, made = np.random.default_rng([seed, 8]), drawn(seed, ANY)
+    rng = np.random.default_rng([seed, 8])
+    made = drawn(seed, ANY)
     pairs, corners = _pairs(made, seed, what == "corners")
     for side in ("robot", "camera") if what == "tables" else ():
-        name = str(rng.choice(["wxyz", "xyzw", "rpy", "ur", "kuka", "staubli", "matrix"]))
+        name = str(
+            rng.choice(["wxyz", "xyzw", "rpy", "ur", "kuka", "staubli", "matrix"])
+        )
         pairs = misread(side, name, name)[0](pairs)
     return Case(pairs, made.setting.mount, (made.parent_from_camera,), NOTHING, corners)
 
@@ -275,7 +324,8 @@ def _pairs(
 NOTHING = "^left out: .*; corners: ; $"
 """Messages about a clean recording."""
 LIMIT = float(chi2.ppf(0.99, 6))
-SMALL, ANY = (0.02, 0.025, 0.05), (0.02, 0.025, 0.05, 0.1, 0.2, 0.25)
+SMALL = (0.02, 0.025, 0.05)
+ANY = (0.02, 0.025, 0.05, 0.1, 0.2, 0.25)
 ORDERS = [name for name in CONVENTIONS if name.startswith(("fixed_", "moving_"))]
 KINDS: dict[str, Callable[[int], Case]] = {
     **{name: partial(_misread, name) for name in MISTAKES},
@@ -299,13 +349,15 @@ KINDS: dict[str, Callable[[int], Case]] = {
 
 def measure(name: str, draws: int) -> Row:
     """Make one mistake in many recordings."""
-    counts, messages = dict.fromkeys(("refused", "warned", "named", "safe"), 0), list[str]()
+    counts = dict.fromkeys(("refused", "warned", "named", "safe"), 0)
+    messages = list[str]()
     for seed in range(FIRST_SEED, FIRST_SEED + draws):
         case = KINDS[name](seed)
         try:
             answer = solve(case.pairs, case.mount, corners=case.corners)
         except InputError as error:
-            text, safe = str(error), True
+            text = str(error)
+            safe = True
             counts["refused"] += 1
         else:
             checks = answer.checks
@@ -313,8 +365,12 @@ def measure(name: str, draws: int) -> Row:
             notes = [*checks["warnings"], f"left out: {', '.join(left_out)}"]
             notes += [f"corners: {', '.join(checks.get('corners_left_out', ()))}"]
             text = "; ".join([*notes, ""])
-            counts["warned"] += bool(checks["warnings"] or checks.get("corners_left_out"))
-            distances = [answer.uncertain_pose.squared_mahalanobis(x) for x in case.right]
+            counts["warned"] += bool(
+                checks["warnings"] or checks.get("corners_left_out")
+            )
+            distances = [
+                answer.uncertain_pose.squared_mahalanobis(x) for x in case.right
+            ]
             safe = min(distances, default=np.inf) < LIMIT
         named = bool(re.search(case.pattern, text))
         counts["named"] += named
@@ -322,12 +378,18 @@ def measure(name: str, draws: int) -> Row:
         if not (named and safe):
             messages.append(f"{seed}: {text}" if safe else f"{seed} WRONG: {text}")
     percent = {key: 100 * value / draws for key, value in counts.items()}
-    return {"mistake": name, "draws": draws, **percent, "otherwise": "\n".join(messages)}
+    return {
+        "mistake": name,
+        "draws": draws,
+        **percent,
+        "otherwise": "\n".join(messages),
+    }
 
 
 def origins(draws: int) -> Row:
     """Renumber the corners from each end of the board; return the largest change of the answer."""
-    largest, spread = 0.0, 0.0
+    largest = 0.0
+    spread = 0.0
     for seed in range(FIRST_SEED, FIRST_SEED + draws):
         drawn = record(BoardSetting(), seed)
         pairs, corners = corner_pairs(drawn)
@@ -335,7 +397,9 @@ def origins(draws: int) -> Row:
         sigma = np.sqrt(np.diag(base.covariance))
         points = drawn.views[0].points_m
         for corner in (8, 45, 53):  # the other ends of 9x6 corners
-            moved = tuple(replace(v, points_m=v.points_m - points[corner]) for v in corners.views)
+            moved = tuple(
+                replace(v, points_m=v.points_m - points[corner]) for v in corners.views
+            )
             shift = SE3.from_translation(points[corner])
             poses = replace(pairs, camera_from_board=pairs.camera_from_board @ shift)
             other = solve(poses, "eye_in_hand", corners=replace(corners, views=moved))
@@ -343,10 +407,16 @@ def origins(draws: int) -> Row:
             largest = max(largest, float((np.abs(change) / sigma).max()))
             ratio = np.sqrt(np.diag(other.covariance)) / sigma
             spread = max(spread, float(np.abs(ratio - 1).max()))
-    return {"draws": draws, "largest_change_sigma": largest, "largest_change_of_sigma": spread}
+    return {
+        "draws": draws,
+        "largest_change_sigma": largest,
+        "largest_change_of_sigma": spread,
+    }
 
 
-def run(draws: int = 100, clean: int = 1000, out: Path = Path("runs/mistakes.csv")) -> None:
+def run(
+    draws: int = 100, clean: int = 1000, out: Path = Path("runs/mistakes.csv")
+) -> None:
     """Mistakes in pose files and boards, recordings without mistakes, other origins of the board.
 
     `named`: the message, a warning or the list of what is left out names the mistake. `safe`:

@@ -39,7 +39,9 @@ def summary(name: str, single: bool = False) -> Callable[[], Table]:
         places = rows.groupby(["strategy", "seed"], sort=False)["environment"].first()
         common = rows[rows["environment"] == places.mode(dropna=False).iloc[0]]
         if len(common):
-            lines["s"] = method_table(run_scores(common))["s"].reindex(names).fillna("-")
+            lines["s"] = (
+                method_table(run_scores(common))["s"].reindex(names).fillna("-")
+            )
         lines = lines[(lines["runs"] == 1) == single]
         return lines[["runs", FINAL, *columns]].reset_index()
 
@@ -53,7 +55,13 @@ def _bench(name: str) -> Table:
 
 def contrasts() -> Table:
     """The contrasts that were named before the runs."""
-    others = ("icarl", "sars_old_output", "sars_reprojection", "reservoir_spdd", "buff_cs")
+    others = (
+        "icarl",
+        "sars_old_output",
+        "sars_reprojection",
+        "reservoir_spdd",
+        "buff_cs",
+    )
     pairs = [("sars_spdd", other) for other in others]
     return contrast_table(run_scores(_bench("networks-a")), pairs).reset_index()
 
@@ -63,12 +71,20 @@ def environments() -> Table:
     rows = results.read(FOLDER / "networks-a").drop_duplicates(["strategy", "seed"])
     table = pd.DataFrame(results.read_environments(FOLDER / "networks-a")).T
     table["runs"] = rows.groupby("environment").size()
-    return table[["commit", "processor", "gpu", "precision", "torch", "threads", "runs"]]
+    return table[
+        ["commit", "processor", "gpu", "precision", "torch", "threads", "runs"]
+    ]
 
 
 def memory() -> Table:
     """The same scenes with several shares of keyframes, means over runs."""
-    wanted = ("er", "sars_reprojection", "reservoir_spdd", "sars_spdd", "sars_spdd_filled")
+    wanted = (
+        "er",
+        "sars_reprojection",
+        "reservoir_spdd",
+        "sars_spdd",
+        "sars_spdd_filled",
+    )
     bounds = {
         "5 cm/5 deg": "within_5cm_5deg",
         "1 cm/1 deg": "within_1cm_1deg",
@@ -77,7 +93,8 @@ def memory() -> Table:
     table = []
     for share in (1, 3, 30):
         folder = FOLDER / f"networks-memory-{share}"
-        rows, frames = _bench(folder.name), results.read_frames(folder)
+        rows = _bench(folder.name)
+        frames = results.read_frames(folder)
         last = rows[rows["stage"] == rows["stage"].max()]
         for name in rows["strategy"].unique():
             if name not in wanted:
@@ -97,13 +114,18 @@ def memory() -> Table:
 def draw(name: str, path: Path) -> None:
     """Draw final accuracy over forgetting, a point per strategy, with intervals over seeds."""
     scores = run_scores(_bench(name)).fillna(0.0)  # joint training has no stages
-    grouped = scores.groupby("strategy").filter(lambda runs: len(runs) > 1).groupby("strategy")
+    grouped = (
+        scores.groupby("strategy")
+        .filter(lambda runs: len(runs) > 1)
+        .groupby("strategy")
+    )
     order = grouped[FINAL].mean().sort_values(ascending=False).index
     figure = new_figure(7.2, 4.4)
     panel = figure.subplots()
     for number, strategy in enumerate(order):
         final, forgetting = (grouped.get_group(strategy)[key] for key in (FINAL, "TFR"))
-        x, y = forgetting.mean(), final.mean()
+        x = forgetting.mean()
+        y = final.mean()
         panel.errorbar(
             x,
             y,
@@ -116,7 +138,9 @@ def draw(name: str, path: Path) -> None:
             elinewidth=0.7,
             label=f"{strategy}  {y:.0f}",
         )
-    panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8)
+    panel.legend(
+        loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8
+    )
     panel.set_xlabel("total forgetting rate (points)")
     panel.set_ylabel("final accuracy, 5 cm and 5 deg (%)")
     panel.set_ylim(0, 103)

@@ -13,7 +13,11 @@ from tyro.conf import Positional
 from evercal.cli.bench import Bench
 from evercal.continual.learning.presets import preset
 from evercal.continual.methods.gec import EpisodicConstraint
-from evercal.continual.methods.penalties import BoundedByTeacher, Distillation, OldOutput
+from evercal.continual.methods.penalties import (
+    BoundedByTeacher,
+    Distillation,
+    OldOutput,
+)
 from evercal.continual.methods.replay import Replay
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.errors import InputError
@@ -60,20 +64,27 @@ class Experiment(Bench):
         return self.given
 
 
-def experiments(data: Path, out: Path, device: str) -> Mapping[str, Sequence[Experiment]]:
+def experiments(
+    data: Path, out: Path, device: str
+) -> Mapping[str, Sequence[Experiment]]:
     """Return the calls of every experiment, in order."""
-    ours, paper_head = tuned(10.0), tuned(1.0)
+    ours = tuned(10.0)
+    paper_head = tuned(1.0)
     compared = ("sars_spdd", "er", "sars_reprojection", "reservoir_spdd")
     contrasts = (*compared, "icarl", "buff_cs", "sars_old_output")
     filled = (*compared, "sars_spdd_filled")
     controls = ("evercal", "evercal_network", "joint", "isolation", "finetune")
 
-    def chosen(names: Sequence[str], known: Mapping[str, Strategy] = ours) -> tuple[Strategy, ...]:
+    def chosen(
+        names: Sequence[str], known: Mapping[str, Strategy] = ours
+    ) -> tuple[Strategy, ...]:
         return tuple(known.get(name) or STRATEGIES[name] for name in names)
 
     def bench(suite: str, name: str, names: Sequence[str], seeds: str) -> Experiment:
         common = Experiment(suite, data=data / suite, out=out / name, order="balanced")
-        return replace(common, preset="converged", seeds=seeds, given=chosen(names), device=device)
+        return replace(
+            common, preset="converged", seeds=seeds, given=chosen(names), device=device
+        )
 
     gate = bench("sim-mini", "networks-a", ["joint"], SEEDS)
     head = replace(
@@ -81,12 +92,16 @@ def experiments(data: Path, out: Path, device: str) -> Mapping[str, Sequence[Exp
         steps=4 * STEPS,
         backbone="paper_head",
     )
-    unseen = replace(bench("sim-unseen", "networks-c", filled, FEW_SEEDS), steps=2 * STEPS)
+    unseen = replace(
+        bench("sim-unseen", "networks-c", filled, FEW_SEEDS), steps=2 * STEPS
+    )
     paper = ("sars_spdd", "joint", "finetune", "icarl", "buff_cs", "gec")
     return {
         "gate": [gate],
         "a": [
-            replace(gate, given=chosen([*controls, *ours.keys() - {"sars_spdd_filled"}])),
+            replace(
+                gate, given=chosen([*controls, *ours.keys() - {"sars_spdd_filled"}])
+            ),
             replace(gate, given=chosen(contrasts), seeds=MORE_SEEDS),
         ],
         "memory": [
@@ -103,13 +118,17 @@ def experiments(data: Path, out: Path, device: str) -> Mapping[str, Sequence[Exp
         ],
         "real": [
             replace(
-                bench("real2", "networks-real", [*filled, "joint", "finetune"], FEW_SEEDS),
+                bench(
+                    "real2", "networks-real", [*filled, "joint", "finetune"], FEW_SEEDS
+                ),
                 steps=2 * STEPS,
             )
         ],
         "paper": [
             replace(
-                Experiment("sim-unseen", data=data / "sim-unseen", out=out / "networks-paper"),
+                Experiment(
+                    "sim-unseen", data=data / "sim-unseen", out=out / "networks-paper"
+                ),
                 preset="paper",
                 seeds="0",
                 given=tuple(STRATEGIES[name] for name in paper),
@@ -137,7 +156,9 @@ def run(
     known = experiments(data, out, device)
     unknown = [name for name in names if name not in known]
     if unknown or not names:
-        raise InputError(f"{' '.join(unknown) or 'no experiment'}: choose of {', '.join(known)}")
+        raise InputError(
+            f"{' '.join(unknown) or 'no experiment'}: choose of {', '.join(known)}"
+        )
     for experiment in (experiment for name in names for experiment in known[name]):
         experiment.run()
     return 0

@@ -70,19 +70,26 @@ def trial(seed: int, pool: int) -> Trial:
     """Draw a cell, a mount and a start."""
     rng = np.random.default_rng([seed, 41])
     cell = VirtualCell(seed)
-    reachable, mount = cell.reachable_poses(pool), cell.truth.gripper_from_camera
+    reachable = cell.reachable_poses(pool)
+    mount = cell.truth.gripper_from_camera
     points = WORK_AREA_M + rng.uniform(-1, 1, (80, 3)) * (0.3, 0.4, 0.08)
     image = [CAMERA_NOISE + seen_covariance(pose, points) for pose in reachable @ mount]
-    return Trial(reachable, mount, np.stack(image), rng, rng.choice(pool, FIRST, replace=False))
+    return Trial(
+        reachable, mount, np.stack(image), rng, rng.choice(pool, FIRST, replace=False)
+    )
 
 
-def seen_covariance(base_from_camera: SE3, points_m: NDArray[np.floating]) -> NDArray[np.floating]:
+def seen_covariance(
+    base_from_camera: SE3, points_m: NDArray[np.floating]
+) -> NDArray[np.floating]:
     """(6, 6) covariance of a camera pose from the points that the camera sees."""
     camera = default_camera(640, 480)
     pixels = camera.project(base_from_camera.inverse().apply(points_m))
     visible = ((pixels >= 0) & (pixels <= (camera.width - 1, camera.height - 1))).all(1)
     at = base_from_camera.rotation_matrix(), base_from_camera.translation_m
-    slopes = linearise(pixels[visible], points_m[visible], *at, camera)[1].reshape(6, -1)
+    slopes = linearise(pixels[visible], points_m[visible], *at, camera)[1].reshape(
+        6, -1
+    )
     return np.linalg.inv(slopes @ slopes.T + 1e-9 * np.eye(6)) * PIXEL_PX**2
 
 
@@ -126,20 +133,26 @@ def reached(draw: Trial, order: NDArray[np.int64], sigma_mm: float) -> int:
 
 def simulated_mm(draw: Trial, order: NDArray[np.int64], draws: int) -> float:
     """Root mean square error of the position per axis, from drawn noise and nonlinear estimates."""
-    grippers, views = draw.reachable[order], len(order)
+    grippers = draw.reachable[order]
+    views = len(order)
     cameras = SE3.from_translation(-WORK_AREA_M) @ grippers @ draw.mount
     roots = np.linalg.cholesky(draw.image[order])
     errors = []
     for _ in range(draws):
-        robot = draw.rng.standard_normal((views, 6)) @ np.linalg.cholesky(GRIPPER_NOISE).T
+        robot = (
+            draw.rng.standard_normal((views, 6)) @ np.linalg.cholesky(GRIPPER_NOISE).T
+        )
         seen = (roots @ draw.rng.standard_normal((views, 6, 1)))[..., 0]
-        stated, measured = grippers @ SE3.exp(robot), cameras @ SE3.exp(seen)
+        stated = grippers @ SE3.exp(robot)
+        measured = cameras @ SE3.exp(seen)
         estimate = _estimate(draw.mount, stated, measured, draw.weights[order])
         errors.append(estimate.translation_m - draw.mount.translation_m)
     return 1000 * float(np.sqrt(np.mean(np.square(errors))))
 
 
-def _estimate(mount: SE3, stated: SE3, measured: SE3, weights: NDArray[np.floating]) -> SE3:
+def _estimate(
+    mount: SE3, stated: SE3, measured: SE3, weights: NDArray[np.floating]
+) -> SE3:
     """Gauss-Newton from the truth; the weights are those of the model."""
     scene = SE3.from_translation(WORK_AREA_M)
     for _ in range(5):
@@ -151,8 +164,10 @@ def _estimate(mount: SE3, stated: SE3, measured: SE3, weights: NDArray[np.floati
         step = -np.linalg.solve(normal, (weighted @ residual[..., None]).sum(0)[:, 0])
         turned = mount.rotation_matrix() @ Rotation.from_rotvec(step[3:6]).as_matrix()
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = turned, mount.translation_m + step[:3]
-        mount, scene = SE3.from_matrix(matrix), scene @ SE3.exp(step[6:])
+        matrix[:3, :3] = turned
+        matrix[:3, 3] = mount.translation_m + step[:3]
+        mount = SE3.from_matrix(matrix)
+        scene = scene @ SE3.exp(step[6:])
     return mount
 
 
@@ -188,10 +203,14 @@ def run(
         for name, order in ORDERS.items():
             index = order(draw)
             sigma = axis_deviation(covariances(draw, index)[at - 1])[0]
-            counts = {f"{limit:g} mm": reached(draw, index, limit) for limit in sigmas_mm}
+            counts = {
+                f"{limit:g} mm": reached(draw, index, limit) for limit in sigmas_mm
+            }
             simulated = simulated_mm(draw, index[:at], noise_draws)
             sigmas = {f"sigma_mm at {at}": sigma, "simulated_mm": simulated}
             rows.append({"order": name, "draw": seed, **counts, **sigmas})
     save(out, rows, {"pool": pool, "at": at})
-    medians = pd.DataFrame(rows).drop(columns="draw").groupby("order", sort=False).median()
+    medians = (
+        pd.DataFrame(rows).drop(columns="draw").groupby("order", sort=False).median()
+    )
     show(medians.reset_index())

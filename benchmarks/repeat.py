@@ -19,8 +19,11 @@ from evercal.map import Map
 from evercal.recordings import Frame, Recording
 
 CAMERA = Camera(960, 600, 760.0, 760.0, 479.5, 299.5)
-SQUARES, SQUARE_M = (28, 17), 0.015
-BEHIND_M, NOISE_M, NOISE_DEG = 0.25, 2e-4, 0.02
+SQUARES = (28, 17)
+SQUARE_M = 0.015
+BEHIND_M = 0.25
+NOISE_M = 2e-4
+NOISE_DEG = 0.02
 PIXELS_PER_M = 4000
 FOLDS = 3
 NOTHING: Row = {"mm": np.nan, "deg": np.nan, "squared_mahalanobis": np.nan}
@@ -69,7 +72,9 @@ def summary(mounts: list[Row], located: list[Row]) -> Row:
         "mounts": len(mounts),
         "refused": len(mounts) - len(found),
         "median mm": float(np.median([float(row["mm"]) for row in found] or [np.inf])),
-        "in ellipsoid": sum(float(row["squared_mahalanobis"]) < CHI2_6 for row in found),
+        "in ellipsoid": sum(
+            float(row["squared_mahalanobis"]) < CHI2_6 for row in found
+        ),
         "images": len(located),
         "located": len(good),
         "median mm of images": float(np.median(errors)),
@@ -78,7 +83,9 @@ def summary(mounts: list[Row], located: list[Row]) -> Row:
     }
 
 
-def _fold(recording: Recording, truth: SE3, fold: int, store: Path) -> tuple[Row, list[Row]]:
+def _fold(
+    recording: Recording, truth: SE3, fold: int, store: Path
+) -> tuple[Row, list[Row]]:
     train = tuple(f for i, f in enumerate(recording.train) if i % FOLDS != fold)
     cell = Map.open(store)
     try:
@@ -91,23 +98,34 @@ def _fold(recording: Recording, truth: SE3, fold: int, store: Path) -> tuple[Row
     for true, frame in zip(recording.test, recording.train, strict=True):
         if frame in train:
             continue
-        answer, pose = cell.localize(frame.read_image()), true.base_from_camera
+        answer = cell.localize(frame.read_image())
+        pose = true.base_from_camera
         assert pose is not None
         row = NOTHING | {"status": answer.status}
         if answer.uncertain_pose is not None:
             row |= pose_error(answer.uncertain_pose, pose)
         rows.append(row)
-    return pose_error(estimate, truth) | {"warnings": len(report.hand_eye.warnings)}, rows
+    return pose_error(estimate, truth) | {
+        "warnings": len(report.hand_eye.warnings)
+    }, rows
 
 
-def chessboard_recording(seed: int, images: int, curtain: float) -> tuple[Recording, SE3]:
+def chessboard_recording(
+    seed: int, images: int, curtain: float
+) -> tuple[Recording, SE3]:
     """Return a recording of gripper poses, with its true camera poses as test, and the mount."""
     rng = np.random.default_rng(seed)
-    board, back = _board(rng), _curtain(rng, curtain)
-    mount = SE3(Rotation.random(rng=rng).as_quat(scalar_first=True), rng.uniform(-0.1, 0.1, 3))
-    base_from_board = SE3(Rotation.random(rng=rng).as_quat(scalar_first=True), np.zeros(3))
+    board = _board(rng)
+    back = _curtain(rng, curtain)
+    mount = SE3(
+        Rotation.random(rng=rng).as_quat(scalar_first=True), rng.uniform(-0.1, 0.1, 3)
+    )
+    base_from_board = SE3(
+        Rotation.random(rng=rng).as_quat(scalar_first=True), np.zeros(3)
+    )
     sigma = np.repeat([NOISE_M, np.deg2rad(NOISE_DEG)], 3)
-    train, test = [], []
+    train = []
+    test = []
     for i, board_from_camera in enumerate(_orbit(rng, images)):
         image = draw(board, back, board_from_camera)
         noisy = np.clip(image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
@@ -123,15 +141,20 @@ def chessboard_recording(seed: int, images: int, curtain: float) -> tuple[Record
 def _orbit(rng: np.random.Generator, images: int) -> Iterator[SE3]:
     """Yield poses board_from_camera that look at points of the board from 0.45 to 0.7 m."""
     for _ in range(images):
-        tilt, turn = np.deg2rad(rng.uniform(5, 40)), rng.uniform(0, 2 * np.pi)
-        away = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)])
+        tilt = np.deg2rad(rng.uniform(5, 40))
+        turn = rng.uniform(0, 2 * np.pi)
+        away = np.array(
+            [np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)]
+        )
         aim = np.array([*rng.uniform(-0.06, 0.06, 2), 0.0])
-        position, roll = aim + rng.uniform(0.45, 0.7) * away, np.deg2rad(rng.uniform(-30, 30))
+        position = aim + rng.uniform(0.45, 0.7) * away
+        roll = np.deg2rad(rng.uniform(-30, 30))
         z = (aim - position) / np.linalg.norm(aim - position)
         x = np.cross([-np.sin(roll), np.cos(roll), 0], z)
         x /= np.linalg.norm(x)
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = np.stack([x, np.cross(z, x), z], 1), position
+        matrix[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
+        matrix[:3, 3] = position
         yield SE3.from_matrix(matrix)
 
 
@@ -149,12 +172,18 @@ def _curtain(rng: np.random.Generator, contrast: float) -> np.ndarray:
     return (50 + 200 * contrast * (0.5 * folds + 0.3 * noise)).astype(np.float32)
 
 
-def _smooth(rng: np.random.Generator, shape: tuple[int, ...], px: float, size: float) -> np.ndarray:
+def _smooth(
+    rng: np.random.Generator, shape: tuple[int, ...], px: float, size: float
+) -> np.ndarray:
     """Return noise with a correlation length of `px` and a standard deviation of `size`."""
     step = max(1, int(px / 3))
     small = tuple(-(-n // step) + 1 for n in shape)
-    noise = cv2.GaussianBlur(rng.normal(size=small).astype(np.float32), (0, 0), px / step)
-    noise = cv2.resize(noise, (small[1] * step, small[0] * step), interpolation=cv2.INTER_CUBIC)
+    noise = cv2.GaussianBlur(
+        rng.normal(size=small).astype(np.float32), (0, 0), px / step
+    )
+    noise = cv2.resize(
+        noise, (small[1] * step, small[0] * step), interpolation=cv2.INTER_CUBIC
+    )
     return size * (noise / noise.std())[: shape[0], : shape[1]]
 
 
@@ -179,5 +208,11 @@ def _texture(
     middle = (np.array(texture.shape[::-1]) - 1) / 2
     where = (points * per_m + middle).astype(np.float32)
     return cv2.remap(
-        texture, where[..., 0], where[..., 1], cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, [-1.0]
+        texture,
+        where[..., 0],
+        where[..., 1],
+        cv2.INTER_LINEAR,
+        None,
+        cv2.BORDER_CONSTANT,
+        [-1.0],
     )

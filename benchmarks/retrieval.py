@@ -65,11 +65,15 @@ def run(out: Path = Path("runs/retrieval"), scenes: int = 2000) -> None:
         every = np.concatenate([packed, keys[: count - len(packed)]])
         bank = _bank(every)
         rooms = {
-            "box rooms": [(len(packed) + n, q) for n, room in enumerate(asked[:97]) for q in room],
+            "box rooms": [
+                (len(packed) + n, q) for n, room in enumerate(asked[:97]) for q in room
+            ],
             "packaged rooms": [(n, q) for n, room in enumerate(their) for q in room],
         }
         for name, queries in rooms.items():
-            rows.append({"queries": name, "keyframes": bank.scene.size, **_right(bank, queries)})
+            rows.append(
+                {"queries": name, "keyframes": bank.scene.size, **_right(bank, queries)}
+            )
         some = [q.astype(np.float32) for _, q in rooms["box rooms"][:4]]
         rows[-2] |= {
             "one_image_ms": _milliseconds(lambda b=bank, q=some: _ranked(b, q[:1])),
@@ -82,7 +86,9 @@ def run(out: Path = Path("runs/retrieval"), scenes: int = 2000) -> None:
     maps = []
     for count in (10, 100, 1000, 2000):
         if count <= len(keys) + len(packed):
-            root = _large_map(learned, out / f"map-{count}", keys[: count - len(packed)])
+            root = _large_map(
+                learned, out / f"map-{count}", keys[: count - len(packed)]
+            )
             maps.append({"scenes": count, **_asked(root)})
     save(out / "large-maps.csv", maps, {"keyframes": KEYFRAMES})
 
@@ -94,9 +100,13 @@ def _learned(root: Path) -> Path:
         if room.scene.name not in opened.scenes:
             opened.learn(room.scene)
     if "room" not in opened.scenes:
-        room, camera = BoxRoom(FIRST_SEED - 1, texture_px=TEXTURE_PX), default_camera()
+        room = BoxRoom(FIRST_SEED - 1, texture_px=TEXTURE_PX)
+        camera = default_camera()
         path = room.path(2 * KEYFRAMES, 0)
-        views = [(f"{i:03d}", room.render(camera, path[i]), path[i]) for i in range(len(path))]
+        views = [
+            (f"{i:03d}", room.render(camera, path[i]), path[i])
+            for i in range(len(path))
+        ]
         frames = tuple(Frame(name, image, camera, pose) for name, image, pose in views)
         opened.learn(Recording("room", frames, ()), memory="50%")
     return root
@@ -136,7 +146,9 @@ def _large_map(learned: Path, root: Path, keys: np.ndarray) -> Path:
 def _asked(root: Path) -> Row:
     """Time to open a map, memory, and time of its images, in a process of its own."""
     command = python_command("-c", _ASK, str(root))
-    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    return json.loads(
+        subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    )
 
 
 _ASK = """
@@ -170,13 +182,19 @@ print(json.dumps({**row, "median_ms": float(np.median(times[len(images):]))}))
 
 
 def _right(bank: KeyframeBank, queries: list[tuple[int, np.ndarray]]) -> Row:
-    first, among = 0, 0
+    first = 0
+    among = 0
     for scene, query in queries:
         (similarity,) = bank.similarity(query.astype(np.float32))
         proposed = bank.scene[bank.ranked(similarity, ATTEMPT.retrieved)]
-        first, among = first + (proposed[0] == scene), among + (scene in proposed)
+        first = first + (proposed[0] == scene)
+        among = among + (scene in proposed)
     count = len(queries)
-    return {"images": count, "first": 100 * first / count, "proposed": 100 * among / count}
+    return {
+        "images": count,
+        "first": 100 * first / count,
+        "proposed": 100 * among / count,
+    }
 
 
 def _ranked(bank: KeyframeBank, queries: list[np.ndarray]) -> None:
@@ -200,9 +218,13 @@ def _milliseconds(work: Callable[[], None], times: int = 10) -> float:
 
 def _bank(keys: np.ndarray) -> KeyframeBank:
     """A bank of descriptors (scenes, keyframes, width) alone; nothing can be loaded from it."""
-    camera, empty = default_camera(), (b"",) * keys.shape[1]
+    camera = default_camera()
+    empty = (b"",) * keys.shape[1]
     poses = SE3.identity((keys.shape[1],))
-    made = [Keyframes(empty, (camera,) * len(empty), poses, descriptors=each) for each in keys]
+    made = [
+        Keyframes(empty, (camera,) * len(empty), poses, descriptors=each)
+        for each in keys
+    ]
     frame = MapFrame()
     scenes = [SceneMap(str(n), camera, camera, k, frame, 0) for n, k in enumerate(made)]
     return KeyframeBank(MapContents(load_encoder(), SIDE, scenes), 1)
@@ -210,18 +232,23 @@ def _bank(keys: np.ndarray) -> KeyframeBank:
 
 def _packaged(encoder: Encoder) -> tuple[np.ndarray, list[np.ndarray]]:
     """Descriptors of 50 training images of each packaged room, and of its queries."""
-    keys, queries = [], []
+    keys = []
+    queries = []
     for room in sample_rooms():
-        train, test = room.scene.train, room.scene.test
+        train = room.scene.train
+        test = room.scene.test
         few = np.linspace(0, len(train) - 1, KEYFRAMES).astype(int)
         keys.append([_described(encoder, train[i].read_image()) for i in few])
-        queries.append(np.array([_described(encoder, f.read_image()) for f in test[::10]]))
+        queries.append(
+            np.array([_described(encoder, f.read_image()) for f in test[::10]])
+        )
     return np.array(keys, np.float16), queries
 
 
 def descriptors(out: Path, scenes: int) -> list[Path]:
     """Draw rooms and describe their keyframes; complete files are not repeated."""
-    encoder, files = load_encoder(), []
+    encoder = load_encoder()
+    files = []
     for first in tqdm(range(0, scenes, AT_ONCE), unit="file"):
         file = out / f"rooms-{first:06d}.npz"
         files.append(file)
@@ -237,10 +264,14 @@ def descriptors(out: Path, scenes: int) -> list[Path]:
 
 def _room(encoder: Encoder, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Descriptors (50, width) of the keyframes of a room, and (0 or 5, width) of queries."""
-    room, camera = BoxRoom(FIRST_SEED + number, texture_px=TEXTURE_PX), default_camera()
+    room = BoxRoom(FIRST_SEED + number, texture_px=TEXTURE_PX)
+    camera = default_camera()
     path = room.path(2 * KEYFRAMES, number)
     queries = QUERIES if number < QUERIED else 0
-    numbers = [*range(0, 2 * KEYFRAMES, 2), *range(1, 2 * KEYFRAMES, 2 * KEYFRAMES // QUERIES)]
+    numbers = [
+        *range(0, 2 * KEYFRAMES, 2),
+        *range(1, 2 * KEYFRAMES, 2 * KEYFRAMES // QUERIES),
+    ]
     vectors = []
     for i in numbers[: KEYFRAMES + queries]:
         image = room.render(camera, path[i])

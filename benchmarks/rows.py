@@ -15,7 +15,9 @@ Rows = TypeVar("Rows", Row, list[Row])
 
 
 def save(
-    out: Path, rows: Sequence[Mapping[str, object]], settings: Mapping[str, object] | None = None
+    out: Path,
+    rows: Sequence[Mapping[str, object]],
+    settings: Mapping[str, object] | None = None,
 ) -> None:
     """Write rows and their settings as results/ has them, and print the rows.
 

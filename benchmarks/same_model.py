@@ -32,7 +32,9 @@ INSIDE_95 = 7.815
 """95 % quantile of a squared deviation in three dimensions (chi-squared)."""
 
 
-def run(out: Path = Path("runs/same-model.csv"), cameras: int = 8, every: int = 3) -> None:
+def run(
+    out: Path = Path("runs/same-model.csv"), cameras: int = 8, every: int = 3
+) -> None:
     """Locate test images of the packaged rooms as other cameras of the same model see them.
 
     The images are of the recording's own camera and of others. No camera is stated, or the
@@ -59,7 +61,11 @@ def run(out: Path = Path("runs/same-model.csv"), cameras: int = 8, every: int = 
             fixed += [room.fixed.test[:FIXED_IMAGES]] if room.fixed else []
         for name, changes in (("own", np.zeros((1, 4))), ("another", draws)):
             images = [_seen(frame, change) for change in changes for frame in frames]
-            views = [[_seen(frame, change) for frame in of] for change in changes for of in fixed]
+            views = [
+                [_seen(frame, change) for frame in of]
+                for change in changes
+                for of in fixed
+            ]
             choices: dict[str, Callable[[Frame], Camera | None]] = {
                 "none": lambda _: None,
                 "the recording's": lambda _: recorded,
@@ -71,7 +77,9 @@ def run(out: Path = Path("runs/same-model.csv"), cameras: int = 8, every: int = 
                 answers = _answers(learned, images, given)
                 rows.append({"answer": "image", **what, **_summary(answers, images)})
                 first = [of[0] for of in views]
-                rows.append({"answer": "fixed camera", **what, **_summary(poses, first)})
+                rows.append(
+                    {"answer": "fixed camera", **what, **_summary(poses, first)}
+                )
     settings = {"cameras": cameras, "every": every, "draws": draws.round(5).tolist()}
     save(out, rows, settings)
 
@@ -79,13 +87,16 @@ def run(out: Path = Path("runs/same-model.csv"), cameras: int = 8, every: int = 
 def _seen(frame: Frame, change: np.ndarray) -> Frame:
     """The middle of a frame as a camera with changed intrinsics (4,) sees it, see `SPREAD`."""
     own = frame.camera
-    left, top = round(MARGIN * own.width), round(MARGIN * own.height)
+    left = round(MARGIN * own.width)
+    top = round(MARGIN * own.height)
     middle = cropped(own, left, top, own.width - 2 * left, own.height - 2 * top)
     zoomed, (x, y) = middle.zoomed(1 + change[0]), change[1:3] * own.width
     camera = replace(zoomed, cx=middle.cx + x, cy=middle.cy + y)
     if change[3]:
         camera = replace(camera, distortion=(float(change[3]), 0.0, 0.0, 0.0))
-    return replace(frame, image=View(camera).render(frame.read_image(), own), camera=camera)
+    return replace(
+        frame, image=View(camera).render(frame.read_image(), own), camera=camera
+    )
 
 
 def _answers(
@@ -98,7 +109,9 @@ def _answers(
     return list(in_parallel(located, frames))
 
 
-def _calibrated(learned: Map, frames: Sequence[Frame], camera: Camera | None) -> UncertainPose:
+def _calibrated(
+    learned: Map, frames: Sequence[Frame], camera: Camera | None
+) -> UncertainPose:
     found = learned.calibrate([frame.read_image() for frame in frames], camera=camera)
     return UncertainPose(found.parent_from_child, found.covariance)
 
@@ -107,7 +120,9 @@ def _summary(
     answers: Sequence[UncertainPose | None], frames: Sequence[Frame]
 ) -> Mapping[str, object]:
     """Errors in millimetres, and whether the covariance contains them."""
-    errors, deviations, sigmas = [], [], []
+    errors = []
+    deviations = []
+    sigmas = []
     for pose, frame in zip(answers, frames, strict=True):
         truth = frame.base_from_camera
         if pose is not None and truth is not None:
@@ -116,7 +131,8 @@ def _summary(
             errors.append(1000 * np.linalg.norm(off))
             deviations.append(off @ np.linalg.solve(covariance, off))
             sigmas.append(1000 * np.sqrt(np.trace(covariance) / 3))
-    mm, squared = np.array(errors), np.array(deviations)
+    mm = np.array(errors)
+    squared = np.array(deviations)
     return {
         "answers": len(frames),
         "located": len(errors),

@@ -32,7 +32,8 @@ TRIPOD_IMAGES = 12
 JPEG_QUALITY = 85
 NOISE_M, NOISE_RAD = 0.0002, np.deg2rad(0.02)
 """Standard deviation per axis of the noise on stated gripper poses."""
-BUMP_M, BUMP_RAD = 0.005, np.deg2rad(0.3)
+BUMP_M = 0.005
+BUMP_RAD = np.deg2rad(0.3)
 
 _SEED = 22
 _WRIST_CENTRE_RAD = np.array([0.4, -1.0, 0.0, -2.3, -0.6, 1.8, 1.1])
@@ -64,10 +65,14 @@ def render_sample_cell(out: Path) -> None:
     def take(path: Path, joints: np.ndarray, base_from_camera: SE3) -> None:
         renderer.move({mesh.name: mesh for mesh, _ in panda_meshes(joints)})
         seed = int.from_bytes(path.relative_to(out).as_posix().encode()) % 2**31
-        write_jpeg(path, renderer.render(camera, base_from_camera, options, seed), JPEG_QUALITY)
+        write_jpeg(
+            path, renderer.render(camera, base_from_camera, options, seed), JPEG_QUALITY
+        )
 
     for i, joints in enumerate(wrist_joints):
-        take(out / f"wrist/images/{i:04d}.jpg", joints, grippers[i] @ gripper_from_camera)
+        take(
+            out / f"wrist/images/{i:04d}.jpg", joints, grippers[i] @ gripper_from_camera
+        )
     for i, joints in enumerate(work_joints[:-1]):
         take(out / f"tripod/{i:04d}.jpg", joints, tripod)
     take(out / "bumped.jpg", work_joints[-1], bumped)
@@ -108,22 +113,30 @@ def _bump() -> SE3:
     return SE3.exp(np.concatenate([BUMP_M * directions[0], BUMP_RAD * directions[1]]))
 
 
-def _arm_path(count: int, centre: np.ndarray, spread: np.ndarray, stream: int) -> np.ndarray:
+def _arm_path(
+    count: int, centre: np.ndarray, spread: np.ndarray, stream: int
+) -> np.ndarray:
     rng = np.random.default_rng([_SEED, stream])
     t = np.linspace(0, 2 * np.pi, count, endpoint=False)[:, None]
     cycles = np.array([1.0, 2.0, 1.0, 2.0, 2.0, 1.0, 2.0])
     phase = rng.uniform(0, 2 * np.pi, (2, 7))
-    wave = 0.75 * np.sin(cycles * t + phase[0]) + 0.25 * np.sin(2 * cycles * t + phase[1])
+    wave = 0.75 * np.sin(cycles * t + phase[0]) + 0.25 * np.sin(
+        2 * cycles * t + phase[1]
+    )
     return centre + spread * wave
 
 
 def _write_gripper_poses(path: Path, grippers: SE3) -> None:
     sigma = np.repeat([NOISE_M, NOISE_RAD], 3)
-    noise = sigma * np.random.default_rng([_SEED, 4]).standard_normal((len(grippers), 6))
+    noise = sigma * np.random.default_rng([_SEED, 4]).standard_normal(
+        (len(grippers), 6)
+    )
     rows = ["image,x,y,z,qw,qx,qy,qz"]
     for i, pose in enumerate(grippers @ SE3.exp(noise)):
         numbers = [*pose.translation_m, *pose.rotation_wxyz]
-        rows.append(",".join([f"{i:04d}.jpg", *(f"{number:.7f}" for number in numbers)]))
+        rows.append(
+            ",".join([f"{i:04d}.jpg", *(f"{number:.7f}" for number in numbers)])
+        )
     write_bytes(path, ("\n".join(rows) + "\n").encode())
 
 

@@ -49,7 +49,8 @@ def run(
         clients: Clients that ask at the same time.
         out: File of the rows.
     """
-    opened, images = Map.open(store), []
+    opened = Map.open(store)
+    images = []
     for path in scenes:
         recording = load_recording(path)
         if recording.name not in opened.scenes:
@@ -77,7 +78,9 @@ class _Service:
 
     process: subprocess.Popen[str]
     url: str
-    pool: urllib3.PoolManager = field(default_factory=lambda: urllib3.PoolManager(maxsize=16))
+    pool: urllib3.PoolManager = field(
+        default_factory=lambda: urllib3.PoolManager(maxsize=16)
+    )
 
     @property
     def resident_mb(self) -> float:
@@ -94,12 +97,17 @@ class _Service:
 
     def _memory(self, name: str) -> float:
         lines = Path(f"/proc/{self.process.pid}/status").read_text().splitlines()
-        return next(float(line.split()[1]) for line in lines if line.startswith(name)) / 1000
+        return (
+            next(float(line.split()[1]) for line in lines if line.startswith(name))
+            / 1000
+        )
 
     def localize(self, image: bytes) -> int:
         """Locate an image, and return the status."""
         fields = {"image": ("image.jpg", image, "image/jpeg")}
-        return self.pool.request("POST", f"{self.url}/localize", fields=fields, retries=0).status
+        return self.pool.request(
+            "POST", f"{self.url}/localize", fields=fields, retries=0
+        ).status
 
     def send(self, data: bytes) -> int:
         """Send bytes, and return the status; 0 without an answer."""
@@ -115,7 +123,9 @@ class _Service:
 
 @contextmanager
 def _served(store: Path) -> Iterator[_Service]:
-    command = python_command("-m", "evercal", "serve", str(store), "--port", "0", "--json")
+    command = python_command(
+        "-m", "evercal", "serve", str(store), "--port", "0", "--json"
+    )
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
@@ -139,7 +149,9 @@ def _decoded(data: bytes) -> np.ndarray:
     return image
 
 
-def _pairs(opened: Map, service: _Service, images: list[bytes], requests: int) -> list[Row]:
+def _pairs(
+    opened: Map, service: _Service, images: list[bytes], requests: int
+) -> list[Row]:
     def direct(number: int) -> None:
         opened.localize(_decoded(images[number % len(images)]))
 
@@ -171,7 +183,9 @@ def _mixed(
         else:
             assert 400 <= service.send(malformed(number)) < 500
 
-    def timed(work: Callable[[int], None], count: int, workers: int) -> tuple[np.ndarray, float]:
+    def timed(
+        work: Callable[[int], None], count: int, workers: int
+    ) -> tuple[np.ndarray, float]:
         began = time.perf_counter()
         with ThreadPoolExecutor(workers) as pool:
             times = np.array(list(pool.map(lambda i: _ms(work, i), range(count))))
@@ -185,17 +199,25 @@ def _mixed(
     ):
         times, seconds = timed(work, number, workers)
         located = good if work is ask else number
-        yield _row(part, times) | {"per_second": located / seconds, "mb": service.resident_mb}
+        yield _row(part, times) | {
+            "per_second": located / seconds,
+            "mb": service.resident_mb,
+        }
 
 
 def _bad(service: _Service, count: int) -> Row:
     """Malformed requests one after the other, and /health at the same time."""
-    idle, statuses, health, done = service.resident_mb, Counter[str](), list[float](), False
+    idle = service.resident_mb
+    statuses = Counter[str]()
+    health = list[float]()
+    done = False
     service.forget_peak()
 
     def ask_health() -> None:
         while not done:
-            health.append(_ms(lambda _: service.pool.request("GET", f"{service.url}/health"), 0))
+            health.append(
+                _ms(lambda _: service.pool.request("GET", f"{service.url}/health"), 0)
+            )
             time.sleep(0.02)
 
     asking = threading.Thread(target=ask_health)
@@ -230,7 +252,10 @@ def _memory(service: _Service, images: list[bytes], count: int, clients: int) ->
             times += pool.map(ask, part)
         marks.append(service.resident_mb)
         print(f"{len(times)} requests, {marks[-1]:.0f} MB", flush=True)
-    return _row(f"{clients} clients", np.array(times)) | {"mb": marks[0], "peak_mb": max(marks)}
+    return _row(f"{clients} clients", np.array(times)) | {
+        "mb": marks[0],
+        "peak_mb": max(marks),
+    }
 
 
 def _end(service: _Service, images: list[bytes], clients: int) -> Row:
@@ -260,4 +285,10 @@ def _ms(work: Callable[[int], object], number: int) -> float:
 
 def _row(name: str, milliseconds: np.ndarray) -> Row:
     p50, p95, p99 = np.percentile(milliseconds, [50, 95, 99])
-    return {"measured": name, "requests": len(milliseconds), "p50": p50, "p95": p95, "p99": p99}
+    return {
+        "measured": name,
+        "requests": len(milliseconds),
+        "p50": p50,
+        "p95": p95,
+        "p99": p99,
+    }

@@ -104,32 +104,55 @@ def run(
         values = [float(np.median([m[name] for m in measured])) for measured in found]
         row: dict[str, str | float] = {"what": name, "now": values[-1]}
         rows.append(
-            row if beside is None else {**row, "beside": values[0], "ratio": values[-1] / values[0]}
+            row
+            if beside is None
+            else {**row, "beside": values[0], "ratio": values[-1] / values[0]}
         )
     save(out, rows, {"repeat": repeat, "avx2": avx2, "scene": scene and scene.name})
 
 
-def _measured(tree: Path, scene: Path | None, avx2: bool, demo: bool) -> dict[str, float]:
-    environment = {**os.environ, "PYTHONPATH": str(tree / "src"), **(_AVX2 if avx2 else {})}
+def _measured(
+    tree: Path, scene: Path | None, avx2: bool, demo: bool
+) -> dict[str, float]:
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(tree / "src"),
+        **(_AVX2 if avx2 else {}),
+    }
 
     def called(*words: str) -> tuple[str, float, float, float]:
         """Output, seconds, processor seconds and peak MB of a process."""
         command = python_command(*words)
         with tempfile.TemporaryFile() as printed:
             process = subprocess.Popen(
-                command, stdout=printed, stderr=subprocess.DEVNULL, env=environment, cwd=tree
+                command,
+                stdout=printed,
+                stderr=subprocess.DEVNULL,
+                env=environment,
+                cwd=tree,
             )
             began = os.times().elapsed
             _, status, used = os.wait4(process.pid, 0)
             if status:
-                raise InputError(f"{tree}: {' '.join(words)[:40]!r} ended with {status}")
+                raise InputError(
+                    f"{tree}: {' '.join(words)[:40]!r} ended with {status}"
+                )
             printed.seek(0)
             busy = used.ru_utime + used.ru_stime
-            return printed.read().decode(), os.times().elapsed - began, busy, used.ru_maxrss / 1024
+            return (
+                printed.read().decode(),
+                os.times().elapsed - began,
+                busy,
+                used.ru_maxrss / 1024,
+            )
 
     with tempfile.TemporaryDirectory() as scratch:
-        found = json.loads(called("-c", _MEASURE, scratch, str(scene or ""))[0].splitlines()[-1])
-        images = sorted(map(str, _ROOT.glob("src/evercal/recordings/sample_rooms/*/images/*")))[::4]
+        found = json.loads(
+            called("-c", _MEASURE, scratch, str(scene or ""))[0].splitlines()[-1]
+        )
+        images = sorted(
+            map(str, _ROOT.glob("src/evercal/recordings/sample_rooms/*/images/*"))
+        )[::4]
         locate = ["-m", "evercal", "localize", f"{scratch}/whole", "--json"]
         _, _, found["cold start, processor s"], _ = called(*locate, images[0])
         _, _, _, found["peak of locating, MB"] = called(*locate, *images)

@@ -33,7 +33,10 @@ def run(figure: bool = False) -> None:
 def markdown(table: Table) -> str:
     """Format a table as the pages have it: without padding, numbers to the right."""
     text = table.to_markdown(index=False, disable_numparse=True, tablefmt="pipe")
-    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()]
+    lines = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in text.splitlines()
+    ]
     lines[1] = ["---", *["---:"] * (len(lines[0]) - 1)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -48,12 +51,16 @@ def _rows(columns: str, *names: str) -> Callable[[], Table]:
     def table() -> Table:
         rows: Table = pd.concat([rows_of(name) for name in names])[columns.split(",")]
         cells = rows.map(lambda v: f"{v:.3g}" if isinstance(v, float) else str(v))
-        return cells.replace("nan", "").rename(columns=lambda name: name.replace("_", " "))
+        return cells.replace("nan", "").rename(
+            columns=lambda name: name.replace("_", " ")
+        )
 
     return table
 
 
-def _accuracy(title: str, groups: Sequence[tuple[str, str, str]]) -> Callable[[], Table]:
+def _accuracy(
+    title: str, groups: Sequence[tuple[str, str, str]]
+) -> Callable[[], Table]:
     """Return a table of rooms: shares of all frames, means of the rooms' medians.
 
     Args:
@@ -86,9 +93,14 @@ def _degraded() -> Table:
     """Degraded images; each such row of the file is a mean over the three rooms."""
     rows = rows_of("mini").iloc[4:]
     changed = rows["scene"].str.endswith("changed")
-    groups = [(row.scene, rows.loc[[row.Index]], 3) for row in rows[~changed].itertuples()]
+    groups = [
+        (row.scene, rows.loc[[row.Index]], 3) for row in rows[~changed].itertuples()
+    ]
     table = []
-    for title, group, rooms in [*groups, ("after a change in the room", rows[changed], 1)]:
+    for title, group, rooms in [
+        *groups,
+        ("after a change in the room", rows[changed], 1),
+    ]:
         refused, frames = (rooms * group[key].sum() for key in ("refused", "frames"))
         cells = {"sim-mini, degraded images": title}
         cells["1 cm/1 deg"] = _share(group["1 cm/1 deg"].mean())
@@ -117,8 +129,12 @@ def _bad_poses() -> Table:
     table = []
     for kind, group in rows.groupby(rows["scene"].str.split().str[0], sort=False):
         first = group.iloc[0]
-        common = f"{first['common_error_mm']:.3f} mm, {first['common_error_deg']:.3f} deg"
-        reported = f"{group['named'].sum():.0f} of {group['planted'].sum():.0f} reported"
+        common = (
+            f"{first['common_error_mm']:.3f} mm, {first['common_error_deg']:.3f} deg"
+        )
+        reported = (
+            f"{group['named'].sum():.0f} of {group['planted'].sum():.0f} reported"
+        )
         title, estimate = {
             "none": ("correct poses", f"common offset of {common}"),
             "noise": (
@@ -148,7 +164,8 @@ def _bad_poses() -> Table:
 
 def _trials() -> Table:
     """`calibration wrist` and `fixed`: cameras from images alone."""
-    wrist, fixed = rows_of("wrist"), rows_of("fixed-sim7").query("images == 25")
+    wrist = rows_of("wrist")
+    fixed = rows_of("fixed-sim7").query("images == 25")
     mount = "`gripper_from_camera`, without an initial value, packaged rooms, gripper poses to"
     table = []
     for title, rows, prefix in (
@@ -156,7 +173,8 @@ def _trials() -> Table:
         ("then `base_from_camera` of a fixed camera in that map", wrist, "fixed_"),
         ("fixed, 25 images, sim-7, version 0.1.0", fixed, ""),
     ):
-        mm, deg = rows[f"{prefix}mm"], rows[f"{prefix}deg"]
+        mm = rows[f"{prefix}mm"]
+        deg = rows[f"{prefix}deg"]
         inside = (rows[f"{prefix}squared_mahalanobis"] < CHI2_6).sum()
         cells = {"camera, from images alone": title, "trials": len(rows)}
         cells["median"] = f"{mm.median():.2f} mm, {deg.median():.3f} deg"
@@ -186,7 +204,11 @@ def _tuning(name: str, suite: str) -> Callable[[], Table]:
             best = int(trials["auc_20cm"].to_numpy().argmax())
             cells[best] = f"**{cells[best]}**"
             values = ", ".join(f"{value:g}" for value in trials["value"])
-            line = {"method": method, "setting": trials["setting"].iloc[0], "trials": values}
+            line = {
+                "method": method,
+                "setting": trials["setting"].iloc[0],
+                "trials": values,
+            }
             lines.append(line | {suite: ", ".join(cells)})
         return pd.DataFrame(lines)
 
@@ -226,7 +248,8 @@ TABLES: dict[str, Callable[[], Table]] = {
     "results: wrong training poses": _bad_poses,
     "results: fixed cameras": _fixed,
     "results: another camera of the model": _rows(
-        "answer,camera,stated,answers,located,median_mm,95_%_mm,inside_95_%,wrong", "same-model"
+        "answer,camera,stated,answers,located,median_mm,95_%_mm,inside_95_%,wrong",
+        "same-model",
     ),
     "results: speed": _rows("what,beside,now,ratio", "speed"),
     "speed: AVX2": _rows("what,beside,now,ratio", "speed-avx2"),
@@ -236,14 +259,17 @@ TABLES: dict[str, Callable[[], Table]] = {
         "handeye-boards",
     )().query("not condition.str.startswith('two sessions')"),
     "boards: sessions": lambda: _rows(
-        "condition,trials,median_mm,inside_95,truth_d2,answers_d2,lens_d2", "handeye-boards"
+        "condition,trials,median_mm,inside_95,truth_d2,answers_d2,lens_d2",
+        "handeye-boards",
     )().query("`truth d2` != ''"),
     "handeye: a thing in the gripper": _rows(
         "condition,method,draws,refused,mm,mm_90,deg,sigma_mm,inside_95,squared_mahalanobis",
         "eye-to-hand",
     ),
     "boards: mistakes": _rows("mistake,draws,refused,warned,named,safe", "mistakes"),
-    "boards: detection": _rows("board,tilt_deg,finder,found,any_of_opencv,rms_px,ms", "boards"),
+    "boards: detection": _rows(
+        "board,tilt_deg,finder,found,any_of_opencv,rms_px,ms", "boards"
+    ),
     "results: cameras from images": _trials,
     "handeye: bumps": _bump,
     "joints: arms": _rows(
@@ -255,7 +281,9 @@ TABLES: dict[str, Callable[[], Table]] = {
         "queries,keyframes,images,first,proposed,one_image_ms,four_turns_ms,before_ms,megabytes",
         "retrieval",
     ),
-    "scale: maps": _rows("scenes,open_s,own_mb,images,right,wrong,median_ms", "large-maps"),
+    "scale: maps": _rows(
+        "scenes,open_s,own_mb,images,right,wrong,median_ms", "large-maps"
+    ),
     "scale: cluster": _rows(
         "way,wall_s,processor_s,killed,same_map,images_per_s,median_ms,processor_ms,same_answers",
         "cluster",
@@ -283,7 +311,11 @@ TABLES: dict[str, Callable[[], Table]] = {
                 "twelve-bedroom-1,twelve-bedroom-2,twelve-kitchen-1,twelve-kitchen-2,"
                 "twelve-living-1,twelve-living-2",
             ),
-            ("sim, its three rooms, 1,000 frames each", "long", "bedroom,kitchen,living"),
+            (
+                "sim, its three rooms, 1,000 frames each",
+                "long",
+                "bedroom,kitchen,living",
+            ),
         ],
     ),
     "streams: refresh": _rows(
@@ -300,12 +332,18 @@ TABLES: dict[str, Callable[[], Table]] = {
     "network: contrasts": network_tables.contrasts,
     "network: machines": network_tables.environments,
     "network-checks: unseen rooms": network_tables.summary("networks-c"),
-    "network-checks: unseen rooms, one run": network_tables.summary("networks-c", single=True),
-    "network-checks: the paper's network": network_tables.summary("networks-paper", single=True),
+    "network-checks: unseen rooms, one run": network_tables.summary(
+        "networks-c", single=True
+    ),
+    "network-checks: the paper's network": network_tables.summary(
+        "networks-paper", single=True
+    ),
     "network-checks: the paper's head": network_tables.summary("networks-b"),
     "network-checks: memory": network_tables.memory,
     "network-checks: real rooms": network_tables.summary("networks-real"),
     "network-trials: tuning": _tuning("tuned-converged", "sim-tune"),
-    "network-trials: tuning of the paper's head": _tuning("tuned-paper-head", "sim-tune"),
+    "network-trials: tuning of the paper's head": _tuning(
+        "tuned-paper-head", "sim-tune"
+    ),
 }
 """Tables by page and title."""

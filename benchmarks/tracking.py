@@ -34,7 +34,9 @@ EVERY = 5
 
 def pose_at(s: float) -> SE3:
     """Return base_from_camera on a closed path, 0.4 m/s where s rises by 1 a second."""
-    eye = np.array([0.5 * np.sin(s), 0.4 * np.sin(0.7 * s + 1), 1.3 + 0.15 * np.sin(1.3 * s)])
+    eye = np.array(
+        [0.5 * np.sin(s), 0.4 * np.sin(0.7 * s + 1), 1.3 + 0.15 * np.sin(1.3 * s)]
+    )
     heading = 34 + 0.6 * np.sin(0.5 * s)
     ahead = np.array([np.cos(heading), np.sin(heading), 0.1 * np.sin(s)])
     return look_at(eye, eye + ahead, 0.1 * np.sin(0.9 * s))
@@ -66,7 +68,8 @@ def run(
         out: File of the row.
     """
     room = BoxRoom(seed, texture_px=256 if width < 400 else 512)
-    camera, rng = default_camera(width, width * 3 // 4), np.random.default_rng(seed)
+    camera = default_camera(width, width * 3 // 4)
+    rng = np.random.default_rng(seed)
     localizer = Localizer(_learned(room, camera))
     localizer.localize(room.render(camera, pose_at(0.5)))  # loads and encodes keyframes
     tracker = Tracker(localizer, options=TrackOptions(at_most_ms=at_most))
@@ -74,14 +77,18 @@ def run(
     dark = {i for first, end in COVERED for i in range(first, end)}
     tracked: list[tuple[int, TrackedFrame, float]] = []
     singles: list[tuple[int, PoseEstimate, float]] = []
-    places, start = path(count), time.perf_counter()
+    places = path(count)
+    start = time.perf_counter()
     for i in tqdm(range(count), unit="frame"):
         if i in gone:
             continue
         image = room.render(camera, pose_at(places[i]))
         noisy = image + rng.normal(0, 3, image.shape)
-        image = np.zeros_like(image) if i in dark else noisy.clip(0, 255).astype(np.uint8)
-        if at_most is not None:  # what goes on in the background has as much time as it would
+        image = (
+            np.zeros_like(image) if i in dark else noisy.clip(0, 255).astype(np.uint8)
+        )
+        # What goes on in the background has as much time as it would.
+        if at_most is not None:
             time.sleep(max(0.0, start + i / RATE - time.perf_counter()))
         began = time.perf_counter()
         frame = tracker.track(image, i / RATE)
@@ -102,7 +109,9 @@ def run(
         "tracking": sum(f.state == "tracking" for _, f, _ in seen),
         "relocalized": sum(f.state == "relocalized" for _, f, _ in seen),
         "lost": sum(f.state == "lost" for _, f, _ in seen),
-        "found_while_covered": sum(f.state != "lost" for i, f, _ in tracked if i in dark),
+        "found_while_covered": sum(
+            f.state != "lost" for i, f, _ in tracked if i in dark
+        ),
         "frames_until_found": _recovery(tracked, dark),
         "wrong_10_mm": sum(error > 10 for error in errors),
         "median_mm": float(np.median(errors)),
@@ -113,7 +122,9 @@ def run(
         "ms_p99": float(np.quantile(ms, 0.99)),
         "tracking_ms_p50": float(np.median(near)),
         "all_ms_p99": float(np.quantile([ms for _, _, ms in tracked], 0.99)),
-        "over_budget": 0 if at_most is None else sum(ms > at_most for _, _, ms in tracked),
+        "over_budget": 0
+        if at_most is None
+        else sum(ms > at_most for _, _, ms in tracked),
         "per_second": 1000 / float(np.mean(ms)),
         "single_ms_p50": float(np.median(single_ms)),
     }
@@ -125,7 +136,8 @@ def _learned(room: BoxRoom, lens: Camera) -> MapContents:
         Frame(f"{i}", room.render(lens, pose_at(s)), lens, pose_at(s))
         for i, s in enumerate(np.linspace(0, 12.5, 100))
     ]
-    split, encoder = split_held_out(frames), load_encoder()
+    split = split_held_out(frames)
+    encoder = load_encoder()
     built = build_map("room", split.train, encoder, MapOptions(memory=MemoryBudget()))
     contents = MapContents(encoder, 240, [built.scene])
     scene = with_scatter(
@@ -143,7 +155,8 @@ def _errors(answers: Iterable[tuple[PoseEstimate, SE3]]) -> list[float]:
 
 
 def _recovery(tracked: list[tuple[int, TrackedFrame, float]], dark: set[int]) -> int:
-    longest, waiting = 0, 0
+    longest = 0
+    waiting = 0
     for i, frame, _ in tracked:
         waiting = 0 if i in dark else waiting + 1
         if frame.state != "lost":

@@ -74,9 +74,17 @@ def run(
         rows = lens(folders, out, images)
     else:
         count = DRAWS[what] if draws is None else draws
-        rows = few(folders, out, count, sizes) if what == "few" else arm(folders, out, count)
+        rows = (
+            few(folders, out, count, sizes)
+            if what == "few"
+            else arm(folders, out, count)
+        )
     save(out / f"{what}.csv", rows)
-    show(summary(rows, {"lens": ["what", "case"], "few": ["images"], "arm": ["room"]}[what]))
+    show(
+        summary(
+            rows, {"lens": ["what", "case"], "few": ["images"], "arm": ["room"]}[what]
+        )
+    )
 
 
 def summary(rows: Sequence[Row], by: Sequence[str]) -> Table:
@@ -85,7 +93,8 @@ def summary(rows: Sequence[Row], by: Sequence[str]) -> Table:
     table["wrong"] = wrong(table["mm"], table["squared_mahalanobis"])
     table["inside"] = 100.0 * (table["squared_mahalanobis"] < CHI2_6)
     table["1 cm/1 deg %"] = 100.0 * ((table["mm"] < 10) & (table["deg"] < 1))
-    of, answered = table.groupby(by, sort=False), table[table["status"] == "ok"]
+    of = table.groupby(by, sort=False)
+    answered = table[table["status"] == "ok"]
     located = answered.groupby(by, sort=False)
     columns = {"n": of.size(), "located": located.size()}
     for unit in ("mm", "deg"):
@@ -96,7 +105,8 @@ def summary(rows: Sequence[Row], by: Sequence[str]) -> Table:
         if f"sigma_{unit}" in table:
             columns[f"sigma {unit}"] = located[f"sigma_{unit}"].median()
     columns["in ellipsoid %"] = located["inside"].mean()
-    columns["1 cm/1 deg %"], columns["wrong"] = of["1 cm/1 deg %"].mean(), of["wrong"].sum()
+    columns["1 cm/1 deg %"] = of["1 cm/1 deg %"].mean()
+    columns["wrong"] = of["wrong"].sum()
     return pd.DataFrame(columns, index=of.size().index).reset_index()
 
 
@@ -121,7 +131,9 @@ def cases() -> dict[str, Case]:
         found[f"stated focal {percent:+g} %"] = Case(View, 1 + percent / 100)
     for deg in ROLLS_DEG:
         found[f"roll {deg}"] = Case(partial(rolled, roll_deg=deg))
-        found[f"roll {deg}, true camera stated"] = Case(partial(rolled, roll_deg=deg), 1.0)
+        found[f"roll {deg}, true camera stated"] = Case(
+            partial(rolled, roll_deg=deg), 1.0
+        )
     return found
 
 
@@ -138,8 +150,11 @@ def lens(rooms: Sequence[Path], out: Path, images: int | None) -> list[Row]:
     return rows
 
 
-def _lens_draw(localizer: Localizer, room: Path, case: Case, count: int | None) -> list[Row]:
-    scene, fixed = load_recording(room), load_recording(room / "calibration" / "fixed")
+def _lens_draw(
+    localizer: Localizer, room: Path, case: Case, count: int | None
+) -> list[Row]:
+    scene = load_recording(room)
+    fixed = load_recording(room / "calibration" / "fixed")
     frames = [seen(frame, case) for frame in posed_frames(scene.test)[:count]]
     views = [seen(frame, case) for frame in fixed.test[:count]]
     return [*_located(localizer, scene, frames, case), _camera(localizer, views, case)]
@@ -147,7 +162,8 @@ def _lens_draw(localizer: Localizer, room: Path, case: Case, count: int | None) 
 
 def seen(frame: Frame, case: Case) -> Frame:
     """Return a frame as a case sees it, with its true intrinsics and pose."""
-    view, pose = case.view(frame.camera), frame.base_from_camera
+    view = case.view(frame.camera)
+    pose = frame.base_from_camera
     assert pose is not None
     image = view.render(frame.read_image(), frame.camera)
     true = pose @ view.own_from_view
@@ -181,14 +197,19 @@ def _located(
             "what": "image",
             "name": result.frame,
             "status": result.status,
-            "mm": 1000 * result.translation_error_m if result.status == "ok" else np.nan,
-            "deg": np.rad2deg(result.rotation_error_rad) if result.status == "ok" else np.nan,
+            "mm": 1000 * result.translation_error_m
+            if result.status == "ok"
+            else np.nan,
+            "deg": np.rad2deg(result.rotation_error_rad)
+            if result.status == "ok"
+            else np.nan,
             "squared_mahalanobis": squared,
         }
 
 
 def _camera(localizer: Localizer, frames: Sequence[Frame], case: Case) -> Row:
-    true, pose = frames[0].camera, frames[0].base_from_camera
+    true = frames[0].camera
+    pose = frames[0].base_from_camera
     assert pose is not None
     images = [(frame.name, frame.read_image()) for frame in frames]
     row: Row = {"what": "fixed camera", "name": "fixed"}
@@ -205,9 +226,13 @@ def _camera(localizer: Localizer, frames: Sequence[Frame], case: Case) -> Row:
     return row | pose_error(calibration.uncertain_pose, pose)
 
 
-def few(rooms: Sequence[Path], out: Path, draws: int, sizes: Sequence[int]) -> list[Row]:
+def few(
+    rooms: Sequence[Path], out: Path, draws: int, sizes: Sequence[int]
+) -> list[Row]:
     """Calibrate a wrist camera from few images of every room."""
-    jobs = [(room, size, draw) for room in rooms for size in sizes for draw in range(draws)]
+    jobs = [
+        (room, size, draw) for room in rooms for size in sizes for draw in range(draws)
+    ]
     rows = []
     for room, size, draw in tqdm(jobs, "few images"):
         path = out / "few" / _file(room.name, size, draw)
@@ -251,7 +276,9 @@ def _mount(recording: Recording, truth: SE3, store: Path) -> Row:
 def arm(rooms: Sequence[Path], out: Path, draws: int) -> list[Row]:
     """Calibrate a wrist camera on an inaccurate arm, then a fixed camera in its map."""
     rows = []
-    for room, draw in tqdm([(room, draw) for room in rooms for draw in range(draws)], "arms"):
+    for room, draw in tqdm(
+        [(room, draw) for room in rooms for draw in range(draws)], "arms"
+    ):
         path = out / "arm" / _file(room.name, draw)
         rows.append(once(path, partial(_arm_draw, room, draw)))
     return rows
@@ -280,7 +307,8 @@ def _arm_size(exact: Recording, noisy: Recording) -> Row:
 
 def _frame_of(localizer: Localizer, scene: Recording) -> tuple[SE3 | None, Row]:
     """Fit the base frame to the test frames; None with fewer answers than a frame needs."""
-    estimated, true = [], []
+    estimated = []
+    true = []
     for frame in posed_frames(scene.test):
         pose = localizer.localize(frame.read_image()).base_from_camera
         if pose is not None:
@@ -305,10 +333,12 @@ def frame_offset(estimated: SE3, true: SE3) -> SE3:
     middle = SE3(np.array([1.0, 0, 0, 0]), true.translation_m.mean(0))
     each = middle.inverse() @ (estimated @ true.inverse()) @ middle
     rough = middle @ average_poses(each) @ middle.inverse()
-    to, of = estimated.translation_m, true.translation_m
+    to = estimated.translation_m
+    of = true.translation_m
     off = np.linalg.norm(to - rough.apply(of), axis=1)
     good = off <= WRONG_MEDIANS * np.median(off) + 1e-9
-    centre_to, centre_of = to[good].mean(0), of[good].mean(0)
+    centre_to = to[good].mean(0)
+    centre_of = of[good].mean(0)
     rotation = Rotation.align_vectors(to[good] - centre_to, of[good] - centre_of)[0]
     quaternion = rotation.as_quat(canonical=True, scalar_first=True)
     return SE3(quaternion, centre_to - rotation.apply(centre_of))

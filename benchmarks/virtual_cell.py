@@ -12,7 +12,9 @@ from evercal.simulation.cell_recording import WRIST_IMAGES, record_cell
 from evercal.simulation.virtual_cell import CellOptions, VirtualCell
 
 
-def errors_of(seed: int, images: int, options: CellOptions) -> tuple[float, float, float, float]:
+def errors_of(
+    seed: int, images: int, options: CellOptions
+) -> tuple[float, float, float, float]:
     """Errors of the mount and of the tripod, each in millimetres and degrees."""
     truth = VirtualCell(seed, options).truth
     with tempfile.TemporaryDirectory() as folder:

@@ -35,9 +35,13 @@ def main(path: Path) -> None:
     print(f"scene: {estimate.scene}")
     print(f"base_from_camera, metres:\n{estimate.uncertain_pose.pose.matrix()}")
     deviation = np.sqrt(np.diag(estimate.uncertain_pose.covariance))
-    print(f"standard deviation: {1000 * deviation[:3]} mm, {np.rad2deg(deviation[3:])} deg")
+    print(
+        f"standard deviation: {1000 * deviation[:3]} mm, {np.rad2deg(deviation[3:])} deg"
+    )
     if frame.base_from_camera is not None:
-        mm, deg = pose_distance_mm_deg(estimate.uncertain_pose.pose, frame.base_from_camera)
+        mm, deg = pose_distance_mm_deg(
+            estimate.uncertain_pose.pose, frame.base_from_camera
+        )
         print(f"error: {mm:.2f} mm, {deg:.3f} deg")
 
 

@@ -30,7 +30,9 @@ def main(out: Path) -> None:
     print(tripod.verdict)
 
     shift = cell.check(CELL / "bumped.jpg", tripod)
-    print(f"moved: {shift.moved}, {shift.translation_mm:.1f} mm, {shift.rotation_deg:.2f} deg")
+    print(
+        f"moved: {shift.moved}, {shift.translation_mm:.1f} mm, {shift.rotation_deg:.2f} deg"
+    )
 
 
 if __name__ == "__main__":

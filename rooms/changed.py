@@ -47,8 +47,14 @@ def rearranged(before: Room, seed: int) -> Room:
 def relit(before: Room, seed: int) -> Room:
     """Switch and dim lamps."""
     items = list(before.items)
-    lamps = [i for i, item in enumerate(items) if any(mat.emission > 0 for _, mat in item.parts)]
-    ceiling, *factors = _factors(1 + len(lamps), np.random.default_rng([seed, 13, before.seed]))
+    lamps = [
+        i
+        for i, item in enumerate(items)
+        if any(mat.emission > 0 for _, mat in item.parts)
+    ]
+    ceiling, *factors = _factors(
+        1 + len(lamps), np.random.default_rng([seed, 13, before.seed])
+    )
     for factor, i in zip(factors, lamps, strict=True):
         parts = [(mesh, _dimmed(material, factor)) for mesh, material in items[i].parts]
         items[i] = replace(items[i], parts=parts)
@@ -92,7 +98,9 @@ def _rearranged(before: Room, rng: np.random.Generator) -> list[Item]:
     return [remaining[i] for i in sorted(remaining)]
 
 
-def moved_item(item: Item, room: Room, rest: list[Item], rng: np.random.Generator) -> Item | None:
+def moved_item(
+    item: Item, room: Room, rest: list[Item], rng: np.random.Generator
+) -> Item | None:
     """The item at a free position on the floor or on furniture; None after 60 failed attempts."""
     low, high = item.bounds_m()
     middle = (low + high)[:2] / 2
@@ -101,7 +109,8 @@ def moved_item(item: Item, room: Room, rest: list[Item], rng: np.random.Generato
     tops = [(other, top) for other in rest for top in other.tops]
     area = np.array([(x1 - x0) * (y1 - y0) for _, (x0, x1, y0, y1, _) in tops])
     for _ in range(60):
-        host, z = None, float(room.low_m[2])
+        host = None
+        z = float(room.low_m[2])
         if on_floor:
             inner = room.low_m[:2] + 0.25, room.high_m[:2] - 0.25
             spot = rng.uniform(*inner)
@@ -124,7 +133,9 @@ def moved_item(item: Item, room: Room, rest: list[Item], rng: np.random.Generato
 def _fits(item: Item, room: Room, rest: list[Item], host: Item | None) -> bool:
     """Whether the item is inside the room and overlaps no other item and no part of its host."""
     bounds = item.bounds_m()
-    if (bounds[0, :2] < room.low_m[:2]).any() or (bounds[1, :2] > room.high_m[:2]).any():
+    if (bounds[0, :2] < room.low_m[:2]).any() or (
+        bounds[1, :2] > room.high_m[:2]
+    ).any():
         return False
     boxes = [_FOOT_M, *(other.bounds_m() for other in rest if other is not host)]
     if host is not None:

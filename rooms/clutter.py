@@ -19,7 +19,11 @@ from rooms.shapes import (
     tube,
 )
 
-FRUIT = {"orange": (0.85, 0.45, 0.1), "apple": (0.68, 0.12, 0.1), "lime": (0.45, 0.62, 0.15)}
+FRUIT = {
+    "orange": (0.85, 0.45, 0.1),
+    "apple": (0.68, 0.12, 0.1),
+    "lime": (0.45, 0.62, 0.15),
+}
 GLASS = ((0.08, 0.2, 0.1), (0.2, 0.1, 0.05), (0.3, 0.42, 0.5))
 LEAVES = ((0.25, 0.42, 0.18), (0.33, 0.48, 0.22), (0.2, 0.34, 0.2))
 
@@ -31,7 +35,8 @@ class SmallObjects:
         self.shop = shop
         self.rng = shop.rng
         self.glazes = [
-            m.lacquer(f"glaze{i}", pick(self.rng, (*CLOTHS, *PAINTS)), self.rng) for i in range(3)
+            m.lacquer(f"glaze{i}", pick(self.rng, (*CLOTHS, *PAINTS)), self.rng)
+            for i in range(3)
         ]
         self._spines: m.Material | None = None
 
@@ -41,13 +46,16 @@ class SmallObjects:
 
     def mug(self) -> Item:
         """A mug with a handle."""
-        r, h = 0.04, float(self.rng.uniform(0.085, 0.11))
+        r = 0.04
+        h = float(self.rng.uniform(0.085, 0.11))
         body = lathe(
             [(0, 0), (0.8 * r, 0), (r, 0.012), (r, h), (r - 0.004, h), (r - 0.005, 0.01),
              (0, 0.008)], 24, 2,
         )  # fmt: skip
         t = np.linspace(-np.pi / 2, np.pi / 2, 9)
-        ear = np.stack([r - 0.002 + 0.028 * np.cos(t), np.zeros(9), h / 2 + 0.03 * np.sin(t)], -1)
+        ear = np.stack(
+            [r - 0.002 + 0.028 * np.cos(t), np.zeros(9), h / 2 + 0.03 * np.sin(t)], -1
+        )
         return Item("mug", [(body, self.glaze()), (tube(ear, 0.006), self.glazes[0])])
 
     def bowl(self) -> Item:
@@ -61,8 +69,11 @@ class SmallObjects:
         colour = FRUIT[str(self.rng.choice(tuple(FRUIT)))]
         fruit = m.stone(self.shop.name("fruit"), colour, self.rng)
         for i in range(int(self.rng.integers(0, 6))):
-            angle, radius = 2.2 * i, 0.045 if i else 0.0
-            x, y, z = radius * np.cos(angle), radius * np.sin(angle), 0.03 + 0.012 * i
+            angle = 2.2 * i
+            radius = 0.045 if i else 0.0
+            x = radius * np.cos(angle)
+            y = radius * np.sin(angle)
+            z = 0.03 + 0.012 * i
             parts.append((ball(0.037, 0.95, 16).shifted(x, y, z), fruit))
         return Item("bowl", parts)
 
@@ -78,24 +89,29 @@ class SmallObjects:
 
     def bottle(self) -> Item:
         """A glass bottle with a printed label."""
-        r, h = float(self.rng.uniform(0.032, 0.042)), float(self.rng.uniform(0.24, 0.32))
+        r = float(self.rng.uniform(0.032, 0.042))
+        h = float(self.rng.uniform(0.24, 0.32))
         body = lathe(
             [(0, 0), (0.9 * r, 0), (r, 0.01), (r, 0.55 * h), (0.85 * r, 0.65 * h),
              (0.36 * r, 0.78 * h), (0.34 * r, h), (0.4 * r, h), (0, h)], 24, 2,
         )  # fmt: skip
         glass = m.plain(self.shop.name("glass"), pick(self.rng, GLASS), "coated", 0.05)
-        band = self._labelled(cylinder(r + 0.0006, 0.3 * h, 0.001).shifted(0, 0, 0.16 * h))
+        band = self._labelled(
+            cylinder(r + 0.0006, 0.3 * h, 0.001).shifted(0, 0, 0.16 * h)
+        )
         return Item("bottle", [(body, glass), band])
 
     def jar(self) -> Item:
         """A tin or jar with a lid and a label."""
-        r, h = float(self.rng.uniform(0.035, 0.055)), float(self.rng.uniform(0.09, 0.16))
+        r = float(self.rng.uniform(0.035, 0.055))
+        h = float(self.rng.uniform(0.09, 0.16))
         lid = cylinder(r * 0.98, 0.02, 0.005).shifted(0, 0, h)
         return Item("jar", [self._labelled(cylinder(r, h)), (lid, self.shop.steel)])
 
     def vase(self) -> Item:
         """A vase of random profile with up to five flowers."""
-        h, r = float(self.rng.uniform(0.18, 0.34)), self.rng.uniform(0.4, 1.0, 4) * 0.085
+        h = float(self.rng.uniform(0.18, 0.34))
+        r = self.rng.uniform(0.4, 1.0, 4) * 0.085
         body = lathe(
             [(0, 0), (r[0], 0), (r[1] + 0.02, 0.3 * h), (r[2], 0.6 * h), (0.025, 0.85 * h),
              (0.03 + 0.2 * r[3], h), (0.02 + 0.2 * r[3], h), (0.018, 0.8 * h), (0, 0.7 * h)], 30, 4,
@@ -108,18 +124,23 @@ class SmallObjects:
             tip = np.array([*lean, h + self.rng.uniform(0.08, 0.2)])
             stalk = np.array([[0, 0, 0.7 * h], [*(0.3 * lean), h], tip])
             parts.append((tube(stalk, 0.002, 5), green))
-            parts.append((ball(0.02, 0.8, 10).shifted(tip[0], tip[1], tip[2] - 0.01), petal))
+            parts.append(
+                (ball(0.02, 0.8, 10).shifted(tip[0], tip[1], tip[2] - 0.01), petal)
+            )
         return Item("vase", parts)
 
     def books(self) -> Item:
         """A pile of books."""
         if self._spines is None:
             self._spines = m.spines(self.shop.name("spines"), self.rng)
-        z, pile = 0.0, []
+        z = 0.0
+        pile = []
         for _ in range(int(self.rng.integers(2, 6))):
             thick = float(self.rng.uniform(0.018, 0.045))
             upright = self.shop.book(thick, 0.16, float(self.rng.uniform(0.19, 0.25)))
-            lying = upright.rotated(about_y(np.pi / 2), (0, 0, thick / 2)).shifted(-0.11, 0, z)
+            lying = upright.rotated(about_y(np.pi / 2), (0, 0, thick / 2)).shifted(
+                -0.11, 0, z
+            )
             pile.append(lying.placed((0, 0, 0), float(self.rng.normal(0, 0.15))))
             z += thick
         return Item("books", [(Mesh.merged(pile), self._spines)])
@@ -139,11 +160,19 @@ class SmallObjects:
         green = m.stone(self.shop.name("leaf"), pick(self.rng, LEAVES), self.rng)
         leaves = []
         for i in range(int(self.rng.integers(9, 20))):
-            length, width, droop = self.rng.uniform((0.16, 0.04, 0.8), (0.34, 0.08, 2.2)).tolist()
-            blade = leaf(length, width, droop).rotated(about_y(float(self.rng.uniform(-0.7, 0.2))))
-            leaves.append(blade.placed((0, 0, 0.12), 2.4 * i + float(self.rng.normal(0, 0.2))))
+            length, width, droop = self.rng.uniform(
+                (0.16, 0.04, 0.8), (0.34, 0.08, 2.2)
+            ).tolist()
+            blade = leaf(length, width, droop).rotated(
+                about_y(float(self.rng.uniform(-0.7, 0.2)))
+            )
+            leaves.append(
+                blade.placed((0, 0, 0.12), 2.4 * i + float(self.rng.normal(0, 0.2)))
+            )
         parts = [(pot, self.glaze()), (Mesh.merged(leaves), green)]
-        return Item("plant", [(mesh.scaled(scale), material) for mesh, material in parts])
+        return Item(
+            "plant", [(mesh.scaled(scale), material) for mesh, material in parts]
+        )
 
     def lamp(self) -> Item:
         """A table lamp that is on."""
@@ -156,15 +185,20 @@ class SmallObjects:
 
     def pot(self) -> Item:
         """A cooking pot with a lid and two handles."""
-        r, h = float(self.rng.uniform(0.09, 0.12)), float(self.rng.uniform(0.1, 0.16))
+        r = float(self.rng.uniform(0.09, 0.12))
+        h = float(self.rng.uniform(0.1, 0.16))
         body = lathe(
             [(0, 0), (r - 0.01, 0), (r, 0.012), (r, h), (r + 0.004, h + 0.004),
              (r * 0.6, h + 0.02), (0, h + 0.026)], 32, 2,
         )  # fmt: skip
-        parts = [(body, self.shop.steel), (ball(0.016).shifted(0, 0, h + 0.024), self.shop.dark)]
+        parts = [
+            (body, self.shop.steel),
+            (ball(0.016).shifted(0, 0, h + 0.024), self.shop.dark),
+        ]
         t = np.linspace(-np.pi / 2, np.pi / 2, 7)
         for sign in (1, -1):
-            x, y = sign * (r + 0.03 * np.cos(t)), 0.035 * np.sin(t)
+            x = sign * (r + 0.03 * np.cos(t))
+            y = 0.035 * np.sin(t)
             ear = np.stack([x, y, np.full(7, 0.8 * h)], -1)
             parts.append((tube(ear, 0.006), self.shop.dark))
         return Item("pot", parts)
@@ -177,27 +211,37 @@ class SmallObjects:
         )  # fmt: skip
         spout = tube([(0.07, 0, 0.07), (0.11, 0, 0.1), (0.14, 0, 0.15)], 0.014)
         t = np.linspace(0.25, np.pi - 0.25, 10)
-        arch = tube(np.stack([0.085 * np.cos(t), np.zeros(10), 0.12 + 0.11 * np.sin(t)], -1), 0.009)
-        steel, dark = self.shop.steel, self.shop.dark
+        arch = tube(
+            np.stack([0.085 * np.cos(t), np.zeros(10), 0.12 + 0.11 * np.sin(t)], -1),
+            0.009,
+        )
+        steel = self.shop.steel
+        dark = self.shop.dark
         return Item("kettle", [(body, self.glaze()), (spout, steel), (arch, dark)])
 
     def toy_ball(self) -> Item:
         """A patterned ball."""
         cloth = m.fabric(self.shop.name("ball"), pick(self.rng, CLOTHS), self.rng)
-        return Item("ball", [(ball(float(self.rng.uniform(0.05, 0.11)), segments=32), cloth)])
+        return Item(
+            "ball", [(ball(float(self.rng.uniform(0.05, 0.11)), segments=32), cloth)]
+        )
 
     def blocks(self) -> Item:
         """A tower of three toy blocks."""
-        parts, z = [], 0.0
+        parts = []
+        z = 0.0
         for side in (0.05, 0.045, 0.04):
-            block = box(side, side, side, 0.006).placed((0, 0, z), float(self.rng.uniform(0, 1.5)))
+            block = box(side, side, side, 0.006).placed(
+                (0, 0, z), float(self.rng.uniform(0, 1.5))
+            )
             parts.append((block, self.glaze()))
             z += side
         return Item("blocks", parts)
 
     def chessboard(self, square_m: float) -> Item:
         """A printed board of 9 x 7 squares with a margin of one square, lying on its back."""
-        w, d = 11 * square_m, 9 * square_m
+        w = 11 * square_m
+        d = 9 * square_m
         print_ = sheet((-w / 2, -d / 2, 0.005), (w, 0, 0), (0, d, 0))
         board = box(w + 0.004, d + 0.004, 0.0048, 0.001)
         parts = [(board, self.shop.white), (print_, m.chessboard("chessboard", 9, 7))]
@@ -217,7 +261,9 @@ class SmallObjects:
         """A small radio: bevelled case, grille, two knobs."""
         parts = [(box(0.24, 0.1, 0.14, 0.02, steps=4), self.shop.wood())]
         grille = m.fabric(self.shop.name("grille"), (0.3, 0.28, 0.25), self.rng)
-        parts.append((box(0.13, 0.012, 0.1, 0.004).shifted(-0.035, -0.05, 0.02), grille))
+        parts.append(
+            (box(0.13, 0.012, 0.1, 0.004).shifted(-0.035, -0.05, 0.02), grille)
+        )
         for z in (0.045, 0.095):
             knob = cylinder(0.018, 0.02).rotated(about_x(np.pi / 2), (0.08, -0.046, z))
             parts.append((knob, self.shop.steel))
@@ -226,6 +272,8 @@ class SmallObjects:
     def _labelled(self, mesh: Mesh) -> tuple[Mesh, m.Material]:
         """The mesh with a printed label that covers its height and repeats around it."""
         height = float(np.ptp(mesh.vertices_m[:, 2]))
-        material = m.label(self.shop.name("label"), pick(self.rng, (*CLOTHS, *PAINTS)), self.rng)
+        material = m.label(
+            self.shop.name("label"), pick(self.rng, (*CLOTHS, *PAINTS)), self.rng
+        )
         uv = (mesh.uv - (mesh.uv[:, 0].min(), mesh.uv[:, 1].min())) / height
         return Mesh(mesh.vertices_m, mesh.faces, mesh.normals, uv), material

@@ -20,7 +20,12 @@ from evercal.calibration.boards.printing import board_image
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.simulation.box_room import look_at
-from evercal.simulation.panda_arm import HOME_RAD, base_from_flange, joint_frames, joints_for
+from evercal.simulation.panda_arm import (
+    HOME_RAD,
+    base_from_flange,
+    joint_frames,
+    joints_for,
+)
 from evercal.simulation.textures import dead_leaves
 from evercal.storage import write_bytes, write_json
 from rooms.changed import rearranged
@@ -52,8 +57,10 @@ MOST_IMAGES = 40
 """Images of a recording; a shorter one is its beginning and can be continued."""
 TURN_DEG = 32.0
 """Largest turn about each axis of the thing to either side."""
-_GRIPPED_M, _TIPS_M = 0.02, 0.112
-_SAMPLES, _NOISE = 4, 0.012
+_GRIPPED_M = 0.02
+_TIPS_M = 0.112
+_SAMPLES = 4
+_NOISE = 0.012
 _ARM_SIGMA = np.repeat([1e-4, np.deg2rad(0.02)], 3)
 
 
@@ -103,25 +110,31 @@ def render(setting: Setting, out: Path) -> Iterator[int]:
     """
     import cv2
 
-    root, folder = out / setting.name, out / setting.name / "recording"
+    root = out / setting.name
+    folder = out / setting.name / "recording"
     if _finished(root) >= setting.images:
         return
-    plan, half = make_plan(setting), setting.images // 2
+    plan = make_plan(setting)
+    half = setting.images // 2
     things = [] if setting.fault == "bare" else thing_parts(setting, plan.scale)
     opening = SIZES_M[setting.thing][1] * plan.scale / 2
     people = _people(setting) if setting.fault == "people" else []
     folder.mkdir(parents=True, exist_ok=True)
-    renderer, state = None, plan.room
+    renderer = None
+    state = plan.room
     for i in range(setting.images):
         path = folder / f"{i:03d}.png"
         if path.exists():
             continue
         moving = panda_meshes(plan.joints_rad[i], opening)
-        moving += _moved(things, (plan.base_from_gripper @ plan.gripper_from_thing)[i].matrix())
+        moving += _moved(
+            things, (plan.base_from_gripper @ plan.gripper_from_thing)[i].matrix()
+        )
         for k, person in enumerate(people):
             moving += _moved(person, _walk(plan, [setting.seed, i, k]))
         if setting.fault == "change" and i >= half and state is plan.room:
-            state, renderer = rearranged(plan.room, setting.seed), None
+            state = rearranged(plan.room, setting.seed)
+            renderer = None
         if renderer is None:
             renderer = Renderer(state.meshes() + moving)
         else:
@@ -135,7 +148,9 @@ def render(setting: Setting, out: Path) -> Iterator[int]:
     noise = SE3.exp(rng.normal(0, _ARM_SIGMA, (setting.images, 6)))
     write_poses(folder, plan.base_from_gripper @ noise)
     camera = asdict(plan.camera)
-    write_json(folder / "camera.json", {k: camera[k] for k in camera if k != "distortion"})
+    write_json(
+        folder / "camera.json", {k: camera[k] for k in camera if k != "distortion"}
+    )
     write_json(root / "truth.json", _truth(setting, plan))
 
 
@@ -147,7 +162,10 @@ def _finished(root: Path) -> int:
 def write_poses(folder: Path, base_from_gripper: SE3) -> None:
     """Write the pose file of a recording with images 000.png, 001.png, ..."""
     numbers = np.c_[base_from_gripper.translation_m, base_from_gripper.rotation_wxyz]
-    lines = [f"{i:03d}.png," + ",".join(f"{x:.9f}" for x in row) for i, row in enumerate(numbers)]
+    lines = [
+        f"{i:03d}.png," + ",".join(f"{x:.9f}" for x in row)
+        for i, row in enumerate(numbers)
+    ]
     text = "\n".join(["image,x,y,z,qw,qx,qy,qz", *lines, ""])
     write_bytes(folder / "base_from_gripper.csv", text.encode())
 
@@ -170,7 +188,9 @@ def _truth(setting: Setting, plan: Plan) -> dict[str, object]:
 def make_plan(setting: Setting) -> Plan:
     """Choose the room, the camera, and arm poses that show the thing's front to the camera."""
     if not 0 <= setting.seed < RESERVED or setting.fault not in ("", *FAULTS):
-        raise InputError(f"seed {setting.seed}, fault {setting.fault!r}: not a recording")
+        raise InputError(
+            f"seed {setting.seed}, fault {setting.fault!r}: not a recording"
+        )
     width, height = setting.size
     scene = room(sorted(KINDS)[setting.seed % len(KINDS)], setting.seed)
     for attempt in range(60):
@@ -182,7 +202,8 @@ def make_plan(setting: Setting) -> Plan:
         scale = min(1.0, setting.px * FARTHEST_M / focal / length)
         distance = focal * scale * length / setting.px
         middle = rng.uniform((0.45, -0.12, 0.4), (0.58, 0.12, 0.5))
-        azimuth, elevation = rng.uniform(-1.0, 1.0), rng.uniform(-0.05, 0.55)
+        azimuth = rng.uniform(-1.0, 1.0)
+        elevation = rng.uniform(-0.05, 0.55)
         if setting.fault == "hidden":
             azimuth = np.pi + 0.3 * azimuth  # the arm is between
         towards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) * np.cos(elevation)
@@ -194,15 +215,22 @@ def make_plan(setting: Setting) -> Plan:
             continue
         aside = (0.42 if setting.fault == "out" else 0.08) * distance * width / focal
         aim = middle + aside * rng.choice([-1, 1]) * np.cross(towards, [0.0, 0, 1])
-        pose = look_at(eye, aim + rng.uniform(-0.1, 0.1, 3) * distance / 3, rng.uniform(-0.1, 0.1))
+        pose = look_at(
+            eye, aim + rng.uniform(-0.1, 0.1, 3) * distance / 3, rng.uniform(-0.1, 0.1)
+        )
         gripper_from_thing = _grip(setting, scale, rng)
         facing = np.arctan2(towards[1], towards[0]) + rng.uniform(-0.35, 0.35)
-        poses = _arm_poses(setting, camera, pose, middle, facing, gripper_from_thing, scale, rng)
+        poses = _arm_poses(
+            setting, camera, pose, middle, facing, gripper_from_thing, scale, rng
+        )
         if poses is not None:
             joints = np.stack(poses)[: setting.images]
             grippers = SE3.stack([base_from_flange(angles) for angles in joints])
-            cameras, grips = SE3.stack([pose] * len(joints)), [gripper_from_thing] * len(joints)
-            plan = Plan(scene, camera, cameras, grippers, SE3.stack(grips), joints, scale)
+            cameras = SE3.stack([pose] * len(joints))
+            grips = [gripper_from_thing] * len(joints)
+            plan = Plan(
+                scene, camera, cameras, grippers, SE3.stack(grips), joints, scale
+            )
             return _with_break(setting, plan, rng)
     raise InputError(f"seed {setting.seed}: no place for a camera; use another seed")
 
@@ -228,14 +256,17 @@ def _arm_poses(
 ) -> list[np.ndarray] | None:
     """Joint angles of each image, or None where the arm reaches too few poses."""
     # z of the thing points down and its front, y, to the camera.
-    y, z = np.array([np.cos(facing), np.sin(facing), 0.0]), np.array([0.0, 0.0, -1.0])
+    y = np.array([np.cos(facing), np.sin(facing), 0.0])
+    z = np.array([0.0, 0.0, -1.0])
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([np.cross(y, z), y, z], -1)
-    upright, sides = SE3.from_matrix(matrix), np.array(SIZES_M[setting.thing]) * scale
+    upright = SE3.from_matrix(matrix)
+    sides = np.array(SIZES_M[setting.thing]) * scale
     corners = (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) * sides
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
-    found, start = [], HOME_RAD
+    found = []
+    start = HOME_RAD
     for _ in range(8 * MOST_IMAGES):
         turn = np.deg2rad(TURN_DEG) * rng.uniform(-1, 1, 3)
         turn = {"still": 0.04 * turn, "axis": axis * turn[0]}.get(setting.fault, turn)
@@ -254,7 +285,8 @@ def _arm_poses(
         frames = joint_frames(joints)[1:, :3, 3]
         apart = np.linalg.norm(frames - base_from_camera.translation_m, axis=1).min()
         if frames[:, 2].min() > 0.1 and apart > 0.2:
-            found, start = [*found, joints], joints
+            found = [*found, joints]
+            start = joints
         if len(found) == MOST_IMAGES:
             return found
     return None
@@ -272,11 +304,15 @@ def _with_break(setting: Setting, plan: Plan, rng: np.random.Generator) -> Plan:
     signs = rng.choice([-1, 1], 6) * rng.dirichlet(np.ones(3), 2).ravel() ** 0.5
     if setting.fault == "slip":
         first = int(rng.integers(n // 4, 3 * n // 4 + 1))
-        slip = signs * np.repeat([rng.uniform(0.001, 0.01), np.deg2rad(rng.uniform(1, 3))], 3)
+        slip = signs * np.repeat(
+            [rng.uniform(0.001, 0.01), np.deg2rad(rng.uniform(1, 3))], 3
+        )
         steps = SE3.exp(np.where(np.arange(n)[:, None] < first, 0.0, slip))
         return replace(plan, gripper_from_thing=plan.gripper_from_thing @ steps)
     if setting.fault == "bump":
-        bump = signs * np.repeat([rng.uniform(0.005, 0.02), np.deg2rad(rng.uniform(0.5, 2))], 3)
+        bump = signs * np.repeat(
+            [rng.uniform(0.005, 0.02), np.deg2rad(rng.uniform(0.5, 2))], 3
+        )
         steps = SE3.exp(np.where(np.arange(n)[:, None] < n // 2, 0.0, bump))
         return replace(plan, base_from_camera=plan.base_from_camera @ steps)
     return plan
@@ -304,10 +340,15 @@ def thing_parts(setting: Setting, scale: float) -> Parts:
     else:
         sides = [_print(rng, 600, 400, leaves) for leaves in (None, 40)]
         sides += [_print(rng, 600, 150, 12) for _ in range(2)]
-        parts = _carton((x, y, z), [*sides, *(_print(rng, 150, 400, 8) for _ in range(2))])
+        parts = _carton(
+            (x, y, z), [*sides, *(_print(rng, 150, 400, 8) for _ in range(2))]
+        )
     dull = plain("dull", (0.72, 0.6, 0.45)).texture
-    cell = np.tile(label("", tuple(rng.uniform(0.3, 0.8, 3)), rng).texture[::4, ::4], (5, 5, 1))
-    textures, kind = {"smooth": dull, "repeats": cell}, "metal" if setting.fault == "shiny" else ""
+    cell = np.tile(
+        label("", tuple(rng.uniform(0.3, 0.8, 3)), rng).texture[::4, ::4], (5, 5, 1)
+    )
+    textures = {"smooth": dull, "repeats": cell}
+    kind = "metal" if setting.fault == "shiny" else ""
     return [
         (
             replace(mesh.scaled(scale), uv=mesh.uv, name=f"thing{k}"),
@@ -325,12 +366,17 @@ def thing_parts(setting: Setting, scale: float) -> Parts:
 
 def _carton(size_m: tuple[float, float, float], pictures: list[np.ndarray]) -> Parts:
     """A box with pictures on its front and back (y), sides (x), and ends (z)."""
-    parts, half = [], np.array(size_m) / 2
+    parts = []
+    half = np.array(size_m) / 2
     for k, (axis, up) in enumerate([(1, 2), (1, 2), (0, 2), (0, 2), (2, 1), (2, 1)]):
-        normal, v = np.zeros(3), np.zeros(3)
-        normal[axis], v[up] = 1 - 2 * (k % 2), -1.0  # upright where the gripper is above
+        normal = np.zeros(3)
+        v = np.zeros(3)
+        normal[axis] = 1 - 2 * (k % 2)
+        v[up] = -1.0  # upright where the gripper is above
         u = np.cross(v, normal)
-        corner, right, top = ((normal - u - v) * half, 2 * u * half, 2 * v * half)
+        corner = (normal - u - v) * half
+        right = 2 * u * half
+        top = 2 * v * half
         mesh = sheet(corner.tolist(), right.tolist(), top.tolist())
         parts.append((mesh, Material("", pictures[k], kind="coated", roughness=0.3)))
     return parts
@@ -342,7 +388,8 @@ def _print(
     """A printed page: a picture with a label on it."""
     import cv2
 
-    page, side = dead_leaves(rows, columns, rng, leaves), min(rows, columns) * 3 // 5
+    page = dead_leaves(rows, columns, rng, leaves)
+    side = min(rows, columns) * 3 // 5
     badge = label("", tuple(rng.uniform(0.1, 0.9, 3)), rng).texture
     top, left = (int(rng.integers(0, n - side)) for n in (rows, columns))
     badge = cv2.resize(badge, (side, side), interpolation=cv2.INTER_AREA)
@@ -352,12 +399,22 @@ def _print(
 
 def _bottle(length: float, rng: np.random.Generator) -> Parts:
     """Glass with a printed label around it; its neck is in the gripper."""
-    r, profile = 0.03, []
-    for radius, share in ((0, 0.0), (0.8, 0), (1, 0.03), (1, 0.62), (0.85, 0.72), (0.45, 0.82)):
+    r = 0.03
+    profile = []
+    for radius, share in (
+        (0, 0.0),
+        (0.8, 0),
+        (1, 0.03),
+        (1, 0.62),
+        (0.85, 0.72),
+        (0.45, 0.82),
+    ):
         profile.append((r * radius, length * share))
     body = lathe([*profile, (r * 0.42, length), (0, length)], 48, 1)
     middle = lathe([(r * 1.01, 0.08 * length), (r * 1.01, 0.6 * length)], 48, 1)
-    glass = Material("", _print(rng, 300, 256, 3) // 4 + np.uint8(40), 0.2, "coated", 0.1)
+    glass = Material(
+        "", _print(rng, 300, 256, 3) // 4 + np.uint8(40), 0.2, "coated", 0.1
+    )
     paper = Material("", _print(rng, 420, 620), kind="coated", roughness=0.35)
     high = np.ptp(middle.uv, axis=0)
     middle = replace(middle, uv=middle.uv / high)
@@ -375,17 +432,25 @@ def _tool(rng: np.random.Generator) -> Parts:
         ((0.1, 0.05, 0.05), (-0.02, 0, 0.015)),
     ):
         x, y, z = (max(64, round(2500 * side)) for side in size)
-        pictures = [_print(rng, z, x) for _ in range(2)] + [_print(rng, z, y) for _ in range(2)]
+        pictures = [_print(rng, z, x) for _ in range(2)] + [
+            _print(rng, z, y) for _ in range(2)
+        ]
         pictures += [_print(rng, y, x, 8) for _ in range(2)]
-        tools += [(mesh.shifted(*place), material) for mesh, material in _carton(size, pictures)]
+        tools += [
+            (mesh.shifted(*place), material)
+            for mesh, material in _carton(size, pictures)
+        ]
     return tools
 
 
 def _people(setting: Setting) -> list[Parts]:
     """Two persons: a patterned body with a head, feet at the origin."""
-    rng, people = np.random.default_rng([setting.seed, 24]), []
+    rng = np.random.default_rng([setting.seed, 24])
+    people = []
     for k in range(2):
-        body = lathe([(0, 0), (0.16, 0), (0.2, 0.9), (0.24, 1.35), (0.08, 1.5), (0, 1.5)], 24, 1)
+        body = lathe(
+            [(0, 0), (0.16, 0), (0.2, 0.9), (0.24, 1.35), (0.08, 1.5), (0, 1.5)], 24, 1
+        )
         cloth = fabric(f"person{k}", tuple(rng.uniform(0.1, 0.8, 3)), rng)
         head = replace(ball(0.12).shifted(0, 0, 1.48), name=f"head{k}")
         skin = plain(head.name, (0.75, 0.55, 0.42))
@@ -395,10 +460,13 @@ def _people(setting: Setting) -> list[Parts]:
 
 def _walk(plan: Plan, seed: list[int]) -> np.ndarray:
     """base_from_person: beyond the arm, in the camera's view."""
-    rng, camera = np.random.default_rng(seed), plan.base_from_camera[0]
+    rng = np.random.default_rng(seed)
+    camera = plan.base_from_camera[0]
     ahead = camera.rotation_matrix()[:2, 2]
     ahead = ahead / np.linalg.norm(ahead)
-    beyond = plan.base_from_gripper.translation_m.mean(0)[:2] + rng.uniform(0.5, 1.4) * ahead
+    beyond = (
+        plan.base_from_gripper.translation_m.mean(0)[:2] + rng.uniform(0.5, 1.4) * ahead
+    )
     aside = rng.uniform(-0.6, 0.6) * np.array([-ahead[1], ahead[0]])
     matrix = SE3.exp([0, 0, 0, 0, 0, rng.uniform(-3, 3)]).matrix()
     matrix[:3, 3] = [*(beyond + aside), plan.room.low_m[2]]
@@ -406,5 +474,6 @@ def _walk(plan: Plan, seed: list[int]) -> np.ndarray:
 
 
 def _moved(parts: Parts, matrix: np.ndarray) -> Parts:
-    rotation, shift = matrix[:3, :3], matrix[:3, 3].tolist()
+    rotation = matrix[:3, :3]
+    shift = matrix[:3, 3].tolist()
     return [(mesh.rotated(rotation, shift), material) for mesh, material in parts]

@@ -42,7 +42,10 @@ class Material:
     def bsdf(self, mi: Any) -> dict[str, Any]:
         """Mitsuba dictionary of the reflection. Back sides are black."""
         if self.texture.shape[:2] == (1, 1):
-            colour: dict[str, Any] = {"type": "rgb", "value": linear(self.texture[0, 0]).tolist()}
+            colour: dict[str, Any] = {
+                "type": "rgb",
+                "value": linear(self.texture[0, 0]).tolist(),
+            }
         else:
             # Rows run downwards, v of our meshes runs upwards.
             bitmap = mi.Bitmap(np.ascontiguousarray(self.texture[::-1]))
@@ -77,7 +80,9 @@ def plain(
     roughness: float = 0.2, emission: float = 0.0,
 ) -> Material:  # fmt: skip
     """A plain colour, sRGB in [0, 1]."""
-    texel = np.round(np.clip(np.array(rgb), 0, 1) * 255).astype(np.uint8).reshape(1, 1, 3)
+    texel = (
+        np.round(np.clip(np.array(rgb), 0, 1) * 255).astype(np.uint8).reshape(1, 1, 3)
+    )
     return Material(name, texel, kind=kind, roughness=roughness, emission=emission)
 
 
@@ -85,7 +90,9 @@ GLOW = plain("glow", (1.0, 0.82, 0.58), emission=2.2)
 """The shade of a lamp that is on."""
 
 
-def wood(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
+def wood(
+    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
+) -> Material:
     """Varnished wood: grain along u, fine fibres, sometimes a knot."""
     v, u = np.mgrid[0:SIZE, 0:SIZE].astype(np.float32) / SIZE
     warp = 0.05 * _stretched(rng, 1, 6) + 0.02 * _noise(1.8, rng)
@@ -96,14 +103,19 @@ def wood(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -
         cu, cv = rng.uniform(0.2, 0.8, 2)
         value -= 0.35 * np.exp(-(((u - cu) * 26) ** 2 + ((v - cv) * 40) ** 2))
     tint = np.array([0.02, 0.0, -0.02]) * rings[..., None]
-    return Material(name, _bytes(np.array(rgb) * value[..., None] + tint), 0.9, "coated", 0.25)
+    return Material(
+        name, _bytes(np.array(rgb) * value[..., None] + tint), 0.9, "coated", 0.25
+    )
 
 
-def boards(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
+def boards(
+    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
+) -> Material:
     """A floor of staggered planks."""
     base = wood(name, rgb, rng).texture.astype(np.float32)
     picture = np.zeros_like(base)
-    rows, height = 8, SIZE // 8
+    rows = 8
+    height = SIZE // 8
     for row in range(rows):
         joint = int(rng.integers(SIZE))
         for start in (joint, joint + SIZE // 2):
@@ -118,7 +130,11 @@ def boards(name: str, rgb: tuple[float, float, float], rng: np.random.Generator)
 
 
 def tiles(
-    name: str, rgb: tuple[float, float, float], rng: np.random.Generator, count: int, tile_m: float
+    name: str,
+    rgb: tuple[float, float, float],
+    rng: np.random.Generator,
+    count: int,
+    tile_m: float,
 ) -> Material:
     """Glazed tiles with grout, `count` along `tile_m`, each in a slightly different shade."""
     side = SIZE // count
@@ -129,10 +145,14 @@ def tiles(
     if rng.random() < 0.5:  # an ornament on some tiles
         v, u = np.mgrid[0:side, 0:side] / side - 0.5
         radius = np.hypot(u, v)
-        mark = (np.abs(radius - 0.28) < 0.05) | ((np.abs(u) < 0.04) ^ (np.abs(v) < 0.04))
+        mark = (np.abs(radius - 0.28) < 0.05) | (
+            (np.abs(u) < 0.04) ^ (np.abs(v) < 0.04)
+        )
         colour = rng.uniform(0.15, 0.7, 3)
         for row, column in np.argwhere(rng.random((count, count)) < 0.4):
-            tile = picture[row * side : (row + 1) * side, column * side : (column + 1) * side]
+            tile = picture[
+                row * side : (row + 1) * side, column * side : (column + 1) * side
+            ]
             tile[mark] = colour
     line = max(2, side // 28)
     grout = (np.arange(SIZE) % side) < line
@@ -153,12 +173,17 @@ def equal_tiles(
     v, u = np.mgrid[0:side, 0:side] / side - 0.5
     value[np.abs(np.abs(u) + np.abs(v) - 0.36) < 0.02] *= 0.6  # a rhombus
     grout = np.minimum(u, v) < -0.48
-    a, b = (np.where(grout[..., None], 0.5, np.array(colour) * value) for colour in (rgb, other))
+    a, b = (
+        np.where(grout[..., None], 0.5, np.array(colour) * value)
+        for colour in (rgb, other)
+    )
     picture = np.concatenate([np.concatenate([a, b], 1), np.concatenate([b, a], 1)])
     return Material(name, _bytes(picture), tile_m, "coated", 0.12)
 
 
-def fabric(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
+def fabric(
+    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
+) -> Material:
     """Woven cloth with threads, shading and sometimes stripes, checks or dots."""
     v, u = np.mgrid[0:SIZE, 0:SIZE].astype(np.float32)
     weave = np.where(((u // 3) + (v // 3)) % 2, 1.06, 0.94)
@@ -172,22 +197,32 @@ def fabric(name: str, rgb: tuple[float, float, float], rng: np.random.Generator)
         picture = np.where(stripes[..., None], other * value[..., None], picture)
     elif pattern == 2:
         share = 0.5 * (((u % period) < period / 2) + 0.0 + ((v % period) < period / 2))
-        picture = picture * (1 - share[..., None]) + share[..., None] * other * value[..., None]
+        picture = (
+            picture * (1 - share[..., None])
+            + share[..., None] * other * value[..., None]
+        )
     elif pattern == 3:
-        cells = np.hypot((u % period) / period - 0.5, (v % period) / period - 0.5) < 0.24
+        cells = (
+            np.hypot((u % period) / period - 0.5, (v % period) / period - 0.5) < 0.24
+        )
         picture = np.where(cells[..., None], other * value[..., None], picture)
     return Material(name, _bytes(picture), float(rng.uniform(0.4, 0.7)))
 
 
 def striped(
-    name: str, rgb: tuple[float, float, float], other: tuple[float, float, float], tile_m: float
+    name: str,
+    rgb: tuple[float, float, float],
+    other: tuple[float, float, float],
+    tile_m: float,
 ) -> Material:
     """Plain cloth with equal stripes along v in two colours; one pair of stripes is `tile_m`."""
     stripes = np.repeat(np.array([rgb, other]), SIZE // 2, axis=0)
     return Material(name, np.tile(_bytes(stripes), (SIZE, 1, 1)), tile_m)
 
 
-def carpet(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
+def carpet(
+    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
+) -> Material:
     """A woven rug with a border and figures that are mirrored at both axes."""
     half = dead_leaves(SIZE // 2, SIZE // 2, rng, 70).astype(np.float32) / 255
     half = 0.35 * half + 0.2 * half.mean(-1, keepdims=True) + 0.45 * np.array(rgb)
@@ -201,13 +236,17 @@ def carpet(name: str, rgb: tuple[float, float, float], rng: np.random.Generator)
     return Material(name, _bytes(picture))
 
 
-def plaster(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
+def plaster(
+    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
+) -> Material:
     """A painted wall: nearly plain, with faint roller marks."""
     value = 1 + 0.018 * _noise(1.0, rng) + 0.012 * _noise(2.0, rng)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 1.5)
 
 
-def wallpaper(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
+def wallpaper(
+    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
+) -> Material:
     """Wallpaper with a repeated figure, so the same patch appears many times."""
     import cv2
 
@@ -217,41 +256,59 @@ def wallpaper(name: str, rgb: tuple[float, float, float], rng: np.random.Generat
     for _ in range(3):
         centre = tuple(int(c) for c in rng.integers(20, period - 20, 2))
         axes = (int(rng.integers(6, 18)), int(rng.integers(3, 10)))
-        cv2.ellipse(cell, centre, axes, float(rng.uniform(0, 180)), 0, 360, other.tolist(), -1)
+        cv2.ellipse(
+            cell, centre, axes, float(rng.uniform(0, 180)), 0, 360, other.tolist(), -1
+        )
     picture = np.tile(cell, (4, 4, 1)) * (1 + 0.02 * _noise(1.0, rng))[..., None]
     return Material(name, _bytes(picture), 1.2)
 
 
-def stone(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
+def stone(
+    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
+) -> Material:
     """A polished worktop: speckles and shading."""
     speck = (rng.random((SIZE, SIZE)) < 0.16) * rng.normal(0, 0.18, (SIZE, SIZE))
     value = 1 + speck + 0.06 * _noise(1.4, rng)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 0.7, "coated", 0.12)
 
 
-def lacquer(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
+def lacquer(
+    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
+) -> Material:
     """Painted wood with brush strokes."""
     value = 1 + 0.035 * _stretched(rng, 1, 16) + 0.02 * _noise(1.6, rng)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 0.8, "coated", 0.18)
 
 
-def brushed(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
+def brushed(
+    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
+) -> Material:
     """Brushed steel."""
     value = 0.95 + 0.05 * _stretched(rng, 1, 40)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 0.5, "metal", 0.28)
 
 
-def painting(name: str, rng: np.random.Generator, height: int = 256, width: int = 320) -> Material:
+def painting(
+    name: str, rng: np.random.Generator, height: int = 256, width: int = 320
+) -> Material:
     """A painting."""
-    picture = dead_leaves(height, width, rng, int(rng.integers(25, 120))).astype(np.float32)
+    picture = dead_leaves(height, width, rng, int(rng.integers(25, 120))).astype(
+        np.float32
+    )
     if rng.random() < 0.5:  # a landscape behind: sky above, ground below
         v = np.linspace(0, 1, height)[:, None, None]
-        sky = np.where(v < rng.uniform(0.4, 0.7), rng.uniform(120, 230, 3), rng.uniform(30, 150, 3))
+        sky = np.where(
+            v < rng.uniform(0.4, 0.7), rng.uniform(120, 230, 3), rng.uniform(30, 150, 3)
+        )
         picture = 0.45 * picture + 0.55 * sky
-    return Material(name, np.clip(picture, 0, 255).astype(np.uint8), kind="coated", roughness=0.3)
+    return Material(
+        name, np.clip(picture, 0, 255).astype(np.uint8), kind="coated", roughness=0.3
+    )
 
 
-def label(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
+def label(
+    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
+) -> Material:
     """Printed packaging: a word, small print, a bar code."""
     import cv2
 
@@ -264,7 +321,9 @@ def label(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) 
     cv2.putText(picture, word, (16, 105), cv2.FONT_HERSHEY_DUPLEX, scale * 0.9, dark, 2)
     for line in range(4):
         text = " ".join(str(w).lower() for w in rng.choice(_WORDS, 3))
-        cv2.putText(picture, text, (16, 155 + 16 * line), cv2.FONT_HERSHEY_PLAIN, 0.9, light, 1)
+        cv2.putText(
+            picture, text, (16, 155 + 16 * line), cv2.FONT_HERSHEY_PLAIN, 0.9, light, 1
+        )
     bars = np.repeat(rng.integers(0, 2, 32), 2) * 255
     picture[222:250, 170:234] = bars[None, :, None]
     return Material(name, picture, kind="coated", roughness=0.3)
@@ -278,21 +337,40 @@ def spines(name: str, rng: np.random.Generator) -> Material:
     """Sixteen book spines side by side, with titles that run upwards."""
     import cv2
 
-    height, width = 512, 64
+    height = 512
+    width = 64
     cells = []
     for _ in range(BOOKS):
-        colour = np.clip(rng.uniform(0.08, 0.85) + rng.uniform(-0.25, 0.25, 3), 0.03, 0.95) * 255
+        colour = (
+            np.clip(rng.uniform(0.08, 0.85) + rng.uniform(-0.25, 0.25, 3), 0.03, 0.95)
+            * 255
+        )
         lying = np.full((width, height, 3), colour, np.uint8)
         ink = (245, 235, 205) if colour.mean() < 120 else (25, 25, 30)
         for at in rng.integers(10, 60, 2):
-            cv2.line(lying, (int(at), 0), (int(at), width), ink, int(rng.integers(1, 4)))
+            cv2.line(
+                lying, (int(at), 0), (int(at), width), ink, int(rng.integers(1, 4))
+            )
         words = " ".join(str(w) for w in rng.choice(_WORDS, int(rng.integers(1, 3))))
-        cv2.putText(lying, words, (75, 42), int(rng.integers(0, 5)), 1.0, ink, 2, cv2.LINE_AA)
-        cv2.putText(lying, str(rng.choice(_WORDS)).lower(), (400, 40), 0, 0.5, ink, 1, cv2.LINE_AA)
+        cv2.putText(
+            lying, words, (75, 42), int(rng.integers(0, 5)), 1.0, ink, 2, cv2.LINE_AA
+        )
+        cv2.putText(
+            lying,
+            str(rng.choice(_WORDS)).lower(),
+            (400, 40),
+            0,
+            0.5,
+            ink,
+            1,
+            cv2.LINE_AA,
+        )
         cells.append(np.rot90(lying))
     picture = np.concatenate(cells, 1).astype(np.float32)
     picture *= (1 + 0.03 * rng.standard_normal(picture.shape[:2]))[..., None]
-    return Material(name, np.clip(picture, 0, 255).astype(np.uint8), kind="coated", roughness=0.35)
+    return Material(
+        name, np.clip(picture, 0, 255).astype(np.uint8), kind="coated", roughness=0.35
+    )
 
 
 def chessboard(name: str, columns: int, rows: int) -> Material:

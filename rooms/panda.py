@@ -19,7 +19,9 @@ from rooms.shapes import Mesh
 _MESHES = "share/example-robot-data/robots/panda_description/meshes/visual"
 
 
-def panda_meshes(joints_rad: np.ndarray, opening_m: float = 0.03) -> list[tuple[Mesh, Material]]:
+def panda_meshes(
+    joints_rad: np.ndarray, opening_m: float = 0.03
+) -> list[tuple[Mesh, Material]]:
     """Meshes of the arm in the base frame, one named mesh for each colour.
 
     Args:
@@ -32,7 +34,10 @@ def panda_meshes(joints_rad: np.ndarray, opening_m: float = 0.03) -> list[tuple[
     frames = joint_frames(np.asarray(joints_rad, float))
     hand = frames[7] @ SE3.exp([0, 0, 0, 0, 0, -np.pi / 4]).matrix()
     places = {f"link{i}": [frame] for i, frame in enumerate([np.eye(4), *frames[:7]])}
-    places |= {"hand": [hand], "finger": [hand @ finger for finger in _fingers(opening_m)]}
+    places |= {
+        "hand": [hand],
+        "finger": [hand @ finger for finger in _fingers(opening_m)],
+    }
     groups: dict[str, tuple[Material, list[Mesh]]] = {}
     for link, matrices in places.items():
         for matrix in matrices:
@@ -63,15 +68,19 @@ def _link_meshes(link: str) -> list[tuple[Mesh, Material]]:
         import trimesh  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise InputError(_missing(error.name)) from None
-    scene, parts = trimesh.load_scene(_folder() / f"{link}.dae"), []
+    scene = trimesh.load_scene(_folder() / f"{link}.dae")
+    parts = []
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         shape = scene.geometry[name]
         colour = np.asarray(shape.visual.material.main_color, float)[:3] / 255
-        tone = "pale" if colour.min() > 0.85 else "black" if colour.max() < 0.4 else "mark"
+        tone = (
+            "pale" if colour.min() > 0.85 else "black" if colour.max() < 0.4 else "mark"
+        )
         vertices = np.array(shape.vertices, float)
         normals = np.array(shape.vertex_normals, float)
-        faces, uv = np.array(shape.faces), np.zeros((len(vertices), 2))
+        faces = np.array(shape.faces)
+        uv = np.zeros((len(vertices), 2))
         mesh = Mesh(vertices, faces, normals, uv, f"arm_{tone}")
         mesh = mesh.rotated(matrix[:3, :3], matrix[:3, 3].tolist())
         parts.append((mesh, _MATERIALS[tone]))

@@ -18,8 +18,10 @@ from rooms.room import Room
 
 WORK_AREA_M = np.array([0.45, 0.0, 0.15])
 """Centre of the work area that cameras look at, base frame."""
-NEAR_M, NEAR_RAD = 0.05, np.deg2rad(5.0)
-TOO_NEAR_M, TOO_NEAR_RAD = 0.012, np.deg2rad(1.2)
+NEAR_M = 0.05
+NEAR_RAD = np.deg2rad(5.0)
+TOO_NEAR_M = 0.012
+TOO_NEAR_RAD = np.deg2rad(1.2)
 NEAR_SHARE = 0.08
 """Largest fraction of test frames within NEAR_M and NEAR_RAD of a training frame."""
 
@@ -49,7 +51,10 @@ def sweep_shots(room: Room, frames: int, seed: int) -> list[Shot]:
     test = _far_from(room, frames - train_count, train, [seed, 9])
     arm_train = _arm_path(train_count, [seed, 2], hold=12)
     arm_test = _arm_path(frames - train_count, [seed, 3], hold=12)
-    shots = [Shot(f"train-{i:06d}", "train", train[i], arm_train[i]) for i in range(train_count)]
+    shots = [
+        Shot(f"train-{i:06d}", "train", train[i], arm_train[i])
+        for i in range(train_count)
+    ]
     for i in range(frames - train_count):
         shots.append(Shot(f"test-{i:06d}", "test", test[i], arm_test[i]))
     return shots
@@ -88,13 +93,18 @@ def fixed_shots(room: Room, frames: int, seed: int) -> FixedShots:
     pose = _free_path(room, 200, [seed, 5])[int(rng.integers(200))]
     direction = rng.standard_normal(3)
     direction /= np.linalg.norm(direction)
-    still, moves = np.zeros(3), seed % 2 == 0
-    parts = (0.005 * direction, still) if moves else (still, np.deg2rad(0.5) * direction)
+    still = np.zeros(3)
+    moves = seed % 2 == 0
+    parts = (
+        (0.005 * direction, still) if moves else (still, np.deg2rad(0.5) * direction)
+    )
     bump = SE3.exp(np.concatenate(parts))
     arms = _arm_path(2 * frames, [seed, 6], hold=1, cycles=3.0)
     before = [Shot(f"fixed-{i:06d}", "test", pose, arms[i]) for i in range(frames)]
     moved = pose @ bump
-    after = [Shot(f"bumped-{i:06d}", "test", moved, arms[frames + i]) for i in range(frames)]
+    after = [
+        Shot(f"bumped-{i:06d}", "test", moved, arms[frames + i]) for i in range(frames)
+    ]
     return FixedShots(before, after, bump)
 
 
@@ -102,7 +112,9 @@ def hand_camera(seed: int) -> SE3:
     """gripper_from_camera: 8 cm beside the flange, along the fingers, slightly tilted."""
     rng = np.random.default_rng([seed, 7])
     tangent = np.concatenate([rng.uniform(-0.01, 0.01, 3), rng.uniform(-0.12, 0.12, 3)])
-    return SE3(np.array([1.0, 0, 0, 0]), np.array([0.085, 0.0, 0.02])) @ SE3.exp(tangent)
+    return SE3(np.array([1.0, 0, 0, 0]), np.array([0.085, 0.0, 0.02])) @ SE3.exp(
+        tangent
+    )
 
 
 def hand_joints(frames: int, seed: int) -> np.ndarray:
@@ -123,14 +135,18 @@ def sees_work_area(base_from_camera: SE3) -> bool:
     return distance > 0.5 and middle[2] > np.cos(np.deg2rad(25.0)) * distance
 
 
-def _arm_path(frames: int, seed: list[int], hold: int, cycles: float | None = None) -> np.ndarray:
+def _arm_path(
+    frames: int, seed: list[int], hold: int, cycles: float | None = None
+) -> np.ndarray:
     """Joint angles around the ready position, constant for `hold` frames, shape (frames, 7)."""
     rng = np.random.default_rng(seed)
     step = np.arange(frames) // hold * hold
     t = step * (2 * np.pi * (cycles or 1.0 + frames / 400) / max(frames, 1))
     spread = np.array([0.45, 0.25, 0.3, 0.3, 0.5, 0.35, 0.6])
     phase = rng.uniform(0, 2 * np.pi, (2, 7))
-    wave = 0.65 * np.sin(t[:, None] + phase[0]) + 0.35 * np.sin(2.3 * t[:, None] + phase[1])
+    wave = 0.65 * np.sin(t[:, None] + phase[0]) + 0.35 * np.sin(
+        2.3 * t[:, None] + phase[1]
+    )
     return HOME_RAD + spread * wave
 
 
@@ -156,7 +172,9 @@ def _sweep(frames: int, rng: np.random.Generator) -> SE3:
 
     def wave(low: float, high: float, speed: float) -> np.ndarray:
         phase = rng.uniform(0, 2 * np.pi, 2)
-        mix = 0.7 * np.sin(speed * t + phase[0]) + 0.3 * np.sin(2.6 * speed * t + phase[1])
+        mix = 0.7 * np.sin(speed * t + phase[0]) + 0.3 * np.sin(
+            2.6 * speed * t + phase[1]
+        )
         return (low + high) / 2 + (high - low) / 2 * mix
 
     azimuth = wave(-1.9, 1.9, 1.0)
@@ -165,10 +183,13 @@ def _sweep(frames: int, rng: np.random.Generator) -> SE3:
     gaze = [wave(-0.45, 0.15, 0.9), wave(-0.35, 0.35, 1.2), wave(-0.1, 0.3, 1.4)]
     target = WORK_AREA_M + np.stack(gaze, -1)
     roll = wave(-0.12, 0.12, 0.8)
-    x, y = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
+    x = np.cos(azimuth) * np.cos(elevation)
+    y = np.sin(azimuth) * np.cos(elevation)
     direction = np.stack([x, y, np.sin(elevation)], -1)
     position = WORK_AREA_M + distance[:, None] * direction
-    return SE3.stack([look_at(*view) for view in zip(position, target, roll, strict=True)])
+    return SE3.stack(
+        [look_at(*view) for view in zip(position, target, roll, strict=True)]
+    )
 
 
 def _far_from(room: Room, frames: int, train: SE3, seed: list[int]) -> SE3:
@@ -186,4 +207,6 @@ def _far_from(room: Room, frames: int, train: SE3, seed: list[int]) -> SE3:
             selected = np.sort(np.concatenate([far, allowed]))
             if len(selected) >= frames and near[selected[:frames]].mean() <= NEAR_SHARE:
                 return path[selected[:frames]]
-    raise InputError(f"{room.kind} {room.seed}: no test path away from training; use another seed")
+    raise InputError(
+        f"{room.kind} {room.seed}: no test path away from training; use another seed"
+    )

@@ -87,7 +87,10 @@ def choose_variant() -> tuple[str, str]:
             return "llvm_ad_rgb", library
     if _works("cuda_ad_rgb", None):
         return "cuda_ad_rgb", "GPU; no working LLVM"
-    return "scalar_rgb", "slow; neither a working LLVM >= 16 nor a GPU: apt-get install libllvm19"
+    return (
+        "scalar_rgb",
+        "slow; neither a working LLVM >= 16 nor a GPU: apt-get install libllvm19",
+    )
 
 
 def _llvm_libraries() -> list[str]:
@@ -95,13 +98,21 @@ def _llvm_libraries() -> list[str]:
     override = os.environ.get("DRJIT_LIBLLVM_PATH")
     if override:
         return [override]
-    folders = ("/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*")
+    folders = (
+        "/usr/lib/*/libLLVM*.so*",
+        "/usr/lib/llvm-*/lib/libLLVM*.so*",
+        "/usr/lib64/libLLVM*",
+    )
     versions = {}
-    for path in {os.path.realpath(path) for folder in folders for path in glob.glob(folder)}:
+    for path in {
+        os.path.realpath(path) for folder in folders for path in glob.glob(folder)
+    }:
         if digits := re.search(r"\d+", os.path.basename(path)):
             versions.setdefault(int(digits[0]), path)
     # Older versions lack opaque pointers or abort on processors with AVX-512.
-    return [versions[version] for version in sorted(versions, reverse=True) if version >= 16]
+    return [
+        versions[version] for version in sorted(versions, reverse=True) if version >= 16
+    ]
 
 
 def _works(variant: str, library: str | None) -> bool:
@@ -132,13 +143,18 @@ class Renderer:
         for number, ((_, name), (material, members)) in enumerate(groups.items()):
             scene[name or f"static{number}"] = _mesh(mi, Mesh.merged(members), material)
         self._scene = mi.load_dict(scene)
-        self._features = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
+        self._features = mi.load_dict(
+            {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
+        )
         self._parameters = mi.traverse(self._scene)
 
     def move(self, moved: dict[str, Mesh]) -> None:
         """Replace vertices and normals of named meshes, in the base frame."""
         for name, mesh in moved.items():
-            for key, value in (("positions", mesh.vertices_m), ("normals", mesh.normals)):
+            for key, value in (
+                ("positions", mesh.vertices_m),
+                ("normals", mesh.normals),
+            ):
                 old = self._parameters[f"{name}.vertex_{key}"]
                 self._parameters[f"{name}.vertex_{key}"] = type(old)(
                     np.ascontiguousarray(value, np.float32).ravel()
@@ -174,7 +190,9 @@ class Renderer:
             light += np.asarray(self._mi.render(self._scene, spp=share, **how))[..., :3]
             if options.denoise:
                 few = min(share, 4)
-                aov = self._mi.render(self._scene, integrator=self._features, spp=few, **how)
+                aov = self._mi.render(
+                    self._scene, integrator=self._features, spp=few, **how
+                )
                 features += np.asarray(aov)[..., -6:]
         if options.denoise:
             light = _denoised(light / len(poses), features / len(poses))
@@ -194,25 +212,34 @@ class Renderer:
         if mi.variant().startswith("scalar"):
             start = mi.Point3f(*origin.tolist())
             hits = [
-                self._scene.ray_intersect_preliminary(mi.Ray3f(start, mi.Vector3f(*ray.tolist()))).t
+                self._scene.ray_intersect_preliminary(
+                    mi.Ray3f(start, mi.Vector3f(*ray.tolist()))
+                ).t
                 for ray in directions
             ]
             distance = np.array(hits, np.float64)
         else:
             # Arrays: a constant would compile a new kernel for every frame.
             starts = np.broadcast_to(origin[:, None], (3, len(rays))).astype(np.float32)
-            ray = mi.Ray3f(mi.Point3f(starts), mi.Vector3f(directions.T.astype(np.float32)))
+            ray = mi.Ray3f(
+                mi.Point3f(starts), mi.Vector3f(directions.T.astype(np.float32))
+            )
             hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
             distance = np.array(hit.t, np.float64)
-        depth = np.where(np.isfinite(distance) & (distance < 1e6), distance / length, 0.0)
+        depth = np.where(
+            np.isfinite(distance) & (distance < 1e6), distance / length, 0.0
+        )
         return depth.reshape(camera.height, camera.width).astype(np.float32)
 
     def _sensor(self, camera: Camera) -> tuple[Any, Any]:
         """Sensor of a camera and its parameters, cached so that kernels are compiled once."""
         if camera not in self._sensors:
             if any(camera.distortion) or abs(camera.fx - camera.fy) > 1e-6 * camera.fx:
-                raise ValueError(f"rendering needs a pinhole with fx = fy, got {camera}")
-            width, height = camera.width, camera.height
+                raise ValueError(
+                    f"rendering needs a pinhole with fx = fy, got {camera}"
+                )
+            width = camera.width
+            height = camera.height
             film = {"type": "hdrfilm", "width": width, "height": height}
             film |= {"rfilter": {"type": "box"}, "component_format": "float32"}
             sensor = self._mi.load_dict(
@@ -250,7 +277,9 @@ def _encode(radiance: np.ndarray, noise: float, rng: np.random.Generator) -> np.
         sigma = noise * np.sqrt(np.clip(linear, 0.01, 1.0) / 0.2)
         linear = linear + sigma * rng.standard_normal(linear.shape)
     linear = np.clip(linear, 0.0, 1.0)
-    curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    curve = np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
+    )
     return np.round(curve * 255).astype(np.uint8)
 
 
@@ -260,7 +289,8 @@ def _mesh(mi: Any, mesh: Mesh, material: Material) -> Any:
     light = material.emitter(mi)
     if light is not None:
         properties["emitter"] = mi.load_dict(light)
-    name, counts = mesh.name or material.name, (len(mesh.vertices_m), len(mesh.faces))
+    name = mesh.name or material.name
+    counts = (len(mesh.vertices_m), len(mesh.faces))
     extras = {"has_vertex_normals": True, "has_vertex_texcoords": True}
     result = mi.Mesh(name, *counts, **extras, props=properties)
     parameters = mi.traverse(result)

@@ -60,9 +60,12 @@ class Room:
 
     def is_free(self, points_m: np.ndarray, margin_m: float = 0.12) -> np.ndarray:
         """Whether points (n, 3) are inside the room and outside all items, with a margin."""
-        inside = (points_m > self.low_m + margin_m) & (points_m < self.high_m - margin_m)
+        inside = (points_m > self.low_m + margin_m) & (
+            points_m < self.high_m - margin_m
+        )
         boxes = self.boxes_m()
-        low, high = boxes[:, 0] - margin_m, boxes[:, 1] + margin_m
+        low = boxes[:, 0] - margin_m
+        high = boxes[:, 1] + margin_m
         hit = (points_m[:, None] > low) & (points_m[:, None] < high)
         return np.asarray(inside.all(-1) & ~hit.all(-1).any(-1))
 
@@ -72,7 +75,9 @@ class _Builder:
 
     def __init__(self, kind: str, seed: int):
         self.rng = np.random.default_rng([seed, sum(map(ord, kind))])
-        self.size = np.array([self.rng.uniform(5.0, 5.7), self.rng.uniform(4.7, 5.3), 2.55])
+        self.size = np.array(
+            [self.rng.uniform(5.0, 5.7), self.rng.uniform(4.7, 5.3), 2.55]
+        )
         self.shop = FurnitureBuilder(self.rng)
         self.trinkets = SmallObjects(self.shop)
         self.hangings = WallObjects(self.shop)
@@ -82,12 +87,16 @@ class _Builder:
     def add(self, item: Item, gap_m: float = 0.03, host: Item | None = None) -> bool:
         """Add an item unless it overlaps another one (except its host) or leaves the room."""
         bounds = item.bounds_m()
-        if (bounds[0, :2] < -0.01).any() or (bounds[1, :2] > self.size[:2] + 0.01).any():
+        if (bounds[0, :2] < -0.01).any() or (
+            bounds[1, :2] > self.size[:2] + 0.01
+        ).any():
             return False
         for owner, other in self.blocked:
             if owner is not None and owner is host:
                 continue
-            if (bounds[0] < other[1] + gap_m).all() and (bounds[1] > other[0] - gap_m).all():
+            if (bounds[0] < other[1] + gap_m).all() and (
+                bounds[1] > other[0] - gap_m
+            ).all():
                 return False
         self.items.append(item)
         self.blocked.append((item, bounds))
@@ -101,10 +110,14 @@ class _Builder:
         length = x if wall % 2 == 0 else y
         along = half + at * (length - 2 * half)
         gap = 0.015 if z == 0.0 else 0.003
-        position = ((along, y - gap), (gap, along), (along, gap), (x - gap, along))[wall]
+        position = ((along, y - gap), (gap, along), (along, gap), (x - gap, along))[
+            wall
+        ]
         return self.add(item.placed(*position, z, WALL_YAW_RAD[wall]))
 
-    def try_wall(self, make: Callable[[], Item], walls: tuple[int, ...], z: float = 0.0) -> bool:
+    def try_wall(
+        self, make: Callable[[], Item], walls: tuple[int, ...], z: float = 0.0
+    ) -> bool:
         """Add an item at a random free position along one of the walls."""
         item = make()
         for _ in range(30):
@@ -119,7 +132,8 @@ class _Builder:
             for _ in range(count):
                 thing = makes[self.rng.integers(len(makes))]()
                 for _ in range(6):
-                    x, y = float(self.rng.uniform(x0, x1)), float(self.rng.uniform(y0, y1))
+                    x = float(self.rng.uniform(x0, x1))
+                    y = float(self.rng.uniform(y0, y1))
                     yaw = float(self.rng.uniform(0, 2 * np.pi))
                     if self.add(thing.placed(x, y, z + 0.001, yaw), 0.004, item):
                         break
@@ -166,10 +180,14 @@ def _small_things(t: SmallObjects, kind: str) -> list[Callable[[], Item]]:
 def _robot_table(build: _Builder, base: np.ndarray, repeated: bool) -> float:
     """Add the robot's table with small objects around the work area, and return its height."""
     height = 0.74
-    table = build.shop.table(1.5, 0.95, height).placed(base[0] + 0.3, base[1] + 0.475, 0.0)
+    table = build.shop.table(1.5, 0.95, height).placed(
+        base[0] + 0.3, base[1] + 0.475, 0.0
+    )
     build.add(table)
     # The foot of the arm and the centre of the work area stay free.
-    foot = np.array([[base[0] - 0.2, base[1] - 0.2, height], [base[0] + 0.2, base[1] + 0.2, 2.0]])
+    foot = np.array(
+        [[base[0] - 0.2, base[1] - 0.2, height], [base[0] + 0.2, base[1] + 0.2, 2.0]]
+    )
     build.blocked.append((None, foot))
     t = build.trinkets
     if repeated:
@@ -179,7 +197,17 @@ def _robot_table(build: _Builder, base: np.ndarray, repeated: bool) -> float:
         for side in (-0.4, 0.4):
             for offset in np.linspace(-0.3, 0.9, 7):
                 build.add(jar.placed(x + offset, y + side, height + 0.001), 0.01, table)
-    makes = [t.mug, t.blocks, t.carton, t.bowl, t.jar, t.books, t.bottle, t.plant, t.toy_ball]
+    makes = [
+        t.mug,
+        t.blocks,
+        t.carton,
+        t.bowl,
+        t.jar,
+        t.books,
+        t.bottle,
+        t.plant,
+        t.toy_ball,
+    ]
     order = build.rng.permutation(len(makes))
     for k in range(3 if repeated else 11):
         thing = makes[order[k % len(makes)]]()
@@ -229,20 +257,27 @@ KINDS = {"bedroom": _bedroom, "kitchen": _kitchen, "living": _living}
 
 
 def _workshop(build: _Builder) -> None:
-    shop, t = build.shop, build.trinkets
-    crates = [[(mesh.scaled(1.5), mat) for mesh, mat in t.carton().parts] for _ in range(2)]
+    shop = build.shop
+    t = build.trinkets
+    crates = [
+        [(mesh.scaled(1.5), mat) for mesh, mat in t.carton().parts] for _ in range(2)
+    ]
     things = [Item("carton", crates[0]), t.jar(), Item("carton", crates[1]), t.bottle()]
     _line_up(build, _stocked(shop.rack(), things), 1)
     _in_rows(build, _stocked(shop.table(1.0, 0.6), things[:3]), 4, 2)
     board = t.chessboard(0.07)
-    parts = [(mesh.rotated(about_x(np.pi / 2)), material) for mesh, material in board.parts]
+    parts = [
+        (mesh.rotated(about_x(np.pi / 2)), material) for mesh, material in board.parts
+    ]
     build.try_wall(lambda: Item(board.kind, parts, curved=False), (0, 2), 1.5)
 
 
 def _canteen(build: _Builder) -> None:
-    shop, t = build.shop, build.trinkets
+    shop = build.shop
+    t = build.trinkets
     _line_up(build, build.hangings.cupboard(), 1, 1.45)
-    table, chair = shop.table(0.9, 0.65), shop.chair()
+    table = shop.table(0.9, 0.65)
+    chair = shop.chair()
     laid = _stocked(table, [t.plate(), t.mug(), t.bottle(), t.plate()])
     for chair_y, yaw in ((0.25, 0.0), (-0.9, np.pi)):
         laid.parts += chair.placed(0, chair_y, 0, yaw).parts
@@ -268,7 +303,9 @@ def _stocked(item: Item, things: Sequence[Item]) -> Item:
     """The item with the same things in a row on each of its tops, as one object."""
     parts = list(item.parts)
     for x0, x1, y0, y1, z in item.tops:
-        for x, thing in zip(np.linspace(x0, x1, len(things) + 2)[1:-1], things, strict=True):
+        for x, thing in zip(
+            np.linspace(x0, x1, len(things) + 2)[1:-1], things, strict=True
+        ):
             parts += thing.placed(x, (y0 + y1) / 2, z + 0.001).parts
     return Item(item.kind, parts)
 
@@ -285,7 +322,8 @@ def _line_up(build: _Builder, item: Item, wall: int, z: float = 0.0) -> None:
 def _in_rows(build: _Builder, item: Item, columns: int, rows: int) -> None:
     """Stand copies of an item in a grid on the floor, wherever there is space."""
     low, high = item.bounds_m()[:, :2]
-    first, last = 0.35 - low, build.size[:2] - 0.35 - high
+    first = 0.35 - low
+    last = build.size[:2] - 0.35 - high
     for x in np.linspace(first[0], last[0], columns):
         for y in np.linspace(first[1], last[1], rows):
             build.add(item.placed(float(x), float(y), 0.0))
@@ -298,21 +336,30 @@ def _few_landmarks(build: _Builder) -> None:
     build.try_wall(hangings.clock, (0, 1, 2), 1.85)
     build.try_wall(hangings.wall_shelf, (0, 2), 1.4)
     for _ in range(4):
-        build.try_wall(hangings.picture, (0, 1, 2, 3), float(build.rng.uniform(1.25, 1.6)))
+        build.try_wall(
+            hangings.picture, (0, 1, 2, 3), float(build.rng.uniform(1.25, 1.6))
+        )
 
 
 def _fill_up(build: _Builder) -> None:
     """Add what every room has: a door, furniture, wall objects and plants."""
-    shop, t, rng = build.shop, build.trinkets, build.rng
+    shop = build.shop
+    t = build.trinkets
+    rng = build.rng
     build.try_wall(build.hangings.door, (3, 2))
-    chair, drawers = shop.chair, shop.drawers
+    chair = shop.chair
+    drawers = shop.drawers
     for make in (drawers, chair, shop.floor_lamp, shop.round_table, chair, drawers):
         build.try_wall(make, (0, 2, 3))
     build.try_wall(build.hangings.clock, (0, 1, 2), float(rng.uniform(1.75, 1.95)))
     for _ in range(3):
-        build.try_wall(build.hangings.wall_shelf, (0, 1, 2), float(rng.uniform(1.3, 1.6)))
+        build.try_wall(
+            build.hangings.wall_shelf, (0, 1, 2), float(rng.uniform(1.3, 1.6))
+        )
     for _ in range(9):
-        build.try_wall(build.hangings.picture, (0, 1, 1, 2, 3), float(rng.uniform(1.25, 1.6)))
+        build.try_wall(
+            build.hangings.picture, (0, 1, 1, 2, 3), float(rng.uniform(1.25, 1.6))
+        )
     for make in (t.plant, t.basket, t.toy_ball, t.basket, t.plant):
         thing = make()
         if thing.kind == "plant":  # larger than on tables
@@ -328,7 +375,8 @@ def _fill_up(build: _Builder) -> None:
 def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
     """Make walls, floor, ceiling, skirting, windows with curtains, a ceiling lamp, a carpet."""
     x, y, z = (float(side) for side in build.size)
-    rng, shop = build.rng, build.shop
+    rng = build.rng
+    shop = build.shop
     tone = WALLS[rng.integers(len(WALLS))]
     paint = m.plaster("plaster", tone, rng)
     accent = m.wallpaper("wallpaper", WALLS[rng.integers(len(WALLS))], rng)
@@ -356,13 +404,16 @@ def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
         slabs += _window(build, wall, float(rng.uniform(low, high)))
     # A broad ceiling lamp keeps shadows soft and noise low.
     lamp = m.plain("lamp", (1.0, 0.95, 0.87), emission=5.0)
-    slabs.append((cylinder(0.38, 0.05, 0.01, 48).shifted(0.55 * x, y / 2, z - 0.07), lamp))
+    slabs.append(
+        (cylinder(0.38, 0.05, 0.01, 48).shifted(0.55 * x, y / 2, z - 0.07), lamp)
+    )
     rim = lathe([(0.38, 0), (0.4, 0), (0.4, 0.06), (0.38, 0.06)], 48, 1)
     slabs.append((rim.shifted(0.55 * x, y / 2, z - 0.06), shop.steel))
     if kind in REPEATED:  # a carpet would hide the tiles
         return slabs
     rug = m.carpet("carpet", tuple(rng.uniform(0.2, 0.6, 3).tolist()), rng)
-    w, d = 0.62 * x, 0.55 * y
+    w = 0.62 * x
+    d = 0.55 * y
     mat = box(w, d, 0.012, 0.005, bottom=False).shifted(0.5 * x, y / 2, 0.0)
     uv = (mat.vertices_m[:, :2] - (0.5 * x - w / 2, y / 2 - d / 2)) / (w, d)
     slabs.append((Mesh(mat.vertices_m, mat.faces, mat.normals, uv), rug))
@@ -377,17 +428,27 @@ def _panel(corner: tuple, u: tuple, v: tuple) -> Mesh:
 
 def _window(build: _Builder, wall: int, at: float) -> list[tuple[Mesh, m.Material]]:
     """Make a window with bars and a sill, and add curtains on both sides."""
-    shop, rng = build.shop, build.rng
-    w, h, low = float(rng.uniform(1.1, 1.5)), 1.25, 0.9
+    shop = build.shop
+    rng = build.rng
+    w = float(rng.uniform(1.1, 1.5))
+    h = 1.25
+    low = 0.9
     sky = m.plain("sky", (0.86, 0.93, 1.0), emission=4.2)
     x, y, _ = build.size
     length = x if wall % 2 == 0 else y
     along = w / 2 + 0.6 + at * (length - w - 1.2)
-    position = ((along, y, 0.0), (0.0, along, 0.0), (along, 0.0, 0.0), (x, along, 0.0))[wall]
+    position = ((along, y, 0.0), (0.0, along, 0.0), (along, 0.0, 0.0), (x, along, 0.0))[
+        wall
+    ]
     yaw = WALL_YAW_RAD[wall]
     parts = [(sheet((-w / 2, -0.012, low), (w, 0, 0), (0, 0, h)), sky)]
     for px in (-w / 2, 0.0, w / 2):
-        parts.append((box(0.06, 0.07, h + 0.06, 0.012).shifted(px, -0.03, low - 0.03), shop.white))
+        parts.append(
+            (
+                box(0.06, 0.07, h + 0.06, 0.012).shifted(px, -0.03, low - 0.03),
+                shop.white,
+            )
+        )
     for pz in (low - 0.03, low + 0.62 * h, low + h):
         parts.append((box(w, 0.06, 0.05, 0.012).shifted(0, -0.03, pz), shop.white))
     sill = box(w + 0.2, 0.2, 0.035, 0.014, steps=3).shifted(0, -0.1, low - 0.06)

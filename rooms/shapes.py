@@ -32,7 +32,9 @@ class Mesh:
         starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
         return cls(
             np.concatenate([mesh.vertices_m for mesh in meshes]),
-            np.concatenate([m.faces + start for m, start in zip(meshes, starts, strict=False)]),
+            np.concatenate(
+                [m.faces + start for m, start in zip(meshes, starts, strict=False)]
+            ),
             np.concatenate([mesh.normals for mesh in meshes]),
             np.concatenate([mesh.uv for mesh in meshes]),
             meshes[0].name,
@@ -40,11 +42,14 @@ class Mesh:
 
     def placed(self, position_m: Sequence[float], yaw_rad: float = 0.0) -> "Mesh":
         """The mesh rotated about z, then shifted."""
-        c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+        c = np.cos(yaw_rad)
+        s = np.sin(yaw_rad)
         rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return self.rotated(rotation, position_m)
 
-    def rotated(self, rotation: np.ndarray, position_m: Sequence[float] = (0, 0, 0)) -> "Mesh":
+    def rotated(
+        self, rotation: np.ndarray, position_m: Sequence[float] = (0, 0, 0)
+    ) -> "Mesh":
         """The mesh rotated by a (3, 3) matrix, then shifted."""
         return replace(
             self,
@@ -63,13 +68,15 @@ class Mesh:
 
 def about_x(angle_rad: float) -> np.ndarray:
     """Rotation matrix about x."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    c = np.cos(angle_rad)
+    s = np.sin(angle_rad)
     return np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
 
 
 def about_y(angle_rad: float) -> np.ndarray:
     """Rotation matrix about y."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    c = np.cos(angle_rad)
+    s = np.sin(angle_rad)
     return np.array([[c, 0, s], [0, 1.0, 0], [-s, 0, c]])
 
 
@@ -77,9 +84,15 @@ def _grid(points: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> Mesh:
     """A surface through points (rows, columns, 3); normals define the outside."""
     rows, columns = points.shape[:2]
     number = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
-    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(-1, 3)
-    vertices, flat = points.reshape(-1, 3), normals.reshape(-1, 3)
+    a = number[:-1, :-1]
+    b = number[:-1, 1:]
+    c = number[1:, 1:]
+    d = number[1:, :-1]
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(
+        -1, 3
+    )
+    vertices = points.reshape(-1, 3)
+    flat = normals.reshape(-1, 3)
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=-1)
@@ -89,7 +102,12 @@ def _grid(points: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> Mesh:
 
 
 def box(
-    x: float, y: float, z: float, bevel_m: float = 0.006, bottom: bool = True, steps: int = 2
+    x: float,
+    y: float,
+    z: float,
+    bevel_m: float = 0.006,
+    bottom: bool = True,
+    steps: int = 2,
 ) -> Mesh:
     """A bevelled box on z = 0, centred at x = y = 0.
 
@@ -99,14 +117,18 @@ def box(
     radius = min(bevel_m, 0.499 * min(x, y, z))
     meshes = []
     for axis in range(3):
-        a, b = (axis + 1) % 3, (axis + 2) % 3
+        a = (axis + 1) % 3
+        b = (axis + 2) % 3
         for sign in (1.0, -1.0):
             if axis == 2 and sign < 0 and not bottom:
                 continue
             ring = np.tan(np.linspace(0, np.pi / 4, steps + 1)) * radius
             # A flat face between its bevels is two triangles.
             inner = half - radius
-            lines = [np.concatenate([-inner[i] - ring[::-1], inner[i] + ring]) for i in (a, b)]
+            lines = [
+                np.concatenate([-inner[i] - ring[::-1], inner[i] + ring])
+                for i in (a, b)
+            ]
             p = np.empty((len(lines[0]), len(lines[1]), 3))
             p[..., axis] = sign * half[axis]
             p[..., a], p[..., b] = np.meshgrid(*lines, indexing="ij")
@@ -123,7 +145,9 @@ def box(
     return Mesh.merged(meshes).shifted(0, 0, z / 2)
 
 
-def lathe(profile: Sequence[tuple[float, float]], segments: int = 28, smooth: int = 3) -> Mesh:
+def lathe(
+    profile: Sequence[tuple[float, float]], segments: int = 28, smooth: int = 3
+) -> Mesh:
     """A body of revolution about z.
 
     The profile holds (radius, height) pairs in metres, from the bottom of the outside over the rim
@@ -138,7 +162,9 @@ def lathe(profile: Sequence[tuple[float, float]], segments: int = 28, smooth: in
     tangent = np.gradient(points, axis=0)
     normal = np.stack([tangent[:, 1], -tangent[:, 0]], -1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
+    along = np.concatenate(
+        [[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))]
+    )
     around = np.stack([np.cos(angle), np.sin(angle)], -1)
     p = np.zeros((len(points), len(angle), 3))
     n = np.zeros_like(p)
@@ -153,7 +179,10 @@ def lathe(profile: Sequence[tuple[float, float]], segments: int = 28, smooth: in
 
 def lampshade(*outside: tuple[float, float]) -> list[tuple[float, float]]:
     """Profile of a thin wall, open below and above, from the profile of its outside."""
-    return [*outside, *((radius - 0.002, height) for radius, height in reversed(outside))]
+    return [
+        *outside,
+        *((radius - 0.002, height) for radius, height in reversed(outside)),
+    ]
 
 
 def _spline(points: np.ndarray, pieces: int) -> np.ndarray:
@@ -163,14 +192,18 @@ def _spline(points: np.ndarray, pieces: int) -> np.ndarray:
     parts = []
     for i in range(len(points) - 1):
         a, b, c, d = padded[i : i + 4]
-        square, cube = 2 * a - 5 * b + 4 * c - d, 3 * b - a - 3 * c + d
+        square = 2 * a - 5 * b + 4 * c - d
+        cube = 3 * b - a - 3 * c + d
         parts.append(0.5 * (2 * b + (c - a) * t + square * t**2 + cube * t**3))
     return np.concatenate([*parts, points[-1:]])
 
 
-def cylinder(radius: float, height: float, bevel_m: float = 0.004, segments: int = 28) -> Mesh:
+def cylinder(
+    radius: float, height: float, bevel_m: float = 0.004, segments: int = 28
+) -> Mesh:
     """A cylinder with bevelled ends on z = 0."""
-    r, b = radius, min(bevel_m, 0.45 * height, 0.45 * radius)
+    r = radius
+    b = min(bevel_m, 0.45 * height, 0.45 * radius)
     k = b * (1 - np.sqrt(0.5))
     # Doubled points keep the ends flat although normals are smoothed.
     profile = [
@@ -200,8 +233,12 @@ def tube(path: ArrayLike, radius: float, segments: int = 10) -> Mesh:
     side /= np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), 1e-9)
     up = np.cross(side, tangent)
     angle = np.linspace(0, 2 * np.pi, segments + 1)
-    normal = side[:, None] * np.cos(angle)[:, None] + up[:, None] * np.sin(angle)[:, None]
-    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=-1))])
+    normal = (
+        side[:, None] * np.cos(angle)[:, None] + up[:, None] * np.sin(angle)[:, None]
+    )
+    along = np.concatenate(
+        [[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=-1))]
+    )
     uv = np.stack(np.broadcast_arrays(angle[None, :] * radius, along[:, None]), -1)
     return _grid(path[:, None] + radius * normal, normal, uv)
 
@@ -215,7 +252,9 @@ def cushion(x: float, y: float, z: float, cells: int = 12) -> Mesh:
     pull = 1 - 0.06 * (1 - bulge) * np.cos(u * v * np.pi / 2)
     halves = []
     for sign in (1.0, -1.0):
-        p = np.stack([u * pull * x / 2, v * pull * y / 2, z / 2 * (1 + sign * bulge)], -1)
+        p = np.stack(
+            [u * pull * x / 2, v * pull * y / 2, z / 2 * (1 + sign * bulge)], -1
+        )
         uv = np.stack([u * x / 2, v * y / 2], -1)
         halves.append(_grid(p, sign * _normals(p), uv))
     return Mesh.merged(halves)
@@ -226,11 +265,15 @@ def _normals(points: np.ndarray) -> np.ndarray:
     du, dv = np.gradient(points, axis=(0, 1))
     normal = np.cross(du, dv)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    normal = np.where(length > 1e-12, normal / np.maximum(length, 1e-12), (0.0, 0.0, 1.0))
+    normal = np.where(
+        length > 1e-12, normal / np.maximum(length, 1e-12), (0.0, 0.0, 1.0)
+    )
     return normal * np.where(normal[..., 2:].sum() < 0, -1.0, 1.0)
 
 
-def sheet(corner_m: Sequence[float], u_m: Sequence[float], v_m: Sequence[float]) -> Mesh:
+def sheet(
+    corner_m: Sequence[float], u_m: Sequence[float], v_m: Sequence[float]
+) -> Mesh:
     """A flat rectangle with normal u x v and texture coordinates from 0 to 1."""
     corner, u, v = (np.asarray(value, float) for value in (corner_m, u_m, v_m))
     normal = np.cross(u, v)
@@ -243,10 +286,14 @@ def sheet(corner_m: Sequence[float], u_m: Sequence[float], v_m: Sequence[float])
 def _both_sides(points: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> Mesh:
     """A thin surface as two, 1 mm apart, because back sides are not rendered."""
     step = 5e-4 * normals
-    return Mesh.merged([_grid(points + step, normals, uv), _grid(points - step, -normals, uv)])
+    return Mesh.merged(
+        [_grid(points + step, normals, uv), _grid(points - step, -normals, uv)]
+    )
 
 
-def drape(width: float, height: float, fold_m: float, folds: int, seed: int | None = 0) -> Mesh:
+def drape(
+    width: float, height: float, fold_m: float, folds: int, seed: int | None = 0
+) -> Mesh:
     """A curtain around the plane y = 0 with folds along y, from z = height to 0.
 
     The folds differ in width; without a seed they are equal.
@@ -269,12 +316,16 @@ def leaf(length: float, width: float, droop: float, cells: int = 6) -> Mesh:
     """A leaf from the origin along +x that bends down by `droop` radians."""
     t = np.linspace(0, 1, cells + 1)
     angle = 0.9 - droop * t
-    step = np.stack([np.cos(angle), np.zeros_like(t), np.sin(angle)], -1) * length / cells
+    step = (
+        np.stack([np.cos(angle), np.zeros_like(t), np.sin(angle)], -1) * length / cells
+    )
     spine = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)[:-1]])
     half = width / 2 * np.sin(np.pi * np.clip(t * 0.94 + 0.06, 0, 1)) ** 0.8
     across = np.array([-1.0, 0.0, 1.0])
     p = np.repeat(spine[:, None], 3, axis=1)
     p[..., 1] += half[:, None] * across
     p[..., 2] += 0.25 * half[:, None] * np.abs(across)
-    uv = np.stack(np.broadcast_arrays(across[None, :] * width / 2, t[:, None] * length), -1)
+    uv = np.stack(
+        np.broadcast_arrays(across[None, :] * width / 2, t[:, None] * length), -1
+    )
     return _both_sides(p, _normals(p), uv)

@@ -66,22 +66,42 @@ _CYCLE = ("bedroom", "kitchen", "living")
 
 def _numbered(count: int, first_seed: int) -> tuple[tuple[str, str, int], ...]:
     kinds = [_CYCLE[i % 3] for i in range(count)]
-    return tuple((f"{kind}-{i // 3 + 1}", kind, first_seed + i) for i, kind in enumerate(kinds))
+    return tuple(
+        (f"{kind}-{i // 3 + 1}", kind, first_seed + i) for i, kind in enumerate(kinds)
+    )
 
 
-_THREE = (("bedroom", "bedroom", 101), ("kitchen", "kitchen", 102), ("living", "living", 103))
-_REPEATED = (("workshop", "workshop", 401), ("canteen", "canteen", 402), ("hall", "hall", 403))
+_THREE = (
+    ("bedroom", "bedroom", 101),
+    ("kitchen", "kitchen", 102),
+    ("living", "living", 103),
+)
+_REPEATED = (
+    ("workshop", "workshop", 401),
+    ("canteen", "canteen", 402),
+    ("hall", "hall", 403),
+)
 
 # Rooms of no published table: settings of the networks are chosen on `sim-tune`, and confirmed on
 # `sim-unseen`.
-_TUNE = (("bedroom", "bedroom", 4001), ("kitchen", "kitchen", 4002), ("living", "living", 4003))
-_UNSEEN = (("bedroom", "bedroom", 5001), ("kitchen", "kitchen", 5002), ("living", "living", 5003))
+_TUNE = (
+    ("bedroom", "bedroom", 4001),
+    ("kitchen", "kitchen", 4002),
+    ("living", "living", 4003),
+)
+_UNSEEN = (
+    ("bedroom", "bedroom", 5001),
+    ("kitchen", "kitchen", 5002),
+    ("living", "living", 5003),
+)
 
 SUITES: dict[str, Suite] = {
     "sim": Suite(_THREE, 3300, (640, 480), 16),
     "sim-7": Suite(_numbered(7, 201), 1000, (320, 240), 16),
     "sim-12": Suite(_numbered(12, 301), 1000, (320, 240), 16),
-    "sim-mini": Suite(_THREE, 130, (320, 240), 16, depth=False, jpeg_quality=85, changed=20),
+    "sim-mini": Suite(
+        _THREE, 130, (320, 240), 16, depth=False, jpeg_quality=85, changed=20
+    ),
     "sim-tune": Suite(_TUNE, 130, (320, 240), 16, depth=False, jpeg_quality=85),
     "sim-unseen": Suite(_UNSEEN, 1000, (320, 240), 16, depth=False, jpeg_quality=85),
     "sim-repeat": Suite(_REPEATED, 130, (320, 240), 16, depth=False, jpeg_quality=85),
@@ -155,8 +175,12 @@ def simulate(
         "jpeg_quality": suite.jpeg_quality,
         **asdict(render),
     }
-    existing = sum(1 for scene, *_ in suite.rooms for _ in (out / scene).glob("**/images/*.jpg"))
-    _refuse_full_disk(out, (total - existing) * width * height * (4 if suite.depth else 2))
+    existing = sum(
+        1 for scene, *_ in suite.rooms for _ in (out / scene).glob("**/images/*.jpg")
+    )
+    _refuse_full_disk(
+        out, (total - existing) * width * height * (4 if suite.depth else 2)
+    )
     mi = mitsuba()
     settings["renderer"] = f"mitsuba {mi.__version__} {mi.variant()}"
     lock_settings(out / "render.json", settings)
@@ -167,11 +191,15 @@ def simulate(
         sweep = sweep_shots(before, frames, options.seed)
         recordings = [(out / scene, sweep)]
         if not options.sweep_only:
-            recordings += _calibrations(before, options.seed, out / scene / "calibration")
+            recordings += _calibrations(
+                before, options.seed, out / scene / "calibration"
+            )
         plans = [(before, recordings)]
         if suite.changed and not options.sweep_only:
             after = changed_room(before, options.seed)
-            train = SE3.stack([shot.base_from_camera for shot in sweep if shot.split == "train"])
+            train = SE3.stack(
+                [shot.base_from_camera for shot in sweep if shot.split == "train"]
+            )
             shots = changed_shots(after, suite.changed, train, options.seed)
             plans.append((after, [(out / scene / "changed", shots)]))
         for state, recordings in plans:
@@ -187,12 +215,19 @@ def _checked(name: str, options: SimulateOptions) -> Suite:
     if name not in SUITES:
         raise InputError(f"suite {name!r} is not known; use one of {', '.join(SUITES)}")
     if not 0 <= options.seed < RESERVED:
-        raise InputError(f"seed {options.seed}: use 0 to {RESERVED - 1}; higher ones are reserved")
+        raise InputError(
+            f"seed {options.seed}: use 0 to {RESERVED - 1}; higher ones are reserved"
+        )
     if options.frames is not None and options.frames < 2:
-        raise InputError(f"frames {options.frames}: a room takes at least 2, one per split")
+        raise InputError(
+            f"frames {options.frames}: a room takes at least 2, one per split"
+        )
     if options.size is not None and min(options.size) < 16:
         raise InputError(f"size {options.size[0]}x{options.size[1]}: at least 16x16")
-    for option, count in (("samples", options.samples), ("blur steps", options.blur_steps)):
+    for option, count in (
+        ("samples", options.samples),
+        ("blur steps", options.blur_steps),
+    ):
         if count is not None and count < 1:
             raise InputError(f"{option} {count}: at least 1")
     if not options.noise >= 0:  # also nan
@@ -213,13 +248,18 @@ def _refuse_full_disk(out: Path, needed: int) -> None:
         )
 
 
-def _calibrations(before: Room, seed: int, folder: Path) -> list[tuple[Path, list[Shot]]]:
+def _calibrations(
+    before: Room, seed: int, folder: Path
+) -> list[tuple[Path, list[Shot]]]:
     """Plan the calibration recordings of a room and write the true calibration."""
     fixed, bumped, bump = fixed_shots(before, CALIBRATION_FRAMES, seed)
     gripper_from_camera = hand_camera(seed)
     hand = _hand_shots(before, gripper_from_camera, seed)
     folder.mkdir(parents=True, exist_ok=True)
-    truth = {"gripper_from_camera": gripper_from_camera, "fixed_camera_from_bumped_camera": bump}
+    truth = {
+        "gripper_from_camera": gripper_from_camera,
+        "fixed_camera_from_bumped_camera": bump,
+    }
     poses = {name: pose_to_dict(pose) for name, pose in truth.items()}
     write_json(folder / "truth.json", poses)
     return [
@@ -235,7 +275,11 @@ def _hand_shots(before: Room, gripper_from_camera: SE3, seed: int) -> list[Shot]
     for joints in hand_joints(40 * CALIBRATION_FRAMES, seed):
         camera = base_from_flange(joints) @ gripper_from_camera
         eye = camera.translation_m
-        if eye[2] > 0.2 and sees_work_area(camera) and before.is_free(eye[None], 0.05).all():
+        if (
+            eye[2] > 0.2
+            and sees_work_area(camera)
+            and before.is_free(eye[None], 0.05).all()
+        ):
             shots.append(Shot(f"hand-{len(shots):06d}", "test", camera, joints))
         if len(shots) == CALIBRATION_FRAMES:
             return shots
@@ -262,7 +306,8 @@ class _Writer:
         """Render missing frames, then write scene.json. Yields after each frame."""
         frames = []
         for i, shot in enumerate(shots):
-            image, depth = root / f"images/{i:06d}.jpg", root / f"depth/{i:06d}.png"
+            image = root / f"images/{i:06d}.jpg"
+            depth = root / f"depth/{i:06d}.png"
             if not (image.exists() and (depth.exists() or not self.suite.depth)):
                 following = shots[i + 1] if i + 1 < len(shots) else shot
                 self._render(shot, following, i, image, depth)
@@ -286,11 +331,15 @@ class _Writer:
             for frame, shot in zip(frames, shots, strict=True):
                 writer.add(frame, shot.split)
 
-    def _render(self, shot: Shot, following: Shot, i: int, image: Path, depth: Path) -> None:
+    def _render(
+        self, shot: Shot, following: Shot, i: int, image: Path, depth: Path
+    ) -> None:
         import cv2
 
         if self._renderer is None:
-            self._renderer = Renderer(self.room.meshes() + panda_meshes(shot.joints_rad))
+            self._renderer = Renderer(
+                self.room.meshes() + panda_meshes(shot.joints_rad)
+            )
         elif not np.array_equal(self._joints_rad, shot.joints_rad):
             arm = panda_meshes(shot.joints_rad)
             self._renderer.move({mesh.name: mesh for mesh, _ in arm})

@@ -19,7 +19,8 @@ def render_distorted(room: BoxRoom, camera: Camera, pose: SE3) -> np.ndarray:
     """(h, w, 3) image of a camera with distortion: a fine ideal image, distorted by pixel."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(float)
     rays = camera.unproject(np.stack([u, v], -1))
-    low, high = rays.reshape(-1, 3).min(0) - 0.02, rays.reshape(-1, 3).max(0) + 0.02
+    low = rays.reshape(-1, 3).min(0) - 0.02
+    high = rays.reshape(-1, 3).max(0) + 0.02
     focal = 2.0 * camera.fx
     width, height = (int(np.ceil(side * focal)) for side in (high - low)[:2])
     ideal = Camera(width, height, focal, focal, -low[0] * focal, -low[1] * focal)
@@ -29,7 +30,9 @@ def render_distorted(room: BoxRoom, camera: Camera, pose: SE3) -> np.ndarray:
     return cv2.remap(image, where, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
 
 
-def box_room_scene(seed: int, train: int, test: int, camera: Camera | None = None) -> Recording:
+def box_room_scene(
+    seed: int, train: int, test: int, camera: Camera | None = None
+) -> Recording:
     """A recording `box-room-SEED`: one sweep of training frames and another of test frames."""
     room = BoxRoom(seed)
     intrinsics = camera or default_camera()
@@ -37,7 +40,12 @@ def box_room_scene(seed: int, train: int, test: int, camera: Camera | None = Non
     def record(split: str, count: int, path_seed: int) -> tuple[Frame, ...]:
         poses = room.path(count, path_seed)
         return tuple(
-            Frame(f"{split}-{i:06d}", room.render(intrinsics, poses[i]), intrinsics, poses[i])
+            Frame(
+                f"{split}-{i:06d}",
+                room.render(intrinsics, poses[i]),
+                intrinsics,
+                poses[i],
+            )
             for i in range(count)
         )
 
@@ -56,7 +64,9 @@ def shoot(box: BoxRoom) -> Shoot:
 
     def take(camera: Camera, pose: SE3) -> Frame:
         image = (
-            render_distorted(box, camera, pose) if camera.distortion else box.render(camera, pose)
+            render_distorted(box, camera, pose)
+            if camera.distortion
+            else box.render(camera, pose)
         )
         return Frame("frame", image, camera, pose)
 

@@ -49,7 +49,12 @@ settings.load_profile("busy")
 
 
 def _room(
-    seed: int, name: str, size: tuple[int, int], span: int, every: int = 1, texture_px: int = 96
+    seed: int,
+    name: str,
+    size: tuple[int, int],
+    span: int,
+    every: int = 1,
+    texture_px: int = 96,
 ) -> Recording:
     """`span` views on a walk of half a metre that turns by 50 degrees; each `every`th trains."""
     import numpy as np
@@ -57,10 +62,12 @@ def _room(
     from evercal.recordings.frame import Frame, Recording
     from evercal.simulation.box_room import BoxRoom, default_camera, look_at
 
-    room, camera = BoxRoom(seed, texture_px=texture_px), default_camera(*size)
+    room = BoxRoom(seed, texture_px=texture_px)
+    camera = default_camera(*size)
     frames = []
     for i, s in enumerate(np.linspace(0, 1, span)):
-        sway, heading = np.sin(2 * np.pi * s), seed + 0.9 * s
+        sway = np.sin(2 * np.pi * s)
+        heading = seed + 0.9 * s
         eye = np.array([0.5 * s - 0.25, 0.15 * sway, 1.3 + 0.1 * sway])
         ahead = np.array([np.cos(heading), np.sin(heading), 0.1 * sway - 0.1])
         pose = look_at(eye, eye + ahead, 0.1 * sway)
@@ -120,7 +127,11 @@ def device(request: pytest.FixtureRequest) -> torch.device:
     """The CPU, and with `-m gpu` a CUDA device; the test is skipped without one."""
     import torch
 
-    return request.getfixturevalue("cuda") if request.param == "cuda" else torch.device("cpu")
+    return (
+        request.getfixturevalue("cuda")
+        if request.param == "cuda"
+        else torch.device("cpu")
+    )
 
 
 @pytest.fixture
@@ -143,7 +154,10 @@ def rooms() -> tuple[Recording, Recording, Recording]:
 @pytest.fixture(scope="session")
 def arcs() -> tuple[Recording, Recording]:
     """Two scenes of 24 training and 24 test frames in between, 160x120 pixels."""
-    one, two = (_room(seed, name, (160, 120), 48, 2) for seed, name in ((34, "one"), (31, "two")))
+    one, two = (
+        _room(seed, name, (160, 120), 48, 2)
+        for seed, name in ((34, "one"), (31, "two"))
+    )
     return one, two
 
 
@@ -174,7 +188,8 @@ def hall_built(hall: Recording, shared: Shared) -> BuiltMap:
     from evercal.mapping.scene_map import MapContents
 
     def build() -> BuiltMap:
-        encoder, options = load_encoder(), MapOptions(memory=MemoryBudget(share=0.25))
+        encoder = load_encoder()
+        options = MapOptions(memory=MemoryBudget(share=0.25))
         built = build_map("hall", hall.train, encoder, options)
         contents = MapContents(encoder, options.size.cells, [built.scene])
         return replace(built, scene=with_scatter(contents, hall.test[::10]))
@@ -333,7 +348,9 @@ def everything(
     snapshot: Callable[[Path], dict[str, bytes | None]],
 ) -> Callable[[Path], dict[str, bytes | None]]:
     """As `snapshot`; locks are left out."""
-    return lambda root: {n: c for n, c in snapshot(root).items() if not n.endswith(".lock")}
+    return lambda root: {
+        n: c for n, c in snapshot(root).items() if not n.endswith(".lock")
+    }
 
 
 @pytest.fixture(scope="module")

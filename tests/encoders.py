@@ -17,8 +17,11 @@ class BlockMean(Encoder):
     """One channel: the mean grey value of each cell, in [0, 1]."""
 
     def __init__(self) -> None:
-        self.name, self.data, self.fingerprint = "block_mean", b"", []
-        self.stride, self.width = 8, 1
+        self.name = "block_mean"
+        self.data = b""
+        self.fingerprint = []
+        self.stride = 8
+        self.width = 1
 
     def __call__(self, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
         rows, columns = (side // 8 for side in grey.shape)

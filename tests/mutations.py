@@ -9,8 +9,31 @@ from collections.abc import Callable
 from typing import Any
 
 NUMBER = re.compile(rb"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
-NUMBERS = (b"nan", b"inf", b"-1", b"0", b"1e999", b"-1e308", b"99999999999999999999", b"0.1", b"")
-VALUES: tuple[Any, ...] = (None, True, -1, 0, 1e300, 10**30, "", "x" * 50, [], {}, [[]], [1, "a"])
+NUMBERS = (
+    b"nan",
+    b"inf",
+    b"-1",
+    b"0",
+    b"1e999",
+    b"-1e308",
+    b"99999999999999999999",
+    b"0.1",
+    b"",
+)
+VALUES: tuple[Any, ...] = (
+    None,
+    True,
+    -1,
+    0,
+    1e300,
+    10**30,
+    "",
+    "x" * 50,
+    [],
+    {},
+    [[]],
+    [1, "a"],
+)
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:
@@ -47,7 +70,9 @@ def _truncated(data: bytes, rng: random.Random) -> bytes:
 
 def _inserted(data: bytes, rng: random.Random) -> bytes:
     a = rng.randrange(len(data) + 1)
-    more = rng.choice((rng.randbytes(20), b"\x00" * 8, b"\xff\xfe", b"\n\n", b"{[", b'"'))
+    more = rng.choice(
+        (rng.randbytes(20), b"\x00" * 8, b"\xff\xfe", b"\n\n", b"{[", b'"')
+    )
     return data[:a] + more + data[a:]
 
 
@@ -55,7 +80,9 @@ def _other_number(data: bytes, rng: random.Random) -> bytes:
     found = list(NUMBER.finditer(data[:200_000]))
     if not found:
         return _flip(data, rng)
-    for match in sorted(rng.sample(found, min(len(found), rng.choice((1, 1, 4)))), key=_from_end):
+    for match in sorted(
+        rng.sample(found, min(len(found), rng.choice((1, 1, 4)))), key=_from_end
+    ):
         data = data[: match.start()] + rng.choice(NUMBERS) + data[match.end() :]
     return data
 

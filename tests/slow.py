@@ -21,7 +21,9 @@ _states = pytest.StashKey[dict[str, str]]()
 def state_of(path: str) -> str:
     """Checksum of the files below a path that git does not ignore."""
     command = ["git", "ls-files", "-co", "--exclude-standard", "--", path]
-    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    listed = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
     checksum = hashlib.sha256()
     for name in sorted(set(listed.splitlines())):
         if (file := ROOT / name).is_file():
@@ -30,19 +32,28 @@ def state_of(path: str) -> str:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--due", action="store_true", help="only the slow tests of changed folders")
+    parser.addoption(
+        "--due", action="store_true", help="only the slow tests of changed folders"
+    )
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(
+    config: pytest.Config, items: list[pytest.Item]
+) -> None:
     """Leave out slow tests that are not due, unless `-m` speaks of them."""
     if "slow" in config.option.markexpr:
         return
     groups = [_group(item) for item in items]
-    state = {path: state_of(path) for path in {p for group in groups if group for p in group}}
-    states = {" ".join(g): " ".join(state[path] for path in g) for g in set(groups) if g}
+    state = {
+        path: state_of(path) for path in {p for group in groups if group for p in group}
+    }
+    states = {
+        " ".join(g): " ".join(state[path] for path in g) for g in set(groups) if g
+    }
     passed = json.loads(NOTES.read_text("utf-8")) if NOTES.exists() else {}
-    kept, left = list[pytest.Item](), list[pytest.Item]()
+    kept = list[pytest.Item]()
+    left = list[pytest.Item]()
     for item, group in zip(items, groups, strict=True):
         key = " ".join(group)
         wanted = passed.get(key) != states[key] if group else not config.option.due
@@ -64,6 +75,12 @@ def _group(item: pytest.Item) -> tuple[str, ...]:
 
 
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
-    options, states = session.config.option, session.config.stash.get(_states, None)
-    if options.due and not options.collectonly and states is not None and exitstatus in (0, 5):
+    options = session.config.option
+    states = session.config.stash.get(_states, None)
+    if (
+        options.due
+        and not options.collectonly
+        and states is not None
+        and exitstatus in (0, 5)
+    ):
         NOTES.write_text(json.dumps(states, indent=1, sort_keys=True) + "\n", "utf-8")

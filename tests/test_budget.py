@@ -41,7 +41,12 @@ def code_lines(source: str) -> int:
 
 def test_code_lines_are_counted() -> None:
     assert code_lines('"""A module."""\n\n# Why.\nx = [\n    1,\n]\n') == 3
-    assert code_lines('def f():\n    """Do.\n\n    More.\n    """\n    return """a\nb"""\n') == 3
+    assert (
+        code_lines(
+            'def f():\n    """Do.\n\n    More.\n    """\n    return """a\nb"""\n'
+        )
+        == 3
+    )
 
 
 def test_no_folder_exceeds_its_budget() -> None:
@@ -52,7 +57,8 @@ def test_no_folder_exceeds_its_budget() -> None:
         name: int(most.replace(",", ""))
         for name, most in re.findall(r"^\| `([\w./]+)` \| ([\d,]+) \|$", table, re.M)
     }
-    source, count = ROOT / "src" / "evercal", Counter[str]()
+    source = ROOT / "src" / "evercal"
+    count = Counter[str]()
     for path in source.rglob("*.py"):
         folder = path.relative_to(source).parts[0]
         lines = code_lines(path.read_text(encoding="utf-8"))
@@ -62,5 +68,9 @@ def test_no_folder_exceeds_its_budget() -> None:
         for path in (ROOT / folder).rglob("*.py"):
             count[folder] += code_lines(path.read_text(encoding="utf-8"))
     assert budget.keys() == count.keys()
-    over = {name: (lines, budget[name]) for name, lines in count.items() if lines > budget[name]}
+    over = {
+        name: (lines, budget[name])
+        for name, lines in count.items()
+        if lines > budget[name]
+    }
     assert not over, f"more code lines than docs/architecture.md allows: {over}"

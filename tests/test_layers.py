@@ -45,7 +45,9 @@ MOST_LOCALIZING, MOST_LEARNING = 43, 64
 """Modules of evercal that a program loads, at most."""
 
 
-def imported(tree: ast.AST, package: tuple[str, ...]) -> Iterator[tuple[int, tuple[str, ...]]]:
+def imported(
+    tree: ast.AST, package: tuple[str, ...]
+) -> Iterator[tuple[int, tuple[str, ...]]]:
     """(line, dotted parts) of everything that a module in `package` imports, at any depth."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -60,7 +62,9 @@ def imported(tree: ast.AST, package: tuple[str, ...]) -> Iterator[tuple[int, tup
             # importlib.import_module("evercal.x") and __import__("evercal.x")
             name = getattr(node.func, "attr", getattr(node.func, "id", None))
             target = node.args[0]
-            if name in ("import_module", "__import__") and isinstance(target, ast.Constant):
+            if name in ("import_module", "__import__") and isinstance(
+                target, ast.Constant
+            ):
                 yield node.lineno, tuple(str(target.value).split("."))
 
 
@@ -81,7 +85,9 @@ def violations(root: Path) -> list[str]:
             lines.append(f"{inside}: {layer} is not in the order")
             continue
         package = ("evercal", *inside.parent.parts)
-        for line, parts in imported(ast.parse(file.read_text(encoding="utf-8")), package):
+        for line, parts in imported(
+            ast.parse(file.read_text(encoding="utf-8")), package
+        ):
             if parts[0] == "evercal" and not (set(parts[1:2]) & {*allowed, *FOR_ALL}):
                 lines.append(f"{inside}:{line}: imports {'.'.join(parts)}")
     return lines
@@ -89,15 +95,25 @@ def violations(root: Path) -> list[str]:
 
 def torch_imports(root: Path) -> list[str]:
     """Modules outside `continual` that import torch, at any depth."""
-    files = {file.relative_to(root).as_posix(): file for file in sorted(root.rglob("*.py"))}
-    found = {name: imported(ast.parse(file.read_text("utf-8")), ()) for name, file in files.items()}
-    using = [name for name, of in found.items() if "torch" in {parts[0] for _, parts in of}]
+    files = {
+        file.relative_to(root).as_posix(): file for file in sorted(root.rglob("*.py"))
+    }
+    found = {
+        name: imported(ast.parse(file.read_text("utf-8")), ())
+        for name, file in files.items()
+    }
+    using = [
+        name for name, of in found.items() if "torch" in {parts[0] for _, parts in of}
+    ]
     return [name for name in using if not name.startswith("continual/")]
 
 
 def outside_product(module: str) -> bool:
     """Whether a module belongs to the networks, their torch, the simulation or the command line."""
-    return module.split(".")[0] == "torch" or not {*module.split(".")[1:2]} <= {*PRODUCT, *FOR_ALL}
+    return module.split(".")[0] == "torch" or not {*module.split(".")[1:2]} <= {
+        *PRODUCT,
+        *FOR_ALL,
+    }
 
 
 def test_folders_import_only_from_folders_above() -> None:
@@ -110,14 +126,18 @@ def test_only_networks_import_torch(tmp_path: Path) -> None:
     (tmp_path / "continual").mkdir()
     for name in ("continual/head.py", "map.py", "plain.py"):
         (tmp_path / name).write_text("def f():\n    from torch.nn import functional\n")
-    (tmp_path / "plain.py").write_text("from evercal.continual import torch\nimport torchlike")
+    (tmp_path / "plain.py").write_text(
+        "from evercal.continual import torch\nimport torchlike"
+    )
     assert torch_imports(tmp_path) == ["map.py"]
 
 
 def printed(code: str, *words: Path) -> list[list[str]]:
     """Words on each line that a program prints."""
     command = [sys.executable, "-c", code, *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=True, timeout=300
+    )
     return [line.split() for line in done.stdout.splitlines()]
 
 
@@ -174,7 +194,16 @@ def test_import_is_fast_and_provides_every_public_name() -> None:
     code = "import sys, time; began = time.perf_counter(); import evercal\n"
     code += "print(time.perf_counter() - began, *sys.modules)"
     ((seconds, *modules),) = printed(code)
-    heavy = {"torch", "cv2", "scipy", "matplotlib", "pandas", "poselib", "tyro", "numpy"}
+    heavy = {
+        "torch",
+        "cv2",
+        "scipy",
+        "matplotlib",
+        "pandas",
+        "poselib",
+        "tyro",
+        "numpy",
+    }
     assert not heavy & set(modules)
     assert float(seconds) < 1.0
     for name in dir(evercal):

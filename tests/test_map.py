@@ -11,7 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evercal import Calibration, InputError, LearnReport, Map, Recording, Shift, read_calibration
+from evercal import (
+    Calibration,
+    InputError,
+    LearnReport,
+    Map,
+    Recording,
+    Shift,
+    read_calibration,
+)
 from evercal.geometry import SE3, pose_distance
 from evercal.mapping.build import MapOptions
 from evercal.mapping.store import MapStore
@@ -27,19 +35,26 @@ GRIPPER_FROM_CAMERA = SE3.exp([0.05, -0.02, 0.1, 0.3, 0.2, -1.0])
 
 @pytest.fixture(scope="module")
 def learned(
-    hall: Recording, arcs: tuple[Recording, Recording], tmp_path_factory: pytest.TempPathFactory
+    hall: Recording,
+    arcs: tuple[Recording, Recording],
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[Map, tuple[LearnReport, LearnReport]]:
     """A map of the hall, learned from its folder, and of an arc, learned from a `Recording`."""
     root = tmp_path_factory.mktemp("map")
     generic.write(root / "hall", hall)
     opened = Map.open(root / "new" / "map")
     assert opened.scenes == ()
-    reports = opened.learn(root / "hall"), opened.learn(arcs[0], name="arc", memory="300kB")
+    reports = (
+        opened.learn(root / "hall"),
+        opened.learn(arcs[0], name="arc", memory="300kB"),
+    )
     return opened, reports
 
 
 @pytest.fixture(scope="module")
-def hall_only(learned: tuple[Map, tuple[LearnReport, LearnReport]], tmp_path_factory: Any) -> Map:
+def hall_only(
+    learned: tuple[Map, tuple[LearnReport, LearnReport]], tmp_path_factory: Any
+) -> Map:
     """A map of the hall."""
     file = tmp_path_factory.mktemp("hall") / "map.zip"
     learned[0].pack(file)
@@ -51,12 +66,15 @@ def hall_only(learned: tuple[Map, tuple[LearnReport, LearnReport]], tmp_path_fac
 @pytest.fixture(scope="module")
 def arm(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SE3]:
     """Images of a camera on the gripper beside their poses.csv, and base_from_gripper of each."""
-    folder, frames = tmp_path_factory.mktemp("arm"), hall.test[::3]
+    folder = tmp_path_factory.mktemp("arm")
+    frames = hall.test[::3]
     grippers = SE3.stack([truth_of(f) @ GRIPPER_FROM_CAMERA.inverse() for f in frames])
     rows = ["image,x,y,z,qw,qx,qy,qz"]
     for i, (frame, pose) in enumerate(zip(frames, grippers, strict=True)):
         write_image(folder / f"{i}.png", frame.read_image())
-        rows.append(",".join(map(str, [f"{i}.png", *pose.translation_m, *pose.rotation_wxyz])))
+        rows.append(
+            ",".join(map(str, [f"{i}.png", *pose.translation_m, *pose.rotation_wxyz]))
+        )
     (folder / "poses.csv").write_text("\n".join(rows))
     return folder, grippers
 
@@ -67,8 +85,12 @@ def truth_of(frame: Frame) -> SE3:
 
 
 def noisy(frame: Frame, count: int, seed: int = 0) -> list[np.ndarray]:
-    rng, image = np.random.default_rng(seed), frame.read_image().astype(float)
-    return [(image + rng.normal(0, 4, image.shape)).clip(0, 255).astype("u1") for _ in range(count)]
+    rng = np.random.default_rng(seed)
+    image = frame.read_image().astype(float)
+    return [
+        (image + rng.normal(0, 4, image.shape)).clip(0, 255).astype("u1")
+        for _ in range(count)
+    ]
 
 
 def test_learned_scenes_and_their_reports(
@@ -82,7 +104,10 @@ def test_learned_scenes_and_their_reports(
     assert hall.adjusted is not None
     assert hall.hand_eye is None
     assert arc.memory_bytes - hall.memory_bytes <= 300_000
-    stored = [json.loads(path.read_text()) for path in sorted(opened.path.rglob("report.json"))]
+    stored = [
+        json.loads(path.read_text())
+        for path in sorted(opened.path.rglob("report.json"))
+    ]
     assert [report["scene"] for report in stored] == ["hall", "arc"]
     assert stored[0]["adjusted"]["residual_px"] == hall.adjusted.residual_px
 
@@ -127,7 +152,9 @@ def test_fixed_camera_from_a_folder_files_and_arrays(
 
 
 @pytest.mark.parametrize("from_file", [True, False])
-def test_camera_on_the_gripper(from_file: bool, hall_only: Map, arm: tuple[Path, SE3]) -> None:
+def test_camera_on_the_gripper(
+    from_file: bool, hall_only: Map, arm: tuple[Path, SE3]
+) -> None:
     folder, grippers = arm
     poses = folder / "poses.csv" if from_file else grippers
     calibration = hall_only.calibrate(folder, robot_poses=poses)
@@ -149,7 +176,8 @@ def test_check_from_one_file(
         write_image(tmp_path / "now.png", noisy(frame, 1, seed=1)[0])
         return hall_only.check(tmp_path / "now.png", calibration)
 
-    still, bumped = shift(hall.test[3]), shift(hall.test[4])
+    still = shift(hall.test[3])
+    bumped = shift(hall.test[4])
     assert still.same_map
     assert bumped.same_map
     assert not still.moved
@@ -158,12 +186,16 @@ def test_check_from_one_file(
     assert bumped.translation_mm == pytest.approx(1000 * metres, abs=3)
 
 
-def test_calibration_is_written_and_exported(calibration: Calibration, tmp_path: Path) -> None:
+def test_calibration_is_written_and_exported(
+    calibration: Calibration, tmp_path: Path
+) -> None:
     calibration.write(tmp_path / "camera.json")
     got = read_calibration(tmp_path / "camera.json")
     # Reading normalises the quaternion, which may change its last digit.
     pose = calibration.parent_from_child
-    np.testing.assert_allclose(got.parent_from_child.matrix(), pose.matrix(), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        got.parent_from_child.matrix(), pose.matrix(), rtol=0, atol=1e-15
+    )
     assert replace(got, parent_from_child=pose).to_dict() == calibration.to_dict()
     text = calibration.export("launch_py", tmp_path / "camera.launch.py")
     assert text
@@ -185,7 +217,9 @@ def test_evaluate(hall_only: Map, hall: Recording, tmp_path: Path) -> None:
         hall_only.evaluate({"attic": few})
 
 
-def test_a_name_that_is_taken_is_refused(hall_only: Map, hall: Recording, tree: Tree) -> None:
+def test_a_name_that_is_taken_is_refused(
+    hall_only: Map, hall: Recording, tree: Tree
+) -> None:
     before = tree(hall_only.path)
     with pytest.raises(InputError, match="scene 'hall': a scene of this name exists"):
         hall_only.learn(hall)
@@ -204,7 +238,9 @@ def test_memory_that_cannot_be_used_is_refused(
     assert not (tmp_path / "map").exists()
 
 
-def test_memory_in_megabytes_and_auto(arcs: tuple[Recording, Recording], tmp_path: Path) -> None:
+def test_memory_in_megabytes_and_auto(
+    arcs: tuple[Recording, Recording], tmp_path: Path
+) -> None:
     opened = Map(MapStore.create(tmp_path / "map", short_side=120))
     quick = MapOptions(adjust=False)
     one = opened.learn(arcs[0], name="one", memory="0.1MB", options=quick)
@@ -245,7 +281,9 @@ def test_interrupted_first_learning_leaves_no_map(
     assert Map.open(tmp_path / "map").scenes == ()
 
 
-def test_a_map_without_scenes_is_refused(rooms: tuple[Recording, ...], tmp_path: Path) -> None:
+def test_a_map_without_scenes_is_refused(
+    rooms: tuple[Recording, ...], tmp_path: Path
+) -> None:
     opened = Map.open(tmp_path / "map")
     with pytest.raises(InputError, match=r"map .*: no scene learned yet"):
         opened.localize(rooms[0].train[0].read_image())
@@ -257,21 +295,32 @@ def test_recordings_with_few_frames_are_refused(
     rooms: tuple[Recording, ...], tmp_path: Path
 ) -> None:
     few = replace(rooms[0], train=rooms[0].train[:3])
-    with pytest.raises(InputError, match="scene 'alpha': 3 training frames are too few"):
+    with pytest.raises(
+        InputError, match="scene 'alpha': 3 training frames are too few"
+    ):
         Map.open(tmp_path / "map").learn(few)
     with pytest.raises(InputError, match="missing"):
         Map.open(tmp_path / "map").learn(tmp_path / "missing")
 
 
-def test_stores_of_networks_and_other_folders_are_refused(hall_only: Map, tmp_path: Path) -> None:
+def test_stores_of_networks_and_other_folders_are_refused(
+    hall_only: Map, tmp_path: Path
+) -> None:
     store = MapStore.open(hall_only.path)
     root = tmp_path / "networks"
     root.mkdir()
     manifest = Manifest.read(store.root)
     empty = {"networks": [], "stages": []}
-    payload = {**manifest.payload, "kind": "networks", "strategy": "evercal_network", **empty}
+    payload = {
+        **manifest.payload,
+        "kind": "networks",
+        "strategy": "evercal_network",
+        **empty,
+    }
     write_manifest(root, payload, [])
-    with pytest.raises(InputError, match=rf"{root}: holds networks of strategy 'evercal_network'"):
+    with pytest.raises(
+        InputError, match=rf"{root}: holds networks of strategy 'evercal_network'"
+    ):
         Map.open(root)
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_bytes(b"")
@@ -285,7 +334,9 @@ def test_stores_of_networks_and_other_folders_are_refused(hall_only: Map, tmp_pa
 def test_a_second_object_of_one_map_does_not_overwrite_its_scenes(
     rooms: tuple[Recording, ...], tmp_path: Path
 ) -> None:
-    first, second = (Map(MapStore.create(tmp_path / "map", short_side=64)) for _ in range(2))
+    first, second = (
+        Map(MapStore.create(tmp_path / "map", short_side=64)) for _ in range(2)
+    )
     first.learn(rooms[0], options=MapOptions(adjust=False))
     with pytest.raises(InputError, match="another process has changed it"):
         second.learn(rooms[1])
@@ -307,7 +358,8 @@ def test_a_merged_map_gives_the_answers_of_one_that_learned_in_turn(
     assert joined.added == merged.scenes == turn.scenes == ("hall", "arc")
     images = [scene.test[i].read_image() for scene in (hall, arcs[0]) for i in (3, 12)]
     for image in images:
-        expected, estimate = turn.localize(image), merged.localize(image)
+        expected = turn.localize(image)
+        estimate = merged.localize(image)
         assert (estimate.status, estimate.scene) == ("ok", expected.scene)
         assert estimate.support == expected.support
         for one, other in (
@@ -327,7 +379,8 @@ def test_a_scene_is_renamed_and_removed_while_a_localizer_answers(
     opened = Map.unpack(tmp_path / "hall.zip", tmp_path / "map")
     opened.merge(hall_only.path, on_clash="rename")
     opened.rename("hall", "first")
-    before, image = opened.localizer, hall.test[9].read_image()
+    before = opened.localizer
+    image = hall.test[9].read_image()
     opened.remove("first")
     assert opened.scenes == ("hall-2",)
     assert opened.localize(image).scene == "hall-2"

@@ -77,7 +77,9 @@ def recording(path: Path, **options: Any) -> None:
 def pictures(root: Path, count: int = 9) -> None:
     (root / "images").mkdir(parents=True)
     for i in range(count):
-        write_image(root / "images" / f"{i:03d}.png", np.full((48, 64, 3), 9 * i, np.uint8))
+        write_image(
+            root / "images" / f"{i:03d}.png", np.full((48, 64, 3), 9 * i, np.uint8)
+        )
 
 
 def file(name: str, data: bytes) -> Callable[[Path], Path]:
@@ -96,7 +98,9 @@ def wrist(root: Path) -> Path:
         image.unlink()
     table = root / "wrist/base_from_gripper.csv"
     lines = table.read_text().splitlines()
-    table.write_text("\n".join(lines[: lines.index(next(x for x in lines if "0" in x)) + 4]))
+    table.write_text(
+        "\n".join(lines[: lines.index(next(x for x in lines if "0" in x)) + 4])
+    )
     return root / "wrist"
 
 
@@ -107,7 +111,9 @@ def seven_scenes(root: Path) -> Path:
         folder = root / f"seq-{sequence:02d}"
         folder.mkdir()
         for i in range(3):
-            write_image(folder / f"frame-{i:06d}.color.png", np.full((48, 64, 3), i, np.uint8))
+            write_image(
+                folder / f"frame-{i:06d}.color.png", np.full((48, 64, 3), i, np.uint8)
+            )
             np.savetxt(folder / f"frame-{i:06d}.pose.txt", POSES[i].matrix())
     return root
 
@@ -160,7 +166,9 @@ def poses(name: str) -> Callable[[Path], Path]:
         elif path.suffix == ".mat":
             savemat(path, {"T": POSES.matrix()})
         elif path.suffix == ".yaml":
-            path.write_text(yaml.safe_dump([{"T": pose.matrix().tolist()} for pose in POSES]))
+            path.write_text(
+                yaml.safe_dump([{"T": pose.matrix().tolist()} for pose in POSES])
+            )
         elif path.suffix == ".tum":
             np.savetxt(path, np.hstack([np.arange(9)[:, None], rows]))
         elif path.suffix == ".json":
@@ -240,7 +248,9 @@ READERS = {
     "poses-yaml": Reader(poses("poses.yaml"), read_robot_poses),
     "poses-tum": Reader(poses("poses.tum"), read_robot_poses),
     "camera-text": Reader(file("lens.txt", MATRIX), read_size),
-    "camera-json": Reader(file("lens.json", json.dumps(LENS.to_dict()).encode()), read_size),
+    "camera-json": Reader(
+        file("lens.json", json.dumps(LENS.to_dict()).encode()), read_size
+    ),
     "camera-ros": Reader(file("lens.yaml", INFO), read_size),
     "camera-kalibr": Reader(file("chain.yaml", CHAIN), read_size),
     "camera-npz": Reader(camera_npz, read_size),
@@ -261,7 +271,8 @@ def outcomes(name: str, reader: Reader, root: Path) -> Counter[str]:
     files = sorted(path for path in root.glob(reader.pattern) if path.is_file())
     assert files, "there is something to damage"
     counts: Counter[str] = Counter()
-    longest, before_kb = 0.0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    longest = 0.0
+    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for seed in range(COUNT):
         rng = random.Random(f"{name} {seed}")
         victim = rng.choice(files)
@@ -289,7 +300,9 @@ def outcomes(name: str, reader: Reader, root: Path) -> Counter[str]:
 
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
-    assert outcomes(name, READERS[name], tmp_path / "files")["refused"], "some damage is noticed"
+    assert outcomes(name, READERS[name], tmp_path / "files")["refused"], (
+        "some damage is noticed"
+    )
 
 
 def test_damaged_recordings_are_read_or_refused(
@@ -304,7 +317,9 @@ def test_damaged_recordings_are_read_or_refused(
 
 
 @pytest.fixture(scope="module")
-def hall_folder(hall_map: MapContents, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def hall_folder(
+    hall_map: MapContents, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     from evercal.mapping.store import MapStore
 
     root = tmp_path_factory.mktemp("mutations") / "hall"
@@ -323,7 +338,9 @@ def test_a_damaged_map_is_refused(hall_folder: Path, tmp_path: Path) -> None:
     assert counts["refused"] > 0.5 * COUNT, "report.json and the like are not read"
 
 
-def test_a_map_of_another_program_is_read_or_refused(hall_folder: Path, tmp_path: Path) -> None:
+def test_a_map_of_another_program_is_read_or_refused(
+    hall_folder: Path, tmp_path: Path
+) -> None:
     """Files are damaged, and their checksums are right."""
 
     def read(path: Path) -> None:
@@ -345,7 +362,9 @@ def test_a_damaged_archive_is_refused(hall_folder: Path, tmp_path: Path) -> None
         try:
             Map.unpack(path, out)
         finally:
-            assert [p.name for p in path.parent.iterdir() if p.name.endswith(".unpacking")] == []
+            assert [
+                p.name for p in path.parent.iterdir() if p.name.endswith(".unpacking")
+            ] == []
             shutil.rmtree(out, ignore_errors=True)
 
     outcomes("archive", Reader(make, read, "*.zip"), tmp_path / "files")
@@ -366,7 +385,9 @@ def test_damaged_calibrations_are_read_or_refused(
 
 
 def test_damaged_board_poses_are_refused(tmp_path: Path) -> None:
-    images = [{"image": f"{i}.png", "pose": None, "reason": "no board"} for i in range(3)]
+    images = [
+        {"image": f"{i}.png", "pose": None, "reason": "no board"} for i in range(3)
+    ]
 
     def make(root: Path) -> Path:
         (root / "board.json").write_text(json.dumps({"format": "x", "images": images}))

@@ -28,8 +28,18 @@ DATA = (
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
     """Names in the wheel of `python -m build`."""
     out = tmp_path_factory.mktemp("dist")
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    command = [
+        sys.executable,
+        "-m",
+        "build",
+        "--wheel",
+        "--no-isolation",
+        "--outdir",
+        str(out),
+    ]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr
     (path,) = out.glob("evercal-*.whl")
     with zipfile.ZipFile(path) as archive:
@@ -44,17 +54,22 @@ def test_wheel_contains_the_data(wheel: set[str], pattern: str) -> None:
 
 
 def test_wheel_contains_every_module_and_nothing_else(wheel: set[str]) -> None:
-    modules = {path.relative_to(ROOT / "src").as_posix() for path in PACKAGE.rglob("*.py")}
+    modules = {
+        path.relative_to(ROOT / "src").as_posix() for path in PACKAGE.rglob("*.py")
+    }
     assert modules <= wheel
     assert {name.split("/")[0].split("-")[0] for name in wheel} == {"evercal"}
-    assert not [name for name in wheel if name.startswith("evercal/") and "test" in name]
+    assert not [
+        name for name in wheel if name.startswith("evercal/") and "test" in name
+    ]
 
 
 def brought(name: str, extras: frozenset[str], found: dict[str, str]) -> dict[str, str]:
     """Versions of a distribution and of all that its installation brings, by name."""
+    # Of another system, or of a tool that is not installed.
     try:
         installed = distribution(name)
-    except PackageNotFoundError:  # of another system, or of a tool that is not installed
+    except PackageNotFoundError:
         return found
     found[canonicalize_name(name)] = installed.version.partition("+")[0]
     for line in installed.requires or ():
@@ -85,7 +100,12 @@ def test_every_version_that_an_installation_brings_is_pinned() -> None:
 
 def test_the_licence_of_every_package_is_listed() -> None:
     page = (ROOT / "docs" / "licences.md").read_text(encoding="utf-8")
-    listed = {canonicalize_name(name) for name in re.findall(r"^\| ([\w.-]+) \|", page, re.M)}
-    for extras in ((), ("serve", "bags", "colmap", "lerobot", "networks", "ray", "urdf", "view")):
+    listed = {
+        canonicalize_name(name) for name in re.findall(r"^\| ([\w.-]+) \|", page, re.M)
+    }
+    for extras in (
+        (),
+        ("serve", "bags", "colmap", "lerobot", "networks", "ray", "urdf", "view"),
+    ):
         everything = brought("evercal", frozenset(extras), {})
         assert everything.keys() - {"evercal"} <= listed

@@ -18,7 +18,9 @@ PAGES = {
 ARCHITECTURE, PAPER, TROUBLESHOOTING = (
     PAGES[f"docs/{name}.md"] for name in ("architecture", "paper", "troubleshooting")
 )
-TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in PACKAGE.rglob("*.py")}
+TREES = {
+    path: ast.parse(path.read_text(encoding="utf-8")) for path in PACKAGE.rglob("*.py")
+}
 
 
 def imports(tree: ast.AST) -> set[str]:
@@ -26,7 +28,10 @@ def imports(tree: ast.AST) -> set[str]:
     names = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module:
-            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+            names |= {
+                node.module,
+                *(f"{node.module}.{alias.name}" for alias in node.names),
+            }
         elif isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
     return names
@@ -40,13 +45,17 @@ def test_arrows_of_the_architecture_are_imports() -> None:
         files = []
         for module in (source, target):
             path = PACKAGE.joinpath(*module.split("."))
-            files.append(path / "__init__.py" if path.is_dir() else path.with_suffix(".py"))
+            files.append(
+                path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+            )
         assert files[1] in TREES, target
         assert f"evercal.{target}" in imports(TREES[files[0]]), f"{source} -> {target}"
 
 
 def test_architecture_describes_every_folder() -> None:
-    folders = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").exists()}
+    folders = {
+        path.name for path in PACKAGE.iterdir() if (path / "__init__.py").exists()
+    }
     assert folders <= set(re.findall(r"^\| `(\w+)`", ARCHITECTURE, re.M))
 
 
@@ -60,22 +69,34 @@ def defined_names(source: str) -> set[str]:
                 names.add(prefix + node.name)
             if isinstance(node, ast.ClassDef):
                 visit(node.body, f"{prefix}{node.name}.")
-            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", 0)]
-            names.update(prefix + target.id for target in targets if isinstance(target, ast.Name))
+            targets = (
+                node.targets
+                if isinstance(node, ast.Assign)
+                else [getattr(node, "target", 0)]
+            )
+            names.update(
+                prefix + target.id for target in targets if isinstance(target, ast.Name)
+            )
 
     visit(ast.parse(source).body, "")
     return names
 
 
 def test_code_that_the_page_of_the_paper_cites_exists() -> None:
-    cited = set(re.findall(r"`((?:[\w.-]+/)+[\w.-]+\.(?:py|md|jsonl))(?:::([\w.]+))?`", PAPER))
+    cited = set(
+        re.findall(r"`((?:[\w.-]+/)+[\w.-]+\.(?:py|md|jsonl))(?:::([\w.]+))?`", PAPER)
+    )
     assert len(cited) > 50
     beside = ("tests", "docs", "benchmarks", "results", "rooms", "training", "research")
     for path, name in cited:
         file = (ROOT if path.split("/")[0] in beside else PACKAGE) / path
         assert file.is_file(), f"docs/paper.md cites {path}, which does not exist"
-        assert not name or name in defined_names(file.read_text("utf-8")), f"{path}::{name}"
-    names = defined_names("A = 1\nB: int = 2\nclass C:\n    x: int = 0\n    def f(self): ...\n")
+        assert not name or name in defined_names(file.read_text("utf-8")), (
+            f"{path}::{name}"
+        )
+    names = defined_names(
+        "A = 1\nB: int = 2\nclass C:\n    x: int = 0\n    def f(self): ...\n"
+    )
     assert names == {"A", "B", "C", "C.x", "C.f"}
 
 
@@ -89,8 +110,13 @@ def test_page_of_the_paper_covers_every_equation_algorithm_table_and_figure() ->
 
 def test_links_of_the_page_of_the_paper_lead_to_headings() -> None:
     for path, anchor in re.findall(r"\]\(([\w/.-]+\.md)(#[\w-]+)?\)", PAPER):
-        headings = re.findall(r"^#+ (.+)$", (ROOT / "docs" / path).read_text("utf-8"), re.M)
-        slugs = {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+        headings = re.findall(
+            r"^#+ (.+)$", (ROOT / "docs" / path).read_text("utf-8"), re.M
+        )
+        slugs = {
+            re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
+            for heading in headings
+        }
         assert not anchor or anchor[1:] in slugs, path + anchor
 
 
@@ -99,7 +125,10 @@ def texts(tree: ast.AST) -> set[str]:
     found = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
-            parts = [str(p.value) if isinstance(p, ast.Constant) else GAP for p in node.values]
+            parts = [
+                str(p.value) if isinstance(p, ast.Constant) else GAP
+                for p in node.values
+            ]
             found.add("".join(parts))
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             found.add(node.value)
@@ -117,10 +146,14 @@ def test_messages_of_troubleshooting_are_in_the_source() -> None:
     assert len(quoted) == len(set(quoted)) > 40
     source = {text for tree in TREES.values() for text in texts(tree)}
     for message in quoted:
-        assert len(re.sub(r"\W", "", message)) >= 8, f"{message}: too short to identify a message"
+        assert len(re.sub(r"\W", "", message)) >= 8, (
+            f"{message}: too short to identify a message"
+        )
         assert any(is_quote(message, text) for text in source), message
     text = "scene …: the map has only …; give one"
-    assert text in texts(ast.parse('f"scene {name!r}: the map has only" f" {names}; give one"'))
+    assert text in texts(
+        ast.parse('f"scene {name!r}: the map has only" f" {names}; give one"')
+    )
     assert is_quote("the map has only", text)
     assert not is_quote("scene …: the map lacks …", text)
 
@@ -162,12 +195,18 @@ def long_sentences(texts: Iterator[str]) -> list[str]:
 
 def test_sentences_of_pages_docstrings_and_help_are_short() -> None:
     long = {page: long_sentences(paragraphs(text)) for page, text in PAGES.items()}
-    long |= {str(path): long_sentences(docstrings(tree)) for path, tree in TREES.items()}
+    long |= {
+        str(path): long_sentences(docstrings(tree)) for path, tree in TREES.items()
+    }
     assert {name: sentences for name, sentences in long.items() if sentences} == {}
 
 
 def test_long_sentences_are_noticed() -> None:
     words = " ".join(["word"] * 41)
     assert long_sentences(iter([f"Short. {words}. Short."])) == [f"{words}."]
-    assert long_sentences(paragraphs(f"# Title\n\n- {words}\n\n```\n{words}\n```\n")) == [words]
-    assert long_sentences(docstrings(ast.parse(f'def f():\n    """{words}"""\n'))) == [words]
+    assert long_sentences(
+        paragraphs(f"# Title\n\n- {words}\n\n```\n{words}\n```\n")
+    ) == [words]
+    assert long_sentences(docstrings(ast.parse(f'def f():\n    """{words}"""\n'))) == [
+        words
+    ]

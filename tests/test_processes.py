@@ -35,7 +35,10 @@ def starts(file: Path) -> list[str]:
             names = [module[0], module[-1], *(alias.name for alias in node.names)]
         elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             owner = node.value.id
-            told = owner in ("os", "sys", "asyncio", "mp") or node.attr == "ProcessPoolExecutor"
+            told = (
+                owner in ("os", "sys", "asyncio", "mp")
+                or node.attr == "ProcessPoolExecutor"
+            )
             names = [node.attr] if told else []
             if owner == "os" and node.attr.startswith(("exec", "spawn")):
                 names.append("system")
@@ -45,7 +48,9 @@ def starts(file: Path) -> list[str]:
 
 def test_processes_are_started_in_one_module() -> None:
     folders = ("src/evercal", "rooms", "training")
-    files = {file for folder in folders for file in (ROOT / folder).rglob("*.py")} - {HOME}
+    files = {file for folder in folders for file in (ROOT / folder).rglob("*.py")} - {
+        HOME
+    }
     assert len(files) > 150
     assert [line for file in sorted(files) for line in starts(file)] == []
     assert len(starts(HOME)) > 3  # it recognises what it looks for
@@ -57,7 +62,16 @@ BAIT = "import pathlib; pathlib.Path(__file__).with_suffix('.ran').touch()\n"
 @pytest.fixture
 def baited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current folder, with modules named as those that processes import."""
-    for name in ("pycolmap", "socket", "pickle", "selectors", "runpy", "torch", "cv2", "tyro"):
+    for name in (
+        "pycolmap",
+        "socket",
+        "pickle",
+        "selectors",
+        "runpy",
+        "torch",
+        "cv2",
+        "tyro",
+    ):
         (tmp_path / f"{name}.py").write_text(BAIT)
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -28,7 +28,9 @@ def test_every_page_is_in_the_navigation_once() -> None:
 
 def test_reference_lists_every_public_name_and_verb() -> None:
     python = (DOCS / "reference" / "python.md").read_text(encoding="utf-8")
-    assert sorted(re.findall(r"^\| `evercal\.(\w+)`", python, re.M)) == sorted(evercal._PUBLIC)
+    assert sorted(re.findall(r"^\| `evercal\.(\w+)`", python, re.M)) == sorted(
+        evercal._PUBLIC
+    )
     verbs = (DOCS / "reference" / "command-line.md").read_text(encoding="utf-8")
     grouped = [verb for group in cli.VERBS.values() for verb in group]
     assert re.findall(r"^\| `([\w-]+)`", verbs, re.M) == grouped
@@ -42,7 +44,16 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("site")
     path = os.pathsep.join([str(ROOT / "src"), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)],
+        [
+            sys.executable,
+            "-m",
+            "mkdocs",
+            "build",
+            "--strict",
+            "--quiet",
+            "--site-dir",
+            str(out),
+        ],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": path, "NO_MKDOCS_2_WARNING": "1"},
         capture_output=True,
@@ -69,15 +80,16 @@ def test_site_holds_the_reference(site: Path) -> None:
 @pytest.mark.slow("docs", "mkdocs.yml")
 def test_pages_load_nothing_from_the_internet(site: Path) -> None:
     loads = r"<(?:script|img|iframe|source)[^>]*\ssrc=[\"']?(?:https?:)?//[^\s>\"']+"
-    loads += (
-        r"|<link[^>]*rel=[\"']?(?:stylesheet|preconnect|icon)[^>]*href=[\"']?(?:https?:)?//[^>]+"
-    )
+    loads += r"|<link[^>]*rel=[\"']?(?:stylesheet|preconnect|icon)"
+    loads += r"[^>]*href=[\"']?(?:https?:)?//[^>]+"
     pages = sorted(site.rglob("*.html"))
     assert len(pages) > 20
     for page in pages:
         assert re.findall(loads, page.read_text(encoding="utf-8")) == [], page.name
     for sheet in site.rglob("*.css"):
-        assert not re.search(r"(?:url\(|@import)\s*[\"']?(?:https?:)?//", sheet.read_text("utf-8"))
+        assert not re.search(
+            r"(?:url\(|@import)\s*[\"']?(?:https?:)?//", sheet.read_text("utf-8")
+        )
 
 
 @pytest.mark.slow("docs", "mkdocs.yml")
@@ -86,13 +98,17 @@ def test_start_page_is_the_readme_and_its_links_stay_inside(site: Path) -> None:
     assert 'href="results.html"' in start
     assert 'href="contributing.html"' in start
     assert 'href="files/src/evercal/features/weights/pretrain.log"' in start
-    assert 'href="../index.html"' in (site / "tutorials" / "fleet.html").read_text(encoding="utf-8")
+    assert 'href="../index.html"' in (site / "tutorials" / "fleet.html").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_drawings_are_made_by_their_command(tmp_path: Path) -> None:
     command = [sys.executable, str(DOCS / "_site" / "drawings.py"), str(tmp_path)]
     subprocess.run(command, check=True, timeout=120)
     for name in ("frames.svg", "pixels.svg"):
-        drawn, stored = ((folder / name).read_text("utf-8") for folder in (tmp_path, DOCS))
+        drawn, stored = (
+            (folder / name).read_text("utf-8") for folder in (tmp_path, DOCS)
+        )
         words = [re.findall(r">([^<>\n]+)</text>", text) for text in (drawn, stored)]
         assert words[0] == words[1] != []

@@ -59,7 +59,9 @@ def run_step(step: Step) -> int | str | None:
         return 0
     program, *words = shlex.split(step.text)
     if program == "curl":
-        print(subprocess.run([program, *words], check=True, capture_output=True, text=True).stdout)  # noqa: T201
+        command = [program, *words]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        print(done.stdout)  # noqa: T201
         return 0
     assert program == "evercal", step.text
     return main(words)
@@ -93,16 +95,22 @@ def thinned(scene: Path, folder: Path, train: int, test: int) -> Path:
     shutil.copytree(scene, folder / scene.name)
     file = folder / scene.name / generic.FILE
     content = json.loads(file.read_text(encoding="utf-8"))
-    splits = [[f for f in content["frames"] if f["split"] == s] for s in ("train", "test")]
+    splits = [
+        [f for f in content["frames"] if f["split"] == s] for s in ("train", "test")
+    ]
     content["frames"] = splits[0][::train] + splits[1][::test]
     file.write_text(json.dumps(content), encoding="utf-8")
     return folder
 
 
-def test_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_of_the_readme_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rooms = thinned(samples.FOLDER / "bedroom", tmp_path / "rooms", 2, 3)
     monkeypatch.setattr(samples, "FOLDER", rooms)
-    lines = run(README.partition("## Python")[2].partition("\n## ")[0], tmp_path).splitlines()
+    lines = run(
+        README.partition("## Python")[2].partition("\n## ")[0], tmp_path
+    ).splitlines()
     assert lines[0] == "bedroom"
     assert (tmp_path / "cell.evercal" / "manifest.json").is_file()
     assert (tmp_path / "tripod.calib").read_text().count(":") > 10
@@ -110,7 +118,9 @@ def test_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert float(lines[-1]) > 80
 
 
-def test_commands_of_the_readme_run_on_the_packaged_cell(cell: Path, tmp_path: Path) -> None:
+def test_commands_of_the_readme_run_on_the_packaged_cell(
+    cell: Path, tmp_path: Path
+) -> None:
     section = README.partition("## Command line")[2].partition("\n## ")[0]
     assert LEARN in section
     before, video = section.partition("    evercal localize")[::2]
@@ -120,9 +130,19 @@ def test_commands_of_the_readme_run_on_the_packaged_cell(cell: Path, tmp_path: P
     run(f"    evercal localize{video}", tmp_path)
     assert {"report.html", "located.mp4"} <= {path.name for path in tmp_path.iterdir()}
     truth = json.loads((tmp_path / "samples/cell/truth.json").read_text("utf-8"))
-    for file, name in (("wrist.json", "gripper_from_camera"), ("tripod.json", "base_from_camera")):
-        true = SE3(*(np.array(truth[name][key]) for key in ("quaternion_wxyz", "translation_m")))
-        millimetres, degrees = pose_distance_mm_deg(read_transform(tmp_path / file), true)
+    for file, name in (
+        ("wrist.json", "gripper_from_camera"),
+        ("tripod.json", "base_from_camera"),
+    ):
+        true = SE3(
+            *(
+                np.array(truth[name][key])
+                for key in ("quaternion_wxyz", "translation_m")
+            )
+        )
+        millimetres, degrees = pose_distance_mm_deg(
+            read_transform(tmp_path / file), true
+        )
         assert millimetres < 2
         assert degrees < 0.1
 
@@ -175,7 +195,8 @@ def test_a_method_of_your_own(tmp_path: Path) -> None:
 
 def example(name: str, *words: Path) -> str:
     """Run an example in this process; return what it prints."""
-    script, printed = str(ROOT / "examples" / name), io.StringIO()
+    script = str(ROOT / "examples" / name)
+    printed = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
         patch.setattr(sys, "argv", [script, *map(str, words)])
         runpy.run_path(script, run_name="__main__")
@@ -212,20 +233,29 @@ def test_notebooks_run(name: str, tmp_path: Path) -> None:
     nbformat.validate(notebook)
     for cell in notebook.cells:
         if "exit_code" in cell.metadata:
-            cell.source += f"\nassert _exit_code == {cell.metadata.exit_code}, _exit_code"
+            cell.source += (
+                f"\nassert _exit_code == {cell.metadata.exit_code}, _exit_code"
+            )
     (tmp_path / "bin").mkdir()
     program = tmp_path / "bin" / "evercal"
-    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m evercal "$@"\n', encoding="utf-8")
+    program.write_text(
+        f'#!/bin/sh\nexec "{sys.executable}" -m evercal "$@"\n', encoding="utf-8"
+    )
     program.chmod(0o755)
     environment = child()
-    environment["PATH"] = os.pathsep.join([str(program.parent), environment.get("PATH", "")])
+    environment["PATH"] = os.pathsep.join(
+        [str(program.parent), environment.get("PATH", "")]
+    )
     resources = {"metadata": {"path": str(tmp_path)}}
-    nbclient.NotebookClient(notebook, timeout=1800, resources=resources).execute(env=environment)
+    nbclient.NotebookClient(notebook, timeout=1800, resources=resources).execute(
+        env=environment
+    )
 
 
 def test_notebooks_hold_all_that_their_pages_hold() -> None:
     for name in NOTEBOOKS:
-        cells, page = json.loads(notebook_of(name))["cells"], list(parts(text_of(name)))
+        cells = json.loads(notebook_of(name))["cells"]
+        page = list(parts(text_of(name)))
         assert len(cells) == len(page)
         for cell, part in zip(cells, page, strict=True):
             assert (cell["cell_type"] == "markdown") == (part.kind == "text")

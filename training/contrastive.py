@@ -127,14 +127,18 @@ def make_data(options: PretrainOptions, folder: Path) -> PretrainData:
         seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.pictures)
         pictures = pool.map(_picture, seeds, chunksize=8)
     seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.furnished)
-    return PretrainData(rooms, pictures, [cached_furnished_views(seed, folder) for seed in seeds])
+    return PretrainData(
+        rooms, pictures, [cached_furnished_views(seed, folder) for seed in seeds]
+    )
 
 
 class PairStream(IterableDataset):
     """Seeded training batches from any first step to the last."""
 
     def __init__(self, data: PretrainData, options: PretrainOptions, first_step: int):
-        self.data, self.options, self.first_step = data, options, first_step
+        self.data = data
+        self.options = options
+        self.first_step = first_step
 
     def draw(self, step: int) -> Batch:
         """Draw the batch of a step."""
@@ -184,12 +188,18 @@ def sample_features(features: Tensor, pixels: Tensor) -> Tensor:
     """Interpolate features (b, c, h, w) at pixels (b, n, 2) as unit vectors (b, n, c)."""
     size = torch.tensor([WIDTH, HEIGHT], dtype=pixels.dtype)
     grid = 2 * (pixels + 0.5) / size - 1
-    sampled = F.grid_sample(features, grid[:, None], align_corners=False, padding_mode="border")
+    sampled = F.grid_sample(
+        features, grid[:, None], align_corners=False, padding_mode="border"
+    )
     return F.normalize(sampled[:, :, 0].transpose(1, 2), dim=-1)
 
 
 def contrastive_loss(
-    points: Tensor, pixels: Tensor, valid: Tensor, temperature: float, cells: Tensor | None = None
+    points: Tensor,
+    pixels: Tensor,
+    valid: Tensor,
+    temperature: float,
+    cells: Tensor | None = None,
 ) -> Tensor:
     """Compute the symmetric InfoNCE loss (van den Oord et al., 2018) over all points of a batch.
 
@@ -209,7 +219,8 @@ def contrastive_loss(
     target = torch.arange(len(image))
     total = points.new_zeros(())
     for one, other in ((0, 1), (1, 0)):
-        x, y = points[one].flatten(0, 1)[keep], points[other].flatten(0, 1)[keep]
+        x = points[one].flatten(0, 1)[keep]
+        y = points[other].flatten(0, 1)[keep]
         where = pixels[other].flatten(0, 1)[keep]
         near = (torch.cdist(where, where) < NEAR_PX) & (image[:, None] == image[None])
         near.fill_diagonal_(False)
@@ -243,7 +254,10 @@ def matching_accuracy(encoder: torch.nn.Module, batches: list[Batch]) -> float:
 
 
 def train_encoder(
-    data: PretrainData, options: PretrainOptions, folder: Path, log: Callable[[str], None]
+    data: PretrainData,
+    options: PretrainOptions,
+    folder: Path,
+    log: Callable[[str], None],
 ) -> LocalEncoder:
     """Train the encoder with a checkpoint every 250 steps; resume from a checkpoint in `folder`.
 
@@ -273,13 +287,16 @@ def train_encoder(
         prefetch_factor=8,
         multiprocessing_context="spawn",
     )
-    began, losses = time.perf_counter(), []
+    began = time.perf_counter()
+    losses = []
     with started_safely():
         batches = iter(loader)
     for images, pixels, valid in batches:
         with autocast():
             maps = encoder(images.flatten(0, 1)).float().unflatten(0, images.shape[:2])
-        points = torch.stack([sample_features(*of) for of in zip(maps, pixels, strict=True)])
+        points = torch.stack(
+            [sample_features(*of) for of in zip(maps, pixels, strict=True)]
+        )
         cells = maps.flatten(3).transpose(2, 3) if options.rivals == "cells" else None
         loss = contrastive_loss(points, pixels, valid, options.temperature, cells)
         optimiser.zero_grad()
@@ -296,7 +313,9 @@ def train_encoder(
             )
             encoder.train()
             seconds = time.perf_counter() - began
-            log(f"step {step} loss {np.mean(losses):.3f} matched {matched} {seconds:.0f} s")
+            log(
+                f"step {step} loss {np.mean(losses):.3f} matched {matched} {seconds:.0f} s"
+            )
             losses.clear()
             _save(folder / CHECKPOINT, trained, step, options)
     return encoder
@@ -314,7 +333,9 @@ def _resume(path: Path, trained: Mapping[str, Any], options: PretrainOptions) ->
     return saved["step"]
 
 
-def _save(path: Path, trained: Mapping[str, Any], step: int, options: PretrainOptions) -> None:
+def _save(
+    path: Path, trained: Mapping[str, Any], step: int, options: PretrainOptions
+) -> None:
     state = {name: part.state_dict() for name, part in trained.items()}
     state |= {"step": step, "options": json.dumps(asdict(options))}
     buffer = io.BytesIO()
@@ -342,9 +363,17 @@ def _earlier(checkpoint: Path) -> dict[str, Tensor]:
 def _validation(data: PretrainData, folder: Path) -> dict[str, list[Batch]]:
     """Draw batches from held-out rooms, by kind of room."""
     seeds = range(VALIDATION_ROOM_SEED, VALIDATION_ROOM_SEED + 8)
-    kinds: dict[str, Sequence[Views]] = {"box rooms": [room_views(seed) for seed in seeds]}
+    kinds: dict[str, Sequence[Views]] = {
+        "box rooms": [room_views(seed) for seed in seeds]
+    }
     if data.furnished:
-        kinds["furnished rooms"] = [cached_furnished_views(seed, folder) for seed in seeds]
+        kinds["furnished rooms"] = [
+            cached_furnished_views(seed, folder) for seed in seeds
+        ]
     options = PretrainOptions(room_pairs=8, furnished_pairs=0, leaf_pairs=0)
-    streams = {kind: PairStream(PretrainData(v, []), options, 0) for kind, v in kinds.items()}
-    return {kind: [stream.draw(i) for i in range(6)] for kind, stream in streams.items()}
+    streams = {
+        kind: PairStream(PretrainData(v, []), options, 0) for kind, v in kinds.items()
+    }
+    return {
+        kind: [stream.draw(i) for i in range(6)] for kind, stream in streams.items()
+    }

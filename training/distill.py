@@ -25,7 +25,14 @@ from evercal.storage.atomic import write_bytes
 from evercal.storage.tensors import save_tensors
 from training.furnished import cached_furnished_views
 from training.network import SHIPPED, TEACHER, LocalEncoder, from_onnx, onnx_bytes
-from training.pairs import FIRST_ROOM_SEED, HEIGHT, WIDTH, leaf_picture, photometric, room_views
+from training.pairs import (
+    FIRST_ROOM_SEED,
+    HEIGHT,
+    WIDTH,
+    leaf_picture,
+    photometric,
+    room_views,
+)
 
 CHECKPOINT_STEPS = 250
 TEMPERATURE, COSINE_WEIGHT = 0.05, 4.0
@@ -53,17 +60,24 @@ def pictures(rooms: int, boxes: int, leaves: int, folder: Path) -> Pictures:
     return Pictures(
         np.concatenate(views),
         np.concatenate([room_views(seed).images for seed in seeds[:boxes]]),
-        np.stack([leaf_picture(np.random.default_rng([seed, 3])) for seed in seeds[:leaves]]),
+        np.stack(
+            [leaf_picture(np.random.default_rng([seed, 3])) for seed in seeds[:leaves]]
+        ),
     )
 
 
 def warped(image: Images, rng: np.random.Generator) -> Images:
     """A random affine view of an image, sometimes mirrored, (HEIGHT, WIDTH)."""
     height, width = image.shape
-    scale = np.exp(rng.uniform(np.log(0.55), np.log(1.25))) * min(height / HEIGHT, width / WIDTH)
+    scale = np.exp(rng.uniform(np.log(0.55), np.log(1.25))) * min(
+        height / HEIGHT, width / WIDTH
+    )
     angle = rng.normal(0, 0.25)
-    cosine, sine = scale * np.cos(angle), scale * np.sin(angle)
-    matrix = np.array([[cosine, -sine], [sine, cosine]]) * (1 + rng.uniform(-0.12, 0.12, (2, 2)))
+    cosine = scale * np.cos(angle)
+    sine = scale * np.sin(angle)
+    matrix = np.array([[cosine, -sine], [sine, cosine]]) * (
+        1 + rng.uniform(-0.12, 0.12, (2, 2))
+    )
     centre = np.array([width, height]) * (0.5 + rng.uniform(-0.2, 0.2, 2))
     affine = np.c_[matrix, centre - matrix @ [WIDTH / 2, HEIGHT / 2]]
     flags = cv2.INTER_AREA | cv2.WARP_INVERSE_MAP
@@ -84,7 +98,9 @@ def batches(data: Pictures, first: int, steps: int) -> Iterator[tuple[Tensor, Te
         ]
         if rng.random() < 0.3:  # of a camera that is always blurred or dark
             drawn = [photometric(image, rng) for image in drawn]
-        changed = [photometric(image, rng) if rng.random() < 0.6 else image for image in drawn]
+        changed = [
+            photometric(image, rng) if rng.random() < 0.6 else image for image in drawn
+        ]
         yield _grey(drawn), _grey(changed)
 
 
@@ -113,32 +129,43 @@ class Teacher(NamedTuple):
     @torch.no_grad()
     def __call__(self, grey: Tensor) -> Tensor:
         """(b, 1, h, w) -> (b, width, rows, columns) unit vectors."""
-        return F.normalize(torch.einsum("bchw,cd->bdhw", self.module(grey), self.axes), dim=1)
+        return F.normalize(
+            torch.einsum("bchw,cd->bdhw", self.module(grey), self.axes), dim=1
+        )
 
 
 def difference(student: Tensor, teacher: Tensor, cells: Tensor) -> Tensor:
     """Loss of features (b, d, h, w): of their cosines, and of the similarities of some cells."""
-    own, target = student.flatten(2), teacher.flatten(2)
-    logits = [torch.einsum("bdn,bdm->bnm", x[:, :, cells], target) for x in (own, target)]
+    own = student.flatten(2)
+    target = teacher.flatten(2)
+    logits = [
+        torch.einsum("bdn,bdm->bnm", x[:, :, cells], target) for x in (own, target)
+    ]
     found, wanted = (F.log_softmax(x / TEMPERATURE, -1) for x in logits)
-    divergence = F.kl_div(found, wanted, log_target=True, reduction="none").sum(-1).mean()
+    divergence = (
+        F.kl_div(found, wanted, log_target=True, reduction="none").sum(-1).mean()
+    )
     return COSINE_WEIGHT * (1 - (own * target).sum(1)).mean() + divergence
 
 
 def distil(data: Pictures, steps: int, folder: Path) -> LocalEncoder:
     """Train the student; a checkpoint in `folder` every 250 steps is resumed."""
     torch.manual_seed(1)
-    student, teacher = LocalEncoder(SHIPPED, fused=False), Teacher.of(data, SHIPPED.width)
+    student = LocalEncoder(SHIPPED, fused=False)
+    teacher = Teacher.of(data, SHIPPED.width)
     optimiser = torch.optim.AdamW(student.parameters(), 1e-4, weight_decay=0.01)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, 3e-3, total_steps=steps, pct_start=0.05
     )
-    parts, file, first = (student, optimiser, schedule), folder / "student.pt", 0
+    parts = (student, optimiser, schedule)
+    file = folder / "student.pt"
+    first = 0
     if file.is_file():
         first, *states = torch.load(file, weights_only=True)
         for part, state in zip(parts, states, strict=True):
             part.load_state_dict(state)
-    began, losses = time.perf_counter(), []
+    began = time.perf_counter()
+    losses = []
     for step, (grey, changed) in enumerate(batches(data, first, steps), first + 1):
         cells = torch.randperm(HEIGHT * WIDTH // student.stride**2)[:COMPARED]
         loss = difference(student(changed), teacher(grey), cells)
@@ -151,7 +178,10 @@ def distil(data: Pictures, steps: int, folder: Path) -> LocalEncoder:
         if step % CHECKPOINT_STEPS == 0 or step == steps:
             torch.save((step, *(part.state_dict() for part in parts)), file)
             seconds = time.perf_counter() - began
-            print(f"step {step} loss {np.mean(losses):.3f} {seconds:.0f} s", file=sys.stderr)
+            print(
+                f"step {step} loss {np.mean(losses):.3f} {seconds:.0f} s",
+                file=sys.stderr,
+            )
             losses.clear()
     return student.fuse()
 

@@ -64,16 +64,23 @@ def furnished_views(seed: int, anchors: int = 5) -> FurnishedViews:
     scene = room(sorted(KINDS)[seed % len(KINDS)], seed)
     joints = HOME_RAD + rng.normal(0, 0.3, 7)
     renderer = Renderer(scene.meshes() + panda_meshes(joints), rng.uniform(1.2, 2.8))
-    poses, cameras, images, depths = [], [], [], []
+    poses = []
+    cameras = []
+    images = []
+    depths = []
     for _ in range(anchors):
         camera = pinhole(rng.uniform(0.65, 1.15) * WIDTH)
         for pose in _anchor(scene, rng):
-            image = renderer.render(camera, pose, RenderOptions(SAMPLES), int(rng.integers(2**31)))
+            image = renderer.render(
+                camera, pose, RenderOptions(SAMPLES), int(rng.integers(2**31))
+            )
             poses.append(pose)
             cameras.append(camera)
             images.append(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
             depths.append(renderer.depth(camera, pose).astype(np.float16))
-    return FurnishedViews(np.stack(images), SE3.stack(poses), tuple(cameras), np.stack(depths))
+    return FurnishedViews(
+        np.stack(images), SE3.stack(poses), tuple(cameras), np.stack(depths)
+    )
 
 
 def _anchor(scene: Room, rng: np.random.Generator) -> Iterator[SE3]:
@@ -95,11 +102,17 @@ def _anchor(scene: Room, rng: np.random.Generator) -> Iterator[SE3]:
 def cached_furnished_views(seed: int, folder: Path) -> FurnishedViews:
     """Read the views of a room from `folder`; render and write them if missing."""
     # Increase the version when the rooms or the renderer change.
-    settings = {"version": 1, "samples": SAMPLES, "size": [WIDTH, HEIGHT], "per_anchor": PER_ANCHOR}
+    settings = {
+        "version": 1,
+        "samples": SAMPLES,
+        "size": [WIDTH, HEIGHT],
+        "per_anchor": PER_ANCHOR,
+    }
     lock_settings(folder / "rooms.json", settings)
     path = folder / f"room-{seed}.npz"
     if not path.is_file():
-        views, buffer = furnished_views(seed), io.BytesIO()
+        views = furnished_views(seed)
+        buffer = io.BytesIO()
         focal = [camera.fx for camera in views.cameras]
         pose = views.base_from_camera
         np.savez_compressed(

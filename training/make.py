@@ -38,7 +38,9 @@ def pretrain(out: Path, work: Path, options: PretrainOptions) -> None:
         return f"{time.perf_counter() - began:.0f} s"
 
     log(f"options {json.dumps(asdict(options))}")
-    log(f"torch {torch.__version__} numpy {np.__version__} threads {torch.get_num_threads()}")
+    log(
+        f"torch {torch.__version__} numpy {np.__version__} threads {torch.get_num_threads()}"
+    )
     data = make_data(options, work)
     log(
         f"rendered {options.rooms} box rooms, {options.furnished} furnished rooms, "

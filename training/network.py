@@ -38,19 +38,26 @@ SHIPPED = Layout(4, ((32, 3, 1), (48, 3, 1), (112, 2, 2)), (3, 3), 3, 64)
 class _ConvBlock(nn.Sequential):
     """Convolution and batch norm; `fused` holds the inference form with the norm folded in."""
 
-    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, fused: bool):
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int, stride: int, fused: bool
+    ):
         padding = kernel // 2 if stride == 1 else 0
         conv = nn.Conv2d(inputs, outputs, kernel, stride, padding, bias=fused)
-        super().__init__(conv) if fused else super().__init__(conv, nn.BatchNorm2d(outputs))
+        super().__init__(conv) if fused else super().__init__(
+            conv, nn.BatchNorm2d(outputs)
+        )
 
 
 class _Residual(nn.Module):
     def __init__(self, width: int, kernels: tuple[int, ...], fused: bool):
         super().__init__()
-        self.layers = nn.ModuleList(_ConvBlock(width, width, k, 1, fused) for k in kernels)
+        self.layers = nn.ModuleList(
+            _ConvBlock(width, width, k, 1, fused) for k in kernels
+        )
 
     def forward(self, x: Tensor) -> Tensor:
-        y, last = x, len(self.layers) - 1
+        y = x
+        last = len(self.layers) - 1
         for i, layer in enumerate(self.layers):
             y = layer(y) if i == last else F.relu(layer(y), inplace=True)
         return F.relu(y + x, inplace=True)
@@ -70,13 +77,18 @@ class LocalEncoder(nn.Module):
 
     def __init__(self, layout: Layout, fused: bool = True):
         super().__init__()
-        self.layout, self.width, self.fold = layout, layout.width, layout.fold
-        inputs, stem = self.fold**2, []
+        self.layout = layout
+        self.width = layout.width
+        self.fold = layout.fold
+        inputs = self.fold**2
+        stem = []
         for outputs, kernel, stride in layout.stem:
             stem.append(_ConvBlock(inputs, outputs, kernel, stride, fused))
             inputs = outputs
         self.stem = nn.ModuleList(stem)
-        blocks = [_Residual(inputs, layout.kernels, fused) for _ in range(layout.blocks)]
+        blocks = [
+            _Residual(inputs, layout.kernels, fused) for _ in range(layout.blocks)
+        ]
         self.blocks = nn.ModuleList(blocks)
         self.project = nn.Conv2d(inputs, layout.width, 1)
 
@@ -84,7 +96,9 @@ class LocalEncoder(nn.Module):
         """(b, 1, h, w) in [0, 1] -> (b, width, h // 8, w // 8) unit vectors."""
         height, width = (side // 8 * 8 for side in grey.shape[-2:])
         x = standardise(grey[..., :height, :width])
-        x = F.pixel_unshuffle(x, self.fold).contiguous(memory_format=torch.channels_last)
+        x = F.pixel_unshuffle(x, self.fold).contiguous(
+            memory_format=torch.channels_last
+        )
         for layer in self.stem:
             x = F.relu(layer(x), inplace=True)
         for block in self.blocks:
@@ -93,7 +107,8 @@ class LocalEncoder(nn.Module):
 
     def fuse(self) -> "LocalEncoder":
         """The same function with batch norm folded in, for inference."""
-        trained, twin = deepcopy(self).eval(), LocalEncoder(self.layout)
+        trained = deepcopy(self).eval()
+        twin = LocalEncoder(self.layout)
         source = [m for m in trained.modules() if isinstance(m, _ConvBlock)]
         target = [m for m in twin.modules() if isinstance(m, _ConvBlock)]
         for a, b in zip(source, target, strict=True):
@@ -116,7 +131,8 @@ def onnx_bytes(module: LocalEncoder) -> bytes:
     The file is the convolutional part: its input (b, 1, h, w) is standardised, its output
     (b, width, h // 8, w // 8) is not normalised. OpenCV's classic engine has no operators for that.
     """
-    nodes, weights = [], []
+    nodes = []
+    weights = []
 
     def node(kind: str, inputs: list[str], **attributes: Any) -> str:
         name = f"{kind.lower()}{len(nodes)}"
@@ -130,22 +146,29 @@ def onnx_bytes(module: LocalEncoder) -> bytes:
             names.append(f"{kind}{len(weights)}")
             weights.append(numpy_helper.from_array(values, names[-1]))
         pads = [*cast(tuple[int, int], conv.padding)] * 2
-        x = node("Conv", names, kernel_shape=conv.kernel_size, strides=conv.stride, pads=pads)
+        x = node(
+            "Conv", names, kernel_shape=conv.kernel_size, strides=conv.stride, pads=pads
+        )
         return node("Relu", [x]) if relu else x
 
     x = node("SpaceToDepth", ["grey"], blocksize=module.fold)
     for layer in module.stem:
         x = convolved(x, cast(Any, layer)[0])
     for block in module.blocks:
-        y, layers = x, [layer[0] for layer in cast(Any, block).layers]
+        y = x
+        layers = [layer[0] for layer in cast(Any, block).layers]
         for conv in layers:
             y = convolved(y, conv, conv is not layers[-1])
         x = node("Relu", [node("Add", [y, x])])
     x = convolved(x, module.project, relu=False)
     ends = [("grey", ["b", 1, "h", "w"]), (x, ["b", module.width, "rows", "columns"])]
-    one, other = (helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in ends)
+    one, other = (
+        helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in ends
+    )
     graph = helper.make_graph(nodes, "encoder", [one], [other], weights)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    model = helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9
+    )
     onnx.checker.check_model(model)
     return model.SerializeToString()
 
@@ -156,5 +179,7 @@ def from_onnx(path: Path, layout: Layout) -> LocalEncoder:
     module = LocalEncoder(layout)
     state = module.state_dict()
     named = zip(state, values, strict=True)
-    module.load_state_dict({name: torch.from_numpy(value.copy()).float() for name, value in named})
+    module.load_state_dict(
+        {name: torch.from_numpy(value.copy()).float() for name, value in named}
+    )
     return module.eval()

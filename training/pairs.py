@@ -10,7 +10,8 @@ from evercal.geometry.se3 import SE3
 from evercal.simulation.box_room import BoxRoom, look_at
 from evercal.simulation.textures import dead_leaves
 
-HEIGHT, WIDTH = 192, 256
+HEIGHT = 192
+WIDTH = 256
 PER_ANCHOR = 4
 FIRST_ROOM_SEED = 1_000
 """First seed of pretraining rooms; tests and demos use lower seeds."""
@@ -43,8 +44,14 @@ def cell_pixels() -> np.ndarray:
 
 def inside(pixels: np.ndarray, margin: float = 3.5) -> np.ndarray:
     """Return a mask (n,) of pixels at least `margin` from the border."""
-    u, v = pixels[:, 0], pixels[:, 1]
-    return (u >= margin) & (u <= WIDTH - 1 - margin) & (v >= margin) & (v <= HEIGHT - 1 - margin)
+    u = pixels[:, 0]
+    v = pixels[:, 1]
+    return (
+        (u >= margin)
+        & (u <= WIDTH - 1 - margin)
+        & (v >= margin)
+        & (v <= HEIGHT - 1 - margin)
+    )
 
 
 def random_homography(side: int, rng: np.random.Generator) -> np.ndarray:
@@ -53,13 +60,20 @@ def random_homography(side: int, rng: np.random.Generator) -> np.ndarray:
 
     scale = np.exp(rng.uniform(np.log(0.6), np.log(1.7)))
     angle = rng.normal(0, 0.3)
-    c, s = np.cos(angle), np.sin(angle)
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [WIDTH / 2, HEIGHT / 2] * scale
+    c = np.cos(angle)
+    s = np.sin(angle)
+    corners = (
+        np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [WIDTH / 2, HEIGHT / 2] * scale
+    )
     corners = corners @ np.array([[c, s], [-s, c]])
     corners *= 1 + rng.uniform(-0.2, 0.2, (4, 2))
     corners += side / 2 + rng.uniform(-0.12, 0.12, 2) * side
-    border = np.array([[0, 0], [WIDTH - 1, 0], [WIDTH - 1, HEIGHT - 1], [0, HEIGHT - 1]])
-    return cv2.getPerspectiveTransform(border.astype(np.float32), corners.astype(np.float32))
+    border = np.array(
+        [[0, 0], [WIDTH - 1, 0], [WIDTH - 1, HEIGHT - 1], [0, HEIGHT - 1]]
+    )
+    return cv2.getPerspectiveTransform(
+        border.astype(np.float32), corners.astype(np.float32)
+    )
 
 
 def homography_pair(picture: np.ndarray, rng: np.random.Generator) -> Pair:
@@ -69,7 +83,9 @@ def homography_pair(picture: np.ndarray, rng: np.random.Generator) -> Pair:
     maps = [random_homography(picture.shape[0], rng) for _ in range(2)]
     flags = cv2.INTER_AREA | cv2.WARP_INVERSE_MAP
     images = [
-        cv2.warpPerspective(picture, m, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REFLECT)
+        cv2.warpPerspective(
+            picture, m, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REFLECT
+        )
         for m in maps
     ]
     first = cell_pixels() + rng.uniform(-3.5, 3.5, (HEIGHT * WIDTH // 64, 2))
@@ -77,7 +93,9 @@ def homography_pair(picture: np.ndarray, rng: np.random.Generator) -> Pair:
     on_picture = cv2.perspectiveTransform(first[None], maps[0])[0]
     keep = inside(first) & inside(second)
     keep &= ((on_picture >= 0) & (on_picture < picture.shape[0])).all(-1)
-    return Pair(np.stack(images), np.stack([first[keep], second[keep]]).astype(np.float32))
+    return Pair(
+        np.stack(images), np.stack([first[keep], second[keep]]).astype(np.float32)
+    )
 
 
 class Views(Protocol):
@@ -128,7 +146,9 @@ def room_views(seed: int, anchors: int = 5, per_anchor: int = PER_ANCHOR) -> Roo
 
     rng = np.random.default_rng([seed, 77])
     room = BoxRoom(seed, texture_px=256)
-    poses, cameras, images = [], [], []
+    poses = []
+    cameras = []
+    images = []
     for _ in range(anchors):
         camera = pinhole(rng.uniform(0.65, 1.15) * WIDTH)
         anchor = room.random_view(rng)
@@ -146,7 +166,8 @@ def room_views(seed: int, anchors: int = 5, per_anchor: int = PER_ANCHOR) -> Roo
             cameras.append(camera)
             images.append(cv2.cvtColor(room.render(camera, pose), cv2.COLOR_RGB2GRAY))
     room.surfaces = [
-        type(s)(s.corner_m, s.edge_u_m, s.edge_v_m, (s.pyramid[-1],)) for s in room.surfaces
+        type(s)(s.corner_m, s.edge_u_m, s.edge_v_m, (s.pyramid[-1],))
+        for s in room.surfaces
     ]
     return RoomViews(np.stack(images), SE3.stack(poses), tuple(cameras), room)
 
@@ -180,7 +201,8 @@ def photometric(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         angle = rng.uniform(0, np.pi)
         half = (length - 1) / 2
         for step in np.linspace(-half, half, 2 * length):
-            row, column = middle + step * np.sin(angle), middle + step * np.cos(angle)
+            row = middle + step * np.sin(angle)
+            column = middle + step * np.cos(angle)
             kernel[round(row), round(column)] = 1
         x = cv2.filter2D(x, -1, kernel / kernel.sum())
     x = np.clip(x, 0, 1) ** np.exp(rng.normal(0, 0.25))

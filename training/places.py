@@ -24,7 +24,9 @@ TEMPERATURE = 0.07
 
 
 @torch.inference_mode()
-def _encode(encoder: LocalEncoder, rooms: Sequence[Views], rng: np.random.Generator) -> Tensor:
+def _encode(
+    encoder: LocalEncoder, rooms: Sequence[Views], rng: np.random.Generator
+) -> Tensor:
     """Encode all views with random photometric changes.
 
     Returns:
@@ -34,15 +36,19 @@ def _encode(encoder: LocalEncoder, rooms: Sequence[Views], rng: np.random.Genera
     for room in rooms:
         images = np.stack([photometric(image, rng) for image in room.images])
         with autocast():
-            maps.append(encoder(torch.from_numpy(images[:, None]).float() / 255).bfloat16())
+            maps.append(
+                encoder(torch.from_numpy(images[:, None]).float() / 255).bfloat16()
+            )
     return torch.stack(maps).unflatten(1, (-1, PER_ANCHOR))
 
 
 def random_crop(maps: Tensor, rng: np.random.Generator) -> Tensor:
     """Crop a random window of the feature grid, to vary the field of view."""
     height, width = maps.shape[-2:]
-    h, w = rng.integers(int(0.7 * height), height + 1), rng.integers(int(0.7 * width), width + 1)
-    top, left = rng.integers(height - h + 1), rng.integers(width - w + 1)
+    h = rng.integers(int(0.7 * height), height + 1)
+    w = rng.integers(int(0.7 * width), width + 1)
+    top = rng.integers(height - h + 1)
+    left = rng.integers(width - w + 1)
     return maps[..., top : top + h, left : left + w]
 
 
@@ -72,7 +78,10 @@ def place_accuracy(descriptor: GlobalDescriptor, maps: Tensor) -> float:
 
 
 def train_descriptor(
-    data: PretrainData, options: PretrainOptions, encoder: LocalEncoder, log: Callable[[str], None]
+    data: PretrainData,
+    options: PretrainOptions,
+    encoder: LocalEncoder,
+    log: Callable[[str], None],
 ) -> GlobalDescriptor:
     """Train the descriptor on features of the frozen encoder."""
     rng = np.random.default_rng([options.seed, 9])
@@ -90,7 +99,8 @@ def train_descriptor(
     losses = []
     for step in range(1, options.descriptor_steps + 1):
         places = rng.permutation(rooms * anchors)[:PLACES_PER_BATCH]
-        room, anchor = places // anchors, places % anchors
+        room = places // anchors
+        anchor = places % anchors
         views = np.argsort(rng.random((len(places), PER_ANCHOR)), axis=1)[:, :2]
         a = descriptor(random_crop(maps[room, anchor, views[:, 0]].float(), rng))
         b = descriptor(random_crop(maps[room, anchor, views[:, 1]].float(), rng))
@@ -102,6 +112,8 @@ def train_descriptor(
         losses.append(float(loss.detach()))
         if step % 250 == 0:
             accuracy = place_accuracy(descriptor, validation)
-            log(f"descriptor step {step} loss {np.mean(losses):.3f} right room {accuracy:.1f} %")
+            log(
+                f"descriptor step {step} loss {np.mean(losses):.3f} right room {accuracy:.1f} %"
+            )
             losses.clear()
     return descriptor

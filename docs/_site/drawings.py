@@ -31,20 +31,35 @@ def frames(path: Path) -> None:
     fixed = np.array([4.3, 1.75])
     point = np.array([3.1, 0.15])
     axes.plot(
-        *np.array([base, [0.1, 1.25], [0.9, 1.95], gripper]).T, color="#cccccc", lw=9, zorder=0
+        *np.array([base, [0.1, 1.25], [0.9, 1.95], gripper]).T,
+        color="#cccccc",
+        lw=9,
+        zorder=0,
     )
-    axes.plot(*np.array([[-0.5, -0.12], [4.6, -0.12]]).T, color="#cccccc", lw=2, zorder=0)
+    axes.plot(
+        *np.array([[-0.5, -0.12], [4.6, -0.12]]).T, color="#cccccc", lw=2, zorder=0
+    )
     axes.add_patch(Rectangle((2.95, -0.1), 0.3, 0.25, color="#dddddd", zorder=0))
-    down, right, forward = np.array([-0.05, -0.45]), np.array([0.33, 0.1]), np.array([0.2, -0.42])
+    down = np.array([-0.05, -0.45])
+    right = np.array([0.33, 0.1])
+    forward = np.array([0.2, -0.42])
     _triad(axes, base, _OBLIQUE * 0.5, "base")
     _triad(axes, gripper, np.array([right, [0.12, 0.3], down]), "gripper", above=True)
     towards = (point - camera) / np.linalg.norm(point - camera) * 0.5
     _triad(
-        axes, camera, np.array([[0.36, 0.12], forward * [-1.2, 0.5], towards]), "camera", above=True
+        axes,
+        camera,
+        np.array([[0.36, 0.12], forward * [-1.2, 0.5], towards]),
+        "camera",
+        above=True,
     )
     towards = (point - fixed) / np.linalg.norm(point - fixed) * 0.5
     _triad(
-        axes, fixed, np.array([[-0.2, 0.28], [-0.12, -0.4], towards]), "fixed camera", above=True
+        axes,
+        fixed,
+        np.array([[-0.2, 0.28], [-0.12, -0.4], towards]),
+        "fixed camera",
+        above=True,
     )
     for eye in (camera, fixed):
         axes.plot(*np.array([eye, point]).T, color=INK, lw=0.8, ls=":")
@@ -60,10 +75,13 @@ def frames(path: Path) -> None:
 def pixels(path: Path) -> None:
     """Pixel coordinates of an image that is four pixels wide and three high."""
     figure, axes = _page(4.6, 3.0)
-    width, height = 4, 3
+    width = 4
+    height = 3
     for u in range(width):
         for v in range(height):
-            axes.add_patch(Rectangle((u - 0.5, v - 0.5), 1, 1, fill=False, ec="#bbbbbb"))
+            axes.add_patch(
+                Rectangle((u - 0.5, v - 0.5), 1, 1, fill=False, ec="#bbbbbb")
+            )
             axes.plot(u, v, ".", color="#bbbbbb", ms=4)
     axes.plot(0, 0, "o", color=AXES["x"], ms=6)
     axes.text(0.08, 0.32, "(0, 0)", color=AXES["x"])
@@ -71,9 +89,16 @@ def pixels(path: Path) -> None:
     axes.text(-0.5, -0.62, "(-0.5, -0.5)", ha="center")
     middle = (width - 1) / 2, (height - 1) / 2
     axes.plot(*middle, "x", color=AXES["z"], ms=8)
-    axes.text(middle[0] + 0.1, middle[1] + 0.32, "(1.5, 1), the middle", color=AXES["z"])
-    for end, name, colour in (((4.0, -0.95), "u", AXES["x"]), ((-0.95, 2.9), "v", AXES["y"])):
-        axes.annotate("", end, (-0.95, -0.95), arrowprops={"arrowstyle": "->", "color": colour})
+    axes.text(
+        middle[0] + 0.1, middle[1] + 0.32, "(1.5, 1), the middle", color=AXES["z"]
+    )
+    for end, name, colour in (
+        ((4.0, -0.95), "u", AXES["x"]),
+        ((-0.95, 2.9), "v", AXES["y"]),
+    ):
+        axes.annotate(
+            "", end, (-0.95, -0.95), arrowprops={"arrowstyle": "->", "color": colour}
+        )
         axes.text(end[0] + 0.08, end[1] + 0.12, name, color=colour)
     axes.set(xlim=(-1.3, 4.4), ylim=(3.2, -1.2))
     _save(figure, path)

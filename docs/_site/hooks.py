@@ -34,7 +34,8 @@ ROOT_PAGES = {
 """Pages of the repository's root and their names in the site."""
 COPIES = "files"
 """Folder of the site for linked files of the repository that are not pages."""
-HELP, NAMES = "<!-- help of every verb -->", "<!-- every public name -->"
+HELP = "<!-- help of every verb -->"
+NAMES = "<!-- every public name -->"
 COLUMNS = "100"
 """Width of the help texts, characters."""
 
@@ -60,7 +61,8 @@ def links(markdown: str, source: str) -> dict[str, str]:
     """Relative links of a page that lead to files: link to path in the repository."""
     folder = posixpath.dirname(source)
     paths = {
-        m[2]: posixpath.normpath(posixpath.join(folder, m[2])) for m in _LINK.finditer(markdown)
+        m[2]: posixpath.normpath(posixpath.join(folder, m[2]))
+        for m in _LINK.finditer(markdown)
     }
     return {link: path for link, path in paths.items() if site_uri(path)}
 
@@ -74,7 +76,11 @@ def with_site_links(markdown: str, source: str) -> str:
         if match[2] not in known or own is None:
             return match[0]
         to = site_uri(known[match[2]])
-        return match[1] + posixpath.relpath(to or "", posixpath.dirname(own) or ".") + match[3]
+        return (
+            match[1]
+            + posixpath.relpath(to or "", posixpath.dirname(own) or ".")
+            + match[3]
+        )
 
     return _LINK.sub(replaced, markdown)
 
@@ -88,14 +94,22 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for file in files.documentation_pages():
         if file.abs_src_path:
             path = Path(file.abs_src_path)
-            sources[path.relative_to(ROOT).as_posix()] = path.read_text(encoding="utf-8")
-    linked = {path for source, text in sources.items() for path in links(text, source).values()}
+            sources[path.relative_to(ROOT).as_posix()] = path.read_text(
+                encoding="utf-8"
+            )
+    linked = {
+        path
+        for source, text in sources.items()
+        for path in links(text, source).values()
+    }
     for path in sorted(linked):
         uri = site_uri(path) or ""
         if uri.startswith(f"{COPIES}/"):
             files.append(File.generated(config, uri, abs_src_path=str(ROOT / path)))
     for name in NOTEBOOKS:
-        files.append(File.generated(config, f"tutorials/{name}.ipynb", content=notebook_of(name)))
+        files.append(
+            File.generated(config, f"tutorials/{name}.ipynb", content=notebook_of(name))
+        )
     return files
 
 

@@ -55,7 +55,9 @@ def notebook(page: str) -> dict[str, Any]:
     for number, part in enumerate(parts(page)):
         cell: dict[str, Any] = {"id": f"cell-{number}", "metadata": {}}
         if part.kind == "text":
-            text = _LINK.sub(r"\1", part.text)  # there are no other pages beside a notebook
+            text = _LINK.sub(
+                r"\1", part.text
+            )  # there are no other pages beside a notebook
             cells.append({**cell, "cell_type": "markdown", "source": text})
             continue
         source = part.text.strip()
@@ -65,7 +67,13 @@ def notebook(page: str) -> dict[str, Any]:
         elif part.kind != "python":
             source = f"%%writefile {part.kind}\n{source}"
         cells.append(
-            {**cell, "cell_type": "code", "execution_count": None, "outputs": [], "source": source}
+            {
+                **cell,
+                "cell_type": "code",
+                "execution_count": None,
+                "outputs": [],
+                "source": source,
+            }
         )
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}

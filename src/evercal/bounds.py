@@ -98,7 +98,8 @@ def reading_a_request() -> Iterator[None]:
 
 @cache
 def _changed(kind: type[Kind], changes: str) -> Kind:
-    own, values = {field.name for field in fields(kind)}, {}
+    own = {field.name for field in fields(kind)}
+    values = {}
     known = {field.name for field in fields(RequestBounds)}
     for change in filter(None, changes.split(",")):
         name, _, number = change.strip().partition("=")
@@ -108,7 +109,9 @@ def _changed(kind: type[Kind], changes: str) -> Kind:
             name = ""
         if name not in known:
             names = ", ".join(sorted(known))
-            raise InputError(f"limit {change!r}: give NAME=NUMBER, the name one of {names}")
+            raise InputError(
+                f"limit {change!r}: give NAME=NUMBER, the name one of {names}"
+            )
     return kind(**{name: value for name, value in values.items() if name in own})
 
 

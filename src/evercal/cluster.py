@@ -33,7 +33,10 @@ def connected(address: str) -> Iterator[Any]:
         environment = {"env_vars": given, "working_dir": empty}
         try:
             ray.init(
-                address, runtime_env=environment, log_to_driver=False, logging_level=logging.ERROR
+                address,
+                runtime_env=environment,
+                log_to_driver=False,
+                logging_level=logging.ERROR,
             )
         except (ConnectionError, TimeoutError, ValueError, RuntimeError) as error:
             reason = str(error).strip().partition("\n")[0]
@@ -53,7 +56,9 @@ def _require_listener(address: str) -> None:
     url = urlsplit(address if "://" in address else f"//{address}")
     if address not in ("auto", "local"):
         try:
-            socket.create_connection((url.hostname or "", url.port or 0), WAIT_S).close()
+            socket.create_connection(
+                (url.hostname or "", url.port or 0), WAIT_S
+            ).close()
         except (OSError, ValueError) as error:
             raise InputError(
                 f"--ray {address}: nothing answers ({error}); give auto, or HOST:PORT or"

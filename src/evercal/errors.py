@@ -31,7 +31,8 @@ def is_plain(character: str) -> bool:
 def printable(text: str) -> str:
     """Escape the characters that a terminal obeys or that cannot be seen, but line breaks."""
     return "".join(
-        c if is_plain(c) or c == "\n" else c.encode("unicode_escape").decode() for c in text
+        c if is_plain(c) or c == "\n" else c.encode("unicode_escape").decode()
+        for c in text
     )
 
 

@@ -53,7 +53,8 @@ class Map:
     """
 
     def __init__(self, store: MapStore, options: LocalizeOptions | None = None):
-        self._store, self._options = store, options
+        self._store = store
+        self._options = options
         self._localizer: Localizer | None = None
 
     @classmethod
@@ -99,7 +100,9 @@ class Map:
 
         if self._localizer is None:
             if not self.scenes:
-                raise InputError(f"map {self.path}: no scene learned yet; run 'evercal learn'")
+                raise InputError(
+                    f"map {self.path}: no scene learned yet; run 'evercal learn'"
+                )
             self._localizer = Localizer(self._store.contents, self._options)
         return self._localizer
 
@@ -134,7 +137,9 @@ class Map:
             InputError: A recording that cannot be used, a name that is taken, or another process
                 is writing into the map.
         """
-        return self._learn(recording, name, memory, gripper_from_camera, options, on_progress)
+        return self._learn(
+            recording, name, memory, gripper_from_camera, options, on_progress
+        )
 
     def eye_to_hand(
         self,
@@ -162,7 +167,9 @@ class Map:
             InputError: A recording that cannot be used, with the cause; a name that is taken; or
                 another process is writing into the map.
         """
-        report = self._learn(recording, name, None, None, None, on_progress, "eye_to_hand")
+        report = self._learn(
+            recording, name, None, None, None, on_progress, "eye_to_hand"
+        )
         return self.calibration(report.scene)
 
     def _learn(
@@ -180,7 +187,9 @@ class Map:
         from evercal.recordings import load_recording
         from evercal.recordings.held_out import named_recording
 
-        loaded = recording if isinstance(recording, Recording) else load_recording(recording)
+        loaded = (
+            recording if isinstance(recording, Recording) else load_recording(recording)
+        )
         loaded = named_recording(loaded, name, self.scenes)
         with self._store.writing(), shown(on_progress) as step:
             contents = self._store.contents
@@ -237,7 +246,8 @@ class Map:
         from evercal.recordings.held_out import named_recording
 
         MemoryBudget.parse(memory)
-        read, loaded = read or load_recording, list[Source]()
+        read = read or load_recording
+        loaded = list[Source]()
         failed: list[str] = []
         taken = {*self.scenes}
         # Workers of a cluster begin in another folder, and results are kept by path.
@@ -270,7 +280,9 @@ class Map:
                 while (learned := ready.pop(following, None)) is not None:
                     following += 1
                     if learned.scene is None or learned.report is None:
-                        failed.append(f"{loaded[learned.number].name} ({learned.error})")
+                        failed.append(
+                            f"{loaded[learned.number].name} ({learned.error})"
+                        )
                         continue
                     size = self._store.contents.with_scene(learned.scene).memory_bytes
                     report = replace(learned.report, memory_bytes=size)
@@ -506,11 +518,15 @@ class Map:
             own = self.localizer.contents.scene(scene)
             scale_known = own.metric and not unknown_scale
             if points is not None:
-                found = align_by_points(self.localizer, scene, points, picks, scale_known)
+                found = align_by_points(
+                    self.localizer, scene, points, picks, scale_known
+                )
             else:
                 given = Images.of(images, None, robot_poses, convention)
                 if (poses := given.base_from_gripper) is None:
-                    raise InputError("give images with robot_poses, or points with picks")
+                    raise InputError(
+                        "give images with robot_poses, or points with picks"
+                    )
                 found = align_by_gripper(
                     self.localizer, scene, given.images, poses, scale_known, boards
                 )
@@ -545,11 +561,16 @@ class Map:
 
         given = Images.of(images, camera, robot_poses)
         poses = given.base_from_gripper
-        return check(self.localizer, given.images, calibration, given.camera, on_image, poses)
+        return check(
+            self.localizer, given.images, calibration, given.camera, on_image, poses
+        )
 
     def evaluate(
         self,
-        recordings: PathLike | Recording | Sequence[Recording] | Mapping[str, Recording],
+        recordings: PathLike
+        | Recording
+        | Sequence[Recording]
+        | Mapping[str, Recording],
     ) -> Scores:
         """Score the map on the test frames of recordings.
 

@@ -39,12 +39,17 @@ def started_safely(variables: Mapping[str, str] = {}) -> Iterator[SpawnContext]:
 def cores() -> int:
     """Processor cores that this process may use; OMP_NUM_THREADS bounds them."""
     most = os.environ.get("OMP_NUM_THREADS", "")
-    free = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    free = (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count() or 1
+    )
     return max(1, min(free, int(most))) if most.isdecimal() and int(most) else free
 
 
 _pools: Any = None
-_limiting, _limits = 0, threading.Lock()
+_limiting = 0
+_limits = threading.Lock()
 
 
 @contextmanager
@@ -83,7 +88,8 @@ def status_of(
 
     The time begins when the code prints a line, after its imports.
     """
-    command, pipe = python_command("-c", code, *words), subprocess.PIPE
+    command = python_command("-c", code, *words)
+    pipe = subprocess.PIPE
     with subprocess.Popen(
         command, stdout=pipe, stderr=subprocess.DEVNULL, env=environment
     ) as process:
@@ -122,7 +128,9 @@ class Worker:
     ):
         with started_safely(variables) as context:
             self.answers, theirs = context.Pipe()
-            self._process = context.Process(target=_work, args=(theirs, begin, state), daemon=True)
+            self._process = context.Process(
+                target=_work, args=(theirs, begin, state), daemon=True
+            )
             self._process.start()
         theirs.close()  # so that the end of the process ends the pipe
 
@@ -171,7 +179,9 @@ def cause_of(status: int, times: int = 1) -> str:
     return f"its process was killed{often} by {name}{hint}"
 
 
-def _work(pipe: Connection, begin: Callable[[Any], Callable[[Any], Any]], state: object) -> None:
+def _work(
+    pipe: Connection, begin: Callable[[Any], Callable[[Any], Any]], state: object
+) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it
     threading.Thread(target=_end_with_parent, daemon=True).start()
     work = begin(state)

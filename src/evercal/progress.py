@@ -54,7 +54,8 @@ class Bars:
     """
 
     def __init__(self, stream: TextIO | None = None, start: str = ""):
-        self._start, self._stream = start, stream or sys.stdout
+        self._start = start
+        self._stream = stream or sys.stdout
         self._bar: tqdm | None = None
         self._step = ""
 
@@ -74,7 +75,8 @@ class Bars:
             self._close()
             # A resumed step starts where it stopped, so that its speed is measured from there.
             first = done if done > 8 else 0
-            self._step, bar = name, progress_bar(name, total, _UNITS.get(name, "step"), first)
+            self._step = name
+            bar = progress_bar(name, total, _UNITS.get(name, "step"), first)
             self._bar = bar
         bar.update(done - bar.n)
         if done >= total:

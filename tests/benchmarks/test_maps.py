@@ -24,22 +24,30 @@ def folders(
     return [root / arc.name for arc in arcs]
 
 
-def test_sequence_reports_each_scene_and_their_mean(folders: list[Path], tmp_path: Path) -> None:
+def test_sequence_reports_each_scene_and_their_mean(
+    folders: list[Path], tmp_path: Path
+) -> None:
     maps.run("sequence", tuple(folders), tmp_path, 0.25)
     rows = pd.read_csv(tmp_path / "sequence" / "sequence.csv").to_dict("records")
     one, two, mean = rows
     assert [row["scene"] for row in rows] == ["one", "two", "mean"]
     assert one["frames"] == two["frames"] == 6
-    assert mean["5 cm/5 deg"] == pytest.approx((one["5 cm/5 deg"] + two["5 cm/5 deg"]) / 2)
+    assert mean["5 cm/5 deg"] == pytest.approx(
+        (one["5 cm/5 deg"] + two["5 cm/5 deg"]) / 2
+    )
     assert min(one["5 cm/5 deg"], two["5 cm/5 deg"]) > 50
     # Each scene counts its own bytes.
     assert 0.5 < one["bytes"] / two["bytes"] < 2
-    settings = json.loads((tmp_path / "sequence" / "sequence.json").read_text())["settings"]
+    settings = json.loads((tmp_path / "sequence" / "sequence.json").read_text())[
+        "settings"
+    ]
     assert settings["map"]["memory"]["share"] == 0.25
     assert settings["localize"]["align"] is True
 
 
-def test_images_of_another_scene_are_refused(folders: list[Path], tmp_path: Path) -> None:
+def test_images_of_another_scene_are_refused(
+    folders: list[Path], tmp_path: Path
+) -> None:
     maps.run("unknown", tuple(folders), tmp_path, 0.25)
     rows = pd.read_csv(tmp_path / "unknown" / "unknown.csv")
     assert rows["images"].tolist()[:3] == ["two", "blank", "noise"]

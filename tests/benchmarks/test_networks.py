@@ -31,5 +31,7 @@ def test_filled_sars_has_the_setting_of_sars_spdd() -> None:
 
 def test_an_unknown_experiment_is_refused() -> None:
     for names in ((), ("d",)):
-        with pytest.raises(InputError, match="choose of gate, a, memory, b, c, real, paper"):
+        with pytest.raises(
+            InputError, match="choose of gate, a, memory, b, c, real, paper"
+        ):
             networks.run(names)

@@ -28,5 +28,8 @@ def test_pages_have_the_numbers_of_the_data(name: str) -> None:
 
 
 def test_pages_have_no_marks_of_generated_tables() -> None:
-    for page in (FOLDER.parent / "docs" / "results.md", *FOLDER.parent.glob("research/*.md")):
+    for page in (
+        FOLDER.parent / "docs" / "results.md",
+        *FOLDER.parent.glob("research/*.md"),
+    ):
         assert not re.search("<!-- (table|end)", page.read_text())

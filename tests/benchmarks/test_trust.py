@@ -27,11 +27,15 @@ def rms(errors: np.ndarray) -> tuple[float, float]:
 
 
 def test_the_errors_of_an_arm_have_their_stated_size() -> None:
-    errors = np.stack([arm_errors(path(91), np.random.default_rng(i)) for i in range(300)])
+    errors = np.stack(
+        [arm_errors(path(91), np.random.default_rng(i)) for i in range(300)]
+    )
     assert rms(errors) == pytest.approx((ARM_MM, ARM_DEG), rel=0.05)
     # What the draws share is backlash: a third of the variance, with the sign of the motion.
     backlash = errors.mean(0)
-    assert rms(backlash) == pytest.approx((ARM_MM / np.sqrt(3), ARM_DEG / np.sqrt(3)), rel=0.05)
+    assert rms(backlash) == pytest.approx(
+        (ARM_MM / np.sqrt(3), ARM_DEG / np.sqrt(3)), rel=0.05
+    )
     moves = np.diff(path(91).translation_m, axis=0)
     assert (np.sign(backlash[1:, :3]) == np.sign(moves)).all()
     # Neighbours share drift: after backlash, half of the variance.
@@ -41,9 +45,12 @@ def test_the_errors_of_an_arm_have_their_stated_size() -> None:
 
 
 def test_the_errors_of_an_arm_move_its_gripper() -> None:
-    camera, poses = Camera(4, 4, 1, 1, 1, 1), path(91)
+    camera = Camera(4, 4, 1, 1, 1, 1)
+    poses = path(91)
     image = np.zeros((4, 4, 3), np.uint8)
-    frames = tuple(Frame(f"{i}", image, camera, None, pose) for i, pose in enumerate(poses))
+    frames = tuple(
+        Frame(f"{i}", image, camera, None, pose) for i, pose in enumerate(poses)
+    )
     recording = Recording("arm", frames, ())
     noisy = grippers(with_arm_errors(recording, np.random.default_rng(0)))
     metres, radians = pose_distance(poses, noisy)
@@ -63,7 +70,8 @@ def test_few_images_are_spread_over_the_recording() -> None:
 
 
 def test_the_fitted_frame_undoes_a_motion_of_the_base() -> None:
-    true, offset = path(30), SE3.exp([0.02, -0.01, 0.03, 0.02, 0.01, -0.03])
+    true = path(30)
+    offset = SE3.exp([0.02, -0.01, 0.03, 0.02, 0.01, -0.03])
     moved = [offset @ pose for pose in true]
     moved[3] = moved[3] @ SE3.exp([0.5, 0, 0, 0, 1, 0])  # one wrong answer
     fitted = trust.frame_offset(SE3.stack(moved), true)
@@ -81,7 +89,8 @@ def test_summaries_count_wrong_answers_and_refusals() -> None:
         common | nothing | {"case": "refused", "status": "failed"},
     ]
     summary = trust.summary(rows, ["case"]).set_index("case")
-    own, refused = summary.loc["own camera"], summary.loc["refused"]
+    own = summary.loc["own camera"]
+    refused = summary.loc["refused"]
     assert own[["n", "located", "1 cm/1 deg %", "wrong"]].tolist() == [4, 3, 25.0, 2]
     assert own["median mm"] == 20.0
     assert np.isinf(own["95 % mm"])

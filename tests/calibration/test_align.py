@@ -37,7 +37,9 @@ GRIPPER_FROM_CAMERA = SE3.exp([0.05, 0.02, 0.08, 0.1, 0.2, -0.4])
 @pytest.fixture(scope="module")
 def arm_views(hall: Recording, hall_room: BoxRoom) -> tuple[NamedImages, SE3]:
     """Ten images with tilted cameras along the walk of the hall, and their map_from_camera."""
-    rng, poses, images = np.random.default_rng(3), [], []
+    rng = np.random.default_rng(3)
+    poses = []
+    images = []
     camera = hall.train[0].camera
     for i, frame in enumerate(hall.train[2::3]):
         assert frame.base_from_camera is not None
@@ -81,7 +83,9 @@ def test_camera_on_the_gripper_determines_the_base(
     # An exact pose in the middle of the scene has the error of the alignment alone.
     truth = Similarity(BASE_FROM_MAP, scale).pose(map_from_camera[5])
     frame = alignment.applied_to(localizer.contents.scenes[0]).frame
-    exact = replace(frame, common=SE3.identity(), correction=None, pose_sigma=(0.0, 0.0))
+    exact = replace(
+        frame, common=SE3.identity(), correction=None, pose_sigma=(0.0, 0.0)
+    )
     estimate = exact.to_base(UncertainPose.exact(map_from_camera[5]))
     metres, _ = pose_distance(estimate.pose, truth)
     assert metres < 0.004 * scale
@@ -92,7 +96,9 @@ def test_a_scale_that_the_arm_contradicts_is_estimated_and_named(
     arm_views: tuple[NamedImages, SE3], localizer: Localizer
 ) -> None:
     images, map_from_camera = arm_views
-    alignment = align_by_gripper(localizer, "hall", images, gripper_poses(map_from_camera, 1.05))
+    alignment = align_by_gripper(
+        localizer, "hall", images, gripper_poses(map_from_camera, 1.05)
+    )
     assert alignment.similarity.scale == pytest.approx(1.05, rel=0.01)
     (warning,) = alignment.warnings
     assert "too short, by the robot's motions" in warning
@@ -100,7 +106,9 @@ def test_a_scale_that_the_arm_contradicts_is_estimated_and_named(
     exact = replace(frame, pose_sigma=(0.0, 0.0))
     for pose in map_from_camera[::3]:
         estimate = exact.to_base(UncertainPose.exact(pose))
-        metres, _ = pose_distance(estimate.pose, Similarity(BASE_FROM_MAP, 1.05).pose(pose))
+        metres, _ = pose_distance(
+            estimate.pose, Similarity(BASE_FROM_MAP, 1.05).pose(pose)
+        )
         assert metres < 4 * np.sqrt(np.trace(estimate.covariance[:3, :3]))
 
 
@@ -111,7 +119,12 @@ def test_board_in_the_gripper_determines_the_base(
     rng = np.random.default_rng(0)
     gripper_from_board = SE3.exp([0.0, 0.1, 0.05, 0.3, 0.0, 0.5])
     grippers = SE3.exp(rng.normal(0, np.repeat([0.2, 0.5], 3), (len(images), 6)))
-    boards = map_from_camera.inverse() @ BASE_FROM_MAP.inverse() @ grippers @ gripper_from_board
+    boards = (
+        map_from_camera.inverse()
+        @ BASE_FROM_MAP.inverse()
+        @ grippers
+        @ gripper_from_board
+    )
     board_poses = {name: pose for (name, _), pose in zip(images, boards, strict=True)}
     alignment = align_by_gripper(localizer, "hall", images, grippers, True, board_poses)
     metres, radians = pose_distance(alignment.similarity.base_from_map, BASE_FROM_MAP)
@@ -131,10 +144,14 @@ def test_touched_points_determine_the_base(
 ) -> None:
     """Also by images of another camera, whose focal length is longer than that of the map."""
     images, map_from_camera = arm_views
-    similarity, camera = Similarity(BASE_FROM_MAP, scale), localizer.contents.scenes[0].camera
+    similarity = Similarity(BASE_FROM_MAP, scale)
+    camera = localizer.contents.scenes[0].camera
     if longer != 1:
         camera = replace(camera, fx=longer * camera.fx, fy=longer * camera.fy)
-        images = [(f"{i}.png", hall_room.render(camera, p)) for i, p in enumerate(map_from_camera)]
+        images = [
+            (f"{i}.png", hall_room.render(camera, p))
+            for i, p in enumerate(map_from_camera)
+        ]
     # A flat wall leaves another focal length open, so the later images are refused then.
     some, seen_from = (slice(2, 9, 2), 5) if longer == 1 else (slice(0, 5), 2)
     eye = map_from_camera[seen_from].translation_m
@@ -148,7 +165,9 @@ def test_touched_points_determine_the_base(
         inside = ((pixels > 0) & (pixels < [319, 239])).all(1)
         visible = {f"p{i}": pixels[i] for i in np.flatnonzero(inside)}
         picks += [(name, image, visible)] if visible else []
-    alignment = align_by_points(localizer, "hall", points, picks, scale_known=scale == 1.0)
+    alignment = align_by_points(
+        localizer, "hall", points, picks, scale_known=scale == 1.0
+    )
     assert alignment.similarity.scale == pytest.approx(scale, rel=0.01)
     np.testing.assert_allclose(
         alignment.similarity.points(in_map), list(points.values()), atol=0.01
@@ -161,8 +180,12 @@ def test_too_few_images_and_unknown_scenes_are_refused(
     arm_views: tuple[NamedImages, SE3], localizer: Localizer
 ) -> None:
     images, map_from_camera = arm_views
-    with pytest.raises(InputError, match="2 of 2 images were located in hall; give at least 5"):
-        align_by_gripper(localizer, "hall", images[:2], gripper_poses(map_from_camera[:2]))
+    with pytest.raises(
+        InputError, match="2 of 2 images were located in hall; give at least 5"
+    ):
+        align_by_gripper(
+            localizer, "hall", images[:2], gripper_poses(map_from_camera[:2])
+        )
     with pytest.raises(InputError, match="scene 'attic': the map has only hall"):
         align_by_gripper(localizer, "attic", images, gripper_poses(map_from_camera))
 
@@ -174,17 +197,23 @@ def test_aligning_again_starts_from_the_map_and_leaves_the_localizer_unchanged(
     elsewhere = Similarity(SE3.exp([5.0, 0, 0, 0, 0, 0.5]), 1.5)
     first = aligned(hall_map, MapAlignment(elsewhere, np.eye(6) * 1e-6, 10, 10, ""))
     # What the recording's poses were off is not added to later answers.
-    off = replace(first.scenes[0].frame, common=SE3.exp([0.02, -0.01, 0.01, 0.01, 0, 0]))
+    off = replace(
+        first.scenes[0].frame, common=SE3.exp([0.02, -0.01, 0.01, 0.01, 0, 0])
+    )
     first = replace(first, scenes=[replace(first.scenes[0], frame=off)])
     localizer = Localizer(first)
     before = localizer.localize(images[4][1])
-    alignment = align_by_gripper(localizer, "hall", images, gripper_poses(map_from_camera))
+    alignment = align_by_gripper(
+        localizer, "hall", images, gripper_poses(map_from_camera)
+    )
     after = localizer.localize(images[4][1])
     again = Localizer(aligned(first, alignment)).localize(images[4][1])
     assert before.base_from_camera is not None
     assert after.base_from_camera is not None
     assert again.base_from_camera is not None
-    np.testing.assert_array_equal(before.base_from_camera.matrix(), after.base_from_camera.matrix())
+    np.testing.assert_array_equal(
+        before.base_from_camera.matrix(), after.base_from_camera.matrix()
+    )
     truth = BASE_FROM_MAP @ map_from_camera[4]
     assert pose_distance(again.base_from_camera, truth)[0] < 0.006
 
@@ -215,20 +244,32 @@ def test_a_map_on_disk_is_aligned(
     from evercal.cli import main
 
     images, map_from_camera = arm_views
-    store = MapStore(tmp_path / "map", MapContents(hall_map.encoder, hall_map.short_side))
+    store = MapStore(
+        tmp_path / "map", MapContents(hall_map.encoder, hall_map.short_side)
+    )
     store.commit(hall_map.scenes[0], {})
     (tmp_path / "arm").mkdir()
     rows = ["image,x,y,z,qw,qx,qy,qz"]
     for (name, image), pose in zip(images, gripper_poses(map_from_camera), strict=True):
         write_image(tmp_path / "arm" / name, image)
-        rows.append(",".join(map(str, [name, *pose.translation_m, *pose.rotation_wxyz])))
+        rows.append(
+            ",".join(map(str, [name, *pose.translation_m, *pose.rotation_wxyz]))
+        )
     (tmp_path / "poses.csv").write_text("\n".join(rows))
-    words = [tmp_path / "map", "hall", tmp_path / "arm", "--robot-poses", tmp_path / "poses.csv"]
+    words = [
+        tmp_path / "map",
+        "hall",
+        tmp_path / "arm",
+        "--robot-poses",
+        tmp_path / "poses.csv",
+    ]
     if form == "verb":
         assert main(["align", *map(str, words)]) == 0
     else:
         poses = gripper_poses(map_from_camera)
-        Map.open(tmp_path / "map").align("hall", [i for _, i in images], robot_poses=poses)
+        Map.open(tmp_path / "map").align(
+            "hall", [i for _, i in images], robot_poses=poses
+        )
     estimate = Localizer.open(tmp_path / "map").localize(images[4][1])
     assert estimate.base_from_camera is not None
     truth = BASE_FROM_MAP @ map_from_camera[4]
@@ -251,7 +292,8 @@ def views(
         x = np.cross([0, 0.3, 1], z)
         x /= np.linalg.norm(x)
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = np.stack([x, np.cross(z, x), z], 1), eye
+        matrix[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
+        matrix[:3, 3] = eye
         base_from_camera = SE3.from_matrix(matrix)
         pixels = CAMERA.project(base_from_camera.inverse().apply(points))
         pixels = pixels + rng.normal(0, sigma_px, pixels.shape)
@@ -279,7 +321,9 @@ def test_covariance_covers_the_errors() -> None:
     squared = []
     for seed in range(25):
         truth, points, rng = drawn(seed)
-        similarity, covariance, _ = fit_picks(views(truth, points, 1.0, rng), scale_known=False)
+        similarity, covariance, _ = fit_picks(
+            views(truth, points, 1.0, rng), scale_known=False
+        )
         in_map = truth.base_from_map.inverse().apply(points) / truth.scale
         estimate = similarity.points(in_map)
         # The seven parameters that map the estimates to the points, by linear least squares.
@@ -288,7 +332,9 @@ def test_covariance_covers_the_errors() -> None:
             rotation = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
             away = np.array([x, y, z]) - points.mean(0)
             rows.append(np.column_stack([np.eye(3), rotation, away]))
-        error = np.linalg.lstsq(np.concatenate(rows), (points - estimate).ravel(), rcond=None)[0]
+        error = np.linalg.lstsq(
+            np.concatenate(rows), (points - estimate).ravel(), rcond=None
+        )[0]
         squared.append(error @ np.linalg.solve(covariance, error))
     assert 2.5 < np.mean(squared) < 9.0  # 7 for an exact covariance
 

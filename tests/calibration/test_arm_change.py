@@ -15,12 +15,20 @@ COVARIANCE = np.deg2rad(0.05) ** 2 * np.array([[9.0, -8.8, 0], [-8.8, 9, 0], [0,
 NAMES = ("pan", "lift", "elbow", "wrist")
 
 
-def calibration(offsets_deg: list[float], names: tuple[str, ...] = NAMES) -> Calibration:
+def calibration(
+    offsets_deg: list[float], names: tuple[str, ...] = NAMES
+) -> Calibration:
     """An arm whose first offset is open; its other three have COVARIANCE."""
     covariance = np.zeros((4, 4))
-    covariance[1:, 1:], covariance[0, 0] = COVARIANCE, 1.0
+    covariance[1:, 1:] = COVARIANCE
+    covariance[0, 0] = 1.0
     joints = tuple(
-        JointOffset(name, np.deg2rad(offset), np.sqrt(variance), open="" if i else "turns the base")
+        JointOffset(
+            name,
+            np.deg2rad(offset),
+            np.sqrt(variance),
+            open="" if i else "turns the base",
+        )
         for i, (name, offset, variance) in enumerate(
             zip(names, offsets_deg, np.diag(covariance), strict=True)
         )
@@ -43,12 +51,15 @@ def test_one_joint_that_changed_is_named_where_neighbours_are_alike() -> None:
 
 
 def test_two_joints_that_changed_are_named() -> None:
-    _, changed, _ = arm_change(calibration([0, 0, 0, 0]), calibration([0, 1.0, 0, -0.5]))
+    _, changed, _ = arm_change(
+        calibration([0, 0, 0, 0]), calibration([0, 1.0, 0, -0.5])
+    )
     assert changed == ["lift", "wrist"]
 
 
 def test_joints_that_did_not_change_rarely_alarm() -> None:
-    rng, alarms = np.random.default_rng(3), 0
+    rng = np.random.default_rng(3)
+    alarms = 0
     root = np.rad2deg(np.linalg.cholesky(COVARIANCE))
     for _ in range(300):
         two = [calibration([0, *(root @ rng.normal(size=3))]) for _ in range(2)]
@@ -58,7 +69,8 @@ def test_joints_that_did_not_change_rarely_alarm() -> None:
 
 def test_changes_too_small_to_matter_do_not_count() -> None:
     sure = [
-        replace(calibration([0, 0, 0, w]), joint_covariance=1e-12 * np.eye(4)) for w in (0, 0.04)
+        replace(calibration([0, 0, 0, w]), joint_covariance=1e-12 * np.eye(4))
+        for w in (0, 0.04)
     ]
     confidence, changed, _ = arm_change(*sure)
     assert confidence > 0.99
@@ -67,9 +79,13 @@ def test_changes_too_small_to_matter_do_not_count() -> None:
 
 def test_other_arms_and_open_offsets_are_refused() -> None:
     one = calibration([0, 0, 0, 0])
-    with pytest.raises(InputError, match=r"\[pan, lift, elbow, wrist\], the recording of \[a, b"):
+    with pytest.raises(
+        InputError, match=r"\[pan, lift, elbow, wrist\], the recording of \[a, b"
+    ):
         arm_change(one, calibration([0, 0, 0, 0], ("a", "b", "c", "d")))
-    with pytest.raises(InputError, match=r"recording of \[\]: give a recording of the same arm"):
+    with pytest.raises(
+        InputError, match=r"recording of \[\]: give a recording of the same arm"
+    ):
         arm_change(one, replace(one, joints=(), joint_covariance=np.zeros((0, 0))))
     still = replace(one, joints=tuple(replace(joint, open="x") for joint in one.joints))
     with pytest.raises(InputError, match="no joint's offset is determined in both"):

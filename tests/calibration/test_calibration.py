@@ -33,7 +33,10 @@ def example() -> Calibration:
         "good for bin picking",
         {"command": "solve"},
         "2026-01-01T00:00:00+00:00",
-        (JointOffset("lift", 0.01, 0.002), JointOffset("rail", 0.0, 0.1, False, "move it")),
+        (
+            JointOffset("lift", 0.01, 0.002),
+            JointOffset("rail", 0.0, 0.1, False, "move it"),
+        ),
         np.array([[4e-6, 1e-6], [1e-6, 1e-2]]),
     )
 
@@ -42,12 +45,17 @@ def test_round_trip(tmp_path: Path) -> None:
     calibration = example()
     calibration.write(tmp_path / "c.json")
     read = read_calibration(tmp_path / "c.json")
-    assert max(pose_distance(read.parent_from_child, calibration.parent_from_child)) < 1e-12
+    assert (
+        max(pose_distance(read.parent_from_child, calibration.parent_from_child))
+        < 1e-12
+    )
     assert read.to_dict() == calibration.to_dict()
     assert read.images == calibration.images
     assert read.joints == calibration.joints
     np.testing.assert_array_equal(read.joint_covariance, calibration.joint_covariance)
-    old = {key: value for key, value in calibration.to_dict().items() if "joint" not in key}
+    old = {
+        key: value for key, value in calibration.to_dict().items() if "joint" not in key
+    }
     assert Calibration.from_dict(old).joint_covariance.shape == (0, 0)
     assert read.meaning.startswith("pose of camera_color_optical_frame in panda_hand")
 
@@ -98,7 +106,9 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 def calibration(mm: float, deg: float, **checks: float) -> Calibration:
     """A calibration with this root mean square error in space."""
     axes = np.repeat([mm / 1000, np.deg2rad(deg)], 3) / np.sqrt(3)
-    return Calibration("eye_in_hand", SE3.identity(), np.diag(axes**2), "gripper", checks=checks)
+    return Calibration(
+        "eye_in_hand", SE3.identity(), np.diag(axes**2), "gripper", checks=checks
+    )
 
 
 @pytest.mark.parametrize(
@@ -113,10 +123,14 @@ def calibration(mm: float, deg: float, **checks: float) -> Calibration:
         (10.1, 0.1, None),
     ],
 )
-def test_worse_of_translation_and_rotation_decides(mm: float, deg: float, name: str | None) -> None:
+def test_worse_of_translation_and_rotation_decides(
+    mm: float, deg: float, name: str | None
+) -> None:
     use = tier(calibration(mm, deg))
     assert (use.name if use else None) == name
-    assert verdict(calibration(mm, deg)).startswith(f"Good for {name}" if name else "Unusable")
+    assert verdict(calibration(mm, deg)).startswith(
+        f"Good for {name}" if name else "Unusable"
+    )
 
 
 def test_the_noise_of_single_poses_is_no_error_of_the_calibration() -> None:
@@ -124,7 +138,9 @@ def test_the_noise_of_single_poses_is_no_error_of_the_calibration() -> None:
     noisy = calibration(0.5, 0.05, held_out_mm=30.0, held_out_deg=3.0)
     assert tier(noisy) is TIERS[0]
     assert "single held-out poses differ by 30 mm" in verdict(noisy)
-    assert "more poses" in verdict(calibration(2.0, 0.05, held_out_mm=0.5, held_out_deg=0.05))
+    assert "more poses" in verdict(
+        calibration(2.0, 0.05, held_out_mm=0.5, held_out_deg=0.05)
+    )
     # Two halves differ by twice the error of their mean.
     halves = calibration(0.5, 0.05, repeatability_mm=3.0)
     assert expected_error(halves) == pytest.approx((1.5, 0.05))

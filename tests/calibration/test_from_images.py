@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 
 from evercal.calibration.audit import audit
-from evercal.calibration.calibration import Calibration, ErrorTerm, Mount, largest_term, rig_of
+from evercal.calibration.calibration import (
+    Calibration,
+    ErrorTerm,
+    Mount,
+    largest_term,
+    rig_of,
+)
 from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
 from evercal.calibration.from_images import _from_many_spots as from_many_spots
@@ -40,9 +46,13 @@ def noisy() -> Draw:
     """Repeated images of a frame with sensor noise."""
 
     def draw(frame: Frame, count: int, seed: int) -> list[tuple[str, np.ndarray]]:
-        rng, image = np.random.default_rng(seed), frame.read_image().astype(float)
+        rng = np.random.default_rng(seed)
+        image = frame.read_image().astype(float)
         return [
-            (f"{seed}-{i}.png", (image + rng.normal(0, 4, image.shape)).clip(0, 255).astype("u1"))
+            (
+                f"{seed}-{i}.png",
+                (image + rng.normal(0, 4, image.shape)).clip(0, 255).astype("u1"),
+            )
             for i in range(count)
         ]
 
@@ -64,10 +74,14 @@ def fixed(localizer: Localizer, hall: Recording, noisy: Draw) -> Calibration:
 def rms_variances(calibration: Calibration) -> tuple[float, float]:
     """Sums of the squared terms, millimetres and degrees."""
     terms = calibration.error_terms
-    return sum(t.translation_mm**2 for t in terms), sum(t.rotation_deg**2 for t in terms)
+    return sum(t.translation_mm**2 for t in terms), sum(
+        t.rotation_deg**2 for t in terms
+    )
 
 
-def test_fixed_camera_within_its_uncertainty(fixed: Calibration, hall: Recording) -> None:
+def test_fixed_camera_within_its_uncertainty(
+    fixed: Calibration, hall: Recording
+) -> None:
     metres, radians = pose_distance(fixed.parent_from_child, truth_of(hall.test[3]))
     assert (fixed.mount, fixed.parent_frame) == ("eye_to_hand", "base")
     assert metres < 0.004
@@ -80,7 +94,8 @@ def test_fixed_camera_within_its_uncertainty(fixed: Calibration, hall: Recording
 def test_terms_of_a_fixed_camera_are_its_images_causes(
     fixed: Calibration, localizer: Localizer, hall: Recording, noisy: Draw
 ) -> None:
-    frame, rows = hall.test[3], rms_variances(fixed)
+    frame = hall.test[3]
+    rows = rms_variances(fixed)
     assert [term.name for term in fixed.error_terms] == [*CAUSES, "scatter of 6 images"]
     assert rows == pytest.approx((fixed.sigma_mm**2, fixed.sigma_deg**2))
     images = noisy(frame, 6, 0)
@@ -96,7 +111,8 @@ def test_terms_of_a_fixed_camera_are_its_images_causes(
 def test_terms_of_a_camera_on_the_gripper_contain_the_arm(
     localizer: Localizer, hall: Recording
 ) -> None:
-    frames, rng = hall.test[::3], np.random.default_rng(0)
+    frames = hall.test[::3]
+    rng = np.random.default_rng(0)
     noise = SE3.from_translation(rng.normal(0, 0.01, (len(frames), 3)))
     grippers = SE3.stack([truth_of(f) for f in frames]) @ noise
     images = [(f.name, f.read_image()) for f in frames]
@@ -123,12 +139,18 @@ def test_advice_where_the_lens_is_the_largest_term(
     def words(lens_mm: float) -> str:
         terms = (ErrorTerm("view", 1.0, 0.1), ErrorTerm("lens", lens_mm, 0.1))
         calibration = Calibration(
-            mount, SE3.identity(), np.eye(6), error_terms=terms, source={"intrinsics": intrinsics}
+            mount,
+            SE3.identity(),
+            np.eye(6),
+            error_terms=terms,
+            source={"intrinsics": intrinsics},
         )
         return " ".join(lens_advice(calibration))
 
     assert words(0.9) == ""
-    assert words(2.0).startswith("The lens is the largest term, 80 % of the position's variance: ")
+    assert words(2.0).startswith(
+        "The lens is the largest term, 80 % of the position's variance: "
+    )
     assert advice in words(2.0)
 
 
@@ -141,8 +163,11 @@ def adjusted(hall_map: MapContents) -> Localizer:
     return Localizer(MapContents(hall_map.encoder, hall_map.short_side, [scene]))
 
 
-def test_given_camera_is_used_and_saved(adjusted: Localizer, hall: Recording, noisy: Draw) -> None:
-    frame, stated = hall.test[3], adjusted.contents.scenes[0].camera
+def test_given_camera_is_used_and_saved(
+    adjusted: Localizer, hall: Recording, noisy: Draw
+) -> None:
+    frame = hall.test[3]
+    stated = adjusted.contents.scenes[0].camera
     camera = replace(stated, fx=1.0005 * stated.fx, fy=1.0005 * stated.fy)
     calibration = calibrate(adjusted, Images(noisy(frame, 2, 0), camera))
     assert pose_distance(calibration.parent_from_child, truth_of(frame))[0] < 0.006
@@ -165,7 +190,9 @@ def test_intrinsics_that_the_images_contradict_are_replaced(
     assert pose_distance(calibration.parent_from_child, truth_of(frame))[0] < 0.01
     assert calibration.camera is not None
     assert calibration.camera.fx == pytest.approx(frame.camera.fx, rel=0.01)
-    words = f"The stated intrinsics (focal length {wrong.fx:.1f} px) do not fit the images"
+    words = (
+        f"The stated intrinsics (focal length {wrong.fx:.1f} px) do not fit the images"
+    )
     assert words in calibration.verdict
 
 
@@ -174,9 +201,14 @@ def test_without_a_camera_that_of_the_map_is_saved_at_the_size_of_the_images(
 ) -> None:
     image = np.repeat(np.repeat(hall.test[3].read_image(), 2, 0), 2, 1)
     calibration = calibrate(localizer, Images([("a", image)]))
-    assert calibration.camera == localizer.contents.scenes[0].adjusted_camera.resized(640, 480)
+    assert calibration.camera == localizer.contents.scenes[0].adjusted_camera.resized(
+        640, 480
+    )
     assert calibration.source["intrinsics"] == "map"
-    assert "The intrinsics are those of the camera that recorded hall" in calibration.verdict
+    assert (
+        "The intrinsics are those of the camera that recorded hall"
+        in calibration.verdict
+    )
     assert "It rests on one image" in calibration.verdict
 
 
@@ -194,11 +226,19 @@ def test_camera_on_the_gripper(localizer: Localizer, hall: Recording) -> None:
 
 
 def test_spots_differ_in_position_or_rotation() -> None:
-    turned, away = SE3.exp([0, 0, 0, 0, 0, 0.5]), SE3.exp([0.5, 0, 0, 0, 0, 0])
-    assert spots_of([SE3.identity(), turned, away, SE3.identity()]).tolist() == [0, 1, 2, 0]
+    turned = SE3.exp([0, 0, 0, 0, 0, 0.5])
+    away = SE3.exp([0.5, 0, 0, 0, 0, 0])
+    assert spots_of([SE3.identity(), turned, away, SE3.identity()]).tolist() == [
+        0,
+        1,
+        2,
+        0,
+    ]
 
 
-def test_eye_in_hand_needs_a_pose_for_every_image(localizer: Localizer, hall: Recording) -> None:
+def test_eye_in_hand_needs_a_pose_for_every_image(
+    localizer: Localizer, hall: Recording
+) -> None:
     images = [("a", hall.test[0].read_image())]
     with pytest.raises(InputError, match="--robot-poses"):
         calibrate(localizer, Images(images), "eye_in_hand")
@@ -215,7 +255,9 @@ def test_images_from_files_and_arrays(hall: Recording, tmp_path: Path) -> None:
     in_order = [f.read_image() for f in (frames[2], frames[0], frames[1])]
     files = [tmp_path / f"{i}.png" for i in (1, 2, 10)]
     assert Images.of(tmp_path).images == [(str(file), file) for file in files]
-    for (_, image), expected in zip(Images.of(np.stack(in_order)).images, in_order, strict=True):
+    for (_, image), expected in zip(
+        Images.of(np.stack(in_order)).images, in_order, strict=True
+    ):
         np.testing.assert_array_equal(image, expected)
     [(_, image)] = Images.of(in_order[0]).images
     np.testing.assert_array_equal(image, in_order[0])
@@ -237,7 +279,9 @@ def test_motion_is_detected_and_rest_is_not(
         pose = fixed.parent_from_child @ SE3.exp(tangent)
         shift = check(localizer, now, replace(fixed, parent_from_child=pose))
         assert shift.moved
-        assert shift.translation_mm == pytest.approx(1000 * np.linalg.norm(tangent[:3]), abs=0.5)
+        assert shift.translation_mm == pytest.approx(
+            1000 * np.linalg.norm(tangent[:3]), abs=0.5
+        )
     [hall_scene] = localizer.contents.scenes
     renamed = replace(localizer.contents, scenes=[replace(hall_scene, name="lobby")])
     assert check(Localizer(renamed), now, fixed).same_map
@@ -249,14 +293,21 @@ def test_motion_is_detected_and_rest_is_not(
         check(localizer, now[:1], replace(fixed, mount="eye_in_hand"))
 
 
-def test_rig_contains_relative_poses(localizer: Localizer, hall: Recording, noisy: Draw) -> None:
+def test_rig_contains_relative_poses(
+    localizer: Localizer, hall: Recording, noisy: Draw
+) -> None:
     frames = {"left": hall.test[2], "right": hall.test[5]}
-    cameras = {name: calibrate(localizer, Images(noisy(f, 2, 0))) for name, f in frames.items()}
+    cameras = {
+        name: calibrate(localizer, Images(noisy(f, 2, 0))) for name, f in frames.items()
+    }
     [pair] = rig_of(cameras).relative
     truth = truth_of(frames["left"]).inverse() @ truth_of(frames["right"])
     assert (pair.first, pair.second) == ("left", "right")
     assert pose_distance(pair.first_from_second.pose, truth)[0] < 0.006
-    assert pair.first_from_second.sigma_mm > max(each.sigma_mm for each in cameras.values()) * 0.7
+    assert (
+        pair.first_from_second.sigma_mm
+        > max(each.sigma_mm for each in cameras.values()) * 0.7
+    )
     with pytest.raises(InputError, match="at least two"):
         rig_of({"left": cameras["left"]})
 
@@ -315,7 +366,9 @@ def squared_distance(seed: int, base_mm: float) -> float:
     for i, camera in enumerate(grippers @ GRIPPER_FROM_CAMERA):
         pose = motion @ drawn(camera, rng.multivariate_normal(np.zeros(6), own))
         answer = UncertainPose(SE3.identity(), base) @ UncertainPose(pose, own)
-        estimate = PoseEstimate("ok", "", "hall", pose, answer.covariance, 100, 0.5, 1.0)
+        estimate = PoseEstimate(
+            "ok", "", "hall", pose, answer.covariance, 100, 0.5, 1.0
+        )
         located.append(ImagePose(str(i), estimate, pose, answer.covariance))
     moved = in_parent_frame(located, grippers.inverse())
     fused = fuse(moved)

@@ -27,7 +27,9 @@ from evercal.recordings.samples import FOLDER
 def without_camera_poses(recording: Recording) -> Recording:
     """All frames with gripper poses only."""
     frames = (*recording.train, *recording.test)
-    return Recording("arm", tuple(replace(f, base_from_camera=None) for f in frames), ())
+    return Recording(
+        "arm", tuple(replace(f, base_from_camera=None) for f in frames), ()
+    )
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +39,9 @@ def hand() -> Recording:
 
 @pytest.fixture(scope="module")
 def truth() -> SE3:
-    content = json.loads((FOLDER / "bedroom" / "calibration" / "truth.json").read_text())
+    content = json.loads(
+        (FOLDER / "bedroom" / "calibration" / "truth.json").read_text()
+    )
     pose = content["gripper_from_camera"]
     return SE3(np.array(pose["quaternion_wxyz"]), np.array(pose["translation_m"]))
 
@@ -57,7 +61,8 @@ def learned(
 def test_gripper_from_camera_within_its_covariance(
     learned: tuple[Path, LearnReport], truth: SE3
 ) -> None:
-    whole, report = learned[1], learned[1].hand_eye
+    whole = learned[1]
+    report = learned[1].hand_eye
     assert (whole.train_frames, whole.held_out_frames) == (14, 0)
     assert whole.frames_kept >= 8
     assert report is not None
@@ -71,7 +76,9 @@ def test_gripper_from_camera_within_its_covariance(
     assert report.warnings == ()
 
 
-def test_the_map_keeps_the_calibration(learned: tuple[Path, LearnReport], tmp_path: Path) -> None:
+def test_the_map_keeps_the_calibration(
+    learned: tuple[Path, LearnReport], tmp_path: Path
+) -> None:
     folder, report = learned
     assert report.hand_eye is not None
     shutil.copytree(folder, tmp_path / "cell")
@@ -85,34 +92,49 @@ def test_the_map_keeps_the_calibration(learned: tuple[Path, LearnReport], tmp_pa
     assert calibration.camera == cell.localizer.contents.scenes[0].adjusted_camera
     assert calibration.created == report.hand_eye.created != ""
     cell.rename("arm", "bench")
-    assert calibration_at(tmp_path / "cell").to_dict() == cell.calibration("bench").to_dict()
+    assert (
+        calibration_at(tmp_path / "cell").to_dict()
+        == cell.calibration("bench").to_dict()
+    )
     assert calibration_at(f"{tmp_path / 'cell'}:bench").source["scene"] == "bench"
     with pytest.raises(InputError, match=r"scene 'arm': map .* has only bench"):
         calibration_at(f"{tmp_path / 'cell'}:arm")
     cell.merge(folder)
-    with pytest.raises(InputError, match="bench, arm each have a calibration; name one"):
+    with pytest.raises(
+        InputError, match="bench, arm each have a calibration; name one"
+    ):
         calibration_at(tmp_path / "cell")
     file = tmp_path / "wrist.json"
     calibration.write(file)
     assert calibration_at(file).to_dict() == calibration.to_dict()
     # As in the report of a fixed camera: images, their residuals, and causes that sum to the whole.
     assert len(calibration.images) > 10
-    assert all(0 < (image.residual_mm or 0) < 5 for image in calibration.images if image.used)
+    assert all(
+        0 < (image.residual_mm or 0) < 5 for image in calibration.images if image.used
+    )
     parts = [term.translation_mm for term in calibration.error_terms]
     assert np.linalg.norm(parts) == pytest.approx(calibration.sigma_mm)
-    doubtful = replace(report.hand_eye, warnings=("the clocks differ",), advice="turn more")
-    verdict = doubtful.calibration(cell.localizer.contents.scenes[0].camera, "arm", 60).verdict
+    doubtful = replace(
+        report.hand_eye, warnings=("the clocks differ",), advice="turn more"
+    )
+    verdict = doubtful.calibration(
+        cell.localizer.contents.scenes[0].camera, "arm", 60
+    ).verdict
     assert verdict == "Do not rely on it: the clocks differ. Turn more."
 
 
 def test_a_map_without_gripper_poses_has_no_calibration(
     hall_map: MapContents, tmp_path: Path
 ) -> None:
-    store = MapStore(tmp_path / "map", MapContents(hall_map.encoder, hall_map.short_side))
+    store = MapStore(
+        tmp_path / "map", MapContents(hall_map.encoder, hall_map.short_side)
+    )
     store.commit(hall_map.scenes[0], {"hand_eye": None})
     with pytest.raises(InputError, match="was not learned from gripper poses"):
         calibration_at(tmp_path / "map")
-    with pytest.raises(InputError, match="map:hall: was not learned from gripper poses"):
+    with pytest.raises(
+        InputError, match="map:hall: was not learned from gripper poses"
+    ):
         Map.open(tmp_path / "map").calibration("hall")
 
 
@@ -120,14 +142,17 @@ def test_images_are_located_in_the_base_frame(
     learned: tuple[Path, LearnReport], hand: Recording
 ) -> None:
     contents = Localizer.open(learned[0]).contents
-    scene, frame = contents.scenes[0], hand.test[3]
+    scene = contents.scenes[0]
+    frame = hand.test[3]
     assert scene.frame.base_covariance is not None
     without_error = replace(scene, frame=replace(scene.frame, base_covariance=None))
     exact = MapContents(contents.encoder, contents.short_side, [without_error])
     estimates = [Localizer(c).localize(frame.read_image()) for c in (contents, exact)]
     assert estimates[0].base_from_camera is not None
     assert frame.base_from_camera is not None
-    assert pose_distance(estimates[0].base_from_camera, frame.base_from_camera)[0] < 0.003
+    assert (
+        pose_distance(estimates[0].base_from_camera, frame.base_from_camera)[0] < 0.003
+    )
     # The covariance contains the error of the camera on the gripper.
     wide, narrow = (estimate.covariance for estimate in estimates)
     assert wide is not None
@@ -154,8 +179,12 @@ def test_rotation_about_one_axis_is_refused(hand: Recording, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
-def test_too_few_images_are_refused(count: int, hand: Recording, tmp_path: Path) -> None:
+def test_too_few_images_are_refused(
+    count: int, hand: Recording, tmp_path: Path
+) -> None:
     arm = without_camera_poses(hand)
     few = replace(arm, train=arm.train[:count])
-    with pytest.raises(InputError, match=rf"^scene 'arm': {count} training frames are too few"):
+    with pytest.raises(
+        InputError, match=rf"^scene 'arm': {count} training frames are too few"
+    ):
         Map.open(tmp_path / "map").learn(few)

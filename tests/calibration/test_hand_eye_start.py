@@ -24,9 +24,12 @@ def grippers(count: int, seed: int, size: tuple[float, float] = (0.3, 0.4)) -> S
     return SE3.exp(rng.normal(0, np.repeat(size, 3), (count, 6)))
 
 
-def image_pairs(poses: SE3, truth: SE3, noise_px: float = 0.0, wrong: int = 0) -> list[ImagePair]:
+def image_pairs(
+    poses: SE3, truth: SE3, noise_px: float = 0.0, wrong: int = 0
+) -> list[ImagePair]:
     """Pairs of images of points in front of the cameras, at 500 px; some of them random."""
-    rng, pairs = np.random.default_rng(1), []
+    rng = np.random.default_rng(1)
+    pairs = []
     cameras = poses @ truth
     middle = cameras.apply(np.array([0.0, 0.0, 0.6])).mean(0)
     points = middle + rng.normal(0, 0.1, (40, 3))
@@ -44,10 +47,13 @@ def image_pairs(poses: SE3, truth: SE3, noise_px: float = 0.0, wrong: int = 0) -
 
 @pytest.mark.parametrize("mount", ["eye_in_hand", "eye_to_hand"])
 def test_exact_pairs_give_the_exact_transform(mount: Mount) -> None:
-    poses, truth = grippers(12, 0), TRUTH
+    poses = grippers(12, 0)
+    truth = TRUTH
     if mount == "eye_to_hand":  # a fixed camera, 1.3 m from the base
         truth = SE3.exp([1.0, -0.3, 0.8, 0.4, -1.2, 2.0])
-        poses = (SE3.from_translation(truth.apply(np.array([0.0, 0.0, 0.6]))) @ poses).inverse()
+        poses = (
+            SE3.from_translation(truth.apply(np.array([0.0, 0.0, 0.6]))) @ poses
+        ).inverse()
     start = solve_pairs(poses, image_pairs(poses, truth), mount)
     metres, radians = pose_distance(start.parent_from_camera, truth)
     assert metres < 1e-4
@@ -79,7 +85,8 @@ def test_a_camera_that_orbits_one_place_does_not_end_there(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_a_thing_of_a_few_pixels_suffices(seed: int) -> None:
     """Of 4 cm in 1.3 m: its essential matrices may be wrong by any angle."""
-    rng, truth = np.random.default_rng(seed), SE3.exp([1.0, -0.3, 0.8, 0.4, -1.2, 2.0])
+    rng = np.random.default_rng(seed)
+    truth = SE3.exp([1.0, -0.3, 0.8, 0.4, -1.2, 2.0])
     place = truth.apply(np.array([0.0, 0.0, 1.3]))
     poses = (SE3.from_translation(place) @ grippers(20, seed, (0.1, 0.3))).inverse()
     points = rng.uniform(-0.02, 0.02, (30, 3)) * (1, 0.2, 1) + (0, 0, 0.2)

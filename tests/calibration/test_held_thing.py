@@ -19,19 +19,32 @@ def texture(seed: int, height: int, width: int) -> np.ndarray:
     return 120 + 40 * smooth / smooth.std()
 
 
-def frames_of(count: int, noise: float, gain: float = 0.0) -> tuple[list[Frame], list[np.ndarray]]:
+def frames_of(
+    count: int, noise: float, gain: float = 0.0
+) -> tuple[list[Frame], list[np.ndarray]]:
     """A textured square that moves before a textured wall, and where it is in each image."""
-    rng, wall, thing = np.random.default_rng(0), texture(1, 240, 320), texture(2, 60, 60)
-    frames, masks = [], []
+    rng = np.random.default_rng(0)
+    wall = texture(1, 240, 320)
+    thing = texture(2, 60, 60)
+    frames = []
+    masks = []
     for i in range(count):
-        left, top = rng.integers(20, 230), rng.integers(20, 150)
-        image, mask = wall * (1 + gain * rng.normal()), np.zeros((240, 320), bool)
-        turned = cv2.warpAffine(thing, cv2.getRotationMatrix2D((30, 30), 40.0 * i, 1.0), (60, 60))
+        left = rng.integers(20, 230)
+        top = rng.integers(20, 150)
+        image = wall * (1 + gain * rng.normal())
+        mask = np.zeros((240, 320), bool)
+        turned = cv2.warpAffine(
+            thing, cv2.getRotationMatrix2D((30, 30), 40.0 * i, 1.0), (60, 60)
+        )
         image[top : top + 60, left : left + 60] = turned
         mask[top + 8 : top + 52, left + 8 : left + 52] = True
         image = image + rng.normal(0, noise, image.shape)
         grey = np.clip(image, 0, 255).astype(np.uint8)
-        frames.append(Frame(str(i), np.repeat(grey[..., None], 3, 2), CAMERA, None, SE3.identity()))
+        frames.append(
+            Frame(
+                str(i), np.repeat(grey[..., None], 3, 2), CAMERA, None, SE3.identity()
+            )
+        )
         masks.append(mask)
     return frames, masks
 
@@ -54,15 +67,20 @@ def test_a_window_follows_the_thing_and_keeps_its_rays() -> None:
     base_from_camera = SE3.identity()
     grippers = SE3.stack(
         [
-            SE3.from_translation((x, 0.05 * (-1) ** i, 1.0)) @ SE3.exp([0, 0, 0, 0.3 * x, x, i])
+            SE3.from_translation((x, 0.05 * (-1) ** i, 1.0))
+            @ SE3.exp([0, 0, 0, 0.3 * x, x, i])
             for i, x in enumerate(np.linspace(-0.2, 0.2, 6))
         ]
     )
     image = np.zeros((240, 320, 3), np.uint8)
-    frames = [Frame(str(i), image, CAMERA, None, pose) for i, pose in enumerate(grippers)]
+    frames = [
+        Frame(str(i), image, CAMERA, None, pose) for i, pose in enumerate(grippers)
+    ]
     seen = [pose.apply(points) for pose in grippers]
     rays = [rows / rows[:, 2:] for rows in seen]
-    pairs = tuple(ImagePair(i, i + 1, np.stack([rays[i], rays[i + 1]])) for i in range(5))
+    pairs = tuple(
+        ImagePair(i, i + 1, np.stack([rays[i], rays[i + 1]])) for i in range(5)
+    )
     around = windows(frames, HandEyeStart(base_from_camera, "eye_to_hand", 5, 5, pairs))
     assert around is not None
     assert around[0, 2] < 90
@@ -76,7 +94,8 @@ def test_a_window_follows_the_thing_and_keeps_its_rays() -> None:
 
 @pytest.mark.parametrize("kind", ["none", "step", "drift"])
 def test_a_step_is_told_from_noise_and_drift(kind: str) -> None:
-    sigma, found = np.repeat([2e-4, 3e-4], 3), 0
+    sigma = np.repeat([2e-4, 3e-4], 3)
+    found = 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
         values = rng.normal(0, sigma, (20, 6))

@@ -27,9 +27,14 @@ MOUNT = SE3.exp(np.array([0.05, -0.04, 0.03, 0.3, -0.2, 0.7]))
 SCENE = np.array([0.5, 0.1, 0.0])
 
 
-def grippers(count: int, turn: tuple[float, float, float] = (0.5, 0.5, 0.5), seed: int = 1) -> SE3:
+def grippers(
+    count: int, turn: tuple[float, float, float] = (0.5, 0.5, 0.5), seed: int = 1
+) -> SE3:
     rng = np.random.default_rng(seed)
-    tangents = [rng.uniform(-0.3, 0.3, (count, 3)), rng.uniform(-1, 1, (count, 3)) * turn]
+    tangents = [
+        rng.uniform(-0.3, 0.3, (count, 3)),
+        rng.uniform(-1, 1, (count, 3)) * turn,
+    ]
     return SE3.exp(np.concatenate(tangents, 1))
 
 
@@ -49,23 +54,34 @@ def numerical(function: object, size: int, step: float = 1e-6) -> np.ndarray:
 
 
 def test_information_is_that_of_the_residuals_under_noise_on_both_poses() -> None:
-    poses, scene = grippers(3), SE3.from_translation(SCENE)
+    poses = grippers(3)
+    scene = SE3.from_translation(SCENE)
     noise = np.zeros((12, 12))
-    noise[:6, :6], noise[6:, 6:] = GRIPPER_NOISE, CAMERA_NOISE
+    noise[:6, :6] = GRIPPER_NOISE
+    noise[6:, 6:] = CAMERA_NOISE
     for i, gripper in enumerate(poses):
         camera = scene.inverse() @ gripper @ MOUNT
 
-        def residual(x: np.ndarray, gripper: SE3 = gripper, camera: SE3 = camera) -> np.ndarray:
+        def residual(
+            x: np.ndarray, gripper: SE3 = gripper, camera: SE3 = camera
+        ) -> np.ndarray:
             moved = (gripper @ SE3.exp(x[13:19]) @ changed(MOUNT, x[:6])).inverse()
             scaled = SE3(camera.rotation_wxyz, (1 + x[12]) * camera.translation_m)
             return (moved @ scene @ SE3.exp(x[6:12]) @ scaled @ SE3.exp(x[19:])).log()
 
         slopes = numerical(residual, 25)
-        by_unknowns, by_noise = slopes[:, :13], slopes[:, 13:]
-        np.testing.assert_allclose(wrist_jacobian(poses, MOUNT, SCENE)[i], by_unknowns, atol=1e-8)
-        expected = by_unknowns.T @ np.linalg.inv(by_noise @ noise @ by_noise.T) @ by_unknowns
+        by_unknowns = slopes[:, :13]
+        by_noise = slopes[:, 13:]
+        np.testing.assert_allclose(
+            wrist_jacobian(poses, MOUNT, SCENE)[i], by_unknowns, atol=1e-8
+        )
+        expected = (
+            by_unknowns.T @ np.linalg.inv(by_noise @ noise @ by_noise.T) @ by_unknowns
+        )
         information = wrist_information(poses, MOUNT, SCENE)[i]
-        np.testing.assert_allclose(information, expected, rtol=1e-4, atol=1e-5 * expected.max())
+        np.testing.assert_allclose(
+            information, expected, rtol=1e-4, atol=1e-5 * expected.max()
+        )
 
 
 @pytest.mark.parametrize(
@@ -93,7 +109,8 @@ def test_the_point_looked_at_is_where_the_axes_meet() -> None:
 
 
 def test_one_view_is_the_best_one_and_two_are_nearly_the_best_two() -> None:
-    used, reachable = grippers(2), grippers(12, seed=2)
+    used = grippers(2)
+    reachable = grippers(12, seed=2)
     known = 1e-2 * np.eye(13) + wrist_information(used, MOUNT, SCENE).sum(0)
     added = wrist_information(reachable, MOUNT, SCENE)
 
@@ -106,8 +123,12 @@ def test_one_view_is_the_best_one_and_two_are_nearly_the_best_two() -> None:
     pairs = sorted(map(cost, itertools.combinations(range(12), 2)))
     assert cost(tuple(chosen.index.tolist())) <= pairs[len(pairs) // 10]
     after = np.linalg.inv(known + added[chosen.index].sum(0))
-    assert chosen.sigma_mm[-1] == pytest.approx(1000 * np.sqrt(np.diag(after)[:3].mean()))
-    assert chosen.sigma_deg[-1] == pytest.approx(np.rad2deg(np.sqrt(np.diag(after)[3:6].mean())))
+    assert chosen.sigma_mm[-1] == pytest.approx(
+        1000 * np.sqrt(np.diag(after)[:3].mean())
+    )
+    assert chosen.sigma_deg[-1] == pytest.approx(
+        np.rad2deg(np.sqrt(np.diag(after)[3:6].mean()))
+    )
 
 
 def test_recorded_and_excluded_poses_and_their_twins_are_not_proposed() -> None:
@@ -122,11 +143,18 @@ def test_recorded_and_excluded_poses_and_their_twins_are_not_proposed() -> None:
 
 
 @pytest.mark.parametrize("mount", [MOUNT, None])
-def test_an_orbit_leaves_the_distance_open_and_other_distances_close_it(mount: SE3 | None) -> None:
+def test_an_orbit_leaves_the_distance_open_and_other_distances_close_it(
+    mount: SE3 | None,
+) -> None:
     """The images show neither the scale of the scene nor, therefore, how far the camera is."""
-    turns = SE3.exp(np.pad(0.3 * np.random.default_rng(0).normal(size=(20, 3)), ((0, 0), (3, 0))))
+    turns = SE3.exp(
+        np.pad(0.3 * np.random.default_rng(0).normal(size=(20, 3)), ((0, 0), (3, 0)))
+    )
     near, far = (
-        SE3.from_translation(SCENE) @ turns @ SE3.from_translation((0, 0, -z)) @ MOUNT.inverse()
+        SE3.from_translation(SCENE)
+        @ turns
+        @ SE3.from_translation((0, 0, -z))
+        @ MOUNT.inverse()
         for z in (0.5, 0.8)
     )
     found = open_position(near, mount)

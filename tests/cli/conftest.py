@@ -37,7 +37,11 @@ def run(capfd: pytest.CaptureFixture[str]) -> Run:
         code = main([str(word) for word in words])
         out, err = capfd.readouterr()
         # A bar rewrites its line after a carriage return and ends it with a line break.
-        lines = [line for line in err.split("\n") if line and not re.search(r"\r|it/s|/s\]", line)]
+        lines = [
+            line
+            for line in err.split("\n")
+            if line and not re.search(r"\r|it/s|/s\]", line)
+        ]
         return Ran(code, out, lines)
 
     return call
@@ -81,7 +85,8 @@ def still_images(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> P
 
     from evercal.recordings import write_image
 
-    folder, rng = tmp_path_factory.mktemp("still"), np.random.default_rng(0)
+    folder = tmp_path_factory.mktemp("still")
+    rng = np.random.default_rng(0)
     image = hall.test[3].read_image().astype(float)
     for i in range(20):
         noisy = (image + rng.normal(0, 4, image.shape)).clip(0, 255).astype("u1")
@@ -99,12 +104,23 @@ def four_images(still_images: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.fixture(scope="session")
-def network_store(tmp_path_factory: pytest.TempPathFactory, rooms: tuple[Path, Path]) -> Path:
+def network_store(
+    tmp_path_factory: pytest.TempPathFactory, rooms: tuple[Path, Path]
+) -> Path:
     """A store of a network with 5 centres that was trained for four steps on `box-room-41`."""
     from evercal.continual.learning.presets import PRESETS
 
-    demo, folder = PRESETS["demo"], tmp_path_factory.mktemp("stores") / "network.evercal"
-    words = ["learn", str(folder), str(rooms[0]), "--strategy", "finetune", "--centres", "5"]
+    demo = PRESETS["demo"]
+    folder = tmp_path_factory.mktemp("stores") / "network.evercal"
+    words = [
+        "learn",
+        str(folder),
+        str(rooms[0]),
+        "--strategy",
+        "finetune",
+        "--centres",
+        "5",
+    ]
     with pytest.MonkeyPatch.context() as patch:
         small = replace(
             demo,

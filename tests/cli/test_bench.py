@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, quick: StageOptions) -> None:
     """Tiny stages."""
-    monkeypatch.setattr(verb.Bench, "_stage", lambda self, seed: replace(quick, seed=seed))
+    monkeypatch.setattr(
+        verb.Bench, "_stage", lambda self, seed: replace(quick, seed=seed)
+    )
 
 
 @pytest.mark.slow("src/evercal/continual", "src/evercal/cli/bench.py")
@@ -32,13 +34,17 @@ def test_bench_and_its_tables(
     folders = []
     for scene in arcs:
         folders.append(tmp_path / scene.name)
-        generic.write(folders[-1], replace(scene, train=scene.train[:18], test=scene.test[:4]))
+        generic.write(
+            folders[-1], replace(scene, train=scene.train[:18], test=scene.test[:4])
+        )
     words = ["custom", *folders, "--strategies", "evercal,finetune", "--seeds", "0"]
     first = run("bench", *words, "--out", tmp_path / "out")
     assert first.code == 0, first.err
     assert "[4/4] finetune seed 0: one " in first.out
     # A map is also evaluated without alignment, under its own name.
-    line = next(line for line in first.out.splitlines() if line.startswith("[2/4] evercal"))
+    line = next(
+        line for line in first.out.splitlines() if line.startswith("[2/4] evercal")
+    )
     assert "evercal:unaligned seed 0: one " in line
     assert "evercal - finetune" in first.out
     assert "BWT (backward transfer): mean change" in first.out
@@ -51,7 +57,9 @@ def test_bench_and_its_tables(
     assert printed.code == 0
     assert "finetune - evercal" in printed.out
     assert "finetune - evercal" in (tmp_path / "out" / "tables.md").read_text()
-    assert r"\multicolumn{3}{c}{finetune}" in (tmp_path / "out" / "tables.tex").read_text()
+    assert (
+        r"\multicolumn{3}{c}{finetune}" in (tmp_path / "out" / "tables.tex").read_text()
+    )
     assert "<svg" in (tmp_path / "out" / "figure.svg").read_text()
 
 
@@ -61,7 +69,9 @@ def test_held_out_frames_are_training_frames(
     folders = []
     for scene in arcs:
         folders.append(tmp_path / scene.name)
-        generic.write(folders[-1], replace(scene, train=scene.train[:30], test=scene.test[:2]))
+        generic.write(
+            folders[-1], replace(scene, train=scene.train[:30], test=scene.test[:2])
+        )
     plugin = tmp_path / "mine.py"
     plugin.write_text(
         "from evercal.continual.methods.replay import Replay\n"
@@ -69,11 +79,20 @@ def test_held_out_frames_are_training_frames(
         "STRATEGIES = {'er_3': Strategy('er_3', Replay(weight=0.9))}\n"
     )
     # Equal strategies run once.
-    words = ["custom", *folders, "--strategies", "er_3,er_3", "--seeds", "0", "--held-out"]
+    words = [
+        "custom",
+        *folders,
+        "--strategies",
+        "er_3,er_3",
+        "--seeds",
+        "0",
+        "--held-out",
+    ]
     ran = run("bench", *words, "--plugin", plugin, "--out", tmp_path / "out")
     assert ran.code == 0, ran.err
     train = {frame.name for scene in arcs for frame in scene.train}
-    results, frames = read(tmp_path / "out"), read_frames(tmp_path / "out")
+    results = read(tmp_path / "out")
+    frames = read_frames(tmp_path / "out")
     stages = results[["strategy", "stage", "scene"]].itertuples(index=False, name=None)
     assert list(stages) == [("er_3", 0, "one"), ("er_3", 1, "one"), ("er_3", 1, "two")]
     described = json.loads((tmp_path / "out" / STRATEGIES).read_text())
@@ -88,7 +107,10 @@ def test_held_out_frames_are_training_frames(
 
 def test_table4_stands_for_its_strategies() -> None:
     def names(strategies: str) -> list[str]:
-        return [one.name for one in verb.Bench("sim-mini", strategies=strategies)._strategies()]
+        return [
+            one.name
+            for one in verb.Bench("sim-mini", strategies=strategies)._strategies()
+        ]
 
     ablation = names("table4")
     assert {"icarl", "sars_old_output", "sars_spdd", "reservoir_spdd"} < set(ablation)
@@ -96,7 +118,9 @@ def test_table4_stands_for_its_strategies() -> None:
 
 
 def test_options_of_the_backbone_of_the_paper() -> None:
-    ours, paper = (verb.Bench("sim-mini", backbone=b, steps=7) for b in ("evercal", "paper"))
+    ours, paper = (
+        verb.Bench("sim-mini", backbone=b, steps=7) for b in ("evercal", "paper")
+    )
     stage = paper._stage(3)
     assert (stage.seed, stage.fit.iterations) == (3, 7)
     assert stage.head.centres == "fixed"
@@ -104,7 +128,9 @@ def test_options_of_the_backbone_of_the_paper() -> None:
     assert ours._stage(3).head.condition == "code"
     head = verb.Bench("sim-mini", backbone="paper_head", steps=7)._stage(3)
     assert (head.head, head.fit) == (stage.head, ours._stage(3).fit)
-    whole, part = (verb.Bench("sim", preset="paper", batch=n)._stage(0) for n in (None, 2048))
+    whole, part = (
+        verb.Bench("sim", preset="paper", batch=n)._stage(0) for n in (None, 2048)
+    )
     assert (whole.fit.batch, whole.fit.replay_batch) == (40_960, 40_960)
     changed = replace(whole.fit, batch=2048, replay_batch=2048)
     assert part == replace(whole, fit=changed)
@@ -113,10 +139,15 @@ def test_options_of_the_backbone_of_the_paper() -> None:
     assert (shared.head.offsets, shared.head.centres) == ("shared", "fixed")
 
 
-def test_the_papers_working_images_are_not_larger_than_the_recorded(hall: Recording) -> None:
+def test_the_papers_working_images_are_not_larger_than_the_recorded(
+    hall: Recording,
+) -> None:
     def sides(factor: float) -> tuple[int, int]:
         frames = [
-            replace(frame, camera=frame.camera.resized(round(320 * factor), round(240 * factor)))
+            replace(
+                frame,
+                camera=frame.camera.resized(round(320 * factor), round(240 * factor)),
+            )
             for frame in hall.train[:2]
         ]
         return short_side("paper", frames), short_side("fast", frames)

@@ -16,7 +16,14 @@ from evercal.recordings import write_image
 if TYPE_CHECKING:
     from evercal.recordings import Frame, Recording
 
-CHECK_KEYS = {"moved", "translation_mm", "rotation_deg", "sigma_mm", "sigma_deg", "confidence"}
+CHECK_KEYS = {
+    "moved",
+    "translation_mm",
+    "rotation_deg",
+    "sigma_mm",
+    "sigma_deg",
+    "confidence",
+}
 CHECK_KEYS |= {"same_map", "reference_from_now", "images", "left_out", "note"}
 
 
@@ -52,14 +59,21 @@ def test_cameras_of_a_rig(
 ) -> None:
     (tmp_path / "right").mkdir()
     write_image(tmp_path / "right" / "0.png", hall.test[6].read_image())
-    words = ("calibrate", hall_store, f"left={four_images}", f"right={tmp_path / 'right'}")
+    words = (
+        "calibrate",
+        hall_store,
+        f"left={four_images}",
+        f"right={tmp_path / 'right'}",
+    )
     ran = run(*words, "--out", tmp_path / "rig.json", "--json")
     assert ran.code == 0, ran.err
     assert json.loads(ran.out) == json.loads((tmp_path / "rig.json").read_text())
     left_from_right = truth_of(hall.test[3]).inverse() @ truth_of(hall.test[6])
     text = run(*words, "--out", tmp_path / "rig.json", "--at", "0,0,1").out
     assert text.count("mm at (0, 0, 1) m in the camera frame") == 2
-    line = next(line for line in text.splitlines() if line.startswith("left_from_right: "))
+    line = next(
+        line for line in text.splitlines() if line.startswith("left_from_right: ")
+    )
     estimate = [float(word) for word in line.split()[1:4]]
     np.testing.assert_allclose(estimate, 1000 * left_from_right.translation_m, atol=6)
 
@@ -73,11 +87,22 @@ def test_point_in_the_camera_frame_has_a_standard_deviation(
     own = read_calibration(tmp_path / "c.json")
     sigma = own.uncertain_pose.point_sigma_mm([0.1, 0, 1.5])
     at = own.parent_from_child.apply(np.array([0.1, 0, 1.5])).tolist()
-    expected = {"point_m": [0.1, 0, 1.5], "in_parent_m": at, "sigma_mm": pytest.approx(sigma)}
+    expected = {
+        "point_m": [0.1, 0, 1.5],
+        "in_parent_m": at,
+        "sigma_mm": pytest.approx(sigma),
+    }
     assert record.pop("at") == expected
     assert record == json.loads((tmp_path / "c.json").read_text())
     assert f"{sigma:.2f} mm at (0.1, 0, 1.5) m in the camera frame" in run(*words).out
-    page = ("report", tmp_path / "c.json", "--out", tmp_path / "r.html", "--at", "0.1,0,1.5")
+    page = (
+        "report",
+        tmp_path / "c.json",
+        "--out",
+        tmp_path / "r.html",
+        "--at",
+        "0.1,0,1.5",
+    )
     assert json.loads(run(*page, "--json").out)["at"] == expected
     assert (
         "point (0.1, 0, 1.5) m of camera along the axes of base"

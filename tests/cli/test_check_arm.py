@@ -18,7 +18,8 @@ pytestmark = pytest.mark.slow(
 pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
 
 CAMERA = Camera(320, 240, 320, 320, 159.5, 119.5)
-HOME, SPREAD = np.array([0, -0.2, 0.3, 0, 1.2, 0]), np.array([0.8, 0.35, 0.4, 0.5, 0.4, 0.8])
+HOME = np.array([0, -0.2, 0.3, 0, 1.2, 0])
+SPREAD = np.array([0.8, 0.35, 0.4, 0.5, 0.4, 0.8])
 LINKS = (
     ("0 0 0.15", "0 0 1"),
     ("0 0 0.05", "0 1 0"),
@@ -38,7 +39,9 @@ def write_urdf(file: Path) -> None:
         place = f'<origin xyz="{origin}"/><axis xyz="{axis}"/>'
         text += f'<joint name="j{i + 1}" type="revolute">{ends}{place}{limit}</joint>'
     ends = '<parent link="l6"/><child link="l7"/><origin xyz="0.05 0 0"/>'
-    file.write_text(f'<robot name="six">{text}<joint name="f" type="fixed">{ends}</joint></robot>')
+    file.write_text(
+        f'<robot name="six">{text}<joint name="f" type="fixed">{ends}</joint></robot>'
+    )
 
 
 class Cell:
@@ -48,9 +51,14 @@ class Cell:
         folder.mkdir()
         write_urdf(folder / "arm.urdf")
         self.arm = RobotModel(folder / "arm.urdf").arm("l0", "l7")
-        self.room, self.rng = cell_room(1), np.random.default_rng(1)
-        axes = np.array([[0, 0, 1.0, 0.03], [-1, 0, 0, 0.01], [0, -1, 0, 0.06], [0, 0, 0, 1]])
-        self.gripper_from_camera = SE3.from_matrix(axes) @ SE3.exp([0, 0, 0, 0.1, -0.05, 0.08])
+        self.room = cell_room(1)
+        self.rng = np.random.default_rng(1)
+        axes = np.array(
+            [[0, 0, 1.0, 0.03], [-1, 0, 0, 0.01], [0, -1, 0, 0.06], [0, 0, 0, 1]]
+        )
+        self.gripper_from_camera = SE3.from_matrix(axes) @ SE3.exp(
+            [0, 0, 0, 0.1, -0.05, 0.08]
+        )
         self.offsets = np.deg2rad([0, 1.2, -0.8, 0.6, -1.1, 0])
 
     def record(self, folder: Path, images: int = 20) -> Path:
@@ -64,9 +72,15 @@ class Cell:
             pose = self.arm.poses(joints[None])[0] @ self.gripper_from_camera
             seen = pose.inverse().apply(WORK_AREA_M)
             far = np.linalg.norm(seen)
-            if pose.translation_m[2] < 0.12 or not 0.18 < far < 0.9 or seen[2] < 0.82 * far:
+            if (
+                pose.translation_m[2] < 0.12
+                or not 0.18 < far < 0.9
+                or seen[2] < 0.82 * far
+            ):
                 continue
-            image = self.room.render(CAMERA, pose) + self.rng.normal(0, 2, (240, 320, 3))
+            image = self.room.render(CAMERA, pose) + self.rng.normal(
+                0, 2, (240, 320, 3)
+            )
             name = f"{len(rows):03d}.png"
             write_image(folder / name, np.clip(image, 0, 255).astype(np.uint8))
             stated = joints - self.offsets + np.deg2rad(0.02) * self.rng.normal(size=6)
@@ -75,9 +89,15 @@ class Cell:
         return folder
 
 
-def test_a_joint_that_slipped_is_named_and_others_are_not(run: Any, tmp_path: Path) -> None:
-    cell, store, reference = Cell(tmp_path / "arm"), tmp_path / "cell", tmp_path / "wrist.json"
-    ran = run("learn", store, cell.record(tmp_path / "first"), "--calibration", reference)
+def test_a_joint_that_slipped_is_named_and_others_are_not(
+    run: Any, tmp_path: Path
+) -> None:
+    cell = Cell(tmp_path / "arm")
+    store = tmp_path / "cell"
+    reference = tmp_path / "wrist.json"
+    ran = run(
+        "learn", store, cell.record(tmp_path / "first"), "--calibration", reference
+    )
     assert ran.code == 0, ran.err
 
     same = run("check", store, cell.record(tmp_path / "same"), "--reference", reference)
@@ -98,4 +118,7 @@ def test_a_joint_that_slipped_is_named_and_others_are_not(run: Any, tmp_path: Pa
     refused = run("check", store, slipped / "001.png", "--reference", reference)
     assert refused.code == 2
     images = run("check", store, slipped, slipped, "--reference", reference)
-    assert (images.code, "give one recording with joint values" in images.err[-1]) == (2, True)
+    assert (images.code, "give one recording with joint values" in images.err[-1]) == (
+        2,
+        True,
+    )

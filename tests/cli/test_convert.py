@@ -10,7 +10,13 @@ import pytest
 
 from evercal.cli.args import Reading
 from evercal.geometry import SE3, pose_distance
-from evercal.recordings import FORMATS, ReadOptions, generic, load_recording, write_image
+from evercal.recordings import (
+    FORMATS,
+    ReadOptions,
+    generic,
+    load_recording,
+    write_image,
+)
 
 
 @pytest.fixture
@@ -32,7 +38,16 @@ def test_recording_is_converted_to_a_scene_folder(
     run: Any, wave: Path, tmp_path: Path, options: list[str]
 ) -> None:
     out = tmp_path / "out"
-    words = ["convert", wave, out, "--camera", tmp_path / "camera.txt", "--name", "cell", *options]
+    words = [
+        "convert",
+        wave,
+        out,
+        "--camera",
+        tmp_path / "camera.txt",
+        "--name",
+        "cell",
+        *options,
+    ]
     ran = run(*words, "--json")
     assert (ran.code, ran.err) == (0, [])
     record = json.loads(ran.out)
@@ -69,7 +84,9 @@ def test_next_command_repeats_the_reading_options(run: Any, wave: Path) -> None:
 def test_options_are_those_of_load_recording(run: Any) -> None:
     names = {field.name: field.default for field in dataclasses.fields(Reading)}
     assert names.pop("format") is None
-    assert names == {field.name: field.default for field in dataclasses.fields(ReadOptions)}
+    assert names == {
+        field.name: field.default for field in dataclasses.fields(ReadOptions)
+    }
     text = run("inspect", "--help").out.replace("│", "")
     page = " ".join(text.split())
     for name in FORMATS:
@@ -94,8 +111,16 @@ def test_bad_input_is_one_line(run: Any, wave: Path, tmp_path: Path, verb: str) 
     for scene, words, message in (
         (wave, [], "no camera file in it"),
         (wave, ["--camera", tmp_path / "no"], "camera file is missing"),
-        (wave, ["--camera", camera, "--image-topic", "/a"], "--image-topic: not used by"),
-        (room, ["--camera", camera], "--camera: not used by recordings of format generic"),
+        (
+            wave,
+            ["--camera", camera, "--image-topic", "/a"],
+            "--image-topic: not used by",
+        ),
+        (
+            room,
+            ["--camera", camera],
+            "--camera: not used by recordings of format generic",
+        ),
         (room, ["--every", 0], "--every 0: give a number >= 1"),
         (tmp_path / "file", [], "a file, not a folder"),
         (tmp_path / "no", [], "no such folder"),

@@ -113,7 +113,9 @@ def test_headlines_are_medians() -> None:
         FixedCamera("a", 5, 5, 0.8, 0.02, 0.5, 5.1, 5.0, True),
         FixedCamera("b", 5, true_shift_mm=5.0),
     ]
-    result = DemoResult(test=test, cameras=cameras, unknown_images=12, unknown_refused=11)
+    result = DemoResult(
+        test=test, cameras=cameras, unknown_images=12, unknown_refused=11
+    )
     assert result.headlines() == {
         "3.00 mm": "median position error of one image, 0.057 deg in rotation",
         "0.80 mm": "median position error of a fixed camera after calibration",

@@ -41,7 +41,10 @@ def test_json_has_the_documented_keys(run: Any, store: Path, rooms: Any) -> None
 def test_scenes_are_named_by_folder_or_option(rooms: Any, tmp_path: Path) -> None:
     odd = tmp_path / "a=b"
     shutil.copytree(rooms[0], odd)
-    assert list(load_named((str(rooms[0]), f"other={rooms[0]}"))) == ["box-room-41", "other"]
+    assert list(load_named((str(rooms[0]), f"other={rooms[0]}"))) == [
+        "box-room-41",
+        "other",
+    ]
     assert list(load_named((str(odd),))) == ["box-room-41"]
     assert list(load_named((f"x={odd}",))) == ["x"]
     with pytest.raises(InputError, match="was given twice"):

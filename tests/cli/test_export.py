@@ -58,7 +58,9 @@ def test_the_list_names_every_format(run: Any) -> None:
 
 
 @pytest.mark.parametrize("name", ["easy_handeye2", "urdf", "opencv", "kuka"])
-def test_printed_and_written_text_are_equal(run: Any, make: Any, tmp_path: Path, name: str) -> None:
+def test_printed_and_written_text_are_equal(
+    run: Any, make: Any, tmp_path: Path, name: str
+) -> None:
     file = make()
     printed = run("export", file, "--format", name)
     assert (printed.code, printed.err) == (0, [])
@@ -76,7 +78,9 @@ def test_printed_and_written_text_are_equal(run: Any, make: Any, tmp_path: Path,
     assert record["translation_m"] == POSE.translation_m.tolist()
 
 
-def test_binary_files_and_folders_are_not_printed(run: Any, make: Any, tmp_path: Path) -> None:
+def test_binary_files_and_folders_are_not_printed(
+    run: Any, make: Any, tmp_path: Path
+) -> None:
     file = make()
     for name in ("npy", "colmap"):
         refused = run("export", file, "--format", name)
@@ -84,7 +88,9 @@ def test_binary_files_and_folders_are_not_printed(run: Any, make: Any, tmp_path:
         assert "cannot be printed; give --out" in refused.err[0]
     assert run("export", file, "--format", "npy", "--out", tmp_path / "m.npy").code == 0
     np.testing.assert_allclose(np.load(tmp_path / "m.npy"), POSE.matrix())
-    written = run("export", file, "--format", "colmap", "--out", tmp_path / "m", "--json")
+    written = run(
+        "export", file, "--format", "colmap", "--out", tmp_path / "m", "--json"
+    )
     names = {Path(path).name for path in json.loads(written.out)["files"]}
     assert names == {path.name for path in (tmp_path / "m").iterdir()}
     assert names == {"cameras.txt", "images.txt", "points3D.txt"}
@@ -96,17 +102,29 @@ def test_binary_files_and_folders_are_not_printed(run: Any, make: Any, tmp_path:
 def test_frames_are_renamed_and_the_file_gives_the_name(
     run: Any, make: Any, tmp_path: Path
 ) -> None:
-    words = ("--format", "easy_handeye2", "--parent", "panda_link0", "--child", "cam_link")
+    words = (
+        "--format",
+        "easy_handeye2",
+        "--parent",
+        "panda_link0",
+        "--child",
+        "cam_link",
+    )
     out = tmp_path / "cell_left.calib"
     run("export", make(), *words, "--robot-frame", "panda_hand", "--out", out)
     parameters = yaml.safe_load(out.read_text())["parameters"]
     assert parameters["name"] == "cell_left"
     frames = ("robot_base_frame", "robot_effector_frame", "tracking_base_frame")
-    assert [parameters[key] for key in frames] == ["panda_link0", "panda_hand", "cam_link"]
+    assert [parameters[key] for key in frames] == [
+        "panda_link0",
+        "panda_hand",
+        "cam_link",
+    ]
 
 
 def test_the_driver_root_frame_is_exported(run: Any, make: Any, tmp_path: Path) -> None:
-    file, tf = make(child="camera_color_optical_frame"), tmp_path / "tf.yaml"
+    file = make(child="camera_color_optical_frame")
+    tf = tmp_path / "tf.yaml"
     words = ("export", file, "--format", "transform_stamped")
     note = "note: most camera drivers publish camera_color_optical_frame themselves"
     assert note in run(*words).err[0]
@@ -127,7 +145,14 @@ def test_the_driver_root_frame_is_exported(run: Any, make: Any, tmp_path: Path) 
 def test_a_camera_on_the_arm_gets_a_pose_per_robot_pose(
     run: Any, make: Any, gripper: Path, tmp_path: Path
 ) -> None:
-    words = ("export", make("eye_in_hand"), "--format", "tum", "--out", tmp_path / "c.tum")
+    words = (
+        "export",
+        make("eye_in_hand"),
+        "--format",
+        "tum",
+        "--out",
+        tmp_path / "c.tum",
+    )
     assert run(*words, "--robot-poses", gripper).code == 0
     camera = read_robot_poses(tmp_path / "c.tum").poses
     expected = read_robot_poses(gripper).poses @ POSE
@@ -143,20 +168,34 @@ def test_the_arm_is_exported_with_the_offsets_of_its_joints(
     run: Any, make: Any, tmp_path: Path
 ) -> None:
     file = make("eye_in_hand")
-    refused = run("export", file, "--format", "corrected_urdf", "--urdf", tmp_path / "arm.urdf")
+    refused = run(
+        "export", file, "--format", "corrected_urdf", "--urdf", tmp_path / "arm.urdf"
+    )
     assert "record joints.csv and a URDF, not gripper poses" in refused.err[0]
-    joints, covariance = (JointOffset("lift", 0.02, 0.001),), np.array([[1e-6]])
-    replace(read_calibration(file), joints=joints, joint_covariance=covariance).write(file)
+    joints = (JointOffset("lift", 0.02, 0.001),)
+    covariance = np.array([[1e-6]])
+    replace(read_calibration(file), joints=joints, joint_covariance=covariance).write(
+        file
+    )
     (tmp_path / "arm.urdf").write_text(
         '<robot name="r"><link name="a"/><link name="b"/><joint name="lift" type="continuous">'
         '<parent link="a"/><child link="b"/><origin rpy="0 0 0"/><axis xyz="1 0 0"/></joint>'
         "</robot>"
     )
     (tmp_path / "so101.json").write_text('{"lift": {"id": 1, "homing_offset": 5}}')
-    of_lerobot = ("--lerobot-calibration", tmp_path / "so101.json", "--lerobot-motors", "feetech")
+    of_lerobot = (
+        "--lerobot-calibration",
+        tmp_path / "so101.json",
+        "--lerobot-motors",
+        "feetech",
+    )
     for name, words, expected in (
         ("joint-offsets", (), '"offset_rad": 0.02,'),
-        ("corrected-urdf", ("--urdf", tmp_path / "arm.urdf"), '<origin rpy="0.02 0.0 0.0"/>'),
+        (
+            "corrected-urdf",
+            ("--urdf", tmp_path / "arm.urdf"),
+            '<origin rpy="0.02 0.0 0.0"/>',
+        ),
         ("lerobot", of_lerobot, '"homing_offset": -8'),
     ):
         ran = run("export", file, "--format", name, *words, "--out", tmp_path / "out")

@@ -12,7 +12,9 @@ MAP_KEYS |= {"adjusted", "hand_eye"}
 def test_info_of_a_map(run: Any, store: Path) -> None:
     info = json.loads(run("info", store, "--json").out)
     assert info["strategy"] == "evercal"
-    assert info["total_bytes"] == sum(f.stat().st_size for f in store.rglob("*") if f.is_file())
+    assert info["total_bytes"] == sum(
+        f.stat().st_size for f in store.rglob("*") if f.is_file()
+    )
     assert 0 < info["memory_bytes"] < info["total_bytes"]
     assert info["head_bytes"] == 0
     (scene,) = info["scenes"]
@@ -49,6 +51,10 @@ def test_damaged_files_are_named(run: Any, store: Path, tmp_path: Path) -> None:
     record = json.loads(run("info", "--check", copy, "--json").out)
     assert record["ok"] is False
     assert len(record["problems"]) == 2
-    for words in (["info", copy], ["learn", copy, tmp_path], ["evaluate", copy, tmp_path]):
+    for words in (
+        ["info", copy],
+        ["learn", copy, tmp_path],
+        ["evaluate", copy, tmp_path],
+    ):
         ran = run(*words)
         assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)

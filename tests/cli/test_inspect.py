@@ -23,12 +23,24 @@ def test_sound_recording_has_no_warnings(run: Any, rooms: Any) -> None:
 def test_frames_in_both_splits_are_a_warning(rooms: Any) -> None:
     recorded = load_recording(rooms[0])
     both = dataclasses.replace(recorded, test=recorded.train[:6])
-    assert "test frames have the pose or the file" in "\n".join(inspect_recording(both).warnings)
+    assert "test frames have the pose or the file" in "\n".join(
+        inspect_recording(both).warnings
+    )
 
 
 def test_coverage_and_next_poses_of_a_wrist_recording(run: Any, tmp_path: Path) -> None:
     cell = tmp_path / "cell"
-    ran = run("simulate", "cell", "--out", cell, "--frames", "9", "--size", "160x120", "--json")
+    ran = run(
+        "simulate",
+        "cell",
+        "--out",
+        cell,
+        "--frames",
+        "9",
+        "--size",
+        "160x120",
+        "--json",
+    )
     made = json.loads(ran.out)
     assert (ran.code, made["wrist"], made["frames"]) == (0, str(cell / "wrist"), 42)
     words = ["inspect", cell / "wrist", "--coverage", "--next", cell / "reachable.csv"]

@@ -23,13 +23,18 @@ def test_significant_offsets_and_their_use_are_named() -> None:
     assert lines[0] == "joint lift: add +1.25 deg (standard deviation 0.20)"
     words = "evercal export wrist.json --format corrected_urdf --urdf ROBOT.urdf --out NEW.urdf"
     assert lines[1].endswith(words)
-    assert lines[2:] == ["joint pan: not determined; its offset turns the frame of the base"]
+    assert lines[2:] == [
+        "joint pan: not determined; its offset turns the frame of the base"
+    ]
 
 
 def test_insignificant_offsets_have_a_bound() -> None:
     bound = "joints: no offset above 0.22 deg (elbow)"
     lines = [*joint_lines((SMALL, PAN), "wrist.json")]
-    assert lines == [bound, "joint pan: not determined; its offset turns the frame of the base"]
+    assert lines == [
+        bound,
+        "joint pan: not determined; its offset turns the frame of the base",
+    ]
     assert [*joint_lines((SMALL, RAIL), "wrist.json")] == [f"{bound}, 0.50 mm (rail)"]
     assert [*joint_lines((), "wrist.json")] == []
 
@@ -38,9 +43,14 @@ def test_eye_to_hand_prints_them(
     run: Any, rooms: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def made(cell: Map, recording: Recording, **_: Any) -> Calibration:
-        small, joints = 1e-8 * np.eye(6), (LIFT,)
+        small = 1e-8 * np.eye(6)
+        joints = (LIFT,)
         return Calibration(
-            "eye_to_hand", SE3.identity(), small, joints=joints, joint_covariance=np.eye(1)
+            "eye_to_hand",
+            SE3.identity(),
+            small,
+            joints=joints,
+            joint_covariance=np.eye(1),
         )
 
     monkeypatch.setattr(Map, "eye_to_hand", made)

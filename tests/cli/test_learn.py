@@ -22,7 +22,12 @@ from evercal.recordings.samples import CELL
 
 KEYS = {"scene", "seconds", "iterations", "memory_bytes", "head_bytes", "frames_kept"}
 KEYS |= {"landmarks", "train_frames", "held_out_frames", "adjusted", "hand_eye"}
-ADJUSTED = {"common_translation_mm", "common_rotation_deg", "focal_percent", "residual_px"}
+ADJUSTED = {
+    "common_translation_mm",
+    "common_rotation_deg",
+    "focal_percent",
+    "residual_px",
+}
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +41,9 @@ def wrist(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_two_scenes_are_learned_and_reported(run: Any, rooms: Any, tmp_path: Path) -> None:
+def test_two_scenes_are_learned_and_reported(
+    run: Any, rooms: Any, tmp_path: Path
+) -> None:
     store = tmp_path / "s"
     ran = run("learn", store, rooms[0], "--name", "cell", "--memory", "60kB")
     assert ran.code == 0
@@ -75,7 +82,9 @@ def test_calibration_has_the_estimated_transform_and_the_adjusted_camera(
     )
     [scene] = MapStore.open(tmp_path / "s").contents.scenes
     assert calibration.camera == scene.adjusted_camera
-    assert scene.adjusted_camera.fx / scene.camera.fx == pytest.approx(1 / 1.01, abs=0.005)
+    assert scene.adjusted_camera.fx / scene.camera.fx == pytest.approx(
+        1 / 1.01, abs=0.005
+    )
 
 
 def test_intrinsics_that_the_images_contradict_are_shown(
@@ -98,7 +107,14 @@ def test_intrinsics_that_the_images_contradict_are_shown(
 
 
 def test_interrupt_leaves_no_map(rooms: Any, tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "evercal", "learn", str(tmp_path / "s"), str(rooms[0])]
+    words = [
+        sys.executable,
+        "-m",
+        "evercal",
+        "learn",
+        str(tmp_path / "s"),
+        str(rooms[0]),
+    ]
 
     def interruptible() -> None:  # a shell's background jobs ignore SIGINT
         signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -133,10 +149,14 @@ def damaged(kind: str, room: Path, folder: Path) -> Path:
     elif kind == "few frames":
         data["frames"] = data["frames"][:5]
     elif kind == "no poses":
-        data["frames"] = [frame | {"base_from_camera": None} for frame in data["frames"]]
+        data["frames"] = [
+            frame | {"base_from_camera": None} for frame in data["frames"]
+        ]
     elif kind == "escape":
         data["name"] = "../../escape"
-    (folder / "scene.json").write_text("{" if kind == "broken json" else json.dumps(data))
+    (folder / "scene.json").write_text(
+        "{" if kind == "broken json" else json.dumps(data)
+    )
     return folder
 
 
@@ -145,7 +165,13 @@ def damaged(kind: str, room: Path, folder: Path) -> Path:
 )
 @pytest.mark.parametrize("new", [False, True])
 def test_bad_recordings_are_one_line_and_leave_the_store(
-    run: Any, store: Path, rooms: Any, snapshot: Any, tmp_path: Path, kind: str, new: bool
+    run: Any,
+    store: Path,
+    rooms: Any,
+    snapshot: Any,
+    tmp_path: Path,
+    kind: str,
+    new: bool,
 ) -> None:
     into = tmp_path / "new" if new else store
     before = snapshot(into)

@@ -23,7 +23,8 @@ def test_a_network_learns_a_second_scene(
     from evercal.continual import threshold
     from evercal.continual.learning.presets import PRESETS
 
-    demo, rng = PRESETS["demo"], np.random.default_rng(0)
+    demo = PRESETS["demo"]
+    rng = np.random.default_rng(0)
     noise = [rng.integers(0, 256, (240, 320, 3)).astype(np.uint8) for _ in range(2)]
     fit = replace(demo.fit, iterations=4, batch=64, replay_batch=32)
     encode = replace(demo.encode, views_per_frame=1)

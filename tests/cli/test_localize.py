@@ -19,8 +19,24 @@ from evercal.recordings import read_image, write_image
 if TYPE_CHECKING:
     from evercal.recordings import Recording
 
-KEYS = {"path", "status", "reason", "scene", "base_from_camera", "covariance", "inliers"}
-KEYS |= {"inlier_ratio", "support", "ms", "error_terms", "unit", "alternatives", "parent_frame"}
+KEYS = {
+    "path",
+    "status",
+    "reason",
+    "scene",
+    "base_from_camera",
+    "covariance",
+    "inliers",
+}
+KEYS |= {
+    "inlier_ratio",
+    "support",
+    "ms",
+    "error_terms",
+    "unit",
+    "alternatives",
+    "parent_frame",
+}
 CAUSES = ["view", "lens", "map", "stated poses", "base frame"]
 
 
@@ -34,16 +50,25 @@ def images(hall: Recording, tmp_path: Path) -> Path:
     return folder
 
 
-def test_json_of_a_folder(run: Any, hall_store: Path, images: Path, hall: Recording) -> None:
+def test_json_of_a_folder(
+    run: Any, hall_store: Path, images: Path, hall: Recording
+) -> None:
     ran = run("localize", hall_store, images, "--json")
     assert ran.code == 0  # one image has a pose
     record = json.loads(ran.out)
     assert record.keys() == {"images"}
     located, unknown = record["images"]
     assert located.keys() == unknown.keys() == KEYS
-    assert [Path(image["path"]) for image in (located, unknown)] == sorted(images.iterdir())
-    assert (located["status"], located["reason"], located["scene"]) == ("ok", "", "hall")
-    pose, truth = located["base_from_camera"], hall.test[7].base_from_camera
+    assert [Path(image["path"]) for image in (located, unknown)] == sorted(
+        images.iterdir()
+    )
+    assert (located["status"], located["reason"], located["scene"]) == (
+        "ok",
+        "",
+        "hall",
+    )
+    pose = located["base_from_camera"]
+    truth = hall.test[7].base_from_camera
     assert pose.keys() == {"translation_m", "quaternion_wxyz", "matrix"}
     estimate = SE3(np.array(pose["quaternion_wxyz"]), np.array(pose["translation_m"]))
     np.testing.assert_allclose(pose["matrix"], estimate.matrix(), atol=1e-12)
@@ -51,7 +76,8 @@ def test_json_of_a_folder(run: Any, hall_store: Path, images: Path, hall: Record
     assert pose_distance(estimate, truth)[0] < 0.005
     assert np.shape(located["covariance"]) == (6, 6)
     assert located["inliers"] > 20
-    terms, variance = located["error_terms"], np.diag(located["covariance"])
+    terms = located["error_terms"]
+    variance = np.diag(located["covariance"])
     assert [term["name"] for term in terms] == CAUSES
     assert sum(term["share"] for term in terms) == pytest.approx(1)
     mean = 1e6 * variance[:3].mean()
@@ -68,7 +94,9 @@ def test_text_has_millimetres_and_the_next_command(
     run: Any, hall_store: Path, images: Path
 ) -> None:
     files = sorted(images.iterdir())
-    [located, _] = json.loads(run("localize", hall_store, images, "--json").out)["images"]
+    [located, _] = json.loads(run("localize", hall_store, images, "--json").out)[
+        "images"
+    ]
     lines = run("localize", hall_store, images).out.splitlines()
     assert lines[0] == str(files[0])
     assert lines[1].split() == ["scene", "hall"]
@@ -97,7 +125,9 @@ def test_point_in_the_camera_frame_has_a_standard_deviation(
     assert f"sd {sigma:.2f} mm at (-0.2, 0.1, 1.5) m in the camera frame" in text
 
 
-def test_exit_code_is_1_without_any_pose(run: Any, hall_store: Path, images: Path) -> None:
+def test_exit_code_is_1_without_any_pose(
+    run: Any, hall_store: Path, images: Path
+) -> None:
     ran = run("localize", hall_store, images / "2-black.png")
     assert ran.code == 1
     assert ran.out.splitlines()[-1] == f"next: evercal learn {hall_store} RECORDING"
@@ -106,7 +136,8 @@ def test_exit_code_is_1_without_any_pose(run: Any, hall_store: Path, images: Pat
 def test_overlays_have_the_size_of_their_images(
     run: Any, hall_store: Path, images: Path, hall: Recording, tmp_path: Path
 ) -> None:
-    twin, out = tmp_path / "other" / "1-hall.png", tmp_path / "overlays"
+    twin = tmp_path / "other" / "1-hall.png"
+    out = tmp_path / "overlays"
     twin.parent.mkdir()
     write_image(twin, np.repeat(np.repeat(hall.test[8].read_image(), 2, 0), 2, 1))
     assert run("localize", hall_store, twin, images, "--overlay", out).code == 0
@@ -120,10 +151,14 @@ def test_overlays_have_the_size_of_their_images(
 def test_camera_file_replaces_the_camera_of_the_scene(
     run: Any, hall_store: Path, images: Path, hall: Recording, tmp_path: Path
 ) -> None:
-    camera, image = hall.test[7].camera, images / "1-hall.png"
+    camera = hall.test[7].camera
+    image = images / "1-hall.png"
     (tmp_path / "camera.json").write_text(json.dumps(camera.to_dict()))
     matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-    np.savetxt(tmp_path / "longer.txt", np.array(matrix) * [[1.2, 1, 1], [1, 1.2, 1], [1, 1, 1]])
+    np.savetxt(
+        tmp_path / "longer.txt",
+        np.array(matrix) * [[1.2, 1, 1], [1, 1.2, 1], [1, 1, 1]],
+    )
 
     def pose(*options: object) -> object:
         ran = run("localize", hall_store, image, "--json", *options)
@@ -146,7 +181,9 @@ def test_video_holds_every_image_and_json_only_its_object(
     assert frames[0].shape == (560, 1280, 3)
 
 
-@pytest.mark.slow("src/evercal/features", "src/evercal/localization", "src/evercal/cli/__init__.py")
+@pytest.mark.slow(
+    "src/evercal/features", "src/evercal/localization", "src/evercal/cli/__init__.py"
+)
 def test_float32_gives_the_same_bytes_with_other_instructions(
     hall_store: Path, hall: Recording, tmp_path: Path
 ) -> None:
@@ -176,7 +213,9 @@ def test_float32_gives_the_same_bytes_with_other_instructions(
     assert rows[0] == rows[1]
 
 
-def test_an_unreadable_image_has_a_row(run: Any, hall_store: Path, images: Path) -> None:
+def test_an_unreadable_image_has_a_row(
+    run: Any, hall_store: Path, images: Path
+) -> None:
     (images / "0-cut.png").write_bytes((images / "1-hall.png").read_bytes()[:-200])
     (images / "._1-hall.png").write_bytes(b"hidden")
     ran = run("localize", hall_store, images, "--json")

@@ -16,15 +16,41 @@ import evercal
 from evercal.cli import main
 
 VERBS = {
-    "Map": ["learn", "localize", "track", "view", "refresh", "evaluate", "info", "map", "serve"],
-    "Calibrate": ["studio", "eye-to-hand", "calibrate", "check", "watch", "audit", "align"],
+    "Map": [
+        "learn",
+        "localize",
+        "track",
+        "view",
+        "refresh",
+        "evaluate",
+        "info",
+        "map",
+        "serve",
+    ],
+    "Calibrate": [
+        "studio",
+        "eye-to-hand",
+        "calibrate",
+        "check",
+        "watch",
+        "audit",
+        "align",
+    ],
     "Boards and pose pairs": ["detect", "solve"],
     "Results": ["export", "report"],
     "Recordings": ["inspect", "convert", "reconstruct", "simulate", "demo"],
     "Networks": ["bench"],
 }
 ALL = [verb for verbs in VERBS.values() for verb in verbs]
-OTHER_PROGRAMS = {"--once", "--frame-id", "--child-frame-id", "--qw", "--qx", "--qy", "--qz"}
+OTHER_PROGRAMS = {
+    "--once",
+    "--frame-id",
+    "--child-frame-id",
+    "--qw",
+    "--qx",
+    "--qy",
+    "--qz",
+}
 OTHER_PROGRAMS |= {"--nproc-per-node", "--tyro-print-completion", "--version"}
 """Options in messages that are not those of a verb."""
 SOLVE = ("--robot-poses", "R", "--camera-poses", "C", "--mount", "eye_in_hand")
@@ -76,7 +102,9 @@ def test_help_of_a_verb_fits_and_has_an_example(
         assert "--preset {fast,demo,bench,converged,paper}" in ran.out
 
 
-def test_messages_name_existing_options(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_name_existing_options(
+    run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     options = set(OTHER_PROGRAMS)
     for words in [*([verb] for verb in ALL), ["map", "merge"]]:
@@ -119,7 +147,9 @@ def test_version(run: Any) -> None:
         (["qqqq"], "'evercal --help' lists all verbs"),
     ],
 )
-def test_unusable_arguments_are_an_error_object(run: Any, words: list[str], message: str) -> None:
+def test_unusable_arguments_are_an_error_object(
+    run: Any, words: list[str], message: str
+) -> None:
     ran = run(*words, "--json")
     assert ran.code == 2
     assert message in json.loads(ran.out)["error"]
@@ -129,12 +159,24 @@ def test_unusable_arguments_are_an_error_object(run: Any, words: list[str], mess
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["learn", "S", "R", "--calibration", "GONE/c.json"], "--calibration GONE/c.json: folder"),
+        (
+            ["learn", "S", "R", "--calibration", "GONE/c.json"],
+            "--calibration GONE/c.json: folder",
+        ),
         (["learn", "S", "R", "--calibration", "DIR"], "--calibration DIR: is a folder"),
-        (["localize", "S", "IMAGE", "--overlay", "FILE/x"], "--overlay FILE/x: cannot be created"),
-        (["calibrate", "S", "IMAGE", "--out", "GONE/c.json"], "--out GONE/c.json: folder"),
+        (
+            ["localize", "S", "IMAGE", "--overlay", "FILE/x"],
+            "--overlay FILE/x: cannot be created",
+        ),
+        (
+            ["calibrate", "S", "IMAGE", "--out", "GONE/c.json"],
+            "--out GONE/c.json: folder",
+        ),
         (["calibrate", "S", "IMAGE", "--out", "DIR"], "--out DIR: is a folder"),
-        (["detect", "IMAGE", "--board", "apriltag", "--out", "GONE/b.json"], "--out GONE/b.json"),
+        (
+            ["detect", "IMAGE", "--board", "apriltag", "--out", "GONE/b.json"],
+            "--out GONE/b.json",
+        ),
         (["solve", *SOLVE, "--out", "GONE/c.json"], "--out GONE/c.json: folder"),
         (["report", "C", "--out", "GONE/r.html"], "--out GONE/r.html: folder"),
         (["convert", "R", "FILE"], "FILE: is a file; give a folder"),
@@ -161,10 +203,15 @@ def test_output_paths_are_refused_before_the_work(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["DIR", "FILE"]
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="this system has no /dev/full"
+)
 @pytest.mark.parametrize(
     ("words", "message"),
-    [(["--version"], "No space left on device"), (["info", "x", "--json"], "x: no such folder")],
+    [
+        (["--version"], "No space left on device"),
+        (["info", "x", "--json"], "x: no such folder"),
+    ],
 )
 def test_full_disk_is_one_line(words: list[str], message: str) -> None:
     with Path("/dev/full").open("w") as full:
@@ -193,7 +240,9 @@ def test_bugs_are_not_reported_as_bad_input(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_closed_pipe_is_no_error() -> None:
     with subprocess.Popen(
-        [sys.executable, "-m", "evercal", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [sys.executable, "-m", "evercal", "--help"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
     ) as process:
         assert process.stdout is not None
         assert process.stderr is not None

@@ -31,7 +31,10 @@ def test_a_map_is_packed_unpacked_merged_renamed_and_emptied(
     assert ran.out.startswith("hall: 7 keyframes, ")
     ran = run("map", "pack", copy, tmp_path / "hall.zip")
     assert (ran.code, ran.err) == (0, [])
-    assert ran.out.splitlines()[-1] == f"next: evercal map unpack {tmp_path / 'hall.zip'} MAP"
+    assert (
+        ran.out.splitlines()[-1]
+        == f"next: evercal map unpack {tmp_path / 'hall.zip'} MAP"
+    )
     record = json.loads(run("map", "pack", copy, tmp_path / "hall.zip", "--json").out)
     assert record["bytes"] == (tmp_path / "hall.zip").stat().st_size
     two = tmp_path / "two"
@@ -48,8 +51,12 @@ def test_a_map_is_packed_unpacked_merged_renamed_and_emptied(
     assert run("map", "list", two).out == f"{two}: no scene\n"
 
 
-@pytest.mark.parametrize("action", ["list", "remove", "rename", "merge", "pack", "unpack"])
-def test_help_of_an_action_has_an_example(action: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "action", ["list", "remove", "rename", "merge", "pack", "unpack"]
+)
+def test_help_of_an_action_has_an_example(
+    action: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["map", action, "--help"]) == 0
     page = capsys.readouterr().out
     assert f"Example: evercal map {action} " in page

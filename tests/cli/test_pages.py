@@ -15,9 +15,22 @@ pytest.importorskip("viser")
 
 
 @pytest.mark.parametrize("verb", ["view", "studio"])
-def test_it_serves_a_page_and_ends_cleanly(verb: str, hall_store: Path, tmp_path: Path) -> None:
-    words = {"view": [hall_store], "studio": ["--virtual", "--out", tmp_path / "s"]}[verb]
-    command = [sys.executable, "-m", "evercal", verb, *map(str, words), "--port", "0", "--json"]
+def test_it_serves_a_page_and_ends_cleanly(
+    verb: str, hall_store: Path, tmp_path: Path
+) -> None:
+    words = {"view": [hall_store], "studio": ["--virtual", "--out", tmp_path / "s"]}[
+        verb
+    ]
+    command = [
+        sys.executable,
+        "-m",
+        "evercal",
+        verb,
+        *map(str, words),
+        "--port",
+        "0",
+        "--json",
+    ]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
         try:

@@ -168,7 +168,9 @@ REFUSED = {
 }
 for _verb in ("localize MAP image.png", "calibrate MAP image.png", "report c.json"):
     for _text in ("0,1", "a,b,c", "0,0,nan", "0,0,1,2"):
-        REFUSED[f"{_verb} --at={_text}"] = f"--at {_text}: give x,y,z in metres such as 0,0.05,0.4"
+        REFUSED[f"{_verb} --at={_text}"] = (
+            f"--at {_text}: give x,y,z in metres such as 0,0.05,0.4"
+        )
 
 
 @pytest.fixture
@@ -184,11 +186,16 @@ def folder(tmp_path: Path, hall: Recording, monkeypatch: pytest.MonkeyPatch) -> 
     Path("file").write_text("x")
     Path("short.txt").write_text("300 0 160")
     Path("poses.csv").write_text("x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0\n")
-    Path("tall.json").write_text(json.dumps(Camera(240, 320, 250, 250, 119.5, 159.5).to_dict()))
-    pose, spread = SE3.exp([0.1, 0.05, 1.0, 3.1, 0, 0]), 1e-8 * np.eye(6)
+    Path("tall.json").write_text(
+        json.dumps(Camera(240, 320, 250, 250, 119.5, 159.5).to_dict())
+    )
+    pose = SE3.exp([0.1, 0.05, 1.0, 3.1, 0, 0])
+    spread = 1e-8 * np.eye(6)
     images = (ImageUse("image.png", True, "", 0.5, 0.01),)
     camera = hall.test[7].camera
-    Calibration("eye_to_hand", pose, spread, camera=camera, images=images).write("c.json")
+    Calibration("eye_to_hand", pose, spread, camera=camera, images=images).write(
+        "c.json"
+    )
     Calibration("eye_in_hand", pose, spread, "gripper").write("hand.json")
     return tmp_path
 
@@ -203,7 +210,9 @@ def test_bad_input_is_one_line_and_writes_nothing(
     snapshot: Any,
     words: str,
 ) -> None:
-    extra = {"serve": "fastapi", "view": "viser", "studio": "viser"}.get(words.split()[0])
+    extra = {"serve": "fastapi", "view": "viser", "studio": "viser"}.get(
+        words.split()[0]
+    )
     if extra:
         pytest.importorskip(extra)
     paths = {"MAP": hall_store, "ROOM": rooms[1]}
@@ -257,7 +266,9 @@ def test_limits_hold_for_files_and_for_opencv(tmp_path: Path) -> None:
     ends = []
     for limits in ("pixels=1999", "pixels=2e3"):
         words = [*command, "--limits", limits, "--out", str(tmp_path / "found.json")]
-        ends.append(subprocess.run(words, capture_output=True, text=True, env=clean).stderr)
+        ends.append(
+            subprocess.run(words, capture_output=True, text=True, env=clean).stderr
+        )
     assert "a.png: not a readable image" in ends[0]
     assert "of at most 1,999 pixels" in ends[0]
     assert "not a readable image" not in ends[1]

@@ -25,13 +25,20 @@ POSE = pose([0.0, 1.0, 0.0, 0.0], [0.1, 0.05, 1.0])
 @pytest.fixture
 def calibration(tmp_path: Path) -> Path:
     write_image(tmp_path / "a.png", np.full((48, 64, 3), 90, np.uint8))
-    images = (ImageUse("a.png", True, "", 0.5, 0.01), ImageUse("b.png", False, "too dark"))
-    own = Calibration("eye_to_hand", POSE, 1e-8 * np.eye(6), camera=CAMERA, images=images)
+    images = (
+        ImageUse("a.png", True, "", 0.5, 0.01),
+        ImageUse("b.png", False, "too dark"),
+    )
+    own = Calibration(
+        "eye_to_hand", POSE, 1e-8 * np.eye(6), camera=CAMERA, images=images
+    )
     own.write(tmp_path / "c.json")
     return tmp_path / "c.json"
 
 
-def test_report_is_one_self_contained_file(run: Any, calibration: Path, tmp_path: Path) -> None:
+def test_report_is_one_self_contained_file(
+    run: Any, calibration: Path, tmp_path: Path
+) -> None:
     ran = run("report", calibration, "--out", tmp_path / "r.html")
     assert ran.code == 0
     assert "Good for precision assembly" in ran.out
@@ -45,11 +52,20 @@ def test_report_is_one_self_contained_file(run: Any, calibration: Path, tmp_path
     assert not re.search(r"(?:src|href)=\"(?!data:)|https?://", page)
 
 
-def test_json_with_an_older_calibration(run: Any, calibration: Path, tmp_path: Path) -> None:
+def test_json_with_an_older_calibration(
+    run: Any, calibration: Path, tmp_path: Path
+) -> None:
     moved = SE3.exp([0.003, 0.0, 0.004, 0, 0, 0]) @ POSE
     Calibration("eye_to_hand", moved, 1e-8 * np.eye(6)).write(tmp_path / "old.json")
     out = tmp_path / "r.html"
-    words = ("--images", tmp_path / "a.png", "--against", tmp_path / "old.json", "--out", out)
+    words = (
+        "--images",
+        tmp_path / "a.png",
+        "--against",
+        tmp_path / "old.json",
+        "--out",
+        out,
+    )
     ran = run("report", calibration, *words, "--json")
     record = json.loads(ran.out)
     assert ran.code == 0
@@ -63,7 +79,8 @@ def test_json_with_an_older_calibration(run: Any, calibration: Path, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("camera", "message"), [(None, "no intrinsics"), (CAMERA, "names no images; pass some")]
+    ("camera", "message"),
+    [(None, "no intrinsics"), (CAMERA, "names no images; pass some")],
 )
 def test_calibration_without_images_or_camera(
     run: Any, tmp_path: Path, camera: Camera | None, message: str

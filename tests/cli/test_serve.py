@@ -19,9 +19,22 @@ from evercal.errors import InputError
 from evercal.service.client import Client
 
 
-def started(store: Path, *words: str, **variables: str) -> tuple[subprocess.Popen[str], str]:
-    serve = [sys.executable, "-m", "evercal", "serve", str(store), "--port", "0", "--json", *words]
-    pipe, env = subprocess.PIPE, {**os.environ, **variables}
+def started(
+    store: Path, *words: str, **variables: str
+) -> tuple[subprocess.Popen[str], str]:
+    serve = [
+        sys.executable,
+        "-m",
+        "evercal",
+        "serve",
+        str(store),
+        "--port",
+        "0",
+        "--json",
+        *words,
+    ]
+    pipe = subprocess.PIPE
+    env = {**os.environ, **variables}
     process = subprocess.Popen(
         serve,
         stdout=pipe,
@@ -43,7 +56,8 @@ def test_requests_under_way_are_answered_before_the_end(
 ) -> None:
     process, url = started(hall_store, EVERCAL_TOKEN="0123456789abcdef")
     with process:
-        client, answers = Client(url, "0123456789abcdef"), []
+        client = Client(url, "0123456789abcdef")
+        answers = []
 
         def calibrate() -> None:
             answers.append(client.calibrate(still_images))

@@ -9,7 +9,17 @@ from evercal.recordings import load_recording
 
 def test_a_cell_has_the_stated_parts(run: Any, tmp_path: Path) -> None:
     out = tmp_path / "cell"
-    words = ("--frames", "3", "--size", "64x64", "--seed", "4", "--noise", "0", "--json")
+    words = (
+        "--frames",
+        "3",
+        "--size",
+        "64x64",
+        "--seed",
+        "4",
+        "--noise",
+        "0",
+        "--json",
+    )
     ran = run("simulate", "cell", "--out", out, *words)
     assert ran.code == 0, ran.err
     report = json.loads(ran.out)

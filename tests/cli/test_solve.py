@@ -27,7 +27,12 @@ def write_poses(path: Path, poses: SE3) -> None:
 def files(folder: Path, simulated: SimulatedPairs) -> list[Any]:
     write_poses(folder / "robot.csv", simulated.pairs.base_from_gripper)
     write_poses(folder / "camera.csv", simulated.pairs.camera_from_board)
-    poses = ["--robot-poses", folder / "robot.csv", "--camera-poses", folder / "camera.csv"]
+    poses = [
+        "--robot-poses",
+        folder / "robot.csv",
+        "--camera-poses",
+        folder / "camera.csv",
+    ]
     return ["solve", *poses, "--out", folder / "out.json"]
 
 
@@ -42,7 +47,9 @@ def test_a_calibration_is_written_and_printed(run: Any, tmp_path: Path) -> None:
     assert ran.out.splitlines()[-1].startswith("next: evercal export")
     calibration = read_calibration(tmp_path / "out.json")
     assert (
-        np.linalg.norm(error(calibration.parent_from_child, simulated.parent_from_camera)[:3])
+        np.linalg.norm(
+            error(calibration.parent_from_child, simulated.parent_from_camera)[:3]
+        )
         < 0.001
     )
     assert calibration.source["command"] == "solve"
@@ -52,7 +59,9 @@ def test_a_calibration_is_written_and_printed(run: Any, tmp_path: Path) -> None:
 
 
 def test_an_unusable_calibration_exits_with_1(run: Any, tmp_path: Path) -> None:
-    simulated = recording(Setting("eye_to_hand", noise_mm=12, noise_deg=1.0, path="table"), 1)
+    simulated = recording(
+        Setting("eye_to_hand", noise_mm=12, noise_deg=1.0, path="table"), 1
+    )
     ran = run(*files(tmp_path, simulated), "--mount", "eye_to_hand")
     assert ran.code == 1
     assert "Unusable" in ran.out
@@ -67,7 +76,9 @@ def test_mistakes_are_one_line_and_exit_with_2(run: Any, tmp_path: Path) -> None
     assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
     assert "--invert robot" in ran.err[0]
     assert not (tmp_path / "out.json").exists()
-    assert json.loads(run(*words, "--mount", "eye_in_hand", "--json").out).keys() == {"error"}
+    assert json.loads(run(*words, "--mount", "eye_in_hand", "--json").out).keys() == {
+        "error"
+    }
     # The advice of the message solves it.
     assert run(*words, "--mount", "eye_in_hand", "--invert", "robot").code == 0
     write_poses(tmp_path / "robot.csv", inverted[:20])
@@ -75,7 +86,9 @@ def test_mistakes_are_one_line_and_exit_with_2(run: Any, tmp_path: Path) -> None
     assert ran.code == 2
     assert "20 poses for 25 images" in ran.err[0]
     assert run(*words, "--mount", "beside").code == 2
-    ran = run(*words[:3], "--camera-poses", tmp_path / "no.csv", "--mount", "eye_in_hand")
+    ran = run(
+        *words[:3], "--camera-poses", tmp_path / "no.csv", "--mount", "eye_in_hand"
+    )
     assert (ran.code, len(ran.err)) == (2, 1)
     assert "no.csv: file of camera poses is missing; check --camera-poses" in ran.err[0]
 
@@ -116,7 +129,15 @@ def test_from_photographs_to_a_calibration(run: Any, tmp_path: Path) -> None:
     board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
     out = tmp_path / "board.json"
     # Sorted like in a shell: image-10 before image-2.
-    ran = run("detect", *sorted(paths), *board, "--camera", tmp_path / "camera.json", "--out", out)
+    ran = run(
+        "detect",
+        *sorted(paths),
+        *board,
+        "--camera",
+        tmp_path / "camera.json",
+        "--out",
+        out,
+    )
     assert ran.code == 0
     assert "11 of 11 images show the board" in ran.out
     words = ["solve", "--robot-poses", tmp_path / "robot.csv", "--camera-poses", out]
@@ -150,7 +171,9 @@ def test_detect_reports_images_without_a_board(run: Any, tmp_path: Path) -> None
     assert "no chessboard with 9x6 inner corners" in record["images"][3]["reason"]
     # The robot poses of these images are skipped.
     words = ["solve", "--robot-poses", tmp_path / "robot.csv", "--camera-poses", out]
-    assert run(*words, "--mount", "eye_in_hand", "--out", tmp_path / "out.json").code == 0
+    assert (
+        run(*words, "--mount", "eye_in_hand", "--out", tmp_path / "out.json").code == 0
+    )
     calibration = read_calibration(tmp_path / "out.json")
     assert len(calibration.images) == 7
     assert np.linalg.norm(error(calibration.parent_from_child, truth)[:3]) < 0.005
@@ -159,12 +182,17 @@ def test_detect_reports_images_without_a_board(run: Any, tmp_path: Path) -> None
 def test_detect_refuses_unusable_input(run: Any, tmp_path: Path) -> None:
     paths, _, _ = photographs(tmp_path, 1)
     board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
-    small, bad, cut = (tmp_path / name for name in ("small.json", "bad.json", "cut.png"))
+    small, bad, cut = (
+        tmp_path / name for name in ("small.json", "bad.json", "cut.png")
+    )
     bad.write_text("{}")
     cut.write_bytes(b"")
     small.write_text(json.dumps({**CAMERA.to_dict(), "width": 320, "height": 240}))
     for words, reason in (
-        ([paths[0], "--board", "chessboard", "--square-mm", "30"], "size of 3x3 to 200x200"),
+        (
+            [paths[0], "--board", "chessboard", "--square-mm", "30"],
+            "size of 3x3 to 200x200",
+        ),
         ([paths[0], "--board", "chessboard", "--size", "9x6"], "--square-mm"),
         ([paths[0], *board[:3], "9 by 6", *board[4:]], "9x6"),
         ([tmp_path / "no.png", *board], "missing"),
@@ -179,9 +207,13 @@ def test_detect_refuses_unusable_input(run: Any, tmp_path: Path) -> None:
         assert reason in ran.err[-1], ran.err
 
 
-def test_boards_on_the_page_of_formats_are_printed_but_grids(run: Any, tmp_path: Path) -> None:
+def test_boards_on_the_page_of_formats_are_printed_but_grids(
+    run: Any, tmp_path: Path
+) -> None:
     page = Path(__file__).parents[2] / "docs" / "formats.md"
-    boards = re.findall(r"^    evercal detect images/ (--board (\w+) .*)$", page.read_text(), re.M)
+    boards = re.findall(
+        r"^    evercal detect images/ (--board (\w+) .*)$", page.read_text(), re.M
+    )
     assert {kind for _, kind in boards} == set(get_args(BoardKind))
     for words, _ in boards:
         board = ["--make-board", tmp_path / "board.png", "--paper", "a3"]
@@ -191,7 +223,9 @@ def test_boards_on_the_page_of_formats_are_printed_but_grids(run: Any, tmp_path:
         else:
             assert done.code == 0
     other = "--board charuco --size 7,5 --square-mm 30 --marker-mm 20 --dictionary DICT_4X4_50"
-    again = run("detect", *other.split(), "--make-board", tmp_path / "board.png", "--json")
+    again = run(
+        "detect", *other.split(), "--make-board", tmp_path / "board.png", "--json"
+    )
     board = json.loads(again.out)["board"]
     assert (board["columns"], board["rows"], board["dictionary"]) == (7, 5, "4X4_50")
 
@@ -201,9 +235,16 @@ def test_report_finds_the_images_of_detect(run: Any, tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
     photographs(tmp_path / "images", 7)
     board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
-    poses, out = tmp_path / "poses" / "board.json", tmp_path / "results" / "calibration.json"
-    camera, robot = tmp_path / "images" / "camera.json", tmp_path / "images" / "robot.csv"
-    assert run("detect", tmp_path / "images", *board, "--camera", camera, "--out", poses).code == 0
+    poses = tmp_path / "poses" / "board.json"
+    out = tmp_path / "results" / "calibration.json"
+    camera = tmp_path / "images" / "camera.json"
+    robot = tmp_path / "images" / "robot.csv"
+    assert (
+        run(
+            "detect", tmp_path / "images", *board, "--camera", camera, "--out", poses
+        ).code
+        == 0
+    )
     names = [image["name"] for image in json.loads(poses.read_text())["images"]]
     assert names[0] == "../images/image-1.png"
     words = ["--robot-poses", robot, "--camera-poses", poses, "--mount", "eye_in_hand"]
@@ -214,7 +255,9 @@ def test_report_finds_the_images_of_detect(run: Any, tmp_path: Path) -> None:
     assert len(pictures) > 0
 
 
-def test_poses_of_easy_handeye_before_a_fixed_camera_lead_to_it(run: Any, tmp_path: Path) -> None:
+def test_poses_of_easy_handeye_before_a_fixed_camera_lead_to_it(
+    run: Any, tmp_path: Path
+) -> None:
     """Each refusal or warning names options that bring base_from_camera at last."""
     simulated = recording(Setting("eye_to_hand", path="table"), 1)
     pairs = simulated.pairs
@@ -230,20 +273,29 @@ def test_poses_of_easy_handeye_before_a_fixed_camera_lead_to_it(run: Any, tmp_pa
         )
         for p in inverse.base_from_gripper
     ]
-    samples = {"parameters": {"eye_on_hand": False}, "samples": [{"robot": r} for r in rows]}
+    samples = {
+        "parameters": {"eye_on_hand": False},
+        "samples": [{"robot": r} for r in rows],
+    }
     (tmp_path / "robot.yaml").write_text(json.dumps(samples))
-    on_hand, fixed = ["--mount", "eye_in_hand"], ["--mount", "eye_to_hand"]
+    on_hand = ["--mount", "eye_in_hand"]
+    fixed = ["--mount", "eye_to_hand"]
     ran = run(*words, *on_hand)
     assert "use --mount eye_to_hand and --invert robot" in ran.out
     ran = run(*words, *fixed)
-    assert "look inverted (gripper_from_base): invert them (--invert robot)" in ran.err[-1]
+    assert (
+        "look inverted (gripper_from_base): invert them (--invert robot)" in ran.err[-1]
+    )
     ran = run(*words, *fixed, "--invert", "robot", "--robot-convention", "ur:inverse")
     assert "if --invert or :inverse is given, leave it out" in ran.err[-1]
     ran = run(*words, *on_hand, "--invert", "robot")
     assert "the mount looks wrong: use --mount eye_to_hand" in ran.err[-1]
     yaml = [*words[:2], tmp_path / "robot.yaml", *words[3:]]
     ran = run(*yaml, *fixed, "--invert", "robot")
-    assert "(eye_to_hand); give --robot-convention wxyz:inverse in place of --invert" in ran.err[-1]
+    assert (
+        "(eye_to_hand); give --robot-convention wxyz:inverse in place of --invert"
+        in ran.err[-1]
+    )
     for done in (
         run(*words, *fixed, "--invert", "robot"),
         run(*yaml, *fixed, "--robot-convention", "wxyz:inverse"),
@@ -251,7 +303,10 @@ def test_poses_of_easy_handeye_before_a_fixed_camera_lead_to_it(run: Any, tmp_pa
         assert "warning" not in done.out
         found = read_calibration(tmp_path / "out.json")
         assert found.parent_frame == "base"
-        assert np.linalg.norm(error(found.parent_from_child, simulated.parent_from_camera)) < 0.03
+        assert (
+            np.linalg.norm(error(found.parent_from_child, simulated.parent_from_camera))
+            < 0.03
+        )
 
 
 def axes(values: np.ndarray) -> dict[str, float]:

@@ -16,7 +16,8 @@ from .conftest import Run
 def test_a_folder_is_tracked_into_files(
     run: Run, store: Path, rooms: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    images, tum = rooms[0] / "images", tmp_path / "t.tum"
+    images = rooms[0] / "images"
+    tum = tmp_path / "t.tum"
     lines = tmp_path / "t.jsonl"
     ran = run("track", store, images, "--out", tum, lines, "--most", 6, "--json")
     report = json.loads(ran.out)
@@ -29,7 +30,11 @@ def test_a_folder_is_tracked_into_files(
 
 
 def test_a_live_camera_is_tracked_in_its_newest_frames(
-    run: Run, hall_store: Path, hall: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run,
+    hall_store: Path,
+    hall: Recording,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     image = hall.test[3].read_image()
 

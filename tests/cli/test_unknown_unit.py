@@ -36,13 +36,21 @@ def phone(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The training frames of `hall` as a nerfstudio recording."""
     root = tmp_path_factory.mktemp("units") / "phone"
     (root / "images").mkdir(parents=True)
-    camera, frames = hall.train[0].camera, []
+    camera = hall.train[0].camera
+    frames = []
     for i, frame in enumerate(hall.train):
         write_image(root / "images" / f"{i:03d}.png", frame.read_image())
         matrix = truth_of(frame).matrix() @ CV_FROM_GL
         matrix[:3, 3] *= UNITS
-        frames.append({"file_path": f"images/{i:03d}.png", "transform_matrix": matrix.tolist()})
-    intrinsics = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
+        frames.append(
+            {"file_path": f"images/{i:03d}.png", "transform_matrix": matrix.tolist()}
+        )
+    intrinsics = {
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+    }
     intrinsics |= {"cx": camera.cx + 0.5, "cy": camera.cy + 0.5}
     (root / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
     return root
@@ -63,7 +71,9 @@ def phone_store(phone: Path) -> Path:
 
 @pytest.fixture
 def reference(tmp_path: Path) -> Path:
-    Calibration("eye_to_hand", SE3.identity(), np.eye(6)).write(tmp_path / "reference.json")
+    Calibration("eye_to_hand", SE3.identity(), np.eye(6)).write(
+        tmp_path / "reference.json"
+    )
     return tmp_path / "reference.json"
 
 
@@ -96,7 +106,9 @@ def test_poses_have_no_millimetres(
     [image] = json.loads(run(*words, "--json").out)["images"]
     assert (image["status"], image["unit"], image["at"]) == ("ok", "unknown", None)
     truth = UNITS * truth_of(hall.test[3]).translation_m
-    np.testing.assert_allclose(image["base_from_camera"]["translation_m"], truth, atol=0.01)
+    np.testing.assert_allclose(
+        image["base_from_camera"]["translation_m"], truth, atol=0.01
+    )
     assert sum(term["share"] for term in image["error_terms"]) == pytest.approx(1)
     assert all(term["translation_mm"] is None for term in image["error_terms"])
     text = run(*words).out
@@ -125,7 +137,10 @@ def test_no_command_prints_a_length_in_metres(
         ran = run(*words)
         assert ran.code == 0, ran.err
         assert not re.search(r"\d (mm|cm|m)\b", ran.out), ran.out
-    assert "no millimetres to measure" in run("evaluate", phone_store, f"hall={phone}").err[0]
+    assert (
+        "no millimetres to measure"
+        in run("evaluate", phone_store, f"hall={phone}").err[0]
+    )
 
 
 def test_alignment_gives_metres(
@@ -133,9 +148,12 @@ def test_alignment_gives_metres(
 ) -> None:
     """The scale is estimated without --unknown-scale."""
     store = Path(shutil.copytree(phone_store, tmp_path / "map"))
-    rng, picks = np.random.default_rng(0), ["image,name,u,v"]
+    rng = np.random.default_rng(0)
+    picks = ["image,name,u,v"]
     frames = hall.test[::2]
-    points = truth_of(frames[7]).apply(rng.uniform([-0.7, -0.5, 1.0], [0.7, 0.5, 2.5], (12, 3)))
+    points = truth_of(frames[7]).apply(
+        rng.uniform([-0.7, -0.5, 1.0], [0.7, 0.5, 2.5], (12, 3))
+    )
     for i, frame in enumerate(frames):
         write_image(tmp_path / f"{i}.png", frame.read_image())
         pixels = frame.camera.project(truth_of(frame).inverse().apply(points))
@@ -145,7 +163,9 @@ def test_alignment_gives_metres(
     (tmp_path / "points.csv").write_text("\n".join(touched))
     files = ("--points", tmp_path / "points.csv", "--picks", tmp_path / "picks.csv")
     (tmp_path / "fewer.csv").write_text("\n".join(touched[1:]))
-    refused = run("align", store, "hall", "--points", tmp_path / "fewer.csv", *files[2:])
+    refused = run(
+        "align", store, "hall", "--points", tmp_path / "fewer.csv", *files[2:]
+    )
     assert refused.code == 2
     assert f"point 'p0' is not in {tmp_path / 'fewer.csv'}" in refused.err[0]
     ran = run("align", store, "hall", *files, "--json")
@@ -155,12 +175,16 @@ def test_alignment_gives_metres(
     assert run("calibrate", store, four_images, "--out", out).code == 0
     pose = read_calibration(out).parent_from_child
     assert pose_distance(pose, truth_of(hall.test[3]))[0] < 0.02
-    [image] = json.loads(run("localize", store, four_images / "00.png", "--json").out)["images"]
+    [image] = json.loads(run("localize", store, four_images / "00.png", "--json").out)[
+        "images"
+    ]
     assert image["unit"] == "metres"
     assert image["error_terms"][0]["translation_mm"] > 0
 
 
-def test_unit_survives_conversion_and_can_be_stated(run: Any, phone: Path, tmp_path: Path) -> None:
+def test_unit_survives_conversion_and_can_be_stated(
+    run: Any, phone: Path, tmp_path: Path
+) -> None:
     from evercal.recordings import load_recording
 
     assert run("convert", phone, tmp_path / "unknown").code == 0

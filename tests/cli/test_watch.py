@@ -23,7 +23,9 @@ def reference(
     hall_store: Path, four_images: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     out = tmp_path_factory.mktemp("reference") / "calibration.json"
-    assert main(["calibrate", str(hall_store), str(four_images), "--out", str(out)]) == 0
+    assert (
+        main(["calibrate", str(hall_store), str(four_images), "--out", str(out)]) == 0
+    )
     return out
 
 
@@ -67,9 +69,12 @@ def test_moved_camera_ends_the_watch_with_exit_code_1(
     assert "The camera has moved by" in ran.out
 
 
-def test_half_written_file_is_read_when_it_is_complete(four_images: Path, tmp_path: Path) -> None:
+def test_half_written_file_is_read_when_it_is_complete(
+    four_images: Path, tmp_path: Path
+) -> None:
     data = (four_images / "00.png").read_bytes()
-    arrivals, path = Arrivals(tmp_path), tmp_path / "late.png"
+    arrivals = Arrivals(tmp_path)
+    path = tmp_path / "late.png"
     path.write_bytes(data[: len(data) // 2])
     assert list(arrivals.scan()) == []
     path.write_bytes(data)
@@ -88,15 +93,21 @@ def test_broken_file_does_not_end_the_watch_nor_prolong_it(
     (folder / "2-image.png").write_bytes((four_images / "00.png").read_bytes())
     ran = run(*words, "--idle", "0.5", "--json")
     assert ran.code == 0
-    assert [json.loads(line)["image"] for line in ran.out.splitlines()] == ["2-image.png"]
+    assert [json.loads(line)["image"] for line in ran.out.splitlines()] == [
+        "2-image.png"
+    ]
     warnings = [line for line in ran.err if line.startswith("warning: ")]
-    assert [Path(line.split(": ")[1]).name for line in warnings] == ["0-broken.png", "1-folder.png"]
+    assert [Path(line.split(": ")[1]).name for line in warnings] == [
+        "0-broken.png",
+        "1-folder.png",
+    ]
 
 
 def test_neither_one_moved_image_nor_one_of_another_shape_ends_the_watch(
     run: Any, words: tuple[object, ...], hall: Recording, tmp_path: Path
 ) -> None:
-    black, moved = np.zeros((240, 320, 3), np.uint8), hall.test[6].read_image()
+    black = np.zeros((240, 320, 3), np.uint8)
+    moved = hall.test[6].read_image()
     for i, image in enumerate((black, black[:200, :200], black, moved)):
         write_image(tmp_path / "arriving" / f"{i}.png", image)
     ran = run(*words, "--idle", "0.5", "--json")

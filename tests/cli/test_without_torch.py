@@ -43,7 +43,8 @@ def meant(
     manifest = json.loads((root / MANIFEST).read_text())
     changed = manifest["payload"] | {"kind": "networks", "strategy": "er"}
     write_manifest(root, changed, list(manifest["files"]))
-    new, image = tmp_path / "new", still_images / "00.png"
+    new = tmp_path / "new"
+    image = still_images / "00.png"
     return {"NEW": new, "NETWORKS": root, "ROOM": rooms[0], "IMAGE": image}
 
 

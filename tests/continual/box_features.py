@@ -32,21 +32,30 @@ def learnable(box: BoxRoom) -> Learnable:
     waves = np.random.default_rng(0).normal(0, 0.6, (CHANNELS // 2, 3))
 
     def make(
-        scene: int = 0, views: int = 6, lens: Camera | None = None, correctable: bool = False
+        scene: int = 0,
+        views: int = 6,
+        lens: Camera | None = None,
+        correctable: bool = False,
     ) -> tuple[FeatureBuffer, Tensor]:
         rng = np.random.default_rng(scene)
         buffer = FeatureBuffer(scene, ATLAS_FROM_BASE, correctable)
         everything = []
         for _ in range(views):
-            pose, pixels = box.random_view(rng), cell_centres(120, 160, 8)
+            pose = box.random_view(rng)
+            pixels = cell_centres(120, 160, 8)
             rays = (lens or CAMERA).unproject(pixels) @ pose.rotation_matrix().T
             points, _ = box.intersect(pose.translation_m, rays)
             phase = points @ waves.T
             features = np.concatenate([np.sin(phase), np.cos(phase)], 1)
-            intrinsics = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy], np.float32)
-            grey, valid = np.zeros((120, 160), np.uint8), np.ones(300, bool)
+            intrinsics = np.array(
+                [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy], np.float32
+            )
+            grey = np.zeros((120, 160), np.uint8)
+            valid = np.ones(300, bool)
             view = View(grey, pixels.astype(np.float32), valid, intrinsics, pose)
-            descriptor = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=6)), dim=0)
+            descriptor = torch.nn.functional.normalize(
+                torch.from_numpy(rng.normal(size=6)), dim=0
+            )
             rows = torch.from_numpy(features).float()
             buffer.append(view, (rows, descriptor), torch.ones(300, dtype=torch.bool))
             everything.append(torch.from_numpy(ATLAS_FROM_BASE.apply(points)).float())

@@ -25,7 +25,15 @@ if TYPE_CHECKING:
 __all__ = ["block_mean", "box", "describe", "learnable", "shoot"]
 
 
-FOLDERS = ("continual", "features", "geometry", "mapping", "recordings", "storage", "evaluation")
+FOLDERS = (
+    "continual",
+    "features",
+    "geometry",
+    "mapping",
+    "recordings",
+    "storage",
+    "evaluation",
+)
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
@@ -43,7 +51,8 @@ def empty_scenes() -> EmptyScenes:
     from evercal.continual.scenes import LearnedScenes
 
     torch.manual_seed(0)
-    encoder, descriptor = tiny_encoder(), GlobalDescriptor(8, maps=2, hidden=4, width=8).eval()
+    encoder = tiny_encoder()
+    descriptor = GlobalDescriptor(8, maps=2, hidden=4, width=8).eval()
     for parameter in descriptor.parameters():
         parameter.data = parameter.data.half().float()  # as they are stored
     return lambda strategy: LearnedScenes(encoder, descriptor, strategy, 48)

@@ -33,7 +33,10 @@ def learn(
 
 
 def second_stage(
-    scenes: LearnedScenes, rooms: Rooms, options: StageOptions, on_event: OnEvent = unobserved
+    scenes: LearnedScenes,
+    rooms: Rooms,
+    options: StageOptions,
+    on_event: OnEvent = unobserved,
 ) -> LearnedScenes:
     """Learn the second room with the strategy of the first."""
     return learn(scenes, STRATEGIES[scenes.strategy], rooms[1], options, on_event)

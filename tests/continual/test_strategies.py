@@ -12,7 +12,12 @@ from evercal.continual.methods.method import FineTuning, described
 from evercal.continual.methods.penalties import Distillation
 from evercal.continual.methods.replay import Replay
 from evercal.continual.selection.selectors import SELECTORS
-from evercal.continual.strategies import STRATEGIES, Strategy, load_plugin, strategy_named
+from evercal.continual.strategies import (
+    STRATEGIES,
+    Strategy,
+    load_plugin,
+    strategy_named,
+)
 from evercal.errors import InputError
 
 
@@ -51,14 +56,24 @@ def test_sars_spdd_has_the_settings_of_the_paper() -> None:
     assert method == Replay("sars", Distillation(), weight=1.0)
     assert isinstance(method.penalty, Distillation)
     options = method.penalty.options
-    assert (options.prior_weight, options.metric_weight, options.output_weight) == (1, 1, 1)
-    assert (options.temperature, options.active_centres, method.penalty.scale) == (2.0, 50, 1.0)
+    assert (options.prior_weight, options.metric_weight, options.output_weight) == (
+        1,
+        1,
+        1,
+    )
+    assert (options.temperature, options.active_centres, method.penalty.scale) == (
+        2.0,
+        50,
+        1.0,
+    )
 
 
 def test_unknown_strategy_is_refused() -> None:
     assert strategy_named("er") is STRATEGIES["er"]
     for name in ("nonsense", "sars+spdd", "er@0.3", ""):
-        with pytest.raises(InputError, match=r"unknown; choose one of evercal, .* joint"):
+        with pytest.raises(
+            InputError, match=r"unknown; choose one of evercal, .* joint"
+        ):
             strategy_named(name)
 
 
@@ -100,13 +115,17 @@ def test_example_can_be_loaded_once() -> None:
         ("x = 1", "defines no STRATEGIES"),
         ("STRATEGIES = {}", "defines no STRATEGIES"),
         ("STRATEGIES = {'mine': Strategy('other')}", "defines no STRATEGIES"),
-        ("STRATEGIES = {'finetune': Strategy('finetune', source='mine')}", "'finetune' exists"),
+        (
+            "STRATEGIES = {'finetune': Strategy('finetune', source='mine')}",
+            "'finetune' exists",
+        ),
         ("1 / 0", "ZeroDivisionError: division by zero"),
         ("def :", "SyntaxError"),
     ],
 )
 def test_invalid_plugins_are_refused(tmp_path: Path, text: str, message: str) -> None:
-    path, before = tmp_path / "mine.py", dict(STRATEGIES)
+    path = tmp_path / "mine.py"
+    before = dict(STRATEGIES)
     path.write_text(f"from evercal.continual.strategies import Strategy\n{text}")
     with pytest.raises(InputError, match=message):
         load_plugin(path)

@@ -68,7 +68,8 @@ def test_scores_of_two_scenes_by_hand() -> None:
     ]
     total = scores(rows)
     assert list(total.scenes) == ["a", "b"]
-    a, b = total.scenes["a"], total.scenes["b"]
+    a = total.scenes["a"]
+    b = total.scenes["b"]
     assert (a.frames, a.accuracy_5cm_5deg, a.accuracy_1cm_1deg) == (4, 50.0, 0.0)
     # The upper median of each error: 1 2 [3] inf and 2 4 [6] inf.
     assert a.median_translation_cm == pytest.approx(3.0)
@@ -81,14 +82,16 @@ def test_scores_of_two_scenes_by_hand() -> None:
     assert total.mean_accuracy_5cm_5deg == 37.5
     assert total.ms_per_image == pytest.approx(11.25)
     rows = [result("small")] + [result("large", 50.0)] * 9
-    assert scores(rows).mean_accuracy_5cm_5deg == 50.0  # the mean over scenes is unweighted
+    # The mean over scenes is unweighted.
+    assert scores(rows).mean_accuracy_5cm_5deg == 50.0
     with pytest.raises(ValueError, match="at least one"):
         scores([])
 
 
 def test_json_has_null_for_infinity() -> None:
     text = json.dumps(
-        scores([result("a"), without_pose("b", "failed", None)]).to_dict(), allow_nan=False
+        scores([result("a"), without_pose("b", "failed", None)]).to_dict(),
+        allow_nan=False,
     )
     data = json.loads(text)
     means = {"mean_accuracy_5cm_5deg", "mean_accuracy_1cm_1deg"}
@@ -121,7 +124,9 @@ def test_kinds_of_forgetting_differ_only_if_the_end_is_best() -> None:
     for _ in range(50):
         matrix = generator.uniform(0, 100, (4, 4))
         total = continual_scores(matrix)
-        assert total == continual_scores(np.where(np.tri(4, dtype=bool), matrix, np.nan))
+        assert total == continual_scores(
+            np.where(np.tri(4, dtype=bool), matrix, np.nan)
+        )
         assert total.total_forgetting >= max(total.forgetting, 0.0)
         assert total.forgetting >= -total.backward_transfer - 1e-9
         matrix[-1] = 0.0
@@ -137,7 +142,8 @@ def test_single_scene_has_no_forgetting() -> None:
 
 
 @pytest.mark.parametrize(
-    "matrix", [[], [1.0, 2.0], [[1.0, 2.0]], [[1.0, 0.0], [math.nan, 2.0]], np.zeros((2, 2, 2))]
+    "matrix",
+    [[], [1.0, 2.0], [[1.0, 2.0]], [[1.0, 0.0], [math.nan, 2.0]], np.zeros((2, 2, 2))],
 )
 def test_invalid_matrix_is_refused(matrix: object) -> None:
     with pytest.raises(ValueError, match="accuracies"):
@@ -153,7 +159,9 @@ def test_squared_errors_follow_chi_square_if_the_covariance_is_true() -> None:
     for error in rng.normal(size=(2000, 6)) @ root.T:
         rotated = estimate @ SE3.exp([0, 0, 0, *error[3:]])
         truth = SE3(rotated.rotation_wxyz, estimate.translation_m + error[:3])
-        squared.append(UncertainPose(estimate, root @ root.T).squared_mahalanobis(truth))
+        squared.append(
+            UncertainPose(estimate, root @ root.T).squared_mahalanobis(truth)
+        )
     assert kstest(squared, chi2(6).cdf).pvalue > 0.01
     assert chi2(6).cdf(CHI2_6) == pytest.approx(0.95, abs=1e-5)
     assert share_inside(squared) == pytest.approx(95, abs=1.5)
@@ -173,5 +181,7 @@ def test_recall_area_equals_the_integral() -> None:
     errors = np.random.default_rng(3).exponential(0.15, 400)
     grid = np.linspace(0, 0.2, 4001)
     curve = (errors[:, None] <= grid).mean(0)
-    assert recall_area(errors) == pytest.approx(500 * np.trapezoid(curve, grid), abs=0.02)
+    assert recall_area(errors) == pytest.approx(
+        500 * np.trapezoid(curve, grid), abs=0.02
+    )
     assert recall_area(errors, 0.1) < recall_area(errors)

@@ -26,7 +26,9 @@ def estimate(
     inlier_ratio: float = 0.25,
     covariance: np.ndarray | None = None,
 ) -> PoseEstimate:
-    return PoseEstimate(status, "", scene, base_from_camera, covariance, inliers, inlier_ratio, 1.0)
+    return PoseEstimate(
+        status, "", scene, base_from_camera, covariance, inliers, inlier_ratio, 1.0
+    )
 
 
 @dataclass
@@ -46,7 +48,9 @@ class Fake:
 
 def pose(x: float, degrees: float = 0.0) -> SE3:
     half = math.radians(degrees) / 2
-    return SE3(np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), np.array([x, 0.0, 0.0]))
+    return SE3(
+        np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), np.array([x, 0.0, 0.0])
+    )
 
 
 def frame(number: int, base_from_camera: SE3 | None) -> Frame:
@@ -67,7 +71,9 @@ def test_pose_in_a_scene_of_the_same_base_frame_is_measured() -> None:
         }
         first, second = evaluate(Fake(estimates), scenes)
         expected = (0.25, 0.0) if base else (math.inf, math.inf)
-        assert (first.translation_error_m, second.translation_error_m) == pytest.approx(expected)
+        assert (first.translation_error_m, second.translation_error_m) == pytest.approx(
+            expected
+        )
         assert first.wrong_scene == (base is None)
 
 
@@ -102,9 +108,13 @@ def test_images_of_all_scenes_are_shuffled_by_seed() -> None:
         "a": scene("a", *(frame(i, pose(0.0)) for i in range(count))),
         "b": scene("b", *(frame(i + count, pose(0.0)) for i in range(count))),
     }
-    first, again, other = Fake(estimates), Fake(estimates), Fake(estimates)
+    first = Fake(estimates)
+    again = Fake(estimates)
+    other = Fake(estimates)
     progress: list[tuple[int, int]] = []
-    results = evaluate(first, scenes, on_frame=lambda done, total: progress.append((done, total)))
+    results = evaluate(
+        first, scenes, on_frame=lambda done, total: progress.append((done, total))
+    )
     evaluate(again, scenes)
     evaluate(other, scenes, seed=1)
     assert sorted(first.calls) == list(range(2 * count))
@@ -130,8 +140,12 @@ def test_time_includes_reading_the_image() -> None:
 def test_near_training_frames_are_of_the_same_scene() -> None:
     estimates = {i: estimate("failed", None, None) for i in range(3)}
     scenes = {
-        "a": scene("a", frame(0, pose(0.0)), frame(1, pose(0.5)), train=(frame(9, pose(0.52)),)),
-        "b": scene("b", frame(2, pose(0.5)), train=(frame(8, pose(9.0)), frame(7, None))),
+        "a": scene(
+            "a", frame(0, pose(0.0)), frame(1, pose(0.5)), train=(frame(9, pose(0.52)),)
+        ),
+        "b": scene(
+            "b", frame(2, pose(0.5)), train=(frame(8, pose(9.0)), frame(7, None))
+        ),
     }
     results = evaluate(Fake(estimates), scenes)
     assert [r.near_training_frame for r in results] == [False, True, False]
@@ -140,7 +154,13 @@ def test_near_training_frames_are_of_the_same_scene() -> None:
 def test_recordings_and_folders_without_a_mapping(tmp_path: Path) -> None:
     recording = scene("a", frame(0, None), frame(1, pose(0.0)))
     generic.write(tmp_path / "a", recording)
-    for given in (recording, [recording], tmp_path / "a", str(tmp_path / "a"), (tmp_path / "a",)):
+    for given in (
+        recording,
+        [recording],
+        tmp_path / "a",
+        str(tmp_path / "a"),
+        (tmp_path / "a",),
+    ):
         results = evaluate(Fake({1: estimate("failed", None, None)}), given)
         assert [r.frame[:2] for r in results] == ["f1"]  # the other one has no pose
     with pytest.raises(InputError, match="given twice"):
@@ -151,12 +171,17 @@ def test_recordings_and_folders_without_a_mapping(tmp_path: Path) -> None:
     ("scenes", "message"),
     [
         ({}, r"no scene to evaluate; give one or more of a, b"),
-        ({"c": scene("c", frame(0, pose(0.0)))}, r"'c' is not in the store; its scenes are a, b;"),
+        (
+            {"c": scene("c", frame(0, pose(0.0)))},
+            r"'c' is not in the store; its scenes are a, b;",
+        ),
         ({"a": scene("a")}, r"'a' has 0 test frames"),
         ({"b": scene("b", frame(0, None))}, r"'b' has 1 test frames, none with a pose"),
     ],
 )
-def test_unusable_scenes_are_refused(scenes: dict[str, Recording], message: str) -> None:
+def test_unusable_scenes_are_refused(
+    scenes: dict[str, Recording], message: str
+) -> None:
     fake = Fake({})
     with pytest.raises(InputError, match=message):
         evaluate(fake, scenes)

@@ -11,9 +11,12 @@ def row(accuracy: float, median_cm: float = 2.0, frames: int = 100) -> SceneScor
 
 
 def test_rows_and_their_mean() -> None:
-    scores = Scores({"chess": row(90.0), "fire": row(61.26, math.inf, 7)}, 75.63, 1.0, 12.0)
+    scores = Scores(
+        {"chess": row(90.0), "fire": row(61.26, math.inf, 7)}, 75.63, 1.0, 12.0
+    )
     chess, fire, mean = (list(cells.values()) for cells in score_rows(scores))
-    accuracies, medians = ["90.0", "8.0", "1.0", "0.7"], ["20.00", "0.500"]
+    accuracies = ["90.0", "8.0", "1.0", "0.7"]
+    medians = ["20.00", "0.500"]
     assert chess == ["chess", "100", *accuracies, *medians, "2.0", "3.0", "-", "4.0"]
     assert fire[:7] == ["fire", "7", "61.3", "8.0", "1.0", "0.7", "inf"]
     assert mean[:3] == ["mean", "", "75.6"]

@@ -21,7 +21,9 @@ TEACHER_FILE = WEIGHTS / "encoder-1.onnx"
 
 
 def image(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
-    return np.random.default_rng(seed).integers(0, 256, (height, width)).astype(np.uint8)
+    return (
+        np.random.default_rng(seed).integers(0, 256, (height, width)).astype(np.uint8)
+    )
 
 
 def blocks(grey: NDArray[np.float32], stride: int = 8) -> NDArray[np.float32]:
@@ -42,7 +44,9 @@ def test_onnx_file_is_the_module_that_it_was_made_of(size: tuple[int, int]) -> N
 
     grey = image(*size)
     with torch.no_grad():
-        features = from_onnx(TEACHER_FILE, TEACHER)(torch.from_numpy(grey[None, None]) / 255)
+        features = from_onnx(TEACHER_FILE, TEACHER)(
+            torch.from_numpy(grey[None, None]) / 255
+        )
     expected = features[0].permute(1, 2, 0).numpy()
     np.testing.assert_allclose(load_encoder(TEACHER_FILE)(grey), expected, atol=1e-5)
 
@@ -54,7 +58,8 @@ def test_weights_in_maps_of_before_are_those_of_the_onnx_file(tmp_path: Path) ->
     state = from_onnx(TEACHER_FILE, TEACHER).half().state_dict()
     path = tmp_path / "encoder-283526ac0c3c.safetensors"
     save_tensors(path, {name: value.numpy() for name, value in state.items()})
-    encoder, shipped = load_encoder(path), load_encoder(TEACHER_FILE)
+    encoder = load_encoder(path)
+    shipped = load_encoder(TEACHER_FILE)
     assert encoder.name == shipped.name == "encoder-1.onnx"
     assert encoder.centroids is not None
     np.testing.assert_array_equal(encoder(image(48, 64)), shipped(image(48, 64)))
@@ -74,7 +79,8 @@ def test_cells_are_unit_vectors_and_pixels_beyond_whole_cells_are_cut_off(
 
 
 def test_brightness_and_contrast_have_little_effect() -> None:
-    encoder, grey = load_encoder(), image(48, 64) // 2 + 32
+    encoder = load_encoder()
+    grey = image(48, 64) // 2 + 32
     for changed in (grey + 60, grey // 2, grey // 2 + 90):
         # Not none: grey levels are whole numbers.
         assert (encoder(grey) * encoder(changed)).sum(2).min() > 0.99
@@ -82,7 +88,8 @@ def test_brightness_and_contrast_have_little_effect() -> None:
 
 
 def test_images_of_any_size_and_colour_are_encoded_at_working_size() -> None:
-    encoder, grey = load_encoder(), image(96, 128)
+    encoder = load_encoder()
+    grey = image(96, 128)
     colour = np.repeat(grey[..., None], 3, 2)
     large = np.repeat(np.repeat(grey, 2, 0), 2, 1)
     for given in (grey, colour, large):
@@ -103,20 +110,26 @@ def test_stride_and_width_are_those_of_what_a_function_makes(stride: int) -> Non
 
 def test_what_is_no_encoder_is_refused() -> None:
     for function in (lambda grey: grey, lambda grey: blocks(grey)[:5]):
-        refused(function, "must make (rows, columns, channels) with a stride of 1, 2, 4")
+        refused(
+            function, "must make (rows, columns, channels) with a stride of 1, 2, 4"
+        )
     refused("encoder.onnx", "give an ONNX file or a function on arrays")
 
 
 def test_threads_get_the_same_features() -> None:
-    encoder, grey = load_encoder(), [image(48, 64, seed) for seed in range(12)]
+    encoder = load_encoder()
+    grey = [image(48, 64, seed) for seed in range(12)]
     alone = [encoder(one) for one in grey]
     with ThreadPoolExecutor(4) as pool:
         np.testing.assert_array_equal(list(pool.map(encoder, grey)), alone)
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(encoder))(grey[0]), alone[0])
+    np.testing.assert_array_equal(
+        pickle.loads(pickle.dumps(encoder))(grey[0]), alone[0]
+    )
 
 
 def test_unusable_files_are_refused(tmp_path: Path) -> None:
-    whole, broken = tiny_onnx(), tmp_path / "broken.onnx"
+    whole = tiny_onnx()
+    broken = tmp_path / "broken.onnx"
     for data in (b"", b"hello", whole[: len(whole) // 2]):
         broken.write_bytes(data)
         refused(broken, f"encoder {broken}: ")
@@ -133,7 +146,9 @@ def with_encoder(hall_map: MapContents, encoder: Encoder) -> MapContents:
     return replace(hall_map, encoder=encoder)
 
 
-def test_map_keeps_the_name_of_its_function(hall_map: MapContents, tmp_path: Path) -> None:
+def test_map_keeps_the_name_of_its_function(
+    hall_map: MapContents, tmp_path: Path
+) -> None:
     contents = with_encoder(hall_map, load_encoder(blocks))
     store = MapStore.create(tmp_path / "map", contents.encoder)
     store.commit(contents.scenes[0], {})
@@ -155,7 +170,10 @@ def test_map_keeps_an_onnx_file_whole(hall_map: MapContents, tmp_path: Path) -> 
     store = MapStore.create(tmp_path / "map", contents.encoder)
     store.commit(contents.scenes[0], {})
     first, vlad = store.networks
-    assert (first[:8], vlad) == ("encoder-", first.replace("encoder", "vlad")[:-4] + "safetensors")
+    assert (first[:8], vlad) == (
+        "encoder-",
+        first.replace("encoder", "vlad")[:-4] + "safetensors",
+    )
     assert (tmp_path / "map" / first).read_bytes() == tiny_onnx()
     again = MapStore.open(tmp_path / "map").contents.encoder
     assert (again.name, again.width, again.stride) == (first, 8, 8)

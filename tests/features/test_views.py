@@ -32,7 +32,9 @@ def grey(image: np.ndarray) -> np.ndarray:
 
 def shifts(image: np.ndarray, expected: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """(n, 2) shift of an image against the expected one in each quarter, pixels."""
-    image, expected = (cv2.GaussianBlur(i.astype(float), (0, 0), 1.2) for i in (image, expected))
+    image, expected = (
+        cv2.GaussianBlur(i.astype(float), (0, 0), 1.2) for i in (image, expected)
+    )
     dv, du = np.gradient(expected)
     height, width = mask.shape
     moved = []
@@ -43,7 +45,9 @@ def shifts(image: np.ndarray, expected: np.ndarray, mask: np.ndarray) -> np.ndar
             if part.sum() < 400:
                 continue
             slopes = np.stack([-du[part], -dv[part], np.ones(part.sum())], -1)
-            moved.append(np.linalg.lstsq(slopes, (image - expected)[part], rcond=None)[0][:2])
+            moved.append(
+                np.linalg.lstsq(slopes, (image - expected)[part], rcond=None)[0][:2]
+            )
     assert len(moved) >= 3
     return np.array(moved)
 
@@ -54,7 +58,9 @@ def inner(view: View) -> np.ndarray:
     cells = view.valid.reshape(height // 8, width // 8).astype(np.uint8)
     cells = cv2.erode(cells, np.ones((3, 3), np.uint8), borderValue=0)
     mask = np.zeros(view.grey.shape, bool)
-    mask[: height // 8 * 8, : width // 8 * 8] = np.kron(cells, np.ones((8, 8))).astype(bool)
+    mask[: height // 8 * 8, : width // 8 * 8] = np.kron(cells, np.ones((8, 8))).astype(
+        bool
+    )
     return mask
 
 
@@ -77,9 +83,12 @@ def virtual_camera(view: View) -> tuple[Camera, SE3]:
 
 
 @pytest.mark.parametrize("kind", CAMERAS)
-def test_augmented_view_is_the_image_of_its_virtual_camera(kind: str, box: BoxRoom, shoot) -> None:
+def test_augmented_view_is_the_image_of_its_virtual_camera(
+    kind: str, box: BoxRoom, shoot
+) -> None:
     rng = np.random.default_rng(3)
-    zooms, rotations = [], []
+    zooms = []
+    rotations = []
     for _ in range(4):
         frame = shoot(CAMERAS[kind], box.random_view(rng))
         view = augmented_view(frame, 8, OPTIONS, rng)
@@ -106,15 +115,21 @@ def test_augmented_view_is_the_image_of_its_virtual_camera(kind: str, box: BoxRo
 
 
 @pytest.mark.parametrize("kind", CAMERAS)
-def test_pose_and_intrinsics_are_those_of_the_frame(kind: str, box: BoxRoom, shoot) -> None:
+def test_pose_and_intrinsics_are_those_of_the_frame(
+    kind: str, box: BoxRoom, shoot
+) -> None:
     frame = shoot(CAMERAS[kind], box.random_view(np.random.default_rng(0)))
     small = frame.camera.short_side_resized(120)
     for view in (
         frame_view(frame, 8, OPTIONS),
         augmented_view(frame, 8, OPTIONS, np.random.default_rng(1)),
     ):
-        np.testing.assert_allclose(view.intrinsics, [small.fx, small.fy, small.cx, small.cy])
-        np.testing.assert_allclose(view.base_from_camera.log(), frame.base_from_camera.log())
+        np.testing.assert_allclose(
+            view.intrinsics, [small.fx, small.fy, small.cx, small.cy]
+        )
+        np.testing.assert_allclose(
+            view.base_from_camera.log(), frame.base_from_camera.log()
+        )
         assert view.grey.shape == (small.height, small.width)
         cells = (small.height // 8) * (small.width // 8)
         assert view.cell_pixels.shape == (cells, 2)
@@ -123,9 +138,12 @@ def test_pose_and_intrinsics_are_those_of_the_frame(kind: str, box: BoxRoom, sho
 
 
 @pytest.mark.parametrize("kind", CAMERAS)
-def test_cells_of_a_plain_view_show_their_ideal_pixels(kind: str, box: BoxRoom, shoot) -> None:
+def test_cells_of_a_plain_view_show_their_ideal_pixels(
+    kind: str, box: BoxRoom, shoot
+) -> None:
     rng = np.random.default_rng(5)
-    actual, expected = [], []
+    actual = []
+    expected = []
     for _ in range(3):
         frame = shoot(CAMERAS[kind], box.random_view(rng))
         view = frame_view(frame, 8, OPTIONS)
@@ -134,7 +152,9 @@ def test_cells_of_a_plain_view_show_their_ideal_pixels(kind: str, box: BoxRoom, 
         height, width = view.grey.shape
         margin = 30  # the ideal image of a barrel lens is larger
         ideal = Camera(width + 60, height + 60, fx, fy, cx + margin, cy + margin)
-        drawn = cv2.GaussianBlur(grey(box.render(ideal, frame.base_from_camera)), (0, 0), 1.5)
+        drawn = cv2.GaussianBlur(
+            grey(box.render(ideal, frame.base_from_camera)), (0, 0), 1.5
+        )
         where = (view.cell_pixels + margin)[:, None]
         expected.append(cv2.remap(drawn, where, None, cv2.INTER_LINEAR))  # type: ignore[call-overload]
         centres = cell_centres(height, width, 8).astype(np.float32)[:, None]
@@ -178,10 +198,14 @@ def test_valid_cells_lie_in_the_distorted_image(kind: str, box: BoxRoom, shoot) 
 
 def test_gamma_changes_the_brightness_only(box: BoxRoom, shoot) -> None:
     frame = shoot(PLAIN, box.random_view(np.random.default_rng(0)))
-    dark = augmented_view(frame, 8, replace(OPTIONS, gamma=0.8), np.random.default_rng(4))
+    dark = augmented_view(
+        frame, 8, replace(OPTIONS, gamma=0.8), np.random.default_rng(4)
+    )
     plain = augmented_view(frame, 8, OPTIONS, np.random.default_rng(4))
     np.testing.assert_array_equal(dark.cell_pixels, plain.cell_pixels)
-    table = {(int(a), int(b)) for a, b in zip(plain.grey.flat, dark.grey.flat, strict=True)}
+    table = {
+        (int(a), int(b)) for a, b in zip(plain.grey.flat, dark.grey.flat, strict=True)
+    }
     levels = dict(table)
     assert len(levels) == len(table)  # a function of the grey value
     ordered = [levels[key] for key in sorted(levels)]
@@ -190,10 +214,15 @@ def test_gamma_changes_the_brightness_only(box: BoxRoom, shoot) -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "expected"), [((320, 240), (160, 120)), ((90, 120), (120, 160)), ((160, 120), None)]
+    ("size", "expected"),
+    [((320, 240), (160, 120)), ((90, 120), (120, 160)), ((160, 120), None)],
 )
 def test_working_image(size: tuple[int, int], expected: tuple[int, int] | None) -> None:
-    image = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
+    image = (
+        np.random.default_rng(0)
+        .integers(0, 256, (size[1], size[0], 3))
+        .astype(np.uint8)
+    )
     camera = Camera(*size, 100.0, 100.0, 40.0, 50.0)
     resized, small = working_image(image, camera, 120)
     width, height = expected or size

@@ -6,7 +6,14 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
-from evercal.features.vlad import CENTROIDS, WIDTH, Array, Vlad, fit_centroids, similar_pairs
+from evercal.features.vlad import (
+    CENTROIDS,
+    WIDTH,
+    Array,
+    Vlad,
+    fit_centroids,
+    similar_pairs,
+)
 
 from ..encoders import tiny_encoder
 
@@ -27,11 +34,13 @@ def test_shipped_centroids_are_unit_vectors_that_differ() -> None:
 
 
 def test_another_encoder_has_centroids_of_given_features() -> None:
-    encoder, other = tiny_encoder(0), tiny_encoder(1)
+    encoder = tiny_encoder(0)
+    other = tiny_encoder(1)
     with pytest.raises(InputError, match="no VLAD centroids; learn a recording"):
         encoder.vlad()
     images = [features(50, 8, seed) for seed in range(4)]
-    one, two = encoder.vlad(images), other.vlad([-image for image in images])
+    one = encoder.vlad(images)
+    two = other.vlad([-image for image in images])
     for vlad in (one, two):
         assert vlad.centroids.shape == (CENTROIDS, 8)
         np.testing.assert_allclose(np.linalg.norm(vlad.centroids, axis=1), 1, atol=1e-5)
@@ -44,7 +53,9 @@ def test_another_encoder_has_centroids_of_given_features() -> None:
 def test_centroids_of_separate_clusters_are_their_means() -> None:
     means = np.eye(CENTROIDS, dtype=np.float32)
     rows = np.tile(means, (100, 1)) + 0.05 * features(100 * CENTROIDS, CENTROIDS, 3)
-    similarity = fit_centroids([rows / np.linalg.norm(rows, axis=1, keepdims=True)]) @ means.T
+    similarity = (
+        fit_centroids([rows / np.linalg.norm(rows, axis=1, keepdims=True)]) @ means.T
+    )
     # k-means from random rows finds most clusters.
     assert (similarity.max(0) > 0.98).mean() > 0.5
 
@@ -55,11 +66,14 @@ def by_hand(rows: Array, centroids: Array) -> NDArray[np.float64]:
     for row in rows.astype(float):
         nearest = int(np.argmax(centroids @ row))
         sums[nearest] += row - centroids[nearest]
-    return (sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)).ravel()
+    return (
+        sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
+    ).ravel()
 
 
 def test_vector_is_the_sum_of_differences_from_the_nearest_centroids() -> None:
-    centroids, rows = features(5, 6, 0), features(40, 6, 1)
+    centroids = features(5, 6, 0)
+    rows = features(40, 6, 1)
     vector = Vlad(centroids)(rows)
     np.testing.assert_allclose(vector, by_hand(rows, centroids) / 5**0.5, atol=1e-5)
     assert float(np.linalg.norm(vector)) == pytest.approx(1, abs=1e-5)
@@ -68,14 +82,16 @@ def test_vector_is_the_sum_of_differences_from_the_nearest_centroids() -> None:
 def test_long_vectors_are_projected_by_numbers_that_never_change() -> None:
     """Those of `torch.randn` with seed 1, which maps of before were made with."""
     torch = pytest.importorskip("torch")
-    centroids, rows = features(32, 64, 0), features(40, 64, 1)
+    centroids = features(32, 64, 0)
+    rows = features(40, 64, 1)
     size = centroids.size
     generator = torch.Generator().manual_seed(1)
     projection = torch.randn(size, WIDTH, generator=generator).numpy() / size**0.5
     vlad = Vlad(centroids)
     assert vlad._projection is not None
     np.testing.assert_allclose(vlad._projection, projection, rtol=1e-4, atol=1e-7)
-    vector, plain = vlad(rows), Vlad(centroids[:16])(rows)
+    vector = vlad(rows)
+    plain = Vlad(centroids[:16])(rows)
     assert vector.shape == plain.shape == (WIDTH,)
     expected = by_hand(rows, centroids) @ projection
     np.testing.assert_allclose(vector, expected / np.linalg.norm(expected), atol=1e-5)
@@ -83,7 +99,9 @@ def test_long_vectors_are_projected_by_numbers_that_never_change() -> None:
 
 def test_every_image_is_paired_with_the_most_similar_ones() -> None:
     images = [features(60, 8, seed) for seed in range(3)]
-    images += [np.asarray(image + 0.01 * features(60, 8, 9), np.float32) for image in images]
+    images += [
+        np.asarray(image + 0.01 * features(60, 8, 9), np.float32) for image in images
+    ]
     pairs = similar_pairs(images, Vlad(features(4, 8, 1)), 1)
     assert pairs == [(0, 3), (1, 4), (2, 5)]
     assert similar_pairs(images[:2], Vlad(features(4, 8, 1)), 5) == [(0, 1)]
@@ -91,8 +109,10 @@ def test_every_image_is_paired_with_the_most_similar_ones() -> None:
 
 @pytest.mark.parametrize("partners", [1, 3, 20])
 def test_pairs_are_those_of_a_search_one_by_one(partners: int) -> None:
-    images, vlad = [features(30, 8, seed) for seed in range(12)], Vlad(features(4, 8, 1))
-    vectors, expected = [vlad(image) for image in images], set()
+    images = [features(30, 8, seed) for seed in range(12)]
+    vlad = Vlad(features(4, 8, 1))
+    vectors = [vlad(image) for image in images]
+    expected = set()
     for i, one in enumerate(vectors):
         others = [j for j in range(len(images)) if j != i]
         others.sort(key=lambda j: -float(one @ vectors[j]))

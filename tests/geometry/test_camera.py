@@ -33,7 +33,9 @@ def test_project_agrees_with_opencv(distortion: tuple[float, ...]) -> None:
 
 
 @pytest.mark.parametrize("distortion", LENSES)
-def test_unproject_inverts_project_over_the_whole_image(distortion: tuple[float, ...]) -> None:
+def test_unproject_inverts_project_over_the_whole_image(
+    distortion: tuple[float, ...],
+) -> None:
     camera = camera_with(distortion)
     x, y = np.meshgrid(np.linspace(0, 639, 17), np.linspace(0, 479, 13))
     pixels = np.stack([x, y], axis=-1)
@@ -52,7 +54,9 @@ def test_unproject_inverts_project_over_the_whole_image(distortion: tuple[float,
 def test_resized_camera_projects_points_to_the_same_part_of_the_image(
     size: tuple[int, int], new: tuple[int, int], lens: tuple[float, ...]
 ) -> None:
-    camera = Camera(*size, 0.9 * size[0], 1.1 * size[0], 0.4 * size[0], 0.6 * size[1], lens)
+    camera = Camera(
+        *size, 0.9 * size[0], 1.1 * size[0], 0.4 * size[0], 0.6 * size[1], lens
+    )
     points = np.array([[0.1, -0.2, 1.0], [0.3, 0.1, 2.0], [-0.5, 0.4, 1.5]])
     # Measured from the image's corner, half a pixel outside the first centre.
     before = (camera.project(points) + 0.5) / size
@@ -84,15 +88,21 @@ def test_resizing_agrees_with_opencv() -> None:
     ],
 )
 def test_short_side(size: tuple[int, int], expected: tuple[int, int]) -> None:
-    camera = Camera(*size, 500.0, 500.0, size[0] / 2, size[1] / 2).short_side_resized(240)
+    camera = Camera(*size, 500.0, 500.0, size[0] / 2, size[1] / 2).short_side_resized(
+        240
+    )
     assert (camera.width, camera.height) == expected
 
 
 @pytest.mark.parametrize(
-    ("distortion", "model"), [*product(LENSES, ["pinhole"]), *product(FISHEYES, ["fisheye"])]
+    ("distortion", "model"),
+    [*product(LENSES, ["pinhole"]), *product(FISHEYES, ["fisheye"])],
 )
-def test_slopes_equal_finite_differences(distortion: tuple[float, ...], model: Model) -> None:
-    camera, step = camera_with(()), 1e-6
+def test_slopes_equal_finite_differences(
+    distortion: tuple[float, ...], model: Model
+) -> None:
+    camera = camera_with(())
+    step = 1e-6
     camera = replace(camera, distortion=distortion, model=model)
     plane = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2))
 
@@ -104,7 +114,9 @@ def test_slopes_equal_finite_differences(distortion: tuple[float, ...], model: M
 
     by_plane, by_lens = camera.slopes(plane)
     ahead, behind = ([pixels_of(c) for c in changed(size)] for size in (step, -step))
-    truth = np.stack([a - b for a, b in zip(ahead, behind, strict=True)], -1) / (2 * step)
+    truth = np.stack([a - b for a, b in zip(ahead, behind, strict=True)], -1) / (
+        2 * step
+    )
     np.testing.assert_allclose(by_lens, truth, atol=1e-6 * np.abs(truth).max())
     moves = (step, 0.0), (0.0, step)
     along = [pixels_of(camera, m) - pixels_of(camera, (-m[0], -m[1])) for m in moves]
@@ -120,7 +132,9 @@ def test_pixels_beyond_the_fold_have_no_ray() -> None:
     assert BARREL.widest == pytest.approx((3 * 0.35) ** -0.5)
     points = np.array([[0.97, 0, 1], [0.98, 0, 1], [1.7, 0, 1]])
     pixels = BARREL.project(points)
-    assert pixels[0] == pytest.approx((319.5 + 400 * 0.97 * (1 - 0.35 * 0.97**2), 239.5))
+    assert pixels[0] == pytest.approx(
+        (319.5 + 400 * 0.97 * (1 - 0.35 * 0.97**2), 239.5)
+    )
     assert np.isnan(pixels[1:]).all()
     x, y = np.meshgrid(np.arange(0, 640, 7.0), np.arange(0, 480, 7.0))
     pixels = np.stack([x, y], -1)
@@ -137,7 +151,10 @@ def test_pixels_beyond_the_fold_have_no_ray() -> None:
         (KINECT, np.inf),
         ((0.0, 0.0, 0.01, 0.01), np.inf),
         ((0.0, 0.0, 0.0, 0.0, 0.0, -0.25, 0.0, 0.0), 2.0),  # its denominator is 0 there
-        ((0.0, 0.0, 0.0, 0.0, 0.0, 0.25, 0.0, 0.0), 2.0),  # x / (1 + x^2 / 4) is largest there
+        (
+            (0.0, 0.0, 0.0, 0.0, 0.0, 0.25, 0.0, 0.0),
+            2.0,
+        ),  # x / (1 + x^2 / 4) is largest there
     ],
 )
 def test_range_of_the_distortion(distortion: tuple[float, ...], widest: float) -> None:
@@ -150,10 +167,13 @@ def fisheye(distortion: tuple[float, ...], focal: float = 180.0) -> Camera:
 
 @pytest.mark.parametrize("distortion", FISHEYES)
 def test_a_fisheye_agrees_with_opencv(distortion: tuple[float, ...]) -> None:
-    camera, rng = fisheye(distortion), np.random.default_rng(0)
-    angle, around = np.deg2rad(rng.uniform(0, 84, 300)), rng.uniform(0, 2 * np.pi, 300)
+    camera = fisheye(distortion)
+    rng = np.random.default_rng(0)
+    angle = np.deg2rad(rng.uniform(0, 84, 300))
+    around = rng.uniform(0, 2 * np.pi, 300)
     points = np.stack(
-        [np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], -1
+        [np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)],
+        -1,
     ) * rng.uniform(0.5, 3, (300, 1))
     lens = np.array(distortion)
     twin, _ = cv2.fisheye.projectPoints(
@@ -170,21 +190,30 @@ def test_a_fisheye_ends_at_85_deg_or_where_its_polynomial_folds() -> None:
     folds = (-0.3, 0.0, 0.0, 0.0)  # 1 - 0.9 t^2 = 0
     assert fisheye(folds).widest == pytest.approx(np.tan((0.9) ** -0.5))
     far = np.array([[np.tan(np.deg2rad(84.9)), 0, 1], [np.tan(np.deg2rad(85.1)), 0, 1]])
-    assert np.isfinite(fisheye((0.0,) * 4).project(far)).all(1).tolist() == [True, False]
-    across = np.array([[318.6 + 180 * np.deg2rad(deg), 235.3] for deg in (0, 84.9, 85.1, 120)])
+    assert np.isfinite(fisheye((0.0,) * 4).project(far)).all(1).tolist() == [
+        True,
+        False,
+    ]
+    across = np.array(
+        [[318.6 + 180 * np.deg2rad(deg), 235.3] for deg in (0, 84.9, 85.1, 120)]
+    )
     rays = fisheye((0.0,) * 4).unproject(across)
     assert np.isfinite(rays).all(1).tolist() == [True, True, False, False]
 
 
 @pytest.mark.parametrize("distortion", FISHEYES)
-def test_a_fisheye_survives_sizes_dictionaries_and_changes(distortion: tuple[float, ...]) -> None:
+def test_a_fisheye_survives_sizes_dictionaries_and_changes(
+    distortion: tuple[float, ...],
+) -> None:
     camera = fisheye(distortion)
     assert Camera.from_dict(camera.to_dict()) == camera
     assert camera.resized(320, 240).resized(640, 480).model == "fisheye"
     assert camera.pinhole.distortion == ()
     assert camera.pinhole.model == "pinhole"
     changed = camera.changed([0.0, 1.0, 0.0, 0.01, -0.02])
-    assert changed.distortion[:2] == pytest.approx((distortion[0] + 0.01, distortion[1] - 0.02))
+    assert changed.distortion[:2] == pytest.approx(
+        (distortion[0] + 0.01, distortion[1] - 0.02)
+    )
     assert changed.cx == camera.cx + 1
     with pytest.raises(ValueError, match="k1 k2 k3 k4"):
         fisheye((0.1,) * 5)
@@ -197,7 +226,9 @@ def test_zero_coefficients_and_points_behind_the_camera() -> None:
         assert camera_with((0.0,) * count) == camera_with(())
     assert camera_with(KINECT).coefficients == (*KINECT, 0.0, 0.0, 0.0)
     # Points behind the camera have no pixel.
-    pixels = camera_with(()).project([[0.0, 0.0, -1.0], [0.1, 0.1, 0.0], [0.0, 0.0, 1.0]])
+    pixels = camera_with(()).project(
+        [[0.0, 0.0, -1.0], [0.1, 0.1, 0.0], [0.0, 0.0, 1.0]]
+    )
     assert np.isnan(pixels[:2]).all()
     assert pixels[2] == pytest.approx((318.6, 255.3))
 
@@ -222,7 +253,9 @@ def test_matrix_and_dict_round_trips() -> None:
         ({"fy": "500"}, "'fy' is a number"),
     ],
 )
-def test_bad_intrinsics_are_refused_by_name(change: dict[str, object], message: str) -> None:
+def test_bad_intrinsics_are_refused_by_name(
+    change: dict[str, object], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         Camera.from_dict({**camera_with(()).to_dict(), **change})
 

@@ -11,7 +11,9 @@ from scipy.linalg import expm
 from evercal.geometry import SE3, average_poses, pose_distance
 
 
-def random_poses(rng: np.random.Generator, shape: tuple[int, ...], angle: str = "any") -> SE3:
+def random_poses(
+    rng: np.random.Generator, shape: tuple[int, ...], angle: str = "any"
+) -> SE3:
     axis = rng.normal(size=(*shape, 3))
     axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
     low, high = {
@@ -30,7 +32,9 @@ def assert_close(a: SE3, b: SE3, tolerance: float = 1e-12) -> None:
     assert np.max(radians, initial=0) < tolerance
 
 
-cases = st.tuples(st.integers(0, 2**32 - 1), st.sampled_from(["any", "tiny", "half_turn"]))
+cases = st.tuples(
+    st.integers(0, 2**32 - 1), st.sampled_from(["any", "tiny", "half_turn"])
+)
 
 
 @given(cases)
@@ -54,7 +58,9 @@ def test_agrees_with_matrices(case: tuple[int, str]) -> None:
     a, b = (random_poses(rng, (4,), angle) for _ in range(2))
     points = rng.normal(size=(4, 3))
     np.testing.assert_allclose((a @ b).matrix(), a.matrix() @ b.matrix(), atol=1e-12)
-    np.testing.assert_allclose(a.inverse().matrix(), np.linalg.inv(a.matrix()), atol=1e-12)
+    np.testing.assert_allclose(
+        a.inverse().matrix(), np.linalg.inv(a.matrix()), atol=1e-12
+    )
     homogeneous = np.concatenate([points, np.ones((4, 1))], axis=1)
     twin = np.einsum("nij,nj->ni", a.matrix(), homogeneous)[:, :3]
     np.testing.assert_allclose(a.apply(points), twin, atol=1e-12)
@@ -79,13 +85,17 @@ def test_exp_is_the_matrix_exponential_of_translation_then_rotation() -> None:
         generator = np.zeros((4, 4))
         generator[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
         generator[:3, 3] = v
-        np.testing.assert_allclose(SE3.exp(tangent).matrix(), expm(generator), atol=1e-10)
+        np.testing.assert_allclose(
+            SE3.exp(tangent).matrix(), expm(generator), atol=1e-10
+        )
 
 
 def test_quarter_rotation_about_z_maps_x_to_y() -> None:
     half = math.sqrt(0.5)
     turned = SE3(np.array([half, 0, 0, half]), np.array([1.0, 2.0, 3.0]))
-    np.testing.assert_allclose(turned.apply([1.0, 0.0, 0.0]), [1.0, 3.0, 3.0], atol=1e-15)
+    np.testing.assert_allclose(
+        turned.apply([1.0, 0.0, 0.0]), [1.0, 3.0, 3.0], atol=1e-15
+    )
 
 
 @pytest.mark.parametrize("angle", [1e-9, 1e-4, 1.0, math.pi - 1e-9])
@@ -110,7 +120,9 @@ def test_batches_broadcast_index_stack_and_iterate() -> None:
     assert poses[:, 1:3].shape == (2, 2)
     assert poses[0][np.array([True, False, True, False, False])].shape == (2,)
     points = rng.normal(size=(7, 9, 3))
-    np.testing.assert_allclose(one.apply(points)[6, 8], one.apply(points[6, 8]), atol=1e-14)
+    np.testing.assert_allclose(
+        one.apply(points)[6, 8], one.apply(points[6, 8]), atol=1e-14
+    )
     assert poses[:, :, None].apply(np.zeros((11, 3))).shape == (2, 5, 11, 3)
     assert SE3.stack([]).shape == (0,)
     assert SE3.stack([]).matrix().shape == (0, 4, 4)
@@ -124,7 +136,9 @@ def test_from_matrix_corrects_rounding_and_refuses_other_matrices() -> None:
     assert_close(mended, pose, 2e-4)
     rotation = mended.rotation_matrix()
     np.testing.assert_allclose(
-        rotation @ np.swapaxes(rotation, -1, -2), np.tile(np.eye(3), (50, 1, 1)), atol=1e-12
+        rotation @ np.swapaxes(rotation, -1, -2),
+        np.tile(np.eye(3), (50, 1, 1)),
+        atol=1e-12,
     )
     scaled = pose.matrix()
     scaled[7, :3, :3] *= 1.01
@@ -191,4 +205,6 @@ def test_average_of_one_and_two_poses() -> None:
 def test_unit_quaternions_stay_the_same_to_the_last_bit() -> None:
     random = np.random.default_rng(0).normal(size=(1000, 4))
     once = SE3(random, np.zeros((1000, 3)))
-    assert (SE3(once.rotation_wxyz, once.translation_m).rotation_wxyz == once.rotation_wxyz).all()
+    assert (
+        SE3(once.rotation_wxyz, once.translation_m).rotation_wxyz == once.rotation_wxyz
+    ).all()

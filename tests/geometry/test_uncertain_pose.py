@@ -22,8 +22,12 @@ def sampled(uncertain: UncertainPose, seed: int, count: int = 40_000) -> SE3:
         np.zeros(6), uncertain.covariance, size=count
     )
     rotation = SE3.exp(np.concatenate([np.zeros((count, 3)), draws[:, 3:]], 1))
-    turned = SE3(uncertain.pose.rotation_wxyz[None].repeat(count, 0), np.zeros((count, 3)))
-    return SE3((turned @ rotation).rotation_wxyz, uncertain.pose.translation_m + draws[:, :3])
+    turned = SE3(
+        uncertain.pose.rotation_wxyz[None].repeat(count, 0), np.zeros((count, 3))
+    )
+    return SE3(
+        (turned @ rotation).rotation_wxyz, uncertain.pose.translation_m + draws[:, :3]
+    )
 
 
 def sample_covariance(poses: SE3, mean: SE3) -> np.ndarray:
@@ -38,7 +42,8 @@ def assert_same(estimate: np.ndarray, expected: np.ndarray) -> None:
 
 
 def test_composition_adds_the_errors_of_both() -> None:
-    a, b = UncertainPose(FIRST, covariance(0)), UncertainPose(SECOND, covariance(1))
+    a = UncertainPose(FIRST, covariance(0))
+    b = UncertainPose(SECOND, covariance(1))
     both = a @ b
     draws = sampled(a, 2) @ sampled(b, 3)
     assert_same(both.covariance, sample_covariance(draws, FIRST @ SECOND))
@@ -47,13 +52,19 @@ def test_composition_adds_the_errors_of_both() -> None:
 
 def test_inverse() -> None:
     a = UncertainPose(FIRST, covariance(4))
-    assert_same(a.inverse().covariance, sample_covariance(sampled(a, 5).inverse(), FIRST.inverse()))
-    np.testing.assert_allclose(a.inverse().inverse().covariance, a.covariance, atol=1e-15)
+    assert_same(
+        a.inverse().covariance,
+        sample_covariance(sampled(a, 5).inverse(), FIRST.inverse()),
+    )
+    np.testing.assert_allclose(
+        a.inverse().inverse().covariance, a.covariance, atol=1e-15
+    )
 
 
 def test_exact_transforms_on_either_side() -> None:
     a = UncertainPose(SECOND, covariance(6))
-    left, right = FIRST @ a, a @ FIRST
+    left = FIRST @ a
+    right = a @ FIRST
     assert_same(left.covariance, sample_covariance(FIRST @ sampled(a, 7), left.pose))
     assert_same(right.covariance, sample_covariance(sampled(a, 8) @ FIRST, right.pose))
 
@@ -61,7 +72,9 @@ def test_exact_transforms_on_either_side() -> None:
 def test_common_motion_of_the_cameras_moves_the_base_frame() -> None:
     motion = covariance(9)
     frame = frame_covariance(SE3.stack([FIRST]), motion)
-    draws = np.random.default_rng(10).multivariate_normal(np.zeros(6), motion, size=40_000)
+    draws = np.random.default_rng(10).multivariate_normal(
+        np.zeros(6), motion, size=40_000
+    )
     # exp(x) in the base frame moves FIRST as the drawn motion moves it in the camera frame.
     moved = FIRST @ SE3.exp(draws) @ FIRST.inverse()
     errors = moved.log()
@@ -82,12 +95,16 @@ def test_squared_mahalanobis_has_six_degrees_of_freedom() -> None:
 
 
 @pytest.mark.parametrize("point", [(0.3, -0.2, 0.9), (0.0, 0.0, 0.0)])
-def test_point_moves_as_sampled_poses_move_it(point: tuple[float, float, float]) -> None:
+def test_point_moves_as_sampled_poses_move_it(
+    point: tuple[float, float, float],
+) -> None:
     a = UncertainPose(FIRST, covariance(13))
     moved = sampled(a, 14).apply(np.array(point)) - FIRST.apply(np.array(point))
     expected = moved.T @ moved / len(moved)
     assert_same(a.point_covariance(point), expected)
-    assert a.point_sigma_mm(point) == pytest.approx(1000 * np.sqrt((moved**2).mean()), rel=0.02)
+    assert a.point_sigma_mm(point) == pytest.approx(
+        1000 * np.sqrt((moved**2).mean()), rel=0.02
+    )
 
 
 def test_rotation_error_moves_a_point_ahead_across_and_not_along() -> None:
@@ -95,14 +112,16 @@ def test_rotation_error_moves_a_point_ahead_across_and_not_along() -> None:
     a = UncertainPose(quarter, np.diag([0, 0, 0, 4e-6, 0, 0]))
     # 2 mrad about x move a point 0.5 m along z by 1 mm along -y of the child, x of the parent.
     expected = np.diag([1e-6, 0, 0])
-    np.testing.assert_allclose(a.point_covariance([0.0, 0.0, 0.5]), expected, atol=1e-15)
+    np.testing.assert_allclose(
+        a.point_covariance([0.0, 0.0, 0.5]), expected, atol=1e-15
+    )
     assert a.point_sigma_mm([0.0, 0.0, 0.5]) == pytest.approx(1 / 3**0.5)
 
 
 def test_axis_deviation() -> None:
-    assert axis_deviation(np.diag([1e-6, 4e-6, 4e-6, 1e-4, 1e-4, 1e-4])) == pytest.approx(
-        (3**0.5, np.rad2deg(0.01))
-    )
+    assert axis_deviation(
+        np.diag([1e-6, 4e-6, 4e-6, 1e-4, 1e-4, 1e-4])
+    ) == pytest.approx((3**0.5, np.rad2deg(0.01)))
 
 
 def test_batches_and_other_shapes_are_refused() -> None:

@@ -31,7 +31,9 @@ class Deadly(StoredImage):
     """An image whose first readers are killed."""
 
     def __init__(self, pixels: np.ndarray, marks: Path, times: int):
-        self._pixels, self._marks, self._times = pixels, marks, times
+        self._pixels = pixels
+        self._marks = marks
+        self._times = times
 
     def read(self) -> np.ndarray:
         deaths = len(list(self._marks.iterdir()))
@@ -69,14 +71,18 @@ def few(small: tuple[Recording, ...]) -> Recording:
     return replace(small[0], name="few", train=small[0].train[:3])
 
 
-def test_the_map_is_that_of_learning_in_turn(small: tuple[Recording, ...], tmp_path: Path) -> None:
+def test_the_map_is_that_of_learning_in_turn(
+    small: tuple[Recording, ...], tmp_path: Path
+) -> None:
     # The first recording of another encoder determines the centroids of all scenes.
     own = tmp_path / "own.onnx"
-    own.write_bytes(ENCODER_FILE.read_bytes() + b"\x32\x03own")  # `doc_string` of the model
+    # `doc_string` of the model.
+    own.write_bytes(ENCODER_FILE.read_bytes() + b"\x32\x03own")
     turn, many = (small_map(tmp_path / name, own) for name in ("turn", "many"))
     for recording in small:
         turn.learn(recording, options=QUICK)
-    seen, steps = [], []
+    seen = []
+    steps = []
     reports = many.learn_many(
         small,
         workers=2,
@@ -89,7 +95,9 @@ def test_the_map_is_that_of_learning_in_turn(small: tuple[Recording, ...], tmp_p
     assert reports[0].memory_bytes < reports[1].memory_bytes < reports[2].memory_bytes
     for stage in ("0001-alpha", "0002-beta", "0003-gamma"):
         for name in ("keyframes.safetensors", "scene.json"):
-            one, other = (tmp_path / root / "stages" / stage / name for root in ("turn", "many"))
+            one, other = (
+                tmp_path / root / "stages" / stage / name for root in ("turn", "many")
+            )
             assert one.read_bytes() == other.read_bytes()
 
 
@@ -100,7 +108,9 @@ def test_unusable_recordings_and_killed_workers_do_not_stop_the_others(
     always = deadly(small[2], tmp_path / "always", 99)
     opened = small_map(tmp_path / "map")
     items = (tmp_path / "missing", once, few, always, small[1])
-    with pytest.raises(InputError, match=r"3 of 5 recordings were not learned") as error:
+    with pytest.raises(
+        InputError, match=r"3 of 5 recordings were not learned"
+    ) as error:
         opened.learn_many(items, workers=2, options=QUICK)
     assert f"{items[0]}: no such folder" in str(error.value)
     assert re.search(r"few \(.*3 training", str(error.value))
@@ -144,7 +154,9 @@ if __name__ == "__main__":
 """
 
 
-def test_workers_end_with_their_parent(rooms: tuple[Recording, ...], tmp_path: Path) -> None:
+def test_workers_end_with_their_parent(
+    rooms: tuple[Recording, ...], tmp_path: Path
+) -> None:
     from evercal.recordings.formats import generic
 
     for recording in rooms[:2]:
@@ -153,7 +165,9 @@ def test_workers_end_with_their_parent(rooms: tuple[Recording, ...], tmp_path: P
     script.write_text(PARENT)
     words = [tmp_path / "map", *(tmp_path / recording.name for recording in rooms[:2])]
     with subprocess.Popen([sys.executable, script, *map(str, words)]) as parent:
-        children = wait_for(lambda: [c for c in children_of(parent.pid) if is_worker(c)])
+        children = wait_for(
+            lambda: [c for c in children_of(parent.pid) if is_worker(c)]
+        )
         parent.kill()
     wait_for(lambda: not any(Path(f"/proc/{child}").exists() for child in children))
 
@@ -185,7 +199,9 @@ def wait_for(condition):
     return value
 
 
-def test_stopping_early_ends_the_workers(small: tuple[Recording, ...], few: Recording) -> None:
+def test_stopping_early_ends_the_workers(
+    small: tuple[Recording, ...], few: Recording
+) -> None:
     task = LearnTask(MapContents(load_encoder(), 64), options=QUICK)
     outcomes = learn_scenes(task, (few, *small), 2)
     next(iter(outcomes))

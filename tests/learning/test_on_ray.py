@@ -29,13 +29,17 @@ from evercal.recordings.formats import generic
 
 QUICK = MapOptions(adjust=False)
 pytestmark = [
-    pytest.mark.slow("src/evercal/learning", "src/evercal/recordings", "src/evercal/mapping"),
+    pytest.mark.slow(
+        "src/evercal/learning", "src/evercal/recordings", "src/evercal/mapping"
+    ),
     pytest.mark.filterwarnings("ignore"),  # of Ray: open sockets
 ]
 
 
 @pytest.fixture(scope="module")
-def folders(rooms: tuple[Recording, ...], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def folders(
+    rooms: tuple[Recording, ...], tmp_path_factory: pytest.TempPathFactory
+) -> list[Path]:
     """Recordings of as few frames as a map needs, each in a folder."""
     root = tmp_path_factory.mktemp("recordings")
     for room in rooms:
@@ -63,10 +67,14 @@ def kill_workers(stop: threading.Event, killed: list[int]) -> None:
 
 
 @pytest.fixture
-def contents(tree: Callable[[Path], dict[str, str]]) -> Callable[[Path], dict[str, str]]:
+def contents(
+    tree: Callable[[Path], dict[str, str]],
+) -> Callable[[Path], dict[str, str]]:
     """Checksums of all files of a map but those that state how long it took."""
     varying = ("report.json", "manifest.json")
-    return lambda root: {k: v for k, v in tree(root).items() if Path(k).name not in varying}
+    return lambda root: {
+        k: v for k, v in tree(root).items() if Path(k).name not in varying
+    }
 
 
 def test_the_map_is_the_same_though_workers_and_a_node_go(
@@ -77,13 +85,15 @@ def test_the_map_is_the_same_though_workers_and_a_node_go(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    turn, many = small_map(tmp_path / "turn"), small_map(tmp_path / "many")
+    turn = small_map(tmp_path / "turn")
+    many = small_map(tmp_path / "many")
     for folder in folders:
         turn.learn(folder, options=QUICK)
     # A file of the folder that the program runs in must not become a module of the workers.
     (tmp_path / "cv2.py").write_text("raise SystemExit('imported')")
     monkeypatch.chdir(tmp_path)
-    stop, killed = threading.Event(), list[int]()
+    stop = threading.Event()
+    killed = list[int]()
     killer = threading.Thread(target=kill_workers, args=(stop, killed))
     killer.start()
 
@@ -112,8 +122,11 @@ def test_bad_recordings_and_kept_results(
     contents: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    address, kept = f"file://{folders[1]}", f"file://{tmp_path}/kept"
-    with pytest.raises(InputError, match=r"1 of 3 .* missing \(file:///nowhere/missing: no such"):
+    address = f"file://{folders[1]}"
+    kept = f"file://{tmp_path}/kept"
+    with pytest.raises(
+        InputError, match=r"1 of 3 .* missing \(file:///nowhere/missing: no such"
+    ):
         small_map(tmp_path / "one").learn_many(
             [folders[0], address, "file:///nowhere/missing"],
             ray=cluster.address,
@@ -126,14 +139,19 @@ def test_bad_recordings_and_kept_results(
     )
     assert contents(tmp_path / "two") == contents(tmp_path / "one")
     before = MapStore.open(tmp_path / "one").reports()
-    assert [report.seconds for report in reports] == [report["seconds"] for report in before]
+    assert [report.seconds for report in reports] == [
+        report["seconds"] for report in before
+    ]
     assert len(list((tmp_path / "kept").iterdir())) == 2
 
 
 def test_another_way_of_reading_gets_another_result(folders: list[Path]) -> None:
-    source, contents = RecordingAt.of(f"file://{folders[0]}"), MapContents(load_encoder(), 64)
+    source = RecordingAt.of(f"file://{folders[0]}")
+    contents = MapContents(load_encoder(), 64)
     ways = [partial(read_recording, Reading(every=every)) for every in (1, 1, 2)]
-    files = [LearnTask(contents, read=way, results="kept").result_of(source) for way in ways]
+    files = [
+        LearnTask(contents, read=way, results="kept").result_of(source) for way in ways
+    ]
     assert files[0] == files[1] != files[2]
 
 

@@ -21,10 +21,13 @@ def test_a_pose_where_the_map_locates_its_image_is_not_called_wrong(
     frames = [*hall.train]
     pose = frames[5].base_from_camera
     assert pose is not None
-    frames[5] = replace(frames[5], base_from_camera=pose @ SE3.exp([0.05, 0, 0, 0, 0, 0]))
+    frames[5] = replace(
+        frames[5], base_from_camera=pose @ SE3.exp([0.05, 0, 0, 0, 0, 0])
+    )
     accused = PoseCheck(np.array([3, 5]), np.zeros(0, np.int64))
     monkeypatch.setattr(build, "check_poses", lambda *_: accused)
-    contents, options = MapContents(load_encoder(), 240), MapOptions(adjust=False)
+    contents = MapContents(load_encoder(), 240)
+    options = MapOptions(adjust=False)
     recording = replace(hall, train=tuple(frames))
     _, report = learn_scene(recording, contents, options=options)
     assert report.adjusted is not None

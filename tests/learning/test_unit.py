@@ -19,7 +19,9 @@ from evercal.recordings.frame import Frame, Recording
 def scaled(frames: tuple[Frame, ...], factor: float) -> tuple[Frame, ...]:
     poses = [(frame, frame.base_from_camera) for frame in frames]
     return tuple(
-        replace(f, base_from_camera=SE3(pose.rotation_wxyz, factor * pose.translation_m))
+        replace(
+            f, base_from_camera=SE3(pose.rotation_wxyz, factor * pose.translation_m)
+        )
         for f, pose in poses
         if pose is not None
     )
@@ -31,10 +33,12 @@ def answers(arc: Recording, factor: float) -> tuple[np.ndarray, list[str]]:
     empty = MapContents(load_encoder(), 120)
     scene, _ = learn_scene(recording, empty, memory="50%")
     assert not scene.unit_known
-    localizer, rows = Localizer(empty.with_scene(scene)), []
+    localizer = Localizer(empty.with_scene(scene))
+    rows = []
     test = scaled(arc.test[4:8], factor)
     for frame in test:
-        pose, truth = localizer.localize(frame.read_image()).uncertain_pose, frame.base_from_camera
+        pose = localizer.localize(frame.read_image()).uncertain_pose
+        truth = frame.base_from_camera
         assert pose is not None
         assert truth is not None
         off = pose.pose.translation_m - truth.translation_m
@@ -44,7 +48,9 @@ def answers(arc: Recording, factor: float) -> tuple[np.ndarray, list[str]]:
 
 
 @pytest.mark.parametrize("factor", [0.001, 50.0])
-def test_answers_scale_with_the_unit(factor: float, arcs: tuple[Recording, Recording]) -> None:
+def test_answers_scale_with_the_unit(
+    factor: float, arcs: tuple[Recording, Recording]
+) -> None:
     rows, states = answers(arcs[0], 1.0)
     again, others = answers(arcs[0], factor)
     assert rows[:, 0].max() < 0.02

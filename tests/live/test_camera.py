@@ -30,13 +30,17 @@ def test_a_folder_gives_its_images_in_order(tmp_path: Path) -> None:
             source.read()
 
 
-def test_a_live_image_is_not_older_than_the_call(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_live_image_is_not_older_than_the_call(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     closed = []
 
     def frames(source: str, rate: float) -> Iterator[StreamFrame]:
         try:
             for i in range(400):
-                yield StreamFrame(str(i), time.time(), picture(i % 250), time.monotonic())
+                yield StreamFrame(
+                    str(i), time.time(), picture(i % 250), time.monotonic()
+                )
                 time.sleep(0.005)
         finally:
             closed.append(source)
@@ -67,9 +71,14 @@ def test_an_image_from_before_the_call_is_not_given_after_the_clock_steps_back(
         assert int(source.read()[1][0, 0, 0]) == 1
 
 
-def test_a_live_source_that_stops_or_fails_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_live_source_that_stops_or_fails_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(camera, "stream", lambda source, rate: iter(()))
-    with StreamCamera("rtsp://cell") as source, pytest.raises(InputError, match="rtsp://cell"):
+    with (
+        StreamCamera("rtsp://cell") as source,
+        pytest.raises(InputError, match="rtsp://cell"),
+    ):
         source.read()
 
     def frames(source: str, rate: float) -> Iterator[StreamFrame]:

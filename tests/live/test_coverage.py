@@ -20,12 +20,17 @@ def turned(count: int, spread_deg: tuple[float, float, float]) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("spread_deg", "rank"), [((0, 0, 0), 0), ((20, 0, 0), 1), ((20, 0, 20), 2), ((20, 20, 20), 3)]
+    ("spread_deg", "rank"),
+    [((0, 0, 0), 0), ((20, 0, 0), 1), ((20, 0, 20), 2), ((20, 20, 20), 3)],
 )
-def test_rank_counts_axes_of_rotation(spread_deg: tuple[float, float, float], rank: int) -> None:
+def test_rank_counts_axes_of_rotation(
+    spread_deg: tuple[float, float, float], rank: int
+) -> None:
     found = coverage(samples(turned(30, spread_deg)))
     assert found.rotation_rank == rank
-    assert [axis.covered for axis in found.rotations] == [spread > 0 for spread in spread_deg]
+    assert [axis.covered for axis in found.rotations] == [
+        spread > 0 for spread in spread_deg
+    ]
     assert found.ready == (rank >= 2)
     for axis, spread in zip(found.rotations, spread_deg, strict=True):
         assert axis.spread == pytest.approx(spread, rel=0.35, abs=3.0)
@@ -72,6 +77,7 @@ def test_sharpness_falls_with_blur_in_any_direction_and_not_with_contrast() -> N
 
 def test_clipped_share_counts_black_and_white() -> None:
     image = np.full((10, 10, 3), 100, np.uint8)
-    image[:2], image[2:3] = 255, 0
+    image[:2] = 255
+    image[2:3] = 0
     image[5, :, 0] = 255  # red, not white
     assert clipped_share(image) == pytest.approx(0.3)

@@ -29,7 +29,9 @@ def assert_same(a: SE3, b: SE3) -> None:
 
 
 def test_the_last_complete_row_wins_at_every_byte(tmp_path: Path) -> None:
-    path, three, header = tmp_path / "poses.csv", poses(2), f"# written by a program\n#{HEADER}"
+    path = tmp_path / "poses.csv"
+    three = poses(2)
+    header = f"# written by a program\n#{HEADER}"
     rows = [row(i, pose) for i, pose in enumerate(three)]
     whole = header + "".join(rows)
     robot = PoseFileRobot(path)
@@ -41,7 +43,8 @@ def test_the_last_complete_row_wins_at_every_byte(tmp_path: Path) -> None:
 
 
 def test_json_lines(tmp_path: Path) -> None:
-    path, two = tmp_path / "poses.jsonl", poses(2)
+    path = tmp_path / "poses.jsonl"
+    two = poses(2)
     entries = [
         json.dumps(
             {
@@ -69,7 +72,11 @@ def test_a_long_file_without_header_in_a_robots_convention(tmp_path: Path) -> No
 def test_bad_files_are_named(tmp_path: Path) -> None:
     path = tmp_path / "poses.csv"
     robot = PoseFileRobot(path, most_age_s=60.0)
-    for text, words in ((None, "missing"), ("", "no complete line"), (HEADER, "no line of num")):
+    for text, words in (
+        (None, "missing"),
+        ("", "no complete line"),
+        (HEADER, "no line of num"),
+    ):
         if text is not None:
             path.write_text(text)
         with pytest.raises(InputError, match=words) as error:

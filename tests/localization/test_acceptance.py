@@ -6,12 +6,19 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3, UncertainPose
-from evercal.localization.acceptance import CHANCE, FALSE_ACCEPTS, SAME_SURFACE, accepted, support
+from evercal.localization.acceptance import (
+    CHANCE,
+    FALSE_ACCEPTS,
+    SAME_SURFACE,
+    accepted,
+    support,
+)
 from evercal.localization.query import Hypothesis
 
 
 def hypothesis(inliers: int, expected: int) -> Hypothesis:
-    points, pose = np.zeros((inliers, 3)), UncertainPose(SE3.identity(), np.eye(6))
+    points = np.zeros((inliers, 3))
+    pose = UncertainPose(SE3.identity(), np.eye(6))
     return Hypothesis(0, pose, None, points[:, :2], points, expected, inliers)
 
 

@@ -31,27 +31,39 @@ def test_moved_points_shift_their_pixels() -> None:
     points = POSE.apply(rng.uniform([-1, -0.8, 1.5], [1, 0.8, 4.0], (40, 3)))
     moves = rng.normal(0, 1e-5, (40, 3))
     inverse = POSE.inverse()
-    shift = _shift_px(points, moves, inverse.rotation_matrix(), inverse.translation_m, CAMERA)
+    shift = _shift_px(
+        points, moves, inverse.rotation_matrix(), inverse.translation_m, CAMERA
+    )
     before, after = (CAMERA.project(inverse.apply(p)) for p in (points, points + moves))
     np.testing.assert_allclose(shift, after - before, rtol=1e-3, atol=1e-7)
 
 
 def test_depth_errors_shift_pixels_only_away_from_the_keyframe() -> None:
-    points = POSE.apply(np.random.default_rng(1).uniform([-1, -1, 1], [1, 1, 4], (20, 3)))
+    points = POSE.apply(
+        np.random.default_rng(1).uniform([-1, -1, 1], [1, 1, 4], (20, 3))
+    )
     inverse = POSE.inverse()
     along = 0.05 * (points - POSE.translation_m)
-    rotation, position = inverse.rotation_matrix(), inverse.translation_m
-    np.testing.assert_allclose(_shift_px(points, along, rotation, position, CAMERA), 0, atol=1e-9)
+    rotation = inverse.rotation_matrix()
+    position = inverse.translation_m
+    np.testing.assert_allclose(
+        _shift_px(points, along, rotation, position, CAMERA), 0, atol=1e-9
+    )
     beside = SE3.exp(np.array([0.3, 0, 0, 0, 0, 0])) @ inverse
-    rotation, position = beside.rotation_matrix(), beside.translation_m
-    assert np.abs(_shift_px(points, along, rotation, position, CAMERA)[:, 0]).min() > 0.5
+    rotation = beside.rotation_matrix()
+    position = beside.translation_m
+    assert (
+        np.abs(_shift_px(points, along, rotation, position, CAMERA)[:, 0]).min() > 0.5
+    )
 
 
 def test_distorted_image_is_located(hall: Recording, hall_map: MapContents) -> None:
     frame = hall.test[1]
     camera = replace(frame.camera, distortion=(-0.25, 0.0, 0.0, 0.0))
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    source = frame.camera.project(camera.unproject(np.stack([u, v], -1))).astype(np.float32)
+    source = frame.camera.project(camera.unproject(np.stack([u, v], -1))).astype(
+        np.float32
+    )
     image = cv2.remap(frame.read_image(), source, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
     estimate = Localizer(hall_map).localize(image, camera)
     assert estimate.base_from_camera is not None
@@ -69,18 +81,28 @@ def texture(height: int = 240, width: int = 320) -> np.ndarray:
 
 
 def spots(count: int) -> Array:
-    return np.random.default_rng(1).integers([20, 20], [300, 220], (count, 2)).astype(float)
+    return (
+        np.random.default_rng(1)
+        .integers([20, 20], [300, 220], (count, 2))
+        .astype(float)
+    )
 
 
 def wall(image: np.ndarray, pixels: Array) -> AlignedLandmarks:
     """Landmarks on a wall two metres ahead of a keyframe at the origin."""
     count = len(pixels)
-    flat = Landmarks(pixels, np.full(count, 0.5), np.zeros((count, 2)), np.full(count, 1e-3))
+    flat = Landmarks(
+        pixels, np.full(count, 0.5), np.zeros((count, 2)), np.full(count, 1e-3)
+    )
     patches = [
-        cut_patches(level, to_level(pixels, i)) for i, level in enumerate(image_pyramid(image, 2))
+        cut_patches(level, to_level(pixels, i))
+        for i, level in enumerate(image_pyramid(image, 2))
     ]
     return AlignedLandmarks(
-        flat.surface(CAMERA), flat.sigma / flat.inverse_depth, np.zeros(3), tuple(patches)
+        flat.surface(CAMERA),
+        flat.sigma / flat.inverse_depth,
+        np.zeros(3),
+        tuple(patches),
     )
 
 
@@ -89,7 +111,8 @@ def aligned(count: int, options: AlignmentOptions | None = None) -> RefinedPose 
     image = texture()
     start = SE3.exp([0.01, -0.01, 0.005, 0.004, -0.003, 0.002])
     pyramid = image_pyramid(image, 2)
-    walls, options = [wall(image, spots(count))], options or AlignmentOptions()
+    walls = [wall(image, spots(count))]
+    options = options or AlignmentOptions()
     return align_pose(pyramid, CAMERA, walls, start, options, NOT_STATED)
 
 
@@ -110,7 +133,8 @@ def test_few_matches_widen_the_next_search() -> None:
     keyframe = wall(image, spots(3000))
     image[:, 90:] = 0
     start = SE3.exp([0.002, 0, 0, 0, 0, 0])
-    pyramid, options = image_pyramid(image, 2), AlignmentOptions()
+    pyramid = image_pyramid(image, 2)
+    options = AlignmentOptions()
     occluded = align_pose(pyramid, CAMERA, [keyframe], start, options, NOT_STATED)
     assert occluded is not None
     assert 900 < occluded.observed.expected <= 2700
@@ -123,7 +147,8 @@ def test_too_few_landmarks_give_no_pose() -> None:
 
 def test_pattern_of_a_keyframe_has_the_period_of_its_wall() -> None:
     across = np.meshgrid(np.arange(20.0, 300, 20), np.arange(20.0, 220, 20))
-    pixels, period = np.stack(across, -1).reshape(-1, 2), 40 * 2 / np.array([290, 280])
+    pixels = np.stack(across, -1).reshape(-1, 2)
+    period = 40 * 2 / np.array([290, 280])
     keyframe = wall(np.tile(texture(40, 40), (6, 8)), pixels)
     steps = keyframe.pattern
     assert keyframe.pattern is steps  # it is calculated once

@@ -30,7 +30,9 @@ def test_few_keyframes_locate_the_other_frames(
         estimate = localizer.localize(frame.read_image())
         assert estimate.base_from_camera is not None
         assert frame.base_from_camera is not None
-        assert pose_distance(estimate.base_from_camera, frame.base_from_camera)[0] < 0.01
+        assert (
+            pose_distance(estimate.base_from_camera, frame.base_from_camera)[0] < 0.01
+        )
 
 
 def test_all_keyframes_are_kept_if_fewer_are_worse(
@@ -39,7 +41,11 @@ def test_all_keyframes_are_kept_if_fewer_are_worse(
     empty: MapContents,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for name, value in {"SHARES": (0.05, 0.2), "MOST_M": 1e-9, "PROBE_FRAMES": 8}.items():
+    for name, value in {
+        "SHARES": (0.05, 0.2),
+        "MOST_M": 1e-9,
+        "PROBE_FRAMES": 8,
+    }.items():
         monkeypatch.setattr(f"evercal.learning.fewest_keyframes.{name}", value)
     selected = fewest_keyframes(empty, hall_built, hall.train)
     np.testing.assert_array_equal(selected, np.arange(7))
@@ -48,10 +54,15 @@ def test_all_keyframes_are_kept_if_fewer_are_worse(
 def test_all_keyframes_are_kept_without_other_frames(
     hall: Recording, hall_built: BuiltMap, empty: MapContents
 ) -> None:
-    keyframes = [frame for frame in hall.train if frame.name in hall_built.keyframe_names]
+    keyframes = [
+        frame for frame in hall.train if frame.name in hall_built.keyframe_names
+    ]
     steps: list[tuple[str, int, int]] = []
     selected = fewest_keyframes(
-        empty, hall_built, keyframes, lambda *step: steps.append((step[0], step[1], step[2]))
+        empty,
+        hall_built,
+        keyframes,
+        lambda *step: steps.append((step[0], step[1], step[2])),
     )
     np.testing.assert_array_equal(selected, np.arange(7))
     assert steps[-1][1] == steps[-1][2]

@@ -29,11 +29,14 @@ def answer(
     rng = np.random.default_rng(seed)
     pixels = rng.uniform((5, 5), (634, 474), (400, 2))
     camera = CAMERA.zoomed(longer)
-    rays, normal = camera.unproject(pixels), np.array([np.sin(tilt), 0, np.cos(tilt)])
+    rays = camera.unproject(pixels)
+    normal = np.array([np.sin(tilt), 0, np.cos(tilt)])
     points = rays * (2 / (rays @ normal))[:, None]
     white = np.repeat(10 * np.eye(2)[..., None], 400, 2)
     seen = Observed(pixels + rng.normal(0, 0.05, pixels.shape), points, white)
-    refined = self_calibrated(seen, CAMERA, (np.eye(3), np.zeros(3)), np.zeros(5), prior)
+    refined = self_calibrated(
+        seen, CAMERA, (np.eye(3), np.zeros(3)), np.zeros(5), prior
+    )
     for _ in range(3):
         at = refined.pose.pose.rotation_matrix(), refined.pose.pose.translation_m
         refined = self_calibrated(seen, CAMERA, at, refined.change, prior)
@@ -50,7 +53,9 @@ def answer(
         (STATED, 1.02, 0.6),
     ],
 )
-def test_a_wrong_focal_length_is_wide(prior: IntrinsicsPrior, longer: float, tilt: float) -> None:
+def test_a_wrong_focal_length_is_wide(
+    prior: IntrinsicsPrior, longer: float, tilt: float
+) -> None:
     for seed in range(5):
         error, sigma = answer(prior, longer, tilt, seed)
         assert error < 0.01 or sigma > 0.05 or error < 4 * sigma

@@ -29,7 +29,8 @@ def features(seed: int, contents: MapContents) -> NDArray[np.float32]:
 
 
 def test_retrieval_ranks_the_keyframes_of_all_scenes(several: MapContents) -> None:
-    bank, descriptors = KeyframeBank(several, 9), several.scenes[1].keyframes.descriptors
+    bank = KeyframeBank(several, 9)
+    descriptors = several.scenes[1].keyframes.descriptors
     assert len(bank.scene) == 21
     assert descriptors is not None
     for seed in range(5):
@@ -57,12 +58,16 @@ def test_keyframes_that_are_not_in_use_are_not_ranked(several: MapContents) -> N
 
 
 @pytest.mark.parametrize("most", [1, 3, 7])
-def test_least_recently_used_keyframes_are_dropped(most: int, hall_map: MapContents) -> None:
-    bank, rng = KeyframeBank(hall_map, most), np.random.default_rng(0)
+def test_least_recently_used_keyframes_are_dropped(
+    most: int, hall_map: MapContents
+) -> None:
+    bank = KeyframeBank(hall_map, most)
+    rng = np.random.default_rng(0)
     recent: dict[int, object] = {}
     dropped: list[object] = []
     for index in rng.integers(0, 7, 25).tolist():
-        loaded, expected = bank.load(index), recent.pop(index, None)
+        loaded = bank.load(index)
+        expected = recent.pop(index, None)
         assert expected is None or loaded is expected
         assert expected is not None or loaded not in dropped
         recent[index] = loaded
@@ -71,15 +76,21 @@ def test_least_recently_used_keyframes_are_dropped(most: int, hall_map: MapConte
 
 
 def test_landmarks_project_to_their_pixels(hall_map: MapContents) -> None:
-    bank, keyframes = KeyframeBank(hall_map, 9), hall_map.scenes[0].keyframes
+    bank = KeyframeBank(hall_map, 9)
+    keyframes = hall_map.scenes[0].keyframes
     for i, landmarks in enumerate(keyframes.landmarks):
-        loaded, pose = bank.load(i).landmarks, keyframes.base_from_camera[i]
+        loaded = bank.load(i).landmarks
+        pose = keyframes.base_from_camera[i]
         pixels = keyframes.cameras[i].project(pose.inverse().apply(loaded.surface_m[0]))
         np.testing.assert_allclose(pixels, landmarks.pixels, atol=1e-6)
         np.testing.assert_array_equal(loaded.position_m, pose.translation_m)
         cells = bank.load(i).cells
         assert len(cells.points_m) == len(cells.features) == 30 * 40
-        assert len(loaded.depth_noise) == len(landmarks) == len(loaded.patches[0].templates)
+        assert (
+            len(loaded.depth_noise)
+            == len(landmarks)
+            == len(loaded.patches[0].templates)
+        )
 
 
 class Counted(Encoder):

@@ -14,7 +14,13 @@ from evercal.features.encoder import load_encoder
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization import acceptance
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.intrinsics import NOT_STATED, OWN, STATED, cameras_in_scenes, prior_of
+from evercal.localization.intrinsics import (
+    NOT_STATED,
+    OWN,
+    STATED,
+    cameras_in_scenes,
+    prior_of,
+)
 from evercal.localization.localizer import Localizer
 from evercal.localization.parallel import in_parallel
 from evercal.localization.pnp import PnpOptions
@@ -36,7 +42,13 @@ def everything(estimate: PoseEstimate) -> list[bytes | object]:
     arrays = [estimate.covariance, estimate.pixels, estimate.points_m]
     if estimate.base_from_camera is not None:
         arrays.append(estimate.base_from_camera.matrix())
-    plain = [estimate.status, estimate.reason, estimate.scene, estimate.inliers, estimate.support]
+    plain = [
+        estimate.status,
+        estimate.reason,
+        estimate.scene,
+        estimate.inliers,
+        estimate.support,
+    ]
     return [*plain, *(None if array is None else array.tobytes() for array in arrays)]
 
 
@@ -77,7 +89,9 @@ def estimates(localizer: Localizer, views: tuple[Frame, ...]) -> list[PoseEstima
 def test_new_views_are_located_to_millimetres(
     estimates: list[PoseEstimate], views: tuple[Frame, ...]
 ) -> None:
-    errors = np.array([error(e, f.base_from_camera) for e, f in zip(estimates, views, strict=True)])
+    errors = np.array(
+        [error(e, f.base_from_camera) for e, f in zip(estimates, views, strict=True)]
+    )
     assert np.median(errors[:, 0]) < 0.003
     assert errors[:, 0].max() < 0.02
     assert np.median(errors[:, 1]) < np.deg2rad(0.1)
@@ -89,7 +103,9 @@ def test_new_views_are_located_to_millimetres(
         assert estimate.base_from_camera is not None
         assert len(estimate.pixels) == len(estimate.points_m) == estimate.inliers > 100
         assert 0.3 < estimate.inlier_ratio <= 1
-        projected = CAMERA.project(estimate.base_from_camera.inverse().apply(estimate.points_m))
+        projected = CAMERA.project(
+            estimate.base_from_camera.inverse().apply(estimate.points_m)
+        )
         assert np.linalg.norm(projected - estimate.pixels, axis=1).max() < 1.1
 
 
@@ -97,7 +113,8 @@ def test_alignment_halves_the_error_of_pnp(
     estimates: list[PoseEstimate], views: tuple[Frame, ...], hall_map: MapContents
 ) -> None:
     rough = Localizer(hall_map, LocalizeOptions(align=False))
-    by_pnp, aligned = [], []
+    by_pnp = []
+    aligned = []
     for f, estimate in list(zip(views, estimates, strict=True))[::2]:
         located = rough.localize(f.read_image(), f.camera)
         by_pnp.append(error(located, f.base_from_camera))
@@ -113,8 +130,12 @@ def test_covariance_matches_the_errors(
         assert estimate.uncertain_pose is not None
         assert estimate.covariance is not None
         assert frame.base_from_camera is not None
-        np.testing.assert_allclose(estimate.covariance, estimate.covariance.T, atol=1e-12)
-        squares.append(estimate.uncertain_pose.squared_mahalanobis(frame.base_from_camera))
+        np.testing.assert_allclose(
+            estimate.covariance, estimate.covariance.T, atol=1e-12
+        )
+        squares.append(
+            estimate.uncertain_pose.squared_mahalanobis(frame.base_from_camera)
+        )
     # The median is 5.3 for six Gaussian axes. A rendered room without clutter gives smaller errors.
     # A covariance that is wrong by a factor of three is outside of the bounds.
     assert 0.3 < np.median(squares) < 4.5
@@ -122,9 +143,12 @@ def test_covariance_matches_the_errors(
 
 @pytest.mark.parametrize("seed", [77, 78, 79])
 def test_other_rooms_are_rejected(seed: int, localizer: Localizer) -> None:
-    room, rng = BoxRoom(seed, texture_px=192), np.random.default_rng(seed)
+    room = BoxRoom(seed, texture_px=192)
+    rng = np.random.default_rng(seed)
     for _ in range(2):
-        estimate = localizer.localize(room.render(CAMERA, room.random_view(rng)), CAMERA)
+        estimate = localizer.localize(
+            room.render(CAMERA, room.random_view(rng)), CAMERA
+        )
         assert estimate.status in ("unknown_scene", "failed")
         assert estimate.reason
         assert estimate.scene is None
@@ -133,7 +157,9 @@ def test_other_rooms_are_rejected(seed: int, localizer: Localizer) -> None:
 
 
 @pytest.mark.parametrize("level", [0, 128, 255, None])
-def test_blank_images_and_noise_are_rejected(level: int | None, localizer: Localizer) -> None:
+def test_blank_images_and_noise_are_rejected(
+    level: int | None, localizer: Localizer
+) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3)).astype(np.uint8)
     image = noise if level is None else np.full((240, 320, 3), level, np.uint8)
     estimate = localizer.localize(image, CAMERA)
@@ -141,7 +167,9 @@ def test_blank_images_and_noise_are_rejected(level: int | None, localizer: Local
     assert estimate.base_from_camera is None
 
 
-def test_image_without_six_inliers_fails(hall_map: MapContents, hall: Recording) -> None:
+def test_image_without_six_inliers_fails(
+    hall_map: MapContents, hall: Recording
+) -> None:
     strict = LocalizeOptions(pnp=PnpOptions(threshold_px=1e-7))
     estimate = Localizer(hall_map, strict).localize(hall.test[1].read_image())
     assert estimate.status == "failed"
@@ -165,7 +193,8 @@ def test_estimates_do_not_depend_on_earlier_images(
 @pytest.mark.usefixtures("two_threads")
 def test_batch_equals_single_images(hall: Recording, hall_map: MapContents) -> None:
     frames = hall.test[1:13:4]
-    single, fresh = Localizer(hall_map), Localizer(hall_map)
+    single = Localizer(hall_map)
+    fresh = Localizer(hall_map)
     # A localizer without decoded keyframes loads them in both threads at once.
     batch = in_parallel(lambda f: fresh.localize(f.read_image(), f.camera), frames)
     for frame, estimate in zip(frames, batch, strict=True):
@@ -174,7 +203,10 @@ def test_batch_equals_single_images(hall: Recording, hall_map: MapContents) -> N
 
 
 def test_map_on_disk_gives_the_same_poses(
-    estimates: list[PoseEstimate], views: tuple[Frame, ...], hall_map: MapContents, tmp_path: Path
+    estimates: list[PoseEstimate],
+    views: tuple[Frame, ...],
+    hall_map: MapContents,
+    tmp_path: Path,
 ) -> None:
     MapStore(tmp_path / "map", with_scene(hall_map, hall_map.scenes[0])).commit(
         hall_map.scenes[0], {}
@@ -198,7 +230,9 @@ def test_pose_and_points_are_in_the_base_frame_of_an_aligned_scene(
     assert estimates[0].points_m is not None
     assert estimate.points_m is not None
     assert max(error(estimate, similarity.pose(estimates[0].base_from_camera))) < 1e-9
-    np.testing.assert_allclose(estimate.points_m, similarity.points(estimates[0].points_m))
+    np.testing.assert_allclose(
+        estimate.points_m, similarity.points(estimates[0].points_m)
+    )
 
 
 def test_support_below_the_threshold_is_rejected(
@@ -218,13 +252,18 @@ def test_support_below_the_threshold_is_rejected(
 def test_default_camera_is_the_adjusted_one(
     hall_map: MapContents, views: tuple[Frame, ...]
 ) -> None:
-    scene, camera = hall_map.scenes[0], views[0].camera
+    scene = hall_map.scenes[0]
+    camera = views[0].camera
     longer = replace(scene.camera, fx=1.03 * scene.camera.fx, fy=1.03 * scene.camera.fy)
     localizer = Localizer(with_scene(hall_map, replace(scene, adjusted_camera=longer)))
     asked = cameras_in_scenes(None, views[0].read_image(), localizer.contents.scenes)
     assert asked == [longer]
-    assert cameras_in_scenes(camera, views[0].read_image(), localizer.contents.scenes) == [longer]
-    assert cameras_in_scenes(longer, views[0].read_image(), localizer.contents.scenes) == [longer]
+    assert cameras_in_scenes(
+        camera, views[0].read_image(), localizer.contents.scenes
+    ) == [longer]
+    assert cameras_in_scenes(
+        longer, views[0].read_image(), localizer.contents.scenes
+    ) == [longer]
     # Another scene has its own adjusted camera.
     both = [replace(scene, adjusted_camera=longer), replace(scene, camera=longer)]
     expected = [longer, scene.adjusted_camera]
@@ -242,10 +281,14 @@ def test_wrong_focal_length_is_corrected(
         assert estimate.camera.fx == pytest.approx(frame.camera.fx, rel=0.01)
         assert estimate.uncertain_pose is not None
         assert frame.base_from_camera is not None
-        assert estimate.uncertain_pose.squared_mahalanobis(frame.base_from_camera) < 22.5
+        assert (
+            estimate.uncertain_pose.squared_mahalanobis(frame.base_from_camera) < 22.5
+        )
 
 
-def test_camera_of_a_crop_is_estimated(localizer: Localizer, views: tuple[Frame, ...]) -> None:
+def test_camera_of_a_crop_is_estimated(
+    localizer: Localizer, views: tuple[Frame, ...]
+) -> None:
     for frame in views[:3]:
         image = np.ascontiguousarray(frame.read_image()[20:220, 40:280])
         estimate = localizer.localize(image)
@@ -266,8 +309,11 @@ def test_turned_images_are_located(
     assert error(localizer.localize(image), turned)[0] < 0.02
 
 
-def test_prior_of_a_stated_camera(localizer: Localizer, views: tuple[Frame, ...]) -> None:
-    scene, image = localizer.contents.scenes[0], views[0].read_image()
+def test_prior_of_a_stated_camera(
+    localizer: Localizer, views: tuple[Frame, ...]
+) -> None:
+    scene = localizer.contents.scenes[0]
+    image = views[0].read_image()
     recorded = scene.camera
     other = replace(recorded, fx=1.0005 * recorded.fx)
     cameras = (recorded, scene.adjusted_camera, other, None)
@@ -279,12 +325,17 @@ def test_prior_of_a_stated_camera(localizer: Localizer, views: tuple[Frame, ...]
 def test_images_and_cameras_have_any_size(
     size: tuple[int, int], localizer: Localizer, views: tuple[Frame, ...]
 ) -> None:
-    image, camera = resized(views[0], *size), views[0].camera
+    image = resized(views[0], *size)
+    camera = views[0].camera
     for given in (None, camera, camera.resized(1280, 960)):
-        assert error(localizer.localize(image, given), views[0].base_from_camera)[0] < 0.01
+        assert (
+            error(localizer.localize(image, given), views[0].base_from_camera)[0] < 0.01
+        )
 
 
-def test_portrait_image_of_a_given_camera(localizer: Localizer, hall_room: BoxRoom) -> None:
+def test_portrait_image_of_a_given_camera(
+    localizer: Localizer, hall_room: BoxRoom
+) -> None:
     camera = Camera(240, 320, 262.0, 262.0, 119.5, 159.5)
     truth = hall_view(hall_room)
     estimate = localizer.localize(hall_room.render(camera, truth), camera)
@@ -295,8 +346,11 @@ def test_portrait_image_of_a_given_camera(localizer: Localizer, hall_room: BoxRo
     assert "its position is uncertain by" in unknown.reason
 
 
-def test_terms_sum_to_the_covariance(localizer: Localizer, views: tuple[Frame, ...]) -> None:
-    image, camera = views[1].read_image(), views[1].camera
+def test_terms_sum_to_the_covariance(
+    localizer: Localizer, views: tuple[Frame, ...]
+) -> None:
+    image = views[1].read_image()
+    camera = views[1].camera
     own = localizer.localize(image, camera)
     stated = localizer.localize(image, replace(camera, fx=1.0001 * camera.fx))
     for estimate in (own, stated):
@@ -315,11 +369,14 @@ def hall_view(room: BoxRoom) -> SE3:
     """A pose in the middle of the walk through the hall."""
     from evercal.simulation.box_room import look_at
 
-    eye, heading = np.array([0.0, 0.0, 1.3]), 34 + 0.45
+    eye = np.array([0.0, 0.0, 1.3])
+    heading = 34 + 0.45
     return look_at(eye, eye + np.array([np.cos(heading), np.sin(heading), -0.1]), 0.0)
 
 
-def test_grey_image_equals_its_rgb_image(localizer: Localizer, views: tuple[Frame, ...]) -> None:
+def test_grey_image_equals_its_rgb_image(
+    localizer: Localizer, views: tuple[Frame, ...]
+) -> None:
     grey = cv2.cvtColor(views[0].read_image(), cv2.COLOR_RGB2GRAY)
     rgb = np.repeat(grey[..., None], 3, -1)
     assert everything(localizer.localize(grey)) == everything(localizer.localize(rgb))
@@ -327,7 +384,9 @@ def test_grey_image_equals_its_rgb_image(localizer: Localizer, views: tuple[Fram
 
 def test_camera_of_another_aspect_ratio_is_refused(localizer: Localizer) -> None:
     image = np.zeros((90, 160, 3), np.uint8)
-    with pytest.raises(InputError, match="camera 320x240 does not fit the image 160x90"):
+    with pytest.raises(
+        InputError, match="camera 320x240 does not fit the image 160x90"
+    ):
         localizer.localize(image, CAMERA)
     with pytest.raises(InputError, match="image"):
         localizer.localize(image[..., :2])

@@ -48,7 +48,8 @@ def test_matches_are_the_most_similar_cells_of_all_keyframes(
     spots = [(i, j) for i in range(0, rows, 2) for j in range(0, columns, 2)]
     similar = np.array([features @ query.features[i, j] for i, j in spots])
     order = np.argsort(-similar.max(1), kind="stable")  # the most similar first
-    nearest, pixels = similar.argmax(1), np.array([(8 * j + 3.5, 8 * i + 3.5) for i, j in spots])
+    nearest = similar.argmax(1)
+    pixels = np.array([(8 * j + 3.5, 8 * i + 3.5) for i, j in spots])
     same = (matches.points_m == points[nearest[order]]).all(1)
     same &= (matches.pixels == pixels[order]).all(1)
     assert np.mean(same) > 0.98  # equal to rounding
@@ -60,19 +61,25 @@ def test_matches_are_the_most_similar_cells_of_all_keyframes(
 def test_similarities_are_calculated_once(
     localizer: Localizer, frame: Frame, hall_map: MapContents
 ) -> None:
-    query, attempt = query_of(frame.read_image(), hall_map), Attempt(7, 4)
+    query = query_of(frame.read_image(), hall_map)
+    attempt = Attempt(7, 4)
     (candidate,) = localizer._matcher.candidates(query, attempt)
     assert set(query.similar) == {(4, k) for k in range(7)}
     known = dict(query.similar)
     again = query_of(frame.read_image(), hall_map)
-    one, other = (localizer._matcher.matches(q, candidate, frame.camera) for q in (query, again))
+    one, other = (
+        localizer._matcher.matches(q, candidate, frame.camera) for q in (query, again)
+    )
     assert query.similar == known
     for a, b in zip(one, other, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 def test_every_patch_is_matched_before_a_repeated_pattern(
-    localizer: Localizer, frame: Frame, hall_map: MapContents, monkeypatch: pytest.MonkeyPatch
+    localizer: Localizer,
+    frame: Frame,
+    hall_map: MapContents,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(localizer._bank, "pattern", lambda _: np.eye(3))
     query = query_of(frame.read_image(), hall_map)
@@ -108,7 +115,8 @@ def test_matches_of_a_magnified_image_are_at_the_same_places(
 def test_noise_is_no_turned_image(
     localizer: Localizer, frame: Frame, hall_map: MapContents
 ) -> None:
-    image, rng = frame.read_image().copy(), np.random.default_rng(0)
+    image = frame.read_image().copy()
+    rng = np.random.default_rng(0)
     image[:, 80:] = rng.integers(0, 256, image[:, 80:].shape)
     assert localizer._matcher.upright(query_of(image, hall_map)).turns == 0
 
@@ -116,20 +124,26 @@ def test_noise_is_no_turned_image(
 def test_a_pose_beside_the_true_one_converges(
     localizer: Localizer, frame: Frame, hall_map: MapContents
 ) -> None:
-    truth, query = truth_of(frame), query_of(frame.read_image(), hall_map)
+    truth = truth_of(frame)
+    query = query_of(frame.read_image(), hall_map)
     beside = truth @ SE3.exp([0.04, 0.02, 0, 0, 0.01, 0])
     (candidate,) = localizer._matcher.candidates(query, Attempt(7, 4))
     found = localizer.aligned(query, candidate, frame.camera, beside, np.zeros(5))
     assert found is not None
     assert found.pose is not None
-    assert pose_distance(found.pose.pose, truth)[0] < 0.01 < pose_distance(beside, truth)[0]
+    assert (
+        pose_distance(found.pose.pose, truth)[0]
+        < 0.01
+        < pose_distance(beside, truth)[0]
+    )
 
 
 def test_a_pose_of_little_support_is_aligned_to_the_keyframes_that_see_its_view(
     hall_map: MapContents, frame: Frame
 ) -> None:
     localizer = Localizer(hall_map, LocalizeOptions(keyframes=2, immediate=99))
-    truth, query = truth_of(frame), query_of(frame.read_image(), hall_map)
+    truth = truth_of(frame)
+    query = query_of(frame.read_image(), hall_map)
     ranked = localizer._bank.seen(0, truth, frame.camera)
     supports = []
     for chosen in (ranked[-2:], ranked[:2]):

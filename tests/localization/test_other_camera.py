@@ -20,10 +20,14 @@ if TYPE_CHECKING:
 
 
 def deviations(
-    hall: Recording, room: BoxRoom, contents: MapContents, change: tuple[float, float, float]
+    hall: Recording,
+    room: BoxRoom,
+    contents: MapContents,
+    change: tuple[float, float, float],
 ) -> list[float]:
     """Squared deviations of located images by a camera with changed intrinsics."""
-    localizer, squares = Localizer(contents), []
+    localizer = Localizer(contents)
+    squares = []
     factor, *shift = change
     for frame in hall.test[1::5]:
         zoomed = frame.camera.zoomed(factor)

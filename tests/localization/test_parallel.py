@@ -21,11 +21,15 @@ def test_results_come_in_the_order_of_the_items(two_threads: None) -> None:
     assert list(in_parallel(slowest_first, range(6))) == [i * i for i in range(6)]
     assert len(workers) == 2
     # One item needs no other thread.
-    assert list(in_parallel(lambda _: threading.get_ident(), [0])) == [threading.get_ident()]
+    assert list(in_parallel(lambda _: threading.get_ident(), [0])) == [
+        threading.get_ident()
+    ]
     assert list(in_parallel(lambda item: item, [])) == []
 
 
-def test_an_error_is_raised_in_its_turn_and_what_follows_is_left_out(two_threads: None) -> None:
+def test_an_error_is_raised_in_its_turn_and_what_follows_is_left_out(
+    two_threads: None,
+) -> None:
     begun = []
 
     def work(item: int) -> int:

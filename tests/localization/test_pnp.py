@@ -17,7 +17,9 @@ def case(
 ) -> tuple[SE3, np.ndarray, np.ndarray]:
     """A random pose, pixels (n, 2) and their points (n, 3) in the world."""
     rng = np.random.default_rng(seed)
-    world_from_camera = SE3.exp(np.array([*rng.normal(0, 3, 3), *rng.normal(0, 1.5, 3)]))
+    world_from_camera = SE3.exp(
+        np.array([*rng.normal(0, 3, 3), *rng.normal(0, 1.5, 3)])
+    )
     pixels = rng.uniform([0, 0], [319, 239], (count, 2))
     in_camera = CAMERA.unproject(pixels) * rng.uniform(*depth, (count, 1))
     return world_from_camera, pixels, world_from_camera.apply(in_camera)
@@ -49,7 +51,9 @@ def test_half_of_the_points_are_outliers(seed: int) -> None:
     # Inliers are the matches that reproject within the threshold.
     camera_from_world = result.pose.inverse()
     with np.errstate(invalid="ignore"):
-        error = np.linalg.norm(CAMERA.project(camera_from_world.apply(points)) - noisy, axis=1)
+        error = np.linalg.norm(
+            CAMERA.project(camera_from_world.apply(points)) - noisy, axis=1
+        )
     assert (result.inliers == (np.nan_to_num(error, nan=np.inf) < 5.0)).mean() > 0.99
     assert result.inliers[~wrong].all()
 
@@ -87,9 +91,11 @@ def test_too_few_inliers_give_none() -> None:
 
 def test_random_matches_give_no_pose_in_time() -> None:
     rng = np.random.default_rng(0)
-    times, shares = [], []
+    times = []
+    shares = []
     for _ in range(5):
-        pixels, points = rng.uniform([0, 0], [319, 239], (1200, 2)), rng.normal(0, 2, (1200, 3))
+        pixels = rng.uniform([0, 0], [319, 239], (1200, 2))
+        points = rng.normal(0, 2, (1200, 3))
         began = time.thread_time()
         result = solve_pnp(pixels, points, CAMERA, PnpOptions())
         times.append(time.thread_time() - began)
@@ -126,7 +132,9 @@ def test_covariance_equals_least_squares_with_a_numeric_jacobian() -> None:
     jacobian = np.stack(
         [(residual(step * e) - residual(-step * e)) / (2 * step) for e in np.eye(6)], -1
     )
-    expected = (residual(np.zeros(6)) ** 2).mean() * np.linalg.inv(jacobian.T @ jacobian)
+    expected = (residual(np.zeros(6)) ** 2).mean() * np.linalg.inv(
+        jacobian.T @ jacobian
+    )
     covariance = uncertain(noisy, points, CAMERA, truth).covariance
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(covariance / scale, expected / scale, atol=1e-4)
@@ -136,10 +144,13 @@ def test_covariance_matches_the_spread_of_many_solutions() -> None:
     # Looking along world x at a tall, nearly flat strip: every axis has its own spread, so mixing
     # up axes or frames would change some standard deviation by more than 20 %.
     rng = np.random.default_rng(2)
-    truth = SE3.from_matrix(np.array([[0.0, 0, 1, 1], [-1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]]))
+    truth = SE3.from_matrix(
+        np.array([[0.0, 0, 1, 1], [-1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]])
+    )
     pixels = rng.uniform([140, 20], [180, 220], (80, 2))
     points = truth.apply(CAMERA.unproject(pixels) * rng.uniform(3.8, 4.2, (80, 1)))
-    errors, claimed = [], []
+    errors = []
+    claimed = []
     for _ in range(400):
         noisy = pixels + rng.normal(0, 0.3, pixels.shape)
         result = solve_pnp(noisy, points, CAMERA, PnpOptions())
@@ -149,12 +160,15 @@ def test_covariance_matches_the_spread_of_many_solutions() -> None:
         errors.append([*(pose.translation_m - truth.translation_m), *rotation])
         seen = noisy[result.inliers], points[result.inliers]
         claimed.append(uncertain(*seen, CAMERA, pose).covariance)
-    spread, claim = np.std(errors, axis=0), np.sqrt(np.mean(claimed, axis=0).diagonal())
+    spread = np.std(errors, axis=0)
+    claim = np.sqrt(np.mean(claimed, axis=0).diagonal())
     ratios = claim / spread
     assert (np.abs(ratios - 1) < 0.2).all(), ratios
     for part in (spread[:3], spread[3:]):  # otherwise mixed-up axes pass
         ordered = np.sort(part)
         assert (ordered[1:] / ordered[:-1] > 1.3).all()
     # The squared Mahalanobis error of six Gaussian dimensions has mean 6.
-    distances = [e @ np.linalg.inv(c) @ e for e, c in zip(np.array(errors), claimed, strict=True)]
+    distances = [
+        e @ np.linalg.inv(c) @ e for e, c in zip(np.array(errors), claimed, strict=True)
+    ]
     assert np.mean(distances) == pytest.approx(6.0, rel=0.25)

@@ -42,7 +42,9 @@ def project(points_m: Array, camera: Camera = CAMERA) -> Array:
     return camera.project(POSE.inverse().apply(points_m))
 
 
-def refined(pixels: Array, points_m: Array, white: Array) -> tuple[UncertainPose, Minimum]:
+def refined(
+    pixels: Array, points_m: Array, white: Array
+) -> tuple[UncertainPose, Minimum]:
     """With fixed intrinsics; whitening (n, 2, 2)."""
     observed = Observed(pixels, points_m, white.transpose(1, 2, 0))
     found = minimise(observed, CAMERA, matrix_and_position(NEAR))
@@ -52,7 +54,9 @@ def refined(pixels: Array, points_m: Array, white: Array) -> tuple[UncertainPose
 def test_exact_pixels_give_the_exact_pose() -> None:
     points_m = points(30)
     # It ends at a tenth of a standard deviation; these are small.
-    result, found = refined(project(points_m), points_m, np.tile(1e4 * np.eye(2), (30, 1, 1)))
+    result, found = refined(
+        project(points_m), points_m, np.tile(1e4 * np.eye(2), (30, 1, 1))
+    )
     metres, radians = pose_distance(result.pose, POSE)
     assert metres < 1e-8
     assert radians < 1e-8
@@ -61,7 +65,8 @@ def test_exact_pixels_give_the_exact_pose() -> None:
 
 def test_every_step_leads_nearer() -> None:
     points_m = points(30)
-    seen, at = Observed(project(points_m), points_m, precise(30, 1e-4)), matrix_and_position(NEAR)
+    seen = Observed(project(points_m), points_m, precise(30, 1e-4))
+    at = matrix_and_position(NEAR)
     found = [minimise(seen, CAMERA, at, steps) for steps in (1, 2, 3)]
     away = [np.linalg.norm(a.position - POSE.translation_m) for a in found]
     assert away[0] < 0.2 * np.linalg.norm(NEAR.translation_m - POSE.translation_m)
@@ -69,7 +74,8 @@ def test_every_step_leads_nearer() -> None:
 
 
 def test_a_third_of_outliers_does_not_bias_the_pose() -> None:
-    points_m, rng = points(120), np.random.default_rng(1)
+    points_m = points(120)
+    rng = np.random.default_rng(1)
     pixels = project(points_m) + rng.normal(0, 0.2, (120, 2))
     white = np.tile(np.eye(2) / 0.2, (120, 1, 1))
     right, _ = refined(pixels, points_m, white)
@@ -83,12 +89,15 @@ def test_a_third_of_outliers_does_not_bias_the_pose() -> None:
 
 
 def test_covariance_matches_repeated_trials() -> None:
-    count, runs, rng = 60, 400, np.random.default_rng(2)
+    count = 60
+    runs = 400
+    rng = np.random.default_rng(2)
     points_m = points(count)
     # Errors that differ from point to point and are longer in one direction.
     root = rng.normal(0, 0.15, (count, 2, 2)) + 0.2 * np.eye(2)
     white = np.linalg.inv(root)
-    drawn, claimed = [], []
+    drawn = []
+    claimed = []
     for _ in range(runs):
         noise = np.einsum("nij,nj->ni", root, rng.normal(size=(count, 2)))
         result, _ = refined(project(points_m) + noise, points_m, white)
@@ -110,12 +119,15 @@ def test_covariance_matches_repeated_trials() -> None:
 
 
 def test_covariance_follows_the_residuals() -> None:
-    points_m, rng = points(200), np.random.default_rng(3)
+    points_m = points(200)
+    rng = np.random.default_rng(3)
     noise = rng.normal(0, 0.3, (200, 2))
     white = np.tile(np.eye(2) / 0.3, (200, 1, 1))
     right, _ = refined(project(points_m) + noise, points_m, white)
     overconfident, _ = refined(project(points_m) + noise, points_m, 10 * white)
-    np.testing.assert_allclose(overconfident.covariance, right.covariance, rtol=0.05, atol=1e-12)
+    np.testing.assert_allclose(
+        overconfident.covariance, right.covariance, rtol=0.05, atol=1e-12
+    )
 
 
 def matrix_and_position(pose: SE3) -> tuple[Array, Array]:
@@ -124,7 +136,8 @@ def matrix_and_position(pose: SE3) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("lens", [(), (-0.2, 0.05, 0.001, -0.002, 0.01)])
 def test_derivatives_equal_finite_differences(lens: tuple[float, ...]) -> None:
-    camera, points_m = replace(CAMERA, distortion=lens), points(10)
+    camera = replace(CAMERA, distortion=lens)
+    points_m = points(10)
     pixels = project(points_m)
 
     def residual(tangent: Array, change: Array) -> Array:
@@ -146,7 +159,8 @@ def test_matches_without_a_common_pose_do_not_diverge() -> None:
     variances = np.array([2e-8, 5e-3, 5e-3, 6e-7, 6e-7])
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        pixels, points_m = rng.uniform(0, [640, 480], (28, 2)), points(28, seed)
+        pixels = rng.uniform(0, [640, 480], (28, 2))
+        points_m = points(28, seed)
         seen = Observed(pixels, points_m, precise(28, 0.1))
         result = minimise(seen, CAMERA, matrix_and_position(POSE), 10, variances)
         assert np.linalg.norm(result.position - POSE.translation_m) < 100
@@ -165,7 +179,8 @@ CHANGE = np.array([0.004, 1.5, -1.0, 0.004, -0.003])
 
 def seen_with(change: Array, seed: int, sigma_px: float, noise_px: float) -> Observed:
     """300 points seen with other intrinsics than those of `CAMERA`."""
-    points_m, noise = points(300, seed), np.random.default_rng(seed).normal(size=(300, 2))
+    points_m = points(300, seed)
+    noise = np.random.default_rng(seed).normal(size=(300, 2))
     pixels = project(points_m, CAMERA.changed(change)) + noise_px * noise
     return Observed(pixels, points_m, precise(300, sigma_px))
 
@@ -181,11 +196,13 @@ def seen_with(change: Array, seed: int, sigma_px: float, noise_px: float) -> Obs
 def test_a_minimum_moves_to_that_of_another_prior(
     sigma_px: float, noise_px: float, share: float, off: float, other: IntrinsicsPrior
 ) -> None:
-    tight, wide = OWN.variances(CAMERA), other.variances(CAMERA)
+    tight = OWN.variances(CAMERA)
+    wide = other.variances(CAMERA)
     for seed in range(4):
         seen = seen_with(share * CHANGE, seed, sigma_px, noise_px)
         own, expected = (
-            minimise(seen, CAMERA, matrix_and_position(NEAR), 30, v) for v in (tight, wide)
+            minimise(seen, CAMERA, matrix_and_position(NEAR), 30, v)
+            for v in (tight, wide)
         )
         step, covariance = own.moved(own.variance / wide)
         again, inverse = expected.moved(expected.variance / wide)
@@ -193,7 +210,9 @@ def test_a_minimum_moves_to_that_of_another_prior(
         shift = own.rotation.T @ (expected.position - own.position)
         real = np.concatenate([shift, turn, expected.change - own.change])
         root = np.linalg.inv(np.linalg.cholesky(expected.variance * inverse))
-        assert np.linalg.norm(root @ (step - real)) < off < 2 * np.linalg.norm(root @ step)
+        assert (
+            np.linalg.norm(root @ (step - real)) < off < 2 * np.linalg.norm(root @ step)
+        )
         assert np.linalg.norm(root @ again) < 0.1  # it is at its own minimum
         assert own.after(step).variance == pytest.approx(expected.variance, rel=0.15)
         ratio = np.linalg.eigvals(np.linalg.solve(inverse, covariance)).real
@@ -204,18 +223,23 @@ def test_a_minimum_moves_to_that_of_another_prior(
 def test_a_far_camera_is_reached_by_repetition(factor: float) -> None:
     """The errors are linear in the intrinsics; `align_pose` begins again where the last ended."""
     far = np.array([np.log(factor), 12.0, -9.0, -0.06, 0.03])
-    seen, change, prior = seen_with(far, 0, 0.3, 0.3), np.zeros(5), UNKNOWN
+    seen = seen_with(far, 0, 0.3, 0.3)
+    change = np.zeros(5)
+    prior = UNKNOWN
     result = self_calibrated(seen, CAMERA, matrix_and_position(NEAR), change, prior)
     moved = []
     for _ in range(8):
         moved.append(_moved_px(CAMERA, change, result.change))
         if moved[-1] < 0.2:
             break
-        at, change = matrix_and_position(result.pose.pose), result.change
+        at = matrix_and_position(result.pose.pose)
+        change = result.change
         result = self_calibrated(seen, CAMERA, at, change, prior)
     assert moved[-1] < 0.2 < moved[-2]
     truth = CAMERA.changed(far)
     assert result.camera.fx == pytest.approx(truth.fx, rel=2e-3)
-    np.testing.assert_allclose(result.camera.distortion[:2], truth.distortion[:2], atol=0.01)
+    np.testing.assert_allclose(
+        result.camera.distortion[:2], truth.distortion[:2], atol=0.01
+    )
     assert result.pose.squared_mahalanobis(POSE) < 22.5
     assert pose_distance(result.pose.pose, POSE)[0] < 0.01

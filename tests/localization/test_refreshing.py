@@ -62,7 +62,9 @@ def changed(hall: Recording, hall_room: BoxRoom) -> tuple[BoxRoom, Surface]:
 
 
 @pytest.fixture(scope="module")
-def images(hall: Recording, changed: tuple[BoxRoom, Surface]) -> list[tuple[str, np.ndarray]]:
+def images(
+    hall: Recording, changed: tuple[BoxRoom, Surface]
+) -> list[tuple[str, np.ndarray]]:
     frames = hall.test[::3]
     return [(f.name, changed[0].render(f.camera, truth(f))) for f in frames]
 
@@ -94,9 +96,11 @@ def test_landmarks_on_the_changed_surface_leave(
     for i in kept:
         j = stays[before.keyframes.images[i]]
         # A kept keyframe keeps its pose: it holds the base frame.
-        new, old = scene.keyframes.base_from_camera[j], before.keyframes.base_from_camera[i]
+        new = scene.keyframes.base_from_camera[j]
+        old = before.keyframes.base_from_camera[i]
         np.testing.assert_allclose(new.matrix(), old.matrix(), rtol=0, atol=1e-12)
-        pose, camera = old, before.keyframes.cameras[i]
+        pose = old
+        camera = before.keyframes.cameras[i]
         left = {tuple(p) for p in scene.keyframes.landmarks[j].pixels.tolist()}
         marks = before.keyframes.landmarks[i]
         missing = np.array([tuple(p) not in left for p in marks.pixels.tolist()])
@@ -106,7 +110,10 @@ def test_landmarks_on_the_changed_surface_leave(
 
 
 def test_memory_stays_and_images_are_located_as_well_as_before(
-    hall: Recording, hall_map: MapContents, after: Refreshed, changed: tuple[BoxRoom, Surface]
+    hall: Recording,
+    hall_map: MapContents,
+    after: Refreshed,
+    changed: tuple[BoxRoom, Surface],
 ) -> None:
     before, (scene, report) = hall_map.scenes[0], after
     assert len(scene.keyframes) == len(before.keyframes)
@@ -129,29 +136,37 @@ def test_wrong_images_are_left_out(
     hall_map: MapContents, images: list[tuple[str, np.ndarray]], after: Refreshed
 ) -> None:
     rng = np.random.default_rng(0)
-    other, pose = BoxRoom(55, texture_px=256), SE3.exp([0, 0, 1.2, 0.3, 0.1, 0.2])
+    other = BoxRoom(55, texture_px=256)
+    pose = SE3.exp([0, 0, 1.2, 0.3, 0.1, 0.2])
     camera = hall_map.scenes[0].camera
     wrong = [
         ("other.png", other.render(camera, pose)),
         ("noise.png", rng.integers(0, 255, (240, 320, 3)).astype(np.uint8)),
         ("dark.png", np.zeros((240, 320, 3), np.uint8)),
     ]
-    scene, report = refresh_scene(Localizer(hall_map), [*images[:4], *wrong, *images[4:]])
+    scene, report = refresh_scene(
+        Localizer(hall_map), [*images[:4], *wrong, *images[4:]]
+    )
     assert {name for name, _ in wrong} <= set(report.left_out)
     assert report.located == after[1].located
     assert np.array_equal(points_of(scene), points_of(after[0]))
 
 
 def test_a_refresh_that_loses_its_only_image_outside_is_refused(
-    hall_map: MapContents, images: list[tuple[str, np.ndarray]], monkeypatch: pytest.MonkeyPatch
+    hall_map: MapContents,
+    images: list[tuple[str, np.ndarray]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Without an image outside the map, the shift of the base frame is unknown, not zero."""
-    few, localize = images[:5], Localizer.localize
+    few = images[:5]
+    localize = Localizer.localize
 
     def blind(self: Localizer, image: np.ndarray, *given: Any) -> PoseEstimate:
         estimate = localize(self, image, *given)
         refreshed = self.contents is not hall_map
-        return replace(estimate, status="failed", reason="weak") if refreshed else estimate
+        return (
+            replace(estimate, status="failed", reason="weak") if refreshed else estimate
+        )
 
     monkeypatch.setattr(Localizer, "localize", blind)
     with pytest.raises(InputError, match=r"locates 0 of 1 images .*unchanged"):
@@ -159,14 +174,23 @@ def test_a_refresh_that_loses_its_only_image_outside_is_refused(
 
 
 def test_images_of_a_recording_have_their_own_cameras(
-    hall: Recording, hall_map: MapContents, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    hall: Recording,
+    hall_map: MapContents,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    MapStore(tmp_path, MapContents(hall_map.encoder, 240)).commit(hall_map.scenes[0], {})
+    MapStore(tmp_path, MapContents(hall_map.encoder, 240)).commit(
+        hall_map.scenes[0], {}
+    )
     cameras = [Camera(320, 240, f, f, 160, 120) for f in (200, 210)]
-    train = tuple(replace(f, camera=c) for f, c in zip(hall.test, cameras, strict=False))
+    train = tuple(
+        replace(f, camera=c) for f, c in zip(hall.test, cameras, strict=False)
+    )
     given = []
 
-    def localize(self: Localizer, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
+    def localize(
+        self: Localizer, image: np.ndarray, camera: Camera | None = None
+    ) -> PoseEstimate:
         given.append(camera)
         return PoseEstimate("failed", "", None, None, None, 0, 0, 0)
 
@@ -185,10 +209,17 @@ def test_a_refresh_is_refused_or_undone_as_a_whole(
 ) -> None:
     contents = MapContents(hall_map.encoder, hall_map.short_side)
     MapStore(tmp_path / "map", contents).commit(hall_map.scenes[0], {})
-    before, opened = tree(tmp_path / "map"), Map.open(tmp_path / "map")
-    other, camera = BoxRoom(55, texture_px=256), hall.train[0].camera
-    wrong = [other.render(camera, SE3.exp([0.05 * i, 0, 1.2, 0.3, 0.1, 0.2])) for i in range(2)]
-    with pytest.raises(InputError, match=r"0 of 2 images are located precisely.*unchanged"):
+    before = tree(tmp_path / "map")
+    opened = Map.open(tmp_path / "map")
+    other = BoxRoom(55, texture_px=256)
+    camera = hall.train[0].camera
+    wrong = [
+        other.render(camera, SE3.exp([0.05 * i, 0, 1.2, 0.3, 0.1, 0.2]))
+        for i in range(2)
+    ]
+    with pytest.raises(
+        InputError, match=r"0 of 2 images are located precisely.*unchanged"
+    ):
         opened.refresh(wrong)
     with pytest.raises(InputError, match="no refresh to undo"):
         opened.undo_refresh("hall")

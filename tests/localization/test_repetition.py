@@ -21,8 +21,12 @@ STEP_M = 0.1
 
 def grid(rng: np.random.Generator, alike: bool) -> tuple[np.ndarray, np.ndarray]:
     """A wall of 8x8 landmarks before single ones, and their patches."""
-    across = STEP_M * np.stack(np.meshgrid(np.arange(8), np.arange(8), [0]), -1).reshape(-1, 3)
-    points = np.concatenate([across + rng.normal(0, 2e-4, across.shape), rng.normal(size=(60, 3))])
+    across = STEP_M * np.stack(
+        np.meshgrid(np.arange(8), np.arange(8), [0]), -1
+    ).reshape(-1, 3)
+    points = np.concatenate(
+        [across + rng.normal(0, 2e-4, across.shape), rng.normal(size=(60, 3))]
+    )
     patches = rng.normal(size=(len(points), 121))
     if alike:
         patches[:64] = patches[0] + 0.1 * patches[:64]
@@ -58,13 +62,20 @@ class _WithRival(Localizer):
     def _slipped(self) -> Hypothesis:
         assert self.true.pose is not None
         pose = UncertainPose(
-            displaced(self.true.pose.pose, np.array([0.03, 0, 0])), self.true.pose.covariance
+            displaced(self.true.pose.pose, np.array([0.03, 0, 0])),
+            self.true.pose.covariance,
         )
         expected = round(self.weaker * self.true.expected)
         return replace(self.true, pose=pose, expected=expected, matches=None)
 
-    def rivals(self, _: Query, best: Hypothesis, camera: Camera) -> Iterator[Hypothesis]:
-        yield replace(self.true, matches=None) if best is not self.true else self._slipped()
+    def rivals(
+        self, _: Query, best: Hypothesis, camera: Camera
+    ) -> Iterator[Hypothesis]:
+        yield (
+            replace(self.true, matches=None)
+            if best is not self.true
+            else self._slipped()
+        )
 
 
 @pytest.mark.parametrize(
@@ -78,7 +89,8 @@ def test_a_clearly_stronger_pose_wins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(rivals, "_rivals", _WithRival.rivals)
-    localizer, frame = _WithRival(hall_map), hall.test[5]
+    localizer = _WithRival(hall_map)
+    frame = hall.test[5]
     localizer.weaker = weaker
     truth = frame.base_from_camera
     assert truth is not None
@@ -89,7 +101,9 @@ def test_a_clearly_stronger_pose_wins(
         return
     assert "mm" in estimate.reason
     assert len(estimate.alternatives) == 2
-    distances = sorted(float(pose_distance(pose, truth)[0]) for pose in estimate.alternatives)
+    distances = sorted(
+        float(pose_distance(pose, truth)[0]) for pose in estimate.alternatives
+    )
     np.testing.assert_allclose(distances, [0, 0.03], atol=0.005)
 
 
@@ -97,12 +111,18 @@ def test_an_image_of_two_places_is_not_located_in_one(
     hall: Recording, hall_map: MapContents
 ) -> None:
     localizer = Localizer(hall_map)
-    first, second = hall.test[2], hall.test[14]
-    image, other = first.read_image().copy(), second.read_image()
+    first = hall.test[2]
+    second = hall.test[14]
+    image = first.read_image().copy()
+    other = second.read_image()
     image[:, 160:] = other[:, 160:]
     estimate = localizer.localize(image)
     assert estimate.status == "ambiguous"
-    truths = [f.base_from_camera for f in (first, second) if f.base_from_camera is not None]
-    near, far = sorted(estimate.alternatives, key=lambda pose: pose_distance(pose, truths[0])[0])
+    truths = [
+        f.base_from_camera for f in (first, second) if f.base_from_camera is not None
+    ]
+    near, far = sorted(
+        estimate.alternatives, key=lambda pose: pose_distance(pose, truths[0])[0]
+    )
     for truth, pose in zip(truths, (near, far), strict=True):
         assert pose_distance(pose, truth)[0] < 0.02

@@ -14,7 +14,9 @@ from evercal.mapping.scene_map import LeftOut, MapContents
 from evercal.recordings.frame import Frame, Recording
 
 
-def test_only_the_newest_scene_is_fitted(hall: Recording, hall_map: MapContents) -> None:
+def test_only_the_newest_scene_is_fitted(
+    hall: Recording, hall_map: MapContents
+) -> None:
     second = replace(hall_map.scenes[0], name="second")
     both = hall_map.with_scene(second)
     scene = with_scatter(both, hall.test[::20])
@@ -28,7 +30,11 @@ def test_shared_errors_of_held_out_poses_widen_the_stated_frame(
     def off(frames: Sequence[Frame], metres: float) -> list[Frame]:
         shift = SE3.exp([metres, 0, 0, 0, 0, 0])
         stated = [(frame, frame.base_from_camera) for frame in frames]
-        return [replace(f, base_from_camera=shift @ pose) for f, pose in stated if pose is not None]
+        return [
+            replace(f, base_from_camera=shift @ pose)
+            for f, pose in stated
+            if pose is not None
+        ]
 
     held_out = hall.test[::3]
     few = with_scatter(hall_map, off(held_out[:7], 0.02))

@@ -24,11 +24,13 @@ CAMERA = Camera(160, 120, 118.0, 118.0, 79.5, 59.5, (-0.4, 0.0, 0.0, 0.0))
 
 def distorted(recording: Recording, room: BoxRoom) -> Recording:
     """The recording as `CAMERA` records it, with sensor noise where there are no rays."""
-    ideal, v_u = Camera(480, 480, 240.0, 240.0, 239.5, 239.5), np.mgrid[0:120, 0:160]
+    ideal = Camera(480, 480, 240.0, 240.0, 239.5, 239.5)
+    v_u = np.mgrid[0:120, 0:160]
     rays = CAMERA.unproject(np.moveaxis(v_u[::-1], 0, -1).astype(float))
     pixels = np.nan_to_num(ideal.project(rays), nan=-9.0).astype(np.float32)
     dark = np.isnan(rays).any(-1)
-    rng, frames = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    frames = []
     for frame in (*recording.train[:16], *recording.test[2:14:4]):
         assert frame.base_from_camera is not None
         image = room.render(ideal, frame.base_from_camera)
@@ -38,11 +40,15 @@ def distorted(recording: Recording, room: BoxRoom) -> Recording:
     return Recording("distorted", tuple(frames[:16]), tuple(frames[16:]))
 
 
-def test_scene_is_mapped_and_images_are_located(arcs: tuple[Recording, Recording]) -> None:
+def test_scene_is_mapped_and_images_are_located(
+    arcs: tuple[Recording, Recording],
+) -> None:
     recording = distorted(arcs[0], BoxRoom(34, texture_px=96))
     options = MapOptions(MemoryBudget(share=0.25), WorkingSize(cells=120))
     scene = build_map("distorted", recording.train, load_encoder(), options).scene
-    for camera, landmarks in zip(scene.keyframes.cameras, scene.keyframes.landmarks, strict=True):
+    for camera, landmarks in zip(
+        scene.keyframes.cameras, scene.keyframes.landmarks, strict=True
+    ):
         assert len(landmarks) > 30
         assert np.isfinite(landmarks.surface(camera)[0]).all()
     localizer = Localizer(MapContents(load_encoder(), 120, [scene]))
@@ -50,7 +56,9 @@ def test_scene_is_mapped_and_images_are_located(arcs: tuple[Recording, Recording
         estimate = localizer.localize(frame.read_image(), frame.camera)
         assert estimate.base_from_camera is not None
         assert frame.base_from_camera is not None
-        assert pose_distance(estimate.base_from_camera, frame.base_from_camera)[0] < 0.02
+        assert (
+            pose_distance(estimate.base_from_camera, frame.base_from_camera)[0] < 0.02
+        )
 
 
 def test_some_cells_have_no_ray() -> None:

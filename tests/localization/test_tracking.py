@@ -23,7 +23,8 @@ from evercal.simulation.box_room import BoxRoom
 @pytest.fixture(scope="module")
 def views(hall: Recording, hall_room: BoxRoom) -> list[tuple[np.ndarray, SE3]]:
     """40 views along the middle of the recording's path, 15 a second at 0.1 m/s."""
-    a, b = hall.test[10].base_from_camera, hall.test[16].base_from_camera
+    a = hall.test[10].base_from_camera
+    b = hall.test[16].base_from_camera
     assert a is not None
     assert b is not None
     step = (a.inverse() @ b).log()
@@ -34,7 +35,8 @@ def views(hall: Recording, hall_room: BoxRoom) -> list[tuple[np.ndarray, SE3]]:
 def test_frames_are_tracked_as_exactly_as_single_images(
     hall_map: MapContents, views: list[tuple[np.ndarray, SE3]]
 ) -> None:
-    tracker, localizer = Tracker(Localizer(hall_map)), Localizer(hall_map)
+    tracker = Tracker(Localizer(hall_map))
+    localizer = Localizer(hall_map)
     frames = [tracker.track(image, i / 15) for i, (image, _) in enumerate(views)]
     assert frames[0].state == "relocalized"
     assert {frame.state for frame in frames[2:]} == {"tracking"}
@@ -71,23 +73,35 @@ def test_a_jump_is_located_from_nothing(
     assert frame.state == "relocalized"
     assert frame.estimate.base_from_camera is not None
     assert far.base_from_camera is not None
-    assert pose_distance(frame.estimate.base_from_camera, far.base_from_camera)[0] < 0.01
+    assert (
+        pose_distance(frame.estimate.base_from_camera, far.base_from_camera)[0] < 0.01
+    )
 
 
 def test_where_a_period_of_texture_is_in_reach_the_frame_is_located_from_nothing(
-    hall_map: MapContents, views: list[tuple[np.ndarray, SE3]], monkeypatch: pytest.MonkeyPatch
+    hall_map: MapContents,
+    views: list[tuple[np.ndarray, SE3]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     step = np.array([[0.05, 0.0, 0.0]])
     monkeypatch.setattr(Localizer, "slips", lambda *_: step)
-    tracker, image = Tracker(Localizer(hall_map)), views[0][0]
+    tracker = Tracker(Localizer(hall_map))
+    image = views[0][0]
     # Without a known motion 0.05 m are possible in a fifteenth of a second, with one in 0.2 s.
     stamps = np.cumsum([0, 1 / 15, 1 / 15, 1 / 15, 0.2, 1 / 15])
     states = [tracker.track(image, float(stamp)).state for stamp in stamps]
-    assert states == [*["relocalized"] * 2, *["tracking"] * 2, "relocalized", "tracking"]
+    assert states == [
+        *["relocalized"] * 2,
+        *["tracking"] * 2,
+        "relocalized",
+        "tracking",
+    ]
 
 
 def test_a_pose_that_is_too_uncertain_is_not_tracked(
-    hall_map: MapContents, views: list[tuple[np.ndarray, SE3]], monkeypatch: pytest.MonkeyPatch
+    hall_map: MapContents,
+    views: list[tuple[np.ndarray, SE3]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     tracker = Tracker(Localizer(hall_map))
     for image, _ in views[:3]:
@@ -120,9 +134,11 @@ def test_a_long_gap_and_time_that_runs_backwards_are_no_prediction(
 def test_a_time_for_a_frame_is_kept_while_frames_are_located(
     hall_map: MapContents, views: list[tuple[np.ndarray, SE3]]
 ) -> None:
-    localizer, images = Localizer(hall_map), [image for image, _ in views]
+    localizer = Localizer(hall_map)
+    images = [image for image, _ in views]
     localizer.localize(images[0])
-    slow, ended = Localizer.located, threading.Event()
+    slow = Localizer.located
+    ended = threading.Event()
 
     def located(self: Localizer, *given: Any) -> Any:
         ended.wait(30)
@@ -149,10 +165,13 @@ def test_a_time_for_a_frame_is_kept_while_frames_are_located(
 def test_a_dark_frame_ends_the_tracking_in_time(
     hall_map: MapContents, views: list[tuple[np.ndarray, SE3]]
 ) -> None:
-    localizer, images = Localizer(hall_map), [image for image, _ in views]
+    localizer = Localizer(hall_map)
+    images = [image for image, _ in views]
     localizer.localize(images[0])
     tracker = Tracker(localizer, options=TrackOptions(at_most_ms=1000.0))
-    assert [tracker.track(image, 0.1 * i).state for i, image in enumerate(images[:3])] == [
+    assert [
+        tracker.track(image, 0.1 * i).state for i, image in enumerate(images[:3])
+    ] == [
         "relocalized",
         "tracking",
         "tracking",
@@ -163,17 +182,22 @@ def test_a_dark_frame_ends_the_tracking_in_time(
     assert "localization" in dark.estimate.omitted
 
 
-def smoothed(positions_m: list[float], sigma_m: float = 0.001) -> tuple[list[float], list[bool]]:
+def smoothed(
+    positions_m: list[float], sigma_m: float = 0.001
+) -> tuple[list[float], list[bool]]:
     """Feed positions along x to the smoother of a tracker without a map."""
     tracker = Tracker.__new__(Tracker)
-    tracker.options, tracker._smoothed = TrackOptions(smooth=0.5), None
+    tracker.options = TrackOptions(smooth=0.5)
+    tracker._smoothed = None
     values: list[float] = []
     jumps: list[bool] = []
     lost = PoseEstimate("failed", "", None, None, None, 0, 0.0, 1.0)
     for i, x in enumerate(positions_m):
         pose = SE3.from_translation([x, 0, 0])
         uncertain = UncertainPose(pose, sigma_m**2 * np.eye(6))
-        estimate = PoseEstimate("ok", "", "room", uncertain.pose, uncertain.covariance, 9, 1.0, 1.0)
+        estimate = PoseEstimate(
+            "ok", "", "room", uncertain.pose, uncertain.covariance, 9, 1.0, 1.0
+        )
         now, jumped = tracker._smooth(estimate, i / 15)
         assert now is not None
         values.append(float(now.translation_m[0]))

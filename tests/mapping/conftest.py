@@ -39,7 +39,8 @@ def scenes(rooms: tuple[Recording, ...]) -> list[SceneMap]:
     from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity
     from evercal.mapping.scene_map import SceneMap
 
-    rng, made = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    made = []
     for i, room in enumerate(rooms):
         camera = room.train[0].camera
         marks = [
@@ -57,7 +58,8 @@ def scenes(rooms: tuple[Recording, ...]) -> list[SceneMap]:
             landmarks=tuple(marks),
             descriptors=rng.normal(size=(2, 16)).astype(np.float16),
         )
-        poses, motion = SE3.exp(rng.normal(size=(5, 6))), SE3.exp(rng.normal(size=6))
+        poses = SE3.exp(rng.normal(size=(5, 6)))
+        motion = SE3.exp(rng.normal(size=6))
         frame = MapFrame(
             common=SE3.exp(0.01 * rng.normal(size=6)),
             correction=FrameCorrection(poses, rng.normal(size=(5, 6)), (0.2, 0.26)),
@@ -87,7 +89,8 @@ def make() -> Callable[[Path, Sequence[SceneMap]], MapStore]:
     from ..encoders import tiny_encoder
 
     def store(root: Path, scenes: Sequence[SceneMap]) -> MapStore:
-        encoder, rows = tiny_encoder(), np.random.default_rng(0).normal(size=(200, 8))
+        encoder = tiny_encoder()
+        rows = np.random.default_rng(0).normal(size=(200, 8))
         unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
         encoder.vlad([unit.astype(np.float32)])
         store = MapStore.create(root, encoder, 48)
@@ -106,13 +109,17 @@ def content() -> Contents:
     def values(contents: MapContents) -> list[object]:
         listed: list[object] = []
         for scene in contents.scenes:
-            listed.append((scene.name, scene.camera, scene.adjusted_camera, scene.train_frames))
+            listed.append(
+                (scene.name, scene.camera, scene.adjusted_camera, scene.train_frames)
+            )
             listed.append((scene.metric, scene.unit_known))
             listed.append(_rounded(frame_to_dict(scene.frame)))
             tensors = scene.keyframes.to_tensors()
             if scene.frame.correction is not None:
                 tensors |= correction_tensors(scene.frame.correction)
-            listed.append({name: _rounded(value.tolist()) for name, value in tensors.items()})
+            listed.append(
+                {name: _rounded(value.tolist()) for name, value in tensors.items()}
+            )
         return listed
 
     return values

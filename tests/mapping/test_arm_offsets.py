@@ -27,29 +27,49 @@ ARM = Arm(
     SE3.from_translation(0.1 * X).matrix(),
 )
 FORWARD = SE3.from_matrix(
-    np.block([[np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.zeros((3, 1))], [0, 0, 0, 1]])
+    np.block(
+        [
+            [np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.zeros((3, 1))],
+            [0, 0, 0, 1],
+        ]
+    )
 )
 MOUNT = FORWARD @ SE3.from_translation((0.02, 0.05, 0.03))
 
 
-def adjusted(offsets_deg: tuple[float, ...], mount: Mount, moving: int = 5) -> Adjustment:
+def adjusted(
+    offsets_deg: tuple[float, ...], mount: Mount, moving: int = 5
+) -> Adjustment:
     """An adjustment of frames of an arm, of which the first `moving` joints move."""
     rng = np.random.default_rng(3)
     joints = np.deg2rad(rng.uniform(-20, 20, (FRAMES, 5)) * (1, 1, 1, 1, 3))
     joints[:, moving:] = 0.1
     offsets = np.deg2rad(offsets_deg)
-    true, stated = ARM.poses(joints), ARM.poses(joints - offsets)
+    true = ARM.poses(joints)
+    stated = ARM.poses(joints - offsets)
     wrist = mount == "eye_in_hand"
     # A fixed camera looks at the arm from 2 m away.
     turned = SE3.exp(np.array([0, 0, 0, 0, 0, np.pi]))
-    camera = MOUNT if wrist else SE3.from_translation((2.5, 0.0, 0.6)) @ turned @ FORWARD
+    camera = (
+        MOUNT if wrist else SE3.from_translation((2.5, 0.0, 0.6)) @ turned @ FORWARD
+    )
     truth, restated = (
-        poses @ camera if wrist else poses.inverse() @ camera for poses in (true, stated)
+        poses @ camera if wrist else poses.inverse() @ camera
+        for poses in (true, stated)
     )
     made = world(noise_px=0.1, truth=truth, every=2)
     frames = [
-        Frame(str(i), np.zeros((1, 1, 3), np.uint8), CAMERA, pose, gripper, joints_rad=tuple(q))
-        for i, (pose, gripper, q) in enumerate(zip(restated, stated, joints - offsets, strict=True))
+        Frame(
+            str(i),
+            np.zeros((1, 1, 3), np.uint8),
+            CAMERA,
+            pose,
+            gripper,
+            joints_rad=tuple(q),
+        )
+        for i, (pose, gripper, q) in enumerate(
+            zip(restated, stated, joints - offsets, strict=True)
+        )
     ]
     begun = ArmOffsets.start(ARM, mount, np.zeros(5))
     options = replace(MapOptions().for_hand_eye(mount).bundle, intrinsics=False)
@@ -66,7 +86,8 @@ def adjusted(offsets_deg: tuple[float, ...], mount: Mount, moving: int = 5) -> A
 @pytest.mark.parametrize("mount", ["eye_in_hand", "eye_to_hand"])
 def test_offsets_are_estimated_from_images(mount: Mount) -> None:
     result = adjusted((0, 0.8, -1.1, 0.6, 0), mount)
-    offsets, sigma = np.rad2deg(result.offsets), np.sqrt(np.diag(result.offsets_covariance))
+    offsets = np.rad2deg(result.offsets)
+    sigma = np.sqrt(np.diag(result.offsets_covariance))
     assert offsets == pytest.approx([0, 0.8, -1.1, 0.6, 0], abs=0.1)
     assert np.rad2deg(sigma[1:4]).max() < 0.12
     assert result.offsets_known.tolist() == [False, True, True, True, False]
@@ -99,12 +120,15 @@ def test_frames_keep_the_transform_of_gripper_and_camera() -> None:
     assert moved.base_from_camera is not None
     change = moved.base_from_gripper.inverse() @ moved.base_from_camera
     assert np.allclose(change.matrix(), MOUNT.matrix())
-    assert np.allclose(moved.base_from_gripper.matrix(), ARM.poses(joints[None] + 0.02)[0].matrix())
+    assert np.allclose(
+        moved.base_from_gripper.matrix(), ARM.poses(joints[None] + 0.02)[0].matrix()
+    )
 
 
 def test_a_fixed_camera_keeps_its_place_in_the_base() -> None:
     joints = np.array([0.1, 0.2, -0.3, 0.4, 0.5])
-    gripper, camera = ARM.poses(joints[None])[0], SE3.from_translation((1.0, 0.2, 0.5))
+    gripper = ARM.poses(joints[None])[0]
+    camera = SE3.from_translation((1.0, 0.2, 0.5))
     offsets = ArmOffsets.start(ARM, "eye_to_hand", np.full(5, 0.02))
     pose = gripper.inverse() @ camera
     image = np.zeros((1, 1, 3), np.uint8)

@@ -28,7 +28,9 @@ from evercal.mapping.prepared_frames import WorkingSize
 from evercal.recordings.frame import Frame, Recording
 from evercal.simulation.box_room import BoxRoom
 
-SMALL = MapOptions(size=WorkingSize(cells=120, patches=120), memory=MemoryBudget(share=0.2))
+SMALL = MapOptions(
+    size=WorkingSize(cells=120, patches=120), memory=MemoryBudget(share=0.2)
+)
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +54,12 @@ def rays_of(keyframes: Keyframes, i: int, pixels: np.ndarray) -> np.ndarray:
     return keyframes.cameras[i].unproject(pixels) @ rotation.T
 
 
-def test_landmarks_lie_on_the_surfaces(hall_built: BuiltMap, hall_room: BoxRoom) -> None:
-    keyframes, errors, standardised = hall_built.scene.keyframes, [], []
+def test_landmarks_lie_on_the_surfaces(
+    hall_built: BuiltMap, hall_room: BoxRoom
+) -> None:
+    keyframes = hall_built.scene.keyframes
+    errors = []
+    standardised = []
     for i, marks in enumerate(keyframes.landmarks):
         assert len(marks) > 100
         position = keyframes.base_from_camera[i].translation_m
@@ -67,20 +73,26 @@ def test_landmarks_lie_on_the_surfaces(hall_built: BuiltMap, hall_room: BoxRoom)
     assert 0.1 < np.median(np.concatenate(standardised)) < 3
 
 
-def test_slants_are_those_of_the_surfaces(hall_built: BuiltMap, hall_room: BoxRoom) -> None:
+def test_slants_are_those_of_the_surfaces(
+    hall_built: BuiltMap, hall_room: BoxRoom
+) -> None:
     keyframes = hall_built.scene.keyframes
     steps = np.array([[8.0, 0], [-8, 0], [0, 8], [0, -8], [0, 0]])
-    slopes, truths = [], []
+    slopes = []
+    truths = []
     for i, marks in enumerate(keyframes.landmarks):
         position = keyframes.base_from_camera[i].translation_m
         rays = rays_of(keyframes, i, marks.pixels[None] + steps[:, None])
         rho = np.stack([1 / hall_room.intersect(position, ray)[1] for ray in rays])
         truth = np.stack([rho[0] - rho[1], rho[2] - rho[3]], -1) / 16
         # On a plane, inverse depth is linear in the image; an edge has no slant.
-        flat = np.abs(rho[:2].mean(0) - rho[4]) + np.abs(rho[2:4].mean(0) - rho[4]) < 1e-6
+        flat = (
+            np.abs(rho[:2].mean(0) - rho[4]) + np.abs(rho[2:4].mean(0) - rho[4]) < 1e-6
+        )
         slopes.append(marks.slope[flat])
         truths.append(truth[flat])
-    slope, truth = np.concatenate(slopes), np.concatenate(truths)
+    slope = np.concatenate(slopes)
+    truth = np.concatenate(truths)
     assert len(slope) > 300
     # The slants are coarse, but better than zero.
     assert np.corrcoef(slope.ravel(), truth.ravel())[0, 1] > 0.5
@@ -88,12 +100,17 @@ def test_slants_are_those_of_the_surfaces(hall_built: BuiltMap, hall_room: BoxRo
     assert np.median(error) < np.median(np.linalg.norm(truth, axis=1))
 
 
-def test_exact_poses_and_intrinsics_hardly_change(hall_built: BuiltMap, hall: Recording) -> None:
+def test_exact_poses_and_intrinsics_hardly_change(
+    hall_built: BuiltMap, hall: Recording
+) -> None:
     truth = {frame.name: pose_of(frame) for frame in hall.train}
-    scene, adjusted = hall_built.scene, hall_built.adjusted
+    scene = hall_built.scene
+    adjusted = hall_built.adjusted
     assert len(scene.keyframes) == len(hall_built.keyframe_names) == 7
     for i, name in enumerate(hall_built.keyframe_names):
-        assert pose_distance(scene.keyframes.base_from_camera[i], truth[name])[0] < 0.003
+        assert (
+            pose_distance(scene.keyframes.base_from_camera[i], truth[name])[0] < 0.003
+        )
     assert scene.adjusted_camera.fx == pytest.approx(hall.train[0].camera.fx, rel=2e-3)
     assert adjusted.residual_px is not None
     assert adjusted.residual_px < 0.2
@@ -106,16 +123,24 @@ def test_exact_poses_and_intrinsics_hardly_change(hall_built: BuiltMap, hall: Re
     assert 0 < scene.frame.pose_sigma[1] < 0.003
 
 
-def test_steps_are_reported_in_order(arcs: tuple[Recording, Recording], encoder: Encoder) -> None:
+def test_steps_are_reported_in_order(
+    arcs: tuple[Recording, Recording], encoder: Encoder
+) -> None:
     steps: list[tuple[str, int, int]] = []
     build_map("a", arcs[0].train[:16], encoder, SMALL, lambda *step: steps.append(step))
-    assert list(dict.fromkeys(what for what, _, _ in steps)) == ["encoding", "mapping", "adjusting"]
+    assert list(dict.fromkeys(what for what, _, _ in steps)) == [
+        "encoding",
+        "mapping",
+        "adjusting",
+    ]
     assert [done for what, done, _ in steps if what == "encoding"] == list(range(1, 17))
     assert all(0 <= done <= total for _, done, total in steps)
     assert steps[-1][1] == steps[-1][2]
 
 
-def test_common_transform_is_estimated(arcs: tuple[Recording, Recording], encoder: Encoder) -> None:
+def test_common_transform_is_estimated(
+    arcs: tuple[Recording, Recording], encoder: Encoder
+) -> None:
     change = SE3.exp(np.array([0, 0, 0, 0.012, -0.02, 0.015]))
     built = build_map("a", moved(arcs[0].train[:18], change.inverse()), encoder, SMALL)
     # Adjusted = stated @ common, and stated = true @ change^-1.
@@ -124,16 +149,22 @@ def test_common_transform_is_estimated(arcs: tuple[Recording, Recording], encode
     np.testing.assert_allclose(rotation, change.log()[3:], atol=4e-3)
 
 
-def test_time_shift_is_undone(arcs: tuple[Recording, Recording], encoder: Encoder) -> None:
+def test_time_shift_is_undone(
+    arcs: tuple[Recording, Recording], encoder: Encoder
+) -> None:
     """Answers are true poses, though poses are stated half a frame after their images."""
     true = {frame.name: pose_of(frame) for frame in arcs[0].train}
     frames = [
         replace(frame, base_from_camera=late.base_from_camera)
         for frame, late in zip(arcs[0].train, arcs[0].test, strict=True)
     ]
-    built = build_map("a", frames, encoder, replace(SMALL, memory=MemoryBudget(share=0.25)))
+    built = build_map(
+        "a", frames, encoder, replace(SMALL, memory=MemoryBudget(share=0.25))
+    )
     assert built.adjusted.time_shift_frames == pytest.approx(-0.5, abs=0.1)
-    stated, before, after = {frame.name: pose_of(frame) for frame in frames}, [], []
+    stated = {frame.name: pose_of(frame) for frame in frames}
+    before = []
+    after = []
     for i, name in enumerate(built.keyframe_names):
         pose = UncertainPose.exact(built.scene.keyframes.base_from_camera[i])
         after.append(pose_distance(built.scene.frame.to_base(pose).pose, true[name])[0])
@@ -163,7 +194,8 @@ CAMERA = Camera(320, 240, 280.0, 280.0, 159.5, 119.5)
 def test_landmarks_are_tracked_again_after_noticeable_changes(
     change: np.ndarray, camera: Camera | None, noticeable: bool
 ) -> None:
-    stated, zero = SE3.exp(np.random.default_rng(0).normal(size=(10, 6))), np.zeros((10, 6, 6))
+    stated = SE3.exp(np.random.default_rng(0).normal(size=(10, 6)))
+    zero = np.zeros((10, 6, 6))
     adjustment = Adjustment(
         poses=stated @ SE3.exp(np.broadcast_to(change, (10, 6))),
         cameras=camera and [camera] * 10,
@@ -219,11 +251,15 @@ def test_frame_with_a_wrong_pose_is_excluded(hall: Recording, encoder: Encoder) 
     )
     built = build_map("hall", frames, encoder, options)
     assert built.adjusted.wrong_poses == (frames[wrong].name,)
-    assert len(built.scene.keyframes) == len(built.keyframe_names) == 7  # another one replaces it
+    # Another one replaces it.
+    assert len(built.scene.keyframes) == len(built.keyframe_names) == 7
     stated = {frame.name: pose_of(frame) for frame in frames}
     assert frames[wrong].name not in built.keyframe_names
     for i, name in enumerate(built.keyframe_names):
-        assert pose_distance(built.scene.keyframes.base_from_camera[i], stated[name])[0] < 0.003
+        assert (
+            pose_distance(built.scene.keyframes.base_from_camera[i], stated[name])[0]
+            < 0.003
+        )
 
 
 def test_frames_with_one_position_are_refused(
@@ -233,7 +269,9 @@ def test_frames_with_one_position_are_refused(
         replace(f, base_from_camera=SE3(pose_of(f).rotation_wxyz, np.ones(3)))
         for f in arcs[0].train[:16]
     ]
-    with pytest.raises(InputError, match=r"no two training frames show the same .* parallax"):
+    with pytest.raises(
+        InputError, match=r"no two training frames show the same .* parallax"
+    ):
         build_map("a", frames, encoder, SMALL)
 
 
@@ -257,9 +295,12 @@ def test_maps_are_similar_at_other_scales(
     assert np.median(depths[1]) == pytest.approx(scale * np.median(depths[0]), rel=0.03)
 
 
-def test_maps_are_deterministic(arcs: tuple[Recording, Recording], encoder: Encoder) -> None:
+def test_maps_are_deterministic(
+    arcs: tuple[Recording, Recording], encoder: Encoder
+) -> None:
     one, two = (build_map("a", arcs[1].train[:10], encoder, SMALL) for _ in range(2))
-    a, b = one.scene.keyframes.to_tensors(), two.scene.keyframes.to_tensors()
+    a = one.scene.keyframes.to_tensors()
+    b = two.scene.keyframes.to_tensors()
     assert a.keys() == b.keys()
     for name, value in a.items():
         np.testing.assert_array_equal(value, b[name])
@@ -267,7 +308,9 @@ def test_maps_are_deterministic(arcs: tuple[Recording, Recording], encoder: Enco
 
 
 @pytest.mark.parametrize("capacity", [1, 5, 24, 100])
-def test_spread_frames_fill_the_capacity(capacity: int, arcs: tuple[Recording, Recording]) -> None:
+def test_spread_frames_fill_the_capacity(
+    capacity: int, arcs: tuple[Recording, Recording]
+) -> None:
     selected = spread_frames(arcs[0].train, capacity).tolist()
     assert len(selected) == min(capacity, 24)
     assert selected == sorted(set(selected))
@@ -301,10 +344,13 @@ def test_depths_are_refined_again_only_where_poses_moved(
     encoder: Encoder,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    solved, solve = list[object](), BundleAdjustment.solve
+    solved = list[object]()
+    solve = BundleAdjustment.solve
     monkeypatch.setattr(build, "_moved", lambda *_: noticeable)
     monkeypatch.setattr(
-        BundleAdjustment, "solve", lambda self, tracks: solved.append(self) or solve(self, tracks)
+        BundleAdjustment,
+        "solve",
+        lambda self, tracks: solved.append(self) or solve(self, tracks),
     )
     options = replace(SMALL, size=WorkingSize(cells=64, patches=64))
     build_map("room", rooms[0].train[:16], encoder, options)

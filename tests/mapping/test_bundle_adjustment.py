@@ -13,7 +13,12 @@ from scipy.spatial.transform import Rotation
 from evercal.errors import InputError
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3, pose_distance
-from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment, BundleOptions, noise_of
+from evercal.mapping.bundle_adjustment import (
+    Adjustment,
+    BundleAdjustment,
+    BundleOptions,
+    noise_of,
+)
 from evercal.mapping.bundle_equations import (
     COMMON,
     INTRINSICS,
@@ -36,7 +41,9 @@ def path(times: Array) -> SE3:
     """A smooth walk in front of a wall, rotating about all axes."""
     poses = []
     for t in times / FRAMES * 2 * np.pi:
-        eye = np.array([0.6 * np.sin(t), 0.4 * np.cos(2 * t + 1), 1.4 + 0.3 * np.sin(3 * t)])
+        eye = np.array(
+            [0.6 * np.sin(t), 0.4 * np.cos(2 * t + 1), 1.4 + 0.3 * np.sin(3 * t)]
+        )
         ahead = np.array([0.3 * np.cos(2 * t), 2.5, 0.3 * np.sin(t)])
         poses.append(look_at(eye, eye + ahead, 0.5 * np.sin(t + 2)))
     return SE3.stack(poses)
@@ -61,14 +68,20 @@ def world(
     landmarks: int = 25,
 ) -> World:
     """Landmarks of every third frame at random depths, observed by all frames that see them."""
-    rng, poses = np.random.default_rng(seed), truth or path(np.arange(float(FRAMES)))
+    rng = np.random.default_rng(seed)
+    poses = truth or path(np.arange(float(FRAMES)))
     host = np.repeat(np.arange(0, len(poses), every), landmarks)
     pixels = rng.uniform([40, 40], [600, 440], (len(host), 2))
     inverse = 1 / rng.uniform(1.5, 4.0, len(host))
     rays = camera.unproject(pixels)
-    landmark, frame, observed = [], [], []
+    landmark = []
+    frame = []
+    observed = []
     points = np.stack(
-        [poses[int(k)].apply(r / d) for k, r, d in zip(host, rays, inverse, strict=True)]
+        [
+            poses[int(k)].apply(r / d)
+            for k, r, d in zip(host, rays, inverse, strict=True)
+        ]
     )
     for j in range(len(poses)):
         local = poses[j].inverse().apply(points)
@@ -157,9 +170,14 @@ def test_pixel_noise_hardly_moves_poses() -> None:
     assert result.residual_px == pytest.approx(0.2 * 1.177, rel=0.1)
 
 
-@pytest.mark.parametrize(("sigma_m", "sigma_deg"), [(0.005, 0.3), (0.02, 0.1), (0.002, 1.0)])
-def test_pose_errors_shrink_and_their_size_is_estimated(sigma_m: float, sigma_deg: float) -> None:
-    made, sigma_rad = world(), np.deg2rad(sigma_deg)
+@pytest.mark.parametrize(
+    ("sigma_m", "sigma_deg"), [(0.005, 0.3), (0.02, 0.1), (0.002, 1.0)]
+)
+def test_pose_errors_shrink_and_their_size_is_estimated(
+    sigma_m: float, sigma_deg: float
+) -> None:
+    made = world()
+    sigma_rad = np.deg2rad(sigma_deg)
     stated = jittered(made.truth, sigma_m, sigma_rad)
     result = adjusted(made, stated)
     before = errors(without_gauge(stated, made.truth), made.truth)
@@ -172,7 +190,8 @@ def test_pose_errors_shrink_and_their_size_is_estimated(sigma_m: float, sigma_de
 
 
 def test_covariance_matches_errors_of_many_runs() -> None:
-    deviations, spread = [], []
+    deviations = []
+    spread = []
     for seed in range(6):
         made = world(seed=seed)
         stated = jittered(made.truth, 0.004, 0.004, seed + 100)
@@ -188,8 +207,11 @@ def test_covariance_matches_errors_of_many_runs() -> None:
 @pytest.mark.parametrize("systematic", [False, True])
 def test_systematic_errors_of_an_arm_widen_the_covariance(systematic: bool) -> None:
     """Errors that are linear in the pose are told from independent ones by the residuals."""
-    made, rng = world(noise_px=0.05), np.random.default_rng(0)
-    options = BundleOptions(common_stated=False, common_sigma_m=0.2, common_sigma_deg=10.0)
+    made = world(noise_px=0.05)
+    rng = np.random.default_rng(0)
+    options = BundleOptions(
+        common_stated=False, common_sigma_m=0.2, common_sigma_deg=10.0
+    )
     rotations = Rotation.from_quat(made.truth.rotation_wxyz, scalar_first=True)
     turns = (rotations.mean().inv() * rotations).as_rotvec()
     linear = np.concatenate([turns, made.truth.translation_m], 1)
@@ -206,20 +228,29 @@ def test_systematic_errors_of_an_arm_widen_the_covariance(systematic: bool) -> N
 
 def test_an_arm_errs_at_the_gripper() -> None:
     """A rotation of the gripper moves a camera on a lever and nearly cancels at the landmarks."""
-    made, rng = world(noise_px=0.05), np.random.default_rng(0)
-    options = BundleOptions(common_stated=False, common_sigma_m=0.2, common_sigma_deg=10.0)
+    made = world(noise_px=0.05)
+    rng = np.random.default_rng(0)
+    options = BundleOptions(
+        common_stated=False, common_sigma_m=0.2, common_sigma_deg=10.0
+    )
     gripper_from_camera = SE3.stack([SE3.from_translation((0.3, 0.0, 1.2))] * FRAMES)
     errors = rng.normal(0, np.repeat([2e-4, np.deg2rad(0.2)], 3), (FRAMES, 6))
     grippers = made.truth @ gripper_from_camera.inverse()
     stated = grippers @ SE3.exp(errors) @ gripper_from_camera
     still = np.zeros((FRAMES, 6))
-    at_camera = BundleAdjustment(stated, [CAMERA] * FRAMES, still, options).solve(made.tracks)
-    problem = BundleAdjustment(stated, [CAMERA] * FRAMES, still, options, gripper_from_camera)
+    at_camera = BundleAdjustment(stated, [CAMERA] * FRAMES, still, options).solve(
+        made.tracks
+    )
+    problem = BundleAdjustment(
+        stated, [CAMERA] * FRAMES, still, options, gripper_from_camera
+    )
     at_gripper = problem.solve(made.tracks)
     assert at_gripper.sigma_m < 5e-4
     assert np.rad2deg(at_gripper.sigma_rad) == pytest.approx(0.2, rel=0.3)
     assert at_camera.sigma_m > 2e-3
-    widest = [np.linalg.eigvalsh(a.common_covariance)[-1] for a in (at_gripper, at_camera)]
+    widest = [
+        np.linalg.eigvalsh(a.common_covariance)[-1] for a in (at_gripper, at_camera)
+    ]
     assert widest[0] < widest[1]
 
 
@@ -251,7 +282,9 @@ def test_focal_length_is_estimated(factor: float) -> None:
     fixed = adjusted(made, made.truth, wrong, options=BundleOptions(intrinsics=False))
     assert fixed.cameras is None
     several = [wrong, *[CAMERA] * (FRAMES - 1)]
-    mixed = BundleAdjustment(made.truth, several, np.zeros((FRAMES, 6)), BundleOptions())
+    mixed = BundleAdjustment(
+        made.truth, several, np.zeros((FRAMES, 6)), BundleOptions()
+    )
     assert mixed.solve(made.tracks).cameras is None
 
 
@@ -261,13 +294,16 @@ def test_missing_distortion_is_estimated() -> None:
     result = adjusted(made, made.truth, CAMERA)
     assert result.cameras is not None
     corners = np.array([[30.0, 30], [610, 30], [320, 440], [100, 240], [320, 240]])
-    rays, truth = result.cameras[0].unproject(corners), distorted.unproject(corners)
+    rays = result.cameras[0].unproject(corners)
+    truth = distorted.unproject(corners)
     assert np.abs(CAMERA.unproject(corners) - truth).max() > 0.015
     assert np.abs(rays - truth).max() < 2e-3
     # A stated distortion does not change.
     same = adjusted(made, made.truth, distorted)
     assert same.cameras is not None
-    np.testing.assert_allclose(same.cameras[0].distortion, distorted.distortion, atol=1e-3)
+    np.testing.assert_allclose(
+        same.cameras[0].distortion, distorted.distortion, atol=1e-3
+    )
 
 
 def velocities(stated: SE3) -> Array:
@@ -292,7 +328,9 @@ def test_outlier_pose_gets_little_weight() -> None:
     stated = jittered(made.truth, 0.002, 0.001)
     # Larger errors leave a frame without tracks; `pose_check` removes it.
     off = SE3.exp(np.array([0.06, -0.03, 0.04, 0.01, 0.02, 0.0]))
-    corrupted = SE3.stack([stated[i] @ off if i == 13 else stated[i] for i in range(FRAMES)])
+    corrupted = SE3.stack(
+        [stated[i] @ off if i == 13 else stated[i] for i in range(FRAMES)]
+    )
     result = adjusted(made, corrupted)
     assert result.weight.argmin() == 13
     assert result.weight[13] < 0.1
@@ -308,7 +346,9 @@ def test_outlier_pose_gets_little_weight() -> None:
 def test_few_outlier_tracks_change_little() -> None:
     made = world()
     rng = np.random.default_rng(3)
-    outliers = rng.choice(len(made.tracks.frame), len(made.tracks.frame) // 20, replace=False)
+    outliers = rng.choice(
+        len(made.tracks.frame), len(made.tracks.frame) // 20, replace=False
+    )
     observed = made.tracks.observed.copy()
     observed[outliers] += rng.normal(0, 15, (len(outliers), 2))
     made.tracks = replace(made.tracks, observed=observed)
@@ -329,7 +369,9 @@ DISTORTIONS = [
 def dense(lin: Linearised, tracks: BundleTracks) -> Array:
     """(2 m, 6 n + 12) derivatives by corrections and shared parameters."""
     jacobian = np.zeros((len(tracks.frame), 2, 6 * FRAMES + SHARED))
-    for i, (host, frame) in enumerate(zip(tracks.host_frame, tracks.frame, strict=True)):
+    for i, (host, frame) in enumerate(
+        zip(tracks.host_frame, tracks.frame, strict=True)
+    ):
         jacobian[i, :, 6 * host : 6 * host + 6] = lin.by_host[i]
         jacobian[i, :, 6 * frame : 6 * frame + 6] = lin.by_frame[i]
     jacobian[..., -INTRINSICS:] = lin.by_intrinsics
@@ -338,18 +380,26 @@ def dense(lin: Linearised, tracks: BundleTracks) -> Array:
 
 def test_normal_equations_are_those_of_the_dense_derivatives() -> None:
     made = world(CAMERA)
-    frames, tracks = StatedFrames(made.truth, [CAMERA] * FRAMES), made.tracks
-    rng, size = np.random.default_rng(1), 6 * FRAMES + SHARED
-    own, shared = rng.normal(0, 1e-3, (FRAMES, 6)), np.zeros(SHARED)
+    frames = StatedFrames(made.truth, [CAMERA] * FRAMES)
+    tracks = made.tracks
+    rng = np.random.default_rng(1)
+    size = 6 * FRAMES + SHARED
+    own = rng.normal(0, 1e-3, (FRAMES, 6))
+    shared = np.zeros(SHARED)
     lin = frames.linearise(tracks, Parameters(own, shared, tracks.inverse_depth))
     weight = rng.uniform(0.5, 2, len(tracks.frame))
-    solution = NormalEquations.of(tracks, lin, weight, np.eye(size), np.zeros(size)).solve(0.1)
+    solution = NormalEquations.of(
+        tracks, lin, weight, np.eye(size), np.zeros(size)
+    ).solve(0.1)
     assert solution is not None
     depth = np.zeros((2 * len(tracks.frame), len(tracks.host)))
     depth[np.arange(len(depth)), np.repeat(tracks.landmark, 2)] = lin.by_depth.ravel()
     root = np.sqrt(np.repeat(weight, 2))[:, None]
-    whole, slope = np.hstack([dense(lin, tracks), depth]) * root, lin.residual.ravel() * root[:, 0]
-    system = whole.T @ whole + np.diag(np.r_[np.ones(size), np.full(depth.shape[1], 1e-6)])
+    whole = np.hstack([dense(lin, tracks), depth]) * root
+    slope = lin.residual.ravel() * root[:, 0]
+    system = whole.T @ whole + np.diag(
+        np.r_[np.ones(size), np.full(depth.shape[1], 1e-6)]
+    )
     system += 0.1 * np.diag(np.diag(system))
     step = -np.linalg.solve(system, whole.T @ slope)
     np.testing.assert_allclose(solution.change, step[:size], rtol=1e-6, atol=1e-12)
@@ -360,10 +410,12 @@ def test_normal_equations_are_those_of_the_dense_derivatives() -> None:
 def test_derivatives_are_finite_differences(distortion: tuple[float, ...]) -> None:
     camera = replace(CAMERA, distortion=distortion)
     made = world(camera)
-    frames, tracks = StatedFrames(made.truth, [camera] * FRAMES), made.tracks
+    frames = StatedFrames(made.truth, [camera] * FRAMES)
+    tracks = made.tracks
 
     def parameters(change: Array, depth: Array) -> Parameters:
-        own, shared = change[: 6 * FRAMES].reshape(-1, 6), change[6 * FRAMES :]
+        own = change[: 6 * FRAMES].reshape(-1, 6)
+        shared = change[6 * FRAMES :]
         return Parameters(own, shared, depth)
 
     def residual(change: Array, depth: Array = tracks.inverse_depth) -> Array:
@@ -380,12 +432,16 @@ def test_derivatives_are_finite_differences(distortion: tuple[float, ...]) -> No
         # Changes of the distortion below 1e-4 are ignored.
         step[column] = 1e-3 if column >= 6 * FRAMES + SHARED - 2 else 1e-5
         slope = (residual(step) - residual(-step)) / (2 * step[column])
-        np.testing.assert_allclose(jacobian[:, column], slope, atol=1e-3 * np.abs(slope).max())
+        np.testing.assert_allclose(
+            jacobian[:, column], slope, atol=1e-3 * np.abs(slope).max()
+        )
     # Common transform and time shift act through the priors alone.
     assert not jacobian[:, 6 * FRAMES : 6 * FRAMES + COMMON + SHIFT].any()
     rho = tracks.inverse_depth
     slope = (residual(zero, rho + 1e-6) - residual(zero, rho - 1e-6)) / 2e-6
-    np.testing.assert_allclose(lin.by_depth.ravel(), slope, atol=1e-4 * np.abs(slope).max())
+    np.testing.assert_allclose(
+        lin.by_depth.ravel(), slope, atol=1e-4 * np.abs(slope).max()
+    )
 
 
 def test_steps_reach_the_minimum_of_a_slow_solver() -> None:
@@ -394,14 +450,21 @@ def test_steps_reach_the_minimum_of_a_slow_solver() -> None:
     made = world(truth=truth, every=1, landmarks=8)
     stated = jittered(truth, 0.004, 0.004)
     options = BundleOptions(distortion_sigma=1e-9)
-    tracks, velocity = made.tracks, velocities(stated)
+    tracks = made.tracks
+    velocity = velocities(stated)
     bundle = problem(stated, velocity=velocity, options=options)
-    variances, estimate = bundle.start_variances(), bundle.start(tracks)
+    variances = bundle.start_variances()
+    estimate = bundle.start(tracks)
     for _ in range(80):
         estimate = bundle.step(tracks, estimate, variances)
-    noise, n = noise_of(estimate.linearised), len(truth)
+    noise = noise_of(estimate.linearised)
+    n = len(truth)
     scale = np.concatenate(
-        [np.tile(variances.sigma, n), np.sqrt(variances.shared), 0.01 * tracks.inverse_depth]
+        [
+            np.tile(variances.sigma, n),
+            np.sqrt(variances.shared),
+            0.01 * tracks.inverse_depth,
+        ]
     )
 
     def parameters(x: Array) -> Parameters:
@@ -416,9 +479,13 @@ def test_steps_reach_the_minimum_of_a_slow_solver() -> None:
         explained = at.shared[:COMMON] + at.shared[COMMON] * velocity
         prior = (at.correction - explained) / variances.sigma
         shared = at.shared / np.sqrt(variances.shared)
-        return np.concatenate([(lin.residual * robust[:, None]).ravel(), prior.ravel(), shared])
+        return np.concatenate(
+            [(lin.residual * robust[:, None]).ravel(), prior.ravel(), shared]
+        )
 
-    slow = scipy.optimize.least_squares(residuals, np.zeros(len(scale)), xtol=1e-14, ftol=1e-14)
+    slow = scipy.optimize.least_squares(
+        residuals, np.zeros(len(scale)), xtol=1e-14, ftol=1e-14
+    )
     cost = bundle.cost(estimate.linearised, estimate.parameters, variances, noise)
     assert 2 * slow.cost == pytest.approx(cost, rel=2e-6)
     expected = parameters(slow.x)
@@ -431,7 +498,9 @@ def test_steps_reach_the_minimum_of_a_slow_solver() -> None:
     deviation = np.sqrt(np.einsum("ij,ij->j", estimate.root, estimate.root))
     assert np.abs(difference / deviation).max() < 0.05
     observed = np.unique(tracks.landmark)
-    depth, slow_depth = (p.inverse_depth[observed] for p in (estimate.parameters, expected))
+    depth, slow_depth = (
+        p.inverse_depth[observed] for p in (estimate.parameters, expected)
+    )
     np.testing.assert_allclose(depth, slow_depth, rtol=1e-3)
 
 
@@ -445,7 +514,8 @@ def test_no_step_raises_the_cost_far_from_the_minimum() -> None:
     stated = jittered(made.truth, 0.1, 0.1, seed=9)
     tracks = replace(made.tracks, inverse_depth=0.2 * made.inverse_depth)
     bundle = problem(stated)
-    variances, estimate = bundle.start_variances(), bundle.start(tracks)
+    variances = bundle.start_variances()
+    estimate = bundle.start(tracks)
     for _ in range(10):
         noise = noise_of(estimate.linearised)
         before = bundle.cost(estimate.linearised, estimate.parameters, variances, noise)

@@ -44,9 +44,13 @@ def test_poses_and_cameras_are_stored_exactly() -> None:
     frames = []
     for i, distortion in enumerate(DISTORTIONS):
         width, height = [(64, 48), (48, 64), (101, 77), (640, 480)][i]
-        camera = Camera(width, height, 71.3 + i, 70.1, width / 2.1, height / 1.9, distortion)
+        camera = Camera(
+            width, height, 71.3 + i, 70.1, width / 2.1, height / 1.9, distortion
+        )
         pose = SE3.exp(rng.normal(size=6))
-        frames.append(Frame(str(i), np.zeros((height, width, 3), np.uint8), camera, pose))
+        frames.append(
+            Frame(str(i), np.zeros((height, width, 3), np.uint8), camera, pose)
+        )
     keyframes = store_keyframes(frames, 48)
     for again in (keyframes, through_a_file(keyframes)):
         assert tuple(again.images) == keyframes.images
@@ -108,7 +112,9 @@ def mapped(frames: tuple[Frame, ...], counts: tuple[int, ...]) -> Keyframes:
     depths = tuple(rng.uniform(0.1, 1, 48).astype(np.float16) for _ in counts)
     descriptors = rng.normal(size=(len(counts), 16)).astype(np.float16)
     plain = store_keyframes(frames[: len(counts)], 48)
-    return replace(plain, inverse_depth=depths, landmarks=marks, descriptors=descriptors)
+    return replace(
+        plain, inverse_depth=depths, landmarks=marks, descriptors=descriptors
+    )
 
 
 @pytest.mark.parametrize("counts", [(7, 0, 12), (0, 0), (5,)])
@@ -129,7 +135,12 @@ def test_landmarks_are_stored_exactly(
     assert back.descriptors.dtype == back.inverse_depth[0].dtype == np.float16
     # 16 bytes of floats and 4 of pixels a landmark.
     plain = replace(keyframes, landmarks=(), descriptors=None, inverse_depth=())
-    extra = 20 * sum(counts) + 8 * len(counts) + (2 * 48 + 8) * len(counts) + 32 * len(counts)
+    extra = (
+        20 * sum(counts)
+        + 8 * len(counts)
+        + (2 * 48 + 8) * len(counts)
+        + 32 * len(counts)
+    )
     assert keyframes.bytes == plain.bytes + extra
     empty = through_a_file(plain)
     assert (empty.landmarks, empty.descriptors, empty.inverse_depth) == ((), None, ())
@@ -146,7 +157,8 @@ def test_pixels_need_two_bytes(rooms: tuple[Recording, ...]) -> None:
 def test_keyframes_stay_in_their_file_until_they_are_used(
     counts: tuple[int, ...], rooms: tuple[Recording, ...], tmp_path: Path
 ) -> None:
-    keyframes, file = mapped(rooms[0].train, counts), tmp_path / "a.safetensors"
+    keyframes = mapped(rooms[0].train, counts)
+    file = tmp_path / "a.safetensors"
     save_tensors(file, keyframes.to_tensors())
     back = Keyframes.from_tensors(open_tensors(file))
     file.unlink()  # as when another process replaces a scene
@@ -163,7 +175,8 @@ def test_keyframes_stay_in_their_file_until_they_are_used(
 def test_parts_beyond_their_arrays_are_errors_at_once(
     name: str, rooms: tuple[Recording, ...], tmp_path: Path
 ) -> None:
-    tensors, file = mapped(rooms[0].train, (7, 3)).to_tensors(), tmp_path / "a.safetensors"
+    tensors = mapped(rooms[0].train, (7, 3)).to_tensors()
+    file = tmp_path / "a.safetensors"
     for change in (+1, -tensors[name][-1] - 1):
         counts = tensors[name].copy()
         counts[-1] += change

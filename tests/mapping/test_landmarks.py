@@ -28,7 +28,9 @@ def on_a_plane(camera: Camera, normal: Array, pixels: Array) -> Landmarks:
         return camera.unproject(at) @ normal
 
     steps = np.array([[2.0, 0], [0, 2.0]])
-    beside = [(inverse_depth(pixels + step) - inverse_depth(pixels)) / 2 for step in steps]
+    beside = [
+        (inverse_depth(pixels + step) - inverse_depth(pixels)) / 2 for step in steps
+    ]
     n = len(pixels)
     return Landmarks(pixels, inverse_depth(pixels), np.stack(beside, -1), np.ones(n))
 
@@ -47,13 +49,16 @@ def test_patches_warp_like_a_slanted_plane(camera: Camera) -> None:
     normal = np.array([0.15, -0.1, 0.5])
     marks = on_a_plane(camera, normal, spots())
     surface = marks.surface(camera)
-    np.testing.assert_allclose(surface @ normal, 1, atol=1e-9)  # all three points lie on it
+    # All three points lie on it.
+    np.testing.assert_allclose(surface @ normal, 1, atol=1e-9)
     which, pixels, affines = project_surface(surface, ROTATION, TRANSLATION, camera)
     assert len(which) > 40
 
     def projected(at: Array) -> Array:
         ray = camera.unproject(at)
-        return camera.project((ray / (ray @ normal)[:, None]) @ ROTATION.T + TRANSLATION)
+        return camera.project(
+            (ray / (ray @ normal)[:, None]) @ ROTATION.T + TRANSLATION
+        )
 
     at = marks.pixels[which]
     np.testing.assert_allclose(pixels, projected(at), atol=1e-6)
@@ -71,11 +76,14 @@ def test_patches_warp_like_a_slanted_plane(camera: Camera) -> None:
 
 def test_landmarks_behind_outside_or_too_slanted_are_not_visible() -> None:
     marks = on_a_plane(PLAIN, np.array([0, 0, 0.5]), spots())
-    surface, eye = marks.surface(PLAIN), np.eye(3)
+    surface = marks.surface(PLAIN)
+    eye = np.eye(3)
     visible, pixels, affines = project_surface(surface, eye, np.zeros(3), PLAIN)
     assert visible.tolist() == list(range(len(marks)))
     np.testing.assert_allclose(pixels, marks.pixels, atol=1e-9)
-    np.testing.assert_allclose(affines, np.broadcast_to(np.eye(2), affines.shape), atol=1e-9)
+    np.testing.assert_allclose(
+        affines, np.broadcast_to(np.eye(2), affines.shape), atol=1e-9
+    )
     # Behind the camera, and at its centre.
     for forward in (-2.5, -2.0):
         which, _, _ = project_surface(surface, eye, np.array([0, 0, forward]), PLAIN)
@@ -87,7 +95,8 @@ def test_landmarks_behind_outside_or_too_slanted_are_not_visible() -> None:
     shift = np.array([0.9, 0.4, 0])
     which, pixels, _ = project_surface(surface, eye, shift, PLAIN)
     at = PLAIN.project(surface[0] + shift)
-    low, high = BORDER_PX, np.array([320, 240]) - 1 - BORDER_PX
+    low = BORDER_PX
+    high = np.array([320, 240]) - 1 - BORDER_PX
     expected = [i for i, p in enumerate(at) if (p > low).all() and (p < high).all()]
     assert 0 < len(which) < len(marks)
     assert which.tolist() == expected
@@ -105,7 +114,9 @@ def test_landmarks_behind_outside_or_too_slanted_are_not_visible() -> None:
 
 @pytest.mark.parametrize("most", [1, 20, 400])
 def test_at_most_so_many_patches_are_evenly_spread(most: int) -> None:
-    surface = on_a_plane(DISTORTED, np.array([0.15, -0.1, 0.5]), spots()).surface(DISTORTED)
+    surface = on_a_plane(DISTORTED, np.array([0.15, -0.1, 0.5]), spots()).surface(
+        DISTORTED
+    )
     surface[1:, ::5] = surface[0, ::5]  # patches without an area are never visible
     which, *others = project_surface(surface, ROTATION, TRANSLATION, DISTORTED)
     some, *fewer = project_surface(surface, ROTATION, TRANSLATION, DISTORTED, most)
@@ -118,11 +129,14 @@ def test_at_most_so_many_patches_are_evenly_spread(most: int) -> None:
 
 
 def test_slopes_of_a_plane_are_exact_inside() -> None:
-    grid, cell = (30, 40), 8.0
+    grid = (30, 40)
+    cell = 8.0
     row, column = np.mgrid[0:30, 0:40]
     field = 0.5 + 0.003 * cell * column - 0.002 * cell * row
     result = slopes(field.ravel(), grid, cell).reshape(30, 40, 2)[5:-5, 5:-5]
-    np.testing.assert_allclose(result, np.broadcast_to([0.003, -0.002], result.shape), atol=1e-6)
+    np.testing.assert_allclose(
+        result, np.broadcast_to([0.003, -0.002], result.shape), atol=1e-6
+    )
     # One wrong cell has no effect.
     corrupted = field.copy()
     corrupted[15, 20] = 4.0
@@ -139,7 +153,12 @@ def test_most_textured_pixel_of_every_cell_is_detected() -> None:
     pixels, cells = detect(grey, (12, 16), 8.0)
     assert {16 * i + j for i, j in textured} <= set(cells.tolist())
     # The 5x5 window includes texture of neighbouring cells.
-    near = {16 * (i + a) + j + b for i, j in textured for a in (-1, 0, 1) for b in (-1, 0, 1)}
+    near = {
+        16 * (i + a) + j + b
+        for i, j in textured
+        for a in (-1, 0, 1)
+        for b in (-1, 0, 1)
+    }
     assert set(cells.tolist()) <= near
     assert len(set(cells.tolist())) == len(cells)
     np.testing.assert_array_equal(cells, (pixels[:, 1] // 8) * 16 + pixels[:, 0] // 8)

@@ -45,7 +45,8 @@ def root(scenes: list[SceneMap], tmp_path: Path, make: Make) -> Path:
 @pytest.fixture
 def other(scenes: list[SceneMap], tmp_path: Path, make: Make) -> Path:
     """A map of beta, with a number of frames of its own, and delta."""
-    beta, delta = replace(scenes[1], train_frames=7), replace(scenes[2], name="delta")
+    beta = replace(scenes[1], train_frames=7)
+    delta = replace(scenes[2], name="delta")
     return make(tmp_path / "other", [beta, delta]).root
 
 
@@ -54,10 +55,14 @@ def names(root: Path) -> list[str]:
 
 
 def frames_of(root: Path) -> dict[str, int]:
-    return {scene.name: scene.train_frames for scene in MapStore.open(root).contents.scenes}
+    return {
+        scene.name: scene.train_frames for scene in MapStore.open(root).contents.scenes
+    }
 
 
-@pytest.mark.parametrize("gone", [["alpha"], ["beta"], ["gamma", "alpha"], ["beta", "alpha"]])
+@pytest.mark.parametrize(
+    "gone", [["alpha"], ["beta"], ["gamma", "alpha"], ["beta", "alpha"]]
+)
 def test_removed_scenes_are_gone_and_the_others_unchanged(
     gone: list[str], root: Path, scenes: list[SceneMap], content: Contents
 ) -> None:
@@ -72,7 +77,9 @@ def test_removed_scenes_are_gone_and_the_others_unchanged(
     assert sorted(os.listdir(root / "stages")) == sorted(opened.stages)
 
 
-def test_a_map_without_scenes_can_grow_again(root: Path, scenes: list[SceneMap]) -> None:
+def test_a_map_without_scenes_can_grow_again(
+    root: Path, scenes: list[SceneMap]
+) -> None:
     store = MapStore.open(root)
     remove_scenes(store, ["alpha", "beta", "gamma"])
     assert names(root) == []
@@ -82,7 +89,8 @@ def test_a_map_without_scenes_can_grow_again(root: Path, scenes: list[SceneMap])
 
 def test_no_folder_name_is_used_again(root: Path, scenes: list[SceneMap]) -> None:
     """A process that opened the map before would take the new scene for the old one."""
-    late, store = MapStore.open(root), MapStore.open(root)
+    late = MapStore.open(root)
+    store = MapStore.open(root)
     remove_scenes(store, ["gamma"])
     store.commit(replace(scenes[2], train_frames=9), {"scene": "gamma"})
     assert store.stages == ["0001-alpha", "0002-beta", "0004-gamma"]
@@ -96,7 +104,8 @@ def test_no_folder_name_is_used_again(root: Path, scenes: list[SceneMap]) -> Non
 def test_a_renamed_scene_keeps_its_place_and_content(
     root: Path, scenes: list[SceneMap], content: Contents
 ) -> None:
-    before, store = MapStore.open(root).contents, MapStore.open(root)
+    before = MapStore.open(root).contents
+    store = MapStore.open(root)
     rename_scene(store, "alpha", "Küche 2")
     renamed = [replace(before.scenes[0], name="Küche 2"), *before.scenes[1:]]
     opened = MapStore.open(root)
@@ -116,11 +125,18 @@ def test_undo_keeps_a_later_name(root: Path, scenes: list[SceneMap]) -> None:
 
 
 def test_misuse_is_refused_by_name_and_changes_nothing(root: Path, tree: Tree) -> None:
-    before, store = tree(root), MapStore.open(root)
+    before = tree(root)
+    store = MapStore.open(root)
     attempts: list[tuple[Callable[[], object], str]] = [
-        (lambda: remove_scenes(store, ["alpha", "attic"]), "'attic'.* it has alpha, beta, gamma"),
+        (
+            lambda: remove_scenes(store, ["alpha", "attic"]),
+            "'attic'.* it has alpha, beta, gamma",
+        ),
         (lambda: rename_scene(store, "attic", "a"), "scene 'attic'"),
-        (lambda: rename_scene(store, "alpha", "beta"), "scene 'beta': .* has a scene of this name"),
+        (
+            lambda: rename_scene(store, "alpha", "beta"),
+            "scene 'beta': .* has a scene of this name",
+        ),
         (lambda: rename_scene(store, "alpha", "a/b"), "scene name 'a/b'"),
         (lambda: merge_maps(store, [root]), "is the map that scenes are merged into"),
         (lambda: merge_maps(store, [root / "gone"]), "gone: no such folder"),
@@ -151,8 +167,12 @@ def test_misuse_is_refused_by_name_and_changes_nothing(root: Path, tree: Tree) -
 def test_names_that_are_taken(
     on_clash: OnClash, expected: dict[str, int], root: Path, other: Path, tree: Tree
 ) -> None:
-    before, source, store = tree(root), tree(other), MapStore.open(root)
-    with pytest.raises(InputError, match=r"scene 'beta' of map .*other: the name is taken"):
+    before = tree(root)
+    source = tree(other)
+    store = MapStore.open(root)
+    with pytest.raises(
+        InputError, match=r"scene 'beta' of map .*other: the name is taken"
+    ):
         merge_maps(store, [other])
     assert tree(root) == before
     merged = merge_maps(store, [other], on_clash)
@@ -189,10 +209,13 @@ def test_a_new_map_has_the_encoder_of_the_first_one(
 ) -> None:
     store = MapStore.create(tmp_path / "new")
     merge_maps(store, [other])
-    opened, source = MapStore.open(tmp_path / "new"), MapStore.open(other)
+    opened = MapStore.open(tmp_path / "new")
+    source = MapStore.open(other)
     assert opened.networks == source.networks
     assert (opened.contents.short_side, store.contents.short_side) == (48, 48)
-    assert content(opened.contents) == content(source.contents) == content(store.contents)
+    assert (
+        content(opened.contents) == content(source.contents) == content(store.contents)
+    )
 
 
 @pytest.mark.parametrize("difference", ["encoder", "size"])
@@ -204,7 +227,9 @@ def test_maps_of_other_networks_are_refused(
     )
     foreign.commit(replace(scenes[0], name="new"), {"scene": "new"})
     before = tree(root)
-    message = "another encoder" if difference == "encoder" else "image size 96, map .* has 48"
+    message = (
+        "another encoder" if difference == "encoder" else "image size 96, map .* has 48"
+    )
     with pytest.raises(InputError, match=rf"map .*foreign: .*{message}"):
         merge_maps(MapStore.open(root), [foreign.root])
     assert tree(root) == before
@@ -214,7 +239,9 @@ def test_a_damaged_map_is_not_merged(root: Path, other: Path, tree: Tree) -> Non
     file = other / "stages" / "0002-delta" / "keyframes.safetensors"
     file.write_bytes(file.read_bytes()[:-1] + b"\0")
     before = tree(root)
-    with pytest.raises(InputError, match=r"keyframes\.safetensors: checksum does not match"):
+    with pytest.raises(
+        InputError, match=r"keyframes\.safetensors: checksum does not match"
+    ):
         merge_maps(MapStore.open(root), [other], "skip")
     assert tree(root) == before
 
@@ -230,7 +257,9 @@ def test_a_map_that_changes_while_it_is_copied_is_refused(
         return result
 
     monkeypatch.setattr(manage, "read_store", late)
-    with pytest.raises(InputError, match=r"map .*other: another process has changed it"):
+    with pytest.raises(
+        InputError, match=r"map .*other: another process has changed it"
+    ):
         merge_maps(MapStore.open(root), [other], "skip")
     assert names(root) == ["alpha", "beta", "gamma"]
 
@@ -254,12 +283,17 @@ def test_a_kill_at_any_step_leaves_the_old_state_or_the_new_one(
             merge_maps(MapStore.open_or_create(where), [other], "rename")
 
     def state(where: Path) -> object:
-        return content(MapStore.open(where).contents) if (where / MANIFEST).exists() else None
+        return (
+            content(MapStore.open(where).contents)
+            if (where / MANIFEST).exists()
+            else None
+        )
 
     where = tmp_path / "new" if action == "merge into new" else root
     before = state(where)
     snapshots = every_step(where, lambda: change(where))
-    after, final = state(where), tree(where)
+    after = state(where)
+    final = tree(where)
     outcomes = [state(snapshot) for snapshot in snapshots]
     assert all(outcome in (before, after) for outcome in outcomes)
     first = outcomes.index(after)
@@ -285,7 +319,9 @@ def test_changes_that_a_full_disk_refuses_leave_nothing(
     packed = tmp_path / "packed.zip"
     pack_map(root, packed)
     store = MapStore.open(root)
-    new, merged = (MapStore.create(tmp_path / name, short_side=48) for name in ("new", "merged"))
+    new, merged = (
+        MapStore.create(tmp_path / name, short_side=48) for name in ("new", "merged")
+    )
     left: dict[str, Callable[[], object]] = {
         "merge": lambda: merge_maps(store, [other], "replace"),
         "merge into new": lambda: merge_maps(merged, [other]),
@@ -331,13 +367,16 @@ def test_a_map_that_lost_its_manifest_keeps_its_scenes(
         lambda: unpack_map(packed, root),
     ):
         with pytest.raises(
-            InputError, match=r"store: (holds scenes but no manifest\.json; restore|exists)"
+            InputError,
+            match=r"store: (holds scenes but no manifest\.json; restore|exists)",
         ):
             change()
         assert everything(root) == before
 
 
-def test_a_packed_map_is_unpacked_to_the_same_files(root: Path, tmp_path: Path, tree: Tree) -> None:
+def test_a_packed_map_is_unpacked_to_the_same_files(
+    root: Path, tmp_path: Path, tree: Tree
+) -> None:
     (root / "notes.txt").write_text("not of the map")
     pack_map(root, tmp_path / "map.zip")
     unpack_map(tmp_path / "map.zip", tmp_path / "deep" / "copy")
@@ -355,7 +394,8 @@ def test_a_packed_map_is_unpacked_to_the_same_files(root: Path, tmp_path: Path, 
 def test_pack_reads_again_if_another_process_changes_the_map(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write, changes = manage.write_archive, iter("c")
+    write = manage.write_archive
+    changes = iter("c")
 
     def late(*args: object) -> None:
         for _ in changes:
@@ -368,7 +408,9 @@ def test_pack_reads_again_if_another_process_changes_the_map(
     assert names(tmp_path / "copy") == ["beta", "gamma"]
 
 
-def rezipped(source: Path, target: Path, change: Callable[[dict[str, bytes]], None]) -> Path:
+def rezipped(
+    source: Path, target: Path, change: Callable[[dict[str, bytes]], None]
+) -> Path:
     """An archive with changed entries."""
     with zipfile.ZipFile(source) as archive:
         entries = {name: archive.read(name) for name in archive.namelist()}
@@ -384,7 +426,8 @@ def test_archives_that_are_no_complete_map_are_refused(
 ) -> None:
     packed = tmp_path / "map.zip"
     pack_map(root, packed)
-    keyframes, scene = "stages/0001-alpha/keyframes.safetensors", "stages/0002-beta/scene.json"
+    keyframes = "stages/0001-alpha/keyframes.safetensors"
+    scene = "stages/0002-beta/scene.json"
     schema = tmp_path / "schema"
     shutil.copytree(root, schema)
     listed = Manifest.read(schema)
@@ -395,10 +438,15 @@ def test_archives_that_are_no_complete_map_are_refused(
     write_manifest(foreign, listed.payload, [*listed.files])
 
     def of(folder: Path) -> Callable[[dict[str, bytes]], None]:
-        return lambda entries: entries.update({n: (folder / n).read_bytes() for n in entries})
+        return lambda entries: entries.update(
+            {n: (folder / n).read_bytes() for n in entries}
+        )
 
     changes: list[tuple[Callable[[dict[str, bytes]], object], str]] = [
-        (lambda e: e.update({keyframes: e[keyframes][:-1] + b"\0"}), "checksum does not match"),
+        (
+            lambda e: e.update({keyframes: e[keyframes][:-1] + b"\0"}),
+            "checksum does not match",
+        ),
         (lambda e: e.update({scene: b"{}"}), "2 bytes, expected"),
         (lambda e: e.pop(keyframes), "missing"),
         (lambda e: e.pop(MANIFEST), "no manifest.json in it"),

@@ -24,7 +24,9 @@ def walk(n: int, rng: np.random.Generator) -> SE3:
     steps = np.linspace(0, 6, n)
     position = np.stack([np.cos(steps), np.sin(steps), 0.1 * steps], -1)
     rotation = np.stack([0.2 * np.sin(steps), 0.1 * steps, 0.3 * np.cos(steps)], -1)
-    return SE3.exp(np.concatenate([position + 0.01 * rng.normal(size=(n, 3)), rotation], 1))
+    return SE3.exp(
+        np.concatenate([position + 0.01 * rng.normal(size=(n, 3)), rotation], 1)
+    )
 
 
 def smooth(poses: SE3) -> np.ndarray:
@@ -62,7 +64,9 @@ def test_landmarks_project_to_the_same_pixels_in_both_frames(
 
 
 def test_similarity_has_an_inverse_and_scales_views() -> None:
-    assert max(pose_distance(SIMILARITY.inverse_pose(SIMILARITY.pose(POSE)), POSE)) < 1e-12
+    assert (
+        max(pose_distance(SIMILARITY.inverse_pose(SIMILARITY.pose(POSE)), POSE)) < 1e-12
+    )
     assert max(pose_distance(Similarity(SE3.identity()).pose(POSE), POSE)) < 1e-12
     points = np.random.default_rng(0).normal(size=(20, 3))
     before = POSE.inverse().apply(points)
@@ -72,7 +76,8 @@ def test_similarity_has_an_inverse_and_scales_views() -> None:
 
 def test_covariance_is_scaled_and_rotated() -> None:
     frame = MapFrame(
-        pose_sigma=(0.2, 0.3), similarity=Similarity(SE3.exp([0, 0, 0, 0, 0, np.pi / 2]), 2.0)
+        pose_sigma=(0.2, 0.3),
+        similarity=Similarity(SE3.exp([0, 0, 0, 0, 0, np.pi / 2]), 2.0),
     )
     covariance = np.diag([1.0, 4.0, 9.0, 0.1, 0.2, 0.3])
     result = frame.to_base(UncertainPose(POSE, covariance)).covariance
@@ -83,11 +88,15 @@ def test_covariance_is_scaled_and_rotated() -> None:
 @pytest.mark.parametrize("axis", range(6))
 def test_error_of_the_base_frame_is_propagated(axis: int) -> None:
     """The slow twin moves the base frame by a finite difference."""
-    step, unit = np.zeros(6), np.zeros((6, 6))
-    step[axis], unit[axis, axis] = 1e-6, 1.0
+    step = np.zeros(6)
+    unit = np.zeros((6, 6))
+    step[axis] = 1e-6
+    unit[axis, axis] = 1.0
     moved = SE3(SE3.exp(step).rotation_wxyz, step[:3]) @ POSE
     rotation = (POSE.inverse() @ moved).log()[3:]
-    tangent = np.concatenate([moved.translation_m - POSE.translation_m, rotation]) / 1e-6
+    tangent = (
+        np.concatenate([moved.translation_m - POSE.translation_m, rotation]) / 1e-6
+    )
     result = MapFrame(base_covariance=unit).to_base(UncertainPose.exact(POSE))
     assert result.covariance == pytest.approx(np.outer(tangent, tangent), abs=1e-5)
 
@@ -98,7 +107,8 @@ def test_smooth_corrections_are_undone() -> None:
     adjusted = stated @ COMMON @ SE3.exp(smooth(stated))
     correction = fit_correction(adjusted @ COMMON.inverse(), smooth(stated))
     assert correction is not None
-    frame, new = MapFrame(common=COMMON, correction=correction), walk(57, rng)
+    frame = MapFrame(common=COMMON, correction=correction)
+    new = walk(57, rng)
     true = new @ COMMON @ SE3.exp(smooth(new))
     for pose, measured in zip(new, true, strict=True):
         plain = measured @ COMMON.inverse()
@@ -116,7 +126,8 @@ def test_noise_and_zero_corrections_are_not_fitted() -> None:
 
 def test_errors_that_neighbours_share_widen_the_stated_frame() -> None:
     rng = np.random.default_rng(0)
-    poses, independent = walk(200, rng), rng.normal(0, [0.004] * 3 + [0.003] * 3, (200, 6))
+    poses = walk(200, rng)
+    independent = rng.normal(0, [0.004] * 3 + [0.003] * 3, (200, 6))
     assert shared_sigma(poses, independent, None) == (0.0, 0.0)
     drift = np.cumsum(independent, 0)
     drift *= 0.004 / drift.std(0)

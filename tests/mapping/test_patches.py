@@ -22,13 +22,15 @@ from evercal.mapping.patches import (
 
 Array = NDArray[np.floating]
 Picture = Callable[[Array], Array]
-HEIGHT, WIDTH = 120, 160
+HEIGHT = 120
+WIDTH = 160
 
 
 def picture(seed: int, shortest_px: float = 6.0) -> Picture:
     """A smooth random function of pixels (..., 2): a sum of waves, 0 to 255."""
     rng = np.random.default_rng(seed)
-    angle, length = rng.uniform(0, 2 * np.pi, 40), rng.uniform(shortest_px, 40, 40)
+    angle = rng.uniform(0, 2 * np.pi, 40)
+    length = rng.uniform(shortest_px, 40, 40)
     wave = 2 * np.pi / length[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     phase = rng.uniform(0, 2 * np.pi, 40)
     return lambda where: 128 + 25 * np.cos(where @ wave.T + phase).sum(-1) / np.sqrt(20)
@@ -47,7 +49,8 @@ def image(of: Picture, affine: Array, shift: Array) -> Array:
 
 def spots(count: int = 60, margin: int = 35) -> Array:
     rng = np.random.default_rng(1)
-    low, high = np.array([margin, margin]), np.array([WIDTH, HEIGHT]) - margin
+    low = np.array([margin, margin])
+    high = np.array([WIDTH, HEIGHT]) - margin
     return np.round(rng.uniform(low, high, (count, 2)))
 
 
@@ -68,7 +71,8 @@ def warped(affine: Array, at: Array) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("name", AFFINES)
 def test_warped_patch_is_aligned_to_a_twentieth_of_a_pixel(name: str) -> None:
-    affine, at = AFFINES[name], spots()
+    affine = AFFINES[name]
+    at = spots()
     other, truth = warped(affine, at)
     patches = cut_patches(image(picture(0), np.eye(2), np.zeros(2)), at)
     start = truth + np.random.default_rng(2).uniform(-1.5, 1.5, truth.shape)
@@ -90,7 +94,9 @@ def test_gain_and_offset_have_no_effect() -> None:
     other, truth = warped(AFFINES["sheared"], at)
     affines = np.broadcast_to(AFFINES["sheared"], (len(at), 2, 2))
     reference = align_patches(cut_patches(plain, at), other, truth + 0.7, affines, 8)
-    brighter = align_patches(cut_patches(plain, at), 0.4 * other + 90, truth + 0.7, affines, 8)
+    brighter = align_patches(
+        cut_patches(plain, at), 0.4 * other + 90, truth + 0.7, affines, 8
+    )
     for a, b in zip(reference, brighter, strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)
     templates = cut_patches(3 * plain - 7, at).templates
@@ -115,8 +121,10 @@ def test_patches_of_another_image_do_not_fit() -> None:
 
 
 def test_step_of_one_patch_is_that_of_least_squares() -> None:
-    plain, at = image(picture(3), np.eye(2), np.zeros(2)), np.array([[60.0, 50.0]])
-    patches, affine = cut_patches(plain, at), AFFINES["sheared"]
+    plain = image(picture(3), np.eye(2), np.zeros(2))
+    at = np.array([[60.0, 50.0]])
+    patches = cut_patches(plain, at)
+    affine = AFFINES["sheared"]
     other = image(picture(3), affine, np.array([10.3, 14.2]))
     truth = at @ affine.T + [10.3, 14.2]
     start = truth + np.array([0.4, -0.3])
@@ -133,8 +141,10 @@ def test_step_of_one_patch_is_that_of_least_squares() -> None:
     slope /= np.std(template) + 1e-3
 
     def bilinear(u: float, v: float) -> float:
-        i, j = int(np.floor(v)), int(np.floor(u))
-        a, b = v - i, u - j
+        i = int(np.floor(v))
+        j = int(np.floor(u))
+        a = v - i
+        b = u - j
         top = (1 - b) * other[i, j] + b * other[i, j + 1]
         return (1 - a) * top + a * ((1 - b) * other[i + 1, j] + b * other[i + 1, j + 1])
 
@@ -151,7 +161,8 @@ def test_coarse_to_fine_alignment_has_a_larger_reach() -> None:
     truth = at + np.array([8.3, -6.6])
     pyramid = image_pyramid(plain, 3)
     levels = [cut_patches(pyramid[i], to_level(at, i)) for i in range(3)]
-    affines, others = np.broadcast_to(np.eye(2), (len(at), 2, 2)), image_pyramid(other, 3)
+    affines = np.broadcast_to(np.eye(2), (len(at), 2, 2))
+    others = image_pyramid(other, 3)
     steps = ((2, 10), (1, 6), (0, 6))
     aligned, correlation = align_down(levels, others, at, affines, steps)
     good = np.linalg.norm(aligned - truth, axis=1) < 0.05
@@ -185,7 +196,9 @@ def test_levels_have_inverse_and_consistent_pixels(level: int) -> None:
     shown = image_pyramid(ramp, 3)[level]
     assert shown.shape == (HEIGHT >> level, WIDTH >> level)
     pixel = np.stack([shown[3], np.full(shown.shape[1], 0.0)], -1)
-    np.testing.assert_allclose(to_level(pixel, level)[:, 0], np.arange(shown.shape[1]), atol=1e-4)
+    np.testing.assert_allclose(
+        to_level(pixel, level)[:, 0], np.arange(shown.shape[1]), atol=1e-4
+    )
 
 
 def test_pyramids_of_odd_sizes_have_consistent_pixels() -> None:
@@ -217,7 +230,9 @@ def test_whitening_is_the_root_of_the_inverse_covariance() -> None:
         white = whitening(affines, hessian, 0.1, 0.8, moved)
         for i in range(7):
             spread = affines[i] @ hessian[i] @ affines[i].T + 0.01 * np.eye(2)
-            covariance = 0.64 * spread + (0 if moved is None else np.outer(line[i], line[i]))
+            covariance = 0.64 * spread + (
+                0 if moved is None else np.outer(line[i], line[i])
+            )
             root = np.linalg.cholesky(np.linalg.inv(covariance)).T
             np.testing.assert_allclose(white[:, :, i], root, atol=1e-9)
 

@@ -27,14 +27,18 @@ DISTORTED = Camera(320, 240, 280.0, 280.0, 159.5, 119.5, (-0.15, 0.02, 0.0, 0.0)
 
 def look_from(x: float, y: float = 0.0, angle_rad: float = 0.0) -> SE3:
     """A camera beside the origin that looks along z, rotated about its own y axis."""
-    return SE3.exp(np.array([x, y, 0, 0, 0, 0])) @ SE3.exp(np.array([0, 0, 0, 0, angle_rad, 0]))
+    return SE3.exp(np.array([x, y, 0, 0, 0, 0])) @ SE3.exp(
+        np.array([0, 0, 0, 0, angle_rad, 0])
+    )
 
 
 def true_depth(rays: np.ndarray, pose: SE3, wall_m: float, tilt: float) -> np.ndarray:
     """Depth (n,) along the optical axis of the wall z = wall + tilt x."""
     direction = rays @ pose.rotation_matrix().T
     eye = pose.translation_m
-    along = (wall_m + tilt * eye[0] - eye[2]) / (direction[:, 2] - tilt * direction[:, 0])
+    along = (wall_m + tilt * eye[0] - eye[2]) / (
+        direction[:, 2] - tilt * direction[:, 0]
+    )
     return along
 
 
@@ -56,7 +60,9 @@ def cells(
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
 def test_other_views_determine_the_depth(camera: Camera, tilt: float) -> None:
     view = cells(look_from(0), 2.0, camera, tilt)
-    others = [cells(look_from(x, y), 2.0, camera, tilt) for x, y in ((0.3, 0), (-0.2, 0.2))]
+    others = [
+        cells(look_from(x, y), 2.0, camera, tilt) for x, y in ((0.3, 0), (-0.2, 0.2))
+    ]
     truth = true_depth(view.rays(), view.base_from_camera, 2.0, tilt)
     for off in (0.8, 1.0, 1.3):
         depth = 1 / inverse_depths(view, others, off * truth)
@@ -78,7 +84,8 @@ def similarities(view: PosedCells, other: PosedCells, planes: np.ndarray) -> np.
         points = across.apply(ray / planes[:, None])
         seen = points[:, 2] * planes > 0.05
         pixels = other.camera.project(np.where(seen[:, None], points, [0, 0, 1]))
-        low, high = -STRIDE / 2 - 0.5, STRIDE * (np.array([columns, rows]) + 0.5) - 0.5
+        low = -STRIDE / 2 - 0.5
+        high = STRIDE * (np.array([columns, rows]) + 0.5) - 0.5
         seen &= ((pixels > low) & (pixels < high)).all(1)
         at = (np.nan_to_num(pixels) + 0.5) / STRIDE - 0.5
         values = map_coordinates(grid, at.T[::-1], order=1, mode="nearest")
@@ -90,10 +97,12 @@ def similarities(view: PosedCells, other: PosedCells, planes: np.ndarray) -> np.
 def test_best_plane_is_that_of_a_sweep_cell_by_cell(
     camera: Camera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("evercal.mapping.plane_sweep.MIN_PEAK_SIMILARITY", 2.0)  # not refined
+    # Not refined.
+    monkeypatch.setattr("evercal.mapping.plane_sweep.MIN_PEAK_SIMILARITY", 2.0)
     places = (0.4, 0.1), (-0.3, 0), (0.2, -0.3, 0.4), (-0.1, 0.3), (9, 0)
     poses = [look_from(*place) for place in places]
-    view, others = cells(look_from(0), 2.0, camera), [cells(p, 2.0, camera) for p in poses]
+    view = cells(look_from(0), 2.0, camera)
+    others = [cells(p, 2.0, camera) for p in poses]
     planes = np.linspace(1 / FAR_M, 1 / NEAR_M, PLANES)
     swept = np.stack([similarities(view, other, planes) for other in others])
     for other, expected in zip(others, swept, strict=True):
@@ -130,7 +139,9 @@ def test_without_other_views_the_guess_is_returned() -> None:
 
 def test_selected_views_have_parallax() -> None:
     view = cells(look_from(0), 2.0)
-    near, side, wide = look_from(0.01), look_from(0.3), look_from(2.5)
+    near = look_from(0.01)
+    side = look_from(0.3)
+    wide = look_from(2.5)
     away = look_from(0.3, angle_rad=np.pi)
     beyond = look_from(0.3, angle_rad=np.deg2rad(75))
     poses = SE3.stack([look_from(0), near, away, side, beyond, wide])
@@ -145,7 +156,9 @@ def test_peak_between_cells() -> None:
     row, column = np.mgrid[0:9, 0:12]
     hill = 1 - 0.02 * ((row - 4.3) ** 2 + (column - 6.8) ** 2)
     for start in ((4, 6), (5, 7), (4, 7), (3, 6)):
-        position, (value,) = peak(hill[None], np.array([start[0]]), np.array([start[1]]))
+        position, (value,) = peak(
+            hill[None], np.array([start[0]]), np.array([start[1]])
+        )
         np.testing.assert_allclose(position[0], [6.8, 4.3], atol=1e-3)
         assert float(value) == pytest.approx(hill[4, 7], abs=1e-6)
     # At most half a cell.

@@ -53,7 +53,8 @@ def test_right_poses_are_consistent(recording: PreparedFrames) -> None:
 
 # At the end of the walk, a step along it keeps all matches on their segments.
 @pytest.mark.parametrize(
-    ("frame", "direction"), [(0, (0, 1, 0)), (6, (0, 1, 0)), (14, (0, 1, 0)), (6, (1, 0, 0))]
+    ("frame", "direction"),
+    [(0, (0, 1, 0)), (6, (0, 1, 0)), (14, (0, 1, 0)), (6, (1, 0, 0))],
 )
 def test_one_frame_30_cm_away_is_detected(
     frame: int, direction: tuple[float, ...], recording: PreparedFrames
@@ -63,14 +64,18 @@ def test_one_frame_30_cm_away_is_detected(
 
 
 def test_shifted_and_rotated_frames_are_detected(recording: PreparedFrames) -> None:
-    up, rotated = SE3.exp(np.array([0, 0.3, 0, 0, 0, 0])), SE3.exp(np.array([0, 0, 0, 0, 0.2, 0]))
+    up = SE3.exp(np.array([0, 0.3, 0, 0, 0, 0]))
+    rotated = SE3.exp(np.array([0, 0, 0, 0, 0.2, 0]))
     assert detected(moved(recording, {3: up, 10: rotated})) == [3, 10]
 
 
 @pytest.mark.parametrize("scale", [0.1, 8.0])
-def test_depth_scale_is_that_of_the_recording(scale: float, recording: PreparedFrames) -> None:
+def test_depth_scale_is_that_of_the_recording(
+    scale: float, recording: PreparedFrames
+) -> None:
     vlad = recording.encoder.vlad()
-    pairs, scaled = matched_pairs(recording, vlad), moved(recording, {})
+    pairs = matched_pairs(recording, vlad)
+    scaled = moved(recording, {})
     assert depth_scale(recording, pairs) == 1  # as a room is
     poses = recording.poses
     scaled.adjust(SE3(poses.rotation_wxyz, scale * poses.translation_m), None)
@@ -82,7 +87,9 @@ def test_depth_scale_is_that_of_the_recording(scale: float, recording: PreparedF
 def test_small_pose_errors_are_accepted(recording: PreparedFrames) -> None:
     rng = np.random.default_rng(0)
     noise = rng.normal(size=(len(recording), 6)) * ([0.005] * 3 + [0.004] * 3)
-    assert detected(moved(recording, {i: SE3.exp(n) for i, n in enumerate(noise)})) == []
+    assert (
+        detected(moved(recording, {i: SE3.exp(n) for i, n in enumerate(noise)})) == []
+    )
 
 
 def test_excluding_frames_does_not_change_the_others(
@@ -93,19 +100,29 @@ def test_excluding_frames_does_not_change_the_others(
     assert [f.name for f in rest.frames] == [recording.frames[i].name for i in keep]
     for new, old in enumerate(keep):
         np.testing.assert_array_equal(rest.grey[new], recording.grey[old])
-        np.testing.assert_allclose(rest.poses[new].matrix(), recording.poses[old].matrix())
+        np.testing.assert_allclose(
+            rest.poses[new].matrix(), recording.poses[old].matrix()
+        )
         np.testing.assert_array_equal(rest.features(new), recording.features(old))
     rotation, translation = rest.relative(1, 0)
-    one, two = rest.poses[1], rest.poses[0]
-    np.testing.assert_allclose(rotation, (one.inverse() @ two).rotation_matrix(), atol=1e-12)
-    np.testing.assert_allclose(translation, (one.inverse() @ two).translation_m, atol=1e-12)
+    one = rest.poses[1]
+    two = rest.poses[0]
+    np.testing.assert_allclose(
+        rotation, (one.inverse() @ two).rotation_matrix(), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        translation, (one.inverse() @ two).translation_m, atol=1e-12
+    )
     assert rest.cameras == [recording.cameras[i] for i in keep]
 
 
 def test_distances_from_segments() -> None:
-    start, end = np.array([[0.0, 0], [0, 0], [0, 0], [1, 1]]), np.array([[4.0, 0]] * 3 + [[1, 1]])
+    start = np.array([[0.0, 0], [0, 0], [0, 0], [1, 1]])
+    end = np.array([[4.0, 0]] * 3 + [[1, 1]])
     points = np.array([[2.0, 3], [-3, 4], [7, -4], [4, 5]])
-    np.testing.assert_allclose(_segment_distance(points, start, end), [3, 5, 5, 5], atol=1e-6)
+    np.testing.assert_allclose(
+        _segment_distance(points, start, end), [3, 5, 5, 5], atol=1e-6
+    )
 
 
 def test_cells_with_a_similar_cell_elsewhere_are_not_distinct() -> None:
@@ -133,7 +150,8 @@ def test_sift_clears_frames_that_the_encoder_suspects(
         pairs = matched_pairs(frames, frames.encoder.vlad())
         shift = np.array([60.0, 0.0])  # the encoder mistakes one square for another
         return [
-            replace(p, pixels=p.pixels + shift) if 6 in (p.first, p.second) else p for p in pairs
+            replace(p, pixels=p.pixels + shift) if 6 in (p.first, p.second) else p
+            for p in pairs
         ]
 
     assert check_poses(recording, suspicious(recording)).excluded.tolist() == []

@@ -27,9 +27,11 @@ def slow_sars(distance, capacity, radius):
             continue
         if len(buffer) >= capacity:
             nearest = {
-                j: min((distance[j][k] for k in buffer if k != j), default=math.inf) for j in buffer
+                j: min((distance[j][k] for k in buffer if k != j), default=math.inf)
+                for j in buffer
             }
-            buffer.remove(min(sorted(buffer), key=nearest.__getitem__))  # first of equals: older
+            # First of equals: older.
+            buffer.remove(min(sorted(buffer), key=nearest.__getitem__))
         buffer.append(new)
     return sorted(buffer)
 
@@ -62,10 +64,12 @@ def covering_radius(positions, quaternions, selected):
 
 def test_metric_equals_the_formula():
     rng = np.random.default_rng(0)
-    positions, quaternions = rng.normal(size=(40, 3)), rng.normal(size=(40, 4))
+    positions = rng.normal(size=(40, 3))
+    quaternions = rng.normal(size=(40, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     side = max(positions.max(axis=0) - positions.min(axis=0))
-    table = metric_table(positions, 3.0 * quaternions, weight=0.7)  # length does not matter
+    # Length does not matter.
+    table = metric_table(positions, 3.0 * quaternions, weight=0.7)
     for i in range(40):
         for j in range(40):
             slow = slow_distance(
@@ -79,13 +83,19 @@ def test_identical_rotations_are_exactly_zero_apart():
     rng = np.random.default_rng(1)
     quaternion = rng.normal(size=4)
     quaternion /= np.linalg.norm(quaternion)
-    table = metric_table(np.zeros((3, 3)), np.stack([quaternion, -quaternion, quaternion]))
+    table = metric_table(
+        np.zeros((3, 3)), np.stack([quaternion, -quaternion, quaternion])
+    )
     assert (table == 0.0).all()
 
 
-@pytest.mark.parametrize("angle", [1e-12, 1e-6, 0.1, 1.0, math.pi - 1e-6, math.pi, 4.0, 6.0])
+@pytest.mark.parametrize(
+    "angle", [1e-12, 1e-6, 0.1, 1.0, math.pi - 1e-6, math.pi, 4.0, 6.0]
+)
 def test_angle_of_known_rotations(angle):
-    quaternions = np.array([[1, 0, 0, 0], [math.cos(angle / 2), 0, math.sin(angle / 2), 0]])
+    quaternions = np.array(
+        [[1, 0, 0, 0], [math.cos(angle / 2), 0, math.sin(angle / 2), 0]]
+    )
     expected = min(angle, 2 * math.pi - angle)
     table = metric_table(np.zeros((2, 3)), quaternions)
     assert table[0, 1] == pytest.approx(expected, rel=1e-12, abs=1e-14)
@@ -106,10 +116,13 @@ def test_sars_equals_slow_twin_for_a_camera_that_stops_and_returns(seed):
     rng = np.random.default_rng(seed)
     positions, quaternions = grid_walk(rng, 25)
     visits = np.repeat(rng.integers(0, 25, size=60), 5)
-    positions, quaternions = positions[visits], quaternions[visits]
+    positions = positions[visits]
+    quaternions = quaternions[visits]
     table = metric_table(positions, quaternions).tolist()
     for capacity in (5, 20, 40):
-        selected = select_sars(positions, quaternions, capacity, SarsOptions(radius=0.0))
+        selected = select_sars(
+            positions, quaternions, capacity, SarsOptions(radius=0.0)
+        )
         assert selected.tolist() == slow_sars(table, capacity, 0.0)
 
 
@@ -120,7 +133,10 @@ def test_sars_equals_twin_with_the_formula_of_the_paper(radius):
     positions, _ = grid_walk(rng, 300)
     quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (300, 1))
     table = [
-        [slow_distance(a, quaternions[0], b, quaternions[0], 1.0, 1.0) for b in positions.tolist()]
+        [
+            slow_distance(a, quaternions[0], b, quaternions[0], 1.0, 1.0)
+            for b in positions.tolist()
+        ]
         for a in positions.tolist()
     ]
     selected = select_sars(positions, quaternions, 40, SarsOptions(radius=radius))
@@ -171,7 +187,8 @@ def test_fill_with_repeats_selects_every_pose():
     rng = np.random.default_rng(6)
     positions, quaternions = random_walk(rng, 12)
     visits = np.concatenate([np.arange(12), rng.integers(0, 12, size=288)])
-    positions, quaternions = positions[visits], quaternions[visits]
+    positions = positions[visits]
+    quaternions = quaternions[visits]
     selected = select_sars(positions, quaternions, 30, SarsOptions(fill=True))
     assert len(selected) == 30
     assert set(visits[selected]) == set(range(12))
@@ -199,14 +216,19 @@ def test_farthest_equals_slow_twin():
 
 
 def test_farthest_selects_repeats_last():
-    positions, quaternions = np.zeros((5, 3)), np.tile([1.0, 0, 0, 0], (5, 1))
+    positions = np.zeros((5, 3))
+    quaternions = np.tile([1.0, 0, 0, 0], (5, 1))
     assert select_farthest(positions, quaternions, 9).tolist() == [0, 1, 2, 3, 4]
 
 
 def test_farthest_selects_its_start():
     positions = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [9, 0, 0], [10, 0, 0]])
     quaternions = np.tile([1.0, 0, 0, 0], (5, 1))
-    assert select_farthest(positions, quaternions, 3, start=[1, 3]).tolist() == [1, 2, 3]
+    assert select_farthest(positions, quaternions, 3, start=[1, 3]).tolist() == [
+        1,
+        2,
+        3,
+    ]
     assert select_farthest(positions, quaternions, 2, start=[1, 3]).tolist() == [1, 3]
 
 

@@ -30,8 +30,12 @@ def test_opened_map_equals_committed_map(
     store = make(tmp_path / "store", scenes)
     opened = MapStore.open(tmp_path / "store")
     assert (opened.stages, opened.contents.short_side) == (store.stages, 48)
-    assert content(opened.contents) == content(MapContents(store.contents.encoder, 48, scenes))
-    assert opened.reports() == [{"scene": scene.name, "seconds": 1.5} for scene in scenes]
+    assert content(opened.contents) == content(
+        MapContents(store.contents.encoder, 48, scenes)
+    )
+    assert opened.reports() == [
+        {"scene": scene.name, "seconds": 1.5} for scene in scenes
+    ]
     grey = np.random.default_rng(0).integers(0, 256, (48, 64)).astype(np.uint8)
     expected = store.contents.encoder(grey)
     np.testing.assert_array_equal(opened.contents.encoder(grey), expected)
@@ -42,14 +46,22 @@ def test_writing_an_opened_map_changes_nothing(
 ) -> None:
     make(tmp_path / "a", scenes[:1])
     make(tmp_path / "b", MapStore.open(tmp_path / "a").contents.scenes)
-    a, b = tree(tmp_path / "a"), tree(tmp_path / "b")
+    a = tree(tmp_path / "a")
+    b = tree(tmp_path / "b")
     assert a.keys() == b.keys()
     changed = {Path(name).name for name in a if a[name] != b[name]}
     # Quaternions are normalised on entry, which may change their last bit.
-    assert changed <= {"scene.json", "keyframes.safetensors", "correction.safetensors", MANIFEST}
+    assert changed <= {
+        "scene.json",
+        "keyframes.safetensors",
+        "correction.safetensors",
+        MANIFEST,
+    }
 
 
-def test_any_scene_name_is_stored(scenes: list[SceneMap], tmp_path: Path, make: Make) -> None:
+def test_any_scene_name_is_stored(
+    scenes: list[SceneMap], tmp_path: Path, make: Make
+) -> None:
     for name in ("Küche 2", "x" * 200, 'a"b', "部屋", "a.b:c*?"):
         root = tmp_path / "deep" / "store"
         make(root, [replace(scenes[1], name=name)])
@@ -75,7 +87,9 @@ def test_a_name_that_evercal_does_not_give_is_refused(
     manifest = Manifest.read(root)
     write_manifest(root, manifest.payload, list(manifest.files))
     for read in (MapStore.open, stored_scenes):
-        with pytest.raises(InputError, match=r"scene name .*: give one of at most 200") as error:
+        with pytest.raises(
+            InputError, match=r"scene name .*: give one of at most 200"
+        ) as error:
             read(root)
         assert str(error.value).isprintable()
 
@@ -85,7 +99,8 @@ def test_every_changed_byte_is_refused_by_file_name(
 ) -> None:
     root = tmp_path / "store"
     make(root, scenes[:2])
-    names, rng = list(tree(root)), np.random.default_rng(0)
+    names = list(tree(root))
+    rng = np.random.default_rng(0)
     # Encoder and centroids; scene, keyframes and report twice; one correction; the manifest.
     assert len(names) == 2 + 2 * 3 + 1 + 1
     for name in names:
@@ -129,11 +144,17 @@ def test_stores_of_networks_are_refused(
     manifest = json.loads((root / MANIFEST).read_text())
     write_manifest(root, manifest["payload"] | change, list(manifest["files"]))
     before = tree(root)
-    with pytest.raises(InputError, match=f"{root}.*: holds networks of strategy 'sars'"):
+    with pytest.raises(
+        InputError, match=f"{root}.*: holds networks of strategy 'sars'"
+    ):
         MapStore.open(root)
     assert tree(root) == before
-    write_manifest(root, manifest["payload"] | {"short_side": "a"}, list(manifest["files"]))
-    with pytest.raises(InputError, match="'short_side' in the manifest is not a number"):
+    write_manifest(
+        root, manifest["payload"] | {"short_side": "a"}, list(manifest["files"])
+    )
+    with pytest.raises(
+        InputError, match="'short_side' in the manifest is not a number"
+    ):
         MapStore.open(root)
 
 
@@ -149,7 +170,9 @@ def test_unlisted_files_are_ignored(
     store = MapStore.open(tmp_path)
     assert content(store.contents) == expected
     sizes = store.size_bytes()
-    assert sizes["stages/0001-alpha/scene.json"] == (stage / "scene.json").stat().st_size
+    assert (
+        sizes["stages/0001-alpha/scene.json"] == (stage / "scene.json").stat().st_size
+    )
     assert not any("ghost" in name for name in sizes)
     store.commit(scenes[1], {})
     for stray in strays:
@@ -165,13 +188,18 @@ def test_update_replaces_one_scene(
     root = tmp_path / "store"
     make(root, scenes)
     similarity = Similarity(SE3.exp([1.0, 2, 3, 0.1, 0.2, 0.3]), 2.5)
-    moved = replace(scenes[index], frame=MapFrame(similarity=similarity), train_frames=7)
+    moved = replace(
+        scenes[index], frame=MapFrame(similarity=similarity), train_frames=7
+    )
     for _ in range(2):
         MapStore.open(root).update(moved)
     assert verify(root) == []
     expected = [moved if i == index else scene for i, scene in enumerate(scenes)]
     opened = MapStore.open(root)
-    assert content(opened.contents)[:2] == content(MapContents(load_encoder(), 48, expected))[:2]
+    assert (
+        content(opened.contents)[:2]
+        == content(MapContents(load_encoder(), 48, expected))[:2]
+    )
     assert opened.contents.scenes[index].frame.similarity is not None
     assert opened.contents.scenes[index].train_frames == 7
     assert len(list((root / "stages").iterdir())) == 3
@@ -201,7 +229,9 @@ def test_centroids_of_another_encoder_are_stored(
     np.testing.assert_array_equal(stored, expected)
 
 
-def test_shipped_centroids_are_not_stored(scenes: list[SceneMap], tmp_path: Path) -> None:
+def test_shipped_centroids_are_not_stored(
+    scenes: list[SceneMap], tmp_path: Path
+) -> None:
     store = MapStore.create(tmp_path / "store")
     store.commit(scenes[0], {})
     assert not list((tmp_path / "store").glob("vlad-*"))
@@ -225,7 +255,9 @@ def test_update_removes_a_correction_that_no_longer_applies(
     corrected = replace(scene, frame=replace(scene.frame, correction=correction))
     store = MapStore.create(tmp_path / "map")
     store.commit(corrected, {})
-    assert MapStore.open(tmp_path / "map").contents.scenes[0].frame.correction is not None
+    assert (
+        MapStore.open(tmp_path / "map").contents.scenes[0].frame.correction is not None
+    )
     store.update(replace(scene, frame=replace(scene.frame, correction=None)))
     assert MapStore.open(tmp_path / "map").contents.scenes[0].frame.correction is None
 

@@ -16,12 +16,16 @@ def assert_pose(pose: SE3 | None, expected: SE3, tolerance: float = 1e-9) -> Non
 
 def with_orientation(jpeg: bytes, value: int) -> bytes:
     """The same JPEG with EXIF data that hold only an orientation."""
-    tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([value]) + bytes(6)
+    tiff = (
+        b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([value]) + bytes(6)
+    )
     body = b"Exif\0\0" + tiff
     return jpeg[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + jpeg[2:]
 
 
-def refused(message: str, read: Callable[..., object], *words: object, **options: object) -> None:
+def refused(
+    message: str, read: Callable[..., object], *words: object, **options: object
+) -> None:
     """Reading is refused with a message that matches."""
     with pytest.raises(InputError, match=message):
         read(*words, **options)

@@ -59,7 +59,9 @@ def aliased(levels: int) -> str:
     return "\n".join([*lines, f"camera_matrix: [*a{levels - 1}]"])
 
 
-@pytest.mark.parametrize("read", [read_camera, lambda p: read_link_from_optical(p, "a", "b")])
+@pytest.mark.parametrize(
+    "read", [read_camera, lambda p: read_link_from_optical(p, "a", "b")]
+)
 @pytest.mark.parametrize(
     "content",
     [
@@ -89,28 +91,53 @@ def test_yaml_with_references_or_deep_nesting_is_refused(
     ],
 )
 def test_deep_json_is_refused(tmp_path: Path, name: str, read: Read) -> None:
-    refused(read, tmp_path / name, '{"poses": ' * 20_000, "nested too deep|recursion|valid JSON")
+    refused(
+        read,
+        tmp_path / name,
+        '{"poses": ' * 20_000,
+        "nested too deep|recursion|valid JSON",
+    )
 
 
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("underscores.csv", HEADER.replace("x", "x" + "_" * 16_000) + ROW, "16,002 characters"),
-        ("cell.csv", HEADER + ROW + ROW.replace("a", "a" * 10_000), "row 3, column 1: 10,004 ch"),
-        ("columns.csv", HEADER.strip() + ",a" * 50_000 + "\n" + ROW, "50,008 columns, at most 1,0"),
+        (
+            "underscores.csv",
+            HEADER.replace("x", "x" + "_" * 16_000) + ROW,
+            "16,002 characters",
+        ),
+        (
+            "cell.csv",
+            HEADER + ROW + ROW.replace("a", "a" * 10_000),
+            "row 3, column 1: 10,004 ch",
+        ),
+        (
+            "columns.csv",
+            HEADER.strip() + ",a" * 50_000 + "\n" + ROW,
+            "50,008 columns, at most 1,0",
+        ),
         ("names.csv", HEADER + ROW * 20_000, "'a.png' comes twice"),
         ("word.txt", "x" * 300_000, "is not a finite number|no line|characters"),
         ("brackets.txt", "p[" * 100_000 + "]" * 100_000, "[a-z]"),
         ("braces.txt", "{" * 200_000 + "X 1, Y 2", "[a-z]"),
         ("key.json", json.dumps([{"k" * 300: {"a": 1}}]), "300 characters of a key"),
-        ("keys.json", json.dumps([{f"k{i}": 0} for i in range(5_000)]), "5,000 keys, at most"),
+        (
+            "keys.json",
+            json.dumps([{f"k{i}": 0} for i in range(5_000)]),
+            "5,000 keys, at most",
+        ),
         ("list.json", json.dumps([{"a": [0] * 5_000}]), "5,000 numbers of one key"),
         (
             "ragged.json",
             json.dumps({"x": ["A" * 3_000, *[""] * 9_000]}),
             "9,001 numbers of one key, at most",
         ),
-        ("cell.json", json.dumps([{"x": "1" * 5_000}] * 500), "5,000 characters, at most 1,000"),
+        (
+            "cell.json",
+            json.dumps([{"x": "1" * 5_000}] * 500),
+            "5,000 characters, at most 1,000",
+        ),
     ],
 )
 def test_a_pose_table_takes_little_time_and_memory(
@@ -122,7 +149,8 @@ def test_a_pose_table_takes_little_time_and_memory(
 
 def npz(shape: tuple[int, ...], **more: Any) -> bytes:
     """An archive of one array of ones that states a shape."""
-    array, file = io.BytesIO(), io.BytesIO()
+    array = io.BytesIO()
+    file = io.BytesIO()
     np.lib.format.write_array_header_1_0(
         array, {"shape": shape, "fortran_order": False, "descr": "<f8"}
     )
@@ -142,7 +170,9 @@ def test_the_bounds_are_raised_by_the_variable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.csv"
-    path.write_text(HEADER.replace("image", "image," + ",".join(["more"] * 1_500)) + ROW)
+    path.write_text(
+        HEADER.replace("image", "image," + ",".join(["more"] * 1_500)) + ROW
+    )
     with pytest.raises(InputError, match=r"--limits columns=1508"):
         read_robot_poses(path)
     monkeypatch.setenv(VARIABLE, "columns=2000, pixels=1e6")
@@ -151,7 +181,9 @@ def test_the_bounds_are_raised_by_the_variable(
         read_robot_poses(path)
     for wrong in ("columns", "columns=x", "rows=1", "columns=inf"):
         monkeypatch.setenv(VARIABLE, wrong)
-        with pytest.raises(InputError, match=r"limit .*give NAME=NUMBER, the name one of"):
+        with pytest.raises(
+            InputError, match=r"limit .*give NAME=NUMBER, the name one of"
+        ):
             bounds()
 
 
@@ -159,7 +191,9 @@ def test_text_is_measured_before_it_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(VARIABLE, "text_bytes=100")
-    refused(read_camera, tmp_path / "a.json", " " * 101, "101 bytes, at most 100 are read")
+    refused(
+        read_camera, tmp_path / "a.json", " " * 101, "101 bytes, at most 100 are read"
+    )
 
 
 def test_an_image_that_opencv_refuses_is_one_line(
@@ -172,7 +206,9 @@ def test_an_image_that_opencv_refuses_is_one_line(
 
     write_image(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
     monkeypatch.setattr(cv2, "imdecode", refuse)
-    with pytest.raises(InputError, match=r"at most 100,000,000 pixels.* --limits pixels=NUMBER"):
+    with pytest.raises(
+        InputError, match=r"at most 100,000,000 pixels.* --limits pixels=NUMBER"
+    ):
         read_image(tmp_path / "a.png")
 
 
@@ -193,7 +229,9 @@ def test_a_request_is_bounded_more_tightly() -> None:
 def test_a_jpeg_of_many_scans_is_no_image(tmp_path: Path) -> None:
     write_image(tmp_path / "a.jpg", np.zeros((8, 8, 3), np.uint8))
     data = (tmp_path / "a.jpg").read_bytes()
-    refused(read_image, tmp_path / "b.jpg", data + b"\xff\xda" * 100, "not a readable image")
+    refused(
+        read_image, tmp_path / "b.jpg", data + b"\xff\xda" * 100, "not a readable image"
+    )
 
 
 def test_wide_pixels_are_converted_in_parts() -> None:

@@ -11,7 +11,13 @@ import pytest
 from evercal.calibration.calibration import read_transform
 from evercal.cli.align import read_rows
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.recordings import ReadOptions, Recording, load_recording, read_robot_poses, write_image
+from evercal.recordings import (
+    ReadOptions,
+    Recording,
+    load_recording,
+    read_robot_poses,
+    write_image,
+)
 from evercal.recordings.formats import lerobot, wrist
 from evercal.recordings.formats.lerobot import _pose_feature
 from evercal.recordings.poses.camera_file import read_camera
@@ -32,7 +38,11 @@ RECORDINGS = {
     "wave": (["image-1.png", "image-2.png"], 2, 0),
     "timed": (["image-1.png", "image-2.png"], 2, 0),
     "walk": (["image-1.png", "image-2.png"], 2, 0),
-    "redkitchen": (["seq-01/frame-000000.color.png", "seq-02/frame-000000.color.png"], 1, 1),
+    "redkitchen": (
+        ["seq-01/frame-000000.color.png", "seq-02/frame-000000.color.png"],
+        1,
+        1,
+    ),
     "apartment": (["data/frame-000000.color.jpg", "data/frame-000001.color.jpg"], 1, 1),
     "phone": (["images/frame_00001.png"], 0, 1),
     "house": (["images/0001.jpg"], 1, 0),
@@ -78,7 +88,9 @@ def page(tmp_path: Path) -> Path:
 def test_every_example_is_read_here() -> None:
     assert PAGE.read_text().count("```") == 2 * len(EXAMPLES)
     files = SINGLE_FILES | CAMERAS | CHAINS | POSE_FILES.keys()
-    assert {name.split("/")[0] for name in EXAMPLES if name not in files} == set(RECORDINGS)
+    assert {name.split("/")[0] for name in EXAMPLES if name not in files} == set(
+        RECORDINGS
+    )
     assert set(EXAMPLES) >= files
 
 
@@ -87,7 +99,9 @@ def recording(page: Path, name: str) -> Recording:
     for image in RECORDINGS[name][0]:
         (root / image).parent.mkdir(parents=True, exist_ok=True)
         write_image(root / image, np.zeros((480, 640, 3), np.uint8))
-        pose = root / image.replace(".color.png", ".pose.txt").replace(".color.jpg", ".pose.txt")
+        pose = root / image.replace(".color.png", ".pose.txt").replace(
+            ".color.jpg", ".pose.txt"
+        )
         if pose.suffix == ".txt" and not pose.exists():
             pose.write_text(EXAMPLES["base_from_camera.txt"])
     camera = page / "camera.json" if name == "timed" else None
@@ -105,7 +119,9 @@ def test_recordings(page: Path, name: str) -> None:
         pose = frame.base_from_camera
         if pose is not None:
             np.testing.assert_allclose(pose.translation_m, [0.4, 0, 0.6])
-            np.testing.assert_allclose(pose.rotation_matrix(), np.diag([1, -1, -1]), atol=1e-12)
+            np.testing.assert_allclose(
+                pose.rotation_matrix(), np.diag([1, -1, -1]), atol=1e-12
+            )
     if name == "wave":
         assert_poses(read)
 

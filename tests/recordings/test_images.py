@@ -52,7 +52,9 @@ RGB16 = np.stack([RAMP, RAMP[::-1], RAMP.T], axis=2) + np.uint16(100)
     ids=["grey8", "grey16", "rgb8", "rgb16", "rgba8", "rgba16"],
 )
 @pytest.mark.parametrize("ending", [".png", ".tif"])
-def test_files_and_arrays_convert_alike(tmp_path: Path, image: np.ndarray, ending: str) -> None:
+def test_files_and_arrays_convert_alike(
+    tmp_path: Path, image: np.ndarray, ending: str
+) -> None:
     stored = image if image.ndim == 2 else image[:, :, [2, 1, 0, 3][: image.shape[2]]]
     cv2.imwrite(str(tmp_path / f"a{ending}"), stored)
     rgb = as_rgb(image)
@@ -115,7 +117,9 @@ def test_exif_orientation_is_applied(tmp_path: Path) -> None:
     rotated_jpeg(file, 6)
     frame = Frame("a", file, Camera(16, 32, 20.0, 20.0, 7.5, 15.5), SE3.identity())
     generic.write(tmp_path / "out", Recording("x", (frame,), ()))
-    np.testing.assert_array_equal(load_recording(tmp_path / "out").train[0].read_image(), image)
+    np.testing.assert_array_equal(
+        load_recording(tmp_path / "out").train[0].read_image(), image
+    )
 
 
 @pytest.mark.parametrize("order", ["II", "MM"])
@@ -128,14 +132,18 @@ def test_orientation_is_applied_or_not_in_every_format(
     stored = np.full((16, 40, 3), 20, np.uint8)
     stored[:8] += 60
     stored[:, :20] += 120
-    file, exif = tmp_path / f"a{ending}", Image.Exif()
-    exif[0x112], exif.endian = orientation, {"II": "<", "MM": ">"}[order]
+    file = tmp_path / f"a{ending}"
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    exif.endian = {"II": "<", "MM": ">"}[order]
     exif[0x10F] = 5000 * "maker "  # an entry that is long
     image = Image.fromarray(stored)
     if ending == ".tiff":
         tags = TiffImagePlugin.ImageFileDirectory_v2(prefix=order.encode())
         tags[0x112] = orientation
-        image.save(file, tiffinfo=tags, compression="tiff_lzw" if order == "II" else None)
+        image.save(
+            file, tiffinfo=tags, compression="tiff_lzw" if order == "II" else None
+        )
     else:
         image.save(file, exif=exif)
     upright = ImageOps.exif_transpose(Image.open(file))
@@ -168,6 +176,9 @@ def test_image_of_another_size_than_its_camera_is_refused(tmp_path: Path) -> Non
     camera = Camera(32, 16, 20.0, 20.0, 15.5, 7.5)
     image = np.zeros((16, 32, 3), np.uint8)
     write_image(tmp_path / "a.png", image)
-    assert Frame("a", tmp_path / "a.png", camera, SE3.identity()).read_image().shape == image.shape
+    assert (
+        Frame("a", tmp_path / "a.png", camera, SE3.identity()).read_image().shape
+        == image.shape
+    )
     with pytest.raises(InputError, match="b: image is 16x32, its camera 32x16"):
         Frame("b", image.transpose(1, 0, 2), camera, None).read_image()

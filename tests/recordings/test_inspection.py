@@ -12,10 +12,15 @@ LENS = Camera(32, 24, 26, 26, 15.5, 11.5)
 PICTURES = np.random.default_rng(0).integers(0, 255, (7, 24, 32, 3), np.uint8)
 
 
-def recording_of(train: SE3, test: SE3, camera: Camera = LENS, untracked: int = 0) -> Recording:
+def recording_of(
+    train: SE3, test: SE3, camera: Camera = LENS, untracked: int = 0
+) -> Recording:
     def frames(poses: SE3, split: str) -> tuple[Frame, ...]:
         count = len(poses)
-        return tuple(Frame(f"{split}{i}", PICTURES[i % 7], camera, poses[i]) for i in range(count))
+        return tuple(
+            Frame(f"{split}{i}", PICTURES[i % 7], camera, poses[i])
+            for i in range(count)
+        )
 
     return Recording("planted", frames(train, "a"), frames(test, "b"), untracked)
 
@@ -25,7 +30,8 @@ def warned(recording: Recording) -> str:
 
 
 ROOM = BoxRoom(41, furniture=0, texture_px=16)
-TRAIN, TEST = ROOM.path(200, 1), ROOM.path(40, 2)
+TRAIN = ROOM.path(200, 1)
+TEST = ROOM.path(40, 2)
 
 
 def test_summary_of_a_straight_path() -> None:
@@ -41,7 +47,8 @@ def test_summary_of_a_straight_path() -> None:
 
 def test_planted_faults_are_reported() -> None:
     assert warned(recording_of(TRAIN, TEST)) == ""
-    rotations, translations = TRAIN.rotation_wxyz, TRAIN.translation_m
+    rotations = TRAIN.rotation_wxyz
+    translations = TRAIN.translation_m
     for train, message in (
         (SE3(rotations, np.zeros((200, 3))), "stand at one point"),
         (SE3(np.tile(rotations[0], (200, 1)), translations), "look the same way"),

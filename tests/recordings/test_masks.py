@@ -13,11 +13,15 @@ from evercal.recordings.samples import FOLDER
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    return Path(shutil.copytree(FOLDER.parent / "sample_cell/wrist", tmp_path / "wrist"))
+    return Path(
+        shutil.copytree(FOLDER.parent / "sample_cell/wrist", tmp_path / "wrist")
+    )
 
 
 @pytest.mark.parametrize("ending", [".png", ".jpg.png"])
-def test_what_is_black_has_one_colour_and_the_rest_stays(recording: Path, ending: str) -> None:
+def test_what_is_black_has_one_colour_and_the_rest_stays(
+    recording: Path, ending: str
+) -> None:
     before = load_recording(recording).train[0]
     old = before.read_image()
     mask = np.full(old.shape, 255, np.uint8)
@@ -42,7 +46,9 @@ def test_masks_of_another_size_or_name_are_refused(recording: Path) -> None:
     write_image(recording / "masks" / "other.png", np.zeros((4, 4, 3), np.uint8))
     with pytest.raises(InputError, match="no mask has the name of an image"):
         load_recording(recording)
-    name = Path(str(load_recording(FOLDER.parent / "sample_cell/wrist").train[0].image)).stem
+    name = Path(
+        str(load_recording(FOLDER.parent / "sample_cell/wrist").train[0].image)
+    ).stem
     write_image(recording / "masks" / f"{name}.png", np.zeros((4, 4, 3), np.uint8))
     with pytest.raises(InputError, match="mask is 4x4, its image"):
         load_recording(recording).train[0].read_image()

@@ -49,7 +49,11 @@ def test_missing_and_unreadable_images_are_named_and_left_out(root: Path) -> Non
 def test_the_file_that_a_missing_one_may_be_is_shown(root: Path) -> None:
     file = root / "images/000000.png"
     file.rename(root / "images/000000.PNG")
-    assert load_recording(root).notes[0].endswith("000000.png (nearest: images/000000.PNG)")
+    assert (
+        load_recording(root)
+        .notes[0]
+        .endswith("000000.png (nearest: images/000000.PNG)")
+    )
 
 
 def test_paths_of_windows_are_read(root: Path) -> None:

@@ -33,7 +33,9 @@ def test_images_without_structure(
     def changed(image: np.ndarray) -> np.ndarray:
         return change(image.astype(np.float32)).clip(0, 255).round().astype(np.uint8)
 
-    train = tuple(replace(frame, image=changed(frame.read_image())) for frame in hall.train)
+    train = tuple(
+        replace(frame, image=changed(frame.read_image())) for frame in hall.train
+    )
     assert inspect_recording(hall).warnings == ()
     check(replace(hall, train=train), cause, usable)
     some = (*train[:10], *hall.train[10:])

@@ -32,8 +32,12 @@ def frame(number: int, shift_px: int, blur: float = 0) -> StreamFrame:
 
 def test_frames_of_a_standing_camera_are_left_out() -> None:
     shifts = [0] * 5 + [10 * i for i in range(40)] + [390] * 5
-    black = [frame(0, 0)._replace(name="black", image=np.zeros((480, 640, 3), np.uint8))] * 3
-    chosen = list(_moving(iter([*black, *(frame(i, s) for i, s in enumerate(shifts))]), 0.05))
+    black = [
+        frame(0, 0)._replace(name="black", image=np.zeros((480, 640, 3), np.uint8))
+    ] * 3
+    chosen = list(
+        _moving(iter([*black, *(frame(i, s) for i, s in enumerate(shifts))]), 0.05)
+    )
     assert chosen[0].name == "0"
     steps = np.diff([shifts[int(f.name)] for f in chosen])
     assert steps.min() > 0.05 * 640 - 1
@@ -41,7 +45,10 @@ def test_frames_of_a_standing_camera_are_left_out() -> None:
 
 
 def test_the_sharpest_frame_of_a_step_is_chosen() -> None:
-    frames = [frame(0, 0), *(frame(i, 30 + 2 * i, 0.1 if i == 4 else 3.0) for i in range(1, 9))]
+    frames = [
+        frame(0, 0),
+        *(frame(i, 30 + 2 * i, 0.1 if i == 4 else 3.0) for i in range(1, 9)),
+    ]
     chosen = [f.name for f in _moving(iter(frames), 0.05)]
     assert chosen[:2] == ["0", "4"]
 
@@ -57,23 +64,32 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distances of points (n, 3) after the best similarity (Umeyama 1991)."""
-    a, b = a - a.mean(0), b - b.mean(0)
+    a = a - a.mean(0)
+    b = b - b.mean(0)
     u, s, v = np.linalg.svd(b.T @ a)
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ v))])
     scale = (s * np.diag(sign)).sum() / (a**2).sum()
     return np.linalg.norm(b - scale * a @ (u @ sign @ v).T, axis=1)
 
 
-def test_poses_agree_with_the_truth_up_to_a_similarity(folder: Path, tmp_path: Path) -> None:
+def test_poses_agree_with_the_truth_up_to_a_similarity(
+    folder: Path, tmp_path: Path
+) -> None:
     steps: list[str] = []
-    found = reconstruct(folder, tmp_path / "out", on_step=lambda name, *_: steps.append(name))
+    found = reconstruct(
+        folder, tmp_path / "out", on_step=lambda name, *_: steps.append(name)
+    )
     assert found.posed >= 18
-    assert {"choosing frames", "detecting features", "matching", "mapping"} <= set(steps)
+    assert {"choosing frames", "detecting features", "matching", "mapping"} <= set(
+        steps
+    )
     recording = load_recording(tmp_path / "out")
     assert not recording.metric
     truth = {f.name: f.base_from_camera for f in sample_rooms()[0].scene.train}
     poses = [f.base_from_camera for f in recording.train]
-    true = SE3.stack([pose for f in recording.train if (pose := truth[Path(f.name).stem])])
+    true = SE3.stack(
+        [pose for f in recording.train if (pose := truth[Path(f.name).stem])]
+    )
     own = SE3.stack([pose for pose in poses if pose is not None])
     assert np.median(apart(own.translation_m, true.translation_m)) < 0.02
     focal = sample_rooms()[0].scene.train[0].camera.fx
@@ -86,9 +102,18 @@ def test_sources_that_cannot_be_reconstructed(tmp_path: Path) -> None:
     (tmp_path / "few").mkdir()
     (tmp_path / "noise").mkdir()
     for i in range(5):
-        write_image(tmp_path / f"few/{i}.png", rng.integers(0, 255, (60, 80, 3)).astype("u1"))
-    with pytest.raises(InputError, match="5 frames to reconstruct, at least 12 are required"):
+        write_image(
+            tmp_path / f"few/{i}.png", rng.integers(0, 255, (60, 80, 3)).astype("u1")
+        )
+    with pytest.raises(
+        InputError, match="5 frames to reconstruct, at least 12 are required"
+    ):
         reconstruct(tmp_path / "few", tmp_path / "out")
     for i in range(12):
-        write_image(tmp_path / f"noise/{i}.png", rng.integers(0, 255, (120, 160, 3)).astype("u1"))
-    refused("do not connect to a model", reconstruct, tmp_path / "noise", tmp_path / "other")
+        write_image(
+            tmp_path / f"noise/{i}.png",
+            rng.integers(0, 255, (120, 160, 3)).astype("u1"),
+        )
+    refused(
+        "do not connect to a model", reconstruct, tmp_path / "noise", tmp_path / "other"
+    )

@@ -8,7 +8,13 @@ import pytest
 
 from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
 from evercal.recordings import load_recording
-from evercal.recordings.samples import CELL, FOLDER, SampleRoom, copy_samples, sample_rooms
+from evercal.recordings.samples import (
+    CELL,
+    FOLDER,
+    SampleRoom,
+    copy_samples,
+    sample_rooms,
+)
 
 from .checks import refused
 
@@ -29,7 +35,9 @@ def test_rooms_are_complete_and_small(rooms: tuple[SampleRoom, ...]) -> None:
         assert room.scene.test[7].read_image().shape == (240, 320, 3)
         assert room.fixed is not None
         assert len({frame.joints_rad for frame in room.fixed.test}) == 25
-        metres, radians = pose_distance(poses(room.fixed.test), poses(room.fixed.test)[0])
+        metres, radians = pose_distance(
+            poses(room.fixed.test), poses(room.fixed.test)[0]
+        )
         assert max(metres.max(), radians.max()) < 1e-9
     assert sum(path.stat().st_size for path in FOLDER.rglob("*")) <= 13e6
 

@@ -21,7 +21,11 @@ def test_a_folder_in_natural_order_with_times_of_its_names(tmp_path: Path) -> No
     for i in (10, 9, 2):
         write_image(tmp_path / f"image-{i}.png", image(i))
     frames = list(stream(str(tmp_path), rate=10))
-    assert [frame.name for frame in frames] == ["image-2.png", "image-9.png", "image-10.png"]
+    assert [frame.name for frame in frames] == [
+        "image-2.png",
+        "image-9.png",
+        "image-10.png",
+    ]
     assert [frame.stamp_s for frame in frames] == pytest.approx([0, 0.1, 0.2])
     assert frames[1].image[0, 40].tolist() == [9, 9, 9]
 
@@ -33,7 +37,9 @@ def test_a_video_with_its_own_times(tmp_path: Path) -> None:
         writer.write(image(40 * i)[..., ::-1])
     writer.release()
     frames = list(stream(str(path)))
-    assert [frame.stamp_s for frame in frames] == pytest.approx(np.arange(6) / 20, abs=1e-3)
+    assert [frame.stamp_s for frame in frames] == pytest.approx(
+        np.arange(6) / 20, abs=1e-3
+    )
     assert frames[4].image[20, 50] == pytest.approx([160] * 3, abs=6)
     assert frames[4].image[20, 10] == pytest.approx([200, 30, 10], abs=12)  # RGB
 

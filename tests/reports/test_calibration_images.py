@@ -18,7 +18,11 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import write_image
-from evercal.reports.calibration_images import annotate_images, boards_seen, select_images
+from evercal.reports.calibration_images import (
+    annotate_images,
+    boards_seen,
+    select_images,
+)
 from evercal.reports.overlay import LandmarkPicture
 
 
@@ -31,14 +35,18 @@ BASE_FROM_CAMERA = pose([0.0, 1.0, 0.0, 0.0], [0.1, 0.05, 1.0])
 
 
 def calibration(names: dict[str, bool], **more: Any) -> Calibration:
-    uses = tuple(ImageUse(name, used, "" if used else "blurred") for name, used in names.items())
+    uses = tuple(
+        ImageUse(name, used, "" if used else "blurred") for name, used in names.items()
+    )
     result = Calibration(
         "eye_to_hand", BASE_FROM_CAMERA, 1e-6 * np.eye(6), camera=CAMERA, images=uses
     )
     return replace(result, **more)
 
 
-def write_images(folder: Path, *names: str, size: tuple[int, int] = (120, 160)) -> list[Path]:
+def write_images(
+    folder: Path, *names: str, size: tuple[int, int] = (120, 160)
+) -> list[Path]:
     for name in names:
         write_image(folder / name, np.full((*size, 3), 90, np.uint8))
     return [folder / name for name in names]
@@ -64,7 +72,9 @@ class FixedLocalizer:
         points = BASE_FROM_CAMERA.apply([[0.1, 0.1, 1.0], [0.2, -0.1, 1.0]])
         pixels = camera.resized(80, 60).project([[0.1, 0.1, 1.0], [0.2, -0.1, 1.0]])
         pixels[1, 0] += 3
-        return PoseEstimate("ok", "", "room", self.pose, None, 2, 1.0, 1.0, pixels, points)
+        return PoseEstimate(
+            "ok", "", "room", self.pose, None, 2, 1.0, 1.0, pixels, points
+        )
 
 
 def drawn_in(own: Calibration, folder: Path, localizer: Any) -> list[LandmarkPicture]:
@@ -79,13 +89,20 @@ def test_selection_is_spread_and_includes_a_rejected_image(tmp_path: Path) -> No
     files, reason = select_images(calibration(names), tmp_path)
     assert reason == ""
     assert [file.path.name for file in files] == ["0.png", "5.png", "9.png", "4.png"]
-    assert [file.use is not None and file.use.used for file in files] == [True, True, True, False]
+    assert [file.use is not None and file.use.used for file in files] == [
+        True,
+        True,
+        True,
+        False,
+    ]
 
 
 def test_given_images_replace_those_of_the_calibration(tmp_path: Path) -> None:
     own = write_images(tmp_path, "a.png")
     others = write_images(tmp_path, *(f"{i}.png" for i in range(6)))
-    files, _ = select_images(calibration({str(own[0]): True}), tmp_path, [*others[:3], *own])
+    files, _ = select_images(
+        calibration({str(own[0]): True}), tmp_path, [*others[:3], *own]
+    )
     assert [file.path for file in files] == [*others[:3], *own]
     assert [file.use is None for file in files] == [True, True, True, False]
     assert len(select_images(calibration({}), tmp_path, others)[0]) == 4
@@ -93,7 +110,9 @@ def test_given_images_replace_those_of_the_calibration(tmp_path: Path) -> None:
 
 def test_reason_for_no_images_is_given(tmp_path: Path) -> None:
     assert "names no images" in select_images(calibration({}), tmp_path)[1]
-    files, reason = select_images(calibration({"gone.png": True, "b.png": True}), tmp_path)
+    files, reason = select_images(
+        calibration({"gone.png": True, "b.png": True}), tmp_path
+    )
     assert files == []
     assert "none of the 2 images" in reason
     assert "gone.png" in reason
@@ -136,7 +155,10 @@ def test_axes_of_an_older_calibration_are_added(tmp_path: Path) -> None:
     ("mount", "median_px"),
     [
         ("eye_to_hand", 0.5 * (0 + 6)),  # 0 and 3 pixels of an image of half the size
-        ("eye_in_hand", 3.75 + 6.75),  # relative to the image's own pose, 50 mm off: 3.75 pixels
+        (
+            "eye_in_hand",
+            3.75 + 6.75,
+        ),  # relative to the image's own pose, 50 mm off: 3.75 pixels
     ],
 )
 def test_residuals_refer_to_the_calibration_of_a_fixed_camera(
@@ -162,7 +184,8 @@ def test_lines_lead_from_the_detections_to_the_projections(tmp_path: Path) -> No
     red, _, blue = image.image[y].astype(int).T
     orange = np.flatnonzero(red - blue > 100)
     assert orange.min() == pytest.approx(x, abs=2)
-    assert orange.max() == pytest.approx(x + 24 + 3, abs=2)  # with the radius of the yellow dot
+    # With the radius of the yellow dot.
+    assert orange.max() == pytest.approx(x + 24 + 3, abs=2)
 
 
 def test_reason_for_missing_landmarks_is_given(tmp_path: Path) -> None:
@@ -186,7 +209,9 @@ def test_corners_are_projected_with_the_estimated_size(tmp_path: Path) -> None:
     # The board is stated 2 % too large.
     view = BoardView(1.02 * points, CAMERA.project(board_pose.apply(points)))
     views = {"images/a.png": view, "images/b.png": "no board"}
-    board_poses(Board("chessboard", 0.03, 3, 3), CAMERA, views).write(tmp_path / "board.json")
+    board_poses(Board("chessboard", 0.03, 3, 3), CAMERA, views).write(
+        tmp_path / "board.json"
+    )
     (tmp_path / "images").mkdir()
     write_images(tmp_path, "images/a.png")
     stated = {"translation_m": [0.01, 0.02, 0.5], "quaternion_wxyz": [1, 0, 0, 0]}
@@ -197,7 +222,9 @@ def test_corners_are_projected_with_the_estimated_size(tmp_path: Path) -> None:
     )
     seen = boards_seen(own, tmp_path)
     assert list(seen) == ["images/a.png"]
-    assert seen["images/a.png"].projected(CAMERA) == pytest.approx(view.pixels, abs=1e-9)
+    assert seen["images/a.png"].projected(CAMERA) == pytest.approx(
+        view.pixels, abs=1e-9
+    )
     files, _ = select_images(own, tmp_path)
     result = annotate_images(own, files, boards=seen)
     assert [image.summary for image in result.images.values()] == [

@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, JointOffset
+from evercal.calibration.calibration import (
+    Calibration,
+    ErrorTerm,
+    ImageUse,
+    JointOffset,
+)
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.reports.calibration_images import AnnotatedImages
@@ -45,13 +50,31 @@ def full(**changes: Any) -> Calibration:
         CAMERA,
         (
             ImageUse("shots/a.png", True, "", 0.51, 0.012),
-            ImageUse("shots/b.png", False, "lies 20.8 mm and 1.14 deg from the other images", 20.8),
+            ImageUse(
+                "shots/b.png",
+                False,
+                "lies 20.8 mm and 1.14 deg from the other images",
+                20.8,
+            ),
             ImageUse("shots/c.png", False, "failed: too dark"),
         ),
-        (ErrorTerm("landmarks and lens", 0.2, 0.001), ErrorTerm("scatter", 0.05, 0.0002)),
-        {"repeatability_mm": 0.31, "repeatability_deg": 0.013, "held_out_mm": 2.25, "spots": 3},
+        (
+            ErrorTerm("landmarks and lens", 0.2, 0.001),
+            ErrorTerm("scatter", 0.05, 0.0002),
+        ),
+        {
+            "repeatability_mm": 0.31,
+            "repeatability_deg": 0.013,
+            "held_out_mm": 2.25,
+            "spots": 3,
+        },
         "Good enough for bin picking. Move closer.",
-        {"command": "calibrate", "scene": "cell", "map": "abc", "store": "cell.evercal"},
+        {
+            "command": "calibrate",
+            "scene": "cell",
+            "map": "abc",
+            "store": "cell.evercal",
+        },
         "2026-01-02T03:04:05+00:00",
     )
     return replace(calibration, **changes)
@@ -79,12 +102,20 @@ def read(
 
 def test_verdict_comes_first() -> None:
     reader, _ = read(full())
-    assert reader.strings[3] == ("h1", "Good enough for bin picking")  # after title and style
+    # After title and style.
+    assert reader.strings[3] == (
+        "h1",
+        "Good enough for bin picking",
+    )
     assert reader.strings[4] == ("p", "Move closer.")
     # The uncertainty decides; the held-out error of 2.25 mm is that of one image.
     assert reader.strings[5] == ("strong", "0.37 mm")
     suitable = {row[0]: row[3] for row in reader.rows[1:4]}
-    assert suitable == {"precision assembly": "yes", "bin picking": "yes", "tabletop tasks": "yes"}
+    assert suitable == {
+        "precision assembly": "yes",
+        "bin picking": "yes",
+        "tabletop tasks": "yes",
+    }
 
 
 @pytest.mark.parametrize(
@@ -106,7 +137,10 @@ def test_point_of_the_camera_has_a_standard_deviation_along_each_axis() -> None:
         NamedCalibration("c.json", full()), AnnotatedImages(), None, None, (0, 0, 2)
     )
     [row] = [row for row in HtmlReader(page.html).rows if row[0].startswith("point ")]
-    assert row[0] == "point (0, 0, 2) m of camera_optical along the axes of panda_link0 (mm)"
+    assert (
+        row[0]
+        == "point (0, 0, 2) m of camera_optical along the axes of panda_link0 (mm)"
+    )
     # 2 m ahead, 0.01 mrad about the camera's x and y are 0.02 mm across.
     across = [np.hypot(0.1, 0.02), np.hypot(0.2, 0.02), 0.3]
     rms = np.sqrt(np.mean(np.square(across)))
@@ -118,7 +152,9 @@ def test_every_image_and_reason_is_listed() -> None:
     calibration = full()
     reader, _ = read(calibration)
     rows = {row[1]: row for row in reader.rows if len(row) == 6}
-    for image, name in zip(calibration.images, ("a.png", "b.png", "c.png"), strict=True):
+    for image, name in zip(
+        calibration.images, ("a.png", "b.png", "c.png"), strict=True
+    ):
         assert rows[name][2] == ("yes" if image.used else "no")
         assert rows[name][3] == image.reason
     assert rows["a.png"][4:] == ["0.51", "0.012"]
@@ -161,12 +197,16 @@ def test_checks_ellipsoid_and_source_are_shown() -> None:
         assert reader.row(name)[1] == value
     assert page.missing == ()
     assert reader.text("text").count("residual") == 2
-    assert {f"{axis} of panda_link0 (m)" for axis in "xyz"} < {*reader.text("text").splitlines()}
+    assert {f"{axis} of panda_link0 (m)" for axis in "xyz"} < {
+        *reader.text("text").splitlines()
+    }
     assert "lens: intrinsics" in page.html
 
 
 def test_missing_contents_are_listed() -> None:
-    nothing = AnnotatedImages(missing=("No pictures: the calibration holds no intrinsics.",))
+    nothing = AnnotatedImages(
+        missing=("No pictures: the calibration holds no intrinsics.",)
+    )
     reader, page = read(solved(), nothing)
     assert {sentence.split(":")[0] for sentence in page.missing} == {
         "No pictures",
@@ -233,7 +273,10 @@ def test_the_ellipsoid_fits_its_drawing(sigma_mm: float, mount: Any) -> None:
     panels, _ = camera_views(full(mount=mount, covariance=covariance), Surroundings())
     for panel in panels:
         [shape] = [shape for shape in panel.shapes if shape.kind == "area"]
-        (low, high), (first, last) = panel.limits, (shape.points.min(0), shape.points.max(0))
+        (low, high), (first, last) = (
+            panel.limits,
+            (shape.points.min(0), shape.points.max(0)),
+        )
         assert ((low < first) & (first < last) & (last < high)).all()
 
 
@@ -252,7 +295,9 @@ def test_bars_are_as_high_as_the_residuals_of_their_images() -> None:
             rejected.points[[0, 1, 3]], [(2, residuals[1]), (2, 0), (3, 0)]
         )
         # The bar of the rejected image is cut: the chart ends at twice the largest used one.
-        assert panel.limits[1, 1] == pytest.approx(min(2 * residuals[0], 1.1 * max(residuals)))
+        assert panel.limits[1, 1] == pytest.approx(
+            min(2 * residuals[0], 1.1 * max(residuals))
+        )
         numbers = [words for words, *_ in panel.texts if words.isdigit()]
         assert len(numbers) == ticks
     assert residual_chart(full(images=())) is None
@@ -272,7 +317,9 @@ def test_outline_is_the_projection_of_the_ellipsoid(plane: tuple[int, int]) -> N
     outline = ellipse(UncertainPose(SE3.identity(), covariance), 1, plane)
     for angle in np.linspace(0, np.pi, 7):
         along = np.array([np.cos(angle), np.sin(angle)])
-        assert (outline @ along).max() == pytest.approx((surface @ along).max(), rel=3e-3)
+        assert (outline @ along).max() == pytest.approx(
+            (surface @ along).max(), rel=3e-3
+        )
 
 
 def test_difference_between_calibrations() -> None:
@@ -290,7 +337,9 @@ def test_difference_between_calibrations() -> None:
     reader, _ = read(full(), older=replace(older, parent_frame="base", source={}))
     assert "names its parent frame base" in reader.text("p")
     assert "use different maps" in reader.text("p")
-    with pytest.raises(InputError, match="it is eye_in_hand and the calibration is eye_to_hand"):
+    with pytest.raises(
+        InputError, match="it is eye_in_hand and the calibration is eye_to_hand"
+    ):
         difference(full(), full(mount="eye_in_hand"))
 
 
@@ -315,7 +364,12 @@ def test_joints_of_the_arm_are_listed_with_what_would_close_them() -> None:
     checks = {"joints_move_mm": [4.5, 6.25]}
     own = full(joints=joints, joint_covariance=np.eye(3), checks=checks)
     reader, page = read(own)
-    assert ["pan (deg)", "-", "-", "its offset turns the frame of the base"] in reader.rows
+    assert [
+        "pan (deg)",
+        "-",
+        "-",
+        "its offset turns the frame of the base",
+    ] in reader.rows
     assert ["lift (deg)", "+1.250", "0.200", ""] in reader.rows
     assert ["rail (mm)", "-3.100", "0.400", ""] in reader.rows
     assert "They move the gripper by 4.50 mm, at most 6.25 mm." in page.html

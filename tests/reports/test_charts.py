@@ -22,7 +22,9 @@ BOX = (400, 200)
 NAN = np.array([[np.nan, np.nan]])
 
 
-def panel(*shapes: Shape, low: Any = (-1, 0), high: Any = (3, 10), x: str = "a (m)") -> Panel:
+def panel(
+    *shapes: Shape, low: Any = (-1, 0), high: Any = (3, 10), x: str = "a (m)"
+) -> Panel:
     return Panel(BOX, np.array([low, high], np.float64), (x, "b (deg)"), shapes)
 
 
@@ -48,7 +50,9 @@ def written(*panels: Panel) -> str:
         (-5e4, 1e5, "-40000 -20000 0 20000 40000 60000 80000 100000"),
     ],
 )
-def test_ticks_are_few_round_numbers_at_their_places(low: float, high: float, words: str) -> None:
+def test_ticks_are_few_round_numbers_at_their_places(
+    low: float, high: float, words: str
+) -> None:
     texts = panel(low=(low, 0), high=(high, 1)).texts
     ticks = [(word, x) for word, x, y, _ in texts if y == BOX[1] + 18]
     assert " ".join(word for word, _ in ticks) == words.replace("-", MINUS)
@@ -73,13 +77,22 @@ def test_an_axis_without_a_label_has_no_numbers() -> None:
 
 
 def test_paths_are_those_of_the_points() -> None:
-    corner, middle, end = (-1, 0), (1, 5), (3, 10)
+    corner = (-1, 0)
+    middle = (1, 5)
+    end = (3, 10)
     chart = panel()
     assert chart.path(line([corner, middle, end])) == "M0,200 200,100 400,0"
     gap = np.concatenate([NAN, [corner, middle], NAN, NAN, [end, middle], NAN])
-    assert chart.path(line(gap)).replace(" M", "M").strip() == "M 0,200 200,100M 400,0 200,100"
+    assert (
+        chart.path(line(gap)).replace(" M", "M").strip()
+        == "M 0,200 200,100M 400,0 200,100"
+    )
     assert chart.path(line([corner, end], "dots")) == "M0,200h0M400,0h0"
-    assert chart.path(line(np.zeros((0, 2)))) == chart.path(line(np.zeros((0, 2)), "dots")) == ""
+    assert (
+        chart.path(line(np.zeros((0, 2))))
+        == chart.path(line(np.zeros((0, 2)), "dots"))
+        == ""
+    )
 
 
 def test_a_chart_holds_its_shapes_and_escaped_names() -> None:
@@ -91,10 +104,12 @@ def test_a_chart_holds_its_shapes_and_escaped_names() -> None:
     assert reader.text("figcaption") == MARKUP
     assert reader.tags.count("path") == 2 * 2 + len(shapes)  # each grid, and the axes
     assert (
-        'class="line" style="color: var(--orange); stroke-width: 2.5; stroke-opacity: 1.0"' in text
+        'class="line" style="color: var(--orange); stroke-width: 2.5; stroke-opacity: 1.0"'
+        in text
     )
     assert 'stroke-opacity: 0.3" d="M100,180h0"' in text
-    assert not re.search(r"url\(|href| id=", text)  # two charts of a page do not collide
+    # Two charts of a page do not collide.
+    assert not re.search(r"url\(|href| id=", text)
 
 
 def test_every_ink_differs_from_both_papers() -> None:
@@ -115,7 +130,11 @@ def test_frames_show_shapes_where_they_belong() -> None:
     paint(frame, panel(*tall), 80, 40)
     orange = np.abs(frame.astype(int) - rgb("orange")).max(2) < 40
     rows, columns = np.nonzero(orange[:, :330])
-    assert (columns.min(), columns.max()) == (279, 280)  # x = 1 is the middle of the box
+    # X = 1 is the middle of the box.
+    assert (columns.min(), columns.max()) == (
+        279,
+        280,
+    )
     assert (rows.min(), rows.max() > 230) == (40, True)  # and nothing lies outside
     rows, columns = np.nonzero(orange[:, 330:])
     assert (rows.mean() - 40, columns.mean() + 250) == pytest.approx((100, 300), abs=1)
@@ -128,7 +147,9 @@ def test_frames_show_shapes_where_they_belong() -> None:
 def test_a_dot_is_as_pale_as_its_opacity() -> None:
     frame = np.full((300, 520, 3), 255, np.uint8)
     paint(frame, panel(line([(2, 5)], "dots", width=10, opacity=0.5)), 80, 40)
-    np.testing.assert_allclose(frame[140, 380], (255 + np.array(rgb("orange"))) / 2, atol=1)
+    np.testing.assert_allclose(
+        frame[140, 380], (255 + np.array(rgb("orange"))) / 2, atol=1
+    )
 
 
 @pytest.mark.parametrize("align", [0, 1, 2])
@@ -137,7 +158,9 @@ def test_words_are_aligned(align: int) -> None:
     write(image, (f"{MINUS}0.5 été", 200, 25, align))
     columns = np.flatnonzero((image < 128).any((0, 2)))
     ends = columns[0], columns[-1]
-    assert (ends[0], (ends[0] + ends[1]) / 2, ends[1])[align] == pytest.approx(200, abs=3)
+    assert (ends[0], (ends[0] + ends[1]) / 2, ends[1])[align] == pytest.approx(
+        200, abs=3
+    )
 
 
 def test_a_view_has_one_scale_and_shows_what_lies_inside() -> None:
@@ -145,7 +168,9 @@ def test_a_view_has_one_scale_and_shows_what_lies_inside() -> None:
     around = Surroundings(points, np.array([0, 255, 90], np.uint8))
     view = Frustum.of(SE3.identity(), Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
     seen = np.array([[0.0, 0.0, 0.0], [2.0, 0.5, 1.0]])
-    shown = view_panel((300, 200), ABOVE, around, seen, view, names=("base", "unit unknown"))
+    shown = view_panel(
+        (300, 200), ABOVE, around, seen, view, names=("base", "unit unknown")
+    )
     x, y = np.ptp(shown.limits, axis=0)
     assert x / y == pytest.approx(1.5)
     assert (shown.limits[0] < seen[:, :2].min(0)).all()
@@ -155,7 +180,12 @@ def test_a_view_has_one_scale_and_shows_what_lies_inside() -> None:
     drawn = {float(d.opacity): d.points.tolist() for d in dots if len(d.points)}
     dark, bright = sorted(drawn, reverse=True)
     assert (drawn[dark], drawn[bright]) == ([[0.5, 0.5]], [[0.6, -0.4]])
-    assert [s.ink for s in shown.shapes if s.kind == "line"] == ["red", "green", "blue", "orange"]
+    assert [s.ink for s in shown.shapes if s.kind == "line"] == [
+        "red",
+        "green",
+        "blue",
+        "orange",
+    ]
 
 
 @pytest.mark.slow("src/evercal/reports/templates", "src/evercal/reports/charts.py")
@@ -170,7 +200,9 @@ def test_charts_in_a_browser_keep_their_words_inside(
     file.write_text(read(full(parent_frame=frame))[1].html, encoding="utf-8")
     colours = []
     for scheme in ("light", "dark"):
-        visit = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
+        visit = browser.new_page(
+            viewport={"width": width, "height": 800}, color_scheme=scheme
+        )
         visit.goto(file.as_uri())
         outside = visit.evaluate("""() =>
             [...document.querySelectorAll(".chart text")].filter(t => {

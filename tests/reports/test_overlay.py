@@ -25,7 +25,9 @@ from evercal.reports.overlay import (
 
 GREY = np.full((60, 80, 3), 128, np.uint8)
 PINHOLE = Camera(640, 480, 600.0, 610.0, 320.0, 240.0)
-DISTORTED = Camera(640, 480, 600.0, 610.0, 320.0, 240.0, (-0.3, 0.1, 0.001, -0.002, 0.01))
+DISTORTED = Camera(
+    640, 480, 600.0, 610.0, 320.0, 240.0, (-0.3, 0.1, 0.001, -0.002, 0.01)
+)
 
 
 def turned(quaternion: list[float], translation: list[float]) -> SE3:
@@ -35,7 +37,9 @@ def turned(quaternion: list[float], translation: list[float]) -> SE3:
 def dots(pixels: Any, residuals: Any, image: np.ndarray = GREY) -> np.ndarray:
     """Points without vectors, coloured from 0 to 1."""
     at = np.asarray(pixels, np.float64).reshape(-1, 2)
-    return draw_residuals(image, at, np.zeros_like(at), np.asarray(residuals, np.float64), 1.0)[0]
+    return draw_residuals(
+        image, at, np.zeros_like(at), np.asarray(residuals, np.float64), 1.0
+    )[0]
 
 
 def test_dots_are_placed_with_subpixel_accuracy() -> None:
@@ -89,7 +93,12 @@ def test_lines_have_their_colour_and_gaps() -> None:
     drawn = overlay_lines(GREY, [line], [(200, 10, 20)], 3)
     assert [drawn[30, x].tolist() for x in (25, 65)] == [[200, 10, 20]] * 2
     assert drawn[30, 50].tolist() == [128, 128, 128]
-    for nothing in ([[np.nan, 1], [np.inf, 2]], [[3, 3]], np.zeros((0, 2)), [[1e9, 1], [1e12, 5]]):
+    for nothing in (
+        [[np.nan, 1], [np.inf, 2]],
+        [[3, 3]],
+        np.zeros((0, 2)),
+        [[1e9, 1], [1e12, 5]],
+    ):
         points = np.asarray(nothing, np.float64)
         assert (overlay_lines(GREY, [points], [(0, 0, 0)], 2) == GREY).all()
 
@@ -103,7 +112,9 @@ def test_landmarks_are_coloured_by_their_reprojection_error() -> None:
     pixels[1] += [1.2, 1.6]  # two pixels off
     keyframes: Any = None
     scene = SceneMap("room", lens, lens, keyframes, MapFrame(common), 10)
-    localizer: Any = SimpleNamespace(contents=SimpleNamespace(scenes=[scene], short_side=240))
+    localizer: Any = SimpleNamespace(
+        contents=SimpleNamespace(scenes=[scene], short_side=240)
+    )
     pose = adjusted @ common.inverse()
     estimate = PoseEstimate("ok", "", "room", pose, None, 2, 0.5, 1.0, pixels, points)
     image = np.full((240, 320, 3), 90, np.uint8)
@@ -113,7 +124,9 @@ def test_landmarks_are_coloured_by_their_reprojection_error() -> None:
     assert "median residual 1.00 px" in picture.summary
     # The line leads up and to the left.
     exact, off = (
-        picture.image[tuple(np.round(2 * at + 0.5 + [2, 2]).astype(int)[::-1])].astype(int)
+        picture.image[tuple(np.round(2 * at + 0.5 + [2, 2]).astype(int)[::-1])].astype(
+            int
+        )
         for at in pixels
     )
     assert exact[2] > exact[1]  # dark blue: no error
@@ -129,7 +142,10 @@ def test_landmarks_are_coloured_by_their_reprojection_error() -> None:
 @given(seed=st.integers(0, 10_000), camera=st.sampled_from([PINHOLE, DISTORTED]))
 def test_projected_axes_agree_with_opencv(seed: int, camera: Camera) -> None:
     rng = np.random.default_rng(seed)
-    pose = SE3(rng.normal(0, 1, 4), np.array([*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.8, 2.0)]))
+    pose = SE3(
+        rng.normal(0, 1, 4),
+        np.array([*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.8, 2.0)]),
+    )
     corners = np.vstack([np.zeros(3), 0.1 * np.eye(3)])
     rotation, _ = cv2.Rodrigues(pose.rotation_matrix())
     distortion = np.array(camera.distortion or (0.0,) * 4)
@@ -173,7 +189,9 @@ def test_axes_are_drawn_in_their_colours_at_any_size() -> None:
     lines = axes_in_view(PINHOLE, pose)
     for scale in (1, 2):
         image = np.full((480 * scale, 640 * scale, 3), 128, np.uint8)
-        drawn, pale = (draw_axes(image, PINHOLE, pose, pale=p).astype(int) for p in (False, True))
+        drawn, pale = (
+            draw_axes(image, PINHOLE, pose, pale=p).astype(int) for p in (False, True)
+        )
         for line, strongest in zip(lines, range(3), strict=True):
             x, y = np.round((line[20] + 0.5) * scale - 0.5).astype(int)
             assert drawn[y, x].argmax() == pale[y, x].argmax() == strongest

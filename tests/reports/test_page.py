@@ -27,7 +27,9 @@ def page(table: Table, picture: Picture, title: str = "title") -> str:
 
 
 def test_values_are_escaped() -> None:
-    reader = HtmlReader(page(Table([MARKUP], [[MARKUP]], MARKUP), Picture(PHOTO, MARKUP), MARKUP))
+    reader = HtmlReader(
+        page(Table([MARKUP], [[MARKUP]], MARKUP), Picture(PHOTO, MARKUP), MARKUP)
+    )
     for tag in ("title", "h1", "th", "td", "caption", "figcaption"):
         assert reader.text(tag) == MARKUP, tag
     assert "script" not in reader.tags
@@ -43,7 +45,9 @@ def test_pictures_are_embedded() -> None:
     source = HtmlReader(page(Table([], []), Picture(PHOTO))).images[0]["src"] or ""
     head, _, body = source.partition(",")
     assert head == "data:image/jpeg;base64"
-    read = cv2.imdecode(np.frombuffer(base64.b64decode(body), np.uint8), cv2.IMREAD_COLOR)
+    read = cv2.imdecode(
+        np.frombuffer(base64.b64decode(body), np.uint8), cv2.IMREAD_COLOR
+    )
     assert read is not None
     assert np.abs(read[..., ::-1].astype(int) - PHOTO).max() < 6
 
@@ -76,5 +80,14 @@ def test_records_are_rows() -> None:
     table = Table.of_records(
         [Record("a", 3, 1.234, 0.0567, True), Record("b", 0, None, 1.0, False)]
     )
-    assert list(table.header) == ["room", "images used", "error mm", "error deg", "moved"]
-    assert table.rows == [["a", "3", "1.23", "0.057", "yes"], ["b", "0", "-", "1.000", "no"]]
+    assert list(table.header) == [
+        "room",
+        "images used",
+        "error mm",
+        "error deg",
+        "moved",
+    ]
+    assert table.rows == [
+        ["a", "3", "1.23", "0.057", "yes"],
+        ["b", "0", "-", "1.000", "no"],
+    ]

@@ -68,12 +68,16 @@ def test_pages_are_legible(name: str, browser: Any, tmp_path: Path) -> None:
     file = tmp_path / "page.html"
     file.write_text(PAGES[name](), encoding="utf-8")
     for scheme in ("light", "dark"):
-        visit = browser.new_page(viewport={"width": 390, "height": 800}, color_scheme=scheme)
+        visit = browser.new_page(
+            viewport={"width": 390, "height": 800}, color_scheme=scheme
+        )
         visit.goto(file.as_uri())
         faint = [entry for entry in visit.evaluate(CONTRAST) if entry[0] < 4.5]
         assert faint == []
         assert visit.evaluate("document.documentElement.scrollWidth") <= 390
-        first = visit.evaluate("document.querySelector('h1, h2, h3, h4, h5, h6').tagName")
+        first = visit.evaluate(
+            "document.querySelector('h1, h2, h3, h4, h5, h6').tagName"
+        )
         assert first == "H1"
         above = "document.querySelector('h1').getBoundingClientRect().bottom"
         assert visit.evaluate(above) < 400

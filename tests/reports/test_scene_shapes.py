@@ -32,8 +32,11 @@ def scene(request: pytest.FixtureRequest, hall_map: MapContents) -> SceneMap:
     return replace(scene, frame=replace(scene.frame, similarity=SIMILARITY))
 
 
-def test_landmarks_project_onto_their_pixels_and_have_their_grey(scene: SceneMap) -> None:
-    landmarks, keyframes = Landmarks3D.of(scene), scene.keyframes
+def test_landmarks_project_onto_their_pixels_and_have_their_grey(
+    scene: SceneMap,
+) -> None:
+    landmarks = Landmarks3D.of(scene)
+    keyframes = scene.keyframes
     assert len(landmarks) == scene.landmarks
     first = 0
     for view, marks in zip(keyframe_views(scene), keyframes.landmarks, strict=True):
@@ -45,11 +48,19 @@ def test_landmarks_project_onto_their_pixels_and_have_their_grey(scene: SceneMap
         np.testing.assert_array_equal(landmarks.grey[own], view.image[row, column, 0])
 
 
-def test_deviation_is_the_distance_by_which_the_depth_moves_a_landmark(scene: SceneMap) -> None:
-    landmarks, share = Landmarks3D.of(scene), 1e-4
+def test_deviation_is_the_distance_by_which_the_depth_moves_a_landmark(
+    scene: SceneMap,
+) -> None:
+    landmarks = Landmarks3D.of(scene)
+    share = 1e-4
     moved = scene.keyframes.take(np.arange(len(scene.keyframes)))
-    nearer = [replace(m, inverse_depth=m.inverse_depth + share * m.sigma) for m in moved.landmarks]
-    other = Landmarks3D.of(replace(scene, keyframes=replace(moved, landmarks=tuple(nearer))))
+    nearer = [
+        replace(m, inverse_depth=m.inverse_depth + share * m.sigma)
+        for m in moved.landmarks
+    ]
+    other = Landmarks3D.of(
+        replace(scene, keyframes=replace(moved, landmarks=tuple(nearer)))
+    )
     apart_mm = 1000 * np.linalg.norm(landmarks.points_m - other.points_m, axis=1)
     np.testing.assert_allclose(apart_mm / share, landmarks.sigma_mm, rtol=1e-2)
 
@@ -89,12 +100,16 @@ def test_axes_of_an_ellipsoid_are_the_eigenvectors(seed: int) -> None:
     rotation = SE3(ellipsoid.rotation_wxyz, np.zeros(3)).rotation_matrix()
     assert np.linalg.det(rotation) == pytest.approx(1)
     for axis, sigma in zip(rotation.T, ellipsoid.axes_m, strict=True):
-        np.testing.assert_allclose(covariance[:3, :3] @ axis, sigma**2 * axis, atol=1e-15)
+        np.testing.assert_allclose(
+            covariance[:3, :3] @ axis, sigma**2 * axis, atol=1e-15
+        )
     # Its surface is where the Mahalanobis distance is one.
     on_sphere = rng.normal(size=(50, 3))
     on_sphere /= np.linalg.norm(on_sphere, axis=1, keepdims=True)
     surface = (ellipsoid.axes_m * on_sphere) @ rotation.T
-    squared = np.einsum("ni,ij,nj->n", surface, np.linalg.inv(covariance[:3, :3]), surface)
+    squared = np.einsum(
+        "ni,ij,nj->n", surface, np.linalg.inv(covariance[:3, :3]), surface
+    )
     np.testing.assert_allclose(squared, 1, rtol=1e-6)
 
 
@@ -105,10 +120,16 @@ def test_a_flat_covariance_gives_a_flat_ellipsoid() -> None:
     assert ellipsoid.sigmas_mm == "2 / 1 / 0"
 
 
-@pytest.mark.parametrize(("mm", "scale"), [(0.01, 500), (1.0, 50), (0.9, 50), (24.0, 2), (90.0, 1)])
-def test_the_scale_is_round_and_draws_at_most_five_centimetres(mm: float, scale: int) -> None:
+@pytest.mark.parametrize(
+    ("mm", "scale"), [(0.01, 500), (1.0, 50), (0.9, 50), (24.0, 2), (90.0, 1)]
+)
+def test_the_scale_is_round_and_draws_at_most_five_centimetres(
+    mm: float, scale: int
+) -> None:
     sigma = 1e-3 * mm
-    ellipsoid = Ellipsoid(np.zeros(3), np.array([0, 0, sigma]), np.array([1.0, 0, 0, 0]))
+    ellipsoid = Ellipsoid(
+        np.zeros(3), np.array([0, 0, sigma]), np.array([1.0, 0, 0, 0])
+    )
     assert readable_scale([ellipsoid]) == scale
     assert scale * sigma <= DRAWN_M or scale == 1
 

@@ -35,7 +35,10 @@ def write(path: Path) -> Path:
 
 
 def test_json_lines_hold_every_frame(tmp_path: Path) -> None:
-    rows = [json.loads(line) for line in write(tmp_path / "t.jsonl").read_text().splitlines()]
+    rows = [
+        json.loads(line)
+        for line in write(tmp_path / "t.jsonl").read_text().splitlines()
+    ]
     assert [row["state"] for row in rows] == ["relocalized", "lost", "tracking"]
     assert [row["stamp_s"] for row in rows] == [frame.stamp_s for frame in frames()]
     assert rows[0]["base_from_camera"]["matrix"] == POSE.matrix().tolist()

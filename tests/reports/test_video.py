@@ -34,10 +34,14 @@ def answer(x: float, unit_known: bool = True) -> Answer:
     points = np.array([[0.1, 0.1, 1.0], [0.2, -0.1, 1.0], [-0.2, 0.1, 2.0]])
     pixels = CAMERA.project(points) + 0.5
     values: Any = (1e-6 * np.eye(6), 3, 1.0, 1.0, pixels, pose.apply(points), CAMERA)
-    return Answer(Path("a.png"), PoseEstimate("ok", "", "room", pose, *values), 1.0, unit_known)
+    return Answer(
+        Path("a.png"), PoseEstimate("ok", "", "room", pose, *values), 1.0, unit_known
+    )
 
 
-REFUSED = Answer(Path("b.png"), PoseEstimate("failed", "$dark", None, None, None, 0, 0.0, 1.0), 1.0)
+REFUSED = Answer(
+    Path("b.png"), PoseEstimate("failed", "$dark", None, None, None, 0, 0.0, 1.0), 1.0
+)
 
 
 def orange(frame: np.ndarray) -> int:
@@ -61,7 +65,9 @@ def test_images_without_any_pose_are_shown() -> None:
 
 def test_video_holds_the_frames(tmp_path: Path) -> None:
     shades = (40, 120, 200)
-    write_video(tmp_path / "a.mp4", iter([np.full((64, 96, 3), s, np.uint8) for s in shades]))
+    write_video(
+        tmp_path / "a.mp4", iter([np.full((64, 96, 3), s, np.uint8) for s in shades])
+    )
     video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
     assert video.get(cv2.CAP_PROP_FPS) == FRAMES_A_SECOND
     images = [image for ok, image in (video.read() for _ in range(4)) if ok]
@@ -83,5 +89,7 @@ def test_interrupted_video_leaves_the_old_file(tmp_path: Path) -> None:
 
 
 def test_other_endings_are_refused() -> None:
-    with pytest.raises(InputError, match=r"a\.avi: not a video format.*help: end it with \.mp4"):
+    with pytest.raises(
+        InputError, match=r"a\.avi: not a video format.*help: end it with \.mp4"
+    ):
         require_ending(Path("a.avi"))

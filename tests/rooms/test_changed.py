@@ -46,20 +46,25 @@ def changed_fraction(before: Room, after: Room) -> float:
 def lights(rooms: Room) -> list[tuple[str, float]]:
     """Names and radiance of lamps."""
     parts = rooms.meshes()
-    return sorted((m.name, m.emission) for _, m in parts if m.emission > 0 or "off" in m.name)
+    return sorted(
+        (m.name, m.emission) for _, m in parts if m.emission > 0 or "off" in m.name
+    )
 
 
 def test_a_third_of_the_small_items_changes(before: Room, after: Room) -> None:
     assert changed_fraction(before, before) == 0
     assert changed_fraction(before, after) == pytest.approx(1 / 3, abs=0.02)
-    old, new = items_by_position(before, small=True), items_by_position(after, small=True)
-    moved, touched = new.keys() - old.keys(), old.keys() - new.keys()
+    old = items_by_position(before, small=True)
+    new = items_by_position(after, small=True)
+    moved = new.keys() - old.keys()
+    touched = old.keys() - new.keys()
     assert 0.3 < len(moved) / len(touched) <= 0.6
     assert sorted(kind for kind, _ in moved) != sorted(kind for kind, _ in touched)
 
 
 def test_furniture_and_walls_stay(before: Room, after: Room) -> None:
-    old, new = items_by_position(before, small=False), items_by_position(after, small=False)
+    old = items_by_position(before, small=False)
+    new = items_by_position(after, small=False)
     assert old.keys() == new.keys()
     assert len(old) >= 20
     for (mesh, _), (same, _) in zip(before.shell, after.shell, strict=True):
@@ -68,14 +73,22 @@ def test_furniture_and_walls_stay(before: Room, after: Room) -> None:
     assert items_by_position(shifted, small=False).keys() != old.keys()
 
 
-def test_moved_items_stand_on_a_surface_without_overlap(before: Room, after: Room) -> None:
+def test_moved_items_stand_on_a_surface_without_overlap(
+    before: Room, after: Room
+) -> None:
     old = items_by_position(before, small=True)
-    moved = [item for key, item in items_by_position(after, small=True).items() if key not in old]
+    moved = [
+        item
+        for key, item in items_by_position(after, small=True).items()
+        if key not in old
+    ]
     heights = [before.low_m[2], *(top[4] for item in after.items for top in item.tops)]
     for item in moved:
         low, high = item.bounds_m()
         assert np.abs(np.array(heights) - low[2]).min() < 0.002
-        others = [other for other in after.items if other is not item and not other.tops]
+        others = [
+            other for other in after.items if other is not item and not other.tops
+        ]
         boxes = np.stack([other.bounds_m() for other in others])
         assert not ((low < boxes[:, 1]) & (high > boxes[:, 0])).all(-1).any(), item.kind
 
@@ -93,10 +106,18 @@ def test_other_lamps_are_on(before: Room, after: Room) -> None:
 
 
 def test_the_same_seed_gives_the_same_change(before: Room, after: Room) -> None:
-    a, b, c = after, changed_room(before, 0), changed_room(before, 4)
-    assert items_by_position(a, small=True).keys() == items_by_position(b, small=True).keys()
+    a = after
+    b = changed_room(before, 0)
+    c = changed_room(before, 4)
+    assert (
+        items_by_position(a, small=True).keys()
+        == items_by_position(b, small=True).keys()
+    )
     assert lights(a) == lights(b)
-    assert items_by_position(a, small=True).keys() != items_by_position(c, small=True).keys()
+    assert (
+        items_by_position(a, small=True).keys()
+        != items_by_position(c, small=True).keys()
+    )
 
 
 def test_the_changed_path_is_new_and_free(before: Room, after: Room) -> None:
@@ -115,6 +136,8 @@ def test_the_changed_path_is_new_and_free(before: Room, after: Room) -> None:
     arms = np.stack([shot.joints_rad for shot in sweep])
     for shot in shots:
         assert np.abs(arms - shot.joints_rad).max(1).min() > 0.1
-    crammed = replace(after, items=[Item("block", [(box(9, 9, 9), before.shell[0][1])])])
+    crammed = replace(
+        after, items=[Item("block", [(box(9, 9, 9), before.shell[0][1])])]
+    )
     with pytest.raises(InputError, match="no free camera path"):
         changed_shots(crammed, 20, train, seed=0)

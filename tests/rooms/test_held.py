@@ -14,7 +14,11 @@ SETTING = Setting(seed=100, px=100, images=12)
 def test_thing_is_in_the_image_as_large_as_asked() -> None:
     plan = make_plan(SETTING)
     tip = np.array([[0, 0, -0.5], [0, 0, 0.5]]) * SIZES_M["box"][2] * plan.scale
-    thing = plan.base_from_camera.inverse() @ plan.base_from_gripper @ plan.gripper_from_thing
+    thing = (
+        plan.base_from_camera.inverse()
+        @ plan.base_from_gripper
+        @ plan.gripper_from_thing
+    )
     ends = np.stack([plan.camera.project(pose.apply(tip)) for pose in thing])
     assert ((ends > 0) & (ends < SETTING.size)).all()
     length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)

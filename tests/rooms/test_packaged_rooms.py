@@ -30,18 +30,26 @@ def poses(frames: tuple) -> SE3:
     return SE3.stack([frame.base_from_camera for frame in frames])
 
 
-def test_paths_are_those_of_the_simulator(packaged: SampleRoom, simulated: Room) -> None:
+def test_paths_are_those_of_the_simulator(
+    packaged: SampleRoom, simulated: Room
+) -> None:
     assert packaged.changed is not None
-    shots = changed_shots(changed_room(simulated, 0), 20, poses(packaged.scene.train), seed=0)
+    shots = changed_shots(
+        changed_room(simulated, 0), 20, poses(packaged.scene.train), seed=0
+    )
     expected = [shot.base_from_camera.matrix() for shot in shots]
-    np.testing.assert_allclose(poses(packaged.changed.test).matrix(), expected, atol=1e-6)
+    np.testing.assert_allclose(
+        poses(packaged.changed.test).matrix(), expected, atol=1e-6
+    )
     for frame in packaged.scene.test:
         assert frame.base_from_gripper is not None
         gripper = base_from_flange(np.array(frame.joints_rad))
         assert max(pose_distance(frame.base_from_gripper, gripper)) < 1e-6
 
 
-def test_a_packaged_image_is_rendered_again(packaged: SampleRoom, simulated: Room) -> None:
+def test_a_packaged_image_is_rendered_again(
+    packaged: SampleRoom, simulated: Room
+) -> None:
     pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
     frame = packaged.scene.test[5]
     assert frame.base_from_camera is not None

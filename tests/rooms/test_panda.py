@@ -25,7 +25,9 @@ def test_meshes_and_flange_are_where_the_urdf_has_them() -> None:
         urdf.update_cfg(np.append(joints, 0.03))
         flange = SE3.from_matrix(urdf.get_transform("panda_link8", "panda_link0"))
         assert max(pose_distance(base_from_flange(joints), flange)) < 1e-9
-        points = np.concatenate([mesh.vertices_m for mesh, _ in panda.panda_meshes(joints)])
+        points = np.concatenate(
+            [mesh.vertices_m for mesh, _ in panda.panda_meshes(joints)]
+        )
         expected = urdf.scene.to_geometry().vertices
         assert len(points) == len(expected)
         for part in (np.min, np.max, np.mean, np.std):

@@ -42,7 +42,9 @@ def test_balls_appear_at_their_projection(balls: Renderer) -> None:
         near = np.hypot(u - pixel[0], v - pixel[1]) < 0.71
         # The front of a ball is one radius in front of its centre.
         front = depth[near][depth[near] > 0].min()
-        assert front == pytest.approx(centre[2] * (1 - RADIUS / np.linalg.norm(centre)), abs=2e-3)
+        assert front == pytest.approx(
+            centre[2] * (1 - RADIUS / np.linalg.norm(centre)), abs=2e-3
+        )
 
 
 def test_depth_is_exact_along_the_optical_axis() -> None:
@@ -84,22 +86,31 @@ def test_pictures_are_neither_mirrored_nor_upside_down(side: int) -> None:
     cube = box(0.4, 0.4, 0.4, 1e-3)
     cube = replace(cube, uv=cube.uv + 0.2)
     lamp = plain("lamp", (1, 1, 1), emission=20.0)
-    lamps = [(ball(0.3).shifted(x, y, 1.5), lamp) for x, y in ((3, 0), (0, 3), (-3, 0), (0, -3))]
+    lamps = [
+        (ball(0.3).shifted(x, y, 1.5), lamp)
+        for x, y in ((3, 0), (0, 3), (-3, 0), (0, -3))
+    ]
     angle = np.pi / 2 * side
-    pose = look_at(np.array([2 * np.cos(angle), 2 * np.sin(angle), 0.2]), np.array([0, 0, 0.2]))
+    pose = look_at(
+        np.array([2 * np.cos(angle), 2 * np.sin(angle), 0.2]), np.array([0, 0, 0.2])
+    )
     image = Renderer([(cube, poster), *lamps]).render(CAMERA, pose).astype(float)
-    red, blue = image[30:47, 36:53, 0], image[30:47, 36:53, 2]  # the face is 20 pixels wide
+    red = image[30:47, 36:53, 0]
+    blue = image[30:47, 36:53, 2]  # the face is 20 pixels wide
     assert red[:7].min() > red[-7:].max() + 50
     assert blue[:, -7:].min() > blue[:, :7].max() + 50
 
 
 def test_denoising_reduces_the_error_of_few_samples() -> None:
-    grey, lamp = plain("grey", (0.5, 0.5, 0.5)), plain("lamp", (1, 1, 1), emission=20.0)
+    grey = plain("grey", (0.5, 0.5, 0.5))
+    lamp = plain("lamp", (1, 1, 1), emission=20.0)
     plane = box(6.0, 6.0, 0.1, 1e-3).shifted(0, 0, -0.1)
     scene = Renderer([(plane, grey), (ball(0.2).shifted(1.0, 0.0, 2.0), lamp)])
     pose = look_at(np.array([-0.5, 0.0, 1.5]), np.zeros(3))
     few, clean, many = (
-        scene.render(CAMERA, pose, RenderOptions(samples, denoise=denoise)).astype(float)
+        scene.render(CAMERA, pose, RenderOptions(samples, denoise=denoise)).astype(
+            float
+        )
         for samples, denoise in ((4, False), (4, True), (256, False))
     )
     assert np.abs(clean - many).mean() < 0.4 * np.abs(few - many).mean()

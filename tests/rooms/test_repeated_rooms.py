@@ -20,7 +20,9 @@ COPIES = {
 """Smallest number of identical copies, by kind of room and of item."""
 
 
-@pytest.fixture(scope="module", params=SUITES["sim-repeat"].rooms, ids=lambda entry: entry[0])
+@pytest.fixture(
+    scope="module", params=SUITES["sim-repeat"].rooms, ids=lambda entry: entry[0]
+)
 def repeated_room(request: pytest.FixtureRequest) -> Room:
     _, kind, seed = request.param
     return room(kind, seed)
@@ -30,7 +32,8 @@ def are_copies(a: Item, b: Item) -> bool:
     """Whether two items have the same shape and surface, up to a shift."""
     if len(a.parts) != len(b.parts):
         return False
-    middle_a, middle_b = a.bounds_m().mean(0), b.bounds_m().mean(0)
+    middle_a = a.bounds_m().mean(0)
+    middle_b = b.bounds_m().mean(0)
     for (mesh, material), (other, same) in zip(a.parts, b.parts, strict=True):
         if material is not same or mesh.vertices_m.shape != other.vertices_m.shape:
             return False
@@ -48,11 +51,14 @@ def test_each_room_has_many_identical_copies(repeated_room: Room) -> None:
 
 
 def test_floors_are_periodic_and_uncovered(repeated_room: Room) -> None:
-    (mesh, floor), *rest = [part for part in repeated_room.shell if part[1].name == "floor"]
+    (mesh, floor), *rest = [
+        part for part in repeated_room.shell if part[1].name == "floor"
+    ]
     assert not rest
     assert "carpet" not in {material.name for _, material in repeated_room.shell}
     assert np.ptp(mesh.uv, axis=0) == pytest.approx(np.ptp(mesh.vertices_m, axis=0)[:2])
-    one_tile, tiles = SIZE // 2, floor.texture
+    one_tile = SIZE // 2
+    tiles = floor.texture
     np.testing.assert_array_equal(tiles, np.roll(tiles, (one_tile, one_tile), (0, 1)))
     checkered = not np.array_equal(tiles, np.roll(tiles, one_tile, 1))
     assert checkered == (repeated_room.kind == "hall")
@@ -60,7 +66,8 @@ def test_floors_are_periodic_and_uncovered(repeated_room: Room) -> None:
 
 
 def test_folds_without_a_seed_are_equal() -> None:
-    equal, uneven = drape(0.6, 2.0, 0.03, 6, None), drape(0.6, 2.0, 0.03, 6, 1)
+    equal = drape(0.6, 2.0, 0.03, 6, None)
+    uneven = drape(0.6, 2.0, 0.03, 6, 1)
 
     def period_error(mesh_points: np.ndarray) -> float:
         front = mesh_points[: len(mesh_points) // 2, 1].reshape(49, 9)[4:-4]
@@ -88,9 +95,15 @@ def test_a_chessboard_lies_in_the_work_area(repeated_room: Room) -> None:
 
 
 def test_cameras_find_free_paths(repeated_room: Room) -> None:
-    eyes = [shot.base_from_camera.translation_m for shot in sweep_shots(repeated_room, 130, 0)]
+    eyes = [
+        shot.base_from_camera.translation_m
+        for shot in sweep_shots(repeated_room, 130, 0)
+    ]
     assert repeated_room.is_free(np.stack(eyes), 0.05).all()
-    assert len(fixed_shots(repeated_room, CALIBRATION_FRAMES, 0).before) == CALIBRATION_FRAMES
+    assert (
+        len(fixed_shots(repeated_room, CALIBRATION_FRAMES, 0).before)
+        == CALIBRATION_FRAMES
+    )
 
 
 def test_rooms_for_pretraining_are_unchanged() -> None:

@@ -56,7 +56,9 @@ def test_bumps_have_their_documented_size(furnished_room: Room) -> None:
     for seed, metres, degrees in ((0, 0.005, 0.0), (1, 0.0, 0.5)):
         before, after, bump = fixed_shots(furnished_room, 25, seed)
         assert len(before) == len(after) == 25
-        distance, angle = pose_distance(before[0].base_from_camera, after[-1].base_from_camera)
+        distance, angle = pose_distance(
+            before[0].base_from_camera, after[-1].base_from_camera
+        )
         assert distance == pytest.approx(metres, abs=1e-9)
         assert np.rad2deg(angle) == pytest.approx(degrees, abs=1e-6)
         expected = before[3].base_from_camera @ bump
@@ -66,10 +68,14 @@ def test_bumps_have_their_documented_size(furnished_room: Room) -> None:
 
 
 def test_the_same_seed_gives_the_same_room() -> None:
-    a, b, c = room("kitchen", 5), room("kitchen", 5), room("kitchen", 6)
+    a = room("kitchen", 5)
+    b = room("kitchen", 5)
+    c = room("kitchen", 6)
     assert [item.kind for item in a.items] == [item.kind for item in b.items]
     np.testing.assert_array_equal(a.boxes_m(), b.boxes_m())
-    assert a.boxes_m().shape != c.boxes_m().shape or not np.allclose(a.boxes_m(), c.boxes_m())
+    assert a.boxes_m().shape != c.boxes_m().shape or not np.allclose(
+        a.boxes_m(), c.boxes_m()
+    )
 
 
 def test_reserved_seeds_and_unknown_kinds_are_refused() -> None:

@@ -16,9 +16,14 @@ def volume(mesh: Mesh) -> float:
 def test_volumes_match_closed_forms() -> None:
     assert volume(box(0.4, 0.3, 0.2, 1e-4)) == pytest.approx(0.024, rel=2e-3)
     assert volume(ball(0.5, segments=96)) == pytest.approx(np.pi / 6, rel=5e-3)
-    assert volume(cylinder(0.3, 0.5, 1e-4, 128)) == pytest.approx(np.pi * 0.09 * 0.5, rel=5e-3)
+    assert volume(cylinder(0.3, 0.5, 1e-4, 128)) == pytest.approx(
+        np.pi * 0.09 * 0.5, rel=5e-3
+    )
     # Steiner's formula for a box with rounded edges.
-    a, b, c, r = 0.4 - 0.1, 0.3 - 0.1, 0.2 - 0.1, 0.05
+    a = 0.4 - 0.1
+    b = 0.3 - 0.1
+    c = 0.2 - 0.1
+    r = 0.05
     steiner = a * b * c + 2 * r * (a * b + b * c + c * a) + np.pi * r**2 * (a + b + c)
     rounded = volume(box(0.4, 0.3, 0.2, r, steps=24))
     assert rounded == pytest.approx(steiner + 4 / 3 * np.pi * r**3, rel=2e-3)

@@ -20,7 +20,11 @@ pytestmark = pytest.mark.slow("rooms", "src/evercal/simulation")
 
 TINY = SimulateOptions(frames=4, size=(32, 24), samples=1)
 SUITE = Suite((("kitchen", "kitchen", 102),), 4, (32, 24), 1, changed=2)
-PARTS = {"": 4, "changed": 2, **{f"calibration/{name}": 2 for name in ("fixed", "bumped", "hand")}}
+PARTS = {
+    "": 4,
+    "changed": 2,
+    **{f"calibration/{name}": 2 for name in ("fixed", "bumped", "hand")},
+}
 """Frames of each recording."""
 
 
@@ -65,7 +69,9 @@ def test_recordings_have_images_depth_and_poses_of_the_arm(whole: Path) -> None:
         np.testing.assert_allclose(camera.matrix(), hand_camera(0).matrix(), atol=1e-9)
 
 
-def test_interrupted_runs_continue_with_the_same_result(whole: Path, tmp_path: Path) -> None:
+def test_interrupted_runs_continue_with_the_same_result(
+    whole: Path, tmp_path: Path
+) -> None:
     cut = tmp_path / "cut"
     run = simulate("sim", cut, replace(TINY, sweep_only=True))
     for _ in range(3):
@@ -96,7 +102,9 @@ def test_a_finished_suite_is_not_rendered_again(
     assert "seed 0, now it is 1" in capsys.readouterr().err
 
 
-def test_existing_frames_need_no_disk_space(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_existing_frames_need_no_disk_space(
+    whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     frame = 32 * 24 * 4
     usage = suites.shutil.disk_usage(whole)._replace(free=3 * frame)
     monkeypatch.setattr(suites.shutil, "disk_usage", lambda _: usage)

@@ -13,10 +13,13 @@ from typing import Any
 @contextmanager
 def visited(browser: Any, url: str) -> Iterator[Any]:
     """A visit of a page without errors of its scripts and requests to other places."""
-    visit, errors = browser.new_page(viewport={"width": 1200, "height": 720}), []
+    visit = browser.new_page(viewport={"width": 1200, "height": 720})
+    errors = []
     visit.on("pageerror", lambda error: errors.append(str(error)))
     own = (url, "data:", "blob:")
-    visit.on("request", lambda r: None if r.url.startswith(own) else errors.append(r.url))
+    visit.on(
+        "request", lambda r: None if r.url.startswith(own) else errors.append(r.url)
+    )
     try:
         visit.goto(url)
         visit.wait_for_selector("canvas", timeout=120_000)

@@ -79,7 +79,13 @@ Serve = Callable[..., Any]
 @contextmanager
 def running(map: Path, **options: Any) -> Iterator[Running]:
     """Serve a map."""
-    from evercal.service.server import ServeOptions, bound_socket, make_app, server_of, url_of
+    from evercal.service.server import (
+        ServeOptions,
+        bound_socket,
+        make_app,
+        server_of,
+        url_of,
+    )
 
     chosen = ServeOptions(map, port=0, **options)
     ready = threading.Event()

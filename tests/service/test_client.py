@@ -25,10 +25,16 @@ def client(hall_service: Any) -> Client:
 def test_estimates_are_those_of_the_map(
     client: Client, hall_store: Path, image: Path, hall: Recording
 ) -> None:
-    opened, pixels = Map.open(hall_store), read_image(image)
+    opened = Map.open(hall_store)
+    pixels = read_image(image)
     assert client.scenes == opened.scenes
-    for given, camera in ((image, None), (pixels, None), (str(image), hall.test[7].camera)):
-        got, expected = client.localize(given, camera), opened.localize(pixels, camera)
+    for given, camera in (
+        (image, None),
+        (pixels, None),
+        (str(image), hall.test[7].camera),
+    ):
+        got = client.localize(given, camera)
+        expected = opened.localize(pixels, camera)
         assert (got.status, got.scene, got.inliers) == ("ok", "hall", expected.inliers)
         assert got.support == expected.support > 0
         assert got.base_from_camera is not None
@@ -41,7 +47,8 @@ def test_estimates_are_those_of_the_map(
 def test_calibrations_and_checks(
     client: Client, hall_store: Path, hall: Recording, tmp_path: Path
 ) -> None:
-    rng, opened = np.random.default_rng(0), Map.open(hall_store)
+    rng = np.random.default_rng(0)
+    opened = Map.open(hall_store)
     frame = hall.test[3]
     for i in range(3):
         noisy = frame.read_image() + rng.normal(0, 4, (240, 320, 3))
@@ -69,7 +76,9 @@ def test_calibrations_and_checks(
 
 def test_refusals_are_the_lines_of_the_service(client: Client, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"image\.png: 2x2 pixels|camera|aspect|image"):
-        client.localize(np.zeros((2, 200, 3), np.uint8), evercal.Camera(4, 3, 4.0, 4.0, 2.0, 1.5))
+        client.localize(
+            np.zeros((2, 200, 3), np.uint8), evercal.Camera(4, 3, 4.0, 4.0, 2.0, 1.5)
+        )
     with pytest.raises(InputError, match=r"gone\.png: cannot be read"):
         client.localize(tmp_path / "gone.png")
     with pytest.raises(InputError, match=r"127\.0\.0\.1:1: no answer"):

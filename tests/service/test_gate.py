@@ -40,7 +40,11 @@ def connected(server: Any, path: str, **headers: str) -> bool:
     origin: Any = headers.pop("Origin", None)
     try:
         with connect(
-            url, subprotocols=[version], origin=origin, additional_headers=headers, max_size=None
+            url,
+            subprotocols=[version],
+            origin=origin,
+            additional_headers=headers,
+            max_size=None,
         ) as socket:
             return bool(socket.recv(20))
     except InvalidStatus as error:
@@ -53,16 +57,26 @@ def test_only_the_printed_address_shows_the_page(server: Any) -> None:
     key = server.key
     assert len(key) > 20
     assert server.url == f"http://127.0.0.1:{server.get_port()}/{key}/"
-    assert [status(server, path) for path in (f"/{key}/", f"/{key}", f"/{key}/?a=b")] == [200] * 3
+    assert [
+        status(server, path) for path in (f"/{key}/", f"/{key}", f"/{key}/?a=b")
+    ] == [200] * 3
     assert status(server, f"/{key}/none.js") == 404
-    for path in ("/", "/index.html", f"/{key[:-1]}/", f"/{key}x/", f"//{key}/", f"/?{key}"):
+    for path in (
+        "/",
+        "/index.html",
+        f"/{key[:-1]}/",
+        f"/{key}x/",
+        f"//{key}/",
+        f"/?{key}",
+    ):
         assert status(server, path) == 403, path
     assert status(server, f"/{key}/", Host="rebound.example") == 403
     assert status(server, f"/{key}/", Origin="http://page.example") == 403
 
 
 def test_no_page_of_another_origin_connects(server: Any) -> None:
-    key, here = server.key, f"http://127.0.0.1:{server.get_port()}"
+    key = server.key
+    here = f"http://127.0.0.1:{server.get_port()}"
     assert connected(server, f"/{key}", Origin=here)
     assert connected(server, f"/{key}")  # a program that was given the address
     assert not connected(server, "/", Origin=here)
@@ -80,7 +94,10 @@ def test_a_page_for_other_machines_takes_their_names_with_the_key() -> None:
         name = {"Host": "robot.example"}
         assert status(started, f"/{started.key}/", **name) == 200
         assert status(started, "/", **name) == 403
-        assert status(started, f"/{started.key}/", **name, Origin="http://page.example") == 403
+        assert (
+            status(started, f"/{started.key}/", **name, Origin="http://page.example")
+            == 403
+        )
     finally:
         started.stop()
 

@@ -62,7 +62,9 @@ def test_what_needs_no_token_holds_nothing_of_the_map(guarded: Any) -> None:
     with pytest.raises(InvalidStatus, match="403"):
         connect(guarded.url.replace("http", "ws") + "/track")
     headers = {"Authorization": f"Bearer {TOKEN}"}
-    with connect(guarded.url.replace("http", "ws") + "/track", additional_headers=headers) as ws:
+    with connect(
+        guarded.url.replace("http", "ws") + "/track", additional_headers=headers
+    ) as ws:
         ws.send(b"x")
         assert "error" in str(ws.recv())
 
@@ -137,11 +139,16 @@ def test_what_is_no_http_is_refused(hall_service: Any, data: bytes) -> None:
         ({"host": "example.invalid"}, "other machines"),
         ({"token": "short"}, "token: give at least 16"),
         ({"token": "x" * 20 + " "}, "token: give at least 16"),
-        ({"host": "example.invalid", "token": TOKEN}, "--host example.invalid --port 0: "),
+        (
+            {"host": "example.invalid", "token": TOKEN},
+            "--host example.invalid --port 0: ",
+        ),
         ({"port": 70_000}, "--port 70000: "),
     ],
 )
-def test_addresses_that_are_refused(options: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_addresses_that_are_refused(
+    options: dict[str, Any], message: str, tmp_path: Path
+) -> None:
     with pytest.raises(InputError, match=message.replace(".", r"\.")):
         bound_socket(ServeOptions(tmp_path, **{"port": 0, **options}))
 
@@ -155,7 +162,9 @@ def test_a_token_opens_all_addresses_and_a_port_is_used_once(tmp_path: Path) -> 
 
 def test_only_loopback_addresses_are_local() -> None:
     assert [is_local(host) for host in ("127.0.0.1", "::1", "localhost")] == [True] * 3
-    assert [is_local(host) for host in ("0.0.0.0", "192.168.1.4", "robot")] == [False] * 3
+    assert [is_local(host) for host in ("0.0.0.0", "192.168.1.4", "robot")] == [
+        False
+    ] * 3
 
 
 def test_what_serve_takes_for_local_is_answered(hall_store: Path) -> None:
@@ -171,7 +180,9 @@ def hasty(hall_store: Path) -> Iterator[Any]:
     """A service with few connections, which waits for half a second."""
     from .conftest import running
 
-    with running(hall_store, limits=RequestBounds(connections=8, streams=2, wait_s=0.5)) as service:
+    with running(
+        hall_store, limits=RequestBounds(connections=8, streams=2, wait_s=0.5)
+    ) as service:
         yield service
 
 
@@ -183,7 +194,10 @@ def open_socket(service: Any, data: bytes) -> socket.socket:
 
 
 def test_half_a_header_is_closed_and_does_not_hold_a_connection(hasty: Any) -> None:
-    half = [open_socket(hasty, b"GET /health HTTP/1.1\r\nHost: localhost\r\n") for _ in range(30)]
+    half = [
+        open_socket(hasty, b"GET /health HTTP/1.1\r\nHost: localhost\r\n")
+        for _ in range(30)
+    ]
     assert hasty.ask("GET", "/health").status == 200
     for connection in half:
         with suppress(ConnectionResetError):

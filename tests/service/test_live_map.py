@@ -10,7 +10,9 @@ from typing import Any
 from evercal.map import Map
 
 
-def test_changes_by_other_processes_are_noticed(serve: Any, copy: Path, image: Path) -> None:
+def test_changes_by_other_processes_are_noticed(
+    serve: Any, copy: Path, image: Path
+) -> None:
     parts = [("image", (image.name, image.read_bytes()))]
     with serve(copy) as service:
         assert service.ask("POST", "/localize", parts).json["scene"] == "hall"
@@ -25,7 +27,9 @@ def test_changes_by_other_processes_are_noticed(serve: Any, copy: Path, image: P
         assert service.ask("POST", "/localize", parts).json["scene"] == "lobby"
 
 
-def test_no_answer_mixes_two_states(serve: Any, copy: Path, image: Path, tmp_path: Path) -> None:
+def test_no_answer_mixes_two_states(
+    serve: Any, copy: Path, image: Path, tmp_path: Path
+) -> None:
     """A scene of the same place under two names replaces itself while images are located."""
     parts = [("image", (image.name, image.read_bytes()))]
     with serve(copy) as service:

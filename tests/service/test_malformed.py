@@ -15,7 +15,9 @@ from benchmarks.malformed import malformed
 from evercal.bounds import RequestBounds
 
 # The parser of forms leaves the last part of a truncated body to the garbage collector.
-pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning"
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -60,7 +62,9 @@ def statuses(service: Any, seeds: range) -> Counter[int]:
 def test_malformed_requests(narrow: Any, image: Path) -> None:
     counts = statuses(narrow, range(50))
     assert {400, 404, 413, 415} <= counts.keys()
-    row = narrow.ask("POST", "/localize", [("image", (image.name, image.read_bytes()))]).json
+    row = narrow.ask(
+        "POST", "/localize", [("image", (image.name, image.read_bytes()))]
+    ).json
     assert row["status"] == "ok"
 
 
@@ -79,7 +83,9 @@ def test_clients_that_vanish(narrow: Any, image: Path) -> None:
         with socket.create_connection((host, int(port)), timeout=30) as connection:
             connection.sendall(data)
 
-    threads = [threading.Thread(target=vanish, args=(body[: 10 * i],)) for i in range(1, 20)]
+    threads = [
+        threading.Thread(target=vanish, args=(body[: 10 * i],)) for i in range(1, 20)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:

@@ -39,7 +39,11 @@ def served(*words: object) -> Iterator[dict[str, Any]]:
     command = [sys.executable, "-m", "evercal", "serve", *map(str, words), "--json"]
     environment = {**os.environ, "EVERCAL_TOKEN": TOKEN}
     with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as process:
         assert process.stdout is not None
         assert process.stderr is not None
@@ -69,7 +73,10 @@ def test_replicas_answer_as_one_process(
             estimate = client.localize(image)
             assert estimate.base_from_camera is not None
             pose = expected["base_from_camera"]
-            assert estimate.base_from_camera.translation_m.tolist() == pose["translation_m"]
+            assert (
+                estimate.base_from_camera.translation_m.tolist()
+                == pose["translation_m"]
+            )
             assert estimate.covariance is not None
             assert estimate.covariance.tolist() == expected["covariance"]
         with pytest.raises(InputError, match="Authorization: Bearer TOKEN"):
@@ -115,6 +122,11 @@ def test_refusals(
     assert message in capsys.readouterr().err
 
 
-def test_a_cluster_needs_a_token(hall_store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cluster_needs_a_token(
+    hall_store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["serve", str(hall_store), "--ray", "auto"]) == 2
-    assert "--ray: other machines could use the map; give --token-file" in capsys.readouterr().err
+    assert (
+        "--ray: other machines could use the map; give --token-file"
+        in capsys.readouterr().err
+    )

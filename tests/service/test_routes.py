@@ -26,14 +26,17 @@ def part(path: Path) -> tuple[str, bytes]:
 def test_localize_gives_the_row_of_the_command(
     hall_service: Any, hall_store: Path, image: Path, hall: Recording
 ) -> None:
-    opened, camera = Map.open(hall_store), hall.test[7].camera
+    opened = Map.open(hall_store)
+    camera = hall.test[7].camera
     parts = [("image", part(image))]
     lens = ("camera.json", json.dumps(camera.to_dict()).encode())
     for given, sent in ((None, parts), (camera, [*parts, ("camera", lens)])):
         got = hall_service.ask("POST", "/localize", sent)
         assert got.status == 200
         estimate = opened.localize(read_image(image), given)
-        expected = json.loads(json.dumps(answer_row(Answer(Path("hall.png"), estimate, 0.0))))
+        expected = json.loads(
+            json.dumps(answer_row(Answer(Path("hall.png"), estimate, 0.0)))
+        )
         assert expected["status"] == "ok"
         assert got.json.pop("ms") > 0
         assert {**got.json, "ms": 0.0} == expected
@@ -43,7 +46,9 @@ def test_an_unknown_place_is_an_answer(hall_service: Any, tmp_path: Path) -> Non
     from evercal.recordings import write_image
 
     write_image(tmp_path / "black.png", np.zeros((240, 320, 3), np.uint8))
-    got = hall_service.ask("POST", "/localize", [("image", part(tmp_path / "black.png"))])
+    got = hall_service.ask(
+        "POST", "/localize", [("image", part(tmp_path / "black.png"))]
+    )
     assert got.status == 200
     assert got.json["status"] in ("unknown_scene", "failed")
     assert got.json["base_from_camera"] is None
@@ -64,7 +69,8 @@ def test_health_scenes_page_and_metrics(hall_service: Any, image: Path) -> None:
         return float(values[0]) if values else 0.0
 
     line = 'evercal_requests_total{method="POST",route="/localize",status="200"}'
-    before, answers = count(line), count('evercal_answers_total{status="ok"}')
+    before = count(line)
+    answers = count('evercal_answers_total{status="ok"}')
     hall_service.ask("POST", "/localize", [("image", part(image))])
     assert count(line) == before + 1
     assert count('evercal_answers_total{status="ok"}') == answers + 1
@@ -84,13 +90,28 @@ def test_health_scenes_page_and_metrics(hall_service: Any, image: Path) -> None:
         ("localize", {"image": "IMAGE", "camera": ("c", b"{")}, 400, "camera: "),
         ("localize", {"image": "IMAGE", "camera": ("c", b"PK")}, 400, "not a text"),
         ("localize", {"image": "IMAGE", "camera": ("c", b"[" * 60_000)}, 400, "camera"),
-        ("localize", {"image": "IMAGE", "camera": ("c", b" " * 1_000_001)}, 413, "camera"),
+        (
+            "localize",
+            {"image": "IMAGE", "camera": ("c", b" " * 1_000_001)},
+            413,
+            "camera",
+        ),
         ("calibrations", {}, 422, "images: Field required"),
         ("calibrations", {"images": ("a", b"x")}, 400, "a: not a readable image"),
-        ("calibrations", {"images": "IMAGE", "robot_poses": ("p.csv", b"a,b\n1,2")}, 400, "robot_"),
+        (
+            "calibrations",
+            {"images": "IMAGE", "robot_poses": ("p.csv", b"a,b\n1,2")},
+            400,
+            "robot_",
+        ),
         ("calibrations", {"images": "IMAGE", "mount": "table"}, 422, "mount"),
         ("check", {"images": "IMAGE"}, 422, "calibration: Field required"),
-        ("check", {"images": "IMAGE", "calibration": ("c", b"[]")}, 400, "'evercal-calibration'"),
+        (
+            "check",
+            {"images": "IMAGE", "calibration": ("c", b"[]")},
+            400,
+            "'evercal-calibration'",
+        ),
         ("scenes", {}, 405, "Method Not Allowed"),
         ("nowhere", {}, 404, "Not Found"),
         ("scenes/..%2F..%2Fetc", {}, 404, "Not Found"),
@@ -99,7 +120,10 @@ def test_health_scenes_page_and_metrics(hall_service: Any, image: Path) -> None:
 def test_refusals_are_one_line(
     hall_service: Any, image: Path, path: str, parts: Any, status: int, message: str
 ) -> None:
-    sent = [(name, part(image) if value == "IMAGE" else value) for name, value in parts.items()]
+    sent = [
+        (name, part(image) if value == "IMAGE" else value)
+        for name, value in parts.items()
+    ]
     got = hall_service.ask("POST", f"/{path}", sent)
     assert (got.status, list(got.json)) == (status, ["error"])
     assert message in got.json["error"]
@@ -107,15 +131,22 @@ def test_refusals_are_one_line(
     assert "/tmp" not in got.json["error"]
 
 
-def test_limits_of_images_and_of_the_queue(serve: Any, hall_store: Path, image: Path) -> None:
+def test_limits_of_images_and_of_the_queue(
+    serve: Any, hall_store: Path, image: Path
+) -> None:
     limits = RequestBounds(images=2, pixels=1000, held_bytes=10 * image.stat().st_size)
     with serve(hall_store, limits=limits) as service:
         got = service.ask("POST", "/calibrations", [("images", part(image))] * 3)
         assert (got.status, got.json["error"]) == (413, "images: 3 given; at most 2")
         got = service.ask("POST", "/localize", [("image", part(image))])
         assert (got.status, got.json["error"].partition(":")[0]) == (413, "hall.png")
-        got = service.ask("POST", "/localize", [("image", ("a.png", bytes(limits.held_bytes)))])
-        assert (got.status, got.json["error"]) == (429, "too many requests wait; try again")
+        got = service.ask(
+            "POST", "/localize", [("image", ("a.png", bytes(limits.held_bytes)))]
+        )
+        assert (got.status, got.json["error"]) == (
+            429,
+            "too many requests wait; try again",
+        )
     with serve(hall_store, limits=RequestBounds(requests=0)) as service:
         got = service.ask("POST", "/localize", [("image", part(image))])
         assert got.status == 429
@@ -126,17 +157,31 @@ def test_limits_of_images_and_of_the_queue(serve: Any, hall_store: Path, image: 
         )  # fmt: skip
 
 
-def test_other_fields_of_a_form_are_refused_by_name(hall_service: Any, image: Path) -> None:
+def test_other_fields_of_a_form_are_refused_by_name(
+    hall_service: Any, image: Path
+) -> None:
     for name in ("camra", "Image", "x" * 500):
-        got = hall_service.ask("POST", "/localize", [("image", part(image)), (name, part(image))])
+        got = hall_service.ask(
+            "POST", "/localize", [("image", part(image)), (name, part(image))]
+        )
         assert (got.status, got.json["error"]) == (
             400, f"{name[:100]!r} is no field of this form; it has image, camera"
         )  # fmt: skip
     got = hall_service.ask("POST", "/localize", [("image", part(image))] * 2)
-    assert (got.status, got.json["error"]) == (400, "image: given 2 times; give it once")
-    parts = [("images", part(image)), ("mount", "eye_to_hand"), ("mount", "eye_in_hand")]
+    assert (got.status, got.json["error"]) == (
+        400,
+        "image: given 2 times; give it once",
+    )
+    parts = [
+        ("images", part(image)),
+        ("mount", "eye_to_hand"),
+        ("mount", "eye_in_hand"),
+    ]
     got = hall_service.ask("POST", "/calibrations", parts)
-    assert (got.status, got.json["error"]) == (400, "mount: given 2 times; give it once")
+    assert (got.status, got.json["error"]) == (
+        400,
+        "mount: given 2 times; give it once",
+    )
 
 
 def test_the_page_comes_from_the_service_alone_and_sends_the_token(
@@ -148,13 +193,16 @@ def test_the_page_comes_from_the_service_alone_and_sends_the_token(
     assert (got.status, got.headers["location"]) == (307, "docs")
     page = hall_service.ask("GET", "/docs")
     assert "frame-ancestors 'none'" in page.headers["content-security-policy"]
-    addresses = re.findall(r"""(?:href|src|url)[=:]\s*["']([^"']+)""", page.body.decode())
+    addresses = re.findall(
+        r"""(?:href|src|url)[=:]\s*["']([^"']+)""", page.body.decode()
+    )
     assert len(addresses) == 4
     for address in addresses:
         assert "//" not in address
         assert hall_service.ask("GET", f"/{address}").status == 200
     assert (
-        "security" not in hall_service.ask("GET", "/openapi.json").json["paths"]["/check"]["post"]
+        "security"
+        not in hall_service.ask("GET", "/openapi.json").json["paths"]["/check"]["post"]
     )
     with serve(hall_store, token="a-token-of-16-characters") as service:
         assert service.ask("GET", "/pages/swagger-ui.css").status == 200
@@ -167,7 +215,9 @@ def test_stream_of_frames(hall_service: Any, image: Path, hall: Recording) -> No
 
     camera = json.dumps(hall.test[7].camera.to_dict())
     row = hall_service.ask("POST", "/localize", [("image", part(image))]).json
-    with connect(hall_service.url.replace("http", "ws") + "/track", max_size=None) as socket:
+    with connect(
+        hall_service.url.replace("http", "ws") + "/track", max_size=None
+    ) as socket:
         socket.send(image.read_bytes())
         first = json.loads(socket.recv())
         assert {**first, **dict.fromkeys(("path", "ms"))} == {
@@ -175,7 +225,9 @@ def test_stream_of_frames(hall_service: Any, image: Path, hall: Recording) -> No
         }  # fmt: skip
         assert first["state"] == "relocalized"
         socket.send(b"no image")
-        assert json.loads(socket.recv())["error"].startswith("frame 1: not a readable image")
+        assert json.loads(socket.recv())["error"].startswith(
+            "frame 1: not a readable image"
+        )
         socket.send(camera)
         for number in (2, 3):
             socket.send(image.read_bytes())

@@ -70,7 +70,11 @@ def says(studio: Studio, step: str) -> str:
 def calibration(scene: str) -> Calibration:
     pose = SE3.from_translation((0.3, 0, 0.5))
     return Calibration(
-        "eye_in_hand", pose, 1e-6 * np.eye(6), "gripper", source={"scene": scene, "frames": 1}
+        "eye_in_hand",
+        pose,
+        1e-6 * np.eye(6),
+        "gripper",
+        source={"scene": scene, "frames": 1},
     )
 
 
@@ -78,7 +82,12 @@ def test_samples_are_on_disk_at_once_and_a_new_studio_goes_on(
     cell: VirtualCell, tmp_path: Path
 ) -> None:
     studio = studio_in(tmp_path, cell)
-    assert [status(studio, step) for step in STEPS] == ["to do", *["waits"] * 3, "to do", "waits"]
+    assert [status(studio, step) for step in STEPS] == [
+        "to do",
+        *["waits"] * 3,
+        "to do",
+        "waits",
+    ]
     assert studio.next_view() is None
     studio.connection.look()
     assert status(studio, "1 Connect") == "done"
@@ -116,7 +125,9 @@ def test_the_next_view_is_reachable_lowers_sigma_and_is_not_repeated(
     assert not studio.bad_samples()
 
 
-def test_a_pose_out_of_reach_is_not_proposed_again(cell: VirtualCell, tmp_path: Path) -> None:
+def test_a_pose_out_of_reach_is_not_proposed_again(
+    cell: VirtualCell, tmp_path: Path
+) -> None:
     far = SE3.stack([SE3.from_translation((2.0, 0, 0.5))])
     farther = SE3.stack([SE3.from_translation((3.0, 0, 0.5))])
     studio = studio_in(tmp_path, cell, reachable=far, holding=farther)
@@ -127,8 +138,11 @@ def test_a_pose_out_of_reach_is_not_proposed_again(cell: VirtualCell, tmp_path: 
     assert studio.next_view() is None
 
 
-def test_the_arm_moves_only_while_somebody_sees_it(cell: VirtualCell, tmp_path: Path) -> None:
-    studio, looks = studio_in(tmp_path, cell), iter([True, True, True])
+def test_the_arm_moves_only_while_somebody_sees_it(
+    cell: VirtualCell, tmp_path: Path
+) -> None:
+    studio = studio_in(tmp_path, cell)
+    looks = iter([True, True, True])
     studio.take_sample()
     studio.watched = lambda: next(looks, False)
     with pytest.raises(InputError, match="open its page"):
@@ -203,7 +217,9 @@ def test_devices_that_give_nothing_are_named(cell: VirtualCell, tmp_path: Path) 
 
 def test_an_image_of_a_moving_arm_is_refused(cell: VirtualCell, tmp_path: Path) -> None:
     angles = iter(np.arange(0, 1, 0.01))
-    turning = SimpleNamespace(base_from_gripper=lambda: SE3.exp([0, 0, 0, 0, 0, next(angles)]))
+    turning = SimpleNamespace(
+        base_from_gripper=lambda: SE3.exp([0, 0, 0, 0, 0, next(angles)])
+    )
     studio = studio_in(tmp_path, cell, robot=turning)
     with pytest.raises(InputError, match="let it stand still"):
         studio.take_sample()
@@ -226,7 +242,8 @@ class Cell:
     """The scenes of a map, without their content."""
 
     def __init__(self, root: Path, *scenes: str):
-        self.path, self.scenes = root, scenes
+        self.path = root
+        self.scenes = scenes
 
     def learn(self, _: object, name: str, on_progress: object) -> Any:
         self.scenes = (*self.scenes, name)
@@ -259,7 +276,8 @@ def test_samples_learned_again_replace_their_scene_and_no_other(
         os.utime(tmp_path / "wrist" / "base_from_gripper.csv")  # the same samples
         assert not again.samples_changed()
         again.take_sample()
-        os.utime(tmp_path / "wrist" / "base_from_gripper.csv", (1e9, 1e9))  # the clock was set back
+        # The clock was set back.
+        os.utime(tmp_path / "wrist" / "base_from_gripper.csv", (1e9, 1e9))
         assert again.samples_changed()
 
     def fail(*_: object, **__: object) -> None:
@@ -271,10 +289,13 @@ def test_samples_learned_again_replace_their_scene_and_no_other(
     assert opened.scenes == ("wrist", "wrist-2", "wrist-3")
 
 
-def test_a_held_thing_leads_from_an_empty_folder_to_the_fixed_camera(tmp_path: Path) -> None:
+def test_a_held_thing_leads_from_an_empty_folder_to_the_fixed_camera(
+    tmp_path: Path,
+) -> None:
     """No map, no camera on the gripper: within 1 mm and 0.1 deg, and within the stated error."""
     cell = VirtualCell(3, CellOptions(width=320, height=240))
-    studio, truth = studio_in(tmp_path, cell, wrist_camera=None), cell.truth.base_from_tripod
+    studio = studio_in(tmp_path, cell, wrist_camera=None)
+    truth = cell.truth.base_from_tripod
     studio.connection.look("fixed")
     assert status(studio, "1 Connect") == "done"
     frames = studio.recorders["fixed"]
@@ -283,7 +304,10 @@ def test_a_held_thing_leads_from_an_empty_folder_to_the_fixed_camera(tmp_path: P
     assert "1 more images to start with" in says(studio, "or Hold")
     studio.record(silent, lambda: len(frames.frames) == 12, "fixed")
     assert studio.coverage("fixed").ready
-    assert studio.learn(silent, "fixed") == f"Learned 12 images; wrote {tmp_path}/fixed.json."
+    assert (
+        studio.learn(silent, "fixed")
+        == f"Learned 12 images; wrote {tmp_path}/fixed.json."
+    )
     again = studio_in(tmp_path, cell, wrist_camera=None)
     assert [status(again, step) for step in ("4 Fixed", "or Hold")] == ["done", "done"]
     again.export("fixed", "easy_handeye2")
@@ -291,16 +315,20 @@ def test_a_held_thing_leads_from_an_empty_folder_to_the_fixed_camera(tmp_path: P
     millimetres, degrees = pose_distance_mm_deg(found.parent_from_child, truth)
     assert millimetres < 1
     assert degrees < 0.1
-    assert found.uncertain_pose.squared_mahalanobis(truth) < 22.5  # 0.999 of chi-square, 6 degrees
+    # 0.999 of chi-square, 6 degrees.
+    assert found.uncertain_pose.squared_mahalanobis(truth) < 22.5
     assert (tmp_path / "export/fixed.calib").is_file()
     view = cell.holding_poses(3, seed=5)
     images = []
     for pose in view:
         cell.robot.move_to(pose)
         images.append(cell.tripod_camera.read()[1])
-    thing, now = Map.open(tmp_path / "thing"), np.stack(images)
+    thing = Map.open(tmp_path / "thing")
+    now = np.stack(images)
     assert not thing.check(now, found, robot_poses=view).moved
-    bumped = replace(found, parent_from_child=SE3.from_translation((0.004, 0, 0)) @ truth)
+    bumped = replace(
+        found, parent_from_child=SE3.from_translation((0.004, 0, 0)) @ truth
+    )
     assert thing.check(now, bumped, robot_poses=view).moved
     second = thing.calibrate(now, robot_poses=view)
     assert second.mount == "eye_to_hand"
@@ -313,9 +341,12 @@ NEEDING_MORE = ("moveit_samples", "joint_offsets", "corrected_urdf", "lerobot")
 """Formats that need poses of a board, or offsets of joints."""
 
 
-def test_every_format_is_exported_or_says_why_not(cell: VirtualCell, tmp_path: Path) -> None:
+def test_every_format_is_exported_or_says_why_not(
+    cell: VirtualCell, tmp_path: Path
+) -> None:
     studio = studio_in(tmp_path, cell)
-    pose, covariance = cell.truth.base_from_tripod, 1e-6 * np.eye(6)
+    pose = cell.truth.base_from_tripod
+    covariance = 1e-6 * np.eye(6)
     studio.calibrations["fixed"] = Calibration(
         "eye_to_hand", pose, covariance, camera=cell.intrinsics
     )
@@ -326,7 +357,9 @@ def test_every_format_is_exported_or_says_why_not(cell: VirtualCell, tmp_path: P
                 studio.export("fixed", name)
         else:
             written.append(studio.export("fixed", name))
-    assert len(set(written)) == len(FORMATS) - len(NEEDING_MORE), "each has a file of its own"
+    assert len(set(written)) == len(FORMATS) - len(NEEDING_MORE), (
+        "each has a file of its own"
+    )
     assert status(studio, "5 Export") == "done"
 
 
@@ -337,7 +370,8 @@ def ended(tasks: Tasks) -> None:
 
 
 def test_one_task_runs_at_a_time_and_failures_are_one_line() -> None:
-    tasks, go = Tasks(silent), threading.Event()
+    tasks = Tasks(silent)
+    go = threading.Event()
 
     def wait() -> str:
         go.wait(30)
@@ -362,7 +396,9 @@ def test_one_task_runs_at_a_time_and_failures_are_one_line() -> None:
         assert (tasks.failed, tasks.message) == (True, text)
 
 
-def test_the_page_follows_a_task(cell: VirtualCell, tmp_path: Path, caplog: Any) -> None:
+def test_the_page_follows_a_task(
+    cell: VirtualCell, tmp_path: Path, caplog: Any
+) -> None:
     page = StudioPage(studio_in(tmp_path, cell), "127.0.0.1", 0)
     try:
         assert page.tasks.start("taking a sample", page.studio.take_sample)

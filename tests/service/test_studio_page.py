@@ -24,7 +24,9 @@ from .browsing import click, seen_until, shot, visited
 
 
 @pytest.mark.slow("src/evercal/service/studio", "src/evercal/service/viewer")
-def test_from_an_empty_folder_to_both_calibrations(browser: Any, tmp_path: Path) -> None:
+def test_from_an_empty_folder_to_both_calibrations(
+    browser: Any, tmp_path: Path
+) -> None:
     """The exported mount and tripod are within 1 mm and 0.05 deg of the truth."""
     cell = VirtualCell(3, CellOptions(width=320, height=240))
     devices = Devices(
@@ -43,7 +45,8 @@ def test_from_an_empty_folder_to_both_calibrations(browser: Any, tmp_path: Path)
             record(visit, tmp_path)
             calibrate(visit, tmp_path)
             assert page.watched()
-            visit.evaluate("window.requestAnimationFrame = () => 0")  # as for a hidden page
+            # As for a hidden page.
+            visit.evaluate("window.requestAnimationFrame = () => 0")
             time.sleep(2)  # the frame that was requested before is drawn
             assert not page.watched()
         wait_until = time.monotonic() + 20
@@ -52,7 +55,10 @@ def test_from_an_empty_folder_to_both_calibrations(browser: Any, tmp_path: Path)
         assert not page.watched()
     finally:
         page.close()
-    truth = {"wrist": cell.truth.gripper_from_camera, "fixed": cell.truth.base_from_tripod}
+    truth = {
+        "wrist": cell.truth.gripper_from_camera,
+        "fixed": cell.truth.base_from_tripod,
+    }
     for name, true in truth.items():
         found = read_calibration(tmp_path / f"{name}.json").parent_from_child
         millimetres, degrees = pose_distance_mm_deg(found, true)
@@ -95,7 +101,9 @@ def calibrate(visit: Any, root: Path) -> None:
     click(visit, "5 Export", "tab")
     click(visit, "Export file")
     seen_until(visit, f"Wrote {root}/export/wrist.calib.")
-    visit.locator("input[value='camera on the gripper']:not([type=hidden])").last.click()
+    visit.locator(
+        "input[value='camera on the gripper']:not([type=hidden])"
+    ).last.click()
     visit.get_by_role("option", name="fixed camera").last.click()
     click(visit, "Export file")
     seen_until(visit, f"Wrote {root}/export/fixed.calib.")

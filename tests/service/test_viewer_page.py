@@ -56,16 +56,23 @@ def page_of(localizer: Localizer, *given: Any) -> Iterator[Page]:
         page.close()
 
 
-def calibration(mount: Literal["eye_in_hand", "eye_to_hand"], **more: Any) -> Calibration:
+def calibration(
+    mount: Literal["eye_in_hand", "eye_to_hand"], **more: Any
+) -> Calibration:
     parent = "gripper" if mount == "eye_in_hand" else "base"
-    return Calibration(mount, HAND, np.diag([1e-6, 4e-6, 9e-6, 1e-8, 1e-8, 1e-8]), parent, **more)
+    return Calibration(
+        mount, HAND, np.diag([1e-6, 4e-6, 9e-6, 1e-8, 1e-8, 1e-8]), parent, **more
+    )
 
 
 def test_backdrop_shows_each_pixel_where_the_camera_sees_it() -> None:
-    camera = Camera(64, 48, 50.0, 55.0, 20.0, 30.0)  # its centre is far from that of the image
+    # Its centre is far from that of the image.
+    camera = Camera(64, 48, 50.0, 55.0, 20.0, 30.0)
     pose = SE3.exp([0.1, 0.2, 0.3, 0.5, -0.4, 0.3])
     image = np.zeros((48, 64, 3), np.uint8)
-    view = KeyframeView("room", 0, Frustum.of(pose, camera), camera, image, np.array([2.0]))
+    view = KeyframeView(
+        "room", 0, Frustum.of(pose, camera), camera, image, np.array([2.0])
+    )
     centre_m, width_m, height_m = backdrop(view)
     across, down = pose.rotation_matrix()[:, :2].T
     for side, edge in ((-1, -0.5), (1, 63.5)):
@@ -105,7 +112,10 @@ def test_a_bad_file_is_named(localizer: Localizer, tmp_path: Path) -> None:
     for given, message in cases:
         with pytest.raises(InputError, match=message):
             Page(localizer, *given)
-    with page_of(localizer) as page, pytest.raises(InputError, match="gone: no such folder"):
+    with (
+        page_of(localizer) as page,
+        pytest.raises(InputError, match="gone: no such folder"),
+    ):
         page.track(str(tmp_path / "gone"))
 
 
@@ -119,20 +129,26 @@ def test_the_gripper_follows_the_joints(tmp_path: Path) -> None:
         np.testing.assert_allclose(node.position, [0, 0, 0.5], atol=1e-9)
         slider.value = 0.7
         rotation = SE3(np.array(node.wxyz), np.zeros(3)).rotation_matrix()
-        np.testing.assert_allclose(rotation[0], [np.cos(0.7), -np.sin(0.7), 0], atol=1e-9)
+        np.testing.assert_allclose(
+            rotation[0], [np.cos(0.7), -np.sin(0.7), 0], atol=1e-9
+        )
     finally:
         server.stop()
 
 
 def test_calibrations_have_their_place_and_ellipsoid() -> None:
     """The standard deviations 1, 2 and 3 mm are drawn ten times as large."""
-    server, drawn = MagicMock(), MagicMock()
+    server = MagicMock()
+    drawn = MagicMock()
     drawn.node = lambda scene: f"/map/{scene}"
     fixed = calibration("eye_to_hand", source={"scene": "hall"})
     given = {"w/rist": calibration("eye_in_hand"), "tripod": fixed}
     add_calibrations(server, given, drawn, Camera(64, 48, 50.0, 50.0, 31.5, 23.5), 0.1)
     cameras = server.scene.add_camera_frustum.call_args_list
-    assert [call.args[0] for call in cameras] == [f"{GRIPPER}/w_rist", "/map/hall/tripod"]
+    assert [call.args[0] for call in cameras] == [
+        f"{GRIPPER}/w_rist",
+        "/map/hall/tripod",
+    ]
     for call in cameras:
         pose = SE3(call.kwargs["wxyz"], call.kwargs["position"])
         assert max(pose_distance(pose, HAND)) < 1e-12
@@ -144,7 +160,8 @@ def test_calibrations_have_their_place_and_ellipsoid() -> None:
 
 def test_a_keyframe_is_looked_through_until_back(localizer: Localizer) -> None:
     with page_of(localizer) as page:
-        view, client = page.map.keyframes["hall"][2], MagicMock()
+        view = page.map.keyframes["hall"][2]
+        client = MagicMock()
         page.look_through(view, client)
         pose = view.frustum.base_from_camera
         seen = SE3(client.camera.wxyz, client.camera.position)
@@ -154,7 +171,9 @@ def test_a_keyframe_is_looked_through_until_back(localizer: Localizer) -> None:
         page.look_from_above(client)
         removed = client.scene.remove_by_name.call_args.args[0]
         assert removed == client.scene.add_image.call_args.args[0]
-        np.testing.assert_allclose(client.camera.position, page.server.initial_camera.position)
+        np.testing.assert_allclose(
+            client.camera.position, page.server.initial_camera.position
+        )
 
 
 def test_names_of_files_are_no_markup() -> None:
@@ -185,6 +204,8 @@ def test_a_browser_shows_the_map_and_a_tracked_camera(
         seen_until(visit, "3 / 2 / 1 mm")
         for text in ("tracking", "ended"):
             seen_until(visit, text)
-        picture = cv2.imdecode(np.frombuffer(shot(visit, "view"), np.uint8), cv2.IMREAD_GRAYSCALE)
+        picture = cv2.imdecode(
+            np.frombuffer(shot(visit, "view"), np.uint8), cv2.IMREAD_GRAYSCALE
+        )
         assert picture is not None
         assert len(np.unique(picture)) > 50, "a canvas that shows something"

@@ -34,12 +34,15 @@ def test_a_fisheye_shows_what_its_projection_says() -> None:
     assert (image[angle > np.deg2rad(86)] == 0).all()
 
 
-@pytest.mark.slow("src/evercal/mapping", "src/evercal/localization", "src/evercal/geometry")
+@pytest.mark.slow(
+    "src/evercal/mapping", "src/evercal/localization", "src/evercal/geometry"
+)
 def test_a_map_of_a_fisheye_locates_to_a_millimetre(tmp_path: Path) -> None:
     from evercal import Map
 
     room = BoxRoom(6)
-    path, tests = room.path(40, 1), room.path(4, 2)
+    path = room.path(40, 1)
+    tests = room.path(4, 2)
     images = [fisheye_image(WIDE, pose, room.render) for pose in path]
     frames = [Frame(str(i), image, WIDE, path[i]) for i, image in enumerate(images)]
     Map.open(tmp_path / "map").learn(
@@ -47,7 +50,9 @@ def test_a_map_of_a_fisheye_locates_to_a_millimetre(tmp_path: Path) -> None:
     )
     again = Map.open(tmp_path / "map")  # from the disk
     for pose in tests:
-        found = again.localize(fisheye_image(WIDE, pose, room.render), WIDE).base_from_camera
+        found = again.localize(
+            fisheye_image(WIDE, pose, room.render), WIDE
+        ).base_from_camera
         assert found is not None
         millimetres, degrees = pose_distance_mm_deg(found, pose)
         assert millimetres < 1.0

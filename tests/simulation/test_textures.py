@@ -13,7 +13,9 @@ def test_amplitude_falls_as_one_over_f_to_the_exponent(exponent: float) -> None:
     assert noise.dtype == np.float32
     assert abs(noise.mean()) < 1e-5
     assert noise.std() == pytest.approx(1.0, abs=1e-5)
-    power = np.mean([np.abs(np.fft.fft2(one_over_f(128, exponent, rng))) ** 2 for _ in range(8)], 0)
+    power = np.mean(
+        [np.abs(np.fft.fft2(one_over_f(128, exponent, rng))) ** 2 for _ in range(8)], 0
+    )
     frequency = np.hypot(np.fft.fftfreq(128)[:, None], np.fft.fftfreq(128)[None])
     band = (frequency > 0.03) & (frequency < 0.5)
     slope, _ = np.polyfit(np.log(frequency[band]), 0.5 * np.log(power[band]), 1)
@@ -21,7 +23,9 @@ def test_amplitude_falls_as_one_over_f_to_the_exponent(exponent: float) -> None:
 
 
 def test_pictures_repeat_with_the_generator_and_not_with_earlier_calls() -> None:
-    first, other, again = (dead_leaves(40, 60, np.random.default_rng(seed)) for seed in (3, 4, 3))
+    first, other, again = (
+        dead_leaves(40, 60, np.random.default_rng(seed)) for seed in (3, 4, 3)
+    )
     assert first.shape == (40, 60, 3)
     assert first.dtype == np.uint8
     np.testing.assert_array_equal(first, again)
@@ -29,12 +33,17 @@ def test_pictures_repeat_with_the_generator_and_not_with_earlier_calls() -> None
 
 
 def test_pictures_have_contrast_and_edges() -> None:
-    pictures = [dead_leaves(128, 128, np.random.default_rng(seed)).mean(-1) for seed in range(12)]
+    pictures = [
+        dead_leaves(128, 128, np.random.default_rng(seed)).mean(-1)
+        for seed in range(12)
+    ]
     contrast = [picture.std() for picture in pictures]
     assert min(contrast) > 10
     assert np.ptp([picture.mean() for picture in pictures]) > 30
     # Overlapping shapes have many small steps and some large ones, unlike noise.
-    steps = np.concatenate([np.abs(np.diff(picture, axis=1)).ravel() for picture in pictures])
+    steps = np.concatenate(
+        [np.abs(np.diff(picture, axis=1)).ravel() for picture in pictures]
+    )
     assert np.median(steps) < 10
     assert np.mean(steps > 40) > 0.01
 
@@ -42,7 +51,11 @@ def test_pictures_have_contrast_and_edges() -> None:
 def test_few_leaves_give_a_calm_picture() -> None:
     def edges(leaves: int) -> float:
         rng = np.random.default_rng
-        pictures = [dead_leaves(96, 96, rng(seed), leaves).mean(-1) for seed in range(8)]
-        return float(np.mean([(np.abs(np.diff(p, axis=1)) > 30).mean() for p in pictures]))
+        pictures = [
+            dead_leaves(96, 96, rng(seed), leaves).mean(-1) for seed in range(8)
+        ]
+        return float(
+            np.mean([(np.abs(np.diff(p, axis=1)) > 30).mean() for p in pictures])
+        )
 
     assert edges(0) < edges(20) < edges(200)

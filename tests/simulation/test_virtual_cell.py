@@ -37,7 +37,9 @@ def test_the_arm_is_at_its_documented_place_when_stretched() -> None:
 
 def test_inverse_kinematics_undo_forward_kinematics_within_limits() -> None:
     rng = np.random.default_rng(1)
-    for joints in np.clip(HOME_RAD + rng.uniform(-0.8, 0.8, (20, 7)), LOW_RAD, HIGH_RAD):
+    for joints in np.clip(
+        HOME_RAD + rng.uniform(-0.8, 0.8, (20, 7)), LOW_RAD, HIGH_RAD
+    ):
         pose = base_from_flange(joints)
         found = joints_for(pose, HOME_RAD)
         assert max(pose_distance(base_from_flange(found), pose)) < 3e-6
@@ -62,10 +64,13 @@ def test_motions_take_time_and_other_threads_see_them() -> None:
     assert max(pose_distance(robot.base_from_gripper(), target)) < 1e-5
 
 
-def test_the_true_pose_differs_by_the_stated_noise_and_stays_while_the_arm_stands() -> None:
+def test_the_true_pose_differs_by_the_stated_noise_and_stays_while_the_arm_stands() -> (
+    None
+):
     clock = Clock(real=False)
     robot = VirtualRobot(clock, 1e-3, 2e-3, 5)
-    rng, errors = np.random.default_rng(3), []
+    rng = np.random.default_rng(3)
+    errors = []
     for joints in HOME_RAD + rng.uniform(-0.3, 0.3, (80, 7)):
         robot.move_to(base_from_flange(joints))
         truth = robot.true_state(clock.now())[0]
@@ -77,7 +82,9 @@ def test_the_true_pose_differs_by_the_stated_noise_and_stays_while_the_arm_stand
 
 def test_images_follow_the_true_mount() -> None:
     """Rendered from the stated pose and the true mount, an image differs by noise only."""
-    exact = CellOptions(width=160, height=120, arm_noise_mm=0, arm_noise_deg=0, show_arm=False)
+    exact = CellOptions(
+        width=160, height=120, arm_noise_mm=0, arm_noise_deg=0, show_arm=False
+    )
     cell = VirtualCell(4, exact)
     pose = cell.reachable_poses(1)[0]
     cell.robot.move_to(pose)
@@ -143,7 +150,8 @@ def test_the_whole_chain_finds_the_truth(tmp_path: Path) -> None:
     report = learned.learn(tmp_path / "cell/wrist").hand_eye
     assert report is not None
     fixed = learned.calibrate(tmp_path / "cell/tripod").parent_from_child
-    thing, recorded = Map.open(tmp_path / "thing"), load_recording(tmp_path / "cell/held")
+    thing = Map.open(tmp_path / "thing")
+    recorded = load_recording(tmp_path / "cell/held")
     reference = thing.eye_to_hand(recorded)
     held = reference.parent_from_child
     assert all(Path(image.name).is_file() for image in reference.images)
@@ -158,9 +166,15 @@ def test_the_whole_chain_finds_the_truth(tmp_path: Path) -> None:
 
     # The thing is taken again another way, with the camera in its place or not.
     images = [frame.read_image() for frame in recorded.train[::2]]
-    grippers, grip = stated_grippers(recorded.train[::2]), SE3.exp([0.02, -0.01, 0.03, 0.1, 0.2, 0])
+    grippers = stated_grippers(recorded.train[::2])
+    grip = SE3.exp([0.02, -0.01, 0.03, 0.1, 0.2, 0])
     moved = SE3.exp([0.01, 0, 0, 0, 0.02, 0])
-    for by_camera, by_grip in (("", ""), ("", "grip"), ("camera", ""), ("camera", "grip")):
+    for by_camera, by_grip in (
+        ("", ""),
+        ("", "grip"),
+        ("camera", ""),
+        ("camera", "grip"),
+    ):
         stated = grippers @ grip.inverse() if by_grip else grippers
         stated = moved @ stated if by_camera else stated
         shift = thing.check(images, reference, robot_poses=stated)

@@ -14,7 +14,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from evercal.errors import InputError
-from evercal.storage.archive import ArchiveLimits, check_archive, extract_archive, write_archive
+from evercal.storage.archive import (
+    ArchiveLimits,
+    check_archive,
+    extract_archive,
+    write_archive,
+)
 
 Tree = Callable[[Path], dict[str, str]]
 FILES = {"a.txt": b"first", "deep/er/b.bin": bytes(3_000_000), "deep/empty": b""}
@@ -28,7 +33,9 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "in"
 
 
-def zipped(path: Path, *entries: tuple[str | zipfile.ZipInfo, bytes], deflate: bool = True) -> Path:
+def zipped(
+    path: Path, *entries: tuple[str | zipfile.ZipInfo, bytes], deflate: bool = True
+) -> Path:
     kind = zipfile.ZIP_DEFLATED if deflate else zipfile.ZIP_STORED
     with zipfile.ZipFile(path, "w", kind) as archive:
         for name, data in entries:
@@ -137,7 +144,9 @@ def test_changed_bytes_are_refused_or_change_nothing_outside(
     root.mkdir()
     mutated = bytearray(whole())
     for _ in range(data.draw(st.integers(1, 4))):
-        mutated[data.draw(st.integers(0, len(mutated) - 1))] = data.draw(st.integers(0, 255))
+        mutated[data.draw(st.integers(0, len(mutated) - 1))] = data.draw(
+            st.integers(0, 255)
+        )
     (root / "x.zip").write_bytes(mutated)
     try:
         extract_archive(root / "x.zip", root / "out", ArchiveLimits(10_000, 10))

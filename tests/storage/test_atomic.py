@@ -39,10 +39,14 @@ def die_at(step: int, root: Path, code: str) -> bool:
 
 def test_a_file_is_old_or_new_at_every_step(tmp_path: Path) -> None:
     file = tmp_path / "head.bin"
-    outcomes, killed, step = [], True, 0
+    outcomes = []
+    killed = True
+    step = 0
     for step in range(1, 20):
         file.write_bytes(b"old")
-        killed = die_at(step, tmp_path, "atomic.write_bytes(root + '/head.bin', b'new' * 1000)")
+        killed = die_at(
+            step, tmp_path, "atomic.write_bytes(root + '/head.bin', b'new' * 1000)"
+        )
         outcomes.append(file.read_bytes())
         assert outcomes[-1] in (b"old", b"new" * 1000)
         if not killed:
@@ -55,7 +59,8 @@ def test_a_file_is_old_or_new_at_every_step(tmp_path: Path) -> None:
 
 def test_a_folder_is_old_or_new_at_every_step(tmp_path: Path) -> None:
     code = "atomic.replace_folder(root + '/fresh', root + '/stage')"
-    outcomes, killed = [], True
+    outcomes = []
+    killed = True
     for step in range(1, 30):
         root = tmp_path / str(step)
         for name, text in (("stage", "old"), ("fresh", "new")):

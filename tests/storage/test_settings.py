@@ -14,7 +14,10 @@ def test_other_settings_are_refused(tmp_path: Path) -> None:
     before = file.read_bytes()
     lock_settings(file, {"steps": 3, "sizes": (1, 2)})  # tuples come back as lists
     for other, message in (
-        ({"steps": 4, "sizes": (1, 2)}, r"new: .*steps 3, now it is 4; give another --out"),
+        (
+            {"steps": 4, "sizes": (1, 2)},
+            r"new: .*steps 3, now it is 4; give another --out",
+        ),
         ({"steps": 3}, r"sizes \[1, 2\], now it is None"),
         ({"steps": 3, "sizes": (1, 2), "seed": 0}, "seed None, now it is 0"),
     ):

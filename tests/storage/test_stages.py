@@ -18,7 +18,13 @@ import pytest
 from evercal.errors import InputError
 from evercal.storage import MANIFEST, Manifest, verify, write_bytes, write_manifest
 from evercal.storage import manifest as module
-from evercal.storage.stages import SCHEMA, StageStore, is_store, read_store, require_free
+from evercal.storage.stages import (
+    SCHEMA,
+    StageStore,
+    is_store,
+    read_store,
+    require_free,
+)
 
 Tree = Callable[[Path], dict[str, str]]
 PAYLOAD = {"kind": "test"}
@@ -99,8 +105,11 @@ def test_superseded_files_of_earlier_stages_are_dropped(root: Path) -> None:
     assert verify(root) == []
 
 
-def test_an_error_while_writing_leaves_the_store_unchanged(root: Path, tree: Tree) -> None:
-    store, before = opened(root), tree(root)
+def test_an_error_while_writing_leaves_the_store_unchanged(
+    root: Path, tree: Tree
+) -> None:
+    store = opened(root)
+    before = tree(root)
 
     def fail(folder: Path) -> None:
         (folder / "scene.json").write_text("half")
@@ -143,7 +152,8 @@ def test_writer_killed_at_any_step(
     where = tmp_path / "new" if action == "first" else root
     before = [] if action == "first" else ["kitchen", "hall"]
     snapshots = every_step(where, lambda: change(where))
-    after, final = texts(where), tree(where)
+    after = texts(where)
+    final = tree(where)
     outcomes = []
     for i, snapshot in enumerate(snapshots):
         outcomes.append(texts(snapshot) if is_store(snapshot) else [])
@@ -166,7 +176,9 @@ Everything = Callable[[Path], dict[str, "bytes | None"]]
 
 def change_by(action: str, store: StageStore[None]) -> None:
     if action == "replace":
-        store.replace(0, lambda folder: write_bytes(folder / "scene.json", b'"new"'), PAYLOAD)
+        store.replace(
+            0, lambda folder: write_bytes(folder / "scene.json", b'"new"'), PAYLOAD
+        )
     elif action == "remove":
         store.change(store.stages[1:], [], PAYLOAD)
     else:
@@ -176,11 +188,18 @@ def change_by(action: str, store: StageStore[None]) -> None:
 @pytest.mark.parametrize("once", [False, True])
 @pytest.mark.parametrize("action", ["first", "add", "replace", "remove"])
 def test_a_change_that_is_refused_at_any_step_leaves_nothing(
-    action: str, once: bool, root: Path, tmp_path: Path, full_disk: Any, everything: Everything
+    action: str,
+    once: bool,
+    root: Path,
+    tmp_path: Path,
+    full_disk: Any,
+    everything: Everything,
 ) -> None:
     if action == "first":
         shutil.rmtree(root)
-    expected, refused, count = tmp_path / "expected", 0, [0]
+    expected = tmp_path / "expected"
+    refused = 0
+    count = [0]
     if root.exists():
         shutil.copytree(root, expected)
     change_by(action, opened(expected))
@@ -189,7 +208,8 @@ def test_a_change_that_is_refused_at_any_step_leaves_nothing(
         where.parent.mkdir()
         if root.exists():
             shutil.copytree(root, where)
-        store, before = opened(where), everything(where.parent)
+        store = opened(where)
+        before = everything(where.parent)
         memory = list(store.stages), store.networks
         try:
             with full_disk(last, once) as count:
@@ -212,7 +232,9 @@ def test_what_a_killed_change_dropped_is_removed_by_the_next(
 ) -> None:
     for snapshot in every_step(root, lambda: change_by("remove", opened(root))):
         add(opened(snapshot), "attic")
-        assert sorted(os.listdir(snapshot / "stages")) == sorted(opened(snapshot).stages)
+        assert sorted(os.listdir(snapshot / "stages")) == sorted(
+            opened(snapshot).stages
+        )
         assert sorted(os.listdir(snapshot)) == ["encoder-1.bin", MANIFEST, "stages"]
 
 
@@ -227,12 +249,16 @@ def test_scenes_without_a_manifest_are_refused_and_never_removed(
         (root / ".writing").write_text(journal)
     before = everything(root)
     for action in (lambda: add(opened(root), "attic"), lambda: require_free(root)):
-        with pytest.raises(InputError, match=r"holds scenes but no manifest\.json; restore it"):
+        with pytest.raises(
+            InputError, match=r"holds scenes but no manifest\.json; restore it"
+        ):
             action()
         assert everything(root) == before
 
 
-def test_a_stage_that_no_change_has_made_is_neither_removed_nor_replaced(root: Path) -> None:
+def test_a_stage_that_no_change_has_made_is_neither_removed_nor_replaced(
+    root: Path,
+) -> None:
     for name in ("0003-attic", "0001-kitchen~2"):
         shutil.copytree(root / "stages" / "0001-kitchen", root / "stages" / name)
     store = opened(root)
@@ -244,17 +270,24 @@ def test_a_stage_that_no_change_has_made_is_neither_removed_nor_replaced(root: P
 
 
 def test_one_process_writes_at_a_time(root: Path, tree: Tree) -> None:
-    first, second = opened(root), opened(root)
+    first = opened(root)
+    second = opened(root)
     with first.writing():
         before = tree(root)
-        with pytest.raises(InputError, match="another process is writing into it; wait"):
+        with pytest.raises(
+            InputError, match="another process is writing into it; wait"
+        ):
             add(second, "attic")
-        with pytest.raises(InputError, match="another process is writing into it; wait"):
+        with pytest.raises(
+            InputError, match="another process is writing into it; wait"
+        ):
             second.replace(0, lambda folder: None, PAYLOAD)
         assert tree(root) == before
         add(first, "cellar")
     # The second one was opened before the cellar was added.
-    with pytest.raises(InputError, match="another process has changed it; run it again"):
+    with pytest.raises(
+        InputError, match="another process has changed it; run it again"
+    ):
         add(second, "attic")
     assert texts(root) == ["kitchen", "hall", "cellar"]
 
@@ -303,7 +336,9 @@ def other_writer(root: Path) -> Iterator[subprocess.Popen[str]]:
         process.kill()
 
 
-def test_a_killed_process_leaves_no_lock(root: Path, other_writer: subprocess.Popen[str]) -> None:
+def test_a_killed_process_leaves_no_lock(
+    root: Path, other_writer: subprocess.Popen[str]
+) -> None:
     with pytest.raises(InputError, match="another process is writing"):
         add(opened(root), "attic")
     other_writer.kill()
@@ -312,7 +347,9 @@ def test_a_killed_process_leaves_no_lock(root: Path, other_writer: subprocess.Po
     assert texts(root) == ["kitchen", "hall", "attic"]
 
 
-def test_lock_file_survives_so_that_a_waiting_process_locks_the_same_file(root: Path) -> None:
+def test_lock_file_survives_so_that_a_waiting_process_locks_the_same_file(
+    root: Path,
+) -> None:
     lock = root.parent / f".{root.name}.lock"
     with opened(root).writing():
         inode = lock.stat().st_ino
@@ -349,11 +386,14 @@ def test_racing_processes_lose_no_stage(tmp_path: Path) -> None:
     for process in processes:
         process.join(60)
         assert process.exitcode == 0
-    assert sorted(texts(tmp_path / "s")) == [f"{name}-{i}" for name in names for i in range(5)]
+    assert sorted(texts(tmp_path / "s")) == [
+        f"{name}-{i}" for name in names for i in range(5)
+    ]
 
 
 def test_a_reader_starts_over_if_a_writer_replaces_files(root: Path) -> None:
-    writer, attempts = opened(root), []
+    writer = opened(root)
+    attempts = []
 
     def read(manifest: Manifest) -> str:
         attempts.append(manifest.payload["stages"])
@@ -369,7 +409,9 @@ def test_a_reader_starts_over_if_a_writer_replaces_files(root: Path) -> None:
 def test_verify_starts_over_if_a_writer_was_faster(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    writer, writes, read = opened(root), iter("w"), module.sha256_file
+    writer = opened(root)
+    writes = iter("w")
+    read = module.sha256_file
 
     def interrupted(path: Path) -> str:
         for _ in writes:
@@ -385,10 +427,15 @@ def test_verify_starts_over_if_a_writer_was_faster(
 def test_damaged_files_are_named(root: Path, file: str) -> None:
     path = root / file
     path.write_bytes(path.read_bytes()[:-1] + b"x")
-    with pytest.raises(InputError, match=rf"{file}: checksum does not match.*; restore it"):
+    with pytest.raises(
+        InputError, match=rf"{file}: checksum does not match.*; restore it"
+    ):
         texts(root)
     # The damage is still reported after another stage is added.
-    add(StageStore(root, None, ["0001-kitchen", "0002-hall"], ("encoder-1.bin",)), "attic")
+    add(
+        StageStore(root, None, ["0001-kitchen", "0002-hall"], ("encoder-1.bin",)),
+        "attic",
+    )
     assert verify(root) == [f"{path}: checksum does not match, its content was changed"]
     with pytest.raises(InputError, match="checksum"):
         StageStore(root, None, ["0001-kitchen", "0002-hall", "0003-attic"]).replace(
@@ -413,7 +460,9 @@ OUTSIDE = ["../secret.bin", "/etc/hostname", "stages/../../secret.bin", "", 7, N
 
 @pytest.mark.parametrize("name", OUTSIDE)
 @pytest.mark.parametrize("key", ["networks", "stages"])
-def test_names_that_leave_the_folder_are_refused(root: Path, key: str, name: object) -> None:
+def test_names_that_leave_the_folder_are_refused(
+    root: Path, key: str, name: object
+) -> None:
     (root.parent / "secret.bin").write_text("secret")
     manifest = Manifest.read(root)
     payload = {**manifest.payload, key: [name]}
@@ -424,7 +473,9 @@ def test_names_that_leave_the_folder_are_refused(root: Path, key: str, name: obj
 
 @pytest.mark.parametrize("value", ["encoder-1.bin", None, {"a": 1}, 3])
 @pytest.mark.parametrize("key", ["networks", "stages"])
-def test_payload_of_another_shape_is_refused(root: Path, key: str, value: object) -> None:
+def test_payload_of_another_shape_is_refused(
+    root: Path, key: str, value: object
+) -> None:
     manifest = Manifest.read(root)
     write_manifest(root, {**manifest.payload, key: value}, list(manifest.files))
     with pytest.raises(InputError, match=f"store {root}"):
@@ -432,7 +483,8 @@ def test_payload_of_another_shape_is_refused(root: Path, key: str, value: object
 
 
 @pytest.mark.parametrize(
-    ("schema", "message"), [(SCHEMA - 1, "learn the scenes again"), (SCHEMA + 1, "update evercal")]
+    ("schema", "message"),
+    [(SCHEMA - 1, "learn the scenes again"), (SCHEMA + 1, "update evercal")],
 )
 def test_other_schemas_are_refused(root: Path, schema: int, message: str) -> None:
     manifest = Manifest.read(root)
@@ -455,7 +507,9 @@ def test_folders_that_are_links_are_never_changed(
     (root / linked).rename(elsewhere)
     (root / linked).symlink_to(elsewhere)
     (elsewhere / "mine.txt").write_text("of another program")
-    (root / ".writing").write_text(json.dumps({"new": ["0001-kitchen"], "dropped": ["0002-hall"]}))
+    (root / ".writing").write_text(
+        json.dumps({"new": ["0001-kitchen"], "dropped": ["0002-hall"]})
+    )
     for manifest in (True, False):
         before = tree(tmp_path)
         with pytest.raises(InputError, match="is a link; copy the whole map instead"):

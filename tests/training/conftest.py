@@ -15,7 +15,9 @@ SEED = 420
 def coarse() -> Iterator[Callable[[int], RoomViews]]:
     """`room_views` with coarse textures and two anchors."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pairs, "BoxRoom", lambda seed, texture_px: BoxRoom(seed, texture_px=48))
+        patch.setattr(
+            pairs, "BoxRoom", lambda seed, texture_px: BoxRoom(seed, texture_px=48)
+        )
         yield lambda seed: room_views(seed, anchors=2)
 
 

@@ -11,7 +11,9 @@ from training.contrastive import PretrainOptions
 pytestmark = pytest.mark.slow("training", "src/evercal/features")
 
 
-def test_options_reach_the_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_reach_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls: list[tuple[Path, Path, PretrainOptions]] = []
     monkeypatch.setattr(command, "pretrain", lambda *given: calls.append(given))
     assert command.main(["--out", str(tmp_path), "--steps", "7", "--seed", "3"]) == 0

@@ -30,7 +30,9 @@ from ..encoders import TINY
 
 pytestmark = pytest.mark.slow("training", "src/evercal/features")
 
-OPTIONS = PretrainOptions(steps=6, room_pairs=2, furnished_pairs=0, leaf_pairs=1, points=64)
+OPTIONS = PretrainOptions(
+    steps=6, room_pairs=2, furnished_pairs=0, leaf_pairs=1, points=64
+)
 SMALL = Layout(*TINY)
 FAR = torch.tensor([[0.0, 0.0], [100.0, 0.0]])
 
@@ -41,7 +43,9 @@ def data(views: RoomViews) -> PretrainData:
 
 
 def unit(*shape: int, seed: int = 0) -> Tensor:
-    return F.normalize(torch.randn(*shape, generator=torch.Generator().manual_seed(seed)), dim=-1)
+    return F.normalize(
+        torch.randn(*shape, generator=torch.Generator().manual_seed(seed)), dim=-1
+    )
 
 
 def twice(pixels: Tensor) -> Tensor:
@@ -53,14 +57,18 @@ def test_features_at_cell_centres_are_exact() -> None:
     maps = unit(2, HEIGHT // 8, WIDTH // 8, 5).permute(0, 3, 1, 2)
     pixels = torch.from_numpy(cell_pixels()).float().expand(2, -1, -1)
     actual = sample_features(maps, pixels)
-    torch.testing.assert_close(actual, maps.flatten(2).transpose(1, 2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        actual, maps.flatten(2).transpose(1, 2), atol=1e-5, rtol=0
+    )
 
 
 def test_features_between_cells_are_bilinear_unit_vectors() -> None:
     maps = unit(1, HEIGHT // 8, WIDTH // 8, 5).permute(0, 3, 1, 2)
     pixel = torch.tensor([[[8 * 4.25 + 3.5, 8 * 6.5 + 3.5]]])
     grid = maps[0]
-    mixed = 0.5 * (0.75 * (grid[:, 6, 4] + grid[:, 7, 4]) + 0.25 * (grid[:, 6, 5] + grid[:, 7, 5]))
+    mixed = 0.5 * (
+        0.75 * (grid[:, 6, 4] + grid[:, 7, 4]) + 0.25 * (grid[:, 6, 5] + grid[:, 7, 5])
+    )
     actual = sample_features(maps, pixel)[0, 0]
     torch.testing.assert_close(actual, F.normalize(mixed, dim=0), atol=1e-5, rtol=0)
 
@@ -77,7 +85,8 @@ def test_loss_matches_a_slow_reference(dense: bool) -> None:
     total = 0.0
     for one, other in ((0, 1), (1, 0)):
         for i, k in points:
-            here, truth = features[one, i, k], pixels[other, i, k].tolist()
+            here = features[one, i, k]
+            truth = pixels[other, i, k].tolist()
             rivals = [
                 (j, features[other, j, m], pixels[other, j, m].tolist())
                 for j, m in points
@@ -105,7 +114,8 @@ class Oracle(nn.Module):
 
     def forward(self, grey: Tensor) -> Tensor:
         maps = unit(HEIGHT // 8, WIDTH // 8, 64).permute(2, 0, 1)
-        first, second = maps, maps.roll(self.columns, -1)
+        first = maps
+        second = maps.roll(self.columns, -1)
         half = len(grey) // 2
         return torch.stack([first] * half + [second] * half)
 
@@ -116,14 +126,21 @@ def test_matching_accuracy_of_an_oracle(
 ) -> None:
     rng = np.random.default_rng(0)
     inner = cell_pixels().reshape(HEIGHT // 8, WIDTH // 8, 2)[2:-2, 4:-4].reshape(-1, 2)
-    pixels = torch.from_numpy(inner[rng.permutation(len(inner))[:100]]).float().expand(3, -1, -1)
+    pixels = (
+        torch.from_numpy(inner[rng.permutation(len(inner))[:100]])
+        .float()
+        .expand(3, -1, -1)
+    )
     there = pixels + torch.tensor([8.0 * columns, 0.0])
-    images, valid = torch.zeros(2, 3, 1, HEIGHT, WIDTH), torch.ones(3, 100, dtype=torch.bool)
+    images = torch.zeros(2, 3, 1, HEIGHT, WIDTH)
+    valid = torch.ones(3, 100, dtype=torch.bool)
     oracle = Oracle(columns)
 
     def evaluate(moved: float, valid: Tensor = valid) -> float:
         truth = there + torch.tensor([0.0, moved])
-        return matching_accuracy(oracle, [Batch(images, torch.stack([pixels, truth]), valid)])
+        return matching_accuracy(
+            oracle, [Batch(images, torch.stack([pixels, truth]), valid)]
+        )
 
     assert evaluate(0.0) == evaluate(7.5) == 100.0
     assert evaluate(8.5) == evaluate(-40.0) == 0.0
@@ -146,9 +163,14 @@ def test_batches_depend_on_seed_and_step_only(data: PretrainData) -> None:
     assert (pixels[:, valid] >= 3.5 - 1e-4).all()
     assert (pixels[..., ~valid, :] == 0).all()
     for other in (stream.draw(4), next(iter(PairStream(data, OPTIONS, 4)))):
-        assert all(torch.equal(a, b) for a, b in zip(other, (images, pixels, valid), strict=True))
+        assert all(
+            torch.equal(a, b)
+            for a, b in zip(other, (images, pixels, valid), strict=True)
+        )
     assert not torch.equal(stream.draw(5)[0], images)
-    assert not torch.equal(PairStream(data, replace(OPTIONS, seed=2), 0).draw(4)[0], images)
+    assert not torch.equal(
+        PairStream(data, replace(OPTIONS, seed=2), 0).draw(4)[0], images
+    )
     assert len(list(PairStream(data, OPTIONS, 4))) == 2
 
 
@@ -177,7 +199,9 @@ class StopError(Exception):
 
 
 @pytest.mark.usefixtures("small")
-def test_resumed_training_equals_uninterrupted_training(data: PretrainData, tmp_path: Path) -> None:
+def test_resumed_training_equals_uninterrupted_training(
+    data: PretrainData, tmp_path: Path
+) -> None:
     for folder in "ab":
         (tmp_path / folder).mkdir()
     whole = train_encoder(data, OPTIONS, tmp_path / "a", lambda line: None).state_dict()
@@ -221,7 +245,8 @@ def test_training_starts_from_an_earlier_run(
 ) -> None:
     monkeypatch.setattr(contrastive, "DataLoader", DataLoader)  # with a worker process
     lines: list[str] = []
-    first, second = tmp_path / "first", tmp_path / "second"
+    first = tmp_path / "first"
+    second = tmp_path / "second"
     for folder in (first, second):
         folder.mkdir()
     before = train_encoder(data, replace(OPTIONS, steps=2), first, lines.append)

@@ -23,7 +23,8 @@ def data() -> Pictures:
 
 
 def test_batches_are_the_same_from_any_first_step(data: Pictures) -> None:
-    whole, rest = list(batches(data, 0, 3)), list(batches(data, 2, 3))
+    whole = list(batches(data, 0, 3))
+    rest = list(batches(data, 2, 3))
     for a, b in zip(whole[2], rest[0], strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=0)
     assert whole[0][0].shape == (8, 1, HEIGHT, WIDTH)
@@ -31,8 +32,11 @@ def test_batches_are_the_same_from_any_first_step(data: Pictures) -> None:
 
 
 def test_axes_hold_most_of_the_variance(data: Pictures) -> None:
-    teacher, image = Teacher.of(data, 64), torch.from_numpy(data.boxes[:1, None] / 255.0).float()
-    torch.testing.assert_close(teacher.axes.T @ teacher.axes, torch.eye(64), atol=1e-4, rtol=0)
+    teacher = Teacher.of(data, 64)
+    image = torch.from_numpy(data.boxes[:1, None] / 255.0).float()
+    torch.testing.assert_close(
+        teacher.axes.T @ teacher.axes, torch.eye(64), atol=1e-4, rtol=0
+    )
     with torch.no_grad():
         rows = teacher.module(image).flatten(2)[0].T
     kept = ((rows @ teacher.axes) ** 2).sum() / (rows**2).sum()
@@ -49,7 +53,8 @@ def test_the_loss_is_least_for_equal_features() -> None:
     cells = torch.arange(12)
     assert float(difference(target, target, cells)) == pytest.approx(0, abs=1e-5)
     losses = [
-        float(difference(F.normalize(target + k * other, dim=1), target, cells)) for k in (0.1, 0.5)
+        float(difference(F.normalize(target + k * other, dim=1), target, cells))
+        for k in (0.1, 0.5)
     ]
     assert 0 < losses[0] < losses[1]
 
@@ -68,7 +73,9 @@ def test_a_run_is_resumed_and_exported(
     student = distil(data, 2, tmp_path)
     image = data.boxes[0]
     with torch.no_grad():
-        expected = student(torch.from_numpy(image[None, None] / 255.0).float())[0].permute(1, 2, 0)
+        expected = student(torch.from_numpy(image[None, None] / 255.0).float())[
+            0
+        ].permute(1, 2, 0)
     # Weights are exported in half precision.
     cosine = (encoder(image) * expected.numpy()).sum(-1)
     assert cosine.min() > 0.999

@@ -50,7 +50,9 @@ def step() -> FurnishedViews:
     depth[:, :20] = 0.0  # no surface
     move = SE3(np.array([1.0, 0, 0, 0]), np.array([shift, 0, 0]))
     images = np.zeros((2, HEIGHT, WIDTH), np.uint8)
-    return FurnishedViews(images, SE3.stack([SE3.identity(), move]), (CAMERA, CAMERA), depth)
+    return FurnishedViews(
+        images, SE3.stack([SE3.identity(), move]), (CAMERA, CAMERA), depth
+    )
 
 
 def test_depth_maps_give_points_and_occlusion() -> None:
@@ -89,7 +91,9 @@ def test_pretraining_uses_reserved_seeds(tmp_path: Path) -> None:
 
 def test_batch_contains_furnished_rooms() -> None:
     two = step()
-    images = np.stack([np.full((HEIGHT, WIDTH), grey, np.uint8) for grey in (80, 81, 82, 83)])
+    images = np.stack(
+        [np.full((HEIGHT, WIDTH), grey, np.uint8) for grey in (80, 81, 82, 83)]
+    )
     four = FurnishedViews(
         images,
         SE3.stack([*two.base_from_camera, *two.base_from_camera]),
@@ -109,19 +113,24 @@ def test_batch_contains_furnished_rooms() -> None:
     assert (shades[:, 2] == 200).all()
     # The parallax of these cameras is 0, 10 or 20 pixels.
     across = (pixels[0, :2] - pixels[1, :2])[valid[:2]][:, 0].abs()
-    assert (across[:, None] - torch.tensor([0.0, 10.0, 20.0])).abs().min(1).values.max() < 1e-2
+    assert (across[:, None] - torch.tensor([0.0, 10.0, 20.0])).abs().min(
+        1
+    ).values.max() < 1e-2
 
 
 def test_rendered_pairs_correspond_and_are_cached(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
     views = furnished_views(1001, anchors=1)
     assert views.images.shape == views.depth_m.shape == (PER_ANCHOR, HEIGHT, WIDTH)
-    rng, captured = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    captured = []
     for first, second in ((0, 1), (2, 3), (1, 2)):
         pair = view_pair(views, first, second, rng)
         assert pair.pixels.shape[1] > 20
         (u, v), (x, y) = np.rint(pair.pixels).astype(int).transpose(0, 2, 1)
-        captured.append(np.stack([pair.images[0, v, u], pair.images[1, y, x]]).astype(float))
+        captured.append(
+            np.stack([pair.images[0, v, u], pair.images[1, y, x]]).astype(float)
+        )
         # Both views give the same surface point.
         gap = views.hit(first, pair.pixels[0]) - views.hit(second, pair.pixels[1])
         assert np.median(np.linalg.norm(gap, axis=-1)) < 0.01
@@ -137,6 +146,8 @@ def test_rendered_pairs_correspond_and_are_cached(tmp_path: Path) -> None:
         np.testing.assert_array_equal(actual.images, views.images)
         np.testing.assert_array_equal(actual.depth_m, views.depth_m)
         np.testing.assert_allclose(
-            actual.base_from_camera.matrix(), views.base_from_camera.matrix(), atol=1e-12
+            actual.base_from_camera.matrix(),
+            views.base_from_camera.matrix(),
+            atol=1e-12,
         )
         assert actual.cameras == views.cameras

@@ -34,13 +34,19 @@ def trained(request: pytest.FixtureRequest) -> LocalEncoder:
 
 
 def images(height: int, width: int, count: int = 2) -> Tensor:
-    return torch.rand(count, 1, height, width, generator=torch.Generator().manual_seed(7))
+    return torch.rand(
+        count, 1, height, width, generator=torch.Generator().manual_seed(7)
+    )
 
 
-def receptive_field(encoder: nn.Module, image: Tensor, row: int, column: int) -> np.ndarray:
+def receptive_field(
+    encoder: nn.Module, image: Tensor, row: int, column: int
+) -> np.ndarray:
     """(n, 2) pixels (u, v) that the output of one cell depends on."""
     image = image.clone().requires_grad_()
-    weight = torch.rand(encoder(image).shape[1], generator=torch.Generator().manual_seed(1))
+    weight = torch.rand(
+        encoder(image).shape[1], generator=torch.Generator().manual_seed(1)
+    )
     (encoder(image)[0, :, row, column] @ weight).backward()
     assert image.grad is not None
     v, u = torch.nonzero(image.grad[0, 0], as_tuple=True)
@@ -68,21 +74,27 @@ def test_receptive_fields_are_centred_on_the_cells(
     np.testing.assert_array_equal(pixels.mean(0), centre)
     # Strided 3x3 convolutions are half a cell off.
     strided = nn.Sequential(*(nn.Conv2d(1, 1, 3, 2, 1, bias=False) for _ in range(3)))
-    assert (receptive_field(strided, images(160, 176, 1), row, column).mean(0) != centre).all()
+    assert (
+        receptive_field(strided, images(160, 176, 1), row, column).mean(0) != centre
+    ).all()
 
 
 @torch.no_grad()
 def test_fused_equals_unfused(trained: LocalEncoder) -> None:
     twin = trained.fuse()
     assert not any(isinstance(layer, nn.BatchNorm2d) for layer in twin.modules())
-    torch.testing.assert_close(twin(images(48, 64)), trained(images(48, 64)), atol=2e-5, rtol=0)
+    torch.testing.assert_close(
+        twin(images(48, 64)), trained(images(48, 64)), atol=2e-5, rtol=0
+    )
 
 
 @torch.no_grad()
 def test_images_of_a_batch_are_independent(trained: LocalEncoder) -> None:
     image = images(48, 64, 3)
     together = trained(image * torch.tensor([1.0, 0.2, 0.7]).view(3, 1, 1, 1))
-    torch.testing.assert_close(together[1:2], trained(image[1:2] * 0.2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        together[1:2], trained(image[1:2] * 0.2), atol=1e-5, rtol=0
+    )
 
 
 @torch.no_grad()
@@ -92,7 +104,8 @@ def test_onnx_file_is_the_module_in_half_precision(
 ) -> None:
     path = tmp_path / "encoder.onnx"
     path.write_bytes(onnx_bytes(trained.fuse()))
-    encoder, again = load_encoder(path), from_onnx(path, trained.layout)
+    encoder = load_encoder(path)
+    again = from_onnx(path, trained.layout)
     grey = np.random.default_rng(0).integers(0, 256, size).astype(np.uint8)
     actual = encoder(grey)
     assert actual.shape == (size[0] // 8, size[1] // 8, trained.width)

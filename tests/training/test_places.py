@@ -11,7 +11,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evercal.continual.networks.descriptor import DESCRIBED_ENCODER, described, load_descriptor
+from evercal.continual.networks.descriptor import (
+    DESCRIBED_ENCODER,
+    described,
+    load_descriptor,
+)
 from evercal.features.encoder import load_encoder
 from evercal.simulation.box_room import BoxRoom, default_camera
 from training import make, places
@@ -36,7 +40,8 @@ T = places.TEMPERATURE
 
 
 def test_loss_of_two_rooms() -> None:
-    eye, rooms = torch.eye(2), torch.tensor([0, 1])
+    eye = torch.eye(2)
+    rooms = torch.tensor([0, 1])
     expected = math.log(1 + math.exp(-1 / T))
     assert float(place_loss(eye, eye, rooms)) == pytest.approx(expected, abs=1e-6)
     assert float(place_loss(eye, eye.flip(0), rooms)) == pytest.approx(1 / T, rel=1e-4)
@@ -44,8 +49,12 @@ def test_loss_of_two_rooms() -> None:
 
 def test_places_of_one_room_are_ignored() -> None:
     same = torch.ones(2, 2) / math.sqrt(2)
-    assert float(place_loss(same, same, torch.tensor([3, 3]))) == pytest.approx(0, abs=1e-6)
-    assert float(place_loss(same, same, torch.tensor([3, 4]))) == pytest.approx(math.log(2))
+    assert float(place_loss(same, same, torch.tensor([3, 3]))) == pytest.approx(
+        0, abs=1e-6
+    )
+    assert float(place_loss(same, same, torch.tensor([3, 4]))) == pytest.approx(
+        math.log(2)
+    )
     rooms = torch.tensor([3, 3, 4])  # numbers of negatives: 1, 1, 2
     same = torch.ones(3, 2) / math.sqrt(2)
     expected = (math.log(2) + math.log(2) + math.log(3)) / 3
@@ -71,7 +80,8 @@ def test_accuracy_by_hand() -> None:
 
 def test_crops_are_windows_of_the_map() -> None:
     maps = torch.arange(24 * 32.0).view(1, 1, 24, 32)
-    rng, sizes = np.random.default_rng(0), set()
+    rng = np.random.default_rng(0)
+    sizes = set()
     for _ in range(40):
         crop = random_crop(maps, rng)
         height, width = crop.shape[-2:]
@@ -94,7 +104,9 @@ def trained(one_room: RoomViews, steps: int) -> tuple[dict[str, Tensor], list[st
     return descriptor.state_dict(), lines
 
 
-def test_training_is_reproducible(one_room: RoomViews, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_is_reproducible(
+    one_room: RoomViews, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(places, "photometric", lambda image, rng: image)
     first, _ = trained(one_room, 5)
     torch.rand(3)
@@ -133,12 +145,15 @@ def test_small_pretraining_is_complete_and_resumable(tmp_path: Path) -> None:
     options = PretrainOptions(
         steps=3, rooms=2, furnished=0, furnished_pairs=0, pictures=2, descriptor_steps=2
     )
-    out, work = tmp_path / "out", tmp_path / "work"
+    out = tmp_path / "out"
+    work = tmp_path / "work"
     pretrain(out, work, options)
     files = {path.name: path.read_bytes() for path in out.iterdir()}
     assert set(files) == {"encoder.onnx", "descriptor.safetensors", "pretrain.log"}
     encoder = load_encoder(out / "encoder.onnx")
-    _, vector = described(encoder(GREY), load_descriptor(out / "descriptor.safetensors"))
+    _, vector = described(
+        encoder(GREY), load_descriptor(out / "descriptor.safetensors")
+    )
     assert torch.isfinite(vector).all()
     pretrain(out, work, options)
     log = (out / "pretrain.log").read_text()
@@ -155,7 +170,8 @@ def ranks(seeds: range, gallery: int, queries: int) -> np.ndarray:
     Both come from the shipped networks: a gallery from one sweep through each room, queries from
     another walk along the same way; a room is as like as its likest gallery image.
     """
-    encoder, descriptor = load_encoder(DESCRIBED_ENCODER), load_descriptor()
+    encoder = load_encoder(DESCRIBED_ENCODER)
+    descriptor = load_descriptor()
     camera = default_camera(256, 192)
 
     def describe(room: BoxRoom, frames: int, path: int) -> Tensor:

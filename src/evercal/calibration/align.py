@@ -66,7 +66,8 @@ class MapAlignment:
 def _in_own_frame(localizer: "Localizer", name: str) -> "Localizer":
     from evercal.localization.localizer import Localizer
 
-    contents, scene = localizer.contents, localizer.contents.scene(name)
+    contents = localizer.contents
+    scene = localizer.contents.scene(name)
     own = replace(scene, frame=MapFrame(pose_sigma=scene.frame.pose_sigma))
     scenes = [own if other is scene else other for other in contents.scenes]
     return Localizer(replace(contents, scenes=scenes), localizer.options)
@@ -109,7 +110,9 @@ def align_by_gripper(
             f"{len(located)} of {len(images)} images were located in {scene}; give at least"
             f" {LEAST_IMAGES} that show it from places that turn about two axes"
         )
-    base_from_gripper = base_from_gripper[np.array([index[item.name] for item in located])]
+    base_from_gripper = base_from_gripper[
+        np.array([index[item.name] for item in located])
+    ]
     map_from_camera = SE3.stack([item.pose for item in located])
     names = tuple(item.name for item in located)
     pairs = PosePairs(names, base_from_gripper, map_from_camera.inverse())
@@ -170,7 +173,8 @@ def align_by_points(
         picks: (name, (h, w, 3) uint8 RGB, pixels (2,) by name of the point) of each image.
         scale_known: Whether the scene was learned in metres.
     """
-    localizer, images = _in_own_frame(localizer, scene), []
+    localizer = _in_own_frame(localizer, scene)
+    images = []
     own = localizer.contents.scene(scene)
     for name, image, pixels in picks:
         [item] = locate(localizer, [(name, image)])
@@ -178,7 +182,8 @@ def align_by_points(
             continue
         # The pose holds for the intrinsics that were estimated with it.
         camera = item.estimate.camera or cameras_in_scenes(None, image, [own])[0]
-        touched, picked = np.stack([points[key] for key in pixels]), np.stack([*pixels.values()])
+        touched = np.stack([points[key] for key in pixels])
+        picked = np.stack([*pixels.values()])
         images.append(Picks(item.pose, camera, touched, tuple(pixels), picked))
     if len(images) < 2:
         raise InputError(
@@ -222,7 +227,9 @@ class Picks(NamedTuple):
     """(k, 2)."""
 
 
-def fit_picks(images: Sequence[Picks], scale_known: bool) -> tuple[Similarity, Array, float]:
+def fit_picks(
+    images: Sequence[Picks], scale_known: bool
+) -> tuple[Similarity, Array, float]:
     """Estimate the pose and, unless it is known, the scale of a map in the base frame.
 
     Also return the covariance (7, 7) of a small motion (v, w) of the base frame and of the
@@ -234,7 +241,9 @@ def fit_picks(images: Sequence[Picks], scale_known: bool) -> tuple[Similarity, A
             f"{len(triangulated)} points were picked in two or more images; give at least three,"
             " each in two images from different places"
         )
-    in_map, in_base = (np.stack(side) for side in zip(*triangulated.values(), strict=True))
+    in_map, in_base = (
+        np.stack(side) for side in zip(*triangulated.values(), strict=True)
+    )
     start = _umeyama(in_map, in_base, scale_known)
     centre = in_base.mean(0)
     before = Rotation.from_quat(start.base_from_map.rotation_wxyz, scalar_first=True)
@@ -250,11 +259,15 @@ def fit_picks(images: Sequence[Picks], scale_known: bool) -> tuple[Similarity, A
     def residuals(small: Array) -> Array:
         return np.concatenate([_distances(image, moved(small)) for image in images])
 
-    fit = least_squares(residuals, np.zeros(6 if scale_known else 7), loss="cauchy", f_scale=2.0)
+    fit = least_squares(
+        residuals, np.zeros(6 if scale_known else 7), loss="cauchy", f_scale=2.0
+    )
     off = residuals(fit.x)
     sigma = max(np.sqrt((off**2).sum() / max(len(off) - len(fit.x), 1)), PICK_SIGMA_PX)
     covariance = np.zeros((7, 7))
-    covariance[: len(fit.x), : len(fit.x)] = sigma**2 * np.linalg.inv(fit.jac.T @ fit.jac)
+    covariance[: len(fit.x), : len(fit.x)] = sigma**2 * np.linalg.inv(
+        fit.jac.T @ fit.jac
+    )
     # From a motion about the points' centre to one about the base's origin.
     slope = np.eye(7)
     slope[:3, 3:6] = cross_matrix(centre)
@@ -270,11 +283,14 @@ def _distances(image: Picks, similarity: Similarity) -> Array:
 
 def _triangulated(images: Sequence[Picks]) -> dict[str, tuple[Array, Array]]:
     """Return each point that two images show in the map and in the base, by name."""
-    centres, across = defaultdict(list), defaultdict(list)
+    centres = defaultdict(list)
+    across = defaultdict(list)
     base: dict[str, Array] = {}
     for image in images:
         rotation = image.map_from_camera.rotation_matrix()
-        for name, point, pixel in zip(image.names, image.points, image.pixels, strict=True):
+        for name, point, pixel in zip(
+            image.names, image.points, image.pixels, strict=True
+        ):
             ray = rotation @ image.camera.unproject(pixel)
             if np.isfinite(ray).all():
                 across[name].append(np.eye(3) - np.outer(ray, ray) / (ray @ ray))
@@ -290,7 +306,8 @@ def _triangulated(images: Sequence[Picks]) -> dict[str, tuple[Array, Array]]:
 
 
 def _umeyama(source: Array, target: Array, scale_known: bool) -> Similarity:
-    a, b = source - source.mean(0), target - target.mean(0)
+    a = source - source.mean(0)
+    b = target - target.mean(0)
     spread = np.linalg.svd(b, compute_uv=False)
     if spread[1] < 0.02 * spread[0]:
         raise InputError(
@@ -300,4 +317,6 @@ def _umeyama(source: Array, target: Array, scale_known: bool) -> Similarity:
     rotation = Rotation.align_vectors(b, a)[0]
     scale = 1.0 if scale_known else float((b * rotation.apply(a)).sum() / (a**2).sum())
     shift = target.mean(0) - scale * rotation.apply(source.mean(0))
-    return Similarity(SE3(rotation.as_quat(canonical=True, scalar_first=True), shift), scale)
+    return Similarity(
+        SE3(rotation.as_quat(canonical=True, scalar_first=True), shift), scale
+    )

@@ -31,17 +31,27 @@ def arm_change(
     """
     from scipy import stats
 
-    names = [", ".join(joint.name for joint in each.joints) for each in (reference, now)]
+    names = [
+        ", ".join(joint.name for joint in each.joints) for each in (reference, now)
+    ]
     if names[0] != names[1]:
-        other = f"the reference is of joints [{names[0]}], the recording of [{names[1]}]"
-        raise InputError(f"{other}: give a recording of the same arm, with its joint values")
+        other = (
+            f"the reference is of joints [{names[0]}], the recording of [{names[1]}]"
+        )
+        raise InputError(
+            f"{other}: give a recording of the same arm, with its joint values"
+        )
     joints = []
     for a, b in zip(reference.joints, now.joints, strict=True):
         sigma = float(np.hypot(a.sigma, b.sigma))
-        joints.append(replace(b, offset=b.offset - a.offset, sigma=sigma, open=a.open or b.open))
+        joints.append(
+            replace(b, offset=b.offset - a.offset, sigma=sigma, open=a.open or b.open)
+        )
     both = [i for i, joint in enumerate(joints) if not joint.open]
     if not both:
-        raise InputError("no joint's offset is determined in both recordings: turn all joints more")
+        raise InputError(
+            "no joint's offset is determined in both recordings: turn all joints more"
+        )
     change, sigma = np.array([(joints[i].offset, joints[i].sigma) for i in both]).T
     covariance = reference.joint_covariance + now.joint_covariance
     weight = np.linalg.inv(covariance[np.ix_(both, both)])

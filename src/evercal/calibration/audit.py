@@ -58,7 +58,9 @@ def audit(
     """
     audited = []
     for episode in episode_folders(folder):
-        audited.append(_audited(localizer, episode, _shots(episode, stated, images), agreement))
+        audited.append(
+            _audited(localizer, episode, _shots(episode, stated, images), agreement)
+        )
         on_episode()
     return audited
 
@@ -67,19 +69,27 @@ def episode_folders(folder: Path) -> list[Path]:
     """Return the folders of the episodes, sorted by name."""
     inside = sorted(p for p in folder.glob("*/") if not p.name.startswith("."))
     if not inside:
-        raise InputError(f"{folder}: no folders in it; give the folder that holds the episodes")
+        raise InputError(
+            f"{folder}: no folders in it; give the folder that holds the episodes"
+        )
     return inside
 
 
 def _audited(
-    localizer: "Localizer", episode: Path, shots: Sequence[_Shot], agreement: tuple[float, float]
+    localizer: "Localizer",
+    episode: Path,
+    shots: Sequence[_Shot],
+    agreement: tuple[float, float],
 ) -> Episode:
-    differences, reason = [], ""
+    differences = []
+    reason = ""
     for name, image, camera, base_from_camera in shots:
         [item] = locate(localizer, [(name, image)], camera)
         if item.is_located:
             in_stated = base_from_camera.inverse() @ item.pose
-            differences.append(ImagePose(name, item.estimate, in_stated, item.covariance))
+            differences.append(
+                ImagePose(name, item.estimate, in_stated, item.covariance)
+            )
         else:
             reason = item.estimate.reason
     if not differences:
@@ -88,12 +98,18 @@ def _audited(
     localizer.contents.metric_scene(fused.scene)
     millimetres, degrees = pose_distance_mm_deg(fused.pose, SE3.identity())
     wrong = millimetres > agreement[0] or degrees > agreement[1]
-    reason = f"stated pose is {millimetres:.1f} mm and {degrees:.2f} deg from the images"
-    return Episode(episode.name, "wrong" if wrong else "right", reason, millimetres, degrees)
+    reason = (
+        f"stated pose is {millimetres:.1f} mm and {degrees:.2f} deg from the images"
+    )
+    return Episode(
+        episode.name, "wrong" if wrong else "right", reason, millimetres, degrees
+    )
 
 
 def _shots(episode: Path, stated: SE3 | None, count: int) -> list[_Shot]:
-    pose_file = next((episode / name for name in POSE_FILES if (episode / name).is_file()), None)
+    pose_file = next(
+        (episode / name for name in POSE_FILES if (episode / name).is_file()), None
+    )
     pose = stated if pose_file is None else read_transform(pose_file)
     if recognised(episode) is not None:
         scene = load_recording(episode)
@@ -109,7 +125,9 @@ def _shots(episode: Path, stated: SE3 | None, count: int) -> list[_Shot]:
                 " the pose of all episodes with --calibration"
             )
         every = [(file.name, file, None, pose) for file in files]
-    shots = [(name, image, camera, at) for name, image, camera, at in every if at is not None]
+    shots = [
+        (name, image, camera, at) for name, image, camera, at in every if at is not None
+    ]
     if not shots:
         raise InputError(f"{episode}: no images with a stated camera pose in it")
     chosen = np.unique(np.linspace(0, len(shots) - 1, count).round().astype(int))

@@ -29,7 +29,8 @@ from evercal.recordings.text_files import read_text
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
 
-FORMAT, VERSION = "evercal-calibration", 1
+FORMAT = "evercal-calibration"
+VERSION = 1
 
 
 @dataclass(frozen=True)
@@ -123,29 +124,43 @@ class Calibration:
     joints: tuple[JointOffset, ...] = ()
     """Offsets of the k joints of the arm, if its joint values were stated. The transform is that of
     an arm that moves with them."""
-    joint_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    joint_covariance: NDArray[np.float64] = field(
+        default_factory=lambda: np.zeros((0, 0))
+    )
     """(k, k) of the offsets."""
 
     def __post_init__(self) -> None:
         covariance = np.array(self.covariance, dtype=np.float64)
         if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
-            raise ValueError(f"a covariance is (6, 6) and finite, got {covariance.shape}")
+            raise ValueError(
+                f"a covariance is (6, 6) and finite, got {covariance.shape}"
+            )
         if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-18):
             raise ValueError("a covariance is symmetric, got one that is not")
-        if np.linalg.eigvalsh(covariance).min() < -1e-9 * max(np.trace(covariance), 1e-30):
-            raise ValueError("a covariance has no negative eigenvalue, got one that has")
+        if np.linalg.eigvalsh(covariance).min() < -1e-9 * max(
+            np.trace(covariance), 1e-30
+        ):
+            raise ValueError(
+                "a covariance has no negative eigenvalue, got one that has"
+            )
         if self.parent_frame == self.child_frame:
-            raise ValueError(f"parent and child frame are both called {self.parent_frame!r}")
+            raise ValueError(
+                f"parent and child frame are both called {self.parent_frame!r}"
+            )
         object.__setattr__(self, "covariance", covariance)
-        k, of_joints = len(self.joints), np.array(self.joint_covariance, dtype=np.float64)
+        k = len(self.joints)
+        of_joints = np.array(self.joint_covariance, dtype=np.float64)
         if of_joints.size != k * k:
-            raise ValueError(f"the covariance of {k} joints is ({k}, {k}), got {of_joints.shape}")
+            raise ValueError(
+                f"the covariance of {k} joints is ({k}, {k}), got {of_joints.shape}"
+            )
         object.__setattr__(self, "joint_covariance", of_joints.reshape(k, k))
 
     @property
     def meaning(self) -> str:
         """The direction in words."""
-        child, parent = self.child_frame, self.parent_frame
+        child = self.child_frame
+        parent = self.parent_frame
         return f"pose of {child} in {parent}: takes points from {child} to {parent}"
 
     @property
@@ -197,12 +212,18 @@ class Calibration:
     @classmethod
     def _from_mapping(cls, data: Mapping[str, Any]) -> Self:
         if data.get("mount") not in get_args(Mount):
-            raise ValueError(f"'mount' is one of {get_args(Mount)}, got {data.get('mount')!r}")
+            raise ValueError(
+                f"'mount' is one of {get_args(Mount)}, got {data.get('mount')!r}"
+            )
         for name in ("checks", "source"):
             if not isinstance(data.get(name, {}), Mapping):
                 raise ValueError(f"{name!r} is an object")
-        pose, lens = SE3(data["quaternion_wxyz"], data["translation_m"]), data.get("camera")
-        if "matrix" in data and max(pose_distance(pose, SE3.from_matrix(data["matrix"]))) > 1e-6:
+        pose = SE3(data["quaternion_wxyz"], data["translation_m"])
+        lens = data.get("camera")
+        if (
+            "matrix" in data
+            and max(pose_distance(pose, SE3.from_matrix(data["matrix"]))) > 1e-6
+        ):
             raise ValueError(
                 "'matrix' and 'translation_m', 'quaternion_wxyz' are different poses; the file was"
                 " edited by hand: change all of them or leave 'matrix' out"
@@ -279,7 +300,9 @@ class Rig:
         return {
             "format": "evercal-rig",
             "version": 1,
-            "cameras": {name: camera.to_dict() for name, camera in self.cameras.items()},
+            "cameras": {
+                name: camera.to_dict() for name, camera in self.cameras.items()
+            },
             "relative": [
                 {
                     "parent_frame": first,

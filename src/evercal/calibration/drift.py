@@ -81,12 +81,18 @@ def check(
     """Test whether a camera has moved since its calibration, see `Map.check`."""
     _require_fixed(reference)
     located = locate(localizer, images, camera or reference.camera, on_image)
-    if shows_held_thing(localizer, located, base_from_gripper) and base_from_gripper is not None:
+    if (
+        shows_held_thing(localizer, located, base_from_gripper)
+        and base_from_gripper is not None
+    ):
         if (another := held_again(located, base_from_gripper)) is not None:
             calibration = another.solution.calibration()
-            now, uses = calibration.uncertain_pose, calibration.images
+            now = calibration.uncertain_pose
+            uses = calibration.images
             covariance = now.covariance + reference.covariance
-            return shift_of(reference, now.pose, covariance, CONFIDENCE, uses, another.sentence)
+            return shift_of(
+                reference, now.pose, covariance, CONFIDENCE, uses, another.sentence
+            )
         # The lens errs now as it did then. The map does not: the thing is seen from another side.
         located = in_parent_frame(of_cause(located, lens=False), base_from_gripper)
         shift = shift_between(reference, fuse(located), located, localizer)
@@ -112,16 +118,22 @@ def shift_between(
     if same:
         # One camera in one map: the scatter of its images is the same before and now.
         before = int(reference.checks.get("images_used", 1))
-        measured.append((np.array(reference.checks.get("image_scatter", np.zeros((6, 6)))), before))
+        measured.append(
+            (np.array(reference.checks.get("image_scatter", np.zeros((6, 6)))), before)
+        )
         scatter = _scatter(measured)
         covariance = scatter / count + scatter / before + floor
         if scene.parent_frame == "gripper":
-            covariance += np.mean([item.covariance for item in fused.select(located)], 0) / count
+            covariance += (
+                np.mean([item.covariance for item in fused.select(located)], 0) / count
+            )
     else:
         used = [item.covariance for item in fused.select(located)]
         covariance = _scatter(measured) / count + floor
         covariance = covariance + reference.covariance + np.mean(used, axis=0)
-    return shift_of(reference, fused.pose, covariance, confidence, fused.uses, same_map=same)
+    return shift_of(
+        reference, fused.pose, covariance, confidence, fused.uses, same_map=same
+    )
 
 
 def _require_fixed(reference: Calibration) -> None:
@@ -155,7 +167,8 @@ def shift_of(
         sigma_mm=sigma_mm,
         sigma_deg=sigma_deg,
         confidence=probability,
-        moved=probability >= confidence and (millimetres > _LEAST_MM or degrees > _LEAST_DEG),
+        moved=probability >= confidence
+        and (millimetres > _LEAST_MM or degrees > _LEAST_DEG),
         same_map=same_map,
         images=images,
         note=note,
@@ -163,7 +176,9 @@ def shift_of(
 
 
 def _scatter(measured: Sequence[tuple[Array, int]]) -> Array:
-    total, weight = _USUAL_WEIGHT * np.diag(_USUAL_SCATTER**2), _USUAL_WEIGHT
+    total = _USUAL_WEIGHT * np.diag(_USUAL_SCATTER**2)
+    weight = _USUAL_WEIGHT
     for scatter, count in measured:
-        total, weight = total + (count - 1) * scatter, weight + count - 1
+        total = total + (count - 1) * scatter
+        weight = weight + count - 1
     return total / weight

@@ -49,7 +49,11 @@ SPOT_M, SPOT_RAD = 0.1, np.deg2rad(10.0)
 
 
 ImageSource = (
-    str | os.PathLike[str] | np.ndarray | Sequence[str | os.PathLike[str]] | Sequence[np.ndarray]
+    str
+    | os.PathLike[str]
+    | np.ndarray
+    | Sequence[str | os.PathLike[str]]
+    | Sequence[np.ndarray]
 )
 """A folder, an image file or an array (H, W, 3), or several files or arrays."""
 
@@ -82,10 +86,13 @@ class Images:
         items: list[Any] = [source] if single else [*source]  # pyright: ignore[reportGeneralTypeIssues]
         if not items or isinstance(items[0], str | os.PathLike):
             files = image_files(items)
-            poses, notes = robot_poses, []
+            poses = robot_poses
+            notes = []
             if isinstance(poses, str | os.PathLike):
                 poses, notes = poses_of_images(Path(poses), files, convention)
-            return cls([(str(path), path) for path in files], camera, poses, tuple(notes))
+            return cls(
+                [(str(path), path) for path in files], camera, poses, tuple(notes)
+            )
         if isinstance(robot_poses, str | os.PathLike):
             raise InputError(
                 f"{robot_poses}: a file of robot poses is paired with image files by name, time or"
@@ -112,15 +119,20 @@ def calibrate(
             " image"
         )
     if mount == "eye_in_hand" and grippers is None:
-        raise InputError("eye_in_hand needs the gripper's pose at every image: give --robot-poses")
+        raise InputError(
+            "eye_in_hand needs the gripper's pose at every image: give --robot-poses"
+        )
     located = locate(localizer, given.images, given.camera, on_image)
     held = shows_held_thing(localizer, located, grippers)
     if held and mount == "eye_in_hand":
-        raise InputError("eye_in_hand: the gripper holds the scene, which shows fixed cameras only")
+        raise InputError(
+            "eye_in_hand: the gripper holds the scene, which shows fixed cameras only"
+        )
     if mount is None:
         still = held or grippers is None or _stands_still(located)
         mount = "eye_to_hand" if still else "eye_in_hand"
-    moved, parents = located, None
+    moved = located
+    parents = None
     if grippers is not None and (held or mount == "eye_in_hand"):
         parents = grippers if held else grippers.inverse()
         moved = in_parent_frame(located, parents)
@@ -135,7 +147,11 @@ def calibrate(
     }
     stated = cameras_in_scenes(given.camera, first, [scene])[0]
     camera = estimated_camera(fused.select(located), stated)
-    if held and grippers is not None and (another := held_again(located, grippers)) is not None:
+    if (
+        held
+        and grippers is not None
+        and (another := held_again(located, grippers)) is not None
+    ):
         calibration = another.solution.calibration()
         own = in_parent_frame(of_cause(located, lens=True), grippers)
         shown = [item.covariance for item in own if item.is_located]
@@ -180,7 +196,9 @@ def calibrate(
 
 def estimated_camera(used: Sequence[ImagePose], stated: Camera) -> Camera:
     """The stated intrinsics, or the median of the images' own if they contradict these."""
-    cameras = [item.estimate.camera for item in used if item.estimate.camera is not None]
+    cameras = [
+        item.estimate.camera for item in used if item.estimate.camera is not None
+    ]
     if not cameras:
         return stated
     rows = [[c.fx, c.fy, c.cx, c.cy, *c.coefficients] for c in cameras]
@@ -191,12 +209,15 @@ def estimated_camera(used: Sequence[ImagePose], stated: Camera) -> Camera:
     pixels = np.stack(np.meshgrid(*across.T), -1)
     # Compare angles between rays: the principal point trades against the rotation.
     shift = median.unproject(pixels) - stated.unproject(pixels)
-    off = np.nanmax(np.linalg.norm((shift - np.nanmean(shift, (0, 1)))[..., :2], axis=-1))
+    off = np.nanmax(
+        np.linalg.norm((shift - np.nanmean(shift, (0, 1)))[..., :2], axis=-1)
+    )
     return median if stated.fx * off > CONTRADICTED_PX else stated
 
 
 def _stands_still(located: Sequence[ImagePose]) -> bool:
-    fused, items = fuse(located), [item for item in located if item.is_located]
+    fused = fuse(located)
+    items = [item for item in located if item.is_located]
     if len(items) < 2:
         raise InputError(
             "one located image does not show whether the camera moves with the gripper: state it"
@@ -213,7 +234,11 @@ def _from_one_spot(
     used = fused.select(located)
     shared = np.mean([item.covariance for item in used], axis=0)
     own = fused.scatter / len(used)
-    name = f"scatter of {len(used)} images" if len(used) > 1 else "scatter (unknown from one image)"
+    name = (
+        f"scatter of {len(used)} images"
+        if len(used) > 1
+        else "scatter (unknown from one image)"
+    )
     return shared + own, (*_by_cause(used), ErrorTerm.of(name, own))
 
 
@@ -227,12 +252,15 @@ def _from_many_spots(
     """Covariance of a camera that moves in its scene: scatter among spots, one spot, the base."""
     from scipy import stats
 
-    used, cameras = fused.select(moved), [item.pose for item in fused.select(located)]
+    used = fused.select(moved)
+    cameras = [item.pose for item in fused.select(located)]
     spots = _spots(cameras)
     count = int(spots.max()) + 1
     base = np.zeros((6, 6)) if base_covariance is None else base_covariance
     parents = fused.select(list(parent_from_scene))
-    slopes = np.stack([_by_scene_motion(p, c) for p, c in zip(parents, cameras, strict=True)])
+    slopes = np.stack(
+        [_by_scene_motion(p, c) for p, c in zip(parents, cameras, strict=True)]
+    )
     shared = slopes.mean(0) @ base @ slopes.mean(0).T
     whole = np.mean([item.covariance for item in used], axis=0)
     own = (whole - (slopes @ base @ slopes.transpose(0, 2, 1)).mean(0)) / count
@@ -274,7 +302,9 @@ def _by_cause(used: Sequence[ImagePose], spots: int = 1) -> tuple[ErrorTerm, ...
         for term in terms:
             total[term.name] += term.covariance
     count = len(used) * spots
-    return tuple(ErrorTerm.of(name, covariance / count) for name, covariance in total.items())
+    return tuple(
+        ErrorTerm.of(name, covariance / count) for name, covariance in total.items()
+    )
 
 
 def _spots(poses: Sequence[SE3]) -> NDArray[np.int64]:
@@ -282,14 +312,18 @@ def _spots(poses: Sequence[SE3]) -> NDArray[np.int64]:
     numbers = []
     for pose in poses:
         distances = (pose_distance(centre, pose) for centre in centres)
-        near = (i for i, (m, rad) in enumerate(distances) if m < SPOT_M and rad < SPOT_RAD)
+        near = (
+            i for i, (m, rad) in enumerate(distances) if m < SPOT_M and rad < SPOT_RAD
+        )
         numbers.append(next(near, len(centres)))
         if numbers[-1] == len(centres):
             centres.append(pose)
     return np.array(numbers)
 
 
-def _advice(calibration: Calibration, fused: Fused, camera: Camera, stated: Camera) -> list[str]:
+def _advice(
+    calibration: Calibration, fused: Fused, camera: Camera, stated: Camera
+) -> list[str]:
     advice = []
     if camera != stated:
         advice.append(
@@ -302,14 +336,17 @@ def _advice(calibration: Calibration, fused: Fused, camera: Camera, stated: Came
             f"The intrinsics are those of the camera that recorded {fused.scene}: give --camera if"
             " another camera took these images."
         )
-    used, lost = int(fused.used.sum()), int((~fused.used).sum())
+    used = int(fused.used.sum())
+    lost = int((~fused.used).sum())
     if lost > used:
         advice.append(
             f"{lost} of {used + lost} images were rejected: the camera may have moved between them,"
             " see the reasons."
         )
     if used == 1:
-        advice.append("It rests on one image: give five or more to measure their scatter.")
+        advice.append(
+            "It rests on one image: give five or more to measure their scatter."
+        )
     elif calibration.mount == "eye_to_hand" and used >= 5:
         near = largest_term(calibration.error_terms)[0] in ("view", "map")
         advice.append(
@@ -325,11 +362,21 @@ def _lens_advice(calibration: Calibration) -> list[str]:
         return []
     moves = calibration.mount == "eye_in_hand"
     if calibration.source["intrinsics"] == "given":
-        known = f"--camera counts as known to {100 * STATED.focal:g} % of the focal length"
-        more = "images from more spots determine" if moves else "a view with more depth determines"
+        known = (
+            f"--camera counts as known to {100 * STATED.focal:g} % of the focal length"
+        )
+        more = (
+            "images from more spots determine"
+            if moves
+            else "a view with more depth determines"
+        )
         advice = f"{known}; {more} it better"
     else:
-        advice = "give --camera with intrinsics from images of a board ('evercal detect')"
+        advice = (
+            "give --camera with intrinsics from images of a board ('evercal detect')"
+        )
         advice += ", or images from more spots" if moves else ""
     percent = f"{100 * share:.0f} %"
-    return [f"The lens is the largest term, {percent} of the position's variance: {advice}."]
+    return [
+        f"The lens is the largest term, {percent} of the position's variance: {advice}."
+    ]

@@ -15,8 +15,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, JointOffset
-from evercal.calibration.hand_eye_start import HandEyeStart, hand_eye_start, scene_from_parent
+from evercal.calibration.calibration import (
+    Calibration,
+    ErrorTerm,
+    ImageUse,
+    JointOffset,
+)
+from evercal.calibration.hand_eye_start import (
+    HandEyeStart,
+    hand_eye_start,
+    scene_from_parent,
+)
 from evercal.calibration.held_thing import cropped, moving_parts, windows
 from evercal.calibration.located import deviations, length_mm_deg
 from evercal.calibration.next_views import open_position
@@ -27,7 +36,13 @@ from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
 from evercal.mapping.arm_offsets import ArmOffsets, has_joints
 from evercal.mapping.build import Adjusted, BuiltMap, HandEyeCorrection
 from evercal.progress import OnProgress
-from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame, Mount, Recording, stated_grippers
+from evercal.recordings.frame import (
+    MIN_GRIPPER_FRAMES,
+    Frame,
+    Mount,
+    Recording,
+    stated_grippers,
+)
 from evercal.recordings.held_out import require_frames
 
 if TYPE_CHECKING:
@@ -87,7 +102,10 @@ class HandEyeReport:
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """The inverse of `asdict`."""
         kinds = {"error_terms": ErrorTerm, "images": ImageUse, "joints": JointOffset}
-        rows = {key: tuple(of(**row) for row in values.get(key, ())) for key, of in kinds.items()}
+        rows = {
+            key: tuple(of(**row) for row in values.get(key, ()))
+            for key, of in kinds.items()
+        }
         return cls(**{**values, **rows})
 
     @property
@@ -98,10 +116,17 @@ class HandEyeReport:
 
     def calibration(self, camera: Camera, scene: str, frames: int) -> Calibration:
         """Return the estimate as a calibration with the intrinsics that the map adjusted."""
-        estimate, fixed = self.parent_from_camera, self.mount == "eye_to_hand"
+        estimate = self.parent_from_camera
+        fixed = self.mount == "eye_to_hand"
         scatter = [list(row) for row in self.image_scatter]
-        checks = {"images_used": self.images_located, "image_scatter": scatter} if scatter else {}
-        checks |= {"joints_move_mm": [*self.joints_move_mm]} if self.joints_move_mm else {}
+        checks = (
+            {"images_used": self.images_located, "image_scatter": scatter}
+            if scatter
+            else {}
+        )
+        checks |= (
+            {"joints_move_mm": [*self.joints_move_mm]} if self.joints_move_mm else {}
+        )
         calibration = Calibration(
             self.mount,
             estimate.pose,
@@ -138,7 +163,9 @@ def posed_by_gripper(
     Frames without a gripper pose count as untracked. Those of a fixed camera get poses in the frame
     of the gripper, and windows around what it holds.
     """
-    frames = tuple(frame for frame in recording.train if frame.base_from_gripper is not None)
+    frames = tuple(
+        frame for frame in recording.train if frame.base_from_gripper is not None
+    )
     require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
     if mount == "eye_to_hand":
         frames, _ = moving_parts(frames)
@@ -159,7 +186,8 @@ def posed_by_gripper(
     if mount == "eye_to_hand" and (around := windows(frames, start)) is not None:
         frames = tuple(cropped(*both) for both in zip(frames, around, strict=True))
     train = tuple(
-        replace(frame, base_from_camera=pose) for frame, pose in zip(frames, poses, strict=True)
+        replace(frame, base_from_camera=pose)
+        for frame, pose in zip(frames, poses, strict=True)
     )
     lost = len(recording.train) - len(frames)
     posed = replace(recording, train=train, untracked=recording.untracked + lost)
@@ -167,7 +195,10 @@ def posed_by_gripper(
 
 
 def hand_eye_report(
-    start: HandEyeStart, built: BuiltMap, frames: Sequence[Frame], given: SE3 | None = None
+    start: HandEyeStart,
+    built: BuiltMap,
+    frames: Sequence[Frame],
+    given: SE3 | None = None,
 ) -> HandEyeReport:
     """Return the estimate of a map that was built from `frames` with `MapOptions.for_hand_eye`.
 
@@ -177,13 +208,19 @@ def hand_eye_report(
     assert correction is not None, "the map was built for a hand-eye calibration"
     _refuse_slip(frames, correction, start.mount)
     # The covariance of the correction is about camera axes, as that of a pose after an exact one.
-    start_from_camera = UncertainPose(correction.start_camera_from_camera, correction.covariance)
+    start_from_camera = UncertainPose(
+        correction.start_camera_from_camera, correction.covariance
+    )
     estimate = start.parent_from_camera @ start_from_camera
     start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.parent_from_camera)
     fixed = start.mount == "eye_to_hand"
     left = None if fixed else open_position(stated_grippers(frames), estimate.pose)
-    widest_mm = 1000 * float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1]))
-    from_given = (None, None) if given is None else pose_distance_mm_deg(estimate.pose, given)
+    widest_mm = 1000 * float(
+        np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1])
+    )
+    from_given = (
+        (None, None) if given is None else pose_distance_mm_deg(estimate.pose, given)
+    )
     return HandEyeReport(
         translation_m=tuple(estimate.pose.translation_m.tolist()),
         quaternion_wxyz=tuple(estimate.pose.rotation_wxyz.tolist()),
@@ -203,12 +240,16 @@ def hand_eye_report(
             ErrorTerm.of("intrinsics", correction.by_lens),
             ErrorTerm.of("slowly varying errors of gripper poses", correction.by_drift),
         ),
-        images=tuple(use for frame in frames if (use := _use(frame, built)) is not None),
+        images=tuple(
+            use for frame in frames if (use := _use(frame, built)) is not None
+        ),
         joints=() if correction.arm is None else _joint_offsets(correction.arm),
         joint_covariance=()
         if correction.arm is None
         else tuple(tuple(row) for row in correction.arm.covariance.tolist()),
-        joints_move_mm=() if correction.arm is None else _moved_mm(correction.arm, frames),
+        joints_move_mm=()
+        if correction.arm is None
+        else _moved_mm(correction.arm, frames),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
 
@@ -222,7 +263,9 @@ def with_image_scatter(
     """
     posed = [frame for frame in frames if frame.base_from_gripper is not None]
     camera = report.parent_from_camera.pose
-    found = [localizer.localize(f.read_image(), f.camera).base_from_camera for f in posed]
+    found = [
+        localizer.localize(f.read_image(), f.camera).base_from_camera for f in posed
+    ]
     poses = [
         frame.base_from_gripper @ pose
         for frame, pose in zip(posed, found, strict=True)
@@ -235,7 +278,9 @@ def with_image_scatter(
     return replace(report, image_scatter=rows, images_located=len(off))
 
 
-def _refuse_slip(frames: Sequence[Frame], correction: HandEyeCorrection, mount: Mount) -> None:
+def _refuse_slip(
+    frames: Sequence[Frame], correction: HandEyeCorrection, mount: Mount
+) -> None:
     """Refuse a recording of a fixed camera in which the camera or the thing moved once.
 
     A thing that slips in the gripper steps in the gripper's residuals, a camera in its own.
@@ -249,7 +294,8 @@ def _refuse_slip(frames: Sequence[Frame], correction: HandEyeCorrection, mount: 
             (correction.residuals, "what the gripper holds"),
             (correction.moved, "the camera"),
         )
-        if (step := largest_step(np.array([values[name] for name in names]))) is not None
+        if (step := largest_step(np.array([values[name] for name in names])))
+        is not None
     ]
     if steps:
         step, what = max(steps, key=lambda both: both[0].share)
@@ -275,15 +321,24 @@ def largest_step(values: NDArray[np.float64]) -> Step | None:
     """The step that explains most of deviations (n, 6), metres and radians; None by chance."""
     from scipy import stats
 
-    n, best = len(values), None
+    n = len(values)
+    best = None
     for k in range(2, n - 1):
         size = values[k:].mean(0) - values[:k].mean(0)
         total = ((values - values.mean(0)) ** 2).reshape(n, 2, 3).sum((0, 2))
         by_step = k * (n - k) / n * (size**2).reshape(2, 3).sum(1)
         rest = np.maximum(total - by_step, 1e-18)
-        chance = stats.f.sf((by_step / 3) / (rest / (3 * (n - 2))), 3, 3 * (n - 2)).min() * 2 * n
+        chance = (
+            stats.f.sf((by_step / 3) / (rest / (3 * (n - 2))), 3, 3 * (n - 2)).min()
+            * 2
+            * n
+        )
         share = float((by_step / np.maximum(total, 1e-18)).max())
-        if chance < SLIP_CHANCE and share > SLIP_SHARE and (best is None or share > best.share):
+        if (
+            chance < SLIP_CHANCE
+            and share > SLIP_SHARE
+            and (best is None or share > best.share)
+        ):
             best = Step(k, size, share)
     return best
 
@@ -296,28 +351,38 @@ def _use(frame: Frame, built: BuiltMap) -> ImageUse | None:
     if frame.name in built.adjusted.untracked:
         return ImageUse(name, False, "it could not be tracked in other images")
     residual = built.hand_eye.residuals.get(frame.name)
-    return None if residual is None else ImageUse(name, True, "", *length_mm_deg(residual))
+    return (
+        None if residual is None else ImageUse(name, True, "", *length_mm_deg(residual))
+    )
 
 
 def _joint_offsets(arm: ArmOffsets) -> tuple[JointOffset, ...]:
     """The offsets, and why some are not determined."""
-    free, rotates, rows = arm.arm.free(), arm.arm.rotates(), []
+    free = arm.arm.free()
+    rotates = arm.arm.rotates()
+    rows = []
     for i, name in enumerate(arm.arm.joints):
         why = ""
         if not free[i]:
             what = "base" if i == 0 else "gripper"
-            why = f"its offset turns the frame of the {what}: a mark at its zero shows it"
+            why = (
+                f"its offset turns the frame of the {what}: a mark at its zero shows it"
+            )
         elif not arm.determined[i]:
             why = f"move {name} and the joints after it more between the images"
         sigma = arm.prior[i] if why else np.sqrt(arm.covariance[i, i])
-        rows.append(JointOffset(name, float(arm.values[i]), float(sigma), bool(rotates[i]), why))
+        rows.append(
+            JointOffset(name, float(arm.values[i]), float(sigma), bool(rotates[i]), why)
+        )
     return tuple(rows)
 
 
 def _moved_mm(offsets: ArmOffsets, frames: Sequence[Frame]) -> tuple[float, ...]:
     """Mean and largest way of the gripper by the offsets."""
     values = np.array([f.joints_rad for f in frames if f.joints_rad is not None])
-    before, after = (offsets.arm.poses(values + added) for added in (0.0, offsets.values))
+    before, after = (
+        offsets.arm.poses(values + added) for added in (0.0, offsets.values)
+    )
     ways = 1000 * np.linalg.norm(after.translation_m - before.translation_m, axis=1)
     return float(ways.mean()), float(ways.max())
 

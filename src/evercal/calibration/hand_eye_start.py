@@ -129,7 +129,8 @@ def hand_eye_start(
     require_rotations(poses, LEAST_ROTATION_DEG, LEAST_ROTATION_DEG)
     if len(frames) > FRAMES:
         some = spread_poses(poses, FRAMES)
-        frames, poses = [frames[i] for i in some], poses[some]
+        frames = [frames[i] for i in some]
+        poses = poses[some]
     pairs = image_pairs(frames, mount, encoder, on_progress)
     joints = arm and Joints(arm, np.array([frame.joints_rad for frame in frames]))
     try:
@@ -151,7 +152,9 @@ def _refuse_other_mount(
         with suppress(InputError):
             rivals.append(solve_pairs(poses, pairs, other))
     rival = min(rivals, key=lambda rival: rival.distance_deg, default=None)
-    if rival is None or (start is not None and rival.distance_deg > start.distance_deg / 2):
+    if rival is None or (
+        start is not None and rival.distance_deg > start.distance_deg / 2
+    ):
         return
     another = "the camera moves with the gripper ('evercal learn MAP RECORDING --calibration FILE')"
     if mount == "eye_in_hand":
@@ -175,7 +178,8 @@ def solve_pairs(
         )
     epipolar = _EpipolarFit(poses, pairs, SPREAD_M[mount])
     epipolar.rotation = _first_rotation(poses, pairs, mount)
-    starts, most = epipolar.starts(mount), np.deg2rad(AGREE_DEG)
+    starts = epipolar.starts(mount)
+    most = np.deg2rad(AGREE_DEG)
     fits = [epipolar.solve(start, np.mean(starts, axis=0)) for start in starts]
     best = min(fits, key=lambda x: np.minimum(epipolar.medians(x), most).mean())
     if joints is not None:
@@ -212,8 +216,12 @@ def _first_rotation(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> Rot
     angle, and these distances are not.
     """
     some = np.unique(np.linspace(0, len(pairs) - 1, FIRST_PAIRS).round().astype(int))
-    epipolar = _EpipolarFit(poses, [pairs[i] for i in some], SPREAD_M[mount], FIRST_MATCHES)
-    scale, best, least = np.deg2rad(ANGLE_DEG), Rotation.identity(), np.inf
+    epipolar = _EpipolarFit(
+        poses, [pairs[i] for i in some], SPREAD_M[mount], FIRST_MATCHES
+    )
+    scale = np.deg2rad(ANGLE_DEG)
+    best = Rotation.identity()
+    least = np.inf
     for rotation in spread_rotations(ROTATIONS):
         epipolar.rotation = rotation
         fit = least_squares(
@@ -226,7 +234,8 @@ def _first_rotation(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> Rot
         )
         cost = np.minimum(np.abs(epipolar.distances(fit.x)), scale).mean()
         if cost < least:
-            best, least = Rotation.from_rotvec(fit.x[:3]) * rotation, cost
+            best = Rotation.from_rotvec(fit.x[:3]) * rotation
+            least = cost
     return best
 
 
@@ -236,8 +245,15 @@ def spread_rotations(count: int) -> Rotation:
     A spiral through all unit quaternions: Alexa, Super-Fibonacci spirals (CVPR 2022).
     """
     share = (np.arange(count) + 0.5) / count
-    inner, outer = np.sqrt(share), np.sqrt(1 - share)
-    a, b = 2 * np.pi * count * share / np.array([[np.sqrt(2)], [1.533751168755204288118041]])
+    inner = np.sqrt(share)
+    outer = np.sqrt(1 - share)
+    a, b = (
+        2
+        * np.pi
+        * count
+        * share
+        / np.array([[np.sqrt(2)], [1.533751168755204288118041]])
+    )
     parts = inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)
     return Rotation.from_quat(np.stack(parts, -1))
 
@@ -246,10 +262,16 @@ class _EpipolarFit:
     """Sampson distances of matches from the epipolar lines of a transform, as angles."""
 
     def __init__(
-        self, poses: SE3, pairs: Sequence[ImagePair], spread_m: float, most: int = MATCHES
+        self,
+        poses: SE3,
+        pairs: Sequence[ImagePair],
+        spread_m: float,
+        most: int = MATCHES,
     ):
-        self.rotation, self.spread_m = Rotation.identity(), spread_m
-        self.matrices, self.pairs = poses.matrix(), pairs
+        self.rotation = Rotation.identity()
+        self.spread_m = spread_m
+        self.matrices = poses.matrix()
+        self.pairs = pairs
         self.moving: Callable[[Array], Array] = lambda _: self.matrices
         self.ends = np.array([pair[:2] for pair in pairs])
         some = [
@@ -263,7 +285,9 @@ class _EpipolarFit:
     def starts(self, mount: Mount) -> list[Array]:
         """First parameters (6,): rotation vector after `rotation`, position."""
         if mount == "eye_in_hand":
-            beside = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * BESIDE_M
+            beside = (
+                np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * BESIDE_M
+            )
             return list(np.pad(beside, ((0, 0), (3, 0))))
         towards = self.rotation.apply(np.concatenate([self.first, self.second]).mean(0))
         towards = towards / np.linalg.norm(towards)
@@ -272,7 +296,8 @@ class _EpipolarFit:
 
     def solve(self, start: Array, centre: Array) -> Array:
         """Minimise from a start, with a prior about `centre`; all are parameters (6,)."""
-        scale, x = float(np.deg2rad(ANGLE_DEG)), start
+        scale = float(np.deg2rad(ANGLE_DEG))
+        x = start
         matches = len(self.number) / len(self.pairs)
 
         def residuals(x: Array, scale: float) -> Array:
@@ -280,7 +305,9 @@ class _EpipolarFit:
             spread = np.where(np.arange(len(x)) < 6, self.spread_m, JOINT_SPREAD)[3:]
             away = np.sqrt(matches) * (x - centre)[3:] / spread
             # The loss of these residuals is quadratic: the prior is no outlier.
-            prior = scale * np.sign(away) * np.sqrt(np.expm1(np.minimum(away**2, 500.0)))
+            prior = (
+                scale * np.sign(away) * np.sqrt(np.expm1(np.minimum(away**2, 500.0)))
+            )
             return np.r_[self.distances(x), prior]
 
         for _ in range(3):
@@ -293,16 +320,24 @@ class _EpipolarFit:
                 x_scale=np.r_[X_SCALE, np.full(len(x) - 6, X_SCALE[0])],
                 max_nfev=50,
             ).x
-            scale = min(scale, max(3 * float(np.median(np.abs(self.distances(x)))), 1e-4))
+            scale = min(
+                scale, max(3 * float(np.median(np.abs(self.distances(x)))), 1e-4)
+            )
         return x
 
     def distances(self, x: Array) -> Array:
         """(m,) angles of matches from their epipolar planes, radians."""
         camera = self.moving(x[6:]) @ self.transform(x).matrix()
-        second_from_first = np.linalg.inv(camera[self.ends[:, 1]]) @ camera[self.ends[:, 0]]
+        second_from_first = (
+            np.linalg.inv(camera[self.ends[:, 1]]) @ camera[self.ends[:, 0]]
+        )
         moved = second_from_first[:, :3, 3]
-        direction = moved / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-9)
-        essential = (cross_matrix(direction) @ second_from_first[:, :3, :3])[self.number]
+        direction = moved / np.maximum(
+            np.linalg.norm(moved, axis=1, keepdims=True), 1e-9
+        )
+        essential = (cross_matrix(direction) @ second_from_first[:, :3, :3])[
+            self.number
+        ]
         by_second = np.einsum("mij,mj->mi", essential, self.first)
         by_first = np.einsum("mji,mj->mi", essential, self.second)
         squares = (by_second[:, :2] ** 2).sum(1) + (by_first[:, :2] ** 2).sum(1)
@@ -311,7 +346,9 @@ class _EpipolarFit:
     def medians(self, x: Array) -> Array:
         """Median distance of the matches of each pair, radians."""
         distance = np.abs(self.distances(x))
-        return np.array([np.median(distance[self.number == i]) for i in range(len(self.pairs))])
+        return np.array(
+            [np.median(distance[self.number == i]) for i in range(len(self.pairs))]
+        )
 
     def transform(self, x: Array) -> SE3:
         """parent_from_camera of parameters (6,)."""
@@ -337,7 +374,9 @@ def image_pairs(
         images.append(grey)
         cameras.append(camera)
         if not fixed:
-            features.append(encoder.encode(grey, ENCODED_SIDE).reshape(-1, encoder.width))
+            features.append(
+                encoder.encode(grey, ENCODED_SIDE).reshape(-1, encoder.width)
+            )
     pairs = (
         _turned_least(frames)
         if fixed
@@ -349,7 +388,9 @@ def image_pairs(
 
         def matched_pair(pair: tuple[int, int]) -> ImagePair | None:
             i, j = pair
-            found = epipolar_pair(points[i], points[j], cameras[i], cameras[j], STILL_PX * fixed)
+            found = epipolar_pair(
+                points[i], points[j], cameras[i], cameras[j], STILL_PX * fixed
+            )
             if found is None:
                 return None
             return ImagePair(i, j, found.rays)
@@ -362,7 +403,9 @@ def image_pairs(
 
 def _turned_least(frames: Sequence[Frame]) -> list[tuple[int, int]]:
     """Pairs of frames, each with those between which the gripper turned least."""
-    rotation = Rotation.from_quat(stated_grippers(frames).rotation_wxyz, scalar_first=True)
+    rotation = Rotation.from_quat(
+        stated_grippers(frames).rotation_wxyz, scalar_first=True
+    )
     pairs = set()
     for i, first in enumerate(rotation):
         nearest = np.argsort((first.inv() * rotation).magnitude(), kind="stable")[1:]

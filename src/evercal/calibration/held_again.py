@@ -40,7 +40,9 @@ class HeldAgain:
         )
 
 
-def held_again(located: Sequence[ImagePose], base_from_gripper: SE3) -> HeldAgain | None:
+def held_again(
+    located: Sequence[ImagePose], base_from_gripper: SE3
+) -> HeldAgain | None:
     """Solve for camera and grip from n images; None if the grip is that of the map.
 
     The poses `located` are in the frame of the map, and `base_from_gripper` is (n,).

@@ -14,7 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.hand_eye_start import HandEyeStart, ImagePair, scene_from_parent
+from evercal.calibration.hand_eye_start import (
+    HandEyeStart,
+    ImagePair,
+    scene_from_parent,
+)
 from evercal.geometry import SE3
 from evercal.recordings.frame import Frame
 from evercal.recordings.masks import without
@@ -40,7 +44,12 @@ def moving_parts(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], float]:
     scale = min(1.0, LONG_SIDE / max(images[0].shape[:2]))
     greys = [
         cv2.resize(
-            cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None, None, scale, scale, cv2.INTER_AREA
+            cv2.cvtColor(image, cv2.COLOR_RGB2GRAY),
+            None,
+            None,
+            scale,
+            scale,
+            cv2.INTER_AREA,
         )
         for image in images
     ]
@@ -48,17 +57,24 @@ def moving_parts(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], float]:
     share = float((still & textured).sum() / max(textured.sum(), 1))
     return tuple(
         replace(frame, image=without(image, _opened(~stands & visible)))
-        for frame, image, stands, visible in zip(frames, images, still, textured, strict=True)
+        for frame, image, stands, visible in zip(
+            frames, images, still, textured, strict=True
+        )
     ), share
 
 
-def _still(greys: Sequence[NDArray[Any]]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _still(
+    greys: Sequence[NDArray[Any]],
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(n, h, w) whether a patch is repeated at its place, and whether it shows anything."""
     size = (PATCH_PX, PATCH_PX)
     images = [grey.astype(np.float32) for grey in greys]
     means = [cv2.blur(image, size) for image in images]
     variances = np.stack(
-        [np.maximum(cv2.blur(i * i, size) - m * m, 0) for i, m in zip(images, means, strict=True)]
+        [
+            np.maximum(cv2.blur(i * i, size) - m * m, 0)
+            for i, m in zip(images, means, strict=True)
+        ]
     )
     # Most of two images is equal but for the noise.
     changes = [
@@ -80,7 +96,12 @@ def _still(greys: Sequence[NDArray[Any]]) -> tuple[NDArray[np.bool_], NDArray[np
 
 def _opened(moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Without single pixels."""
-    return cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    return (
+        cv2.morphologyEx(
+            moving.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
+        )
+        > 0
+    )
 
 
 def windows(frames: Sequence[Frame], start: HandEyeStart) -> NDArray[np.int64] | None:
@@ -91,13 +112,15 @@ def windows(frames: Sequence[Frame], start: HandEyeStart) -> NDArray[np.int64] |
         return None
     inner = np.abs(points - np.median(points, 0))
     points = points[(inner < 4 * np.median(inner, 0) + 1e-6).all(1)]
-    low, high = [], []
+    low = []
+    high = []
     for frame, pose in zip(frames, poses, strict=True):
         pixels = frame.camera.project(pose.inverse().apply(points))
         low.append(np.nanquantile(pixels, 0.01, axis=0))
         high.append(np.nanquantile(pixels, 0.99, axis=0))
     size = np.array([frames[0].camera.width, frames[0].camera.height])
-    low, high = np.clip(low, 0, size - 1), np.clip(high, 0, size - 1)
+    low = np.clip(low, 0, size - 1)
+    high = np.clip(high, 0, size - 1)
     side = int(MARGIN * np.max(high - low)) + 2 * PATCH_PX
     if not np.isfinite(low + high).all() or side > MOST_WINDOW * size.min():
         return None
@@ -110,19 +133,28 @@ def cropped(frame: Frame, window: NDArray[np.int64]) -> Frame:
     left, top, side = window.tolist()
     camera = frame.camera
     image = frame.read_image()[top : top + side, left : left + side]
-    part = replace(camera, width=side, height=side, cx=camera.cx - left, cy=camera.cy - top)
+    part = replace(
+        camera, width=side, height=side, cx=camera.cx - left, cy=camera.cy - top
+    )
     return replace(frame, image=np.ascontiguousarray(image), camera=part)
 
 
 def _points(poses: SE3, pairs: Sequence[ImagePair]) -> NDArray[np.float64]:
     """(m, 3) matches triangulated in the frame of the gripper."""
-    matrices, points = poses.matrix(), [np.zeros((0, 3))]
+    matrices = poses.matrix()
+    points = [np.zeros((0, 3))]
     for pair in pairs:
-        first, second = matrices[pair.first], matrices[pair.second]
-        a, b = pair.rays[0] @ first[:3, :3].T, pair.rays[1] @ second[:3, :3].T
+        first = matrices[pair.first]
+        second = matrices[pair.second]
+        a = pair.rays[0] @ first[:3, :3].T
+        b = pair.rays[1] @ second[:3, :3].T
         between = second[:3, 3] - first[:3, 3]
         # Nearest points of two rays: a s - b t = between.
-        aa, ab, bb = (a * a).sum(1), (a * b).sum(1), (b * b).sum(1)
-        along = (bb * (a @ between) - ab * (b @ between)) / np.maximum(aa * bb - ab**2, 1e-9)
+        aa = (a * a).sum(1)
+        ab = (a * b).sum(1)
+        bb = (b * b).sum(1)
+        along = (bb * (a @ between) - ab * (b @ between)) / np.maximum(
+            aa * bb - ab**2, 1e-9
+        )
         points.append(first[:3, 3] + a * along[:, None])
     return np.concatenate(points)

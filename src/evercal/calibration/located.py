@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from evercal.calibration.calibration import ImageUse
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, UncertainPose, average_poses, pose_distance_mm_deg
+from evercal.geometry import (
+    SE3,
+    Camera,
+    UncertainPose,
+    average_poses,
+    pose_distance_mm_deg,
+)
 from evercal.localization.learned import localize_picture
 from evercal.recordings.images import Picture
 
@@ -77,7 +83,9 @@ def locate(
     return located
 
 
-def in_parent_frame(located: Sequence[ImagePose], parent_from_scene: SE3) -> list[ImagePose]:
+def in_parent_frame(
+    located: Sequence[ImagePose], parent_from_scene: SE3
+) -> list[ImagePose]:
     """Return the n images with `parent_from_camera` as the pose.
 
     `parent_from_scene` (n,) is gripper_from_base for a camera on the gripper, and base_from_gripper
@@ -97,7 +105,11 @@ def of_cause(located: Sequence[ImagePose], lens: bool) -> list[ImagePose]:
     """
     changed = []
     for item in located:
-        terms = [term.covariance for term in item.estimate.terms if (term.name == "lens") == lens]
+        terms = [
+            term.covariance
+            for term in item.estimate.terms
+            if (term.name == "lens") == lens
+        ]
         whole = item.covariance * (not lens)
         covariance = sum(terms, np.zeros((6, 6))) if item.estimate.terms else whole
         changed.append(replace(item, covariance=covariance))
@@ -131,7 +143,9 @@ def fuse(located: Sequence[ImagePose]) -> Fused:
     reasons = [""] * len(located)
     for i, item in enumerate(located):
         if not item.is_located:
-            reasons[i] = f"{item.estimate.status.replace('_', ' ')}: {item.estimate.reason}"
+            reasons[i] = (
+                f"{item.estimate.status.replace('_', ' ')}: {item.estimate.reason}"
+            )
         elif item.estimate.scene != scene:
             reasons[i] = f"shows scene {item.estimate.scene}; most images show {scene}"
     usable = [i for i, reason in enumerate(reasons) if not reason]
@@ -142,13 +156,16 @@ def fuse(located: Sequence[ImagePose]) -> Fused:
     for row, i in enumerate(usable):
         if far[row]:
             millimetres, degrees = length_mm_deg(off[row])
-            reasons[i] = f"lies {millimetres:.1f} mm and {degrees:.2f} deg from the other images"
+            reasons[i] = (
+                f"lies {millimetres:.1f} mm and {degrees:.2f} deg from the other images"
+            )
     near = ~far
     if near.sum() >= 2:
         mean = average_poses(poses[near])
     off = deviations(poses, mean)
     scatter = off[near].T @ off[near] / max(1, near.sum() - 1)
-    uses, residual = [], dict(zip(usable, off, strict=True))
+    uses = []
+    residual = dict(zip(usable, off, strict=True))
     for i, item in enumerate(located):
         size = length_mm_deg(residual[i]) if i in residual else (None, None)
         uses.append(ImageUse(item.name, not reasons[i], reasons[i], *size))
@@ -167,12 +184,16 @@ def _far(off: Array) -> NDArray[np.bool_]:
     distance = np.linalg.norm(off.reshape(-1, 2, 3), axis=2)
     # For three Gaussian axes the median distance is 1.54 standard deviations.
     spread = np.median(distance, axis=0) / 1.54
-    return (distance > np.maximum(_OUTLIER_SIGMAS * spread, (_LEAST_M, _LEAST_RAD))).any(1)
+    return (
+        distance > np.maximum(_OUTLIER_SIGMAS * spread, (_LEAST_M, _LEAST_RAD))
+    ).any(1)
 
 
 def length_mm_deg(off: Array) -> tuple[float, float]:
     """Return the length of one deviation (6,) in millimetres and degrees."""
-    return 1000 * float(np.linalg.norm(off[:3])), float(np.rad2deg(np.linalg.norm(off[3:])))
+    return 1000 * float(np.linalg.norm(off[:3])), float(
+        np.rad2deg(np.linalg.norm(off[3:]))
+    )
 
 
 def halves_apart(poses: SE3) -> tuple[float, float] | None:

@@ -90,7 +90,9 @@ def next_views(
     scene_m = looked_at(recorded @ mount)
     known = _known(recorded, gripper_from_camera, scene_m)
     added = wrist_information(reachable, mount, scene_m)
-    return _chosen(known, added, reachable, count, recorded if excluded is None else excluded)
+    return _chosen(
+        known, added, reachable, count, recorded if excluded is None else excluded
+    )
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,9 @@ class OpenPosition:
         """What to do; by default with the expected standard deviation, or with a stated one."""
         times = 1.0 if stated_mm is None else stated_mm / self.sigma_mm
         along = ", ".join(f"{value:+.2f}" for value in self.direction)
-        now, across, then = (times * s for s in (self.sigma_mm, self.across_mm, self.then_mm))
+        now, across, then = (
+            times * s for s in (self.sigma_mm, self.across_mm, self.then_mm)
+        )
         return (
             f"the motions leave the position along ({along}) of the gripper open: standard"
             f" deviation {now:.1f} mm, {across:.1f} mm across; {_ADDED} more images {self.motion}"
@@ -120,7 +124,9 @@ class OpenPosition:
         )
 
 
-def open_position(recorded: SE3, gripper_from_camera: SE3 | None = None) -> OpenPosition | None:
+def open_position(
+    recorded: SE3, gripper_from_camera: SE3 | None = None
+) -> OpenPosition | None:
     """The direction that (m,) recorded base_from_gripper leave open, and how to close it.
 
     None if a few images would improve it little. Without a rough `gripper_from_camera`, distances
@@ -133,7 +139,8 @@ def open_position(recorded: SE3, gripper_from_camera: SE3 | None = None) -> Open
     known = _known(recorded, gripper_from_camera, scene_m)
     covariance = np.linalg.inv(known)
     variances, axes = np.linalg.eigh(covariance[:3, :3])
-    along, sigmas = axes[:, 2], 1000 * np.sqrt(variances)
+    along = axes[:, 2]
+    sigmas = 1000 * np.sqrt(variances)
     # An error of the scale moves X as far as the scene is away.
     away_m = np.linalg.norm(covariance[:3, 12]) / covariance[12, 12]
     step_m = float(np.clip(_STEP * away_m, *_STEPS_M))
@@ -159,7 +166,8 @@ def open_position(recorded: SE3, gripper_from_camera: SE3 | None = None) -> Open
 
 def _known(recorded: SE3, gripper_from_camera: SE3 | None, scene_m: Array) -> Array:
     """(13, 13) information about X, Z and the scale of the scene."""
-    mount, known = gripper_from_camera or SE3.identity(), np.zeros((13, 13))
+    mount = gripper_from_camera or SE3.identity()
+    known = np.zeros((13, 13))
     known[:6, :6] = np.linalg.inv(_UNKNOWN if gripper_from_camera is None else _ROUGH)
     known[6:12, 6:12] = np.linalg.inv(_ANYWHERE)
     known[12, 12] = _ANY_SCALE**-2
@@ -171,7 +179,9 @@ def _chosen(
 ) -> NextViews:
     """Greedy choice by information `added` (n, N, N) to `known` (N, N); the first six matter."""
     if not len(reachable):
-        raise InputError("no reachable poses; give at least one pose that the arm can go to")
+        raise InputError(
+            "no reachable poses; give at least one pose that the arm can go to"
+        )
     free = np.trace(added, axis1=1, axis2=2) > 0
     for pose in excluded if excluded is not None else ():
         free &= ~_near(pose, reachable)
@@ -194,7 +204,9 @@ def _chosen(
 
 
 def _of_six(information: Array) -> Array:
-    return np.linalg.solve(information, np.eye(information.shape[-1])[:, :6])[..., :6, :]
+    return np.linalg.solve(information, np.eye(information.shape[-1])[:, :6])[
+        ..., :6, :
+    ]
 
 
 def _near(pose: SE3, others: SE3) -> NDArray[np.bool_]:
@@ -209,7 +221,9 @@ def looked_at(base_from_camera: SE3) -> Array:
     ahead = (base_from_camera.translation_m + _AHEAD_M * axes).mean(0)
     # A weak pull towards that point decides where the axes do not.
     weight = 1e-3 * len(axes) * np.eye(3)
-    right = np.einsum("nij,nj->i", across, base_from_camera.translation_m) + weight @ ahead
+    right = (
+        np.einsum("nij,nj->i", across, base_from_camera.translation_m) + weight @ ahead
+    )
     return np.linalg.solve(across.sum(0) + weight, right)
 
 
@@ -223,7 +237,9 @@ def wrist_information(base_from_gripper: SE3, mount: SE3, scene_m: Array) -> Arr
 
 def wrist_jacobian(base_from_gripper: SE3, mount: SE3, scene_m: Array) -> Array:
     """(n, 6, 13) derivatives of residuals by errors of X, of Z and scale about `scene_m` (3,)."""
-    camera_from_scene = (base_from_gripper @ mount).inverse() @ SE3.from_translation(scene_m)
+    camera_from_scene = (base_from_gripper @ mount).inverse() @ SE3.from_translation(
+        scene_m
+    )
     jacobian = np.zeros((len(base_from_gripper), 6, 13))
     jacobian[:, :, :6] = -_of_mount(mount)
     jacobian[:, :, 6:12] = camera_from_scene.adjoint()

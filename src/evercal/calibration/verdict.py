@@ -40,7 +40,10 @@ def expected_error(calibration: Calibration) -> tuple[float, float]:
     rotation = calibration.parent_from_child.rotation_matrix()
     slope = np.concatenate([np.eye(3), -rotation @ cross_matrix([0.0, 0.0, target])], 1)
     at_target = float(np.sqrt(np.trace(slope @ calibration.covariance @ slope.T)))
-    halves = [float(calibration.checks.get(f"repeatability_{u}") or 0.0) / 2 for u in ("mm", "deg")]
+    halves = [
+        float(calibration.checks.get(f"repeatability_{u}") or 0.0) / 2
+        for u in ("mm", "deg")
+    ]
     mm = max(3**0.5 * calibration.sigma_mm, 1000 * at_target, halves[0])
     return mm, max(3**0.5 * calibration.sigma_deg, halves[1])
 
@@ -58,7 +61,9 @@ def verdict(calibration: Calibration) -> str:
     if "held_out_mm" not in checks or "held_out_deg" not in checks:
         return f"{first}."
     held_out = f"{_length(checks['held_out_mm'])} and {checks['held_out_deg']:.2f} deg"
-    return f"{first}; single held-out poses differ by {held_out} (median). {_advice(use)}"
+    return (
+        f"{first}; single held-out poses differ by {held_out} (median). {_advice(use)}"
+    )
 
 
 def _advice(use: Tier | None) -> str:

@@ -19,8 +19,26 @@ from typing import Any
 from evercal.errors import InputError, printable
 
 VERBS = {
-    "Map": ["learn", "localize", "track", "view", "refresh", "evaluate", "info", "map", "serve"],
-    "Calibrate": ["studio", "eye-to-hand", "calibrate", "check", "watch", "audit", "align"],
+    "Map": [
+        "learn",
+        "localize",
+        "track",
+        "view",
+        "refresh",
+        "evaluate",
+        "info",
+        "map",
+        "serve",
+    ],
+    "Calibrate": [
+        "studio",
+        "eye-to-hand",
+        "calibrate",
+        "check",
+        "watch",
+        "audit",
+        "align",
+    ],
     "Boards and pose pairs": ["detect", "solve"],
     "Results": ["export", "report"],
     "Recordings": ["inspect", "convert", "reconstruct", "simulate", "demo"],
@@ -101,11 +119,15 @@ def verb_class(name: str) -> Any:
 def _help() -> str:
     """The overview of `evercal --help`: verbs by purpose, one line each."""
     lines = ["usage: evercal VERB ...", ""]
-    lines.append("Camera poses in the robot base frame from single images; hand-eye calibration.")
+    lines.append(
+        "Camera poses in the robot base frame from single images; hand-eye calibration."
+    )
     for group, names in VERBS.items():
         lines += ["", f"{group}:"]
         for name in names:
-            summary = " ".join((verb_class(name).__doc__ or "").split("\n\n")[0].split())
+            summary = " ".join(
+                (verb_class(name).__doc__ or "").split("\n\n")[0].split()
+            )
             lines.append(f"  {name:11s} {summary.split('; ')[0].rstrip('.')}")
     lines += [
         "",
@@ -128,13 +150,19 @@ def _parse(words: list[str], as_json: bool) -> Any:
     verbs = [name for names in VERBS.values() for name in names]
     if words[0] not in verbs:
         similar = difflib.get_close_matches(words[0], verbs, 1)
-        hint = f"did you mean '{similar[0]}'?" if similar else "'evercal --help' lists all verbs"
+        hint = (
+            f"did you mean '{similar[0]}'?"
+            if similar
+            else "'evercal --help' lists all verbs"
+        )
         raise InputError(f"{words[0]}: no such verb; {hint}")
     import tyro
 
     caught = io.StringIO()
     # tyro draws frames only on a stream whose encoding has them.
-    shown = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding, write_through=True)
+    shown = io.TextIOWrapper(
+        io.BytesIO(), encoding=sys.stdout.encoding, write_through=True
+    )
     try:
         with contextlib.redirect_stderr(caught), contextlib.redirect_stdout(shown):
             return tyro.cli(
@@ -169,4 +197,7 @@ def _box_text(box: str) -> str:
     """The paragraphs of tyro's framed message as one line, without the last one, on --help."""
     text = " ".join(line.strip("│ ") for line in box.splitlines()[1:])
     parts = [" ".join(part.strip("─╰╯ ").split()) for part in text.split("──")]
-    return "; ".join(filter(None, parts)).partition("; For full help")[0] or "unusable arguments"
+    return (
+        "; ".join(filter(None, parts)).partition("; For full help")[0]
+        or "unusable arguments"
+    )

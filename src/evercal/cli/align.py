@@ -49,8 +49,14 @@ class Align(args.Verb):
     def run(self) -> int:
         by_points = self.points is not None or self.picks is not None
         if by_points == (self.robot_poses is not None):
-            raise InputError("give either images with --robot-poses, or --points with --picks")
-        others = (bool(self.images), self.convention is not None, self.board_poses is not None)
+            raise InputError(
+                "give either images with --robot-poses, or --points with --picks"
+            )
+        others = (
+            bool(self.images),
+            self.convention is not None,
+            self.board_poses is not None,
+        )
         if by_points and any(others):
             raise InputError(
                 "--points: images, --convention and --board-poses belong to --robot-poses; omit"
@@ -68,12 +74,21 @@ class Align(args.Verb):
         from evercal.calibration.boards.board_poses import read_board_poses
         from evercal.recordings.image_files import image_files
 
-        files, boards = image_files(self.images), None
+        files = image_files(self.images)
+        boards = None
         if self.board_poses is not None:
             detected = read_board_poses(self.board_poses).detected
-            by_name = {Path(image.name).name: image.camera_from_board for image in detected}
-            boards = {str(f): pose for f in files if (pose := by_name.get(f.name)) is not None}
-        given = {"robot_poses": self.robot_poses, "convention": self.convention, "boards": boards}
+            by_name = {
+                Path(image.name).name: image.camera_from_board for image in detected
+            }
+            boards = {
+                str(f): pose for f in files if (pose := by_name.get(f.name)) is not None
+            }
+        given = {
+            "robot_poses": self.robot_poses,
+            "convention": self.convention,
+            "boards": boards,
+        }
         return cell.align(self.scene, files, unknown_scale=self.unknown_scale, **given)
 
     def _by_points(self, cell: "Map") -> "MapAlignment":
@@ -81,14 +96,21 @@ class Align(args.Verb):
 
         if self.points is None or self.picks is None:
             raise InputError("--points and --picks belong together; give both")
-        points = {name: at for (name,), at in read_rows(self.points, 1, "name, x, y, z")}
+        points = {
+            name: at for (name,), at in read_rows(self.points, 1, "name, x, y, z")
+        }
         by_image: dict[str, dict[str, np.ndarray]] = {}
         for (image, name), pixel in read_rows(self.picks, 2, "image, name, u, v"):
             if name not in points:
-                raise InputError(f"{self.picks}: point {name!r} is not in {self.points}")
+                raise InputError(
+                    f"{self.picks}: point {name!r} is not in {self.points}"
+                )
             by_image.setdefault(image, {})[name] = pixel
         folder = self.picks.parent
-        picks = [(name, read_image(folder / name), pixels) for name, pixels in by_image.items()]
+        picks = [
+            (name, read_image(folder / name), pixels)
+            for name, pixels in by_image.items()
+        ]
         how = self.unknown_scale
         return cell.align(self.scene, points=points, picks=picks, unknown_scale=how)
 
@@ -106,7 +128,9 @@ class Align(args.Verb):
                 "sigma_deg": deg,
                 "used": alignment.used,
                 "given": alignment.given,
-                "gripper_from_camera": None if gripper is None else gripper.matrix().tolist(),
+                "gripper_from_camera": None
+                if gripper is None
+                else gripper.matrix().tolist(),
                 "warnings": alignment.warnings,
             },
             f"aligned {self.scene}: standard deviation {mm:.2f} mm and {deg:.3f} deg per axis in"
@@ -117,7 +141,9 @@ class Align(args.Verb):
         )
 
 
-def read_rows(path: Path, names: int, columns: str) -> "list[tuple[tuple[str, ...], np.ndarray]]":
+def read_rows(
+    path: Path, names: int, columns: str
+) -> "list[tuple[tuple[str, ...], np.ndarray]]":
     """Words and numbers of every line of a table of these columns; a header line is skipped."""
     import csv
 
@@ -125,7 +151,8 @@ def read_rows(path: Path, names: int, columns: str) -> "list[tuple[tuple[str, ..
 
     from evercal.recordings.text_files import read_text
 
-    count, lines = columns.count(",") + 1, read_text(path, "table of points").splitlines()
+    count = columns.count(",") + 1
+    lines = read_text(path, "table of points").splitlines()
     try:
         cells = list(csv.reader(lines, skipinitialspace=True))
     except csv.Error as error:
@@ -142,7 +169,9 @@ def read_rows(path: Path, names: int, columns: str) -> "list[tuple[tuple[str, ..
             if number == 1:
                 continue
             got = ",".join(row)
-            raise InputError(f"{path}:{number}: expected {columns}, got {got!r}") from None
+            raise InputError(
+                f"{path}:{number}: expected {columns}, got {got!r}"
+            ) from None
         rows.append((tuple(row[:names]), values))
     if not rows:
         raise InputError(f"{path}: no rows in it; expected {columns}")

@@ -41,7 +41,9 @@ Count = Annotated[int | None, shown("N")]
 Number = Annotated[int, arg(metavar="N")]
 OutFile = Annotated[Path, arg(metavar="FILE")]
 OutFolder = Annotated[Path, arg(metavar="DIR")]
-Host = Annotated[str, arg(metavar="H", help="Address to listen on, such as 0.0.0.0 for all.")]
+Host = Annotated[
+    str, arg(metavar="H", help="Address to listen on, such as 0.0.0.0 for all.")
+]
 Port = Annotated[int, arg(metavar="P", help="Port to listen on; 0 for any free one.")]
 At = Annotated[
     str | None,
@@ -53,7 +55,9 @@ At = Annotated[
 ]
 Device = Annotated[
     Literal["auto", "cpu", "cuda"],
-    arg(help="Device of networks (not of a map); auto uses a CUDA device if there is one."),
+    arg(
+        help="Device of networks (not of a map); auto uses a CUDA device if there is one."
+    ),
 ]
 
 
@@ -174,7 +178,9 @@ def open_localizer(store: Path, device: str = "auto") -> "LearnedLocalizer":
     """The localizer of a map, or of a store of networks on a device."""
     if strategy_of(store) in (MAP, None):
         if device != "auto":
-            raise InputError(f"--device {device}: a map needs no device; omit the option")
+            raise InputError(
+                f"--device {device}: a map needs no device; omit the option"
+            )
         return open_map(store)
     from evercal.continual.localizer import open_networks
 

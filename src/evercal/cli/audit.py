@@ -36,7 +36,9 @@ class Audit(args.Verb):
 
     def run(self) -> int:
         if self.images < 1 or self.most_mm <= 0 or self.most_deg <= 0:
-            raise InputError("--images is at least 1, --most-mm and --most-deg are above 0")
+            raise InputError(
+                "--images is at least 1, --most-mm and --most-deg are above 0"
+            )
         from evercal.calibration.audit import audit, episode_folders
 
         stated = args.transform_of(self.calibration)
@@ -44,11 +46,16 @@ class Audit(args.Verb):
         localizer = args.open_map(self.store)
         most = (self.most_mm, self.most_deg)
         with progress_bar("episodes", total, "episode") as bar:
-            episodes = audit(localizer, self.folder, stated, self.images, most, bar.update)
+            episodes = audit(
+                localizer, self.folder, stated, self.images, most, bar.update
+            )
         wrong = sum(episode.verdict == "wrong" for episode in episodes)
         self.answer(
             {"episodes": [dataclasses.asdict(episode) for episode in episodes]},
-            *(f"{episode.verdict:8s} {episode.name}: {episode.reason}" for episode in episodes),
+            *(
+                f"{episode.verdict:8s} {episode.name}: {episode.reason}"
+                for episode in episodes
+            ),
             f"{wrong} of {len(episodes)} episodes state a wrong camera pose",
         )
         return 1 if wrong else 0

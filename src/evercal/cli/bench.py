@@ -37,7 +37,9 @@ class Bench(args.Verb):
     real2, i7s, i12s, custom, regions; or a folder of results."""
     recordings: Annotated[Positional[tuple[Path, ...]], args.shown("[DIR...]")] = ()
     """Recordings of the suite custom, in order of learning; one recording for regions."""
-    strategies: Annotated[str, arg(metavar="A,B")] = "evercal,joint,finetune,er,sars_spdd"
+    strategies: Annotated[str, arg(metavar="A,B")] = (
+        "evercal,joint,finetune,er,sars_spdd"
+    )
     """Comma-separated strategies; the others are compared with the first. table4 stands for those
     of the paper's Table 4."""
     seeds: Annotated[str, arg(metavar="0,1")] = "0,1,2"
@@ -96,11 +98,15 @@ class Bench(args.Verb):
             strategies,
             seeds,
             self.order,
-            short_side(self.preset, (frame for scene in scenes for frame in scene.train)),
+            short_side(
+                self.preset, (frame for scene in scenes for frame in scene.train)
+            ),
             settings={
                 "suite": self.suite,
                 "poses": "sfm" if self.poses else "original",
-                "judged": "held-out training frames" if self.held_out else "test frames",
+                "judged": "held-out training frames"
+                if self.held_out
+                else "test frames",
             },
             device=self.device,
         )
@@ -124,7 +130,9 @@ class Bench(args.Verb):
         from evercal.continual.strategies import strategy_named
 
         words = _words(self.strategies)
-        names = [name for word in words for name in (TABLE4 if word == "table4" else (word,))]
+        names = [
+            name for word in words for name in (TABLE4 if word == "table4" else (word,))
+        ]
         return tuple(strategy_named(name) for name in dict.fromkeys(names))
 
     def _recorded(self) -> "list[Recording]":
@@ -145,7 +153,11 @@ class Bench(args.Verb):
         return load_suite(self.suite, self.data, _words(self.scenes), self.poses)
 
     def _stage(self, seed: int) -> "StageOptions":
-        from evercal.continual.learning.presets import BACKBONES, PAPER_SIM_STEPS, preset
+        from evercal.continual.learning.presets import (
+            BACKBONES,
+            PAPER_SIM_STEPS,
+            preset,
+        )
 
         try:
             stage = preset(self.preset, seed).with_memory(self.memory)
@@ -161,7 +173,9 @@ class Bench(args.Verb):
         fit = dataclasses.replace(stage.fit, iterations=steps)
         if self.batch is not None:
             if self.batch < LEAST_BATCH:
-                raise InputError(f"--batch {self.batch}: give a number >= {LEAST_BATCH}")
+                raise InputError(
+                    f"--batch {self.batch}: give a number >= {LEAST_BATCH}"
+                )
             replayed = fit.replay_batch * self.batch // fit.batch
             fit = dataclasses.replace(fit, batch=self.batch, replay_batch=replayed)
         head = dataclasses.replace(stage.head, offsets=self.offsets)
@@ -172,12 +186,16 @@ def _progress(step: "Step") -> str:
     """Describe a stage: accuracy of each scene, under every name that the strategy is judged by."""
     start = f"[{step.done}/{step.total}] "
     if step.results.empty:
-        return f"{start}{step.strategy} seed {step.seed}: no results before the last stage"
+        return (
+            f"{start}{step.strategy} seed {step.seed}: no results before the last stage"
+        )
     shares = 100 * step.results["within_5cm_5deg"] / step.results["frames"]
     parts = step.results["scene"] + shares.map(" {:.1f}".format)
     names = parts.groupby(step.results["strategy"], sort=False).agg(", ".join)
     text = "; ".join(f"{name} seed {step.seed}: {of}" for name, of in names.items())
-    return f"{start}{text} % within 5 cm, 5 deg ({step.results['seconds'].iloc[0]:.0f} s)"
+    return (
+        f"{start}{text} % within 5 cm, 5 deg ({step.results['seconds'].iloc[0]:.0f} s)"
+    )
 
 
 def _words(text: str) -> tuple[str, ...]:
@@ -187,5 +205,7 @@ def _words(text: str) -> tuple[str, ...]:
 def _numbers(text: str) -> tuple[int, ...]:
     words = _words(text)
     if not words or not all(word.isdecimal() for word in words):
-        raise InputError(f"--seeds {text}: give comma-separated numbers >= 0, such as 0,1,2")
+        raise InputError(
+            f"--seeds {text}: give comma-separated numbers >= 0, such as 0,1,2"
+        )
     return tuple(int(word) for word in words)

@@ -70,7 +70,9 @@ class Calibrate(args.Verb):
 
     def _folders(self) -> dict[str, Path]:
         """The folder of each camera of a rig; empty for one camera."""
-        named = [word for word in self.images if "=" in word and not Path(word).exists()]
+        named = [
+            word for word in self.images if "=" in word and not Path(word).exists()
+        ]
         if named and len(named) < len(self.images):
             raise InputError(
                 f"{named[0]}: NAME=FOLDER and plain images cannot be mixed; give NAME=FOLDER for"
@@ -78,7 +80,10 @@ class Calibrate(args.Verb):
             )
         if named and self.mount == "eye_in_hand":
             raise InputError("--mount: the cameras of a rig are fixed; omit the option")
-        return {name: Path(path) for name, _, path in (word.partition("=") for word in named)}
+        return {
+            name: Path(path)
+            for name, _, path in (word.partition("=") for word in named)
+        }
 
     def _given(self, files: list[Path]) -> "Images":
         from evercal.calibration.from_images import Images
@@ -95,7 +100,9 @@ class Calibrate(args.Verb):
 
         with progress_bar("localizing", len(given.images), "image") as bar:
             calibration = calibrate(localizer, given, mount, on_image=bar.update)
-        return replace(calibration, source={**calibration.source, "store": str(self.store)})
+        return replace(
+            calibration, source={**calibration.source, "store": str(self.store)}
+        )
 
     def _rig(self, folders: dict[str, Path], point: args.Point | None) -> int:
         from evercal.calibration.calibration import rig_of
@@ -103,7 +110,9 @@ class Calibrate(args.Verb):
 
         localizer = args.open_map(self.store)
         cameras = {
-            name: self._calibrated(localizer, self._given(image_files([folder])), "eye_to_hand")
+            name: self._calibrated(
+                localizer, self._given(image_files([folder])), "eye_to_hand"
+            )
             for name, folder in folders.items()
         }
         rig = rig_of(cameras)
@@ -115,17 +124,23 @@ class Calibrate(args.Verb):
         return 0
 
 
-def at_record(calibration: "Calibration", point: args.Point | None) -> dict[str, object]:
+def at_record(
+    calibration: "Calibration", point: args.Point | None
+) -> dict[str, object]:
     """The entry of --at in the JSON answer; empty without a point."""
     return {} if point is None else {"at": point.record(calibration.uncertain_pose)}
 
 
-def calibration_lines(calibration: "Calibration", point: args.Point | None = None) -> Iterator[str]:
+def calibration_lines(
+    calibration: "Calibration", point: args.Point | None = None
+) -> Iterator[str]:
     """A calibration in lines. `point` is that of --at."""
     from evercal.calibration.calibration import position_shares
 
     x, y, z = 1000 * calibration.parent_from_child.translation_m
-    quaternion = " ".join(f"{q:+.6f}" for q in calibration.parent_from_child.rotation_wxyz)
+    quaternion = " ".join(
+        f"{q:+.6f}" for q in calibration.parent_from_child.rotation_wxyz
+    )
     yield f"{calibration.parent_frame}_from_{calibration.child_frame}: the {calibration.meaning}"
     yield f"  translation  {x:+.2f} {y:+.2f} {z:+.2f} mm"
     yield f"  quaternion   {quaternion} wxyz"
@@ -139,12 +154,15 @@ def calibration_lines(calibration: "Calibration", point: args.Point | None = Non
     if point is not None:
         yield f"  point        {point.text(calibration.uncertain_pose)}"
     if "repeatability_mm" in (checks := calibration.checks):
-        mm, deg = checks["repeatability_mm"], checks["repeatability_deg"]
+        mm = checks["repeatability_mm"]
+        deg = checks["repeatability_deg"]
         yield f"  two halves   of the images differ by {mm:.2f} mm and {deg:.3f} deg"
     if calibration.images:
         used = sum(image.used for image in calibration.images)
         yield f"  images       {used} of {len(calibration.images)} used"
-    yield from (f"    rejected   {i.name}: {i.reason}" for i in calibration.images if not i.used)
+    yield from (
+        f"    rejected   {i.name}: {i.reason}" for i in calibration.images if not i.used
+    )
     yield f"  verdict      {calibration.verdict}"
 
 
@@ -153,13 +171,19 @@ def joint_lines(joints: Sequence["JointOffset"], file: object) -> Iterator[str]:
     rows = [(joint, *joint.unit) for joint in joints if not joint.open]
     large = [row for row in rows if abs(row[0].offset) >= 2 * row[0].sigma]
     for joint, unit, times in large:
-        offset, sigma = times * joint.offset, times * joint.sigma
+        offset = times * joint.offset
+        sigma = times * joint.sigma
         yield f"joint {joint.name}: add {offset:+.2f} {unit} (standard deviation {sigma:.2f})"
     if large:
-        words = f"export {file} --format corrected_urdf --urdf ROBOT.urdf --out NEW.urdf"
+        words = (
+            f"export {file} --format corrected_urdf --urdf ROBOT.urdf --out NEW.urdf"
+        )
         yield f"joints: the camera is that of the corrected arm; correct its URDF: evercal {words}"
     elif rows:
-        most = [(times * (abs(j.offset) + 2 * j.sigma), unit, j.name) for j, unit, times in rows]
+        most = [
+            (times * (abs(j.offset) + 2 * j.sigma), unit, j.name)
+            for j, unit, times in rows
+        ]
         bounds = ", ".join(f"{value:.2f} {unit} ({name})" for value, unit, name in most)
         yield f"joints: no offset above {bounds}"
     yield from (f"joint {j.name}: not determined; {j.open}" for j in joints if j.open)

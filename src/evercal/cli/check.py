@@ -62,7 +62,8 @@ class Check(args.Verb):
         files = image_files(self.images)
         camera = args.camera_for(self.camera, files)
         given = Images.of(files, camera, self.robot_poses, self.convention)
-        images, poses = given.images, given.base_from_gripper
+        images = given.images
+        poses = given.base_from_gripper
         localizer = args.open_map(self.store)
         with progress_bar("localizing", len(images), "image") as bar:
             shift = check(localizer, images, reference, camera, bar.update, poses)
@@ -82,22 +83,36 @@ class Check(args.Verb):
         from evercal.map import Map
 
         if len(self.images) != 1 or self.robot_poses is not None:
-            raise InputError("to check an arm, give one recording with joint values and no poses")
-        reading = args.Reading(None, self.camera, gripper_frame=self.gripper_frame, urdf=self.urdf)
-        recording = replace(reading, pose_convention=self.convention).recording(self.images[0])
+            raise InputError(
+                "to check an arm, give one recording with joint values and no poses"
+            )
+        reading = args.Reading(
+            None, self.camera, gripper_frame=self.gripper_frame, urdf=self.urdf
+        )
+        recording = replace(reading, pose_convention=self.convention).recording(
+            self.images[0]
+        )
         with TemporaryDirectory() as folder:
             new = Map.open(Path(folder) / "map")
-            (new.learn if reference.mount == "eye_in_hand" else new.eye_to_hand)(recording)
+            (new.learn if reference.mount == "eye_in_hand" else new.eye_to_hand)(
+                recording
+            )
             now = new.calibration()
         confidence, changed, joints = arm_change(reference, now)
-        shift = shift_of(reference, now.parent_from_child, reference.covariance + now.covariance)
+        shift = shift_of(
+            reference, now.parent_from_child, reference.covariance + now.covariance
+        )
         moved = f"Changed joints: {', '.join(changed)} (confidence {100 * confidence:.1f} %)."
         lines = [moved if changed else "No joint has changed.", shift_line(shift)]
         for joint in joints:
             size, unit = (180 / math.pi, "deg") if joint.is_angle else (1000, "mm")
             sigma = joint.open or f"standard deviation {size * joint.sigma:.3f} {unit}"
             lines.append(f"  {joint.name}  {size * joint.offset:+.3f} {unit}: {sigma}")
-        record = {"confidence": confidence, "changed": changed, "joints": [*map(vars, joints)]}
+        record = {
+            "confidence": confidence,
+            "changed": changed,
+            "joints": [*map(vars, joints)],
+        }
         self.answer({**record, "camera": shift_dict(shift)}, *lines)
         return 1 if changed or shift.moved else 0
 

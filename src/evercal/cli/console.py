@@ -64,7 +64,9 @@ def require_writable(path: Path | None, option: str) -> None:
     if path.is_dir():
         raise InputError(f"{option} {path}: is a folder; give a file name")
     if not folder.is_dir():
-        raise InputError(f"{option} {path}: folder {folder} does not exist; create it first")
+        raise InputError(
+            f"{option} {path}: folder {folder} does not exist; create it first"
+        )
     if not os.access(folder, os.W_OK):
         raise InputError(f"{option} {path}: folder {folder} is not writable")
 
@@ -76,6 +78,8 @@ def require_folder(path: Path | None, option: str) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{option} {path}: cannot be created ({error.strerror})") from None
+        raise InputError(
+            f"{option} {path}: cannot be created ({error.strerror})"
+        ) from None
     if not os.access(path, os.W_OK):
         raise InputError(f"{option} {path}: is not writable")

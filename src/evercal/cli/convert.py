@@ -36,7 +36,9 @@ class Convert(args.Verb):
         scene = self.reading.recording(self.scene, self.name)
         frames = (*scene.train, *scene.test)
         if not frames:
-            raise InputError(f"{self.scene}: no frame to write; see 'evercal inspect {self.scene}'")
+            raise InputError(
+                f"{self.scene}: no frame to write; see 'evercal inspect {self.scene}'"
+            )
         with progress_bar("writing", len(frames), "image") as bar:
             generic.write(self.out, scene, link=self.hard_link, on_frame=bar.update)
         record = {
@@ -45,8 +47,12 @@ class Convert(args.Verb):
             "train": len(scene.train),
             "test": len(scene.test),
             "untracked": scene.untracked,
-            "with_base_from_camera": sum(f.base_from_camera is not None for f in frames),
-            "with_base_from_gripper": sum(f.base_from_gripper is not None for f in frames),
+            "with_base_from_camera": sum(
+                f.base_from_camera is not None for f in frames
+            ),
+            "with_base_from_gripper": sum(
+                f.base_from_gripper is not None for f in frames
+            ),
             "notes": list(scene.notes),
         }
         self.answer(

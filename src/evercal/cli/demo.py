@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from evercal.reports.demo_page import DemoResult, FixedCamera
     from evercal.reports.page import Picture
 
-STORE, QUERY, REPORT = "store", "query.png", "report.html"
+STORE = "store"
+QUERY = "query.png"
+REPORT = "report.html"
 UNKNOWN_IMAGES = 12
 """Images of each room that are localized before the room is learned."""
 PICTURES = 3
@@ -57,20 +59,31 @@ class Demo(args.Verb):
                 {"samples": str(folder)},
                 f"copied {', '.join(ROOMS)} and the robot cell {cell} to {folder}; the cell has"
                 " recordings of a camera on the gripper (wrist) and of a fixed camera (tripod)",
-                then=("learn", "cell.evercal", cell / "wrist", "--calibration", "wrist.json"),
+                then=(
+                    "learn",
+                    "cell.evercal",
+                    cell / "wrist",
+                    "--calibration",
+                    "wrist.json",
+                ),
             )
             return 0
         result = run_demo(self.out, sample_rooms(), quiet=self.json)
         self.answer(
             result.to_dict(),
-            *(f"{number:>12}  {meaning}" for number, meaning in result.headlines().items()),
+            *(
+                f"{number:>12}  {meaning}"
+                for number, meaning in result.headlines().items()
+            ),
             f"wrote {self.out / REPORT} in {result.seconds:.0f} s",
             then=("localize", self.out / STORE, self.out / QUERY),
         )
         return 0
 
 
-def run_demo(out: Path, rooms: "Sequence[SampleRoom]", quiet: bool = True) -> "DemoResult":
+def run_demo(
+    out: Path, rooms: "Sequence[SampleRoom]", quiet: bool = True
+) -> "DemoResult":
     """Map the rooms, measure, and write the report.
 
     Args:
@@ -86,9 +99,12 @@ def run_demo(out: Path, rooms: "Sequence[SampleRoom]", quiet: bool = True) -> "D
     from evercal.reports.demo_page import DemoResult, demo_page
     from evercal.storage import MANIFEST, replace_folder, write_bytes
 
-    began, store = time.perf_counter(), out / STORE
+    began = time.perf_counter()
+    store = out / STORE
     if store.exists() and not (store / MANIFEST).is_file():
-        raise InputError(f"{store}: exists and is not an evercal store; pass another --out")
+        raise InputError(
+            f"{store}: exists and is not an evercal store; pass another --out"
+        )
     require_folder(out, "--out")
     result = DemoResult()
     work = Path(tempfile.mkdtemp(prefix=".demo-", dir=out))
@@ -103,7 +119,11 @@ def run_demo(out: Path, rooms: "Sequence[SampleRoom]", quiet: bool = True) -> "D
         shutil.rmtree(work, ignore_errors=True)
     cell = Map.open(store)
     result.test = _evaluate(cell, {room.scene.name: room.scene for room in rooms})
-    changed = {r.scene.name: replace(r.changed, train=r.scene.train) for r in rooms if r.changed}
+    changed = {
+        r.scene.name: replace(r.changed, train=r.scene.train)
+        for r in rooms
+        if r.changed
+    }
     result.changed = _evaluate(cell, changed)
     result.cameras = [_fixed_camera(cell, room) for room in rooms]
     pictures = [picture for room in rooms for picture in _pictures(cell, room.scene)]
@@ -130,14 +150,18 @@ def _learn(cell: "Map", scene: "Recording", result: "DemoResult", quiet: bool) -
     result.memory_bytes = report.memory_bytes
     if not quiet:
         kept = f"{room.keyframes} keyframes, {room.landmarks} landmarks"
-        time_and_size = f"{room.seconds:.0f} s; {size(result.memory_bytes)} for all rooms"
+        time_and_size = (
+            f"{room.seconds:.0f} s; {size(result.memory_bytes)} for all rooms"
+        )
         say(f"mapped {room.room}: {room.images} images, {kept}, {time_and_size}")
 
 
 def _localize_unknown(cell: "Map", scene: "Recording", result: "DemoResult") -> None:
     """Localize images of a room that is not in the store yet."""
     frames = _spread(scene.test, UNKNOWN_IMAGES)
-    with progress_bar(f"images of unknown room {scene.name}", len(frames), "image") as bar:
+    with progress_bar(
+        f"images of unknown room {scene.name}", len(frames), "image"
+    ) as bar:
         for frame in frames:
             estimate = cell.localize(frame.read_image(), frame.camera)
             result.unknown_images += 1
@@ -157,7 +181,9 @@ def _fixed_camera(cell: "Map", room: "SampleRoom") -> "FixedCamera":
     from evercal.geometry import pose_distance_mm_deg
     from evercal.reports.demo_page import FixedCamera
 
-    name, fixed, bumped = room.scene.name, room.fixed, room.bumped
+    name = room.scene.name
+    fixed = room.fixed
+    bumped = room.bumped
     assert fixed is not None, "rooms of a demo have a fixed camera"
     assert bumped is not None, "rooms of a demo have a bumped camera"
     true_shift_mm, _ = pose_distance_mm_deg(_pose(fixed), _pose(bumped))
@@ -165,8 +191,11 @@ def _fixed_camera(cell: "Map", room: "SampleRoom") -> "FixedCamera":
     count = len(fixed.test) + len(bumped.test)
     # An InputError means that no image was localized.
     with progress_bar(f"camera in {name}", count, "image") as bar, suppress(InputError):
-        lens, images = fixed.test[0].camera, _images(fixed)
-        calibration = cell.calibrate(images, camera=lens, mount="eye_to_hand", on_image=bar.update)
+        lens = fixed.test[0].camera
+        images = _images(fixed)
+        calibration = cell.calibrate(
+            images, camera=lens, mount="eye_to_hand", on_image=bar.update
+        )
         if calibration.source["scene"] != name:
             return camera
         mm, deg = pose_distance_mm_deg(calibration.parent_from_child, _pose(fixed))
@@ -178,7 +207,9 @@ def _fixed_camera(cell: "Map", room: "SampleRoom") -> "FixedCamera":
             sigma_mm=calibration.sigma_mm,
         )
         shift = cell.check(_images(bumped), calibration, on_image=bar.update)
-        camera = replace(camera, shift_mm=shift.translation_mm, bump_detected=shift.moved)
+        camera = replace(
+            camera, shift_mm=shift.translation_mm, bump_detected=shift.moved
+        )
     return camera
 
 

@@ -51,7 +51,8 @@ class Detect(args.Verb):
     gap_mm: Annotated[float, args.shown("MM")] = 0.0
     """Distance between two markers of a grid, millimetres."""
     dictionary: Annotated[
-        str | None, args.shown("NAME", "(default: 4X4_50, APRILTAG_36h11 for tags and aprilgrid)")
+        str | None,
+        args.shown("NAME", "(default: 4X4_50, APRILTAG_36h11 for tags and aprilgrid)"),
     ] = None
     """Dictionary of markers or tags, OpenCV's name without DICT_."""
     tag: Annotated[int | None, args.shown("ID", "(default: any)")] = None
@@ -71,14 +72,19 @@ class Detect(args.Verb):
         if self.make_board is not None:
             return self._make(self.make_board)
         if not self.images:
-            raise InputError("no images: give image files or a folder, or --make-board FILE.pdf")
+            raise InputError(
+                "no images: give image files or a folder, or --make-board FILE.pdf"
+            )
         require_writable(self.out, "--out")
         from evercal.recordings.image_files import image_files
         from evercal.recordings.text_files import refuse_repeated
 
-        board, files = self._board(), image_files(self.images)
+        board = self._board()
+        files = image_files(self.images)
         try:
-            refuse_repeated((path.name for path in files), "give each image a unique name")
+            refuse_repeated(
+                (path.name for path in files), "give each image a unique name"
+            )
         except ValueError as error:
             raise InputError(str(error)) from None
         from evercal.calibration.boards.board_poses import board_poses
@@ -87,16 +93,27 @@ class Detect(args.Verb):
         from evercal.recordings.poses.camera_file import read_camera_of_size
 
         width, height = first_size(files)
-        camera, source = None, "file"
+        camera = None
+        source = "file"
         if self.camera is not None:
-            camera = read_camera_of_size(self.camera, (width, height), "the first image")
+            camera = read_camera_of_size(
+                self.camera, (width, height), "the first image"
+            )
         board, views = self._detected(files, board, width, height)
         detected = [view for view in views.values() if isinstance(view, BoardView)]
         if camera is None:
-            camera, source = calibrate_camera(detected, width, height, self.lens).camera, "board"
+            camera = calibrate_camera(detected, width, height, self.lens).camera
+            source = "board"
         poses = board_poses(board, camera, views, source)
         poses.write(self.out)
-        words = ("--robot-poses", "FILE", "--camera-poses", self.out, "--mount", "eye_in_hand")
+        words = (
+            "--robot-poses",
+            "FILE",
+            "--camera-poses",
+            self.out,
+            "--mount",
+            "eye_in_hand",
+        )
         self.answer(poses.to_dict(), *_lines(poses), then=("solve", *words))
         return 0
 
@@ -118,7 +135,9 @@ class Detect(args.Verb):
         from evercal.calibration.boards.board import Board
 
         if self.square_mm is None:
-            raise InputError("--square-mm: give the side of a square, or of the tag, millimetres")
+            raise InputError(
+                "--square-mm: give the side of a square, or of the tag, millimetres"
+            )
         match = re.fullmatch(r"(\d+)[xX,](\d+)", self.size or "0x0")
         if match is None:
             raise InputError(f"--size {self.size}: give two numbers such as 9x6")
@@ -129,7 +148,9 @@ class Detect(args.Verb):
             rows=int(match[2]),
             marker_m=self.marker_mm / 1000,
             gap_m=self.gap_mm / 1000,
-            dictionary=(self.dictionary or _DICTIONARIES[self.board]).removeprefix("DICT_"),
+            dictionary=(self.dictionary or _DICTIONARIES[self.board]).removeprefix(
+                "DICT_"
+            ),
             tag=self.tag,
         )
 
@@ -141,7 +162,9 @@ class Detect(args.Verb):
         from evercal.recordings import read_image
 
         folder = self.out.absolute().parent
-        names = {Path(os.path.relpath(f.absolute(), folder)).as_posix(): f for f in files}
+        names = {
+            Path(os.path.relpath(f.absolute(), folder)).as_posix(): f for f in files
+        }
         with progress_bar("detecting", len(files), "image") as bar:
 
             def read(name: str) -> "Image | str":
@@ -171,7 +194,9 @@ def _lines(poses: "BoardPoses") -> Iterator[str]:
             where = ", ".join(f"{x:.0f} {y:.0f}" for x, y in image.left_out)
             yield f"{image.name}: left out what leaves its neighbours, corners at x y {where}"
     camera = poses.camera
-    numbers = ", ".join(f"{key} {getattr(camera, key):.2f}" for key in ("fx", "fy", "cx", "cy"))
+    numbers = ", ".join(
+        f"{key} {getattr(camera, key):.2f}" for key in ("fx", "fy", "cx", "cy")
+    )
     yield (
         f"{len(poses.detected)} of {len(poses.images)} images show the board; corner noise"
         f" {poses.corner_sigma_px:.2f} px; camera (from the {poses.camera_from}) {numbers}"

@@ -29,7 +29,9 @@ class Evaluate(args.Verb):
 
     def run(self) -> int:
         if not self.scenes:
-            raise InputError("no scene given; name one or more scene folders after the store")
+            raise InputError(
+                "no scene given; name one or more scene folders after the store"
+            )
         scenes = load_named(self.scenes)
         from evercal.evaluation import evaluate, scores
         from evercal.evaluation.tables import score_rows
@@ -56,7 +58,8 @@ def load_named(words: tuple[str, ...]) -> "dict[str, Recording]":
         name, sign, path = word.partition("=")
         # The name of a folder may contain '='.
         if not sign or not name or Path(word).is_dir():
-            name, path = "", word
+            name = ""
+            path = word
         scene = load_recording(path, name=name or None)
         if not scene.metric:
             raise InputError(

@@ -25,7 +25,9 @@ class Export(args.Verb):
     Example: evercal export tripod.json --format urdf --out camera.urdf
     """
 
-    calibration: Annotated[Positional[Path | None], args.shown("[CALIBRATION.json]")] = None
+    calibration: Annotated[
+        Positional[Path | None], args.shown("[CALIBRATION.json]")
+    ] = None
     """Calibration file, or a map that was learned from gripper poses (MAP or MAP:SCENE)."""
     format: args.Name = None
     """Format, such as easy_handeye2, urdf, opencv or kuka; `list` lists all."""
@@ -74,7 +76,9 @@ class Export(args.Verb):
             )
             return 0
         if self.format is None:
-            raise InputError(f"no format given; add --format NAME, one of {', '.join(FORMATS)}")
+            raise InputError(
+                f"no format given; add --format NAME, one of {', '.join(FORMATS)}"
+            )
         if self.calibration is None:
             raise InputError("no calibration given; name its JSON file after 'export'")
         options = {key: getattr(self, key) for key in ExportOptions.__annotations__}
@@ -84,7 +88,8 @@ class Export(args.Verb):
 
     def _show(self, exported: "Exported") -> None:
         calibration = exported.calibration
-        child, verdict = calibration.child_frame, calibration.verdict
+        child = calibration.child_frame
+        verdict = calibration.verdict
         if exported.format.frame == "tf" and self.via is None and "optical" in child:
             say(
                 f"note: most camera drivers publish {child} themselves; if yours does, give its"
@@ -106,7 +111,10 @@ class Export(args.Verb):
             "files": [str(file) for file in exported.files],
             "text": None if exported.files else exported.text,
         }
-        lines = [f"wrote {', '.join(map(str, exported.files))}", f"  {calibration.meaning}"]
+        lines = [
+            f"wrote {', '.join(map(str, exported.files))}",
+            f"  {calibration.meaning}",
+        ]
         lines += [f"  {verdict}"] if verdict else []
         then = ("check", "MAP", "IMAGE", "--reference", self.calibration)
         self.answer(record, *lines, then=then)

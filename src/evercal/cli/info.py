@@ -32,8 +32,12 @@ class Info(args.Verb):
             from evercal.continual.store import describe
 
             scenes, short_side, heads, sizes = describe(self.store)
-        total = sum(file.stat().st_size for file in self.store.rglob("*") if file.is_file())
-        memory = sum(bytes for file, bytes in sizes.items() if file.endswith(MEMORY_FILES))
+        total = sum(
+            file.stat().st_size for file in self.store.rglob("*") if file.is_file()
+        )
+        memory = sum(
+            bytes for file, bytes in sizes.items() if file.endswith(MEMORY_FILES)
+        )
         record = {
             "store": str(self.store),
             "strategy": strategy,
@@ -50,7 +54,13 @@ class Info(args.Verb):
             f"{self.store}: {count}, strategy {strategy}, images at {short_side} px",
             f"{size(total)} in all: keyframes {size(memory)}, {network}the rest is the encoder",
             *table([_content(scene) for scene in scenes]),
-            *table([adjusted_row(s["name"], s["adjusted"]) for s in scenes if s.get("adjusted")]),
+            *table(
+                [
+                    adjusted_row(s["name"], s["adjusted"])
+                    for s in scenes
+                    if s.get("adjusted")
+                ]
+            ),
             then=("info", self.store, "--check"),
         )
         return 0
@@ -108,7 +118,8 @@ def adjusted_row(scene: str, adjusted: dict[str, Any]) -> dict[str, object]:
         adjusted[key] and sum(x * x for x in adjusted[key]) ** 0.5
         for key in ("common_translation_mm", "common_rotation_deg")
     )
-    sigma, residual = adjusted["pose_sigma_mm"], adjusted["residual_px"]
+    sigma = adjusted["pose_sigma_mm"]
+    residual = adjusted["residual_px"]
     return {
         "bundle adjustment": scene,
         "median residual": "-" if residual is None else f"{residual:.2f} px",

@@ -43,7 +43,8 @@ class Inspect(args.Verb):
 
         recording = self.reading.recording(self.scene)
         found = inspect_recording(recording)
-        record, lines = asdict(found), [*_lines(found)]
+        record = asdict(found)
+        lines = [*_lines(found)]
         if found.poses == "gripper":
             from evercal.calibration.next_views import open_position
             from evercal.recordings.frame import stated_grippers
@@ -54,15 +55,21 @@ class Inspect(args.Verb):
             lines += [f"warning: {left.sentence()}"] if left else []
         if self.coverage or self.next is not None:
             self._advise(recording, record, lines)
-        self.answer(record, *lines, then=("learn", "MAP", self.scene, *self.reading.words()))
+        self.answer(
+            record, *lines, then=("learn", "MAP", self.scene, *self.reading.words())
+        )
         return 0
 
-    def _advise(self, recording: "Recording", record: dict[str, object], lines: list[str]) -> None:
+    def _advise(
+        self, recording: "Recording", record: dict[str, object], lines: list[str]
+    ) -> None:
         """Add coverage and next poses, as far as asked for."""
         from evercal.live.coverage import Sample, coverage
         from evercal.recordings.frame import stated_grippers
 
-        frames = [frame for frame in recording.train if frame.base_from_gripper is not None]
+        frames = [
+            frame for frame in recording.train if frame.base_from_gripper is not None
+        ]
         if not frames:
             raise InputError(
                 f"{self.scene}: states no gripper poses; --coverage and --next need them"

@@ -78,7 +78,9 @@ class Learn(args.Verb):
     strategy: args.Name = None
     """evercal builds a map; every other strategy trains a network. Default: that of the store."""
     reading: Annotated[args.Reading, arg(name="")] = field(default_factory=args.Reading)
-    networks: Annotated[NetworkOptions, arg(name="")] = field(default_factory=NetworkOptions)
+    networks: Annotated[NetworkOptions, arg(name="")] = field(
+        default_factory=NetworkOptions
+    )
     workers: args.Number = 1
     """Recordings to learn in parallel."""
     ray: Annotated[str | None, args.shown("ADDRESS")] = None
@@ -95,9 +97,13 @@ class Learn(args.Verb):
         single = len(self.recordings) == 1 and not is_address(self.recordings[0])
         single = single and not (self.ray or self.results)
         if self.ray is not None and self.workers != 1:
-            raise InputError(f"--workers {self.workers}: --ray has its own; omit one of them")
+            raise InputError(
+                f"--workers {self.workers}: --ray has its own; omit one of them"
+            )
         if self.workers < 1 or (single and self.workers > 1):
-            raise InputError(f"--workers {self.workers}: give 1 to the number of recordings")
+            raise InputError(
+                f"--workers {self.workers}: give 1 to the number of recordings"
+            )
         require_writable(self.calibration, "--calibration")
         if self.encoder is not None and not self.encoder.is_file():
             raise InputError(f"--encoder {self.encoder}: no such file")
@@ -124,11 +130,15 @@ class Learn(args.Verb):
         why = "is for one recording, without --ray, --results and addresses; omit one of them"
         self._refuse(why, "name", "calibration", "gripper_from_camera")
         if strategy != args.MAP:
-            raise InputError("a network learns one recording of this machine; give one folder")
+            raise InputError(
+                "a network learns one recording of this machine; give one folder"
+            )
         from evercal.map import Map
 
         cell = Map.open(self.store, encoder=self.encoder)
-        where = f"{self.workers} at once" if self.ray is None else f"on Ray at {self.ray}"
+        where = (
+            f"{self.workers} at once" if self.ray is None else f"on Ray at {self.ray}"
+        )
         many = "s" if len(self.recordings) > 1 else ""
         with self._bars(f"{len(self.recordings)} recording{many}, {where}") as bars:
             reports = cell.learn_many(
@@ -138,7 +148,9 @@ class Learn(args.Verb):
                 ray=self.ray,
                 results=self.results,
                 memory=self.memory,
-                on_scene=lambda report: bars.write("\n".join(summary(report, self.store))),
+                on_scene=lambda report: bars.write(
+                    "\n".join(summary(report, self.store))
+                ),
                 on_progress=bars.step,
             )
         record = {"scenes": [dataclasses.asdict(report) for report in reports]}
@@ -151,7 +163,9 @@ class Learn(args.Verb):
         recording = read_recording(self.reading, path, self.name)
         if not lacks_camera_poses(recording):
             why = "states camera poses, so gripper_from_camera is not estimated; omit the option"
-            self._refuse(f"{recording.name} {why}", "gripper_from_camera", "calibration")
+            self._refuse(
+                f"{recording.name} {why}", "gripper_from_camera", "calibration"
+            )
         try:
             report = self._learned(recording, strategy)
         except KeyboardInterrupt:
@@ -166,14 +180,19 @@ class Learn(args.Verb):
 
     def _learned(self, recording: "Recording", strategy: str) -> "LearnReport":
         rough = args.transform_of(self.gripper_from_camera)
-        with self._bars(f"{recording.name}: {len(recording.train)} training frames") as bars:
+        with self._bars(
+            f"{recording.name}: {len(recording.train)} training frames"
+        ) as bars:
             if strategy != args.MAP:
                 return learn_into_networks(self, strategy, recording, bars)
             from evercal.map import Map
 
             cell = Map.open(self.store, encoder=self.encoder)
             report = cell.learn(
-                recording, memory=self.memory, gripper_from_camera=rough, on_progress=bars.step
+                recording,
+                memory=self.memory,
+                gripper_from_camera=rough,
+                on_progress=bars.step,
             )
         if self.calibration is not None:
             cell.calibration(report.scene).write(self.calibration)
@@ -185,7 +204,14 @@ class Learn(args.Verb):
         if report.hand_eye is not None:
             return "export", self.calibration or self.store, "--format", "easy_handeye2"
         if not recording.metric:
-            return "align", self.store, report.scene, "IMAGE...", "--robot-poses", "FILE"
+            return (
+                "align",
+                self.store,
+                report.scene,
+                "IMAGE...",
+                "--robot-poses",
+                "FILE",
+            )
         if recording.test:
             return "evaluate", self.store, f"{self.name}={path}" if self.name else path
         return "localize", self.store, "IMAGE"
@@ -200,7 +226,9 @@ class Learn(args.Verb):
                 raise InputError(f"{args.option(name)} {value}: {why}")
 
 
-def read_recording(reading: args.Reading, path: Path, name: str | None = None) -> "Recording":
+def read_recording(
+    reading: args.Reading, path: Path, name: str | None = None
+) -> "Recording":
     """Read a recording and say what its images lack, before the work."""
     from evercal.recordings.pictures import look_at
 
@@ -216,7 +244,10 @@ def learn_into_networks(
     given: Learn, strategy: str, recording: "Recording", bars: "Bars"
 ) -> "LearnReport":
     """Train a network on a recording."""
-    from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
+    from evercal.continual.learning.learn_networks import (
+        NetworkLearnOptions,
+        learn_networks,
+    )
     from evercal.continual.learning.stage import Encoding
     from evercal.continual.networks.trainer import Progress
 
@@ -248,7 +279,9 @@ def learn_into_networks(
 
 def summary(report: "LearnReport", file: Path) -> Iterator[str]:
     """The outcome in lines; `file` holds the calibration, if there is one."""
-    kept = f"{report.scene}: {report.train_frames} images, {report.frames_kept} keyframes"
+    kept = (
+        f"{report.scene}: {report.train_frames} images, {report.frames_kept} keyframes"
+    )
     memory = size(report.memory_bytes)
     if report.iterations:
         yield (

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 from evercal.cli import args
 from evercal.cli.console import require_folder, require_writable
 from evercal.progress import progress_bar
-from evercal.reports.answers import Answer, answer_row, budget_of, finite_pose, unit_known
+from evercal.reports.answers import (
+    Answer,
+    answer_row,
+    budget_of,
+    finite_pose,
+    unit_known,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -55,7 +61,8 @@ class Localize(args.Verb):
             require_writable(self.video, "--video")
             require_ending(self.video)
         localizer = args.open_localizer(self.store, self.device)
-        answers = self._answers(localizer, files, camera)  # all of them before the first is printed
+        # All of them before the first is printed.
+        answers = self._answers(localizer, files, camera)
         lines = [line for answer in answers for line in _lines(answer, point)]
         if self.video is not None:
             self._animate(self.video, localizer, answers)
@@ -81,13 +88,16 @@ class Localize(args.Verb):
         from evercal.reports.overlay import draw_landmarks
 
         def answer(number: int) -> Answer:
-            path, began = files[number], time.perf_counter()
+            path = files[number]
+            began = time.perf_counter()
             estimate = localize_picture(localizer, path, camera)
             milliseconds = 1000 * (time.perf_counter() - began)
             known = unit_known(localizer, estimate.scene)
             if self.overlay is not None and estimate.scene is not None:
                 image = read_image(path)
-                drawn = draw_landmarks(image, estimate, localizer, camera, width=image.shape[1])
+                drawn = draw_landmarks(
+                    image, estimate, localizer, camera, width=image.shape[1]
+                )
                 write_image(self.overlay / _overlay_name(files, number), drawn.image)
             return Answer(path, estimate, milliseconds, known)
 
@@ -98,7 +108,9 @@ class Localize(args.Verb):
                 bar.update()
         return answers
 
-    def _animate(self, path: Path, localizer: "LearnedLocalizer", answers: list[Answer]) -> None:
+    def _animate(
+        self, path: Path, localizer: "LearnedLocalizer", answers: list[Answer]
+    ) -> None:
         from evercal.recordings import read_image
         from evercal.recordings.images import is_readable
         from evercal.reports.video import animate, write_video
@@ -121,16 +133,22 @@ def _overlay_name(files: list[Path], number: int) -> str:
 
 
 def _record(answer: Answer, point: args.Point | None) -> dict[str, object]:
-    record, pose = answer_row(answer), finite_pose(answer.estimate)
+    record = answer_row(answer)
+    pose = finite_pose(answer.estimate)
     if point is not None:
-        record["at"] = point.record(pose) if pose is not None and answer.unit_known else None
+        record["at"] = (
+            point.record(pose) if pose is not None and answer.unit_known else None
+        )
     return record
 
 
 def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
-    estimate, pose = answer.estimate, answer.estimate.base_from_camera
+    estimate = answer.estimate
+    pose = answer.estimate.base_from_camera
     share = f"{100 * estimate.inlier_ratio:.0f} %"
-    inliers = f"  inliers      {estimate.inliers} ({share}), {answer.milliseconds:.0f} ms"
+    inliers = (
+        f"  inliers      {estimate.inliers} ({share}), {answer.milliseconds:.0f} ms"
+    )
     yield str(answer.path)
     if pose is None:
         yield f"  {estimate.status.replace('_', ' ')}: {estimate.reason}"
@@ -141,14 +159,20 @@ def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
         spread = estimate.covariance.diagonal().clip(0) ** 0.5
         sd[0] = f"  sd {_numbers(1000 * spread[:3], '.2f')} mm"
         sd[1] = f"  sd {_numbers(spread[3:] * 180 / math.pi, '.3f')} deg"
-    unit = f"m{sd[0]}" if answer.unit_known else "in an unknown unit: run 'evercal align' first"
+    unit = (
+        f"m{sd[0]}"
+        if answer.unit_known
+        else "in an unknown unit: run 'evercal align' first"
+    )
     held = estimate.parent_frame == "gripper"
     note = " (a thing in the gripper: the pose is gripper_from_camera)" if held else ""
     yield f"  scene        {estimate.scene}{note}"
     yield f"  translation  {_numbers(pose.translation_m, '+.4f')} {unit}"
     yield f"  quaternion   {_numbers(pose.rotation_wxyz, '+.4f')} wxyz{sd[1]}"
     parts = sorted(budget_of(estimate), key=lambda part: -part[1])
-    causes = ", ".join(f"{term.name} {100 * of:.0f} %" for term, of in parts if of >= 0.005)
+    causes = ", ".join(
+        f"{term.name} {100 * of:.0f} %" for term, of in parts if of >= 0.005
+    )
     if causes:
         yield f"  budget       {causes} of the position's variance"
     uncertain = finite_pose(estimate)

@@ -48,10 +48,16 @@ class List(Action):
     def run(self) -> int:
         from evercal.mapping.store import MapStore
 
-        scenes, lines = [], []
+        scenes = []
+        lines = []
         for scene in MapStore.open(self.store).contents.scenes:
-            keyframes, memory = len(scene.keyframes), scene.keyframes.bytes
-            record = {"name": scene.name, "keyframes": keyframes, "landmarks": scene.landmarks}
+            keyframes = len(scene.keyframes)
+            memory = scene.keyframes.bytes
+            record = {
+                "name": scene.name,
+                "keyframes": keyframes,
+                "landmarks": scene.landmarks,
+            }
             scenes.append({**record, "memory_bytes": memory})
             counts = f"{keyframes} keyframes, {scene.landmarks:,} landmarks"
             lines.append(f"{scene.name}: {counts}, {size(memory)}")

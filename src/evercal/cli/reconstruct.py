@@ -37,7 +37,9 @@ class Reconstruct(args.Verb):
         from evercal.recordings.reconstruct import reconstruct
 
         with Bars() as bars:
-            found = reconstruct(self.source, self.out, self.motion, self.most, bars.step)
+            found = reconstruct(
+                self.source, self.out, self.motion, self.most, bars.step
+            )
         whole = found.posed >= _CONNECTED * found.frames
         lines = [
             f"{self.out}: {found.posed} of {found.frames} frames have a pose, {found.points:,}"

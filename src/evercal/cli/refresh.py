@@ -33,7 +33,9 @@ class Refresh(args.Verb):
     """
 
     store: args.Store
-    images: Annotated[Positional[tuple[Path, ...]], args.shown("[RECORDING|IMAGE...]")] = ()
+    images: Annotated[
+        Positional[tuple[Path, ...]], args.shown("[RECORDING|IMAGE...]")
+    ] = ()
     """Images of one camera, a folder of them, or a recording."""
     camera: args.File = None
     """File of the intrinsics. Default: those of the camera that recorded the scene."""
@@ -78,7 +80,8 @@ def _recording(paths: tuple[Path, ...]) -> "Recording | None":
 
 
 def _lines(report: "RefreshReport") -> Iterator[str]:
-    seen, gone = report.landmarks_checked, report.landmarks_gone
+    seen = report.landmarks_checked
+    gone = report.landmarks_gone
     located = f"{report.located} of {report.images} images located"
     yield f"{report.scene}: {located}, refreshed in {report.seconds:.1f} s"
     share = f"{100 * gone / max(seen, 1):.0f} %"
@@ -90,6 +93,8 @@ def _lines(report: "RefreshReport") -> Iterator[str]:
     outside = f"{report.verified} images outside the map"
     yield f"  base frame   moved by {shift} (standard deviation {sigma}; {outside})"
     left_out = list(report.left_out.items())
-    yield from (f"  left out     {name}: {reason}" for name, reason in left_out[:_LISTED])
+    yield from (
+        f"  left out     {name}: {reason}" for name, reason in left_out[:_LISTED]
+    )
     if len(left_out) > _LISTED:
         yield f"  left out     and {len(left_out) - _LISTED} more images"

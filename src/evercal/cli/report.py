@@ -43,7 +43,11 @@ class Report(args.Verb):
         from evercal.calibration.learned import calibration_at
         from evercal.calibration.verdict import expected_error, tier, verdict
         from evercal.reports.calibration_images import boards_seen
-        from evercal.reports.calibration_page import NamedCalibration, calibration_page, difference
+        from evercal.reports.calibration_page import (
+            NamedCalibration,
+            calibration_page,
+            difference,
+        )
         from evercal.storage import write_bytes
 
         calibration = calibration_at(self.calibration)
@@ -70,7 +74,8 @@ class Report(args.Verb):
             "expected_error_mm": mm,
             "expected_error_deg": deg,
             "pictures": list(images.images),
-            "against": change and {"translation_mm": change.mm, "rotation_deg": change.deg},
+            "against": change
+            and {"translation_mm": change.mm, "rotation_deg": change.deg},
             "missing": list(page.missing),
         }
         lines = [str(record["verdict"])]
@@ -97,5 +102,7 @@ class Report(args.Verb):
         files, reason = select_images(calibration, self.calibration.parent, given)
         localizer = None if self.store is None else args.open_localizer(self.store)
         with progress_bar("drawing", len(files), "image") as bar:
-            drawn = annotate_images(calibration, files, older, localizer, boards, bar.update)
+            drawn = annotate_images(
+                calibration, files, older, localizer, boards, bar.update
+            )
         return drawn if files else replace(drawn, missing=(reason,))

@@ -37,7 +37,8 @@ class Simulate(args.Verb):
         from evercal.simulation import cell_recording as cell
         from evercal.simulation.virtual_cell import CellOptions
 
-        began, options = time.perf_counter(), CellOptions()
+        began = time.perf_counter()
+        options = CellOptions()
         frames = cell.WRIST_IMAGES if self.frames is None else self.frames
         if self.size is not None:
             size = re.fullmatch(r"(\d+)x(\d+)", self.size)
@@ -53,7 +54,15 @@ class Simulate(args.Verb):
             for _ in cell.record_cell(self.out, self.seed, frames, options):
                 bar.update()
         seconds = time.perf_counter() - began
-        parts = {name: str(self.out / name) for name in ("wrist", "tripod", "held", "truth.json")}
-        record = {"scenes": [parts["wrist"]], **parts, "frames": bar.n, "seconds": seconds}
+        parts = {
+            name: str(self.out / name)
+            for name in ("wrist", "tripod", "held", "truth.json")
+        }
+        record = {
+            "scenes": [parts["wrist"]],
+            **parts,
+            "frames": bar.n,
+            "seconds": seconds,
+        }
         self.answer(record, then=("learn", "MAP", self.out / "wrist"))
         return 0

@@ -53,7 +53,11 @@ class Solve(args.Verb):
         require_writable(self.out, "--out")
         from evercal.calibration.verdict import tier
 
-        options = {key: value for key, value in vars(self).items() if key not in ("out", "json")}
+        options = {
+            key: value
+            for key, value in vars(self).items()
+            if key not in ("out", "json")
+        }
         files = {key: str(options[key]) for key in ("robot_poses", "camera_poses")}
         source = {"command": "solve", **options, **files}
         calibration = self._with_image_paths(replace(self._solved(), source=source))
@@ -64,7 +68,11 @@ class Solve(args.Verb):
         return 0 if tier(calibration) else 1
 
     def _solved(self) -> "Calibration":
-        from evercal.calibration.pose_pairs.pair_files import PairFiles, read_pairs, read_streams
+        from evercal.calibration.pose_pairs.pair_files import (
+            PairFiles,
+            read_pairs,
+            read_streams,
+        )
         from evercal.calibration.pose_pairs.solve import solve
         from evercal.calibration.pose_pairs.time_offset import solve_with_offset
 
@@ -85,15 +93,24 @@ class Solve(args.Verb):
 
     def _with_image_paths(self, calibration: "Calibration") -> "Calibration":
         """Make image paths relative to the calibration, where `evercal report` looks them up."""
-        folder, target = self.camera_poses.absolute().parent, self.out.absolute().parent
+        folder = self.camera_poses.absolute().parent
+        target = self.out.absolute().parent
 
         def moved(name: str) -> str:
             path = folder / name
-            return Path(os.path.relpath(path, target)).as_posix() if path.is_file() else name
+            return (
+                Path(os.path.relpath(path, target)).as_posix()
+                if path.is_file()
+                else name
+            )
 
-        images = tuple(replace(image, name=moved(image.name)) for image in calibration.images)
+        images = tuple(
+            replace(image, name=moved(image.name)) for image in calibration.images
+        )
         checks = {
-            key: {moved(name): item for name, item in value.items()} if key in _BY_IMAGE else value
+            key: {moved(name): item for name, item in value.items()}
+            if key in _BY_IMAGE
+            else value
             for key, value in calibration.checks.items()
         }
         board = Path(os.path.relpath(self.camera_poses.absolute(), target)).as_posix()
@@ -102,7 +119,8 @@ class Solve(args.Verb):
 
 
 def _check_lines(calibration: "Calibration") -> Iterator[str]:
-    checks, camera = calibration.checks, calibration.camera
+    checks = calibration.checks
+    camera = calibration.camera
     if "held_out_mm" in checks:
         error = f"{checks['held_out_mm']:.2f} mm and {checks['held_out_deg']:.3f} deg"
         yield f"  left out     half of the poses are predicted within {error}"
@@ -122,7 +140,10 @@ def _check_lines(calibration: "Calibration") -> Iterator[str]:
         centre = f"cx {camera.cx:.2f}, cy {camera.cy:.2f} +- {sigma['cx']:.2f} px"
         yield f"  intrinsics   {focal}, {centre}"
     if "time_offset_s" in checks:
-        offset, spread = 1000 * checks["time_offset_s"], 1000 * checks["time_offset_sigma_s"]
+        offset = 1000 * checks["time_offset_s"]
+        spread = 1000 * checks["time_offset_sigma_s"]
         yield f"  clocks       robot time = camera time {offset:+.1f} +- {spread:.1f} ms"
-    yield from (f"  left open    {sentence}" for sentence in checks.get("left_open", ()))
+    yield from (
+        f"  left open    {sentence}" for sentence in checks.get("left_open", ())
+    )
     yield from (f"warning: {warning}" for warning in checks.get("warnings", ()))

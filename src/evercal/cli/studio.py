@@ -67,7 +67,9 @@ class Studio(Page):
         page = StudioPage(Session(devices, self.out, self.map), self.host, self.port)
         try:
             url = page.server.url
-            self.wait(url, f"studio in {self.out} at {url}, where the same command continues")
+            self.wait(
+                url, f"studio in {self.out} at {url}, where the same command continues"
+            )
         finally:
             page.close()
         return 0
@@ -81,7 +83,9 @@ class Studio(Page):
         blind = self.camera is None and self.fixed is None
         if not self.virtual and (blind or self.poses is None):
             missing = "--camera SOURCE" if blind else "--poses FILE"
-            raise InputError(f"no {missing} given; give both, or --virtual to try it without")
+            raise InputError(
+                f"no {missing} given; give both, or --virtual to try it without"
+            )
         if self.fixed_intrinsics is not None and self.fixed is None:
             raise InputError("--fixed-intrinsics: is of --fixed, which is missing")
 
@@ -91,7 +95,11 @@ class Studio(Page):
 
         from evercal.service.studio.devices import Devices
         from evercal.simulation.panda_arm import joint_frames
-        from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
+        from evercal.simulation.virtual_cell import (
+            CellOptions,
+            VirtualCell,
+            nominal_mount,
+        )
 
         cell = VirtualCell(self.seed, CellOptions(realtime=True))
         return Devices(
@@ -117,17 +125,30 @@ class Studio(Page):
         from evercal.service.studio.devices import Devices
 
         assert self.poses is not None, "checked before"
-        convention, fixed_intrinsics = self.pose_convention, self.fixed_intrinsics
+        convention = self.pose_convention
+        fixed_intrinsics = self.fixed_intrinsics
         sources = self.camera, self.fixed
-        wrist, fixed = (None if source is None else StreamCamera(source) for source in sources)
+        wrist, fixed = (
+            None if source is None else StreamCamera(source) for source in sources
+        )
         begun = self.out / "wrist" / "camera.json"
-        default = fixed_intrinsics if self.camera is None else begun if begun.is_file() else None
+        default = (
+            fixed_intrinsics
+            if self.camera is None
+            else begun
+            if begun.is_file()
+            else None
+        )
         intrinsics = self.intrinsics or default
         if intrinsics is None:
-            raise InputError("no --intrinsics FILE given: a new recording needs the intrinsics")
+            raise InputError(
+                "no --intrinsics FILE given: a new recording needs the intrinsics"
+            )
         reachable = None
         if self.reachable is not None:
-            poses = read_robot_poses(self.reachable, convention, option="--pose-convention")
+            poses = read_robot_poses(
+                self.reachable, convention, option="--pose-convention"
+            )
             reachable = poses.poses
         return Devices(
             wrist_camera=wrist,

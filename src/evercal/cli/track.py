@@ -44,7 +44,11 @@ class Track(args.Verb):
     """Stop after so many frames."""
 
     def run(self) -> int:
-        if self.rate <= 0 or self.smooth < 0 or (self.at_most is not None and self.at_most <= 0):
+        if (
+            self.rate <= 0
+            or self.smooth < 0
+            or (self.at_most is not None and self.at_most <= 0)
+        ):
             raise InputError("--rate and --at-most are above 0, --smooth is 0 or more")
         for path in self.out:
             require_writable(path, "--out")
@@ -65,7 +69,9 @@ class Track(args.Verb):
             try:
                 for name, stamp, image, _ in frames:
                     if tracker is None:
-                        camera = args.stated_camera(self.camera, (image.shape[1], image.shape[0]))
+                        camera = args.stated_camera(
+                            self.camera, (image.shape[1], image.shape[0])
+                        )
                         tracker = Tracker(localizer, camera, options)
                     frame = tracker.track(image, stamp)
                     states[frame.state] += 1
@@ -91,10 +97,18 @@ class Track(args.Verb):
         counts = {state: states[state] for state in ("tracking", "relocalized", "lost")}
         files = [str(path) for path in self.out]
         self.answer(
-            {"frames": len(times), **counts, "ms_p50": middle, "ms_p99": high, "out": files},
+            {
+                "frames": len(times),
+                **counts,
+                "ms_p50": middle,
+                "ms_p99": high,
+                "out": files,
+            },
             f"{len(times)} frames: {states['tracking']} tracked, {states['relocalized']}"
             f" relocalized, {states['lost']} lost; {middle:.0f} ms (median), {high:.0f} ms (99 %)",
-            then=() if files else ("track", self.store, self.source, "--out", "track.jsonl"),
+            then=()
+            if files
+            else ("track", self.store, self.source, "--out", "track.jsonl"),
         )
 
 

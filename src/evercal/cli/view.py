@@ -49,7 +49,8 @@ class View(Page):
 
     store: args.Store
     calibrations: Annotated[
-        Positional[tuple[Path, ...]], args.shown("[CALIBRATION.json...]", "(default: none)")
+        Positional[tuple[Path, ...]],
+        args.shown("[CALIBRATION.json...]", "(default: none)"),
     ] = ()
     """Calibration files to draw."""
     live: args.Source = None
@@ -66,14 +67,20 @@ class View(Page):
         from evercal.service.viewer.page import Page as ViewerPage
 
         address = (self.host, self.port)
-        page = ViewerPage(args.open_map(self.store), self.calibrations, self.urdf, address)
+        page = ViewerPage(
+            args.open_map(self.store), self.calibrations, self.urdf, address
+        )
         try:
             if self.live is not None:
                 page.track(self.live, self.camera)
             url = page.server.url
             port = page.server.get_port()
-            tunnel = shlex.join(["ssh", "-L", f"{port}:127.0.0.1:{port}", socket.gethostname()])
-            self.wait(url, f"view of {self.store} at {url} (from another machine: {tunnel})")
+            tunnel = shlex.join(
+                ["ssh", "-L", f"{port}:127.0.0.1:{port}", socket.gethostname()]
+            )
+            self.wait(
+                url, f"view of {self.store} at {url} (from another machine: {tunnel})"
+            )
         finally:
             page.close()
         return 0

@@ -52,7 +52,9 @@ class Watch(args.Verb):
 
     def run(self) -> int:
         if not self.folder.is_dir():
-            raise InputError(f"{self.folder}: no such folder; give the one that images arrive in")
+            raise InputError(
+                f"{self.folder}: no such folder; give the one that images arrive in"
+            )
         if self.window < 1 or self.interval <= 0:
             raise InputError("--window is at least 1 and --interval is above 0")
         from evercal.calibration.calibration import read_calibration
@@ -63,11 +65,14 @@ class Watch(args.Verb):
         localizer = args.open_map(self.store)
         recent: deque[ImagePose] = deque(maxlen=self.window)
         arrivals = Arrivals(self.folder)
-        tests, last = 0, time.monotonic()
+        tests = 0
+        last = time.monotonic()
         while self.idle is None or time.monotonic() - last < self.idle:
             for path, pixels in arrivals.scan():
                 height, width = pixels.shape[:2]
-                camera = args.stated_camera(self.camera, (width, height)) or reference.camera
+                camera = (
+                    args.stated_camera(self.camera, (width, height)) or reference.camera
+                )
                 try:
                     recent.extend(locate(localizer, [(path.name, pixels)], camera))
                 except InputError as error:
@@ -75,13 +80,19 @@ class Watch(args.Verb):
                     continue
                 last = time.monotonic()
                 if not any(item.is_located for item in recent):
-                    self._print(path, {"moved": None, "reason": recent[-1].estimate.reason})
+                    self._print(
+                        path, {"moved": None, "reason": recent[-1].estimate.reason}
+                    )
                     continue
                 tests += 1
                 confidence = 1 - false_alarm_share(tests)
-                shift = shift_between(reference, fuse(recent), list(recent), localizer, confidence)
+                shift = shift_between(
+                    reference, fuse(recent), list(recent), localizer, confidence
+                )
                 self._print(path, shift_dict(shift), shift_line(shift))
-                if shift.moved and sum(use.used for use in shift.images) >= min(3, self.window):
+                if shift.moved and sum(use.used for use in shift.images) >= min(
+                    3, self.window
+                ):
                     return 1
             time.sleep(self.interval)
         return 0
@@ -112,7 +123,8 @@ class Arrivals:
         states: dict[Path, tuple[int, int]] = {}
         for path in files_in(self._folder):
             if path not in self._done:
-                with suppress(FileNotFoundError):  # removed or renamed since it was listed
+                # Removed or renamed since it was listed.
+                with suppress(FileNotFoundError):
                     status = path.stat()
                     states[path] = status.st_mtime_ns, status.st_size
         for path in sorted(states, key=lambda path: (states[path][0], path.name)):

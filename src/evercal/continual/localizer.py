@@ -45,16 +45,23 @@ def open_networks(path: Path, device: str = "auto") -> "NetworkLocalizer":
     where = device_of(device)
     scenes = NetworkStore.open(path).contents
     if not scenes.scenes:
-        raise InputError(f"store {path}: no scene learned yet; run 'evercal learn' first")
+        raise InputError(
+            f"store {path}: no scene learned yet; run 'evercal learn' first"
+        )
     return NetworkLocalizer(scenes.to(where))
 
 
 class NetworkLocalizer:
     """Locates images by scene-coordinate networks of one or more scenes."""
 
-    def __init__(self, scenes: LearnedScenes, options: NetworkLocalizeOptions | None = None):
-        self.contents, self.options = scenes, options or NetworkLocalizeOptions()
-        self._prototypes = [r.prototypes.float().to(scenes.device) for r in scenes.scenes]
+    def __init__(
+        self, scenes: LearnedScenes, options: NetworkLocalizeOptions | None = None
+    ):
+        self.contents = scenes
+        self.options = options or NetworkLocalizeOptions()
+        self._prototypes = [
+            r.prototypes.float().to(scenes.device) for r in scenes.scenes
+        ]
         for head in scenes.heads:
             head.eval()
 
@@ -66,11 +73,15 @@ class NetworkLocalizer:
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         """Locate an image; see `Localizer.localize`."""
         began = time.perf_counter()
-        image, scenes = as_rgb(image), self.contents
+        image = as_rgb(image)
+        scenes = self.contents
         cameras = _fitting_cameras(camera, image, scenes.scenes)
         features = scenes.encoder.encode(image, scenes.short_side)
         query = Query(image, features, self.options.patches_short_side)
-        tried = [self._hypothesis(query, i, cameras) for i in self._candidates(query, cameras)]
+        tried = [
+            self._hypothesis(query, i, cameras)
+            for i in self._candidates(query, cameras)
+        ]
         best = max(tried, key=_support)
         return self._answer(best, 1000 * (time.perf_counter() - began))
 
@@ -84,13 +95,19 @@ class NetworkLocalizer:
         if self._decides_scene:
             return usable[:1]
         _, descriptor = described(query.features, self.contents.descriptor)
-        similarity = {i: float((self._prototypes[i] @ descriptor).max()) for i in usable}
+        similarity = {
+            i: float((self._prototypes[i] @ descriptor).max()) for i in usable
+        }
         usable.sort(key=lambda i: -similarity[i])
         floor = similarity[usable[0]] - self.options.margin
         return [i for i in usable if similarity[i] >= floor][: self.options.candidates]
 
     def _hypothesis(
-        self, query: Query, scene: int, cameras: Sequence[Camera | None], moved: bool = False
+        self,
+        query: Query,
+        scene: int,
+        cameras: Sequence[Camera | None],
+        moved: bool = False,
     ) -> Hypothesis:
         camera = cameras[scene]
         assert camera is not None, "only scenes whose camera fits are tried"
@@ -106,7 +123,9 @@ class NetworkLocalizer:
                 # The pose lies in the cell of a scene with another camera: solve once more.
                 return self._hypothesis(query, other, cameras, moved=True)
             if other != scene:
-                cells = [self.contents.scenes[i].cell.atlas_from_base for i in (other, scene)]
+                cells = [
+                    self.contents.scenes[i].cell.atlas_from_base for i in (other, scene)
+                ]
                 across = cells[0].inverse() @ cells[1]
                 rough = PnpResult(across @ rough.pose, rough.inliers)
                 matches = Matches(matches.pixels, across.apply(matches.points_m))
@@ -116,7 +135,9 @@ class NetworkLocalizer:
         return Hypothesis(scene, pose, pixels=pixels, points_m=points, expected=patches)
 
     @torch.inference_mode()
-    def _predicted(self, query: Query, scene: int, camera: Camera) -> tuple[Matches, int]:
+    def _predicted(
+        self, query: Query, scene: int, camera: Camera
+    ) -> tuple[Matches, int]:
         """Scene coordinates of patches in a scene's base frame, and the number of patches."""
         scenes = self.contents
         patches, pixels = strided_patches(query, camera, scenes.encoder.stride, 1)
@@ -125,14 +146,18 @@ class NetworkLocalizer:
         with autocast(head.device):
             output = head(features, local, descriptor.expand(len(features), -1))
         points = output.points.cpu().double().numpy()
-        points = scenes.scenes[scene].cell.atlas_from_base.inverse().apply(points)[patches]
+        points = (
+            scenes.scenes[scene].cell.atlas_from_base.inverse().apply(points)[patches]
+        )
         valid = np.isfinite(points).all(1)
         return Matches(pixels[valid], points[valid]), len(patches)
 
     def _scene_at(self, base_from_camera: SE3, scene: int) -> int | None:
         """The scene in whose cell a pose of one scene lies."""
         atlas_from_base = self.contents.scenes[scene].cell.atlas_from_base
-        return self.contents.atlas().scene_at(atlas_from_base.apply(base_from_camera.translation_m))
+        return self.contents.atlas().scene_at(
+            atlas_from_base.apply(base_from_camera.translation_m)
+        )
 
     def _answer(self, best: Hypothesis, milliseconds: float) -> PoseEstimate:
         record = self.contents.scenes[best.scene]
@@ -156,7 +181,8 @@ class NetworkLocalizer:
         if self._scene_at(best.pose.pose, best.scene) != best.scene:
             return "failed", "the pose lies outside the cell of its scene"
         if self.options.refuses and best.inlier_ratio < record.inlier_threshold:
-            share, need = 100 * best.inlier_ratio, 100 * record.inlier_threshold
+            share = 100 * best.inlier_ratio
+            need = 100 * record.inlier_threshold
             reason = f"{share:.0f} % of the patches are inliers, {record.name} needs {need:.0f} %"
             return "unknown_scene", reason
         return "ok", ""

@@ -49,11 +49,17 @@ class SceneRecord:
 
     def correct_lens(self, rows: FeatureBuffer) -> None:
         """Apply the intrinsics of the training to the scene's rows; see `corrected_camera`."""
-        nominal, refined = self.camera, self.refined_camera
+        nominal = self.camera
+        refined = self.refined_camera
         if refined is not None:
             k1, k2 = refined.distortion[:2] or (0.0, 0.0)
-            shift = (refined.cx - nominal.cx) / nominal.fx, (refined.cy - nominal.cy) / nominal.fy
-            rows.correct_lens(torch.tensor([refined.fx / nominal.fx - 1, *shift, k1, k2]))
+            shift = (
+                (refined.cx - nominal.cx) / nominal.fx,
+                (refined.cy - nominal.cy) / nominal.fy,
+            )
+            rows.correct_lens(
+                torch.tensor([refined.fx / nominal.fx - 1, *shift, k1, k2])
+            )
 
     @property
     def frame(self) -> MapFrame:
@@ -96,7 +102,9 @@ class LearnedScenes:
     @property
     def memory_bytes(self) -> int:
         """Size of the memory for later stages: keyframes and method states."""
-        frames = sum(keyframes.bytes for keyframes in self.keyframes if keyframes is not None)
+        frames = sum(
+            keyframes.bytes for keyframes in self.keyframes if keyframes is not None
+        )
         states = (value for state in self.method_states for value in state.values())
         return frames + sum(value.nbytes for value in states)
 
@@ -130,8 +138,10 @@ class LearnedScenes:
 def corrected_camera(camera: Camera, correction: Tensor) -> Camera:
     """A nominal pinhole with the correction (5,) of training (see `reprojection_error`)."""
     focal, dx, dy, k1, k2 = (float(value) for value in correction)
-    fx, fy = camera.fx * (1 + focal), camera.fy * (1 + focal)
-    cx, cy = camera.cx + dx * camera.fx, camera.cy + dy * camera.fy
+    fx = camera.fx * (1 + focal)
+    fy = camera.fy * (1 + focal)
+    cx = camera.cx + dx * camera.fx
+    cy = camera.cy + dy * camera.fy
     return Camera(camera.width, camera.height, fx, fy, cx, cy, (k1, k2, 0.0, 0.0))
 
 

@@ -34,11 +34,19 @@ from evercal.mapping.store import KEYFRAMES
 from evercal.recordings.frame import checked_name
 from evercal.storage.atomic import write_bytes, write_json
 from evercal.storage.manifest import Manifest
-from evercal.storage.stages import STAGES, StageStore, read_store, require_free, write_report
+from evercal.storage.stages import (
+    STAGES,
+    StageStore,
+    read_store,
+    require_free,
+    write_report,
+)
 from evercal.storage.tensors import load_tensors, save_tensors
 
-HEAD, RECORD = "head.safetensors", "network.json"
-PROTOTYPES, STATE = "prototypes.safetensors", "state.safetensors"
+HEAD = "head.safetensors"
+RECORD = "network.json"
+PROTOTYPES = "prototypes.safetensors"
+STATE = "state.safetensors"
 
 
 class NetworkStore(StageStore[LearnedScenes]):
@@ -46,7 +54,11 @@ class NetworkStore(StageStore[LearnedScenes]):
 
     @classmethod
     def create(
-        cls, root: Path, strategy: str, short_side: int = 240, encoder: Path | None = None
+        cls,
+        root: Path,
+        strategy: str,
+        short_side: int = 240,
+        encoder: Path | None = None,
     ) -> Self:
         """An empty store; nothing is written before the first `commit`.
 
@@ -68,9 +80,12 @@ class NetworkStore(StageStore[LearnedScenes]):
             networks = tuple(str(name) for name in payload["networks"])
             encoder = load_encoder(root / networks[0])
             for name in networks[1:-1]:
-                encoder.centroids = load_tensors(root / name)["centroids"].astype(np.float32)
+                encoder.centroids = load_tensors(root / name)["centroids"].astype(
+                    np.float32
+                )
             described = descriptor.load_descriptor(root / networks[-1])
-            strategy, short_side = str(payload["strategy"]), int(payload["short_side"])
+            strategy = str(payload["strategy"])
+            short_side = int(payload["short_side"])
             scenes = LearnedScenes(encoder, described, strategy, short_side)
             stages = [str(name) for name in payload["stages"]]
             store = cls(root, scenes, stages, networks)
@@ -81,14 +96,17 @@ class NetworkStore(StageStore[LearnedScenes]):
         return read_store(root, read)
 
     def _read_stage(self, name: str, manifest: Manifest) -> None:
-        scenes, folder = self.contents, self.folder(name)
+        scenes = self.contents
+        folder = self.folder(name)
 
         def listed(file: str) -> bool:
             return f"{STAGES}/{name}/{file}" in manifest.files
 
         scenes.scenes.append(_read_record(folder))
         scenes.keyframes.append(
-            Keyframes.from_tensors(load_tensors(folder / KEYFRAMES)) if listed(KEYFRAMES) else None
+            Keyframes.from_tensors(load_tensors(folder / KEYFRAMES))
+            if listed(KEYFRAMES)
+            else None
         )
         scenes.method_states.append(_tensors(folder / STATE) if listed(STATE) else {})
         if listed(HEAD):
@@ -103,7 +121,9 @@ class NetworkStore(StageStore[LearnedScenes]):
                 self.networks = self._write_networks(scenes)
             record = scenes.scenes[-1]
             write_json(folder / RECORD, _plain(record))
-            save_tensors(folder / PROTOTYPES, _arrays({"prototypes": record.prototypes}))
+            save_tensors(
+                folder / PROTOTYPES, _arrays({"prototypes": record.prototypes})
+            )
             _write_head(folder, scenes.heads[-1])
             if keyframes is not None:
                 save_tensors(folder / KEYFRAMES, keyframes.to_tensors())
@@ -112,8 +132,14 @@ class NetworkStore(StageStore[LearnedScenes]):
             write_report(folder, report)
 
         shared = len(scenes.heads) == 1
-        payload = {"kind": "networks", "strategy": scenes.strategy, "short_side": scenes.short_side}
-        self.add(scenes.scenes[-1].name, write, payload, lambda file: shared and file == HEAD)
+        payload = {
+            "kind": "networks",
+            "strategy": scenes.strategy,
+            "short_side": scenes.short_side,
+        }
+        self.add(
+            scenes.scenes[-1].name, write, payload, lambda file: shared and file == HEAD
+        )
         self.contents = scenes
 
     def _write_networks(self, scenes: LearnedScenes) -> tuple[str, ...]:
@@ -143,7 +169,9 @@ def head_bytes(head: Head) -> int:
 def _stored(head: Head) -> dict[str, Tensor]:
     # Centres stay fp32: half floats are 4 to 16 mm apart at the size of an atlas.
     return {
-        key: value if key == "centres" or not value.is_floating_point() else value.half()
+        key: value
+        if key == "centres" or not value.is_floating_point()
+        else value.half()
         for key, value in head.state_dict().items()
     }
 
@@ -188,7 +216,8 @@ def _plain(record: SceneRecord) -> dict[str, Any]:
 def _read_record(folder: Path) -> SceneRecord:
     content = json.loads((folder / RECORD).read_text())
     checked_name(content["name"])
-    cell, refined = content["cell"], content["refined_camera"]
+    cell = content["cell"]
+    refined = content["refined_camera"]
     read = {
         "camera": Camera.from_dict(content["camera"]),
         "cell": Cell(tuple(cell["centre_m"]), cell["side_m"], tuple(cell["origin_m"])),

@@ -7,10 +7,17 @@ from pathlib import Path
 
 from evercal.continual.methods.ewc import ElasticWeightConsolidation
 from evercal.continual.methods.gec import EpisodicConstraint
-from evercal.continual.methods.learning_without_forgetting import LearningWithoutForgetting
+from evercal.continual.methods.learning_without_forgetting import (
+    LearningWithoutForgetting,
+)
 from evercal.continual.methods.method import FineTuning, Isolation, Method, described
 from evercal.continual.methods.mir import MaximallyInterferedRetrieval
-from evercal.continual.methods.penalties import BoundedByTeacher, Distillation, OldOutput, Relations
+from evercal.continual.methods.penalties import (
+    BoundedByTeacher,
+    Distillation,
+    OldOutput,
+    Relations,
+)
 from evercal.continual.methods.preconditioning import PreconditionedReplay
 from evercal.continual.methods.replay import Replay
 from evercal.errors import InputError
@@ -118,6 +125,8 @@ def load_plugin(path: Path) -> tuple[str, ...]:
         )
     for name, strategy in strategies.items():
         if STRATEGIES.get(name, strategy) is not strategy:
-            raise InputError(f"plugin {path}: strategy {name!r} exists; choose another name")
+            raise InputError(
+                f"plugin {path}: strategy {name!r} exists; choose another name"
+            )
     STRATEGIES.update(strategies)
     return tuple(strategies)

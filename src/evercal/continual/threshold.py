@@ -18,7 +18,9 @@ ACCEPTANCE_FRACTION = 1 / 6
 """Position of the threshold between the inlier ratios of negative and positive images."""
 
 
-def fit_threshold(scenes: LearnedScenes, held_out: Sequence[Frame], index: int = -1) -> SceneRecord:
+def fit_threshold(
+    scenes: LearnedScenes, held_out: Sequence[Frame], index: int = -1
+) -> SceneRecord:
     """Fit the inlier threshold and covariance scale of a scene, by default the newest.
 
     Positives are held-out training frames; negatives are views of box rooms that were never
@@ -31,7 +33,8 @@ def fit_threshold(scenes: LearnedScenes, held_out: Sequence[Frame], index: int =
     records = list(scenes.scenes)
     records[index] = replace(records[index], inlier_threshold=0.0, covariance_scale=1.0)
     localizer = NetworkLocalizer(replace(scenes, scenes=records))
-    squared, ratios = [], []
+    squared = []
+    ratios = []
     for frame in held_out:
         estimate = localizer.localize(frame.read_image(), frame.camera)
         ratios.append(estimate.inlier_ratio)
@@ -48,12 +51,15 @@ def fit_threshold(scenes: LearnedScenes, held_out: Sequence[Frame], index: int =
     low = float(np.quantile(ratios, 0.05)) if ratios else 1.0
     threshold = top + ACCEPTANCE_FRACTION * max(0.0, low - top)
     scale = float(np.median(squared)) / CHI2_6_MEDIAN if squared else 1.0
-    return replace(records[index], inlier_threshold=threshold, covariance_scale=max(scale, 1.0))
+    return replace(
+        records[index], inlier_threshold=threshold, covariance_scale=max(scale, 1.0)
+    )
 
 
 @lru_cache(maxsize=4)
 def _negative_views(width: int, height: int) -> list[np.ndarray]:
-    plain, images = default_camera(width, height), []
+    plain = default_camera(width, height)
+    images = []
     for seed in range(NEGATIVE_ROOM_SEED, NEGATIVE_ROOM_SEED + 4):
         room = BoxRoom(seed, texture_px=192)
         rng = np.random.default_rng(seed)

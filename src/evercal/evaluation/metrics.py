@@ -129,7 +129,9 @@ def correct(
     def right(row: FrameResult) -> bool:
         return row.translation_error_m < metres and row.rotation_error_rad < radians
 
-    return {name: np.array([*map(right, rows)]) for name, rows in _by_scene(results).items()}
+    return {
+        name: np.array([*map(right, rows)]) for name, rows in _by_scene(results).items()
+    }
 
 
 def scores(results: Sequence[FrameResult]) -> Scores:
@@ -173,12 +175,18 @@ def continual_scores(accuracies: ArrayLike) -> ContinualScores:
     matrix = np.asarray(accuracies, dtype=np.float64)
     count = len(matrix) if matrix.ndim == 2 else 0
     if count == 0 or matrix.shape != (count, count):
-        raise ValueError(f"accuracies must be square (stages, scenes), got {matrix.shape}")
+        raise ValueError(
+            f"accuracies must be square (stages, scenes), got {matrix.shape}"
+        )
     learned = matrix[np.tril_indices(count)]
     if not np.isfinite(learned).all():
-        raise ValueError("accuracies must be finite on and below the diagonal, got inf or nan")
-    last, along = matrix[-1], float(learned.mean())
-    final, newest = float(last.mean()), float(last[-1])
+        raise ValueError(
+            "accuracies must be finite on and below the diagonal, got inf or nan"
+        )
+    last = matrix[-1]
+    along = float(learned.mean())
+    final = float(last.mean())
+    newest = float(last[-1])
     if count == 1:
         return ContinualScores(final, math.nan, math.nan, math.nan, newest, along)
     old = range(count - 1)
@@ -204,15 +212,20 @@ def _by_scene(results: Iterable[FrameResult]) -> dict[str, list[FrameResult]]:
 def _scene_scores(rows: list[FrameResult]) -> SceneScores:
     # The upper median: a mean of the two middle errors may include infinity.
     middle = len(rows) // 2
-    within = [_percent(*correct(rows, t).values()) for t in (COARSE, MIDDLE, FINE, FINEST)]
+    within = [
+        _percent(*correct(rows, t).values()) for t in (COARSE, MIDDLE, FINE, FINEST)
+    ]
     return SceneScores(
         frames=len(rows),
         accuracy_5cm_5deg=within[0],
         accuracy_2cm_2deg=within[1],
         accuracy_1cm_1deg=within[2],
         accuracy_5mm_05deg=within[3],
-        median_translation_cm=100.0 * sorted(row.translation_error_m for row in rows)[middle],
-        median_rotation_deg=math.degrees(sorted(row.rotation_error_rad for row in rows)[middle]),
+        median_translation_cm=100.0
+        * sorted(row.translation_error_m for row in rows)[middle],
+        median_rotation_deg=math.degrees(
+            sorted(row.rotation_error_rad for row in rows)[middle]
+        ),
         wrong_scene=_percent([row.wrong_scene for row in rows]),
         unknown=_percent(
             [row.status in ("uncertain", "unknown_scene", "ambiguous") for row in rows]

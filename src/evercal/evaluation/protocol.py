@@ -11,7 +11,13 @@ from evercal.evaluation.metrics import FrameResult
 from evercal.geometry import pose_distance
 from evercal.geometry.near import near_training
 from evercal.localization.learned import SceneLocalizer
-from evercal.recordings import Frame, Recording, load_recording, posed_frames, stated_poses
+from evercal.recordings import (
+    Frame,
+    Recording,
+    load_recording,
+    posed_frames,
+    stated_poses,
+)
 
 Recorded = str | os.PathLike[str] | Recording
 """A recording, or its folder."""
@@ -36,13 +42,21 @@ def evaluate(
         on_frame: Called after each image with the numbers of images done and in total.
     """
     named = _named(scenes)
-    tests = {name: _test_frames(localizer, name, scene) for name, scene in named.items()}
+    tests = {
+        name: _test_frames(localizer, name, scene) for name, scene in named.items()
+    }
     if not tests:
-        raise InputError(f"no scene to evaluate; give one or more of {_listed(localizer.scenes)}")
-    near = [flag for name, frames in tests.items() for flag in _near(named[name], frames)]
+        raise InputError(
+            f"no scene to evaluate; give one or more of {_listed(localizer.scenes)}"
+        )
+    near = [
+        flag for name, frames in tests.items() for flag in _near(named[name], frames)
+    ]
     jobs = [(name, frame) for name, frames in tests.items() for frame in frames]
     results: dict[int, FrameResult] = {}
-    for done, index in enumerate(np.random.default_rng(seed).permutation(len(jobs)), start=1):
+    for done, index in enumerate(
+        np.random.default_rng(seed).permutation(len(jobs)), start=1
+    ):
         name, frame = jobs[index]
         accepted = _same_base(name, named)
         results[int(index)] = _result(localizer, name, frame, near[index], accepted)
@@ -51,7 +65,9 @@ def evaluate(
     return [results[index] for index in range(len(jobs))]
 
 
-def _named(scenes: Recorded | Sequence[Recorded] | Mapping[str, Recorded]) -> dict[str, Recording]:
+def _named(
+    scenes: Recorded | Sequence[Recorded] | Mapping[str, Recorded],
+) -> dict[str, Recording]:
     if isinstance(scenes, Mapping):
         return {name: _loaded(scene) for name, scene in scenes.items()}
     given = [scenes] if isinstance(scenes, str | os.PathLike | Recording) else scenes
@@ -70,7 +86,9 @@ def _loaded(scene: Recorded) -> Recording:
     return scene if isinstance(scene, Recording) else load_recording(scene)
 
 
-def _test_frames(localizer: SceneLocalizer, name: str, scene: Recording) -> tuple[Frame, ...]:
+def _test_frames(
+    localizer: SceneLocalizer, name: str, scene: Recording
+) -> tuple[Frame, ...]:
     if name not in localizer.scenes:
         raise InputError(
             f"scene {name!r} is not in the store; its scenes are {_listed(localizer.scenes)};"
@@ -87,7 +105,9 @@ def _test_frames(localizer: SceneLocalizer, name: str, scene: Recording) -> tupl
 
 def _same_base(name: str, scenes: Mapping[str, Recording]) -> set[str]:
     base = scenes[name].base
-    return {name} | {n for n, scene in scenes.items() if base is not None and scene.base == base}
+    return {name} | {
+        n for n, scene in scenes.items() if base is not None and scene.base == base
+    }
 
 
 def _result(
@@ -98,7 +118,8 @@ def _result(
     milliseconds = 1e3 * (time.perf_counter() - start)
     metres = radians = np.inf
     squared = np.nan
-    truth, pose = frame.base_from_camera, estimate.base_from_camera
+    truth = frame.base_from_camera
+    pose = estimate.base_from_camera
     if estimate.status == "ok" and estimate.scene in accepted:
         assert truth is not None
         assert pose is not None, "an estimate whose status is ok has a pose"

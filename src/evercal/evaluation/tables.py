@@ -24,7 +24,8 @@ _COLUMNS = (
 def score_rows(scores: Scores) -> list[dict[str, str]]:
     """Cells by title: a row a scene and, for several scenes, their unweighted mean."""
     values = [
-        [f * getattr(row, name) for _, name, f, _ in _COLUMNS] for row in scores.scenes.values()
+        [f * getattr(row, name) for _, name, f, _ in _COLUMNS]
+        for row in scores.scenes.values()
     ]
     heads = [(name, str(row.frames)) for name, row in scores.scenes.items()]
     if len(values) > 1:

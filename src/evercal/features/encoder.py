@@ -43,14 +43,19 @@ class Encoder:
     """
 
     def __init__(self, function: Features, name: str, data: bytes = b""):
-        self.name, self.function, self.data = name, function, data
+        self.name = name
+        self.function = function
+        self.data = data
         features = np.asarray(function(_standardised(_probe())))
-        if features.ndim != 3 or len(features) not in {_PROBE[0] // s for s in (1, 2, 4, 8, 16)}:
+        if features.ndim != 3 or len(features) not in {
+            _PROBE[0] // s for s in (1, 2, 4, 8, 16)
+        }:
             raise InputError(
                 f"encoder {name}: made {features.shape} from an image of {_PROBE} pixels; it must"
                 " make (rows, columns, channels) with a stride of 1, 2, 4, 8 or 16 pixels"
             )
-        self.stride, self.width = _PROBE[0] // len(features), features.shape[2]
+        self.stride = _PROBE[0] // len(features)
+        self.width = features.shape[2]
         self.fingerprint = unit(features).mean((0, 1))[:8].round(4).tolist()
         self._centroids: NDArray[np.float32] | None = None
         self._vlad: Vlad | None = None
@@ -71,13 +76,16 @@ class Encoder:
 
     @centroids.setter
     def centroids(self, value: NDArray[np.float32] | None) -> None:
-        self._centroids, self._vlad = value, None
+        self._centroids = value
+        self._vlad = None
 
     def vlad(self, features: Sequence[NDArray[np.float32]] = ()) -> Vlad:
         """The VLAD of the encoder; missing centroids are fitted to features (cells, width)."""
         if self._centroids is None:
             if not features:
-                raise InputError("the encoder has no VLAD centroids; learn a recording first")
+                raise InputError(
+                    "the encoder has no VLAD centroids; learn a recording first"
+                )
             self.centroids = fit_centroids(features)
         if self._vlad is None:
             assert self._centroids is not None, "just fitted"
@@ -99,7 +107,9 @@ class Encoder:
             write_bytes(root / first, json.dumps(record, indent=1).encode())
         if self._centroids is None or (self.data and (WEIGHTS / self.name).exists()):
             return (first,)
-        vlad = f"{stem.replace('encoder', 'vlad', 1) if self.data else 'vlad'}.safetensors"
+        vlad = (
+            f"{stem.replace('encoder', 'vlad', 1) if self.data else 'vlad'}.safetensors"
+        )
         save_tensors(root / vlad, {"centroids": self._centroids})
         return first, vlad
 
@@ -107,7 +117,10 @@ class Encoder:
         """Compare with a record of `write`; another function is an `InputError`."""
         stored = np.asarray(record["fingerprint"], float)
         own = np.asarray(self.fingerprint)
-        if stored.shape != own.shape or np.abs(stored - own).max() > _FINGERPRINT_TOLERANCE:
+        if (
+            stored.shape != own.shape
+            or np.abs(stored - own).max() > _FINGERPRINT_TOLERANCE
+        ):
             raise InputError(
                 f"{path}: encoder {self.name} makes other features than"
                 f" {record['function']!r}, which the map was made with"
@@ -121,7 +134,8 @@ class _OnnxNetwork:
     """
 
     def __init__(self, data: bytes, name: str):
-        self.data, self.name = data, name
+        self.data = data
+        self.name = name
         self._idle: SimpleQueue[Any] = SimpleQueue()
         self._idle.put(self._read())
 
@@ -135,7 +149,9 @@ class _OnnxNetwork:
             return np.ascontiguousarray(network.forward()[0].transpose(1, 2, 0))
         except (cv2.error, ValueError) as error:
             reason = " ".join(str(error).split())[:200]
-            raise InputError(f"encoder {self.name}: does not run on an image ({reason})") from None
+            raise InputError(
+                f"encoder {self.name}: does not run on an image ({reason})"
+            ) from None
         finally:
             self._idle.put(network)
 
@@ -156,7 +172,9 @@ class _OnnxNetwork:
                         reason = " ".join(str(error).split())[:200]
             finally:
                 cv2.utils.logging.setLogLevel(level)
-        raise InputError(f"encoder {self.name}: OpenCV cannot read this ONNX file ({reason})")
+        raise InputError(
+            f"encoder {self.name}: OpenCV cannot read this ONNX file ({reason})"
+        )
 
 
 def load_encoder(
@@ -173,7 +191,9 @@ def load_encoder(
     elif callable(source):
         encoder = Encoder(source, getattr(source, "__name__", type(source).__name__))
     else:
-        raise InputError(f"encoder {source!r}: give an ONNX file or a function on arrays")
+        raise InputError(
+            f"encoder {source!r}: give an ONNX file or a function on arrays"
+        )
     if stored is not None and stored.suffix == ".json":
         encoder.require_same(json.loads(stored.read_text()), stored)
     return encoder
@@ -182,18 +202,23 @@ def load_encoder(
 def _of_file(path: Path) -> Encoder:
     if path.suffix == ".json":
         name = json.loads(path.read_text())["function"]
-        raise InputError(f"{path}: the map was made with the function {name!r}; give it as encoder")
+        raise InputError(
+            f"{path}: the map was made with the function {name!r}; give it as encoder"
+        )
     if not path.is_file():
         raise InputError(f"encoder {path}: no such file")
     name, data = read_network(path)
-    if name is None and path.suffix == ".safetensors":  # maps of before hold weights of PyTorch
+    # Maps of before hold weights of PyTorch.
+    if name is None and path.suffix == ".safetensors":
         raise InputError(
             f"encoder {path}: weights of a PyTorch module; export the module to an ONNX file or"
             " wrap it in a function, and give that as encoder"
         )
     network = _OnnxNetwork(data, str(path))
     if name is None:
-        return Encoder(network, f"encoder-{hashlib.sha256(data).hexdigest()[:12]}.onnx", data)
+        return Encoder(
+            network, f"encoder-{hashlib.sha256(data).hexdigest()[:12]}.onnx", data
+        )
     encoder = Encoder(network, name, data)
     centroids = WEIGHTS / f"{Path(name).stem.replace('encoder', 'vlad')}.safetensors"
     encoder.centroids = load_tensors(centroids)["centroids"].astype(np.float32)

@@ -55,7 +55,11 @@ def sift_features(image: NDArray[np.uint8]) -> SiftFeatures:
 
 
 def epipolar_pair(
-    a: SiftFeatures, b: SiftFeatures, first: Camera, second: Camera, least_px: float = 0.0
+    a: SiftFeatures,
+    b: SiftFeatures,
+    first: Camera,
+    second: Camera,
+    least_px: float = 0.0,
 ) -> EpipolarPair | None:
     """Match two images and estimate the camera's motion; None for fewer than `MIN_INLIERS`.
 
@@ -85,7 +89,9 @@ def epipolar_pair(
         return None
     direction = np.asarray(pose.t) / max(float(np.linalg.norm(pose.t)), 1e-12)
     inliers = np.flatnonzero(np.asarray(info["inliers"], bool))
-    plane = np.stack([ideal_a[valid][inliers] / first.fx, ideal_b[valid][inliers] / second.fx])
+    plane = np.stack(
+        [ideal_a[valid][inliers] / first.fx, ideal_b[valid][inliers] / second.fx]
+    )
     rays = np.concatenate([plane, np.ones((2, len(inliers), 1))], 2)
     return EpipolarPair(Rotation.from_matrix(pose.R), direction, rays)
 
@@ -106,4 +112,9 @@ def _distinct_matches(
 
 
 def _ideal(camera: Camera) -> dict[str, object]:
-    return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [camera.fx, 0.0, 0.0]}
+    return {
+        "model": "SIMPLE_PINHOLE",
+        "width": 1,
+        "height": 1,
+        "params": [camera.fx, 0.0, 0.0],
+    }

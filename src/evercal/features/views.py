@@ -72,7 +72,9 @@ def frame_view(frame: Frame, stride: int, options: ViewOptions) -> View:
     grey, camera = working_image(frame.read_image(), frame.camera, options.short_side)
     pixels = ideal_cell_pixels(camera, stride)
     valid = np.asarray(np.isfinite(pixels).all(axis=1))
-    return View(grey, pixels, valid, _four(camera), frame.base_from_camera or SE3.identity())
+    return View(
+        grey, pixels, valid, _four(camera), frame.base_from_camera or SE3.identity()
+    )
 
 
 def augmented_view(
@@ -86,22 +88,34 @@ def augmented_view(
 
     grey, camera = working_image(frame.read_image(), frame.camera, options.short_side)
     zoom = options.zoom ** rng.uniform(-1, 1)
-    roll, tilt = np.deg2rad(options.roll_deg), np.deg2rad(options.tilt_deg)
-    rotation = SE3.exp(np.array([0, 0, 0, *(rng.uniform(-1, 1, 3) * [tilt, tilt, roll])]))
+    roll = np.deg2rad(options.roll_deg)
+    tilt = np.deg2rad(options.tilt_deg)
+    rotation = SE3.exp(
+        np.array([0, 0, 0, *(rng.uniform(-1, 1, 3) * [tilt, tilt, roll])])
+    )
     camera_from_view = rotation.rotation_matrix()
     height, width = grey.shape
-    virtual = Camera(width, height, zoom * camera.fx, zoom * camera.fy, camera.cx, camera.cy)
+    virtual = Camera(
+        width, height, zoom * camera.fx, zoom * camera.fy, camera.cx, camera.cy
+    )
     homography = camera.matrix() @ camera_from_view @ np.linalg.inv(virtual.matrix())
     ray = virtual.unproject(cell_centres(height, width, stride)) @ camera_from_view.T
     if camera.distortion:
         v, u = np.mgrid[0:height, 0:width]
-        rays = virtual.unproject(np.stack([u, v], -1).astype(float)) @ camera_from_view.T
+        rays = (
+            virtual.unproject(np.stack([u, v], -1).astype(float)) @ camera_from_view.T
+        )
         source = np.nan_to_num(camera.project(rays), nan=-1.0).astype(np.float32)
-        warped = cv2.remap(grey, source, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)  # type: ignore[call-overload]
+        warped = cv2.remap(
+            grey, source, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+        )  # type: ignore[call-overload]
     else:
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        size, border = (width, height), cv2.BORDER_REFLECT
-        warped = cv2.warpPerspective(grey, homography, size, flags=flags, borderMode=border)
+        size = (width, height)
+        border = cv2.BORDER_REFLECT
+        warped = cv2.warpPerspective(
+            grey, homography, size, flags=flags, borderMode=border
+        )
     table = (np.arange(256) / 255.0) ** np.exp(rng.normal(0, options.gamma)) * 255
     warped = cv2.LUT(warped, table.astype(np.uint8))
     source = camera.project(ray)
@@ -109,10 +123,14 @@ def augmented_view(
     plane = ray[:, :2] / ray[:, 2:]
     pixels = plane * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     assert frame.base_from_camera is not None, "augmented frames have poses"
-    return View(warped, pixels.astype(np.float32), valid, _four(camera), frame.base_from_camera)
+    return View(
+        warped, pixels.astype(np.float32), valid, _four(camera), frame.base_from_camera
+    )
 
 
-def working_image(image: np.ndarray, camera: Camera, short_side: int) -> tuple[np.ndarray, Camera]:
+def working_image(
+    image: np.ndarray, camera: Camera, short_side: int
+) -> tuple[np.ndarray, Camera]:
     """Grey (h, w) uint8 image with the given shorter side, and its camera.
 
     The image, (h, w, 3) uint8 RGB or (h, w) grey, may have any size with the camera's aspect ratio.

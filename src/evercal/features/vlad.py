@@ -45,7 +45,9 @@ def fit_centroids(features: Sequence[Array]) -> Array:
     for _ in range(_ROUNDS):
         sums = _sums(rows, centroids)
         # A centroid without members stays where it is.
-        centroids = np.where(np.abs(sums).sum(1, keepdims=True) > 0, unit(sums), centroids)
+        centroids = np.where(
+            np.abs(sums).sum(1, keepdims=True) > 0, unit(sums), centroids
+        )
     return centroids
 
 
@@ -69,17 +71,25 @@ def _random_projection(size: int) -> Array:
     # The numbers are part of every map that was ever made with a projection.
     count = size * WIDTH
     bits = np.random.RandomState(1).randint(0, 2**32, count, dtype=np.uint32)
-    uniform = ((bits & 0xFFFFFF) * np.float32(2**-24)).astype(np.float32).reshape(-1, 2, 8)
+    uniform = (
+        ((bits & 0xFFFFFF) * np.float32(2**-24)).astype(np.float32).reshape(-1, 2, 8)
+    )
     radius = np.sqrt(-2 * np.log1p(-uniform[:, 0])) / np.float32(size) ** 0.5
     angle = np.float32(2 * np.pi) * uniform[:, 1]
     normal = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
     return np.asarray(normal, np.float32).reshape(size, WIDTH)
 
 
-def similar_pairs(features: Sequence[Array], vlad: Vlad, partners: int) -> list[tuple[int, int]]:
+def similar_pairs(
+    features: Sequence[Array], vlad: Vlad, partners: int
+) -> list[tuple[int, int]]:
     """Pairs of images, each with the most similar other ones, by features (cells, channels)."""
     descriptors = np.stack([vlad(rows) for rows in features])
     similarity = descriptors @ descriptors.T
     np.fill_diagonal(similarity, -np.inf)
-    nearest = np.argsort(-similarity, 1, kind="stable")[:, : min(partners, len(features) - 1)]
-    return sorted({(min(i, j), max(i, j)) for i, row in enumerate(nearest.tolist()) for j in row})
+    nearest = np.argsort(-similarity, 1, kind="stable")[
+        :, : min(partners, len(features) - 1)
+    ]
+    return sorted(
+        {(min(i, j), max(i, j)) for i, row in enumerate(nearest.tolist()) for j in row}
+    )

@@ -67,12 +67,16 @@ class Camera:
         for name in ("width", "height"):
             value = getattr(self, name)
             if not (1 <= value < math.inf) or int(value) != value:
-                raise ValueError(f"camera {name} is a whole number of pixels >= 1, got {value}")
+                raise ValueError(
+                    f"camera {name} is a whole number of pixels >= 1, got {value}"
+                )
             object.__setattr__(self, name, int(value))
         for name in ("fx", "fy", "cx", "cy"):
             value = float(getattr(self, name))
             if not math.isfinite(value) or (name.startswith("f") and value <= 0):
-                raise ValueError(f"camera {name} is finite (and > 0 for fx, fy), got {value}")
+                raise ValueError(
+                    f"camera {name} is finite (and > 0 for fx, fy), got {value}"
+                )
             object.__setattr__(self, name, value)
         if self.model not in _COEFFICIENT_COUNTS:
             raise ValueError(f"camera model is pinhole or fisheye, got {self.model!r}")
@@ -89,13 +93,21 @@ class Camera:
 
     @classmethod
     def from_matrix(
-        cls, matrix: ArrayLike, width: int, height: int, distortion: tuple[float, ...] = ()
+        cls,
+        matrix: ArrayLike,
+        width: int,
+        height: int,
+        distortion: tuple[float, ...] = (),
     ) -> Self:
         """Convert a 3x3 intrinsic matrix without skew."""
         k = np.asarray(matrix, dtype=np.float64)
         if k.shape != (3, 3):
             raise ValueError(f"an intrinsic matrix is 3x3, got {k.shape}")
-        if abs(k[0, 1]) > 1e-9 or abs(k[1, 0]) > 1e-9 or not np.allclose(k[2], (0, 0, 1)):
+        if (
+            abs(k[0, 1]) > 1e-9
+            or abs(k[1, 0]) > 1e-9
+            or not np.allclose(k[2], (0, 0, 1))
+        ):
             raise ValueError(
                 f"an intrinsic matrix is [fx 0 cx; 0 fy cy; 0 0 1], got {k.tolist()}; skew is"
                 f" not supported"
@@ -115,22 +127,38 @@ class Camera:
         """
         if self.model == "fisheye":
             folds = _roots(
-                [1.0, *(n * k for n, k in zip((3, 5, 7, 9), self.distortion, strict=True))]
+                [
+                    1.0,
+                    *(
+                        n * k
+                        for n, k in zip((3, 5, 7, 9), self.distortion, strict=True)
+                    ),
+                ]
             )
-            return math.tan(min(math.sqrt(min(folds, default=9.0)), math.radians(FISHEYE_DEG)))
+            return math.tan(
+                min(math.sqrt(min(folds, default=9.0)), math.radians(FISHEYE_DEG))
+            )
         k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
         if not (k4 or k5 or k6):
-            return math.sqrt(min(_roots([1.0, 3 * k1, 5 * k2, 7 * k3]), default=math.inf))
+            return math.sqrt(
+                min(_roots([1.0, 3 * k1, 5 * k2, 7 * k3]), default=math.inf)
+            )
         squared = np.polynomial.Polynomial([0, 1])
         above = np.polynomial.Polynomial([1, k1, k2, k3])
         below = np.polynomial.Polynomial([1, k4, k5, k6])
-        slope = above * below + 2 * squared * (above.deriv() * below - above * below.deriv())
-        return math.sqrt(min([*_roots(slope.coef), *_roots(below.coef)], default=math.inf))
+        slope = above * below + 2 * squared * (
+            above.deriv() * below - above * below.deriv()
+        )
+        return math.sqrt(
+            min([*_roots(slope.coef), *_roots(below.coef)], default=math.inf)
+        )
 
     @property
     def pinhole(self) -> "Camera":
         """The same camera without distortion."""
-        return replace(self, distortion=(), model="pinhole") if self.distortion else self
+        return (
+            replace(self, distortion=(), model="pinhole") if self.distortion else self
+        )
 
     def changed(self, change: ArrayLike) -> "Camera":
         """The camera after a change (5,) of the parameters of `slopes`."""
@@ -153,13 +181,17 @@ class Camera:
 
     def matrix(self) -> Array:
         """(3, 3) intrinsic matrix."""
-        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+        return np.array(
+            [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
+        )
 
     def resized(self, width: int, height: int) -> "Camera":
         """The camera of the same image resized to `width` x `height` pixels."""
-        sx, sy = width / self.width, height / self.height
+        sx = width / self.width
+        sy = height / self.height
         cx, cy = resize_pixels((self.cx, self.cy), np.array([sx, sy])).tolist()
-        fx, fy = self.fx * sx, self.fy * sy
+        fx = self.fx * sx
+        fy = self.fy * sy
         return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def short_side_resized(self, short_side: int) -> "Camera":
@@ -182,13 +214,18 @@ class Camera:
         if points.shape[-1:] != (3,):
             raise ValueError(f"points are (..., 3), got {points.shape}")
         # One array for each coordinate: sums along pairs take several times as long.
-        x, y, depth = points[..., 0], points[..., 1], points[..., 2]
+        x = points[..., 0]
+        y = points[..., 1]
+        depth = points[..., 2]
         if not (depth > 0).all():
             depth = np.where(depth > 0, depth, np.nan)
-        x, y = x / depth, y / depth
+        x = x / depth
+        y = y / depth
         if self.distortion:
             within = x * x + y * y < self.widest**2
-            (x, y), _ = self._distorted(np.where(within, x, np.nan), np.where(within, y, np.nan))
+            (x, y), _ = self._distorted(
+                np.where(within, x, np.nan), np.where(within, y, np.nan)
+            )
         return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
 
     def unproject(self, pixels: ArrayLike) -> Array:
@@ -208,14 +245,19 @@ class Camera:
         lengths, the principal point in pixels, k1 and k2.
         """
         plane = np.asarray(plane, dtype=np.float64)
-        x, y = plane[..., 0], plane[..., 1]
+        x = plane[..., 0]
+        y = plane[..., 1]
         (u, v), (a, b, d) = self._distorted(x, y)
         # One row for each entry: products of small matrices take several times as long.
-        by_plane, lens = np.empty((2, 2, *x.shape)), np.zeros((2, 5, *x.shape))
-        by_plane[0, 0], by_plane[0, 1] = self.fx * a, self.fx * b
-        by_plane[1, 0], by_plane[1, 1] = self.fy * b, self.fy * d
+        by_plane = np.empty((2, 2, *x.shape))
+        lens = np.zeros((2, 5, *x.shape))
+        by_plane[0, 0] = self.fx * a
+        by_plane[0, 1] = self.fx * b
+        by_plane[1, 0] = self.fy * b
+        by_plane[1, 1] = self.fy * d
         r2 = x * x + y * y
-        first, next_power = r2, r2
+        first = r2
+        next_power = r2
         if self.model == "fisheye":
             next_power = np.arctan(np.sqrt(r2)) ** 2
             first = next_power * _angle_per_radius(r2)
@@ -227,47 +269,64 @@ class Camera:
             lens[row, 1 + row] = 1
             lens[row, 3] = focal * ideal * first
             lens[row, 4] = lens[row, 3] * next_power
-        return np.moveaxis(by_plane, (0, 1), (-2, -1)), np.moveaxis(lens, (0, 1), (-2, -1))
+        return np.moveaxis(by_plane, (0, 1), (-2, -1)), np.moveaxis(
+            lens, (0, 1), (-2, -1)
+        )
 
     def to_dict(self) -> dict[str, object]:
         """Plain numbers for JSON; the model only of a fisheye."""
         model = {"model": self.model} if self.model == "fisheye" else {}
-        numbers = {name: value for name, value in asdict(self).items() if name != "model"}
+        numbers = {
+            name: value for name, value in asdict(self).items() if name != "model"
+        }
         return {**numbers, "distortion": list(self.distortion), **model}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, object]) -> Self:
         """Inverse of `to_dict`; unknown keys are ignored, `distortion` is optional."""
         names = ("width", "height", "fx", "fy", "cx", "cy")
-        numbers: dict[str, Any] = {name: _number(data.get(name), name) for name in names}
+        numbers: dict[str, Any] = {
+            name: _number(data.get(name), name) for name in names
+        }
         distortion = data.get("distortion", ())
         if not isinstance(distortion, (list, tuple)):
-            raise ValueError(f"camera 'distortion' is a list of numbers, got {distortion!r}")
+            raise ValueError(
+                f"camera 'distortion' is a list of numbers, got {distortion!r}"
+            )
         model: Any = data.get("model", "pinhole")
         return cls(
-            **numbers, distortion=tuple(_number(k, "distortion") for k in distortion), model=model
+            **numbers,
+            distortion=tuple(_number(k, "distortion") for k in distortion),
+            model=model,
         )
 
-    def _distorted(self, x: Array, y: Array) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
+    def _distorted(
+        self, x: Array, y: Array
+    ) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
         """Distorted points (u, v), and their derivatives du/dx, du/dy = dv/dx and dv/dy."""
         p1, p2 = (0.0, 0.0) if self.model == "fisheye" else self.coefficients[2:4]
         r2 = x * x + y * y
         radial, change = self._radial(r2)
         twice = 2 * change
-        u, v, cross = x * radial, y * radial, x * y * twice
-        a, d = radial + x * x * twice, radial + y * y * twice
+        u = x * radial
+        v = y * radial
+        cross = x * y * twice
+        a = radial + x * x * twice
+        d = radial + y * y * twice
         if p1 or p2:
             u = u + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
             v = v + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
             cross = cross + 2 * (p1 * x + p2 * y)
-            a, d = a + 2 * p1 * y + 6 * p2 * x, d + 6 * p1 * y + 2 * p2 * x
+            a = a + 2 * p1 * y + 6 * p2 * x
+            d = d + 6 * p1 * y + 2 * p2 * x
         return (u, v), (a, cross, d)
 
     def _radial(self, r2: Array) -> tuple[Array, Array]:
         """Distorted over ideal radius, and its derivative by the ideal squared radius `r2`."""
         if self.model == "fisheye":
             k1, k2, k3, k4 = self.distortion
-            ratio, t2 = _angle_per_radius(r2), np.arctan(np.sqrt(r2)) ** 2
+            ratio = _angle_per_radius(r2)
+            t2 = np.arctan(np.sqrt(r2)) ** 2
             longer = 1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
             steeper = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
             radial = ratio * longer
@@ -286,7 +345,8 @@ class Camera:
         """Angles of a fisheye at distorted radii (...); NaN outside its range."""
         k1, k2, k3, k4 = self.distortion
         radius = np.polynomial.Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4])
-        slope, most = radius.deriv(), math.atan(self.widest)
+        slope = radius.deriv()
+        most = math.atan(self.widest)
         angles = np.minimum(radii, most)
         off = radius(angles) - radii
         for _ in range(50):  # Newton's method: a few steps but close to a fold
@@ -300,23 +360,32 @@ class Camera:
         if self.model == "fisheye":
             radii = np.linalg.norm(distorted, axis=-1, keepdims=True)
             return distorted * np.tan(self._angles(radii)) / np.maximum(radii, 1e-12)
-        plane, lost = distorted, np.ones(distorted.shape[:-1], bool)
+        plane = distorted
+        lost = np.ones(distorted.shape[:-1], bool)
         for _ in range(50):  # Newton's method: a few steps but close to `widest`
             far = np.sqrt((plane**2).sum(-1, keepdims=True))
-            plane = plane * np.minimum(1, 0.999999 * self.widest / np.maximum(far, 1e-12))
+            plane = plane * np.minimum(
+                1, 0.999999 * self.widest / np.maximum(far, 1e-12)
+            )
             at, (a, b, d) = self._distorted(plane[..., 0], plane[..., 1])
-            u, v = at[0] - distorted[..., 0], at[1] - distorted[..., 1]
+            u = at[0] - distorted[..., 0]
+            v = at[1] - distorted[..., 1]
             lost = np.maximum(np.abs(u), np.abs(v)) > _EXACT
             if not lost.any():
                 break
-            step = np.stack([d * u - b * v, a * v - b * u], -1) / (a * d - b * b)[..., None]
+            step = (
+                np.stack([d * u - b * v, a * v - b * u], -1)
+                / (a * d - b * b)[..., None]
+            )
             plane = plane - step
         return np.where(lost[..., None], np.nan, plane)
 
 
 def _roots(coefficients: ArrayLike) -> list[float]:
     """Positive real roots of a polynomial, from its coefficients in ascending order."""
-    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(np.asarray(coefficients), "b"))
+    roots = np.polynomial.polynomial.polyroots(
+        np.trim_zeros(np.asarray(coefficients), "b")
+    )
     return roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].tolist()
 
 

@@ -33,16 +33,23 @@ class SE3:
     def __post_init__(self) -> None:
         quaternion = np.array(self.rotation_wxyz, dtype=np.float64)
         translation = np.array(self.translation_m, dtype=np.float64)
-        if quaternion.shape[-1:] != (4,) or translation.shape != (*quaternion.shape[:-1], 3):
+        if quaternion.shape[-1:] != (4,) or translation.shape != (
+            *quaternion.shape[:-1],
+            3,
+        ):
             raise ValueError(
                 f"SE3 takes rotation_wxyz (..., 4) and translation_m (..., 3) with one batch shape,"
                 f" got {quaternion.shape} and {translation.shape}"
             )
         length = np.sqrt((quaternion * quaternion).sum(-1, keepdims=True))
         if not (np.isfinite(length).all() and np.isfinite(translation).all()):
-            raise ValueError("SE3 takes finite numbers, got inf or nan; leave untracked poses out")
+            raise ValueError(
+                "SE3 takes finite numbers, got inf or nan; leave untracked poses out"
+            )
         if not (length > 1e-12).all():
-            raise ValueError("SE3 got a quaternion of length zero, which is no rotation")
+            raise ValueError(
+                "SE3 got a quaternion of length zero, which is no rotation"
+            )
         # Poses that are written and read again stay the same to the last bit.
         length = np.where(np.abs(length - 1) < 1e-15, 1.0, length)
         object.__setattr__(self, "rotation_wxyz", quaternion / length)
@@ -69,11 +76,17 @@ class SE3:
         """
         matrix = np.asarray(matrix, dtype=np.float64)
         if matrix.ndim < 2 or matrix.shape[-2:] not in ((4, 4), (3, 4)):
-            raise ValueError(f"a pose matrix is (..., 4, 4) or (..., 3, 4), got {matrix.shape}")
+            raise ValueError(
+                f"a pose matrix is (..., 4, 4) or (..., 3, 4), got {matrix.shape}"
+            )
         if not np.isfinite(matrix).all():
             raise ValueError("a pose matrix takes finite numbers, got inf or nan")
-        if matrix.shape[-2] == 4 and not np.allclose(matrix[..., 3, :], (0, 0, 0, 1), atol=1e-6):
-            raise ValueError("the last row of a pose matrix is 0 0 0 1, got something else")
+        if matrix.shape[-2] == 4 and not np.allclose(
+            matrix[..., 3, :], (0, 0, 0, 1), atol=1e-6
+        ):
+            raise ValueError(
+                "the last row of a pose matrix is 0 0 0 1, got something else"
+            )
         block = matrix[..., :3, :3]
         drift = np.abs(np.swapaxes(block, -1, -2) @ block - np.eye(3)).max(initial=0.0)
         if drift > tolerance:
@@ -82,7 +95,9 @@ class SE3:
                 f" got one that is off by {drift:.3g}"
             )
         if not (np.linalg.det(block) > 0).all():
-            raise ValueError("a pose matrix got a reflection (determinant -1), which is no pose")
+            raise ValueError(
+                "a pose matrix got a reflection (determinant -1), which is no pose"
+            )
         return cls(_quaternion(block), matrix[..., :3, 3])
 
     @classmethod
@@ -98,7 +113,8 @@ class SE3:
         )
         square = angle * angle
         # 1 - cos cancels for small angles, and so does angle - sin: then their series are used.
-        small, safe = angle < _SMALL_RAD, np.where(angle < _SMALL_RAD, 1.0, angle)
+        small = angle < _SMALL_RAD
+        safe = np.where(angle < _SMALL_RAD, 1.0, angle)
         first = 2 * (np.sin(safe / 2) / safe) ** 2
         first = np.where(small, 0.5 - square / 24, first)
         second = np.where(small, 1 / 6 - square / 120, (safe - np.sin(safe)) / safe**3)
@@ -137,7 +153,8 @@ class SE3:
             raise TypeError("a single SE3 cannot be indexed")
         rows = np.arange(int(np.prod(self.shape))).reshape(self.shape)[index]  # pyright: ignore[reportCallIssue, reportArgumentType]
         return type(self)(
-            self.rotation_wxyz.reshape(-1, 4)[rows], self.translation_m.reshape(-1, 3)[rows]
+            self.rotation_wxyz.reshape(-1, 4)[rows],
+            self.translation_m.reshape(-1, 3)[rows],
         )
 
     def __iter__(self) -> Iterator[Self]:
@@ -150,10 +167,13 @@ class SE3:
         w, x, y, z = np.moveaxis(self.rotation_wxyz, -1, 0)
         matrix = np.empty((*self.shape, 3, 3))
         matrix[..., 0, 0] = 1 - 2 * (y * y + z * z)
-        matrix[..., 0, 1], matrix[..., 0, 2] = 2 * (x * y - w * z), 2 * (x * z + w * y)
-        matrix[..., 1, 0], matrix[..., 1, 2] = 2 * (x * y + w * z), 2 * (y * z - w * x)
+        matrix[..., 0, 1] = 2 * (x * y - w * z)
+        matrix[..., 0, 2] = 2 * (x * z + w * y)
+        matrix[..., 1, 0] = 2 * (x * y + w * z)
+        matrix[..., 1, 2] = 2 * (y * z - w * x)
         matrix[..., 1, 1] = 1 - 2 * (x * x + z * z)
-        matrix[..., 2, 0], matrix[..., 2, 1] = 2 * (x * z - w * y), 2 * (y * z + w * x)
+        matrix[..., 2, 0] = 2 * (x * z - w * y)
+        matrix[..., 2, 1] = 2 * (y * z + w * x)
         matrix[..., 2, 2] = 1 - 2 * (x * x + y * y)
         return matrix
 
@@ -169,7 +189,9 @@ class SE3:
         """`base_from_camera.inverse()` is `camera_from_base`."""
         conjugate = self.rotation_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
         transposed = np.swapaxes(self.rotation_matrix(), -1, -2)
-        return type(self)(conjugate, -(transposed @ self.translation_m[..., None])[..., 0])
+        return type(self)(
+            conjugate, -(transposed @ self.translation_m[..., None])[..., 0]
+        )
 
     def __matmul__(self, other: "SE3") -> Self:
         """`a_from_b @ b_from_c` is `a_from_c`; batch shapes broadcast."""
@@ -204,7 +226,8 @@ class SE3:
         sine = np.linalg.norm(v, axis=-1, keepdims=True)
         angle = 2 * np.arctan2(sine, np.abs(w))
         vector = np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 2) * v
-        small, safe = angle < _SMALL_RAD, np.where(angle < _SMALL_RAD, 1.0, angle)
+        small = angle < _SMALL_RAD
+        safe = np.where(angle < _SMALL_RAD, 1.0, angle)
         second = (1 - safe / 2 / np.tan(safe / 2)) / safe**2
         second = np.where(small, 1 / 12 + angle**2 / 720, second)
         once = np.cross(vector, self.translation_m)
@@ -245,16 +268,20 @@ def average_poses(poses: SE3) -> SE3:
     to the current mean, cut at four median distances, in metres and in radians.
     """
     if len(poses.shape) != 1 or len(poses) == 0:
-        raise ValueError(f"average_poses takes a batch (n,) with n >= 1, got {poses.shape}")
+        raise ValueError(
+            f"average_poses takes a batch (n,) with n >= 1, got {poses.shape}"
+        )
     mean = _medoid(poses)
     for _ in range(50):
         metres, radians = pose_distance(mean, poses)
         weight = _biweight(metres) * _biweight(radians)
-        if weight.sum() <= 0:  # poses near in metres and poses near in radians are disjoint
+        # Poses near in metres and poses near in radians are disjoint.
+        if weight.sum() <= 0:
             return mean
         translation = weight @ poses.translation_m / weight.sum()
         rotation = _dominant(np.einsum("n,ni,nj", weight, *[poses.rotation_wxyz] * 2))
-        before, mean = mean, SE3(rotation, translation)
+        before = mean
+        mean = SE3(rotation, translation)
         if max(pose_distance(before, mean)) < 1e-12:
             break
     return mean

@@ -19,7 +19,9 @@ def cross_matrix(v: ArrayLike) -> Array:
     """(..., 3, 3) matrices of the cross product with vectors (..., 3)."""
     v = np.asarray(v, dtype=np.float64)
     matrix = np.zeros((*v.shape, 3))
-    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    matrix[..., 0, 1] = -v[..., 2]
+    matrix[..., 0, 2] = v[..., 1]
+    matrix[..., 1, 2] = -v[..., 0]
     return matrix - np.swapaxes(matrix, -1, -2)
 
 
@@ -53,13 +55,15 @@ class UncertainPose:
         if not isinstance(other, UncertainPose):
             return NotImplemented
         rotation = self.pose.rotation_matrix()
-        by_first, by_second = np.eye(6), np.eye(6)
+        by_first = np.eye(6)
+        by_second = np.eye(6)
         by_first[:3, 3:] = -rotation @ cross_matrix(other.pose.translation_m)
         by_first[3:, 3:] = other.pose.rotation_matrix().T
         by_second[:3, :3] = rotation
         covariance = by_first @ self.covariance @ by_first.T
         return UncertainPose(
-            self.pose @ other.pose, covariance + by_second @ other.covariance @ by_second.T
+            self.pose @ other.pose,
+            covariance + by_second @ other.covariance @ by_second.T,
         )
 
     def __rmatmul__(self, other: SE3) -> "UncertainPose":
@@ -68,7 +72,8 @@ class UncertainPose:
 
     def inverse(self) -> "UncertainPose":
         """child_from_parent."""
-        inverse, rotation = self.pose.inverse(), self.pose.rotation_matrix()
+        inverse = self.pose.inverse()
+        rotation = self.pose.rotation_matrix()
         slope = np.zeros((6, 6))
         slope[:3, :3] = -rotation.T
         slope[:3, 3:] = cross_matrix(inverse.translation_m)
@@ -113,7 +118,8 @@ class UncertainPose:
 def axis_deviation(covariance: ArrayLike) -> tuple[float, float]:
     """Standard deviation per axis, millimetres and degrees: root mean squares of three axes."""
     variance = np.diag(np.asarray(covariance, dtype=np.float64))
-    metres, radians = np.sqrt(variance[:3].mean()), np.sqrt(variance[3:].mean())
+    metres = np.sqrt(variance[:3].mean())
+    radians = np.sqrt(variance[3:].mean())
     return 1000 * float(metres), float(np.rad2deg(radians))
 
 

@@ -39,10 +39,16 @@ def fewest_keyframes(
     others = [frame for frame in frames if frame.name not in set(built.keyframe_names)]
     poses = built.scene.keyframes.base_from_camera
     everything = np.arange(len(poses))
-    spread = np.linspace(0, len(others) - 1, min(PROBE_FRAMES, len(others))).round().astype(int)
+    spread = (
+        np.linspace(0, len(others) - 1, min(PROBE_FRAMES, len(others)))
+        .round()
+        .astype(int)
+    )
     localizer = Localizer(contents.empty().with_scene(built.scene))
     located = _located(localizer, [others[i] for i in spread])
-    probes = [others[i] for i, pose in zip(spread, located, strict=True) if pose is not None]
+    probes = [
+        others[i] for i, pose in zip(spread, located, strict=True) if pose is not None
+    ]
     reference = [pose for pose in located if pose is not None]
     unit = built.scene.frame.unit
     sizes = sorted({max(1, int(share * built.scene.train_frames)) for share in SHARES})
@@ -50,7 +56,9 @@ def fewest_keyframes(
         on_progress("selecting keyframes", step + 1, len(sizes))
         selected = spread_poses(poses, size)
         poses_of_few = _located(localizer.only(0, selected), probes)
-        good = [_close(*pair, unit) for pair in zip(poses_of_few, reference, strict=True)]
+        good = [
+            _close(*pair, unit) for pair in zip(poses_of_few, reference, strict=True)
+        ]
         if good and sum(good) >= LEAST_LOCATED * len(probes):
             everything = selected
             break
@@ -59,7 +67,9 @@ def fewest_keyframes(
 
 
 def _located(localizer: Localizer, frames: Sequence[Frame]) -> list[SE3 | None]:
-    return [localizer.localize(f.read_image(), f.camera).base_from_camera for f in frames]
+    return [
+        localizer.localize(f.read_image(), f.camera).base_from_camera for f in frames
+    ]
 
 
 def _close(pose: SE3 | None, reference: SE3, unit: float) -> bool:

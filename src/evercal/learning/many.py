@@ -41,11 +41,13 @@ def learn_scenes(
     ended = yield from _in_turn(task, waiting, workers)
     for item, status in ended:
         tries = 1
-        while status < 0 and tries < TRIES:  # alone, so that others do not share its memory
+        # Alone, so that others do not share its memory.
+        while status < 0 and tries < TRIES:
             again = yield from _in_turn(task, [item], 1)
             if not again:
                 break
-            status, tries = again[0][1], tries + 1
+            status = again[0][1]
+            tries = tries + 1
         else:
             yield Learned(item[0], error=cause_of(status, tries))
 
@@ -54,15 +56,19 @@ def _in_turn(
     task: LearnTask, items: Sequence[Item], workers: int
 ) -> Generator[Learned, None, list[tuple[Item, int]]]:
     """Learn items; return those whose process ended, each with its exit status."""
-    waiting, ended = list(items), list[tuple[Item, int]]()
+    waiting = list(items)
+    ended = list[tuple[Item, int]]()
     workers = min(workers, len(waiting))
     threads = max(1, cores() // max(workers, 1))
     state: _State = (task, threads)
-    idle, busy = list[Worker](), dict[Worker, Item]()
+    idle = list[Worker]()
+    busy = dict[Worker, Item]()
     try:
         while waiting or busy:
             while waiting and len(busy) < workers:
-                worker = idle.pop() if idle else Worker(_begin, state, _few_threads(threads))
+                worker = (
+                    idle.pop() if idle else Worker(_begin, state, _few_threads(threads))
+                )
                 if worker.ask(waiting[0]):
                     busy[worker] = waiting.pop(0)
                 else:  # killed while it waited

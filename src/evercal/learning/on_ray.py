@@ -13,7 +13,9 @@ AHEAD = 4
 """Recordings that wait for each core, so that an autoscaler has a reason to add machines."""
 
 
-def learn_on_ray(task: LearnTask, items: Sequence[Item], address: str) -> Iterator[Learned]:
+def learn_on_ray(
+    task: LearnTask, items: Sequence[Item], address: str
+) -> Iterator[Learned]:
     """Learn recordings on a cluster, and yield outcomes as they are ready.
 
     Args:
@@ -23,7 +25,9 @@ def learn_on_ray(task: LearnTask, items: Sequence[Item], address: str) -> Iterat
     """
     with connected(address) as ray:
         learn = ray.remote(num_cpus=1, max_retries=TRIES - 1)(_learned)
-        shared, waiting, running = ray.put(task), [*items][::-1], dict[Any, Item]()
+        shared = ray.put(task)
+        waiting = [*items][::-1]
+        running = dict[Any, Item]()
         try:
             while waiting or running:
                 most = AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
@@ -48,6 +52,8 @@ def _learned(task: LearnTask, wanted: str, number: int, source: Any) -> Learned:
 
     cv2.setNumThreads(1)
     if (here := version("evercal")) != wanted:
-        error = f"the worker has evercal {here}, this program {wanted}; install the same"
+        error = (
+            f"the worker has evercal {here}, this program {wanted}; install the same"
+        )
         return Learned(number, error=f"{error} on all machines")
     return task.learn(number, source)

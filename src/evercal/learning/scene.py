@@ -63,7 +63,8 @@ class LearnReport:
         """The inverse of `asdict`."""
         from evercal.calibration.hand_eye import HandEyeReport
 
-        adjusted, hand_eye = values["adjusted"], values["hand_eye"]
+        adjusted = values["adjusted"]
+        hand_eye = values["hand_eye"]
         return cls(
             **{
                 **values,
@@ -97,25 +98,33 @@ def learn_scene(
             camera is that of the thing that the gripper holds, in the frame of the gripper.
     """
     began = time.perf_counter()
-    budget, options = MemoryBudget.parse(memory), options or MapOptions()
-    start, least = None, MIN_TRAIN_FRAMES
+    budget = MemoryBudget.parse(memory)
+    options = options or MapOptions()
+    start = None
+    least = MIN_TRAIN_FRAMES
     if not (shown := look_at(recording.train)).usable:
         raise InputError(f"scene {recording.name!r}: {'; '.join(shown.warnings)}")
     whole = recording.train
     if lacks_camera_poses(recording):
         from evercal.calibration.hand_eye import posed_by_gripper
 
-        recording, start = posed_by_gripper(recording, mount, contents.encoder, on_progress)
+        recording, start = posed_by_gripper(
+            recording, mount, contents.encoder, on_progress
+        )
         options = replace(options.for_hand_eye(mount), arm=start.arm)
-        least, budget = MIN_GRIPPER_FRAMES, replace(budget, least=MIN_GRIPPER_FRAMES)
+        least = MIN_GRIPPER_FRAMES
+        budget = replace(budget, least=MIN_GRIPPER_FRAMES)
     recording = posed_recording(recording)
     require_frames(recording, least)
     split = split_held_out(recording.train)
-    if options.mount == "eye_to_hand":  # a calibration, in which no image is to be located
+    # A calibration, in which no image is to be located.
+    if options.mount == "eye_to_hand":
         split = HeldOutSplit(recording.train, ())
     options = _sized(options, budget, contents.short_side)
     options = replace(options, metric=recording.metric)
-    built = build_map(recording.name, split.train, contents.encoder, options, on_progress)
+    built = build_map(
+        recording.name, split.train, contents.encoder, options, on_progress
+    )
     if options.mount == "eye_to_hand":
         built = replace(built, scene=of_whole_images(built.scene, whole[0].camera))
     if budget.auto:
@@ -129,7 +138,9 @@ def learn_scene(
         left_out=built.left_out(split.train),
         noise=built.independent_noise,
     )
-    accused = [frame for frame in split.train if frame.name in built.adjusted.wrong_poses]
+    accused = [
+        frame for frame in split.train if frame.name in built.adjusted.wrong_poses
+    ]
     built = built.cleared(located_as_stated(contents, scene, built.corrected(accused)))
     report = LearnReport(
         scene=scene.name,
@@ -151,8 +162,11 @@ def learn_scene(
         used = used if mount == "eye_to_hand" else split.train
         hand_eye = hand_eye_report(start, built, used, gripper_from_camera)
         if mount == "eye_to_hand":
-            others = [frame for frame in whole if frame.name not in built.keyframe_names]
-            localizer, shown = Localizer(contents.empty().with_scene(scene)), others or whole
+            others = [
+                frame for frame in whole if frame.name not in built.keyframe_names
+            ]
+            localizer = Localizer(contents.empty().with_scene(scene))
+            shown = others or whole
             if built.hand_eye is not None and built.hand_eye.arm is not None:
                 shown = built.hand_eye.arm.moved(shown)
             hand_eye = with_image_scatter(hand_eye, localizer, shown)
@@ -162,18 +176,22 @@ def learn_scene(
 
 def of_whole_images(scene: SceneMap, whole: Camera) -> SceneMap:
     """The map of a thing in the gripper, with the camera of whole images instead of windows."""
-    part, adjusted = scene.camera, scene.adjusted_camera
+    part = scene.camera
+    adjusted = scene.adjusted_camera
     moved = adjusted.cx - part.cx, adjusted.cy - part.cy
     size = {"width": whole.width, "height": whole.height}
     adjusted = replace(adjusted, **size, cx=whole.cx + moved[0], cy=whole.cy + moved[1])
-    return replace(scene, camera=whole, adjusted_camera=adjusted, parent_frame="gripper")
+    return replace(
+        scene, camera=whole, adjusted_camera=adjusted, parent_frame="gripper"
+    )
 
 
 def located_as_stated(
     contents: MapContents, scene: SceneMap, frames: Sequence[Frame]
 ) -> tuple[str, ...]:
     """Names of the frames that a map locates where their poses say."""
-    localizer, right = Localizer(contents.empty().with_scene(scene)), []
+    localizer = Localizer(contents.empty().with_scene(scene))
+    right = []
     for frame in frames:
         estimate, found = localizer.located(frame.read_image(), frame.camera)
         assert frame.base_from_camera is not None, "a posed frame"

@@ -42,7 +42,9 @@ def with_scatter(
     for part in left_out:
         few = localizer.only(len(others), part.keyframes)
         answers += _located(few, part.frames, scene)
-    answers = [answer for answer in answers if np.linalg.norm(answer.off[:3]) < WRONG_PLACE_M]
+    answers = [
+        answer for answer in answers if np.linalg.norm(answer.off[:3]) < WRONG_PLACE_M
+    ]
     if len(answers) < LEAST_ANSWERS:
         return scene
     off = np.array([answer.off for answer in answers])
@@ -50,7 +52,9 @@ def with_scatter(
     spread = spread + np.diag(np.repeat(np.square(noise), 3))
     metres, radians = (
         max(known, scatter(off[:, part], spread[:, part, part]))
-        for known, part in zip(scene.frame.frame_sigma, (slice(0, 3), slice(3, 6)), strict=True)
+        for known, part in zip(
+            scene.frame.frame_sigma, (slice(0, 3), slice(3, 6)), strict=True
+        )
     )
     return replace(scene, frame=replace(scene.frame, frame_sigma=(metres, radians)))
 
@@ -65,13 +69,17 @@ class _Answer(NamedTuple):
     """(6, 6)."""
 
 
-def _located(localizer: Localizer, frames: Sequence[Frame], scene: SceneMap) -> list[_Answer]:
-    answers, size = [], np.repeat([scene.frame.unit, 1.0], 3)
+def _located(
+    localizer: Localizer, frames: Sequence[Frame], scene: SceneMap
+) -> list[_Answer]:
+    answers = []
+    size = np.repeat([scene.frame.unit, 1.0], 3)
     index = localizer.scenes.index(scene.name)
     for frame in frames:
         if (stated := frame.base_from_camera) is None:
             continue
-        start, image = scene.frame.from_base(stated), as_rgb(frame.read_image())
+        start = scene.frame.from_base(stated)
+        image = as_rgb(frame.read_image())
         estimate = localizer.from_pose(image, frame.camera, index, start)
         pose = estimate and estimate.uncertain_pose
         if pose is not None and np.isfinite(pose.covariance).all():

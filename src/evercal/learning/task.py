@@ -81,13 +81,18 @@ class LearnTask:
         what = source
         if isinstance(source, RecordingAt):
             what = self.read, addresses.stamps(source.address)
-        of = pickle.dumps((version("evercal"), self.contents, self.memory, self.options, what))
+        of = pickle.dumps(
+            (version("evercal"), self.contents, self.memory, self.options, what)
+        )
         return f"{self.results}/{source.name}-{hashlib.sha256(of).hexdigest()[:16]}.zip"
 
 
-def _keep(file: str, contents: MapContents, scene: SceneMap, report: LearnReport) -> None:
+def _keep(
+    file: str, contents: MapContents, scene: SceneMap, report: LearnReport
+) -> None:
     with tempfile.TemporaryDirectory(prefix="evercal-") as folder:
-        root, packed = Path(folder, "map"), Path(folder, "map.zip")
+        root = Path(folder, "map")
+        packed = Path(folder, "map.zip")
         MapStore(root, contents.empty()).commit(scene, asdict(report))
         pack_map(root, packed)
         addresses.put(packed, file)
@@ -97,6 +102,7 @@ def _kept(file: str) -> tuple[SceneMap, LearnReport]:
     with addresses.local_copy(file) as packed, tempfile.TemporaryDirectory() as folder:
         unpack_map(packed, Path(folder, "map"))
         store = MapStore.open(Path(folder, "map"))
-        scene, report = store.contents.scenes[0], LearnReport.from_dict(store.reports()[0])
+        scene = store.contents.scenes[0]
+        report = LearnReport.from_dict(store.reports()[0])
         every = np.arange(len(scene.keyframes))  # taken out of the file, which goes
         return replace(scene, keyframes=scene.keyframes.take(every)), report

@@ -36,12 +36,16 @@ class StreamCamera:
     """
 
     def __init__(self, source: str, rate: float = 15.0, timeout_s: float | None = 5.0):
-        self._source, self._timeout_s = source, timeout_s
+        self._source = source
+        self._timeout_s = timeout_s
         self._frames = stream(source, rate)
         self._frame: StreamFrame | None = None
         self._error: Exception | None = None
-        self._changed, self._ended = threading.Condition(), False
-        self._thread = threading.Thread(target=self._run, daemon=True) if is_live(source) else None
+        self._changed = threading.Condition()
+        self._ended = False
+        self._thread = (
+            threading.Thread(target=self._run, daemon=True) if is_live(source) else None
+        )
         if self._thread is not None:
             self._thread.start()
 
@@ -49,7 +53,9 @@ class StreamCamera:
         """Take the next image; an error of a live source is raised here."""
         for frame in self:
             return frame.stamp_s, frame.image
-        raise InputError(f"{self._source}: no more frames; check the camera or give another")
+        raise InputError(
+            f"{self._source}: no more frames; check the camera or give another"
+        )
 
     def __iter__(self) -> Iterator[StreamFrame]:
         """The images that `read` takes, with their names, until the source ends."""

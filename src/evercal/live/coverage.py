@@ -46,7 +46,9 @@ class Sample:
         """Measure a frame with a gripper pose."""
         assert frame.base_from_gripper is not None, "coverage is of gripper poses"
         image = frame.read_image()
-        return cls(frame.name, frame.base_from_gripper, sharpness(image), clipped_share(image))
+        return cls(
+            frame.name, frame.base_from_gripper, sharpness(image), clipped_share(image)
+        )
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,9 @@ class Coverage:
     """One or two sentences."""
 
 
-def coverage(samples: Sequence[Sample], gripper_from_camera: SE3 | None = None) -> Coverage:
+def coverage(
+    samples: Sequence[Sample], gripper_from_camera: SE3 | None = None
+) -> Coverage:
     """Report what samples cover, in recorded order; those with problems count as not recorded.
 
     With a rough `gripper_from_camera`, axes are those of the camera.
@@ -101,7 +105,8 @@ def coverage(samples: Sequence[Sample], gripper_from_camera: SE3 | None = None) 
     poses = SE3.stack([sample.base_from_gripper for sample in good])
     mover = "gripper"
     if gripper_from_camera is not None:
-        poses, mover = poses @ gripper_from_camera, "camera"
+        poses = poses @ gripper_from_camera
+        mover = "camera"
     turned, principal = _rotations_deg(poses)
     moved = 1000 * poses.translation_m.std(0) if good else np.zeros(3)
     rotations = _axes(f"about the {mover}'s", turned, ROTATION_DEG)
@@ -124,22 +129,29 @@ def clipped_share(image: NDArray[np.uint8]) -> float:
 
 
 def _sample_reports(samples: Sequence[Sample]) -> tuple[SampleReport, ...]:
-    middle = float(np.median([sample.sharpness for sample in samples])) if samples else 1.0
+    middle = (
+        float(np.median([sample.sharpness for sample in samples])) if samples else 1.0
+    )
     poses = SE3.stack([sample.base_from_gripper for sample in samples])
     rows = []
     for i, sample in enumerate(samples):
-        relative, problems = sample.sharpness / middle if middle > 0 else 0.0, []
+        relative = sample.sharpness / middle if middle > 0 else 0.0
+        problems = []
         if relative < SHARPNESS:
             problems.append(f"blurred (sharpness {100 * relative:.0f} % of the median)")
         if sample.clipped > CLIPPED:
-            problems.append(f"{100 * sample.clipped:.0f} % of its pixels are black or white")
+            problems.append(
+                f"{100 * sample.clipped:.0f} % of its pixels are black or white"
+            )
         if i:
             metres, radians = pose_distance(poses[i], poses[:i])
             away = np.stack([1000 * metres / SAME_MM, np.rad2deg(radians) / SAME_DEG])
             nearest = int(np.argmin(np.hypot(*away)))
             if (away[:, nearest] < 1).all():
                 problems.append(f"same pose as {samples[nearest].name}")
-        rows.append(SampleReport(sample.name, relative, sample.clipped, tuple(problems)))
+        rows.append(
+            SampleReport(sample.name, relative, sample.clipped, tuple(problems))
+        )
     return tuple(rows)
 
 
@@ -156,17 +168,23 @@ def _rotations_deg(poses: SE3) -> tuple[Array, Array]:
 
 def _axes(words: str, spreads: Array, least: float) -> tuple[AxisCoverage, ...]:
     named = zip("xyz", spreads.tolist(), strict=True)
-    return tuple(AxisCoverage(f"{words} {axis} axis", s, s >= least) for axis, s in named)
+    return tuple(
+        AxisCoverage(f"{words} {axis} axis", s, s >= least) for axis, s in named
+    )
 
 
 def _missing(
-    good: int, rank: int, rotations: Sequence[AxisCoverage], positions: Sequence[AxisCoverage]
+    good: int,
+    rank: int,
+    rotations: Sequence[AxisCoverage],
+    positions: Sequence[AxisCoverage],
 ) -> tuple[str, ...]:
     missing = []
     if good < MIN_GRIPPER_FRAMES:
         missing.append(f"{MIN_GRIPPER_FRAMES - good} more images to start with")
     # Two axes of rotation are necessary, the third one makes the result better.
-    rotations_left, positions_left = _uncovered(rotations), _uncovered(positions)
+    rotations_left = _uncovered(rotations)
+    positions_left = _uncovered(positions)
     if rank < 2 and not rotations_left:
         missing.insert(0, "rotations about a second axis: tilt and turn independently")
     for axis in rotations_left:
@@ -181,4 +199,6 @@ def _missing(
 
 
 def _uncovered(axes: Sequence[AxisCoverage]) -> list[AxisCoverage]:
-    return sorted((axis for axis in axes if not axis.covered), key=lambda axis: axis.spread)
+    return sorted(
+        (axis for axis in axes if not axis.covered), key=lambda axis: axis.spread
+    )

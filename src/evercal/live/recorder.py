@@ -30,14 +30,19 @@ class WristRecorder:
     """Adds and removes samples of a recording; one of the same camera is continued."""
 
     def __init__(self, root: Path, camera: Camera):
-        self._root, self._camera = Path(root), camera
+        self._root = Path(root)
+        self._camera = camera
         self._frames: list[Frame] = []
         if wrist.detect(self._root):
             if not (self._root / POSES).is_file():
-                raise InputError(f"{root}: holds gripper poses, but no {POSES}; use a new folder")
+                raise InputError(
+                    f"{root}: holds gripper poses, but no {POSES}; use a new folder"
+                )
             self._frames = list(wrist.load(self._root).train)
             if any(frame.camera != camera for frame in self._frames):
-                raise InputError(f"{root}: was recorded with other intrinsics; use a new folder")
+                raise InputError(
+                    f"{root}: was recorded with other intrinsics; use a new folder"
+                )
 
     @property
     def frames(self) -> tuple[Frame, ...]:
@@ -75,7 +80,9 @@ class WristRecorder:
     def _write_poses(self) -> None:
         path = self._root / POSES
         if self._frames:
-            poses = SE3.stack([p for f in self._frames if (p := f.base_from_gripper) is not None])
+            poses = SE3.stack(
+                [p for f in self._frames if (p := f.base_from_gripper) is not None]
+            )
             names = tuple(frame.name for frame in self._frames)
             write_bytes(path, pose_rows(poses, names).encode())
         else:
@@ -89,5 +96,7 @@ def pose_rows(poses: SE3, names: tuple[str, ...] | None = None) -> str:
     for pose in poses:
         numbers = (*pose.translation_m, *pose.rotation_wxyz)
         rows.append(",".join(f"{number:.8f}" for number in numbers))
-    named = [f"{name},{row}" if name else row for name, row in zip(first, rows, strict=True)]
+    named = [
+        f"{name},{row}" if name else row for name, row in zip(first, rows, strict=True)
+    ]
     return "\n".join(named) + "\n"

@@ -40,15 +40,21 @@ class PoseFileRobot:
     """
 
     def __init__(
-        self, path: Path | str, convention: str | None = None, most_age_s: float | None = None
+        self,
+        path: Path | str,
+        convention: str | None = None,
+        most_age_s: float | None = None,
     ):
-        self._path, self._convention, self._most_age_s = Path(path), convention, most_age_s
+        self._path = Path(path)
+        self._convention = convention
+        self._most_age_s = most_age_s
 
     def base_from_gripper(self) -> SE3:
         """Read the pose of the last complete line, or raise InputError if there is none."""
         pose = read_last_robot_pose(self._path, self._convention)
         if self._most_age_s is not None:
-            changed_s = self._path.stat().st_mtime  # first: it may be written at any time
+            # First: it may be written at any time.
+            changed_s = self._path.stat().st_mtime
             age = time.time() - changed_s
             if age < 0:
                 raise InputError(

@@ -100,7 +100,8 @@ def in_base(
     if hypothesis.refined is None:
         return estimate, ()
 
-    slope, refined = scene.frame.slope, hypothesis.refined
+    slope = scene.frame.slope
+    refined = hypothesis.refined
 
     def moved(covariance: np.ndarray) -> np.ndarray:
         return slope @ covariance @ slope.T
@@ -121,7 +122,9 @@ def in_base(
     )
 
 
-def without_pose(best: Hypothesis, evidence: float, milliseconds: float) -> PoseEstimate:
+def without_pose(
+    best: Hypothesis, evidence: float, milliseconds: float
+) -> PoseEstimate:
     """A rejection of a pose whose support is `evidence`, without its reason."""
     return PoseEstimate(
         status="unknown_scene",
@@ -166,7 +169,11 @@ def answer(
         )
     metres = estimate.sigma_mm / 1000 / scene.frame.unit * scene.metres_per_unit
     if metres > USELESS_M:
-        off = f"{1000 * metres:.0f} mm" if scene.unit_known else f"{estimate.sigma_mm / 1000:.3g}"
+        off = (
+            f"{1000 * metres:.0f} mm"
+            if scene.unit_known
+            else f"{estimate.sigma_mm / 1000:.3g}"
+        )
         wide = f"its position is uncertain by {off} per axis"
         return replace(rejected, status="uncertain", reason=wide, scene=scene.name)
     assert best.points_m is not None, "accepted poses have inliers"

@@ -7,7 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera
-from evercal.localization.intrinsics import IntrinsicsPrior, RefinedPose, self_calibrated
+from evercal.localization.intrinsics import (
+    IntrinsicsPrior,
+    RefinedPose,
+    self_calibrated,
+)
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import (
@@ -16,7 +20,13 @@ from evercal.localization.pose_refinement import (
     minimise,
 )
 from evercal.mapping.landmarks import project_surface
-from evercal.mapping.patches import Patches, align_patches, from_level, to_level, whitening
+from evercal.mapping.patches import (
+    Patches,
+    align_patches,
+    from_level,
+    to_level,
+    whitening,
+)
 
 Array = NDArray[np.floating]
 Pose = tuple[Array, Array]
@@ -94,7 +104,8 @@ def align_pose(
     pose = start.rotation_matrix(), start.translation_m
     rounds = options.rounds if coarse else options.rounds[1:]
     change = np.zeros(INTRINSICS) if change is None else change
-    observed, again = None, 0
+    observed = None
+    again = 0
     while True:
         passed = search.rounds(rounds, camera.changed(change), pose, observed)
         if passed is None:
@@ -104,14 +115,17 @@ def align_pose(
         moved = _moved_px(camera, change, refined.change)
         if moved < _NOTICEABLE_PX:
             break
-        if (refined.residual_px < options.inlier_px).sum() < _HOPELESS * observed.expected:
+        if (
+            refined.residual_px < options.inlier_px
+        ).sum() < _HOPELESS * observed.expected:
             break  # other intrinsics do not make it the right place
         if again == _MOST_AGAIN:
             if prior.other_camera:
                 break  # both are good, and it is undecided between them
             return None  # the intrinsics do not converge
         at = refined.pose.pose
-        pose, change = (at.rotation_matrix(), at.translation_m), refined.change
+        pose = (at.rotation_matrix(), at.translation_m)
+        change = refined.change
         again += 1
         rounds = options.rounds if moved > _FAR_PX else options.rounds[-1:]
     enough = (refined.residual_px < options.inlier_px).sum() >= options.min_matches
@@ -123,7 +137,9 @@ def _moved_px(camera: Camera, before: Array, after: Array) -> float:
     if not change.any():
         return 0.0
     across = [np.linspace(0, side - 1, 5) for side in (camera.width, camera.height)]
-    plane = camera.pinhole.unproject(np.stack(np.meshgrid(*across), -1).reshape(-1, 2))[:, :2]
+    plane = camera.pinhole.unproject(np.stack(np.meshgrid(*across), -1).reshape(-1, 2))[
+        :, :2
+    ]
     off = np.linalg.norm(camera.slopes(plane)[1] @ change, axis=-1)
     return float(np.sort(off[np.isfinite(off)])[-7])  # a fourth of the grid moves more
 
@@ -147,13 +163,18 @@ class _Search:
         keyframes: Sequence[AlignedLandmarks],
         options: AlignmentOptions,
     ):
-        self.pyramid, self.keyframes, self.options = pyramid, keyframes, options
+        self.pyramid = pyramid
+        self.keyframes = keyframes
+        self.options = options
         surfaces = [keyframe.surface_m for keyframe in keyframes]
         self.starts = np.cumsum([0, *(surface.shape[1] for surface in surfaces)])
         self.surface_m = np.concatenate(surfaces, 1)
         # Displacement (n, 3) of a landmark by one standard deviation of its depth.
         self.depth_error_m = np.concatenate(
-            [k.depth_noise[:, None] * (k.surface_m[0] - k.position_m) for k in keyframes]
+            [
+                k.depth_noise[:, None] * (k.surface_m[0] - k.position_m)
+                for k in keyframes
+            ]
         )
 
     def patches(self, level: int, which: NDArray[np.int64]) -> Patches:
@@ -161,7 +182,10 @@ class _Search:
         ends = np.searchsorted(which, self.starts)
         spans = zip(self.keyframes, self.starts, ends, ends[1:], strict=False)
         return Patches.joined(
-            [keyframe.patches[level].take(which[a:b] - start) for keyframe, start, a, b in spans]
+            [
+                keyframe.patches[level].take(which[a:b] - start)
+                for keyframe, start, a, b in spans
+            ]
         )
 
     def rounds(
@@ -198,16 +222,21 @@ class _Search:
         most = int(min(more, options.most_more) * step.landmarks)
         rotation = pose[0].T
         shift = -rotation @ pose[1]
-        which, pixels, affines = project_surface(self.surface_m, rotation, shift, camera, most)
+        which, pixels, affines = project_surface(
+            self.surface_m, rotation, shift, camera, most
+        )
         if not len(which):
             return None
-        patches, level = self.patches(step.level, which), step.level
-        start, image = to_level(pixels, level), self.pyramid[level]
+        patches = self.patches(step.level, which)
+        level = step.level
+        start = to_level(pixels, level)
+        image = self.pyramid[level]
         at, correlation = align_patches(patches, image, start, affines, step.iterations)
         at = from_level(at.astype(np.float64), level)
         good = correlation > options.min_correlation
         good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
-        which, noise = which[good], options.noise * 2**level
+        which = which[good]
+        noise = options.noise * 2**level
         if len(which) < options.min_matches:
             return None
         points = self.surface_m[0, which]
@@ -217,9 +246,12 @@ class _Search:
         return Observed(at[good], points, white, len(good))
 
 
-def _shift_px(points: Array, moves: Array, rotation: Array, shift: Array, camera: Camera) -> Array:
+def _shift_px(
+    points: Array, moves: Array, rotation: Array, shift: Array, camera: Camera
+) -> Array:
     """(n, 2) displacement in the image of points (n, 3) that move by `moves` (n, 3)."""
-    local, move = points @ rotation.T + shift, moves @ rotation.T
+    local = points @ rotation.T + shift
+    move = moves @ rotation.T
     plane = local[:, :2] / local[:, 2:]
     step = (move[:, :2] - plane * move[:, 2:]) / local[:, 2:]
     if not camera.distortion:

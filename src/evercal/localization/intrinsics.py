@@ -86,7 +86,9 @@ class IntrinsicsPrior:
         odds = before / (1 - before) * math.exp(min(max(other - own, -700.0), 700.0))
         return odds / (1 + odds)
 
-    def decided(self, camera: Camera, change: Array, measured: Array) -> tuple[float, Array | None]:
+    def decided(
+        self, camera: Camera, change: Array, measured: Array
+    ) -> tuple[float, Array | None]:
         """Probability of another camera, and variances (5,) that an estimate asks for.
 
         The variances are None where the prior holds; the estimate is as for `tested`.
@@ -159,7 +161,8 @@ def self_calibrated(
     The start is rotation and position of points_from_camera. Other priors than the stated one are
     a linear step away, unless the image contradicts it.
     """
-    tight, free = prior.variances(camera), FREE.variances(camera)
+    tight = prior.variances(camera)
+    free = FREE.variances(camera)
     own = minimise(observed, camera, start, _REFINE_STEPS, tight, change)
     cells = cells_of(observed.pixels, camera)
     step, _ = own.moved(own.against(free))
@@ -175,7 +178,9 @@ def self_calibrated(
             doubt, variances = prior.decided(camera, best.change, measured)
         if variances is not None:
             start = best.rotation, best.position
-            own = minimise(observed, camera, start, _REFINE_STEPS, variances, best.change)
+            own = minimise(
+                observed, camera, start, _REFINE_STEPS, variances, best.change
+            )
     limits = tight if variances is None else variances
     covariance, lens = _covariances(own, limits, cells)
     if variances is None and doubt:
@@ -184,9 +189,11 @@ def self_calibrated(
         off = (own.moved(own.against(other))[0] - own.moved(own.against(limits))[0])[:6]
         wider = _covariances(own, other, cells)[1] - lens + np.outer(off, off)
         more = min(1.0, doubt / _REACHED) * wider
-        covariance, lens = covariance + more, lens + more
+        covariance = covariance + more
+        lens = lens + more
     more = own.bent / own.variance * lens
-    by_lens, pose = in_parent_axes(own.rotation, lens + more), own.pose(covariance + more)
+    by_lens = in_parent_axes(own.rotation, lens + more)
+    pose = own.pose(covariance + more)
     return RefinedPose(pose, observed, own.residual_px, own.camera, own.change, by_lens)
 
 
@@ -196,7 +203,9 @@ def _measured(minimum: Minimum, free: Array, cells: Array) -> Array:
     return (1 + minimum.bent / minimum.variance) * formal
 
 
-def _covariances(minimum: Minimum, variances: Array, cells: Array) -> tuple[Array, Array]:
+def _covariances(
+    minimum: Minimum, variances: Array, cells: Array
+) -> tuple[Array, Array]:
     """(6, 6) covariance of a pose in camera axes, and the share of the intrinsics in it."""
     whole = minimum.covariance(minimum.against(variances), cells)[:6, :6]
     values, axes = np.linalg.eigh(whole - minimum.covariance(np.zeros(0), cells))
@@ -236,7 +245,9 @@ def _is_own(camera: Camera, scene: "LearnedScene") -> bool:
     return camera in (scene.camera, scene.adjusted_camera)
 
 
-def prior_of(camera: Camera | None, image: np.ndarray, scene: "LearnedScene") -> IntrinsicsPrior:
+def prior_of(
+    camera: Camera | None, image: np.ndarray, scene: "LearnedScene"
+) -> IntrinsicsPrior:
     """Prior of the intrinsics of an image: stated, the recording's, or unknown."""
     if camera is not None:
         return OWN if _is_own(camera, scene) else STATED
@@ -244,7 +255,8 @@ def prior_of(camera: Camera | None, image: np.ndarray, scene: "LearnedScene") ->
     height, width = image.shape[:2]
     if (width, height) == (recorded.width, recorded.height):
         return NOT_STATED
-    larger, smaller = max(width, recorded.width), min(width, recorded.width)
+    larger = max(width, recorded.width)
+    smaller = min(width, recorded.width)
     whole = larger % smaller == 0 and recorded.width * height == recorded.height * width
     # An image of half the size is probably resized; other sizes may be cropped.
     return STATED if whole else UNKNOWN

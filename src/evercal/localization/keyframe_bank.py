@@ -50,7 +50,9 @@ class AlignedLandmarks:
     @cached_property
     def pattern(self) -> np.ndarray:
         """(k, 3) displacements between landmarks that look alike, see `pattern_steps`."""
-        return pattern_steps(self.surface_m[0], self.patches[1].templates[:, 2], self.position_m)
+        return pattern_steps(
+            self.surface_m[0], self.patches[1].templates[:, 2], self.position_m
+        )
 
 
 class LoadedKeyframe:
@@ -60,8 +62,11 @@ class LoadedKeyframe:
     """
 
     def __init__(self, contents: MapContents, keyframes: Keyframes, number: int):
-        self._contents, self._keyframes, self._number = contents, keyframes, number
-        self._lock = Lock()  # one lock per keyframe, so that threads can load different ones
+        self._contents = contents
+        self._keyframes = keyframes
+        self._number = number
+        # One lock per keyframe, so that threads can load different ones.
+        self._lock = Lock()
         self._cells: MatchedCells | None = None
         self._landmarks: AlignedLandmarks | None = None
 
@@ -80,9 +85,13 @@ class LoadedKeyframe:
             return self._landmarks
 
     def _encoded(self) -> MatchedCells:
-        contents, keyframes, number = self._contents, self._keyframes, self._number
-        camera, pose = keyframes.cameras[number], keyframes.base_from_camera[number]
-        grey, encoder = keyframes.grey(number), contents.encoder
+        contents = self._contents
+        keyframes = self._keyframes
+        number = self._number
+        camera = keyframes.cameras[number]
+        pose = keyframes.base_from_camera[number]
+        grey = keyframes.grey(number)
+        encoder = contents.encoder
         features = encoder.encode(grey, contents.short_side).reshape(-1, encoder.width)
         small = camera.short_side_resized(contents.short_side)
         rays = small.pinhole.unproject(ideal_cell_pixels(small, encoder.stride))
@@ -93,8 +102,10 @@ class LoadedKeyframe:
         return MatchedCells(features[valid], pose.apply(points[valid]))
 
     def _cut(self) -> AlignedLandmarks:
-        keyframes, number = self._keyframes, self._number
-        pose, marks = keyframes.base_from_camera[number], keyframes.landmarks[number]
+        keyframes = self._keyframes
+        number = self._number
+        pose = keyframes.base_from_camera[number]
+        marks = keyframes.landmarks[number]
         pyramid = image_pyramid(keyframes.grey(number), ALIGNED_LEVELS)
         return AlignedLandmarks(
             pose.apply(marks.surface(keyframes.cameras[number])),
@@ -111,7 +122,9 @@ class KeyframeBank:
     """The keyframes of all scenes of a map; `most_loaded` stay decoded (up to 3 MB each)."""
 
     def __init__(self, contents: MapContents, most_loaded: int):
-        self._contents, self._most, self._lock = contents, most_loaded, Lock()
+        self._contents = contents
+        self._most = most_loaded
+        self._lock = Lock()
         self._loaded: OrderedDict[int, LoadedKeyframe] = OrderedDict()
         self._sampled: dict[int, tuple[np.ndarray, NDArray[np.int64]]] = {}
         keyframes = [scene.keyframes for scene in contents.scenes]
@@ -150,7 +163,9 @@ class KeyframeBank:
         order = best[np.argsort(-similarity[best], kind="stable")][:most]
         return order[self._used[order]]
 
-    def ranked_of(self, scene: int, similarity: NDArray[np.float32]) -> NDArray[np.int64]:
+    def ranked_of(
+        self, scene: int, similarity: NDArray[np.float32]
+    ) -> NDArray[np.int64]:
         """The keyframes of a scene in use, best first."""
         own = np.flatnonzero((self.scene == scene) & self._used)
         return own[np.argsort(-similarity[own], kind="stable")]
@@ -160,24 +175,37 @@ class KeyframeBank:
         if scene not in self._sampled:
             frames = self._contents.scenes[scene].keyframes
             parts = [
-                pose.apply(marks.take(np.arange(0, len(marks), _SAMPLED)).surface(camera))
+                pose.apply(
+                    marks.take(np.arange(0, len(marks), _SAMPLED)).surface(camera)
+                )
                 for pose, marks, camera in zip(
-                    frames.base_from_camera, frames.landmarks, frames.cameras, strict=True
+                    frames.base_from_camera,
+                    frames.landmarks,
+                    frames.cameras,
+                    strict=True,
                 )
             ]
             counts = [part.shape[1] for part in parts]
-            self._sampled[scene] = np.concatenate(parts, 1), np.repeat(range(len(parts)), counts)
+            self._sampled[scene] = (
+                np.concatenate(parts, 1),
+                np.repeat(range(len(parts)), counts),
+            )
         surface_m, owner = self._sampled[scene]
         inverse = pose.inverse()
-        rotation, shift = inverse.rotation_matrix(), inverse.translation_m
+        rotation = inverse.rotation_matrix()
+        shift = inverse.translation_m
         shown = project_surface(surface_m, rotation, shift, camera).landmark
         own = np.flatnonzero(self.scene == scene)
-        order = own[np.argsort(-np.bincount(owner[shown], minlength=len(own)), kind="stable")]
+        order = own[
+            np.argsort(-np.bincount(owner[shown], minlength=len(own)), kind="stable")
+        ]
         return order[self._used[order]]
 
     def pattern(self, keyframes: NDArray[np.int64]) -> np.ndarray:
         """(k, 3) displacements by which a pose before the best keyframes may have slipped."""
-        return np.concatenate([self.load(int(k)).landmarks.pattern for k in keyframes[:1]])
+        return np.concatenate(
+            [self.load(int(k)).landmarks.pattern for k in keyframes[:1]]
+        )
 
     def load(self, index: int) -> LoadedKeyframe:
         """A keyframe of the bank, by its index."""

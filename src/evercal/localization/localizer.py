@@ -53,7 +53,8 @@ class Localizer:
     """Locates images in the scenes of a map."""
 
     def __init__(self, contents: MapContents, options: LocalizeOptions | None = None):
-        self.contents, self.options = contents, options or LocalizeOptions()
+        self.contents = contents
+        self.options = options or LocalizeOptions()
         self._bank = KeyframeBank(contents, self.options.loaded_keyframes)
         self._matcher = Matcher(self._bank, self.options, contents.short_side)
 
@@ -70,13 +71,17 @@ class Localizer:
         """
         contents = MapStore.open(Path(store), encoder).contents
         if not contents.scenes:
-            raise InputError(f"store {store}: no scene learned yet; run 'evercal learn' first")
+            raise InputError(
+                f"store {store}: no scene learned yet; run 'evercal learn' first"
+            )
         return cls(contents, options)
 
     def only(self, scene: int, keyframes: NDArray[np.int64]) -> Self:
         """The same localizer with some keyframes of one scene."""
         part = copy(self)
-        part._bank = self._bank.only(np.flatnonzero(self._bank.scene == scene)[keyframes])
+        part._bank = self._bank.only(
+            np.flatnonzero(self._bank.scene == scene)[keyframes]
+        )
         part._matcher = Matcher(part._bank, self.options, self.contents.short_side)
         return part
 
@@ -103,19 +108,29 @@ class Localizer:
         with one_product_thread():
             return self._located(as_rgb(image), camera)
 
-    def _located(self, image: np.ndarray, camera: Camera | None) -> tuple[PoseEstimate, Hypothesis]:
-        began, contents = time.perf_counter(), self.contents
+    def _located(
+        self, image: np.ndarray, camera: Camera | None
+    ) -> tuple[PoseEstimate, Hypothesis]:
+        began = time.perf_counter()
+        contents = self.contents
         cameras = cameras_in_scenes(camera, image, contents.scenes)
-        query = self.query(image, camera, contents.encoder.encode(image, contents.short_side))
-        best, rival = self._best_hypothesis(query, cameras), None
+        query = self.query(
+            image, camera, contents.encoder.encode(image, contents.short_side)
+        )
+        best = self._best_hypothesis(query, cameras)
+        rival = None
         if accepted(best):
             best, rival = settled(self, query, best, cameras[best.scene])
         milliseconds = 1000 * (time.perf_counter() - began)
-        scene, size = contents.scenes[best.scene], query.image.shape[:2]
+        scene = contents.scenes[best.scene]
+        size = query.image.shape[:2]
         return answer(best, scene, size, milliseconds, rival), best
 
     def query(
-        self, image: np.ndarray, camera: Camera | None, features: NDArray[np.float32] = _NONE
+        self,
+        image: np.ndarray,
+        camera: Camera | None,
+        features: NDArray[np.float32] = _NONE,
     ) -> Query:
         """An image to be located, of the stated camera; alignment alone needs no features."""
         priors = tuple(prior_of(camera, image, scene) for scene in self.contents.scenes)
@@ -128,17 +143,24 @@ class Localizer:
         [at] = cameras_in_scenes(camera, image, self.contents.scenes[scene : scene + 1])
         query = self.query(image, camera)
         seen = self._bank.seen(scene, start, at)[: self.options.keyframes]
-        found = self.aligned(query, Candidate(scene, seen), at, start, np.zeros(INTRINSICS))
-        return found and answer(found, self.contents.scenes[scene], image.shape[:2], 0.0)
+        found = self.aligned(
+            query, Candidate(scene, seen), at, start, np.zeros(INTRINSICS)
+        )
+        return found and answer(
+            found, self.contents.scenes[scene], image.shape[:2], 0.0
+        )
 
     def slips(self, hypothesis: Hypothesis) -> NDArray[np.floating]:
         """(k, 3) displacements, by which an aligned pose may have slipped, the shortest first."""
         found = hypothesis.candidate
-        return np.zeros((0, 3)) if found is None else self._bank.pattern(found.keyframes)
+        return (
+            np.zeros((0, 3)) if found is None else self._bank.pattern(found.keyframes)
+        )
 
     def _best_hypothesis(self, query: Query, cameras: Sequence[Camera]) -> Hypothesis:
         """The pose with the most support, from as few attempts as it takes."""
-        best, few = Hypothesis(0), False
+        best = Hypothesis(0)
+        few = False
         for number, attempt in enumerate(self.options.attempts):
             magnified = attempt.scale != 1
             if number > 1 and magnified != few:
@@ -154,7 +176,9 @@ class Localizer:
                 query = self._matcher.upright(query)
         return best
 
-    def _tried(self, query: Query, attempt: Attempt, cameras: Sequence[Camera]) -> Hypothesis:
+    def _tried(
+        self, query: Query, attempt: Attempt, cameras: Sequence[Camera]
+    ) -> Hypothesis:
         """The pose with the most support of one attempt."""
         best = Hypothesis(0)
         for candidate in self._matcher.candidates(query, attempt):
@@ -173,16 +197,23 @@ class Localizer:
     ) -> Hypothesis:
         """A pose in one scene: match, PnP, align; `matches` are used instead of new ones."""
         height, width = query.grey.shape
-        small = camera.resized(width, height).short_side_resized(self.contents.short_side)
+        small = camera.resized(width, height).short_side_resized(
+            self.contents.short_side
+        )
         matches = matches or self._matcher.matches(query, candidate, small)
-        prior, poses = query.priors[candidate.scene], []
+        prior = query.priors[candidate.scene]
+        poses = []
         # No camera is stated, and the image was not located at once.
-        hard = prior is NOT_STATED and candidate.stride < self.options.attempts[0].stride
+        hard = (
+            prior is NOT_STATED and candidate.stride < self.options.attempts[0].stride
+        )
         hard &= not len(self._bank.pattern(candidate.keyframes))
         own = replace(self.options.pnp, ranked=prior is not UNKNOWN)
         other = replace(own, max_iterations=own.max_iterations // 2)
         for factor in (1.0, *FOCAL_FACTORS):
-            pnp = solve_pnp(*matches, small.zoomed(factor), own if factor == 1 else other)
+            pnp = solve_pnp(
+                *matches, small.zoomed(factor), own if factor == 1 else other
+            )
             poses += [(pnp, factor)] if pnp else []
             few = not pnp or pnp.inliers.sum() < self.options.aligned_inliers
             if factor == 1 and prior is not UNKNOWN and (few or not hard):
@@ -195,13 +226,18 @@ class Localizer:
             pixels, points = (values[pnp.inliers] for values in matches)
             pose = uncertain(pixels, points, small.zoomed(factor), pnp.pose)
             count = len(pnp.inliers)
-            return Hypothesis(candidate.scene, pose, None, pixels, points, count, inliers, inliers)
+            return Hypothesis(
+                candidate.scene, pose, None, pixels, points, count, inliers, inliers
+            )
         change = zoomed(factor)
         aligned = self.aligned(query, candidate, camera, pnp.pose, change)
         if aligned is None:
             return Hypothesis(candidate.scene, pnp_inliers=inliers)
         return self._reselected(
-            query, candidate, camera, replace(aligned, pnp_inliers=inliers, matches=matches)
+            query,
+            candidate,
+            camera,
+            replace(aligned, pnp_inliers=inliers, matches=matches),
         )
 
     def _reselected(
@@ -209,7 +245,8 @@ class Localizer:
     ) -> Hypothesis:
         """The pose by the keyframes that see most of its view, while that raises little support."""
         while best.refined and not accepted(best, self.options.immediate):
-            pose, change = best.refined.pose.pose, best.refined.change
+            pose = best.refined.pose.pose
+            change = best.refined.change
             seen = self._bank.seen(candidate.scene, pose, best.refined.camera)
             candidate = candidate._replace(keyframes=seen[: self.options.keyframes])
             again = self.aligned(query, candidate, camera, pose, change)
@@ -228,7 +265,8 @@ class Localizer:
         coarse: bool = True,
     ) -> Hypothesis | None:
         """A pose map_from_camera, refined by landmarks; see `align_pose`."""
-        options, size = self.options.alignment, query.grey.shape
+        options = self.options.alignment
+        size = query.grey.shape
         refined = align_pose(
             query.pyramid,
             camera.resized(*size[::-1]),
@@ -241,12 +279,15 @@ class Localizer:
         )
         if refined is None:
             return None
-        observed, inliers = refined.observed, refined.residual_px < options.inlier_px
+        observed = refined.observed
+        inliers = refined.residual_px < options.inlier_px
         return Hypothesis(
             candidate.scene,
             refined.pose,
             refined,
-            resize_pixels(observed.pixels[inliers], self.contents.short_side / min(size)),
+            resize_pixels(
+                observed.pixels[inliers], self.contents.short_side / min(size)
+            ),
             observed.points_m[inliers],
             observed.expected,
             len(inliers),

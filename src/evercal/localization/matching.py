@@ -8,14 +8,22 @@ from numpy.typing import NDArray
 from evercal.features.views import cell_centres, ideal_cell_pixels, working_grey
 from evercal.geometry import Camera, resize_pixels
 from evercal.localization.keyframe_bank import KeyframeBank
-from evercal.localization.query import Attempt, Candidate, LocalizeOptions, Matches, Query
+from evercal.localization.query import (
+    Attempt,
+    Candidate,
+    LocalizeOptions,
+    Matches,
+    Query,
+)
 
 
 class Matcher:
     """Retrieval and matching."""
 
     def __init__(self, bank: KeyframeBank, options: LocalizeOptions, short_side: int):
-        self._bank, self._options, self._short_side = bank, options, short_side
+        self._bank = bank
+        self._options = options
+        self._short_side = short_side
 
     def candidates(self, query: Query, attempt: Attempt) -> list[Candidate]:
         """Scenes to try, most likely first.
@@ -45,21 +53,32 @@ class Matcher:
             others = own[~np.isin(own, voted)]
             keyframes = np.concatenate([voted, others])[: self._options.keyframes]
             repeated = len(self._bank.pattern(keyframes)) > 0
-            candidates.append(Candidate(s, keyframes, 1 if repeated else attempt.stride))
+            candidates.append(
+                Candidate(s, keyframes, 1 if repeated else attempt.stride)
+            )
         return candidates
 
     def upright(self, query: Query) -> Query:
         """The image in the quarter turn whose middle is most similar to keyframes."""
-        grey, encoder = working_grey(query.image, self._short_side), self._bank.encoder
-        size, stride = query.features.shape[:2], encoder.stride
+        grey = working_grey(query.image, self._short_side)
+        encoder = self._bank.encoder
+        size = query.features.shape[:2]
+        stride = encoder.stride
         side = min(self._options.middle_px // stride, *size)
         top, left = ((cells - side) // 2 for cells in size)
         middle = grey[stride * top :, stride * left :][: stride * side, : stride * side]
         # Side by side, the other turns take two thirds of the time.
-        others = encoder(np.concatenate([turned(middle, turns) for turns in (1, 2, 3)], 1))
-        views = query.features[top : top + side, left : left + side], *np.split(others, 3, 1)
+        others = encoder(
+            np.concatenate([turned(middle, turns) for turns in (1, 2, 3)], 1)
+        )
+        views = (
+            query.features[top : top + side, left : left + side],
+            *np.split(others, 3, 1),
+        )
         similarity = self._similarity(*views)
-        similar = [self._mean_similarity(*each) for each in zip(views, similarity, strict=True)]
+        similar = [
+            self._mean_similarity(*each) for each in zip(views, similarity, strict=True)
+        ]
         turns = int(np.argmax(similar))
         if similar[turns] <= similar[0] + self._options.clear_turn:
             return query
@@ -68,8 +87,12 @@ class Matcher:
 
     def magnified(self, query: Query, scale: float) -> Query:
         """The image encoded at another size."""
-        features = self._bank.encoder.encode(query.image, round(scale * self._short_side))
-        return replace(query, features=features, scale=scale, turns=0, similar={}, descriptor=[])
+        features = self._bank.encoder.encode(
+            query.image, round(scale * self._short_side)
+        )
+        return replace(
+            query, features=features, scale=scale, turns=0, similar={}, descriptor=[]
+        )
 
     def _similarity(self, *views: NDArray[np.float32]) -> NDArray[np.float32]:
         """(views, keyframes) similarity of whole images by their features."""
@@ -85,7 +108,9 @@ class Matcher:
         """
         proposed = self._bank.ranked(similarity, self._options.keyframes)
         rows = _rows(features[::2, ::2])
-        best = [(rows @ self._bank.load(int(k)).cells.features.T).max(1) for k in proposed]
+        best = [
+            (rows @ self._bank.load(int(k)).cells.features.T).max(1) for k in proposed
+        ]
         return float(np.max(best, 0).mean())
 
     def matches(self, query: Query, candidate: Candidate, camera: Camera) -> Matches:
@@ -95,16 +120,21 @@ class Matcher:
         """
         stride = candidate.stride if self._options.align else 1
         larger = camera.short_side_resized(round(query.scale * self._short_side))
-        patches, pixels = strided_patches(query, larger, self._bank.encoder.stride, stride)
+        patches, pixels = strided_patches(
+            query, larger, self._bank.encoder.stride, stride
+        )
         pixels = resize_pixels(pixels, 1 / query.scale)
         found = [self._most_similar(query, stride, int(k)) for k in candidate.keyframes]
         nearest, height = (np.array(values) for values in zip(*found, strict=True))
         with_ray = np.isin(_grid(query, stride), patches)
-        nearest, best = nearest[:, with_ray], height[:, with_ray].argmax(0)
+        nearest = nearest[:, with_ray]
+        best = height[:, with_ray].argmax(0)
         points = np.empty((len(pixels), 3))
         for number, keyframe in enumerate(candidate.keyframes):
             chosen = best == number
-            points[chosen] = self._bank.load(int(keyframe)).cells.points_m[nearest[number, chosen]]
+            points[chosen] = self._bank.load(int(keyframe)).cells.points_m[
+                nearest[number, chosen]
+            ]
         order = np.argsort(-height[:, with_ray].max(0), kind="stable")
         return Matches(pixels[order], points[order])
 
@@ -152,12 +182,15 @@ def cell_pixels(camera: Camera, stride: int, turns: int) -> np.ndarray:
     """
     if not turns:
         return ideal_cell_pixels(camera, stride).astype(np.float64)
-    right, bottom = camera.width - 1, camera.height - 1
-    rows, columns = camera.height, camera.width
+    right = camera.width - 1
+    bottom = camera.height - 1
+    rows = camera.height
+    columns = camera.width
     if turns % 2:
         rows, columns = columns, rows
     turned = cell_centres(rows, columns, stride)
-    x, y = turned[:, 0], turned[:, 1]
+    x = turned[:, 0]
+    y = turned[:, 1]
     # Clockwise by one quarter, pixel (x, y) moves to (height - 1 - y, x).
     back = {1: (y, bottom - x), 2: (right - x, bottom - y), 3: (right - y, x)}[turns]
     return camera.pinhole.project(camera.unproject(np.stack(back, -1)))

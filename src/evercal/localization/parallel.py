@@ -15,7 +15,9 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def in_parallel(work: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+def in_parallel(
+    work: Callable[[Item], Result], items: Sequence[Item]
+) -> Iterator[Result]:
     """Results of a function in the order of the items, from as many workers as there are cores.
 
     What `work` raises is raised when its turn comes; items not begun are left out.

@@ -66,7 +66,9 @@ def solve_pnp(
     enough = len(inliers) == len(pixels) and inliers.sum() >= MIN_INLIERS
     if not enough or not np.isfinite(pose.t).all():
         return None
-    points_from_camera = SE3(np.asarray(pose.q, float), np.asarray(pose.t, float)).inverse()
+    points_from_camera = SE3(
+        np.asarray(pose.q, float), np.asarray(pose.t, float)
+    ).inverse()
     return PnpResult(points_from_camera, inliers)
 
 

@@ -23,7 +23,8 @@ SHARED = 0.05
 errors beyond the noise of patches, whose variance is 1, are shared more (research/map.md)."""
 SHARED_CELLS = 4
 """Such cells along the shorter side of an image."""
-_FIXED, _UNCHANGED = np.zeros(0), np.zeros(INTRINSICS)
+_FIXED = np.zeros(0)
+_UNCHANGED = np.zeros(INTRINSICS)
 _BENT_PX = 0.01
 """Errors of a map that all landmarks may share, pixels. They bound how well many landmarks measure
 intrinsics: a flat wall seen from the front would otherwise seem to measure the focal length."""
@@ -83,7 +84,8 @@ class Minimum:
         they are fixed. The errors are linear in steps of this size.
         """
         count = len(prior)
-        data, gradient = self.data.copy(), self.gradient.copy()
+        data = self.data.copy()
+        gradient = self.gradient.copy()
         data.flat[6 * len(data) + 6 :: len(data) + 1] += prior
         gradient[6:] += prior * self.change[:count]
         inverse = inverse_of(data)
@@ -99,7 +101,8 @@ class Minimum:
         squares = (self.residual**2).sum(0)
         weight = 1 / (1 + squares / self.variance)
         slope = self.slope[:count] * weight
-        rows, sums = slope.reshape(count, -1), (slope @ cells).reshape(count, -1)
+        rows = slope.reshape(count, -1)
+        sums = (slope @ cells).reshape(count, -1)
         hessian = rows @ rows.T
         noise = float((weight**2 @ squares) / (2 * (weight**2).sum()))
         scores = noise * hessian + SHARED * self.variance**2 * sums @ sums.T
@@ -112,13 +115,18 @@ class Minimum:
     def after(self, step: Array) -> "Minimum":
         """The same with the residuals after a step (k,), to first order."""
         residual = self.residual + np.tensordot(step, self.slope, 1)
-        return replace(self, residual=residual, variance=robust_variance((residual**2).sum(0)))
+        return replace(
+            self, residual=residual, variance=robust_variance((residual**2).sum(0))
+        )
 
     def pose(self, covariance: Array) -> UncertainPose:
         """points_from_camera with a covariance (6, 6) in camera axes."""
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = self.rotation, self.position
-        return UncertainPose(SE3.from_matrix(matrix), in_parent_axes(self.rotation, covariance))
+        matrix[:3, :3] = self.rotation
+        matrix[:3, 3] = self.position
+        return UncertainPose(
+            SE3.from_matrix(matrix), in_parent_axes(self.rotation, covariance)
+        )
 
 
 def minimise(
@@ -136,15 +144,21 @@ def minimise(
     linear in them: the caller repeats it after a large change.
     """
     (rotation, position), best, ahead = start, None, {}
-    now, moved, white = camera.changed(change), change.copy(), observed.whitening
-    free, bent = len(variances), _BENT_PX**2 * float((white**2).sum()) / 2
+    now = camera.changed(change)
+    moved = change.copy()
+    white = observed.whitening
+    free = len(variances)
+    bent = _BENT_PX**2 * float((white**2).sum()) / 2
     for _ in range(max(iterations, 1)):
         raw, slope = linearise(
             observed.pixels, observed.points_m, rotation, position, now, free > 0
         )
         raw += (moved - change)[:free] @ slope[6:].transpose(1, 0, 2)
         residual = white[:, 0] * raw[0] + white[:, 1] * raw[1]
-        slope = white[None, :, 0] * slope[:, 0, None] + white[None, :, 1] * slope[:, 1, None]
+        slope = (
+            white[None, :, 0] * slope[:, 0, None]
+            + white[None, :, 1] * slope[:, 1, None]
+        )
         squares = residual[0] * residual[0] + residual[1] * residual[1]
         variance = robust_variance(squares)
         if best is not None and variance > _DIVERGED * best.variance:
@@ -152,7 +166,8 @@ def minimise(
             break
         root = 1 / np.sqrt(1 + squares / variance)
         rows = (slope * root).reshape(len(slope), -1)
-        data, gradient = rows @ rows.T, rows @ (residual * root).ravel()
+        data = rows @ rows.T
+        gradient = rows @ (residual * root).ravel()
         best = Minimum(
             rotation, position, camera, moved, variance, bent, data, gradient, residual, slope,
             np.hypot(*raw),
@@ -170,7 +185,9 @@ def minimise(
             break
     assert best is not None, "at least one iteration"
     best = replace(best, **ahead)
-    return replace(best, camera=camera.changed(best.change) if best.change.any() else camera)
+    return replace(
+        best, camera=camera.changed(best.change) if best.change.any() else camera
+    )
 
 
 def robust_variance(squares: Array) -> float:
@@ -213,27 +230,42 @@ def linearise(
     """
     local = rotation.T @ (points_m - position).T
     inverse = 1 / np.maximum(local[2], 1e-3)
-    x, y = local[0] * inverse, local[1] * inverse
+    x = local[0] * inverse
+    y = local[1] * inverse
     slope = np.zeros((6 + INTRINSICS * intrinsics, 2, len(x)))
-    slope[0, 0], slope[2, 0], slope[3, 0] = -inverse, x * inverse, x * y
-    slope[4, 0], slope[5, 0] = -1 - x * x, y
-    slope[1, 1], slope[2, 1], slope[3, 1] = -inverse, y * inverse, 1 + y * y
-    slope[4, 1], slope[5, 1] = -slope[3, 0], -x
+    slope[0, 0] = -inverse
+    slope[2, 0] = x * inverse
+    slope[3, 0] = x * y
+    slope[4, 0] = -1 - x * x
+    slope[5, 0] = y
+    slope[1, 1] = -inverse
+    slope[2, 1] = y * inverse
+    slope[3, 1] = 1 + y * y
+    slope[4, 1] = -slope[3, 0]
+    slope[5, 1] = -x
     if camera.distortion:
         # Written out: products of small matrices take four times as long.
         by_plane, lens = camera.slopes(np.stack([x, y], -1))
         chain = np.ascontiguousarray(by_plane.transpose(1, 2, 0))
-        slope[:6] = chain[None, :, 0] * slope[:6, 0, None] + chain[None, :, 1] * slope[:6, 1, None]
+        slope[:6] = (
+            chain[None, :, 0] * slope[:6, 0, None]
+            + chain[None, :, 1] * slope[:6, 1, None]
+        )
         if intrinsics:
             slope[6:] = lens.transpose(2, 1, 0)
         # The derivative by the logarithm of the focal length is the pixel beside the centre.
-        u, v = lens[:, 0, 0], lens[:, 1, 0]
+        u = lens[:, 0, 0]
+        v = lens[:, 1, 0]
     else:
-        u, v = camera.fx * x, camera.fy * y
+        u = camera.fx * x
+        v = camera.fy * y
         slope[:6] *= np.array([camera.fx, camera.fy])[:, None]
         if intrinsics:
             r2 = x * x + y * y
-            slope[6, 0], slope[6, 1], slope[7, 0], slope[8, 1] = u, v, 1, 1
+            slope[6, 0] = u
+            slope[6, 1] = v
+            slope[7, 0] = 1
+            slope[8, 1] = 1
             slope[9] = slope[6] * r2
             slope[10] = slope[9] * r2
     return np.stack([u + camera.cx - pixels[:, 0], v + camera.cy - pixels[:, 1]]), slope

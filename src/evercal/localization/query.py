@@ -88,8 +88,8 @@ class Query:
     """Short side of `grey`, pixels, at most."""
     priors: Sequence[IntrinsicsPrior] = ()
     """Of the intrinsics in each scene."""
-    similar: dict[tuple[int, int], tuple[NDArray[np.int64], NDArray[np.float32]]] = field(
-        default_factory=dict
+    similar: dict[tuple[int, int], tuple[NDArray[np.int64], NDArray[np.float32]]] = (
+        field(default_factory=dict)
     )
     """Most similar cells of keyframes, see `Matcher`."""
     descriptor: list[NDArray[np.float32]] = field(default_factory=list)

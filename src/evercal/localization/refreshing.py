@@ -78,8 +78,10 @@ def refresh_scene(
     The intrinsics of each image are by default those of the camera that recorded the scene. Too few
     located images, or a refreshed map that would locate fewer of them, raise `InputError`.
     """
-    began, options = time.perf_counter(), options or RefreshOptions()
-    cameras, estimates = cameras or [None] * len(images), []
+    began = time.perf_counter()
+    options = options or RefreshOptions()
+    cameras = cameras or [None] * len(images)
+    estimates = []
     for number, ((_, image), camera) in enumerate(zip(images, cameras, strict=True)):
         estimates.append(localize_picture(localizer, image, camera))
         on_progress("locating", number + 1, len(images))
@@ -97,9 +99,13 @@ def refresh_scene(
         )
     check = located[VERIFIED - 1 :: VERIFIED]
     used = [item for i, item in enumerate(located) if i % VERIFIED != VERIFIED - 1]
-    poses = SE3.stack([pose for frame, *_ in used if (pose := frame.base_from_camera) is not None])
+    poses = SE3.stack(
+        [pose for frame, *_ in used if (pose := frame.base_from_camera) is not None]
+    )
     frames = [used[i][0] for i in spread_poses(poses, options.most_frames)]
-    size = WorkingSize(cells=contents.short_side, patches=localizer.options.patches_short_side)
+    size = WorkingSize(
+        cells=contents.short_side, patches=localizer.options.patches_short_side
+    )
     result = refreshed(scene, frames, contents.encoder, size, options, on_progress)
     scenes = [*contents.scenes]
     scenes[index] = result.scene
@@ -108,7 +114,8 @@ def refresh_scene(
     covariance = np.diag(np.repeat(sigma**2, 3))
     known = scene.frame.base_covariance
     frame = replace(
-        result.scene.frame, base_covariance=covariance if known is None else known + covariance
+        result.scene.frame,
+        base_covariance=covariance if known is None else known + covariance,
     )
     updated = replace(result.scene, frame=frame)
     tangent = shift.log()
@@ -124,7 +131,9 @@ def refresh_scene(
         keyframes_added=result.added,
         memory_bytes=updated.keyframes.bytes,
         verified=verified,
-        shift_mm=1000 * float(np.linalg.norm(tangent[:3])) if scene.unit_known else None,
+        shift_mm=1000 * float(np.linalg.norm(tangent[:3]))
+        if scene.unit_known
+        else None,
         shift_deg=float(np.rad2deg(np.linalg.norm(tangent[3:]))),
         shift_sigma_mm=1000 * float(sigma[0]) if scene.unit_known else None,
         shift_sigma_deg=float(np.rad2deg(sigma[1])),
@@ -139,7 +148,8 @@ def _usable(
     scene: SceneMap,
 ) -> tuple[list[_NewImage], dict[str, str]]:
     """Return the precisely located images of a scene, and why others are left out."""
-    located, left_out = [], {}
+    located = []
+    left_out = {}
     for (name, image), stated, estimate in zip(images, cameras, estimates, strict=True):
         answer = estimate.uncertain_pose
         if estimate.status != "ok" or answer is None:
@@ -151,13 +161,17 @@ def _usable(
         else:
             pose = scene.frame.from_base(answer.pose)
             assert estimate.camera is not None, "an answer from a map"
-            located.append((Frame(name, image, estimate.camera, pose), answer.pose, stated))
+            located.append(
+                (Frame(name, image, estimate.camera, pose), answer.pose, stated)
+            )
     return located, left_out
 
 
 def _precise(estimate: PoseEstimate, scene: SceneMap) -> bool:
     """Whether the image determines its own pose well, apart from errors that all answers share."""
-    own = sum(term.covariance for term in estimate.terms if term.name in ("view", "lens"))
+    own = sum(
+        term.covariance for term in estimate.terms if term.name in ("view", "lens")
+    )
     sigma = np.sqrt(np.diag(np.asarray(own)).reshape(2, 3).mean(1))
     metres = sigma[0] / scene.frame.unit * scene.metres_per_unit
     return bool(sigma[1] < PRECISE_RAD and metres < PRECISE_M)
@@ -170,7 +184,11 @@ def _verified(
     moves = []
     for frame, before, camera in check:
         estimate = after.localize(frame.read_image(), camera)
-        if estimate.status == "ok" and estimate.scene == scene and estimate.base_from_camera:
+        if (
+            estimate.status == "ok"
+            and estimate.scene == scene
+            and estimate.base_from_camera
+        ):
             moves.append(estimate.base_from_camera @ before.inverse())
     lost = len(check) - len(moves)
     if not moves or lost > max(1, WORSE * len(check)):

@@ -35,8 +35,11 @@ def pattern_steps(points_m: Array, templates: Array, position_m: Array) -> Array
     """
     if not len(points_m):
         return np.zeros((0, 3))
-    some = np.linspace(0, len(points_m) - 1, min(MOST_LANDMARKS, len(points_m))).astype(int)
-    points, patches = points_m[some], templates[some]
+    some = np.linspace(0, len(points_m) - 1, min(MOST_LANDMARKS, len(points_m))).astype(
+        int
+    )
+    points = points_m[some]
+    patches = templates[some]
     away = float(np.median(np.linalg.norm(points - position_m, axis=1)))
     first, second = np.nonzero(patches @ patches.T > ALIKE * patches.shape[1])
     moves = points[second] - points[first]
@@ -51,7 +54,10 @@ def _shared(moves: Array, tolerance: float, least: float) -> Array:
     """(k, 3) displacements within the tolerance of at least so many of `moves` (n, 3)."""
     cells = np.round(moves / tolerance).astype(np.int64)
     _, where, of, counts = np.unique(
-        cells @ [1, 1 << 20, 1 << 40], return_index=True, return_inverse=True, return_counts=True
+        cells @ [1, 1 << 20, 1 << 40],
+        return_index=True,
+        return_inverse=True,
+        return_counts=True,
     )
     cells = cells[where]
     sums = np.stack([np.bincount(of, column) for column in moves.T], 1)
@@ -61,7 +67,9 @@ def _shared(moves: Array, tolerance: float, least: float) -> Array:
         near = (np.abs(cells - cells[cell]) <= 1).all(1)
         pairs = float(counts[near].sum())
         step = sums[near].sum(0) / pairs
-        if pairs >= least and all(np.linalg.norm(step - s) > 3 * tolerance for _, s in found):
+        if pairs >= least and all(
+            np.linalg.norm(step - s) > 3 * tolerance for _, s in found
+        ):
             found.append((pairs, step))
     # Multiples of a period are nearly as frequent; a pose that slipped by one takes several steps.
     often = [step for pairs, step in found if pairs >= FREQUENT * found[0][0]]

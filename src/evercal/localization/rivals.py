@@ -26,7 +26,8 @@ def settled(
     Without a runner-up that explains the image nearly as well, the second value is None.
     """
     options = localizer.options
-    seen, front = [best], best
+    seen = [best]
+    front = best
     for _ in range(options.climbs):
         rivals = [
             rival
@@ -37,15 +38,22 @@ def settled(
         higher = max(rivals, key=support, default=front)
         if support(higher) <= support(front):
             break
-        front = higher  # several periods away, the way leads over poses of rising support
+        front = (
+            higher  # several periods away, the way leads over poses of rising support
+        )
     if len(seen) == 1:
         return best, None
     strongest = max(seen, key=lambda rival: _strength(localizer, rival, best))
     if _strength(localizer, strongest, best) * options.clear_strength > 1:
         best = strongest
     others = [x for x in seen if x.pose and x is not best and differ(best, x.pose.pose)]
-    runner_up = max(others, key=lambda rival: _strength(localizer, rival, best), default=None)
-    if runner_up is None or _strength(localizer, runner_up, best) <= options.clear_strength:
+    runner_up = max(
+        others, key=lambda rival: _strength(localizer, rival, best), default=None
+    )
+    if (
+        runner_up is None
+        or _strength(localizer, runner_up, best) <= options.clear_strength
+    ):
         return best, None
     return best, runner_up
 
@@ -80,7 +88,8 @@ def _rivals(
     """
     if best.pose is None or best.refined is None or best.candidate is None:
         return
-    pose, change = best.pose.pose, best.refined.change
+    pose = best.pose.pose
+    change = best.refined.change
     if best.matches is not None:
         small = best.refined.camera.short_side_resized(localizer.contents.short_side)
         rest = best.matches.beside(small, pose, localizer.options.rival_px)
@@ -108,13 +117,16 @@ def _other_focal_lengths(
         return
     small = camera.short_side_resized(localizer.contents.short_side)
     # As many inliers are wanted as at the focal length of the pose.
-    options, poses = replace(localizer.options.pnp, wanted=best.pnp_inliers), []
+    options = replace(localizer.options.pnp, wanted=best.pnp_inliers)
+    poses = []
     for factor in (1.0, *FOCAL_FACTORS):
         change = zoomed(factor)
         if abs(change[0] - best.refined.change[0]) > _NEXT_FOCAL:
             pnp = solve_pnp(*best.matches, small.zoomed(factor), options)
             poses += [(int(pnp.inliers.sum()), factor, pnp.pose)] if pnp else []
-    inliers, factor, pose = max(poses, default=(0, 1.0, SE3.identity()), key=lambda found: found[0])
+    inliers, factor, pose = max(
+        poses, default=(0, 1.0, SE3.identity()), key=lambda found: found[0]
+    )
     if inliers >= best.pnp_inliers:
         rival = localizer.aligned(query, best.candidate, camera, pose, zoomed(factor))
         if rival is not None:

@@ -101,7 +101,8 @@ class Tracker:
 
         Frames without a time are `fallback_s` apart.
         """
-        number, self._number = self._number, self._number + 1
+        number = self._number
+        self._number = self._number + 1
         stamp = number * self.options.fallback_s if stamp_s is None else stamp_s
         image = as_rgb(image)
         if self.options.at_most_ms is None:
@@ -120,11 +121,15 @@ class Tracker:
             stamp, image = item if isinstance(item, tuple) else (None, item)
             yield self.track(image, stamp)
 
-    def _located(self, image: np.ndarray, stamp: float) -> tuple[PoseEstimate, TrackState]:
+    def _located(
+        self, image: np.ndarray, stamp: float
+    ) -> tuple[PoseEstimate, TrackState]:
         estimate = self._near_prediction(image, stamp)
         if estimate is not None:
             return estimate, "tracking"
-        before, predicted, scene = self._poses[-1:], self._predicted(stamp), self._scene
+        before = self._poses[-1:]
+        predicted = self._predicted(stamp)
+        scene = self._scene
         estimate, found = self.localizer.located(image, self.camera)
         self._poses.clear()
         if estimate.status != "ok":
@@ -147,7 +152,10 @@ class Tracker:
         self._poses.clear()
         if self._running is None:
             self._pool = self._pool or ThreadPoolExecutor(1, "search")
-            self._running = stamp, self._pool.submit(self.localizer.located, image, self.camera)
+            self._running = (
+                stamp,
+                self._pool.submit(self.localizer.located, image, self.camera),
+            )
             if (done := self._taken(until - _ANSWER_S)) is not None:
                 estimate, found = done[1]
                 if estimate.status == "ok":
@@ -175,18 +183,24 @@ class Tracker:
         return True
 
     def _near_prediction(
-        self, image: np.ndarray, stamp: float, until: float = np.inf, adopted: bool = False
+        self,
+        image: np.ndarray,
+        stamp: float,
+        until: float = np.inf,
+        adopted: bool = False,
     ) -> PoseEstimate | None:
         """Align the landmarks around the predicted pose; None if that does not suffice.
 
         The pose of an earlier frame that is `adopted` is farther away and was not confirmed: the
         search is coarse, and the pose needs the support of a settled one.
         """
-        began, predicted = time.perf_counter(), self._predicted(stamp)
+        began = time.perf_counter()
+        predicted = self._predicted(stamp)
         if predicted is None:
             return None
         settled = self.options.settled if adopted else 1.0
-        localizer, contents = self.localizer, self.localizer.contents
+        localizer = self.localizer
+        contents = self.localizer.contents
         cameras = cameras_in_scenes(self.camera, image, contents.scenes)
         query = localizer.query(image, self.camera)
         candidate = Candidate(self._scene, self._next_keyframes(predicted))
@@ -212,7 +226,9 @@ class Tracker:
                 return estimate
         return None
 
-    def _may_have_slipped(self, found: Hypothesis, predicted: SE3, stamp: float) -> bool:
+    def _may_have_slipped(
+        self, found: Hypothesis, predicted: SE3, stamp: float
+    ) -> bool:
         """Whether a pose that lies a period of repeated texture away is as near the prediction."""
         assert found.pose is not None, "a trusted pose"
         steps = self.localizer.slips(found)
@@ -243,7 +259,9 @@ class Tracker:
 
     def _next_keyframes(self, pose: SE3) -> NDArray[np.int64]:
         keyframes = self.localizer.contents.scenes[self._scene].keyframes
-        first = sum(len(s.keyframes) for s in self.localizer.contents.scenes[: self._scene])
+        first = sum(
+            len(s.keyframes) for s in self.localizer.contents.scenes[: self._scene]
+        )
         metres, radians = pose_distance(pose, keyframes.base_from_camera)
         spread = max(float(np.median(metres)), 1e-6)
         order = np.argsort(metres / spread + radians, kind="stable")
@@ -277,6 +295,10 @@ class Tracker:
         last, before = self._smoothed
         jumped = pose.squared_mahalanobis(before) > 6 * self.options.jump_sigmas**2
         gain = 1 - np.exp(-max(stamp - last, 0.0) / self.options.smooth)
-        now = pose.pose if jumped else before @ SE3.exp(gain * (before.inverse() @ pose.pose).log())
+        now = (
+            pose.pose
+            if jumped
+            else before @ SE3.exp(gain * (before.inverse() @ pose.pose).log())
+        )
         self._smoothed = (stamp, now)
         return now, bool(jumped)

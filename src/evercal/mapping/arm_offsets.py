@@ -45,11 +45,16 @@ class ArmOffsets:
         """
         changed = []
         for frame in frames:
-            gripper, camera = frame.base_from_gripper, frame.base_from_camera
+            gripper = frame.base_from_gripper
+            camera = frame.base_from_camera
             if frame.joints_rad is not None and gripper is not None:
-                after = self.arm.poses((np.array(frame.joints_rad) + self.values)[None])[0]
+                after = self.arm.poses(
+                    (np.array(frame.joints_rad) + self.values)[None]
+                )[0]
                 fixed = self.mount == "eye_to_hand"
-                change = after.inverse() @ gripper if fixed else after @ gripper.inverse()
+                change = (
+                    after.inverse() @ gripper if fixed else after @ gripper.inverse()
+                )
                 frame = replace(frame, base_from_gripper=after)
                 frame = replace(frame, base_from_camera=camera and change @ camera)
             changed.append(frame)

@@ -17,7 +17,11 @@ from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera
 from evercal.geometry.uncertain_pose import frame_covariance
 from evercal.mapping.arm_offsets import ArmOffsets
-from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment, BundleOptions
+from evercal.mapping.bundle_adjustment import (
+    Adjustment,
+    BundleAdjustment,
+    BundleOptions,
+)
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.map_frame import MapFrame, Similarity, fit_correction, shared_sigma
 from evercal.mapping.memory_budget import MemoryBudget
@@ -173,7 +177,10 @@ class BuiltMap:
     @property
     def independent_noise(self) -> tuple[float, float]:
         """Standard deviation of stated poses per axis that neighbouring frames do not share."""
-        stated = (self.adjusted.pose_sigma_mm or 0) / 1000, np.deg2rad(self.adjusted.pose_sigma_deg)
+        stated = (
+            (self.adjusted.pose_sigma_mm or 0) / 1000,
+            np.deg2rad(self.adjusted.pose_sigma_deg),
+        )
         metres, radians = (
             0.0 if shared else float(sigma)
             for sigma, shared in zip(stated, self.scene.frame.frame_sigma, strict=True)
@@ -184,7 +191,8 @@ class BuiltMap:
         """Other frames of the recording, with the adjusted `gripper_from_camera`."""
         if self.hand_eye is None:
             return list(frames)
-        change, arm = self.hand_eye.start_camera_from_camera, self.hand_eye.arm
+        change = self.hand_eye.start_camera_from_camera
+        arm = self.hand_eye.arm
         moved = frames if arm is None else arm.moved(frames)
         return [
             replace(frame, base_from_camera=frame.base_from_camera @ change)
@@ -196,7 +204,9 @@ class BuiltMap:
         """The same map, in which the poses of some frames no longer count as wrong."""
         adjusted = self.adjusted
         wrong = tuple(name for name in adjusted.wrong_poses if name not in names)
-        adjusted = replace(adjusted, wrong_poses=wrong, untracked=(*adjusted.untracked, *names))
+        adjusted = replace(
+            adjusted, wrong_poses=wrong, untracked=(*adjusted.untracked, *names)
+        )
         return replace(self, adjusted=adjusted)
 
     def left_out(self, frames: Sequence[Frame]) -> list[LeftOut]:
@@ -212,9 +222,13 @@ class BuiltMap:
         excluded = {*self.adjusted.wrong_poses, *self.adjusted.untracked}
         count = min(MOST_PARTS, len(frames) // (2 * GAP))
         parts = []
-        for middle in np.linspace(GAP, len(frames) - GAP - 1, count).astype(int).tolist():
+        for middle in (
+            np.linspace(GAP, len(frames) - GAP - 1, count).astype(int).tolist()
+        ):
             others = np.flatnonzero(np.abs(recorded - middle) > GAP)
-            some = [f for f in frames[middle - 3 : middle + 4 : 2] if f.name not in excluded]
+            some = [
+                f for f in frames[middle - 3 : middle + 4 : 2] if f.name not in excluded
+            ]
             if len(others) and some:
                 parts.append(LeftOut(tuple(some), others))
         return parts
@@ -267,10 +281,15 @@ class _Prepared:
 
 
 def _prepare(
-    frames: Sequence[Frame], encoder: Encoder, options: MapOptions, on_progress: OnProgress
+    frames: Sequence[Frame],
+    encoder: Encoder,
+    options: MapOptions,
+    on_progress: OnProgress,
 ) -> _Prepared:
     short_side = min(options.size.patches, *frames[0].read_image().shape[:2])
-    wanted = set(spread_frames(frames, options.memory.capacity(frames, short_side)).tolist())
+    wanted = set(
+        spread_frames(frames, options.memory.capacity(frames, short_side)).tolist()
+    )
     support = sorted({*spread_frames(frames, options.support_frames).tolist(), *wanted})
     prepared = PreparedFrames([frames[i] for i in support], encoder, options.size)
     features = []
@@ -278,21 +297,25 @@ def _prepare(
         features.append(prepared.features(i))
         on_progress("encoding", i + 1, len(prepared))
     pairs = matched_pairs(prepared, encoder.vlad(features))
-    unit, scale = 1.0, depth_scale(prepared, pairs, options.metric)
+    unit = 1.0
+    scale = depth_scale(prepared, pairs, options.metric)
     if options.metric:
         prepared.depth_scale = scale
     else:
-        unit, prepared = scale, prepared.in_unit(scale)
+        unit = scale
+        prepared = prepared.in_unit(scale)
     check = check_poses(prepared, pairs)
     wrong, untracked = (
-        tuple(prepared.frames[i].name for i in part) for part in (check.wrong, check.untracked)
+        tuple(prepared.frames[i].name for i in part)
+        for part in (check.wrong, check.untracked)
     )
     good = sorted(set(range(len(support))) - set(check.excluded.tolist()))
     if len(check.excluded):
         prepared = prepared.without(check.excluded)
     start = [new for new, old in enumerate(good) if support[old] in wanted]
     # Other frames replace excluded keyframes.
-    positions, rotations = prepared.stated.translation_m, prepared.stated.rotation_wxyz
+    positions = prepared.stated.translation_m
+    rotations = prepared.stated.rotation_wxyz
     keyframes = select_farthest(positions, rotations, len(wanted), start=start)
     return _Prepared(prepared, keyframes.tolist(), wrong, untracked, unit)
 
@@ -351,7 +374,8 @@ def _adjust(
 ) -> Adjustment:
     """Alternate tracking and bundle adjustment."""
     stated_cameras = list(prepared.cameras)
-    arm, adjustment = options.arm, None
+    arm = options.arm
+    adjustment = None
     for number in range(options.rounds):
         on_progress("adjusting", number, options.rounds)
         tracks = bundle_tracks(prepared, keyframes)
@@ -380,9 +404,12 @@ def _adjust(
 
 def _offsets(start: ArmOffsets, adjustment: Adjustment) -> ArmOffsets:
     covariance = HAND_EYE_COVARIANCE_SCALE * adjustment.offsets_covariance
-    values, prior = adjustment.offsets, adjustment.offsets_prior
+    values = adjustment.offsets
+    prior = adjustment.offsets_prior
     known = adjustment.offsets_known
-    return replace(start, values=values, covariance=covariance, prior=prior, determined=known)
+    return replace(
+        start, values=values, covariance=covariance, prior=prior, determined=known
+    )
 
 
 def _gripper_from_camera(prepared: PreparedFrames, mount: Mount | None) -> SE3 | None:
@@ -395,7 +422,9 @@ def _gripper_from_camera(prepared: PreparedFrames, mount: Mount | None) -> SE3 |
 
 
 def _moved(stated: SE3, camera: Camera, adjustment: Adjustment) -> bool:
-    change = np.linalg.norm((stated.inverse() @ adjustment.poses).log().reshape(-1, 2, 3), axis=2)
+    change = np.linalg.norm(
+        (stated.inverse() @ adjustment.poses).log().reshape(-1, 2, 3), axis=2
+    )
     metres, radians = np.median(change, 0)
     by_camera = 0.0
     if adjustment.cameras is not None:
@@ -403,7 +432,10 @@ def _moved(stated: SE3, camera: Camera, adjustment: Adjustment) -> bool:
         grid = np.stack(np.meshgrid(*across), -1)
         shift = adjustment.cameras[0].project(camera.unproject(grid)) - grid
         by_camera = float(np.nanmedian(np.linalg.norm(shift, axis=-1))) / camera.fx
-    return max(metres * np.median(adjustment.inverse_depth), radians, by_camera) > NOTICEABLE_RAD
+    return (
+        max(metres * np.median(adjustment.inverse_depth), radians, by_camera)
+        > NOTICEABLE_RAD
+    )
 
 
 def _finish(
@@ -414,11 +446,17 @@ def _finish(
     options: MapOptions,
 ) -> BuiltMap:
     """The built map of all adjusted parts."""
-    frames, numbers = prepared.frames, [keyframe.frame for keyframe in tracks]
+    frames = prepared.frames
+    numbers = [keyframe.frame for keyframe in tracks]
     first = frames.frames[0].camera
     camera = frames.cameras[0].resized(first.width, first.height)
-    frame, hand_eye = MapFrame(), None
-    own = None if options.metric else Similarity(SE3.identity(), prepared.unit, known=False)
+    frame = MapFrame()
+    hand_eye = None
+    own = (
+        None
+        if options.metric
+        else Similarity(SE3.identity(), prepared.unit, known=False)
+    )
     if adjustment is not None:
         block = np.einsum("nii->ni", adjustment.covariance[numbers])
         common = adjustment.common
@@ -429,7 +467,10 @@ def _finish(
         frame = MapFrame(
             common=common,
             correction=correction,
-            pose_sigma=(float(np.sqrt(block[:, :3].mean())), float(np.sqrt(block[:, 3:].mean()))),
+            pose_sigma=(
+                float(np.sqrt(block[:, :3].mean())),
+                float(np.sqrt(block[:, 3:].mean())),
+            ),
             frame_sigma=shared_sigma(stated, adjustment.correction, correction),
         )
         if not options.bundle.common_stated:
@@ -468,7 +509,8 @@ def _finish(
 
 
 def _keyframes(frames: PreparedFrames, tracks: list[KeyframeTracks]) -> Keyframes:
-    numbers, vlad = [keyframe.frame for keyframe in tracks], frames.encoder.vlad()
+    numbers = [keyframe.frame for keyframe in tracks]
+    vlad = frames.encoder.vlad()
     return Keyframes(
         tuple(jpeg(frames.grey[i]) for i in numbers),
         tuple(frames.cameras[i] for i in numbers),
@@ -479,20 +521,31 @@ def _keyframes(frames: PreparedFrames, tracks: list[KeyframeTracks]) -> Keyframe
     )
 
 
-def _adjusted(prepared: _Prepared, adjustment: Adjustment | None, camera: Camera) -> Adjusted:
-    frames, wrong, untracked = prepared.frames, prepared.wrong, prepared.untracked
+def _adjusted(
+    prepared: _Prepared, adjustment: Adjustment | None, camera: Camera
+) -> Adjusted:
+    frames = prepared.frames
+    wrong = prepared.wrong
+    untracked = prepared.untracked
     if adjustment is None:
         zero = (0.0, 0.0, 0.0)
         return Adjusted(zero, zero, 0.0, None, 0.0, 0.0, 0.0, wrong, untracked, ())
     tangent = adjustment.common.log()
-    shift, rotation = 1000 * tangent[:3], np.rad2deg(tangent[3:])
+    shift = 1000 * tangent[:3]
+    rotation = np.rad2deg(tangent[3:])
     doubtful = np.flatnonzero(adjustment.weight < 0.25)
     stated = frames.frames[0].camera
-    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * (stated.width, stated.height) - 0.5
+    corners = (
+        np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * (stated.width, stated.height) - 0.5
+    )
     moved = np.linalg.norm(camera.project(stated.unproject(corners)) - corners, axis=-1)
     return Adjusted(
         common_translation_mm=(float(shift[0]), float(shift[1]), float(shift[2])),
-        common_rotation_deg=(float(rotation[0]), float(rotation[1]), float(rotation[2])),
+        common_rotation_deg=(
+            float(rotation[0]),
+            float(rotation[1]),
+            float(rotation[2]),
+        ),
         focal_percent=100 * (camera.fx / stated.fx - 1),
         residual_px=adjustment.residual_px,
         pose_sigma_mm=1000 * adjustment.sigma_m,

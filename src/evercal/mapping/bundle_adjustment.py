@@ -219,9 +219,16 @@ class BundleAdjustment:
         gripper_from_camera: SE3 | None = None,
         joints: JointSlopes | None = None,
     ):
-        self.options, self.n, self.velocity = options, len(stated), velocity
-        at = SE3.identity((len(stated),)) if gripper_from_camera is None else gripper_from_camera
-        self.gripper_from_camera, self.lever = at, at.adjoint()
+        self.options = options
+        self.n = len(stated)
+        self.velocity = velocity
+        at = (
+            SE3.identity((len(stated),))
+            if gripper_from_camera is None
+            else gripper_from_camera
+        )
+        self.gripper_from_camera = at
+        self.lever = at.adjoint()
         none = np.zeros((self.n, 6, 0))
         self.joints = joints or JointSlopes(none, np.zeros(0, dtype=bool), np.zeros(0))
         own = np.linalg.solve(self.lever, self.joints.slopes)
@@ -230,13 +237,15 @@ class BundleAdjustment:
         """(n, 6, 7 + k) motion of each camera by common transform, time shift and joints."""
         self.size = SHARED + own.shape[2]
         last = self.size - INTRINSICS
-        self.moving, self.offsets = slice(0, last), slice(COMMON + SHIFT, last)
+        self.moving = slice(0, last)
+        self.offsets = slice(COMMON + SHIFT, last)
         self.frames = StatedFrames(stated, cameras)
         self.distorted = any(cameras[0].distortion)
 
     def solve(self, tracks: BundleTracks) -> Adjustment:
         """Estimate all parameters."""
-        widest, estimate = self.start_variances(), self.start(tracks)
+        widest = self.start_variances()
+        estimate = self.start(tracks)
         variances = widest
         for i in range(self.options.iterations):
             estimate = self.step(tracks, estimate, variances)
@@ -251,7 +260,9 @@ class BundleAdjustment:
         shared = np.zeros(self.size)
         shared[self.offsets] = self.joints.at
         parameters = Parameters(np.zeros((self.n, 6)), shared, tracks.inverse_depth)
-        return Estimate(parameters, self.frames.linearise(tracks, parameters), np.zeros((0, 0)))
+        return Estimate(
+            parameters, self.frames.linearise(tracks, parameters), np.zeros((0, 0))
+        )
 
     def start_variances(self) -> Variances:
         """Priors before they are estimated."""
@@ -259,12 +270,19 @@ class BundleAdjustment:
         intrinsics = np.full(INTRINSICS, 1e-9)
         if self.adjusts_camera:
             distortion = 1e-9 if self.distorted else o.distortion_sigma
-            intrinsics[:] = o.focal_sigma, o.centre_sigma_px, o.centre_sigma_px, *[distortion] * 2
+            intrinsics[:] = (
+                o.focal_sigma,
+                o.centre_sigma_px,
+                o.centre_sigma_px,
+                *[distortion] * 2,
+            )
         moves = bool(np.abs(self.velocity).max(initial=0) > 0)
         common = [*[o.common_sigma_m] * 3, *[np.deg2rad(o.common_sigma_deg)] * 3]
         shift = o.shift_sigma_frames if moves else 1e-9
         return Variances(
-            sigma=np.array([*[o.start_sigma_m] * 3, *[np.deg2rad(o.start_sigma_deg)] * 3]),
+            sigma=np.array(
+                [*[o.start_sigma_m] * 3, *[np.deg2rad(o.start_sigma_deg)] * 3]
+            ),
             weight=np.ones(self.n),
             shared=np.array([*common, shift, *self._joint_sigma(), *intrinsics]) ** 2,
         )
@@ -278,7 +296,9 @@ class BundleAdjustment:
         """Whether intrinsics are adjusted."""
         return self.options.intrinsics and self.frames.same_lens
 
-    def step(self, tracks: BundleTracks, estimate: Estimate, variances: Variances) -> Estimate:
+    def step(
+        self, tracks: BundleTracks, estimate: Estimate, variances: Variances
+    ) -> Estimate:
         """One Levenberg-Marquardt step at fixed variances.
 
         A step that raises the cost is rejected, and the damping is multiplied by 10. The first
@@ -287,7 +307,8 @@ class BundleAdjustment:
         noise = noise_of(estimate.linearised)
         normal = self._normal_equations(tracks, estimate, variances, noise)
         cost = self.cost(estimate.linearised, estimate.parameters, variances, noise)
-        undamped, damping = normal.solve(0.0), estimate.damping
+        undamped = normal.solve(0.0)
+        damping = estimate.damping
         # The damping of a step does not make its parameters more certain.
         root = None if undamped is None else undamped.root
         for _ in range(MAX_RAISES + 1):
@@ -296,9 +317,13 @@ class BundleAdjustment:
                 root = solution.root if root is None else root
                 parameters = self._moved(tracks, estimate.parameters, solution)
                 linearised = self.frames.linearise(tracks, parameters)
-                if self.cost(linearised, parameters, variances, noise) <= cost * (1 + ROUNDING):
+                if self.cost(linearised, parameters, variances, noise) <= cost * (
+                    1 + ROUNDING
+                ):
                     eased = damping / 10 if damping > FIRST_DAMPING else 0.0
-                    return Estimate(parameters, linearised, root, eased, solution.length)
+                    return Estimate(
+                        parameters, linearised, root, eased, solution.length
+                    )
             damping = max(10 * damping, FIRST_DAMPING)
         if root is None:
             raise InputError(
@@ -309,17 +334,28 @@ class BundleAdjustment:
         return Estimate(estimate.parameters, estimate.linearised, root)
 
     def cost(
-        self, linearised: Linearised, parameters: Parameters, variances: Variances, noise: float
+        self,
+        linearised: Linearised,
+        parameters: Parameters,
+        variances: Variances,
+        noise: float,
     ) -> float:
         """Twice the negative logarithm of the posterior: Cauchy residuals and Gaussian priors."""
         squares = (linearised.residual**2).sum(1)
         squares[~linearised.valid] = INVALID_SQUARES
         data = np.log1p(squares / noise**2).sum() / self.options.correlation**2
-        own = variances.weight[:, None] * (self._errors(parameters) / variances.sigma) ** 2
+        own = (
+            variances.weight[:, None]
+            * (self._errors(parameters) / variances.sigma) ** 2
+        )
         return float(data + own.sum() + (parameters.shared**2 / variances.shared).sum())
 
     def _normal_equations(
-        self, tracks: BundleTracks, estimate: Estimate, variances: Variances, noise: float
+        self,
+        tracks: BundleTracks,
+        estimate: Estimate,
+        variances: Variances,
+        noise: float,
     ) -> NormalEquations:
         lin = estimate.linearised
         squares = (lin.residual**2).sum(1)
@@ -331,11 +367,14 @@ class BundleAdjustment:
         self, tracks: BundleTracks, parameters: Parameters, solution: Solution
     ) -> Parameters:
         correction, shared = np.split(solution.change, [6 * self.n])
-        rho, scale = parameters.inverse_depth, tracks.depth_scale
+        rho = parameters.inverse_depth
+        scale = tracks.depth_scale
         return Parameters(
             parameters.correction + correction.reshape(-1, 6),
             parameters.shared + shared,
-            (rho + solution.depths.clip(-0.2 * rho, 0.2 * rho)).clip(0.03 / scale, 6 / scale),
+            (rho + solution.depths.clip(-0.2 * rho, 0.2 * rho)).clip(
+                0.03 / scale, 6 / scale
+            ),
         )
 
     def _deviation(self, parameters: Parameters) -> Array:
@@ -350,14 +389,20 @@ class BundleAdjustment:
 
     def _precision(self, variances: Variances) -> Array:
         """(n, 6, 6) information on each deviation."""
-        scaled = self.lever * variances.weight[:, None, None] / variances.sigma[:, None] ** 2
+        scaled = (
+            self.lever * variances.weight[:, None, None] / variances.sigma[:, None] ** 2
+        )
         return self.lever.transpose(0, 2, 1) @ scaled
 
-    def _prior(self, parameters: Parameters, variances: Variances) -> tuple[Array, Array]:
+    def _prior(
+        self, parameters: Parameters, variances: Variances
+    ) -> tuple[Array, Array]:
         """Normal matrix of the priors, and their slope."""
         n = self.n
-        system, slope = np.zeros((6 * n + self.size,) * 2), np.zeros(6 * n + self.size)
-        precision, shared = self._precision(variances), 6 * n + np.arange(self.motion.shape[2])
+        system = np.zeros((6 * n + self.size,) * 2)
+        slope = np.zeros(6 * n + self.size)
+        precision = self._precision(variances)
+        shared = 6 * n + np.arange(self.motion.shape[2])
         pull = np.einsum("nij,nj->ni", precision, self._deviation(parameters))
         drift = precision @ self.motion
         for i, own in enumerate(np.arange(6 * n).reshape(n, 6)):
@@ -380,31 +425,44 @@ class BundleAdjustment:
         A correction d is a share K of what the images say, y = d / K, and y has the variance
         s^2 + v / K with the posterior variance v. So s^2 is the mean of d^2 - v K over that of K^2.
         """
-        root, n = estimate.root, self.n
+        root = estimate.root
+        n = self.n
         own = root[:, : 6 * n].reshape(-1, n, 6)
         own = own if self.options.common_stated else self._error_root(root)
         own = np.einsum("knj,knj->nj", own, own)
-        off, weight = self._errors(estimate.parameters), variances.weight[:, None]
+        off = self._errors(estimate.parameters)
+        weight = variances.weight[:, None]
         share = 1 - np.minimum(own * weight / variances.sigma**2, 1)
         sigma = variances.sigma.copy()
         for part in (slice(0, 3), slice(3, 6)):
-            old, k = variances.sigma[part], share[:, part]
+            old = variances.sigma[part]
+            k = share[:, part]
             if k.mean() < 0.03:  # errors this small are below what the images resolve
                 sigma[part] = old / 1.5
                 continue
             total = (weight * (off[:, part] ** 2 - own[:, part] * k)).sum()
             sigma[part] = np.sqrt(max(total, 0.0) / (k**2).sum()).clip(old / 3, old * 2)
-        least = [self.options.least_sigma_m] * 3 + [np.deg2rad(self.options.least_sigma_deg)] * 3
-        sigma, tail = sigma.clip(least, 0.1), self.options.tail
+        least = [self.options.least_sigma_m] * 3 + [
+            np.deg2rad(self.options.least_sigma_deg)
+        ] * 3
+        sigma = sigma.clip(least, 0.1)
+        tail = self.options.tail
         shared = variances.shared
         if widest is not None:
             after = np.einsum("ij,ij->j", root[:, 6 * n :], root[:, 6 * n :])
-            shared = self._relevant(estimate.parameters.shared, shared, after, widest.shared)
-        return Variances(sigma, (tail + 6) / (tail + ((off / sigma) ** 2).sum(1)), shared)
+            shared = self._relevant(
+                estimate.parameters.shared, shared, after, widest.shared
+            )
+        return Variances(
+            sigma, (tail + 6) / (tail + ((off / sigma) ** 2).sum(1)), shared
+        )
 
-    def _relevant(self, values: Array, prior: Array, posterior: Array, widest: Array) -> Array:
+    def _relevant(
+        self, values: Array, prior: Array, posterior: Array, widest: Array
+    ) -> Array:
         share = np.maximum(1 - np.minimum(posterior / prior, 1), 1e-3)
-        squares, noise = (values / share) ** 2, posterior / share
+        squares = (values / share) ** 2
+        noise = posterior / share
         variances = prior.copy()
         for low, high in _GROUPS if self.options.common_stated else _GROUPS[2:]:
             part = slice(low, high)
@@ -417,15 +475,23 @@ class BundleAdjustment:
             seen = (1 - posterior[part] / prior[part]).clip(0).sum()
             squares = float((values[part] ** 2 / widest[part]).sum()) + USUAL_OFFSET**2
             size = min(squares / (seen + 1), 1.0)
-            variances[part] = max(size, float((prior[part] / widest[part])[0]) / 16) * widest[part]
+            variances[part] = (
+                max(size, float((prior[part] / widest[part])[0]) / 16) * widest[part]
+            )
         return variances
 
-    def _result(self, tracks: BundleTracks, estimate: Estimate, variances: Variances) -> Adjustment:
-        n, parameters = self.n, estimate.parameters
+    def _result(
+        self, tracks: BundleTracks, estimate: Estimate, variances: Variances
+    ) -> Adjustment:
+        n = self.n
+        parameters = estimate.parameters
         lin = estimate.linearised
-        residual = np.linalg.solve(tracks.whitening, lin.residual[..., None])[lin.valid, :, 0]
+        residual = np.linalg.solve(tracks.whitening, lin.residual[..., None])[
+            lin.valid, :, 0
+        ]
         root = [estimate.root[:, 6 * i : 6 * i + 6] for i in range(n + 1)]
-        systematic, joints = self._systematic(estimate, variances), self.offsets
+        systematic = self._systematic(estimate, variances)
+        joints = self.offsets
         moved = estimate.root[:, 6 * n :][:, joints]
         information = 1 / np.diag(moved.T @ moved) - 1 / variances.shared[joints]
         by_images = 1 / np.maximum(information, 1e-9)
@@ -448,11 +514,13 @@ class BundleAdjustment:
             offsets=parameters.shared[joints],
             offsets_covariance=moved.T @ moved + systematic[joints, joints],
             offsets_prior=np.sqrt(variances.shared[joints]),
-            offsets_known=by_images < DETERMINED * self.start_variances().shared[joints],
+            offsets_known=by_images
+            < DETERMINED * self.start_variances().shared[joints],
         )
 
     def _by_lens(self, root: Array) -> Array:
-        common, lens = root[:, 6 * self.n : 6 * self.n + 6], root[:, -INTRINSICS:]
+        common = root[:, 6 * self.n : 6 * self.n + 6]
+        lens = root[:, -INTRINSICS:]
         return common.T @ lens @ np.linalg.solve(lens.T @ lens, lens.T @ common)
 
     def _systematic(self, estimate: Estimate, variances: Variances) -> Array:
@@ -463,7 +531,8 @@ class BundleAdjustment:
         residuals, as that of independent errors is: an error in a unit direction that the images
         see to a share K leaves a residual with the variance K^2 t^2 + K s^2.
         """
-        n, stated = self.n, self.frames.stated
+        n = self.n
+        stated = self.frames.stated
         rotations = Rotation.from_quat(stated.rotation_wxyz, scalar_first=True)
         turns = (rotations.mean().inv() * rotations).as_rotvec()
         # Of a fixed camera the frame of the map is the gripper: the arm's position is inverse.
@@ -472,8 +541,14 @@ class BundleAdjustment:
         basis, size, _ = np.linalg.svd(linear - linear.mean(0), full_matrices=False)
         basis = basis[:, size > 1e-6 * size[0]]
         weight = np.sqrt(variances.weight)[:, None, None]
-        posterior = np.einsum("nr,kni->kri", basis, weight[:, 0] * self._error_root(estimate.root))
-        residual = basis.T @ (weight[:, 0] * self._errors(estimate.parameters)) / variances.sigma
+        posterior = np.einsum(
+            "nr,kni->kri", basis, weight[:, 0] * self._error_root(estimate.root)
+        )
+        residual = (
+            basis.T
+            @ (weight[:, 0] * self._errors(estimate.parameters))
+            / variances.sigma
+        )
         share = (1 - ((posterior / variances.sigma) ** 2).sum(0)).clip(0)
         ratio = np.zeros(6)
         for part in (slice(0, 3), slice(3, 6)):
@@ -511,5 +586,6 @@ def noise_of(linearised: Linearised) -> float:
 def _small_motion(tangent: Array) -> SE3:
     """Transform of a translation (3,) and a rotation vector (3,)."""
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = Rotation.from_rotvec(tangent[3:]).as_matrix(), tangent[:3]
+    matrix[:3, :3] = Rotation.from_rotvec(tangent[3:]).as_matrix()
+    matrix[:3, 3] = tangent[:3]
     return SE3.from_matrix(matrix)

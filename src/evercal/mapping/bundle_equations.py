@@ -13,7 +13,9 @@ from evercal.geometry import SE3, Camera, cross_matrix
 Array = NDArray[np.floating]
 Index = NDArray[np.int64]
 
-COMMON, SHIFT, INTRINSICS = 6, 1, 5
+COMMON = 6
+SHIFT = 1
+INTRINSICS = 5
 SHARED = COMMON + SHIFT + INTRINSICS
 """Shared parameters: common transform, time shift, and intrinsics (logarithm of the focal length,
 principal point in pixels, k1, k2). Offsets of an arm's joints come before the intrinsics."""
@@ -91,7 +93,8 @@ class StatedFrames:
 
     def __init__(self, stated: SE3, cameras: list[Camera]):
         self.stated = stated
-        self._rotation, self._position = stated.rotation_matrix(), stated.translation_m
+        self._rotation = stated.rotation_matrix()
+        self._position = stated.translation_m
         self._cameras = cameras
         lenses = {replace(camera, cx=0.0, cy=0.0) for camera in cameras}
         self.same_lens = len(lenses) == 1
@@ -103,7 +106,8 @@ class StatedFrames:
         """(n,) corrected base_from_camera."""
         rotation, position = self._corrected(parameters)
         matrix = np.tile(np.eye(4), (len(self), 1, 1))
-        matrix[:, :3, :3], matrix[:, :3, 3] = rotation, position
+        matrix[:, :3, :3] = rotation
+        matrix[:, :3, 3] = position
         return SE3.from_matrix(matrix)
 
     def cameras(self, parameters: Parameters) -> list[Camera]:
@@ -111,7 +115,9 @@ class StatedFrames:
         change = parameters.shared[-INTRINSICS:]
         if not (self.same_lens and np.any(change)):
             return self._cameras
-        corrected = {camera: self._changed(camera, change) for camera in set(self._cameras)}
+        corrected = {
+            camera: self._changed(camera, change) for camera in set(self._cameras)
+        }
         return [corrected[camera] for camera in self._cameras]
 
     @staticmethod
@@ -123,7 +129,8 @@ class StatedFrames:
     def linearise(self, tracks: BundleTracks, parameters: Parameters) -> Linearised:
         """Residuals and derivatives at given parameters."""
         rotation, position = self._corrected(parameters)
-        k, j = tracks.host_frame, tracks.frame
+        k = tracks.host_frame
+        j = tracks.frame
         ray, ray_slope = self._rays(tracks, parameters)
         rho = parameters.inverse_depth[tracks.landmark, None]
         frame_from_base = rotation[j].transpose(0, 2, 1)
@@ -132,7 +139,8 @@ class StatedFrames:
         point += np.einsum("nij,nj->ni", frame_from_base, position[k] - position[j])
         point[:, 2] = np.maximum(point[:, 2], MIN_DEPTH * tracks.depth_scale)
         plane = point[:, :2] / point[:, 2:]
-        pixel, by_plane = np.zeros_like(plane), np.zeros((len(j), 2, 2))
+        pixel = np.zeros_like(plane)
+        by_plane = np.zeros((len(j), 2, 2))
         by_camera = np.zeros((len(j), 2, INTRINSICS))
         for camera, rows in self._by_camera(parameters, j):
             pixel[rows] = camera.project(point[rows])
@@ -157,7 +165,9 @@ class StatedFrames:
             part[~valid] = 0
         return Linearised(*parts, valid)
 
-    def _rays(self, tracks: BundleTracks, parameters: Parameters) -> tuple[Array, Array]:
+    def _rays(
+        self, tracks: BundleTracks, parameters: Parameters
+    ) -> tuple[Array, Array]:
         """Rays (m, 3) of the observed landmarks in their hosts, and derivatives (m, 2, 5)."""
         ray = np.zeros((len(tracks.host), 3))
         slope = np.zeros((len(tracks.host), 2, INTRINSICS))
@@ -172,15 +182,21 @@ class StatedFrames:
         """Rotations (n, 3, 3) and positions (n, 3) of the corrected poses."""
         own = parameters.correction
         rotation = self._rotation @ Rotation.from_rotvec(own[:, 3:]).as_matrix()
-        return rotation, self._position + np.einsum("nij,nj->ni", self._rotation, own[:, :3])
+        return rotation, self._position + np.einsum(
+            "nij,nj->ni", self._rotation, own[:, :3]
+        )
 
-    def _by_camera(self, parameters: Parameters, frames: Index) -> list[tuple[Camera, Index]]:
+    def _by_camera(
+        self, parameters: Parameters, frames: Index
+    ) -> list[tuple[Camera, Index]]:
         groups: dict[Camera, list[int]] = {}
         for i, camera in enumerate(self.cameras(parameters)):
             groups.setdefault(camera, []).append(i)
         if len(groups) == 1:
             return [(camera, np.arange(len(frames))) for camera in groups]
-        return [(c, np.flatnonzero(np.isin(frames, which))) for c, which in groups.items()]
+        return [
+            (c, np.flatnonzero(np.isin(frames, which))) for c, which in groups.items()
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,16 +242,29 @@ class NormalEquations:
 
     @classmethod
     def of(
-        cls, tracks: BundleTracks, lin: Linearised, weight: Array, prior: Array, slope: Array
+        cls,
+        tracks: BundleTracks,
+        lin: Linearised,
+        weight: Array,
+        prior: Array,
+        slope: Array,
     ) -> Self:
         """Sum the products of derivatives, weighted (m,), over the observations of each host."""
-        root, p, six = np.sqrt(weight)[:, None], len(tracks.host), np.arange(6)
-        rows = np.concatenate([lin.by_host, lin.by_frame, lin.by_intrinsics], 2) * root[..., None]
-        residual, by_depth = lin.residual * root, lin.by_depth * root
+        root = np.sqrt(weight)[:, None]
+        p = len(tracks.host)
+        six = np.arange(6)
+        rows = (
+            np.concatenate([lin.by_host, lin.by_frame, lin.by_intrinsics], 2)
+            * root[..., None]
+        )
+        residual = lin.residual * root
+        by_depth = lin.by_depth * root
         depth = np.bincount(tracks.landmark, (by_depth**2).sum(1), p) + 1e-6
         depth_slope = np.bincount(tracks.landmark, (by_depth * residual).sum(1), p)
         mixed = np.einsum("mr,mrc->mc", by_depth, rows)
-        gram, slope, blocks = np.zeros(prior.shape), slope.copy(), []
+        gram = np.zeros(prior.shape)
+        slope = slope.copy()
+        blocks = []
         for host in np.unique(tracks.host_frame):
             own = np.flatnonzero(tracks.host_frame == host)
             landmarks, place = np.unique(tracks.landmark[own], return_inverse=True)
@@ -247,7 +276,8 @@ class NormalEquations:
             block = np.zeros((len(landmarks), len(columns)))
             for number, frame in enumerate(frames):
                 which = tracks.frame[own] == frame
-                part, at = own[which], np.r_[0:6, 6 + 6 * number + six, -INTRINSICS:0]
+                part = own[which]
+                at = np.r_[0:6, 6 + 6 * number + six, -INTRINSICS:0]
                 product = rows[part].reshape(-1, len(at))
                 local[at[:, None], at] += product.T @ product
                 slope[columns[at]] += product.T @ residual[part].ravel()
@@ -260,13 +290,16 @@ class NormalEquations:
     def solve(self, damping: float) -> Solution | None:
         """Solve with diagonal elements raised by a share; None if not positive definite."""
         depth = (1 + damping) * self.depth
-        system, slope = self.gram + self.prior, self.slope.copy()
+        system = self.gram + self.prior
+        slope = self.slope.copy()
         for landmarks, columns, mixed in self.blocks:
             scaled = mixed / depth[landmarks, None]
             system[columns[:, None], columns] -= mixed.T @ scaled
             slope[columns] -= scaled.T @ self.depth_slope[landmarks]
         diagonal = np.arange(len(system))
-        system[diagonal, diagonal] += damping * (self.gram.diagonal() + self.prior.diagonal())
+        system[diagonal, diagonal] += damping * (
+            self.gram.diagonal() + self.prior.diagonal()
+        )
         try:
             lower = np.linalg.cholesky(system)
         except np.linalg.LinAlgError:

@@ -63,7 +63,9 @@ class Keyframes:
             images=tuple(self.images[i] for i in rows),
             cameras=tuple(self.cameras[i] for i in rows),
             base_from_camera=self.base_from_camera[index],
-            inverse_depth=tuple(self.inverse_depth[i] for i in rows) if self.inverse_depth else (),
+            inverse_depth=tuple(self.inverse_depth[i] for i in rows)
+            if self.inverse_depth
+            else (),
             landmarks=tuple(self.landmarks[i] for i in rows) if self.landmarks else (),
             descriptors=None if self.descriptors is None else self.descriptors[index],
         )
@@ -72,13 +74,17 @@ class Keyframes:
         """(h, w) uint8 image of a keyframe, decoded."""
         import cv2
 
-        grey = cv2.imdecode(np.frombuffer(self.images[i], np.uint8), cv2.IMREAD_GRAYSCALE)
+        grey = cv2.imdecode(
+            np.frombuffer(self.images[i], np.uint8), cv2.IMREAD_GRAYSCALE
+        )
         assert grey is not None, "stored images have checksums"
         return np.asarray(grey, np.uint8)
 
     def frames(self) -> list[Frame]:
         """The keyframes, decoded."""
-        images = [np.repeat(self.grey(i)[..., None], 3, axis=-1) for i in range(len(self))]
+        images = [
+            np.repeat(self.grey(i)[..., None], 3, axis=-1) for i in range(len(self))
+        ]
         views = zip(images, self.cameras, self.base_from_camera, strict=True)
         return [Frame(f"memory-{i:05d}", *view) for i, view in enumerate(views)]
 
@@ -108,14 +114,18 @@ class Keyframes:
         }
         if self.inverse_depth:
             tensors["inverse_depth"] = np.concatenate(self.inverse_depth)
-            tensors["cells"] = np.array([len(depth) for depth in self.inverse_depth], np.int64)
+            tensors["cells"] = np.array(
+                [len(depth) for depth in self.inverse_depth], np.int64
+            )
         if self.descriptors is not None:
             tensors["descriptors"] = self.descriptors
         if self.landmarks:
             counts = [len(marks) for marks in self.landmarks]
             tensors["landmark_counts"] = np.array(counts, np.int64)
             for name, kind in _LANDMARK_FIELDS.items():
-                joined = np.concatenate([getattr(marks, name) for marks in self.landmarks])
+                joined = np.concatenate(
+                    [getattr(marks, name) for marks in self.landmarks]
+                )
                 tensors[f"landmark_{name}"] = joined.astype(kind)
         return tensors
 
@@ -126,7 +136,9 @@ class Keyframes:
         Arrays of `storage.tensors.open_tensors` stay in their file: images, depths and landmarks
         are read when they are used, so that processes share the memory.
         """
-        lengths, cameras, poses = (tensors[key][:] for key in ("lengths", "cameras", "poses"))
+        lengths, cameras, poses = (
+            tensors[key][:] for key in ("lengths", "cameras", "poses")
+        )
         rows = zip(cameras.tolist(), tensors["distortion"][:].tolist(), strict=True)
         depths: Sequence[NDArray[np.float16]] = ()
         landmarks: Sequence[Landmarks] = ()
@@ -138,9 +150,12 @@ class Keyframes:
             landmarks = _Parts(
                 tensors["landmark_counts"][:],
                 stored,
-                lambda part: Landmarks(*(field[part].astype(np.float64) for field in stored)),
+                lambda part: Landmarks(
+                    *(field[part].astype(np.float64) for field in stored)
+                ),
             )
-        images, descriptors = tensors["images"], tensors.get("descriptors")
+        images = tensors["images"]
+        descriptors = tensors.get("descriptors")
         return cls(
             images=_Parts(lengths, (images,), lambda part: images[part].tobytes()),
             cameras=tuple(
@@ -162,11 +177,17 @@ class _Parts(Sequence[Part]):
     """Parts of stored arrays, one for each keyframe."""
 
     def __init__(
-        self, counts: NDArray[np.int64], stored: Sequence[Any], read: Callable[[slice], Part]
+        self,
+        counts: NDArray[np.int64],
+        stored: Sequence[Any],
+        read: Callable[[slice], Part],
     ):
         if (counts < 0).any() or any(len(array) != counts.sum() for array in stored):
-            raise ValueError(f"parts of {counts.tolist()[:9]} rows do not make up their arrays")
-        self._ends, self._read = [0, *np.cumsum(counts).tolist()], read
+            raise ValueError(
+                f"parts of {counts.tolist()[:9]} rows do not make up their arrays"
+            )
+        self._ends = [0, *np.cumsum(counts).tolist()]
+        self._read = read
 
     def __len__(self) -> int:
         return len(self._ends) - 1
@@ -184,7 +205,8 @@ def _signed_count(camera: Camera) -> int:
 
 def store_keyframes(frames: Sequence[Frame], short_side: int) -> Keyframes:
     """Store frames at working size."""
-    images, cameras = [], []
+    images = []
+    cameras = []
     for frame in frames:
         grey, camera = working_image(frame.read_image(), frame.camera, short_side)
         images.append(jpeg(grey))

@@ -40,7 +40,10 @@ class Landmarks:
     def take(self, index: np.ndarray) -> "Landmarks":
         """The landmarks of an index."""
         return Landmarks(
-            self.pixels[index], self.inverse_depth[index], self.slope[index], self.sigma[index]
+            self.pixels[index],
+            self.inverse_depth[index],
+            self.slope[index],
+            self.sigma[index],
         )
 
     def surface(self, camera: Camera) -> Array:
@@ -66,7 +69,11 @@ class ProjectedPatches(NamedTuple):
 
 
 def project_surface(
-    points: Array, rotation: Array, translation_m: Array, camera: Camera, most: int | None = None
+    points: Array,
+    rotation: Array,
+    translation_m: Array,
+    camera: Camera,
+    most: int | None = None,
 ) -> ProjectedPatches:
     """Predict positions and warps of patches in an image.
 
@@ -77,7 +84,9 @@ def project_surface(
     """
     centre = rotation @ points[0].T + translation_m[:, None]
     u, v = camera.project(centre.T).T
-    inside = (u > BORDER_PX) & (u < camera.width - BORDER_PX - 1) & (centre[2] > NEAREST_M)
+    inside = (
+        (u > BORDER_PX) & (u < camera.width - BORDER_PX - 1) & (centre[2] > NEAREST_M)
+    )
     inside &= (v > BORDER_PX) & (v < camera.height - BORDER_PX - 1)
     visible = np.flatnonzero(inside)
     pixels = np.stack([u[visible], v[visible]], 1)
@@ -105,7 +114,8 @@ def detect(
     middle = slice(BORDER_PX, -BORDER_PX)
     inner[middle, middle] = texture[middle, middle]
     rows, columns = (np.rint(np.arange(n + 1) * cell_px).astype(int) for n in grid)
-    pixels, cells = [], []
+    pixels = []
+    cells = []
     for i in range(grid[0]):
         for j in range(grid[1]):
             block = inner[rows[i] : rows[i + 1], columns[j] : columns[j + 1]]

@@ -19,7 +19,12 @@ from evercal.features.encoder import read_network
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.mapping.store import PREVIOUS, SCENE, MapStore, read_scene, require_map
 from evercal.recordings.frame import checked_name
-from evercal.storage.archive import ArchiveLimits, check_archive, extract_archive, write_archive
+from evercal.storage.archive import (
+    ArchiveLimits,
+    check_archive,
+    extract_archive,
+    write_archive,
+)
 from evercal.storage.atomic import replace_folder, write_bytes, write_json
 from evercal.storage.manifest import MANIFEST, Manifest
 from evercal.storage.stages import REPORT, STAGES, StageStore, is_store, read_store
@@ -60,21 +65,28 @@ def remove_scenes(store: MapStore, names: Sequence[str]) -> None:
     left = [i for i in range(len(store.stages)) if i not in gone]
     store.change([store.stages[i] for i in left], [], store.payload)
     # A localizer that still answers keeps the contents it was made with.
-    store.contents = replace(store.contents, scenes=[store.contents.scenes[i] for i in left])
+    store.contents = replace(
+        store.contents, scenes=[store.contents.scenes[i] for i in left]
+    )
 
 
 def rename_scene(store: MapStore, name: str, new: str) -> None:
     """Give a scene another name."""
-    index, scenes = _index(store, name), list(store.contents.scenes)
+    index = _index(store, name)
+    scenes = list(store.contents.scenes)
     if checked_name(new) in {scene.name for scene in scenes}:
-        raise InputError(f"scene {new!r}: map {store.root} has a scene of this name; give another")
+        raise InputError(
+            f"scene {new!r}: map {store.root} has a scene of this name; give another"
+        )
     store.replace(index, lambda folder: _write_name(folder, new), store.payload)
     scenes[index] = replace(scenes[index], name=new)
     store.contents = replace(store.contents, scenes=scenes)
 
 
 def merge_maps(
-    store: MapStore, others: Sequence[str | os.PathLike[str]], on_clash: OnClash = "refuse"
+    store: MapStore,
+    others: Sequence[str | os.PathLike[str]],
+    on_clash: OnClash = "refuse",
 ) -> Merged:
     """Add the scenes of other maps to a map, all in one step.
 
@@ -88,7 +100,9 @@ def merge_maps(
             `replace` the scene of the map.
     """
     if on_clash not in get_args(OnClash):
-        raise InputError(f"on_clash {on_clash!r}: use one of {', '.join(get_args(OnClash))}")
+        raise InputError(
+            f"on_clash {on_clash!r}: use one of {', '.join(get_args(OnClash))}"
+        )
     if not others:
         raise InputError("no map given; name one or more to merge")
     is_new = not is_store(store.root)
@@ -100,10 +114,14 @@ def merge_maps(
     networks = Path(others[0]) if is_new else store.root
     incoming: dict[str, _Incoming] = {}
     kept = {scene.name: i for i, scene in enumerate(store.contents.scenes)}
-    renamed, skipped, replaced = [], [], []
+    renamed = []
+    skipped = []
+    replaced = []
     for other, (manifest, scenes) in zip(others, maps, strict=True):
         if Path(other).resolve() == store.root.resolve():
-            raise InputError(f"map {other}: is the map that scenes are merged into; give others")
+            raise InputError(
+                f"map {other}: is the map that scenes are merged into; give others"
+            )
         _require_same_networks(first, manifest, networks, Path(other))
         for item in scenes:
             name = item.scene.name
@@ -126,7 +144,9 @@ def merge_maps(
             incoming[name] = item
     if incoming:
         networks = first if is_new else None
-        _commit(store, list(kept.values()), incoming, contents, networks, Path(others[0]))
+        _commit(
+            store, list(kept.values()), incoming, contents, networks, Path(others[0])
+        )
     return Merged(tuple(incoming), tuple(renamed), tuple(skipped), tuple(replaced))
 
 
@@ -141,8 +161,11 @@ def pack_map(root: Path, file: Path) -> None:
     def write(manifest: Manifest) -> None:
         require_map(root, manifest)
         write_archive(file, root, [MANIFEST, *manifest.files])
-        if Manifest.read(root) != manifest:  # read again: another process has changed the map
-            raise InputError(f"store {root}: another process has changed it; run it again")
+        # Read again: another process has changed the map.
+        if Manifest.read(root) != manifest:
+            raise InputError(
+                f"store {root}: another process has changed it; run it again"
+            )
 
     if file.resolve().is_relative_to(root.resolve()):
         raise InputError(f"{file}: lies inside the map; give a file elsewhere")
@@ -162,11 +185,14 @@ def unpack_map(file: Path, folder: Path, limits: ArchiveLimits | None = None) ->
     limits = limits or ArchiveLimits()
     names = check_archive(file, limits)
     if MANIFEST not in names:
-        raise InputError(f"{file}: no {MANIFEST} in it; give an archive of 'evercal map pack'")
+        raise InputError(
+            f"{file}: no {MANIFEST} in it; give an archive of 'evercal map pack'"
+        )
     resolved = folder.resolve()
     temporary = resolved.with_name(f".{resolved.name}.unpacking")
     with StageStore(folder, None).writing():
-        shutil.rmtree(temporary, ignore_errors=True)  # left by a process that was killed
+        # Left by a process that was killed.
+        shutil.rmtree(temporary, ignore_errors=True)
         try:
             extract_archive(file, temporary, limits)
             _require_map_of(temporary, names, file)
@@ -179,12 +205,18 @@ def _index(store: MapStore, name: str) -> int:
     names = [scene.name for scene in store.contents.scenes]
     if name not in names:
         has = f"it has {', '.join(names)}" if names else "it has none"
-        raise InputError(f"scene {name!r}: map {store.root} has no scene of this name; {has}")
+        raise InputError(
+            f"scene {name!r}: map {store.root} has no scene of this name; {has}"
+        )
     return names.index(name)
 
 
 def _write_name(folder: Path, name: str) -> None:
-    for file, key in ((SCENE, "name"), (REPORT, "scene"), (f"{PREVIOUS}{SCENE}", "name")):
+    for file, key in (
+        (SCENE, "name"),
+        (REPORT, "scene"),
+        (f"{PREVIOUS}{SCENE}", "name"),
+    ):
         if file.startswith(PREVIOUS) and not (folder / file).exists():
             continue
         content = json.loads((folder / file).read_text(encoding="utf-8"))
@@ -202,17 +234,23 @@ def _incoming(root: Path) -> tuple[Manifest, list[_Incoming]]:
     def read(manifest: Manifest) -> tuple[Manifest, list[_Incoming]]:
         stages = [str(stage) for stage in require_map(root, manifest)["stages"]]
         return manifest, [
-            _Incoming(root, stage, manifest, read_scene(root / STAGES / stage)) for stage in stages
+            _Incoming(root, stage, manifest, read_scene(root / STAGES / stage))
+            for stage in stages
         ]
 
     return read_store(root, read)
 
 
-def _require_same_networks(first: Manifest, other: Manifest, root: Path, path: Path) -> None:
+def _require_same_networks(
+    first: Manifest, other: Manifest, root: Path, path: Path
+) -> None:
     for key, what in (("short_side", "image size"), ("strategy", "strategy")):
-        a, b = first.payload.get(key), other.payload.get(key)
+        a = first.payload.get(key)
+        b = other.payload.get(key)
         if a != b:
-            raise InputError(f"map {path}: {what} {b}, map {root} has {a}; learn its scenes again")
+            raise InputError(
+                f"map {path}: {what} {b}, map {root} has {a}; learn its scenes again"
+            )
     if _networks(root, first) != _networks(path, other):
         names = ", ".join(other.payload["networks"])
         raise InputError(
@@ -224,7 +262,9 @@ def _require_same_networks(first: Manifest, other: Manifest, root: Path, path: P
 def _networks(root: Path, manifest: Manifest) -> set[object]:
     """What identifies the networks of a map: maps of before store the first encoder otherwise."""
     names = [str(name) for name in manifest.payload["networks"]]
-    return {read_network(root / name)[0] or manifest.files[name]["sha256"] for name in names}
+    return {
+        read_network(root / name)[0] or manifest.files[name]["sha256"] for name in names
+    }
 
 
 def _commit(
@@ -245,7 +285,9 @@ def _commit(
         prefix = f"{STAGES}/{item.stage}/"
         for file in item.manifest.files:
             if file.startswith(prefix):
-                _copy(item.root, file, item.manifest, folder / file.removeprefix(prefix))
+                _copy(
+                    item.root, file, item.manifest, folder / file.removeprefix(prefix)
+                )
         if name != item.scene.name:
             _write_name(folder, name)
 
@@ -274,6 +316,10 @@ def _require_map_of(root: Path, names: Sequence[str], file: Path) -> None:
             raise InputError(f"{root}: {extra[0]} is not in its manifest")
         _incoming(root)
     except InputError as error:
-        raise InputError(f"{file}: {str(error).replace(str(root), file.name)}") from None
+        raise InputError(
+            f"{file}: {str(error).replace(str(root), file.name)}"
+        ) from None
     except Exception as error:  # files with right checksums, written by another program
-        raise InputError(f"{file}: is not a map that evercal wrote ({error!r})") from None
+        raise InputError(
+            f"{file}: is not a map that evercal wrote ({error!r})"
+        ) from None

@@ -58,7 +58,9 @@ class Similarity:
 
     def pose(self, map_from_camera: SE3) -> SE3:
         """Camera pose in the base frame."""
-        scaled = SE3(map_from_camera.rotation_wxyz, self.scale * map_from_camera.translation_m)
+        scaled = SE3(
+            map_from_camera.rotation_wxyz, self.scale * map_from_camera.translation_m
+        )
         return self.base_from_map @ scaled
 
     def inverse_pose(self, base_from_camera: SE3) -> SE3:
@@ -154,13 +156,17 @@ class MapFrame:
         return pose @ SE3.exp(-self.correction.at(stated)) @ self.common.inverse()
 
 
-def fit_correction(poses: SE3, correction: NDArray[np.floating]) -> FrameCorrection | None:
+def fit_correction(
+    poses: SE3, correction: NDArray[np.floating]
+) -> FrameCorrection | None:
     """Fit the correlation length of corrections.
 
     Corrections (n, 6) are without the common transform and the time shift. Returns None if
     neighbours explain too little of them.
     """
-    scale = np.repeat([np.abs(correction[:, :3]).mean(), np.abs(correction[:, 3:]).mean()], 3)
+    scale = np.repeat(
+        [np.abs(correction[:, :3]).mean(), np.abs(correction[:, 3:]).mean()], 3
+    )
     if (scale[[0, 3]] < [1e-4, 1e-5]).any():
         return None
     best: tuple[float, tuple[float, float]] = (MIN_EXPLAINED, RADII[0])
@@ -192,14 +198,17 @@ def shared_sigma(
         left = correction - _left_out(poses, correction, fitted.radius)
     sigmas = []
     for axes in (slice(0, 3), slice(3, 6)):
-        part, variance = left[:, axes], float((correction[:, axes] ** 2).mean())
+        part = left[:, axes]
+        variance = float((correction[:, axes] ** 2).mean())
         shared = float((part[:-1] * part[1:]).mean())
         error = float((part**2).mean()) / np.sqrt(part[1:].size)
         sigmas.append(float(np.sqrt(variance)) if shared > 3 * error else 0.0)
     return sigmas[0], sigmas[1]
 
 
-def _left_out(poses: SE3, correction: NDArray[np.floating], radius: tuple[float, float]) -> Array:
+def _left_out(
+    poses: SE3, correction: NDArray[np.floating], radius: tuple[float, float]
+) -> Array:
     """(n, 6) corrections that the other frames predict."""
     weight = np.stack([_closeness(poses, poses[i], radius) for i in range(len(poses))])
     np.fill_diagonal(weight, 0)

@@ -49,7 +49,9 @@ class MemoryBudget:
         text = str(memory).strip()
         if text.lower() == AUTO:
             return cls(auto=True)
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(%|[kmg]?i?b?)", text, re.IGNORECASE | re.ASCII)
+        match = re.fullmatch(
+            r"(\d+(?:\.\d+)?)\s*(%|[kmg]?i?b?)", text, re.IGNORECASE | re.ASCII
+        )
         unit = match[2].upper() if match else ""
         if match and unit == "%" and 0 < float(match[1]) <= 100:
             return cls(share=float(match[1]) / 100)
@@ -79,7 +81,9 @@ class MemoryBudget:
         total = len(keyframes)
         if self.bytes is None or keyframes.bytes <= self.bytes:
             return np.arange(total)
-        for count in range(min(total - 1, total * self.bytes // keyframes.bytes + 1), 1, -1):
+        for count in range(
+            min(total - 1, total * self.bytes // keyframes.bytes + 1), 1, -1
+        ):
             selected = spread_poses(keyframes.base_from_camera, count)
             if keyframes.take(selected).bytes <= self.bytes:
                 return selected

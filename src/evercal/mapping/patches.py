@@ -30,7 +30,8 @@ def _grid(radius: int) -> Array:
     return np.stack(np.meshgrid(steps, steps), -1).reshape(-1, 2)
 
 
-_OFFSETS, _WIDE = _grid(RADIUS), _grid(RADIUS + 1)
+_OFFSETS = _grid(RADIUS)
+_WIDE = _grid(RADIUS + 1)
 _MEAN = np.full(SIDE * SIDE, 1 / SIDE**2, np.float32)
 
 
@@ -68,7 +69,9 @@ class Patches(NamedTuple):
 
     def take(self, index: np.ndarray | slice) -> "Patches":
         """The patches of an index."""
-        return Patches(self.templates[index], self.inverse_hessian[index], self.rest[index])
+        return Patches(
+            self.templates[index], self.inverse_hessian[index], self.rest[index]
+        )
 
     @classmethod
     def joined(cls, parts: Sequence["Patches"]) -> "Patches":
@@ -87,7 +90,9 @@ def cut_patches(image: Array, pixels: Array) -> Patches:
     patch = wide[:, 1:-1, 1:-1].reshape(n, SIDE * SIDE)
     patch = patch - patch.mean(1, keepdims=True)
     deviation = np.sqrt((patch * patch).mean(1, keepdims=True)) + _FLAT
-    gradient = np.stack([slope_u.reshape(patch.shape), slope_v.reshape(patch.shape)], -1)
+    gradient = np.stack(
+        [slope_u.reshape(patch.shape), slope_v.reshape(patch.shape)], -1
+    )
     gradient /= deviation[..., None]
     hessian = gradient.transpose(0, 2, 1) @ gradient
     # Beside a flat patch the slopes are so large that the damping needs double precision.
@@ -112,24 +117,33 @@ def align_patches(
         starts = range(0, len(centres), _MOST_ROWS)
         parts = [slice(start, start + _MOST_ROWS) for start in starts]
         aligned = [
-            align_patches(patches.take(p), image, centres[p], affines[p], iterations) for p in parts
+            align_patches(patches.take(p), image, centres[p], affines[p], iterations)
+            for p in parts
         ]
         pixels, correlations = zip(*aligned, strict=True)
         return np.concatenate(pixels), np.concatenate(correlations)
     affines = affines.astype(np.float32)
     # One array for each coordinate: interleaved ones take three times as long to add.
-    right, down = affines[:, 0] @ _OFFSETS.T, affines[:, 1] @ _OFFSETS.T
-    centre, x, y = centres.astype(np.float32), np.empty_like(right), np.empty_like(down)
-    product, count = np.zeros((len(centre), 3), np.float32), right.shape[1]
+    right = affines[:, 0] @ _OFFSETS.T
+    down = affines[:, 1] @ _OFFSETS.T
+    centre = centres.astype(np.float32)
+    x = np.empty_like(right)
+    y = np.empty_like(down)
+    product = np.zeros((len(centre), 3), np.float32)
+    count = right.shape[1]
     for passed in range(iterations + 1):
         values = _sample(
-            image, np.add(right, centre[:, :1], out=x), np.add(down, centre[:, 1:], out=y)
+            image,
+            np.add(right, centre[:, :1], out=x),
+            np.add(down, centre[:, 1:], out=y),
         )
         # Templates have zero mean, so that the mean of the values drops out of products with them.
         square = np.einsum("np,np->n", values, values) / count
         variance = np.maximum(square - (values @ _MEAN) ** 2, _ROUNDING * square)
         deviation = np.sqrt(variance) + _FLAT
-        product = np.einsum("nkp,np->nk", patches.templates, values) / deviation[:, None]
+        product = (
+            np.einsum("nkp,np->nk", patches.templates, values) / deviation[:, None]
+        )
         if passed < iterations:
             step = (product[:, :2] - patches.rest).clip(-_LONGEST_STEP, _LONGEST_STEP)
             centre -= affines[..., 0] * step[:, :1] + affines[..., 1] * step[:, 1:]
@@ -148,7 +162,8 @@ def align_down(
     `start` and the result are (n, 2) pixels of level 0, each step is (level, iterations). Returns
     the correlation (n,) at the last level too.
     """
-    pixels, correlation = start, np.zeros(len(start))
+    pixels = start
+    correlation = np.zeros(len(start))
     for level, iterations in steps:
         pixels, correlation = align_patches(
             levels[level], pyramid[level], to_level(pixels, level), affines, iterations
@@ -177,11 +192,17 @@ def whitening(
             line of a landmark with an uncertain depth.
     """
     spread = (affines @ inverse_hessian @ affines.transpose(0, 2, 1)).astype(np.float64)
-    a, b, c = spread[:, 0, 0] + floor_px**2, spread[:, 0, 1], spread[:, 1, 1] + floor_px**2
-    a, b, c = noise**2 * a, noise**2 * b, noise**2 * c
+    a = spread[:, 0, 0] + floor_px**2
+    b = spread[:, 0, 1]
+    c = spread[:, 1, 1] + floor_px**2
+    a = noise**2 * a
+    b = noise**2 * b
+    c = noise**2 * c
     if shift_px is not None:
         u, v = shift_px.T
-        a, b, c = a + u * u, b + u * v, c + v * v
+        a = a + u * u
+        b = b + u * v
+        c = c + v * v
     # The transposed Cholesky factor of the inverse, written out for 2x2.
     inside = 1 / (a * c - b * b)
     white = np.zeros((2, 2, len(a)))
@@ -195,5 +216,7 @@ def _sample(image: Array, right: Array, down: Array) -> Array:
     """(n, p) intensities at (n, p) columns and rows."""
     if not len(right):
         return np.zeros(right.shape, np.float32)
-    values = cv2.remap(image, right, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    values = cv2.remap(
+        image, right, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     return np.asarray(values, np.float32)

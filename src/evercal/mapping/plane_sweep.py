@@ -60,11 +60,17 @@ class PosedCells:
 
         NaN where the distortion has no ray for a cell.
         """
-        return self.camera.pinhole.unproject(ideal_cell_pixels(self.camera, self.stride))
+        return self.camera.pinhole.unproject(
+            ideal_cell_pixels(self.camera, self.stride)
+        )
 
 
 def select_source_views(
-    depth_m: np.ndarray, view: PosedCells, poses: SE3, cameras: Sequence[Camera], count: int
+    depth_m: np.ndarray,
+    view: PosedCells,
+    poses: SE3,
+    cameras: Sequence[Camera],
+    count: int,
 ) -> list[int]:
     """Select the views that show the surfaces of a view under good parallax.
 
@@ -83,10 +89,14 @@ def select_source_views(
     for camera in set(cameras):
         rows = [i for i, own_camera in enumerate(cameras) if own_camera == camera]
         pixels = camera.project(within[rows])
-        visible[rows] &= ((pixels > 0) & (pixels < [camera.width, camera.height])).all(-1)
+        visible[rows] &= ((pixels > 0) & (pixels < [camera.width, camera.height])).all(
+            -1
+        )
     other /= np.linalg.norm(other, axis=-1, keepdims=True) + 1e-9
     parallax = np.arccos(np.clip((own * other).sum(-1), -1, 1))
-    useful = np.clip(parallax / few, 0, 1) * np.clip((many - parallax) / (many - enough), 0, 1)
+    useful = np.clip(parallax / few, 0, 1) * np.clip(
+        (many - parallax) / (many - enough), 0, 1
+    )
     usefulness = np.where(visible, useful, 0).mean(-1)
     best = np.argsort(-usefulness, kind="stable")[:count]
     return [int(i) for i in best if usefulness[i] > MIN_USEFULNESS]
@@ -112,7 +122,8 @@ def inverse_depths(
     Returns:
         (h * w,) per metre, within 1 / 12 and 1 / 0.25 over the scale.
     """
-    least, most = 1 / (scale * FAR_M), 1 / (scale * NEAR_M)
+    least = 1 / (scale * FAR_M)
+    most = 1 / (scale * NEAR_M)
     if not others:
         return (1 / guess_m).clip(least, most).astype(np.float32)
     sources = [_SourceView(view, other) for other in others]
@@ -127,10 +138,12 @@ def inverse_depths(
     score = (volume + SMOOTHING * (near - volume)).reshape(-1, PLANES)
     inverse = planes[score.argmax(1)]
     for _ in range(2):
-        gradient, hessian = np.zeros_like(inverse), np.full_like(inverse, 1e-3)
+        gradient = np.zeros_like(inverse)
+        hessian = np.full_like(inverse, 1e-3)
         for source in sources:
             slope, curvature = source.normal_equation(inverse)
-            gradient, hessian = gradient + slope, hessian + curvature
+            gradient = gradient + slope
+            hessian = hessian + curvature
         step = (gradient / hessian).clip(-0.1 / scale, 0.1 / scale)
         inverse = (inverse + step).clip(least, most).astype(np.float32)
     return inverse
@@ -139,7 +152,9 @@ def inverse_depths(
 def _sums(values: Array) -> Array:
     """Sums over the 3x3 around each cell of (h, w, ...)."""
     kind = cv2.BORDER_CONSTANT
-    return np.asarray(cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=kind), float)
+    return np.asarray(
+        cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=kind), float
+    )
 
 
 class _SourceView:
@@ -172,9 +187,11 @@ class _SourceView:
 
     def along(self, planes: Array) -> Array:
         """(cells, planes) similarity at inverse depths, 0 outside this view."""
-        cells, stride = len(self.ray), self.other.stride
+        cells = len(self.ray)
+        stride = self.other.stride
         u, v, inside = self.pixels(np.broadcast_to(planes, (cells, len(planes))))
-        right, down = (u + 0.5) / stride - 0.5, (v + 0.5) / stride - 0.5
+        right = (u + 0.5) / stride - 0.5
+        down = (v + 0.5) / stride - 0.5
         for at, last in ((right, self.columns - 1), (down, self.rows - 1)):
             inside &= (at > -1) & (at < last + 1)
             np.clip(at, 0, last, out=at)
@@ -184,15 +201,22 @@ class _SourceView:
         for start in range(0, cells, block):
             part = slice(start, start + block)
             image = self.similarity[part].reshape(-1, self.columns)
-            top = np.arange(len(image) // self.rows, dtype=np.float32)[:, None] * self.rows
-            sampled[part] = cv2.remap(image, right[part], down[part] + top, cv2.INTER_LINEAR)
+            top = (
+                np.arange(len(image) // self.rows, dtype=np.float32)[:, None]
+                * self.rows
+            )
+            sampled[part] = cv2.remap(
+                image, right[part], down[part] + top, cv2.INTER_LINEAR
+            )
         return np.maximum(sampled, 0) * inside
 
     def normal_equation(self, inverse: Array) -> tuple[Array, Array]:
         """Gradient and Hessian (cells,) of least squares in the inverse depth of each cell."""
         rho = inverse.astype(np.float64)
         *here, front = self.pixels(rho)
-        here, delta, stride = np.stack(here, 1), 1e-4, self.other.stride
+        here = np.stack(here, 1)
+        delta = 1e-4
+        stride = self.other.stride
         slope = (np.stack(self.pixels(rho + delta)[:2], 1) - here) / delta
         cell = np.rint((here - (stride - 1) / 2) / stride).astype(int)
         last = np.array([self.columns - 2, self.rows - 2])
@@ -217,13 +241,19 @@ def peak(
     _, height, width = similarity.shape
     n = np.arange(len(similarity))
     steps = np.array([(v, u) for v in (-1, 0, 1) for u in (-1, 0, 1)])
-    patch = similarity[n[:, None], row[:, None] + steps[:, 0], column[:, None] + steps[:, 1]]
+    patch = similarity[
+        n[:, None], row[:, None] + steps[:, 0], column[:, None] + steps[:, 1]
+    ]
     best = steps[patch.argmax(1)]
     row = (row + best[:, 0]).clip(1, height - 2)
     column = (column + best[:, 1]).clip(1, width - 2)
     middle = similarity[n, row, column]
-    du = parabola(similarity[n, row, column - 1], middle, similarity[n, row, column + 1])
-    dv = parabola(similarity[n, row - 1, column], middle, similarity[n, row + 1, column])
+    du = parabola(
+        similarity[n, row, column - 1], middle, similarity[n, row, column + 1]
+    )
+    dv = parabola(
+        similarity[n, row - 1, column], middle, similarity[n, row + 1, column]
+    )
     return np.stack([column + du, row + dv], 1), middle
 
 

@@ -78,14 +78,17 @@ class PoseCheck:
 
 def matched_pairs(recording: PreparedFrames, vlad: Vlad) -> list[MatchedPair]:
     """Match every frame with the most similar ones."""
-    pairs = similar_pairs([recording.features(i) for i in range(len(recording))], vlad, PARTNERS)
+    pairs = similar_pairs(
+        [recording.features(i) for i in range(len(recording))], vlad, PARTNERS
+    )
     matched = [_matched(recording, i, j) for i, j in pairs]
     return [pair for pair in matched if len(pair.ray) >= MIN_MATCHES]
 
 
 def check_poses(recording: PreparedFrames, pairs: list[MatchedPair]) -> PoseCheck:
     """Find frames whose stated pose contradicts most of their partners."""
-    count, sift = len(recording), _SiftCheck(recording)
+    count = len(recording)
+    sift = _SiftCheck(recording)
     partners: dict[int, set[int]] = {i: set() for i in range(count)}
     for pair in pairs:
         partners[pair.first].add(pair.second)
@@ -94,7 +97,8 @@ def check_poses(recording: PreparedFrames, pairs: list[MatchedPair]) -> PoseChec
     wrong: list[int] = []
     untracked: list[int] = []
     while rest:
-        against, total = np.zeros(count), np.zeros(count)
+        against = np.zeros(count)
+        total = np.zeros(count)
         for i, j, distance in rest:
             for frame in (i, j):
                 total[frame] += 1
@@ -104,11 +108,15 @@ def check_poses(recording: PreparedFrames, pairs: list[MatchedPair]) -> PoseChec
         if share[worst] <= 0.5:
             break
         rest = [pair for pair in rest if worst not in pair[:2]]
-        agree, disagree = sift.votes(worst, sorted(partners[worst] - {*wrong, *untracked}))
+        agree, disagree = sift.votes(
+            worst, sorted(partners[worst] - {*wrong, *untracked})
+        )
         if agree and agree >= disagree:
             continue
         (wrong if agree or disagree else untracked).append(worst)
-    return PoseCheck(np.array(sorted(wrong), np.int64), np.array(sorted(untracked), np.int64))
+    return PoseCheck(
+        np.array(sorted(wrong), np.int64), np.array(sorted(untracked), np.int64)
+    )
 
 
 class _SiftCheck:
@@ -120,7 +128,11 @@ class _SiftCheck:
 
     def votes(self, frame: int, partners: Sequence[int]) -> tuple[int, int]:
         """Partners whose matches agree and disagree with the stated poses."""
-        pairs = [pair for pair in (self._pair(frame, j) for j in partners) if pair is not None]
+        pairs = [
+            pair
+            for pair in (self._pair(frame, j) for j in partners)
+            if pair is not None
+        ]
         agree = sum(_distance(self.recording, pair) <= MAX_SIFT_PX for pair in pairs)
         return agree, len(pairs) - agree
 
@@ -138,7 +150,9 @@ class _SiftCheck:
         return self._features[frame]
 
 
-def depth_scale(recording: PreparedFrames, pairs: list[MatchedPair], metric: bool = True) -> float:
+def depth_scale(
+    recording: PreparedFrames, pairs: list[MatchedPair], metric: bool = True
+) -> float:
     """Estimate the usual depth relative to that in a room; 1 if the range of a room fits.
 
     Recordings have other scales if their unit of length is unknown (not `metric`: any range), on a
@@ -160,12 +174,16 @@ def scale_of_depths(depth: np.ndarray, metric: bool = True) -> float:
 
 def _matched(recording: PreparedFrames, i: int, j: int) -> MatchedPair:
     """Mutual best matches of two frames."""
-    a, b = recording.features(i)[::STRIDE], recording.features(j)
+    a = recording.features(i)[::STRIDE]
+    b = recording.features(j)
     similar = a @ b.T
-    best, back, rows = similar.argmax(1), similar.argmax(0), np.arange(len(a))
+    best = similar.argmax(1)
+    back = similar.argmax(0)
+    rows = np.arange(len(a))
     first = similar[rows, best]
     stride = recording.encoder.stride
-    camera, other = recording.cell_camera(i), recording.cell_camera(j)
+    camera = recording.cell_camera(i)
+    other = recording.cell_camera(j)
     rows = rows[(back[best] == rows) & (first > MIN_MATCH_SIMILARITY)]
     apart = _apart(other.height // stride, other.width // stride)[best[rows]]
     second = np.where(apart, similar[rows], -1).max(1, initial=-1)
@@ -186,7 +204,8 @@ def _apart(rows: int, columns: int) -> NDArray[np.bool_]:
 
 
 def _distance(recording: PreparedFrames, pair: MatchedPair) -> float:
-    other, scale = recording.cell_camera(pair.second), recording.depth_scale
+    other = recording.cell_camera(pair.second)
+    scale = recording.depth_scale
     rotation, translation = recording.relative(pair.second, pair.first)
     start, end = (
         _pinhole(other, pair.ray @ rotation.T + translation / (scale * depth))

@@ -39,7 +39,9 @@ class PreparedFrames:
     """Posed training frames at working size; poses and camera change during the adjustment."""
 
     def __init__(self, frames: Sequence[Frame], encoder: Encoder, size: WorkingSize):
-        self.frames, self.encoder, self.size = tuple(frames), encoder, size
+        self.frames = tuple(frames)
+        self.encoder = encoder
+        self.size = size
         self._move(self.stated)
         self.grey: list[NDArray[np.uint8]] = []
         self.cameras: list[Camera] = []
@@ -63,13 +65,16 @@ class PreparedFrames:
         rest.cameras = [self.cameras[i] for i in index]
         rest._move(self.poses[index])
         features = self._features
-        rest._features = {new: features[old] for new, old in enumerate(index) if old in features}
+        rest._features = {
+            new: features[old] for new, old in enumerate(index) if old in features
+        }
         rest._cache_pyramids()
         return rest
 
     def in_unit(self, unit: float) -> "PreparedFrames":
         """A copy whose positions are divided by `unit`."""
-        rest, poses = copy(self), self.stated
+        rest = copy(self)
+        poses = self.stated
         scaled = SE3(poses.rotation_wxyz, poses.translation_m / unit)
         rest.frames = tuple(
             replace(frame, base_from_camera=pose)
@@ -98,12 +103,15 @@ class PreparedFrames:
         """(cells, channels) features of a frame, cached in half precision."""
         if i not in self._features:
             features = self.encoder.encode(self.grey[i], self.size.cells)
-            self._features[i] = features.reshape(-1, features.shape[2]).astype(np.float16)
+            self._features[i] = features.reshape(-1, features.shape[2]).astype(
+                np.float16
+            )
         return self._features[i].astype(np.float32)
 
     def posed_cells(self, i: int) -> PosedCells:
         """The encoded cells of a frame with its pose and camera."""
-        camera, stride = self.cell_camera(i), self.encoder.stride
+        camera = self.cell_camera(i)
+        stride = self.encoder.stride
         return PosedCells(self.features(i), camera, self.poses[i], stride)
 
     def swept(self, i: int, source_views: int) -> tuple[NDArray[np.float32], list[int]]:
@@ -117,7 +125,9 @@ class PreparedFrames:
         others = [self.posed_cells(j) for j in near]
         return inverse_depths(view, others, guess, self.depth_scale), near
 
-    def source_views(self, depth_m: NDArray[np.float64], view: PosedCells, count: int) -> list[int]:
+    def source_views(
+        self, depth_m: NDArray[np.float64], view: PosedCells, count: int
+    ) -> list[int]:
         """Frames that show the surfaces of a view, see `plane_sweep.select_source_views`."""
         cameras = [self.cell_camera(j) for j in range(len(self))]
         return select_source_views(depth_m, view, self.poses, cameras, count)
@@ -128,13 +138,18 @@ class PreparedFrames:
 
     def _cache_pyramids(self) -> None:
         grey = self.grey
-        self._pyramid = lru_cache(_PYRAMIDS)(lambda i: image_pyramid(grey[i], PYRAMID_LEVELS))
+        self._pyramid = lru_cache(_PYRAMIDS)(
+            lambda i: image_pyramid(grey[i], PYRAMID_LEVELS)
+        )
 
     def relative(self, j: int, k: int) -> tuple[np.ndarray, np.ndarray]:
         """Rotation (3, 3) and translation (3,) of camera j from camera k."""
-        base_from_j, base_from_k = self._matrices[j], self._matrices[k]
+        base_from_j = self._matrices[j]
+        base_from_k = self._matrices[k]
         rotation = base_from_j[:3, :3].T
-        return rotation @ base_from_k[:3, :3], rotation @ (base_from_k - base_from_j)[:3, 3]
+        return rotation @ base_from_k[:3, :3], rotation @ (base_from_k - base_from_j)[
+            :3, 3
+        ]
 
     def adjust(self, poses: SE3, cameras: list[Camera] | None) -> None:
         """Replace the poses (n,), base_from_camera, and, if given, the cameras (n,)."""
@@ -143,4 +158,5 @@ class PreparedFrames:
 
     def _move(self, poses: SE3) -> None:
         # A pose of a batch takes long to multiply; `relative` is called for every observation.
-        self.poses, self._matrices = poses, poses.matrix()
+        self.poses = poses
+        self._matrices = poses.matrix()

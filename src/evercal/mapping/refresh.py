@@ -58,7 +58,9 @@ class RefreshOptions:
     """Distance, in median keyframe spacings, beyond which an image counts as unexplored."""
     most_novel: float = 0.25
     """Share of the keyframes that leave for new ground in one refresh, at most."""
-    bundle: BundleOptions = field(default_factory=lambda: BundleOptions(intrinsics=False))
+    bundle: BundleOptions = field(
+        default_factory=lambda: BundleOptions(intrinsics=False)
+    )
     """Adjustment of the new images' poses."""
 
 
@@ -95,8 +97,10 @@ def refreshed(
         options: Thresholds.
         on_progress: Called with the step, how much of it is done, and its total.
     """
-    options, old = options or RefreshOptions(), scene.keyframes
-    n, frames = len(old), [*old.frames(), *located]
+    options = options or RefreshOptions()
+    old = scene.keyframes
+    n = len(old)
+    frames = [*old.frames(), *located]
     prepared = PreparedFrames(frames, encoder, size)
     prepared.depth_scale = scale_of_depths(
         1 / np.concatenate([k.inverse_depth for k in old.landmarks])
@@ -145,7 +149,8 @@ class _Survival:
 
 
 def _reopened(prepared: PreparedFrames, old: Keyframes, i: int) -> KeyframeTracks:
-    landmarks, pyramid = old.landmarks[i], prepared.pyramid(i)
+    landmarks = old.landmarks[i]
+    pyramid = prepared.pyramid(i)
     return KeyframeTracks(
         frame=i,
         landmarks=landmarks,
@@ -160,17 +165,24 @@ def _reopened(prepared: PreparedFrames, old: Keyframes, i: int) -> KeyframeTrack
 
 
 def _survival(
-    prepared: PreparedFrames, keyframe: KeyframeTracks, new: range, options: RefreshOptions
+    prepared: PreparedFrames,
+    keyframe: KeyframeTracks,
+    new: range,
+    options: RefreshOptions,
 ) -> _Survival:
     """Look for the landmarks of a keyframe in new images."""
-    n, every = len(keyframe.landmarks), np.arange(len(keyframe.landmarks))
-    expected, found = np.zeros(n, int), np.zeros(n, int)
+    n = len(keyframe.landmarks)
+    every = np.arange(len(keyframe.landmarks))
+    expected = np.zeros(n, int)
+    found = np.zeros(n, int)
     surface = keyframe.landmarks.surface(prepared.cameras[keyframe.frame])
     points = surface[0]
     least = np.cos(np.deg2rad(options.similar_deg))
     for j in new:
         rotation, translation = prepared.relative(j, keyframe.frame)
-        seen = project_surface(surface, rotation, translation, prepared.cameras[j]).landmark
+        seen = project_surface(
+            surface, rotation, translation, prepared.cameras[j]
+        ).landmark
         # The camera of image j in the frame of the keyframe's camera.
         centre = -rotation.T @ translation
         rays = points[seen] - centre
@@ -195,7 +207,11 @@ def _selected(
     if len(kept) > 1:
         between = np.stack([space.distances(int(i), kept) for i in kept])
         step = float(np.median(np.where(between > 0, between, np.inf).min(1)))
-        gap = np.stack([space.distances(int(i), kept).min() for i in new]) if len(new) else new
+        gap = (
+            np.stack([space.distances(int(i), kept).min() for i in new])
+            if len(new)
+            else new
+        )
         most = int(options.most_novel * n)
         room = min(int((gap > options.novel * step).sum()), most) - (n - len(kept))
         if room > 0:
@@ -206,7 +222,10 @@ def _selected(
     count = min(n, len(kept) + len(new))
     pool = np.concatenate([kept, new])
     chosen = select_farthest(
-        poses.translation_m[pool], poses.rotation_wxyz[pool], count, start=range(len(kept))
+        poses.translation_m[pool],
+        poses.rotation_wxyz[pool],
+        count,
+        start=range(len(kept)),
     )
     return kept.tolist(), [int(pool[i]) for i in chosen if i >= len(kept)]
 
@@ -219,7 +238,8 @@ def _nearest(poses: SE3, kept: Sequence[int], new: Sequence[int]) -> dict[int, i
     space = PoseSpace.of(poses.translation_m, poses.rotation_wxyz)
     if len(kept) < 2 or not new:
         return {}
-    rows, columns = np.array(kept), np.array(new)
+    rows = np.array(kept)
+    columns = np.array(new)
     between = np.stack([space.distances(int(i), rows) for i in kept])
     step = np.median(np.where(between > 0, between, np.inf).min(1))
     gaps = np.stack([space.distances(int(i), columns) for i in kept])
@@ -262,7 +282,10 @@ def _adjust(
         return
     observed = bundle_tracks(prepared, keyframes)
     problem = BundleAdjustment(
-        prepared.stated, list(prepared.cameras), np.zeros((len(prepared), 6)), options.bundle
+        prepared.stated,
+        list(prepared.cameras),
+        np.zeros((len(prepared), 6)),
+        options.bundle,
     )
     poses = problem.solve(observed).poses
     # The old keyframes define the frame: undo their mean motion.
@@ -287,7 +310,8 @@ def _joined(
     opened: Sequence[KeyframeTracks],
 ) -> Keyframes:
     """Return kept keyframes without what is gone, and the new ones."""
-    vlad, numbers = prepared.encoder.vlad(), [keyframe.frame for keyframe in opened]
+    vlad = prepared.encoder.vlad()
+    numbers = [keyframe.frame for keyframe in opened]
     stay = old.take(np.array(kept, np.int64))
     assert stay.descriptors is not None, "a map has descriptors"
     rows = [vlad(prepared.features(i)).astype(np.float16) for i in numbers]

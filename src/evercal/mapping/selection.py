@@ -43,7 +43,9 @@ class SarsOptions:
         for name in ("radius", "rotation_weight"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"SarsOptions.{name} is {value}; it is a finite number >= 0")
+                raise ValueError(
+                    f"SarsOptions.{name} is {value}; it is a finite number >= 0"
+                )
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,10 @@ class PoseSpace:
 
     @classmethod
     def of(
-        cls, positions_m: np.ndarray, quaternions_wxyz: np.ndarray, rotation_weight: float = 1.0
+        cls,
+        positions_m: np.ndarray,
+        quaternions_wxyz: np.ndarray,
+        rotation_weight: float = 1.0,
     ) -> PoseSpace:
         """Check, scale and transpose ``(n, 3)`` positions and ``(n, 4)`` quaternions.
 
@@ -73,7 +78,11 @@ class PoseSpace:
                 f"poses are (n, 3) and (n, 4), got {positions.shape} and {quaternions.shape}"
             )
         norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
-        bad = ~np.isfinite(positions).all(axis=1) | ~np.isfinite(norms[:, 0]) | (norms[:, 0] == 0)
+        bad = (
+            ~np.isfinite(positions).all(axis=1)
+            | ~np.isfinite(norms[:, 0])
+            | (norms[:, 0] == 0)
+        )
         if bad.any():
             raise ValueError(
                 f"pose {int(np.argmax(bad))} is not finite or has a zero quaternion; "
@@ -90,13 +99,19 @@ class PoseSpace:
         """Return the number of poses."""
         return self.positions.shape[1]
 
-    def distances(self, index: int, others: slice | np.ndarray = slice(None)) -> np.ndarray:
+    def distances(
+        self, index: int, others: slice | np.ndarray = slice(None)
+    ) -> np.ndarray:
         """Return D from pose `index` to the poses of another index, by default to all."""
-        here, quaternion = self.positions[:, index, None], self.quaternions[:, index, None]
-        step, turned = self.positions[:, others] - here, self.quaternions[:, others]
+        here = self.positions[:, index, None]
+        quaternion = self.quaternions[:, index, None]
+        step = self.positions[:, others] - here
+        turned = self.quaternions[:, others]
         # q and -q are one rotation.
         chords = [((turned + sign * quaternion) ** 2).sum(axis=0) for sign in (-1, 1)]
-        angle = 4.0 * self.rotation_weight * np.arcsin(np.sqrt(np.minimum(*chords)) * 0.5)
+        angle = (
+            4.0 * self.rotation_weight * np.arcsin(np.sqrt(np.minimum(*chords)) * 0.5)
+        )
         return angle + np.sqrt((step**2).sum(axis=0))
 
 
@@ -180,7 +195,8 @@ def select_sars(
         slot = int(ties[frames[ties].argmin()])
         orphans = nearest == pairwise[slot]
         orphans[slot] = True
-        frames[slot], row[slot] = frame, np.inf
+        frames[slot] = frame
+        row[slot] = np.inf
         pairwise[slot] = pairwise[:, slot] = row
         np.minimum(nearest, row, out=nearest)
         nearest[orphans] = pairwise[orphans].min(axis=1)
@@ -189,7 +205,8 @@ def select_sars(
 
 def _largest_radius(space: PoseSpace, capacity: int, tolerance: float) -> float:
     wanted = min(capacity, len(space))
-    low, high = 0.0, math.sqrt(3.0) + math.pi * space.rotation_weight + tolerance
+    low = 0.0
+    high = math.sqrt(3.0) + math.pi * space.rotation_weight + tolerance
     if wanted <= 1:
         return high
     while high - low > tolerance:
@@ -221,5 +238,7 @@ def select_farthest(
         if i == len(selected):
             selected.append(int(gap.argmax()))
         np.minimum(gap, space.distances(selected[i]), out=gap)
-        gap[selected[: i + 1]] = -1.0  # another frame with the same pose can still be selected
+        gap[
+            selected[: i + 1]
+        ] = -1.0  # another frame with the same pose can still be selected
     return np.sort(np.array(selected, np.int64))

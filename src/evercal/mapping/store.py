@@ -39,12 +39,22 @@ from evercal.storage.tensors import load_tensors, open_tensors, save_tensors
 
 KIND, STRATEGY = "map", "evercal"
 """Kind of store in its manifest, and its name among the strategies of `evercal learn`."""
-SCENE, KEYFRAMES, CORRECTION = "scene.json", "keyframes.safetensors", "correction.safetensors"
+SCENE = "scene.json"
+KEYFRAMES = "keyframes.safetensors"
+CORRECTION = "correction.safetensors"
 REFRESHES = "refreshes.json"
 _STATE, PREVIOUS = (SCENE, KEYFRAMES, CORRECTION), "previous-"
 """Files that a refresh replaces, and the prefix of their state before."""
 
-_FIELDS = ("name", "camera", "adjusted_camera", "train_frames", "metric", "parent_frame", "unit")
+_FIELDS = (
+    "name",
+    "camera",
+    "adjusted_camera",
+    "train_frames",
+    "metric",
+    "parent_frame",
+    "unit",
+)
 """Fields of `SceneMap` in scene.json, beside `frame`."""
 
 
@@ -67,7 +77,9 @@ class MapStore(StageStore[MapContents]):
             path = root / first
             local = load_encoder(encoder, path)
             for name in centroids:
-                local.centroids = load_tensors(root / name)["centroids"].astype(np.float32)
+                local.centroids = load_tensors(root / name)["centroids"].astype(
+                    np.float32
+                )
             contents = MapContents(local, int(payload["short_side"]))
             stages = [str(name) for name in payload["stages"]]
             store = cls(root, contents, stages, (first, *centroids))
@@ -78,7 +90,10 @@ class MapStore(StageStore[MapContents]):
 
     @classmethod
     def create(
-        cls, root: Path, encoder: Path | Features | Encoder | None = None, short_side: int = 240
+        cls,
+        root: Path,
+        encoder: Path | Features | Encoder | None = None,
+        short_side: int = 240,
     ) -> Self:
         """An empty map; nothing is written before the first `commit`.
 
@@ -93,7 +108,9 @@ class MapStore(StageStore[MapContents]):
         if not is_store(root):
             return cls.create(root, encoder)
         if isinstance(encoder, Path):
-            raise InputError(f"encoder {encoder}: store {root} keeps the encoder it was made with")
+            raise InputError(
+                f"encoder {encoder}: store {root} keeps the encoder it was made with"
+            )
         return cls.open(root, encoder)
 
     def commit(self, scene: SceneMap, report: Mapping[str, object]) -> None:
@@ -134,7 +151,9 @@ class MapStore(StageStore[MapContents]):
                 _move(folder / name, folder / f"{PREVIOUS}{name}")
             write_scene(folder, scene)
             save_tensors(folder / KEYFRAMES, scene.keyframes.to_tensors())
-            write_json(folder / REFRESHES, {"refreshes": [*refreshes(folder), dict(report)]})
+            write_json(
+                folder / REFRESHES, {"refreshes": [*refreshes(folder), dict(report)]}
+            )
 
         self._exchange(scene, write)
 
@@ -142,7 +161,9 @@ class MapStore(StageStore[MapContents]):
         """Bring back the state of a scene before its last refresh: whole, or not at all."""
         names = [stored.name for stored in self.contents.scenes]
         if name not in names:
-            raise InputError(f"scene {name!r}: store {self.root} has {', '.join(names) or 'none'}")
+            raise InputError(
+                f"scene {name!r}: store {self.root} has {', '.join(names) or 'none'}"
+            )
         before = self.folder(self.stages[names.index(name)])
         if not (before / f"{PREVIOUS}{SCENE}").exists():
             raise InputError(f"scene {name!r}: no refresh to undo")
@@ -155,7 +176,9 @@ class MapStore(StageStore[MapContents]):
 
         self.replace(names.index(name), write, self.payload)
         scenes = [*self.contents.scenes]
-        scenes[names.index(name)] = read_scene(self.folder(self.stages[names.index(name)]))
+        scenes[names.index(name)] = read_scene(
+            self.folder(self.stages[names.index(name)])
+        )
         self.contents = replace(self.contents, scenes=scenes)
 
     def _exchange(self, scene: SceneMap, write: Callable[[Path], None]) -> None:
@@ -169,18 +192,28 @@ class MapStore(StageStore[MapContents]):
     @property
     def payload(self) -> dict[str, object]:
         """Settings in the manifest."""
-        return {"kind": KIND, "strategy": STRATEGY, "short_side": self.contents.short_side}
+        return {
+            "kind": KIND,
+            "strategy": STRATEGY,
+            "short_side": self.contents.short_side,
+        }
 
 
 def stored_scenes(root: Path) -> list[tuple[str, Camera, dict[str, Any]]]:
     """Name, adjusted camera and report of every scene of a map; no keyframes are read."""
 
     def read(manifest: Manifest) -> list[tuple[str, Camera, dict[str, Any]]]:
-        folders = [root / STAGES / str(name) for name in require_map(root, manifest)["stages"]]
+        folders = [
+            root / STAGES / str(name) for name in require_map(root, manifest)["stages"]
+        ]
         scenes = [json.loads((folder / SCENE).read_text()) for folder in folders]
         reports = [json.loads((folder / REPORT).read_text()) for folder in folders]
         return [
-            (checked_name(scene["name"]), Camera.from_dict(scene["adjusted_camera"]), report)
+            (
+                checked_name(scene["name"]),
+                Camera.from_dict(scene["adjusted_camera"]),
+                report,
+            )
             for scene, report in zip(scenes, reports, strict=True)
         ]
 
@@ -195,14 +228,18 @@ def require_map(root: Path, manifest: Manifest) -> dict[str, Any]:
             f"store {root}: holds networks of strategy {payload.get('strategy')!r}, not a map"
         )
     if not isinstance(payload.get("short_side"), int):
-        raise InputError(f"store {root}: 'short_side' in the manifest is not a number; restore it")
+        raise InputError(
+            f"store {root}: 'short_side' in the manifest is not a number; restore it"
+        )
     return payload
 
 
 def write_scene(folder: Path, scene: SceneMap) -> None:
     """Write everything of a scene but its keyframes into its folder."""
     values = {name: getattr(scene, name) for name in _FIELDS}
-    content = {k: v.to_dict() if isinstance(v, Camera) else v for k, v in values.items()}
+    content = {
+        k: v.to_dict() if isinstance(v, Camera) else v for k, v in values.items()
+    }
     write_json(folder / SCENE, {**content, "frame": frame_to_dict(scene.frame)})
     (folder / CORRECTION).unlink(missing_ok=True)  # of the scene that is replaced
     if scene.frame.correction is not None:
@@ -227,9 +264,13 @@ def read_scene(folder: Path) -> SceneMap:
         return _read_scene(folder)
     except (InputError, OSError):
         raise
-    except Exception as error:  # nothing is assumed about what another program has written
+    except (
+        Exception
+    ) as error:  # nothing is assumed about what another program has written
         reason = " ".join(repr(error).split())[:200]
-        raise InputError(f"{folder}: not a scene that evercal wrote ({reason})") from None
+        raise InputError(
+            f"{folder}: not a scene that evercal wrote ({reason})"
+        ) from None
 
 
 def _read_scene(folder: Path) -> SceneMap:
@@ -255,7 +296,8 @@ def _read_scene(folder: Path) -> SceneMap:
 
 def frame_to_dict(frame: MapFrame) -> dict[str, object]:
     """A map's frame as JSON values, without its slowly varying corrections."""
-    similarity, covariance = frame.similarity, frame.base_covariance
+    similarity = frame.similarity
+    covariance = frame.base_covariance
     return {
         "stated_camera_from_camera": pose_to_dict(frame.common),
         "pose_sigma": list(frame.pose_sigma),
@@ -267,13 +309,19 @@ def frame_to_dict(frame: MapFrame) -> dict[str, object]:
     }
 
 
-def frame_of(content: Mapping[str, object], correction: FrameCorrection | None) -> MapFrame:
+def frame_of(
+    content: Mapping[str, object], correction: FrameCorrection | None
+) -> MapFrame:
     """The inverse of `frame_to_dict`."""
-    base, covariance = content["base_from_map"], content["base_covariance"]
-    pose, shared = (np.asarray(content[key], np.float64) for key in ("pose_sigma", "frame_sigma"))
+    base = content["base_from_map"]
+    covariance = content["base_covariance"]
+    pose, shared = (
+        np.asarray(content[key], np.float64) for key in ("pose_sigma", "frame_sigma")
+    )
     similarity = None
     if base is not None:
-        known, scale = bool(content.get("unit_known", True)), float(str(content["scale"]))
+        known = bool(content.get("unit_known", True))
+        scale = float(str(content["scale"]))
         similarity = Similarity(_pose_of(base), scale, known)
     return MapFrame(
         common=_pose_of(content["stated_camera_from_camera"]),
@@ -281,7 +329,9 @@ def frame_of(content: Mapping[str, object], correction: FrameCorrection | None) 
         pose_sigma=(float(pose[0]), float(pose[1])),
         frame_sigma=(float(shared[0]), float(shared[1])),
         similarity=similarity,
-        base_covariance=None if covariance is None else np.asarray(covariance, np.float64),
+        base_covariance=None
+        if covariance is None
+        else np.asarray(covariance, np.float64),
     )
 
 

@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 
 from evercal.mapping.bundle_equations import BundleTracks
 from evercal.mapping.landmarks import Landmarks, detect, project_surface, slopes
-from evercal.mapping.patches import Patches, align_down, cut_patches, to_level, whitening
+from evercal.mapping.patches import (
+    Patches,
+    align_down,
+    cut_patches,
+    to_level,
+    whitening,
+)
 from evercal.mapping.plane_sweep import FAR_M, NEAR_M, PROBED_CELLS
 from evercal.mapping.prepared_frames import PYRAMID_LEVELS, PreparedFrames
 
@@ -96,7 +102,8 @@ def open_keyframe(recording: PreparedFrames, frame: int) -> KeyframeTracks:
     cell_px = recording.cell_px(frame)
     pixels, cells = detect(recording.grey[frame], view.grid, cell_px)
     has_ray = np.isfinite(recording.cameras[frame].unproject(pixels)).all(1)
-    pixels, cells = pixels[has_ray], cells[has_ray]
+    pixels = pixels[has_ray]
+    cells = cells[has_ray]
     slant = slopes(inverse, view.grid, cell_px)
     pyramid = recording.pyramid(frame)
     return KeyframeTracks(
@@ -104,7 +111,8 @@ def open_keyframe(recording: PreparedFrames, frame: int) -> KeyframeTracks:
         landmarks=Landmarks(pixels, inverse[cells], slant[cells], np.ones(len(cells))),
         cell_inverse_depth=inverse,
         patches=tuple(
-            cut_patches(pyramid[level], to_level(pixels, level)) for level in range(PYRAMID_LEVELS)
+            cut_patches(pyramid[level], to_level(pixels, level))
+            for level in range(PYRAMID_LEVELS)
         ),
         sources=tuple(near),
         confirmed=np.zeros(len(cells), bool),
@@ -129,16 +137,22 @@ def observe(
     visible, expected, affines = project_surface(surface, rotation, translation, camera)
     which = which[visible]
     templates = tuple(level.take(which) for level in keyframe.patches)
-    pixels, correlation = align_down(templates, recording.pyramid(frame), expected, affines, steps)
+    pixels, correlation = align_down(
+        templates, recording.pyramid(frame), expected, affines, steps
+    )
     good = correlation > MIN_CORRELATION
     good &= np.linalg.norm(pixels - expected, axis=1) < reach_px
     last = steps[-1][0]
     spread = templates[last].inverse_hessian[good]
-    white = whitening(affines[good], spread, FLOOR_PX, NOISE).transpose(2, 0, 1) / 2**last
+    white = (
+        whitening(affines[good], spread, FLOOR_PX, NOISE).transpose(2, 0, 1) / 2**last
+    )
     return Observations(which[good], np.full(good.sum(), frame), pixels[good], white)
 
 
-def refine_depths(recording: PreparedFrames, keyframe: KeyframeTracks, again: bool = False) -> None:
+def refine_depths(
+    recording: PreparedFrames, keyframe: KeyframeTracks, again: bool = False
+) -> None:
     """Refine the inverse depths of a keyframe's landmarks by Gauss-Newton; poses are fixed.
 
     Landmarks change in place. If the depths are nearly right (`again`), the coarse round is left
@@ -146,9 +160,13 @@ def refine_depths(recording: PreparedFrames, keyframe: KeyframeTracks, again: bo
     """
     if not keyframe.sources or not len(keyframe.landmarks):
         return
-    observations, which = None, np.arange(len(keyframe.landmarks))
+    observations = None
+    which = np.arange(len(keyframe.landmarks))
     for steps, updates in _DEPTH_ROUNDS[again:]:
-        parts = [observe(recording, keyframe, j, which, steps, REACH_PX) for j in keyframe.sources]
+        parts = [
+            observe(recording, keyframe, j, which, steps, REACH_PX)
+            for j in keyframe.sources
+        ]
         observations = _joined(parts)
         # Landmarks with too few observations at a coarse level are not tried at a finer one.
         count = np.bincount(observations.landmark, minlength=len(keyframe.landmarks))
@@ -159,12 +177,17 @@ def refine_depths(recording: PreparedFrames, keyframe: KeyframeTracks, again: bo
     _confirm(recording, keyframe, observations)
 
 
-def bundle_tracks(recording: PreparedFrames, keyframes: list[KeyframeTracks]) -> BundleTracks:
+def bundle_tracks(
+    recording: PreparedFrames, keyframes: list[KeyframeTracks]
+) -> BundleTracks:
     """Observe a spread subset of the landmarks in all frames that show enough of their keyframe."""
     most = max(30, min(LANDMARKS_PER_KEYFRAME, BUNDLE_LANDMARKS // len(keyframes)))
     tied = _tied_frames(recording, keyframes)
     parts: list[Observations] = []
-    host, pixels, inverse, start = [], [], [], 0
+    host = []
+    pixels = []
+    inverse = []
+    start = 0
     for keyframe, frames in zip(keyframes, tied, strict=True):
         which = _bundled(keyframe, most)
         if not len(which):
@@ -201,7 +224,9 @@ def _bundled(keyframe: KeyframeTracks, most: int) -> Index:
     return which
 
 
-def _tied_frames(recording: PreparedFrames, keyframes: list[KeyframeTracks]) -> list[list[int]]:
+def _tied_frames(
+    recording: PreparedFrames, keyframes: list[KeyframeTracks]
+) -> list[list[int]]:
     shared = np.stack([_shared_view(recording, keyframe) for keyframe in keyframes])
     best = np.argsort(-shared, axis=0, kind="stable")[:FRAMES_PER_KEYFRAME]
     tied = np.zeros(shared.shape, bool)
@@ -215,8 +240,11 @@ def _tied_frames(recording: PreparedFrames, keyframes: list[KeyframeTracks]) -> 
 
 def _shared_view(recording: PreparedFrames, keyframe: KeyframeTracks) -> np.ndarray:
     """(n,) share of a keyframe's view that each frame shows from a similar direction."""
-    cells, poses = recording.posed_cells(keyframe.frame), recording.poses
-    some = np.linspace(0, len(keyframe.cell_inverse_depth) - 1, PROBED_CELLS).astype(int)
+    cells = recording.posed_cells(keyframe.frame)
+    poses = recording.poses
+    some = np.linspace(0, len(keyframe.cell_inverse_depth) - 1, PROBED_CELLS).astype(
+        int
+    )
     local = cells.rays()[some] / keyframe.cell_inverse_depth[some, None]
     points = cells.base_from_camera.apply(local)
     direction = points[None] - poses.translation_m[:, None]
@@ -224,9 +252,12 @@ def _shared_view(recording: PreparedFrames, keyframe: KeyframeTracks) -> np.ndar
     within = np.einsum("nji,npj->npi", poses.rotation_matrix(), direction)
     shared = np.zeros(len(recording))
     for i in range(len(recording)):
-        camera, front = recording.cameras[i], within[i, :, 2] > 0
+        camera = recording.cameras[i]
+        front = within[i, :, 2] > 0
         pixel = camera.project(np.where(front[:, None], within[i], [0, 0, 1]))
-        inside = front & (pixel > 0).all(1) & (pixel < [camera.width, camera.height]).all(1)
+        inside = (
+            front & (pixel > 0).all(1) & (pixel < [camera.width, camera.height]).all(1)
+        )
         similar = ((unit[i] * unit[keyframe.frame]).sum(1) - 0.7).clip(0, 1) / 0.3
         shared[i] = np.where(inside, similar, 0).mean()
     shared[keyframe.frame] = 0
@@ -258,13 +289,19 @@ def _residuals(
     pixels, slope = np.zeros((2, len(observations.frame), 2))
     for j in keyframe.sources:
         rows = observations.frame == j
-        which, camera = observations.landmark[rows], recording.cameras[j]
+        which = observations.landmark[rows]
+        camera = recording.cameras[j]
         rotation, translation = recording.relative(j, keyframe.frame)
-        ray, step = rays[which] @ rotation.T, 1e-4 * rho[which, None]
+        ray = rays[which] @ rotation.T
+        step = 1e-4 * rho[which, None]
         predicted = camera.project(_in_front(ray + rho[which, None] * translation))
-        beside = camera.project(_in_front(ray + (rho[which, None] + step) * translation))
+        beside = camera.project(
+            _in_front(ray + (rho[which, None] + step) * translation)
+        )
         valid = np.isfinite(predicted + beside).all(1, keepdims=True)
-        pixels[rows] = np.where(valid, observations.pixels[rows] - predicted, _FAR_OFF_PX)
+        pixels[rows] = np.where(
+            valid, observations.pixels[rows] - predicted, _FAR_OFF_PX
+        )
         slope[rows] = np.where(valid, (beside - predicted) / step, 0)
     whitened = np.einsum("nij,nj->ni", observations.whitening, pixels)
     slope = np.einsum("nij,nj->ni", observations.whitening, slope)
@@ -279,15 +316,20 @@ def _in_front(points: Array) -> Array:
 def _update_depths(
     recording: PreparedFrames, keyframe: KeyframeTracks, observations: Observations
 ) -> None:
-    marks, n = keyframe.landmarks, len(keyframe.landmarks)
+    marks = keyframe.landmarks
+    n = len(keyframe.landmarks)
     _, residual, slope, weight = _residuals(recording, keyframe, observations)
     which = observations.landmark
     gradient = np.bincount(which, weight * (slope * residual).sum(1), n)
     hessian = np.bincount(which, weight * (slope**2).sum(1), n) + 1e-9
-    least, most = 0.6 / FAR_M, 1.25 / NEAR_M
-    rho, scale = marks.inverse_depth, recording.depth_scale
+    least = 0.6 / FAR_M
+    most = 1.25 / NEAR_M
+    rho = marks.inverse_depth
+    scale = recording.depth_scale
     rho = rho + (gradient / hessian).clip(-0.15 * rho, 0.15 * rho)
-    keyframe.landmarks = replace(marks, inverse_depth=rho.clip(least / scale, most / scale))
+    keyframe.landmarks = replace(
+        marks, inverse_depth=rho.clip(least / scale, most / scale)
+    )
 
 
 def _confirm(

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from evercal.recordings.formats import generic as generic
     from evercal.recordings.load import FORMATS as FORMATS
     from evercal.recordings.load import load_recording as load_recording
-    from evercal.recordings.poses.robot_poses import read_robot_poses as read_robot_poses
+    from evercal.recordings.poses.robot_poses import (
+        read_robot_poses as read_robot_poses,
+    )
     from evercal.recordings.read_options import ReadOptions as ReadOptions
 
 _LOADED_ON_USE = {

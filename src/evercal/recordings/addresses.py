@@ -43,7 +43,9 @@ def local_copy(address: str) -> Iterator[Path]:
             for file in _files(store, root, address):
                 inside = file.removeprefix(root).strip("/")
                 if ".." in inside.split("/"):
-                    raise InputError(f"{address}: its file {inside!r} leads out of it; rename it")
+                    raise InputError(
+                        f"{address}: its file {inside!r} leads out of it; rename it"
+                    )
                 to = target / inside if inside else target
                 to.parent.mkdir(parents=True, exist_ok=True)
                 store.get_file(file, str(to))

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 Mount = Literal["eye_to_hand", "eye_in_hand"]
 MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
-MIN_GRIPPER_FRAMES = 8  # the same for a camera on the gripper: a few views around one place
+MIN_GRIPPER_FRAMES = (
+    8  # the same for a camera on the gripper: a few views around one place
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +64,16 @@ def posed_frames(frames: Iterable[Frame]) -> tuple[Frame, ...]:
 
 def stated_poses(frames: Iterable[Frame]) -> SE3:
     """(n,) base_from_camera of the frames that have one."""
-    return SE3.stack([f.base_from_camera for f in frames if f.base_from_camera is not None])
+    return SE3.stack(
+        [f.base_from_camera for f in frames if f.base_from_camera is not None]
+    )
 
 
 def stated_grippers(frames: Iterable[Frame]) -> SE3:
     """(n,) base_from_gripper of the frames that have one."""
-    return SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper is not None])
+    return SE3.stack(
+        [f.base_from_gripper for f in frames if f.base_from_gripper is not None]
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +114,16 @@ def with_images(recording: Recording, folder: Path) -> Recording:
     """Leave out frames without a readable image file in `folder`; more than half are refused."""
     both = recording.train + recording.test
     files = {frame.name: file for frame in both if (file := file_of(frame.image))}
-    lost = {n: os.path.relpath(f, folder) for n, f in files.items() if not is_readable(f)}
+    lost = {
+        n: os.path.relpath(f, folder) for n, f in files.items() if not is_readable(f)
+    }
     if not lost:
         return recording
     is_there = files[next(iter(lost))].is_file()
     unused = set() if is_there else {*files_in(folder, glob="**/*")} - {*files.values()}
-    note = lost_images([*lost.values()], len(files), [os.path.relpath(f, folder) for f in unused])
+    note = lost_images(
+        [*lost.values()], len(files), [os.path.relpath(f, folder) for f in unused]
+    )
     train = tuple(frame for frame in recording.train if frame.name not in lost)
     test = tuple(frame for frame in recording.test if frame.name not in lost)
     return replace(recording, train=train, test=test, notes=(*recording.notes, note))
@@ -123,7 +133,9 @@ def lost_images(lost: Sequence[str], total: int, unused: Iterable[str] = ()) -> 
     """A note of images that are left out, with one of `unused` files that the first may be."""
     words = f"{len(lost)} of {total} images are missing or unreadable"
     if 2 * len(lost) > total:
-        raise ValueError(f"{words}: {few(lost, unused)}; restore them or take their entries out")
+        raise ValueError(
+            f"{words}: {few(lost, unused)}; restore them or take their entries out"
+        )
     return f"{words} and left out: {few(lost, unused)}"
 
 
@@ -137,4 +149,6 @@ def posed_recording(recording: Recording) -> Recording:
 def lacks_camera_poses(recording: Recording) -> bool:
     """Whether a recording states gripper poses but no camera poses."""
     stated = any(frame.base_from_camera is not None for frame in recording.train)
-    return not stated and any(frame.base_from_gripper is not None for frame in recording.train)
+    return not stated and any(
+        frame.base_from_gripper is not None for frame in recording.train
+    )

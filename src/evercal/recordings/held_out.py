@@ -10,7 +10,8 @@ from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording, checked
 if TYPE_CHECKING:
     from evercal.recordings.addresses import RecordingAt
 
-EVERY, BLOCK = 100, 4
+EVERY = 100
+BLOCK = 4
 Named = TypeVar("Named", bound="Recording | RecordingAt")
 
 
@@ -40,7 +41,9 @@ def named_recording(recording: Named, name: str | None, taken: Iterable[str]) ->
     """A recording under the name that its scene will have; its own name by default."""
     name = checked_name(recording.name if name is None else name)
     if name in taken:
-        raise InputError(f"scene {name!r}: a scene of this name exists; give another with --name")
+        raise InputError(
+            f"scene {name!r}: a scene of this name exists; give another with --name"
+        )
     return replace(recording, name=name)
 
 

@@ -16,7 +16,9 @@ def image_files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
     for path in map(Path, paths):
         if path.is_dir():
             if not (inside := files_in(path)):
-                raise InputError(f"{path}: no images in this folder ({', '.join(IMAGE_ENDINGS)})")
+                raise InputError(
+                    f"{path}: no images in this folder ({', '.join(IMAGE_ENDINGS)})"
+                )
             files += inside
         elif path.is_file():
             files.append(path)

@@ -23,7 +23,8 @@ _JPEG, _SCAN, _MOST_SCANS = b"\xff\xd8", b"\xff\xda", 100
 """Beginning of a JPEG file, and of a scan in it: progressive files have about ten."""
 _TURNED = re.compile(rb"(\x01\x12\0\x03\0{3}\x01\0|\x12\x01\x03\0\x01\0{3})[\x02-\x08]")
 """EXIF orientation other than upright."""
-_TIFF, _PNG = {b"II*\0": "<u4", b"MM\0*": ">u4"}, b"\x89PNG"
+_TIFF = {b"II*\0": "<u4", b"MM\0*": ">u4"}
+_PNG = b"\x89PNG"
 
 
 class StoredImage(ABC):
@@ -66,7 +67,9 @@ def file_of(image: Picture) -> Path | None:
     return file if isinstance(file, Path) else None
 
 
-def files_in(folder: Path, end: tuple[str, ...] = IMAGE_ENDINGS, glob: str = "*") -> list[Path]:
+def files_in(
+    folder: Path, end: tuple[str, ...] = IMAGE_ENDINGS, glob: str = "*"
+) -> list[Path]:
     """Files in a folder with one of some endings, in lower case; image-2 comes before image-10.
 
     Hidden files, such as ._a.jpg that macOS puts beside a.jpg, are no content.
@@ -99,17 +102,23 @@ def is_readable(image: Path | NDArray[np.uint8]) -> bool:
     Of a PNG the checksums are compared, which takes a tenth of the time.
     """
     with suppress(OSError, ValueError):  # ValueError: the file is empty
-        data = np.asarray(np.memmap(image, mode="r") if isinstance(image, Path) else image)
+        data = np.asarray(
+            np.memmap(image, mode="r") if isinstance(image, Path) else image
+        )
         return _is_whole_png(data) or decode_image(data) is not None
     return False
 
 
 def _is_whole_png(data: NDArray[np.uint8]) -> bool:
-    at, kind = 8, b""
+    at = 8
+    kind = b""
     while data[:4].tobytes() == _PNG and kind != b"IEND" and at + 12 <= len(data):
         end = at + 8 + int.from_bytes(data[at : at + 4].tobytes(), "big")
         kind = data[at + 4 : at + 8].tobytes()
-        if zlib.crc32(data[at + 4 : end].data).to_bytes(4, "big") != data[end : end + 4].tobytes():
+        if (
+            zlib.crc32(data[at + 4 : end].data).to_bytes(4, "big")
+            != data[end : end + 4].tobytes()
+        ):
             return False
         at = end + 4
     return kind == b"IEND"
@@ -132,7 +141,11 @@ def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
         pixels = np.asarray(image)
     except (TypeError, ValueError):
         raise InputError("image: not an array; give (H, W, 3) uint8 RGB") from None
-    if isinstance(image, (list, tuple)) and np.issubdtype(pixels.dtype, np.integer) and pixels.size:
+    if (
+        isinstance(image, (list, tuple))
+        and np.issubdtype(pixels.dtype, np.integer)
+        and pixels.size
+    ):
         in_range = pixels.min() >= 0 and pixels.max() <= 255
         pixels = pixels.astype(np.uint8) if in_range else pixels
     channels = pixels.shape[2:] or (1,)
@@ -143,9 +156,13 @@ def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
             f" (H, W, 3) RGB or (H, W, 4) RGBA as uint8 or uint16"
         )
     if pixels.dtype == np.uint16:
-        wide, pixels = pixels, np.empty(pixels.shape, np.uint8)
-        for row in range(0, len(wide), 64):  # in parts, because the sums take four bytes each
-            pixels[row : row + 64] = (wide[row : row + 64].astype(np.uint32) + 128) // 257
+        wide = pixels
+        pixels = np.empty(pixels.shape, np.uint8)
+        # In parts, because the sums take four bytes each.
+        for row in range(0, len(wide), 64):
+            pixels[row : row + 64] = (
+                wide[row : row + 64].astype(np.uint32) + 128
+            ) // 257
     if channels == (1,):
         pixels = np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, axis=2)
     return np.ascontiguousarray(pixels[:, :, :3])
@@ -169,7 +186,9 @@ def read_image(path: str | os.PathLike[str], turned: bool = True) -> NDArray[np.
     return image
 
 
-def decode_image(data: NDArray[np.uint8], turned: bool = True) -> NDArray[np.uint8] | None:
+def decode_image(
+    data: NDArray[np.uint8], turned: bool = True
+) -> NDArray[np.uint8] | None:
     """Decode (n,) uint8 bytes of an image file as by `read_image`; None if they are no image."""
     import cv2
 
@@ -204,17 +223,26 @@ def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
 
     path = Path(path)
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-        raise ValueError(f"an image is (H, W, 3) uint8, got {image.shape} {image.dtype}")
+        raise ValueError(
+            f"an image is (H, W, 3) uint8, got {image.shape} {image.dtype}"
+        )
     try:
-        encoded, data = cv2.imencode(path.suffix, np.ascontiguousarray(image[:, :, ::-1]))
+        encoded, data = cv2.imencode(
+            path.suffix, np.ascontiguousarray(image[:, :, ::-1])
+        )
     except cv2.error:
-        encoded, data = False, np.empty(0, np.uint8)
+        encoded = False
+        data = np.empty(0, np.uint8)
     if not encoded:
-        raise InputError(f"{path}: '{path.suffix}' is no image format; use .png or .jpg")
+        raise InputError(
+            f"{path}: '{path.suffix}' is no image format; use .png or .jpg"
+        )
     path.write_bytes(data.tobytes())
 
 
-def write_jpeg(path: str | os.PathLike[str], image: NDArray[np.uint8], quality: int) -> None:
+def write_jpeg(
+    path: str | os.PathLike[str], image: NDArray[np.uint8], quality: int
+) -> None:
     """Write (H, W, 3) uint8 RGB, whole or not at all; missing folders are created."""
     data = encode_jpeg(image, quality)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -231,5 +259,7 @@ def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
 
 def image_size(image: str | os.PathLike[str] | StoredImage) -> tuple[int, int]:
     """Width and height in pixels of an image file, turned upright as by `read_image`."""
-    height, width = pixels_of(image if isinstance(image, StoredImage) else Path(image)).shape[:2]
+    height, width = pixels_of(
+        image if isinstance(image, StoredImage) else Path(image)
+    ).shape[:2]
     return width, height

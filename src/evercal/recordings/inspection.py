@@ -21,7 +21,8 @@ from evercal.recordings.images import file_of
 from evercal.recordings.pictures import look_at
 from evercal.recordings.poses.pose_evidence import rotation_warnings
 
-SAME_M, SAME_DEG = 0.001, 0.1
+SAME_M = 0.001
+SAME_DEG = 0.1
 LARGEST_EXTENT_M = 100.0
 LARGEST_STEP_M = 0.5
 SMALLEST_EXTENT_M = 0.05
@@ -66,8 +67,12 @@ def inspect_recording(recording: Recording) -> Inspection:
     both = (*recording.train, *recording.test)
     grippers = any(frame.base_from_gripper for frame in both)
     owner = "camera" if posed_frames(both) else "gripper" if grippers else "none"
-    pose_of = attrgetter("base_from_gripper" if owner == "gripper" else "base_from_camera")
-    train, test = (tuple(filter(pose_of, part)) for part in (recording.train, recording.test))
+    pose_of = attrgetter(
+        "base_from_gripper" if owner == "gripper" else "base_from_camera"
+    )
+    train, test = (
+        tuple(filter(pose_of, part)) for part in (recording.train, recording.test)
+    )
     cameras = Counter(frame.camera for frame in both)
     for size in {(camera.width, camera.height) for camera in cameras}:
         next(f for f in both if (f.camera.width, f.camera.height) == size).read_image()
@@ -75,23 +80,34 @@ def inspect_recording(recording: Recording) -> Inspection:
     extent = np.ptp(poses.translation_m, axis=0) if len(train) else np.zeros(3)
     untracked = recording.untracked + len(both) - len(train) - len(test)
     shown = look_at(recording.train)
-    warnings = [*_frame_warnings(len(train), len(test), untracked, owner), *shown.warnings]
+    warnings = [
+        *_frame_warnings(len(train), len(test), untracked, owner),
+        *shown.warnings,
+    ]
     warnings += [warning for camera in cameras for warning in _camera_warnings(camera)]
     step_m = step_deg = largest_m = near = None
     if len(train) > 1:
         metres, radians = pose_distance(poses[:-1], poses[1:])
-        step_m, step_deg = float(np.median(metres)), float(np.rad2deg(np.median(radians)))
-        largest_m, of_camera = float(metres.max()), owner == "camera"
+        step_m = float(np.median(metres))
+        step_deg = float(np.rad2deg(np.median(radians)))
+        largest_m = float(metres.max())
+        of_camera = owner == "camera"
         if recording.metric:
             warnings += _motion_warnings(poses, float(extent.max()), step_m, of_camera)
         if np.rad2deg(pose_distance(poses[0], poses)[1].max()) < SAME_DEG:
-            warnings.append("all training frames look the same way; are the rotations missing?")
+            warnings.append(
+                "all training frames look the same way; are the rotations missing?"
+            )
         if shown.usable:
             warnings += rotation_warnings(train, poses, of_camera)
     if train and test:
         same_m = SAME_M if recording.metric else SAME_M * float(extent.max())
         warnings += _copy_warnings(train, test, poses, tested, same_m)
-        near = 100 * float(near_training(poses, tested).mean()) if recording.metric else None
+        near = (
+            100 * float(near_training(poses, tested).mean())
+            if recording.metric
+            else None
+        )
     x, y, z = extent.tolist()
     return Inspection(
         name=recording.name,
@@ -155,7 +171,9 @@ def _camera_warnings(camera: Camera) -> Iterator[str]:
         yield f"{name}: fx {camera.fx:.0f} and fy {camera.fy:.0f} differ; square pixels?"
 
 
-def _motion_warnings(poses: SE3, extent: float, step: float, of_camera: bool) -> Iterator[str]:
+def _motion_warnings(
+    poses: SE3, extent: float, step: float, of_camera: bool
+) -> Iterator[str]:
     rotation_deg = np.rad2deg(pose_distance(poses[0], poses)[1].max())
     reach = float(np.median(np.linalg.norm(poses.translation_m, axis=1)))
     if reach > LARGEST_REACH_M and not of_camera:
@@ -180,7 +198,11 @@ def _motion_warnings(poses: SE3, extent: float, step: float, of_camera: bool) ->
 
 
 def _copy_warnings(
-    train: Sequence[Frame], test: Sequence[Frame], poses: SE3, tested: SE3, same_m: float
+    train: Sequence[Frame],
+    test: Sequence[Frame],
+    poses: SE3,
+    tested: SE3,
+    same_m: float,
 ) -> Iterator[str]:
     from scipy.spatial import KDTree
 

@@ -35,7 +35,9 @@ class Format:
 
 FORMATS = {
     "generic": Format("generic", "scene.json"),
-    "7scenes": Format("seven_scenes", "TrainSplit.txt, TestSplit.txt and seq-XX folders"),
+    "7scenes": Format(
+        "seven_scenes", "TrainSplit.txt, TestSplit.txt and seq-XX folders"
+    ),
     "12scenes": Format("twelve_scenes", "info.txt and data"),
     "nerfstudio": Format("nerfstudio", "transforms.json"),
     "colmap": Format("colmap", "sparse/0 with cameras and images"),
@@ -50,7 +52,9 @@ FORMATS = {
 
 def recognised(root: Path) -> str | None:
     """The format that the files of a folder or a bag are of; None if they are of none."""
-    return next((key for key, entry in FORMATS.items() if entry.reader.detect(root)), None)
+    return next(
+        (key for key, entry in FORMATS.items() if entry.reader.detect(root)), None
+    )
 
 
 def load_recording(
@@ -71,20 +75,28 @@ def load_recording(
         InputError: The recording is missing or broken, or its format is unknown or does not use an
             option that was given.
     """
-    root, options = Path(path), options or ReadOptions()
+    root = Path(path)
+    options = options or ReadOptions()
     if format is not None and format not in FORMATS:
-        raise InputError(f"format {format!r} is not known; use one of {', '.join(FORMATS)}")
+        raise InputError(
+            f"format {format!r} is not known; use one of {', '.join(FORMATS)}"
+        )
     if not root.exists():
         raise InputError(f"{root}: no such folder; give the folder of a recorded scene")
     if format is None:
         format = recognised(root)
     if format is None:
-        what = "no known scene format" if root.is_dir() else "a file, not a folder, and no bag"
+        what = (
+            "no known scene format"
+            if root.is_dir()
+            else "a file, not a folder, and no bag"
+        )
         known = ", ".join(f"{entry.contents} ({key})" for key, entry in FORMATS.items())
         raise InputError(f"{root}: {what}; expected {known}")
     if options.every < 1:
         raise InputError(f"--every {options.every}: give a number >= 1")
-    read, uses = FORMATS[format].reader.load, FORMATS[format].uses
+    read = FORMATS[format].reader.load
+    uses = FORMATS[format].uses
     for given in options.given():
         if given not in ("every", *uses):
             users = [key for key, entry in FORMATS.items() if given in entry.uses]
@@ -94,7 +106,9 @@ def load_recording(
             )
     recording = read(root, options) if uses else read(root)
     if options.every > 1:
-        train, test = (part[:: options.every] for part in (recording.train, recording.test))
+        train, test = (
+            part[:: options.every] for part in (recording.train, recording.test)
+        )
         recording = dataclasses.replace(recording, train=train, test=test)
     with named_errors(root, "recording"):
         recording = with_images(recording, root if root.is_dir() else root.parent)

@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import Picture, StoredImage, file_of, pixels_of, read_image
+from evercal.recordings.images import (
+    Picture,
+    StoredImage,
+    file_of,
+    pixels_of,
+    read_image,
+)
 
 SOFT_PX = 9
 """Side of the square that softens the edge of what is left: a hard one would be texture."""
@@ -27,7 +33,8 @@ class MaskedImage(StoredImage):
 
     def read(self) -> NDArray[np.uint8]:
         """(H, W, 3), with its mean colour where the mask is black."""
-        image, mask = pixels_of(self.image), read_image(self.mask)[..., 0] > 0
+        image = pixels_of(self.image)
+        mask = read_image(self.mask)[..., 0] > 0
         if mask.shape != image.shape[:2]:
             raise InputError(
                 f"{self.mask}: mask is {mask.shape[1]}x{mask.shape[0]}, its image"
@@ -67,4 +74,6 @@ def _masked(frame: Frame, folder: Path) -> Frame:
         return frame
     places = [folder / f"{file.stem}.png", folder / f"{file.name}.png"]
     mask = next((place for place in places if place.is_file()), None)
-    return frame if mask is None else replace(frame, image=MaskedImage(frame.image, mask))
+    return (
+        frame if mask is None else replace(frame, image=MaskedImage(frame.image, mask))
+    )

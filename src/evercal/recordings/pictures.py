@@ -40,22 +40,40 @@ def look_at(frames: Sequence[Frame]) -> Pictures:
     images = [_small(frames[i].read_image()) for i in chosen]
     if blank := [image for image in images if is_blank(image)]:
         level = float(np.median([np.median(image) for image in blank]))
-        what = "almost black" if level < 48 else "almost white" if level > 207 else "of one colour"
-        hint = "; if 12-bit values are stored in 16 bits, multiply them by 16" * (level < 48)
-        words = f"{len(blank)} of {len(images)} images that were looked at are {what}{hint}"
+        what = (
+            "almost black"
+            if level < 48
+            else "almost white"
+            if level > 207
+            else "of one colour"
+        )
+        hint = "; if 12-bit values are stored in 16 bits, multiply them by 16" * (
+            level < 48
+        )
+        words = (
+            f"{len(blank)} of {len(images)} images that were looked at are {what}{hint}"
+        )
         return Pictures((words,), 2 * len(blank) <= len(images))
-    tiny = [cv2.resize(image, (40, 30), interpolation=cv2.INTER_AREA) for image in images]
+    tiny = [
+        cv2.resize(image, (40, 30), interpolation=cv2.INTER_AREA) for image in images
+    ]
     change = np.abs(np.diff(np.stack(tiny).astype(np.float64), axis=0)).mean((1, 2, 3))
     if len(images) > 1 and np.median(change) < _SAME:
-        return Pictures(("all images are the same; is each pose that of its image?",), False)
+        return Pictures(
+            ("all images are the same; is each pose that of its image?",), False
+        )
     if np.median([sharpness(image) for image in images]) < _BLURRED:
-        return Pictures(("all images are blurred; check focus and exposure time",), usable=True)
+        return Pictures(
+            ("all images are blurred; check focus and exposure time",), usable=True
+        )
     return Pictures((), usable=True)
 
 
 def is_blank(image: NDArray[np.uint8]) -> bool:
     """Whether an image (h, w, 3) is black, white or of one colour."""
-    darkest, brightest = np.quantile(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), [0.01, 0.99])
+    darkest, brightest = np.quantile(
+        cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), [0.01, 0.99]
+    )
     return bool(brightest - darkest < _BLANK)
 
 
@@ -68,8 +86,11 @@ def sharpness(image: NDArray[np.uint8]) -> float:
     from scipy.linalg import eigh
 
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    fine, middle, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1.0, 2.0, 4.0))
-    above, below = _structure(fine - middle), _structure(middle - coarse)
+    fine, middle, coarse = (
+        cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1.0, 2.0, 4.0)
+    )
+    above = _structure(fine - middle)
+    below = _structure(middle - coarse)
     if np.linalg.eigvalsh(below)[0] < _FLAT:
         return 0.0
     return float(np.sqrt(max(eigh(above, below, eigvals_only=True)[0], 0.0)))

@@ -106,9 +106,13 @@ def _chosen(source: str, images: Path, motion: float, most: int) -> list[str]:
     folder = Path(source).is_dir()
     names = []
     for frame in stream(source) if folder else _moving(stream(source), motion):
-        name = Path(frame.name).stem + ".jpg" if folder else f"{int(frame.name):06d}.jpg"
+        name = (
+            Path(frame.name).stem + ".jpg" if folder else f"{int(frame.name):06d}.jpg"
+        )
         if name in names:
-            raise InputError(f"{source}: has two images called {Path(name).stem}; rename one")
+            raise InputError(
+                f"{source}: has two images called {Path(name).stem}; rename one"
+            )
         images.mkdir(parents=True, exist_ok=True)
         write_image(images / name, frame.image)
         names.append(name)
@@ -132,12 +136,15 @@ def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFram
             continue
         grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         scale = _SMALL_PX / grey.shape[1]
-        resized = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        resized = cv2.resize(
+            grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
+        )
         small = np.asarray(resized, np.uint8)
         moved = np.inf if last is None else _motion(last, small)
         if best is not None and moved > 1.5 * motion:
             yield best[1]
-            last, best = best[2], None
+            last = best[2]
+            best = None
             moved = _motion(last, small)
         if moved > motion:
             sharp = float(cv2.Laplacian(small, cv2.CV_64F).var())
@@ -156,7 +163,9 @@ def _motion(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:
     found = status.ravel() == 1
     if found.mean() < 0.3:
         return np.inf
-    return float(np.median(np.linalg.norm((moved - corners)[found], axis=-1))) / _SMALL_PX
+    return (
+        float(np.median(np.linalg.norm((moved - corners)[found], axis=-1))) / _SMALL_PX
+    )
 
 
 def _match(pycolmap: Any, root: Path, names: list[str]) -> None:
@@ -174,7 +183,8 @@ def _match(pycolmap: Any, root: Path, names: list[str]) -> None:
 
 
 def _mapped(pycolmap: Any, root: Path, count: int, on_step: OnStep) -> list[Any]:
-    working, done = root / "mapping", itertools.count(1)
+    working = root / "mapping"
+    done = itertools.count(1)
     working.mkdir()
     on_step("mapping", 0, count)
     found = pycolmap.incremental_mapping(

@@ -46,11 +46,15 @@ def sample_rooms() -> tuple[SampleRoom, ...]:
 def copy_samples(target: Path) -> None:
     """Copy `bedroom`, `kitchen`, `living` and `cell` to a new or empty folder."""
     if target.exists() and not target.is_dir():
-        raise InputError(f"{target}: is a file; name a new folder for the sample recordings")
+        raise InputError(
+            f"{target}: is a file; name a new folder for the sample recordings"
+        )
     sources = {name: FOLDER / name for name in ROOMS} | {"cell": CELL}
     try:
         if target.is_dir() and any(target.iterdir()):
-            raise InputError(f"{target}: is not empty; name a new folder for the recordings")
+            raise InputError(
+                f"{target}: is not empty; name a new folder for the recordings"
+            )
         for name, source in sources.items():
             # Installed packages can be read-only; copyfile leaves the copies writable.
             shutil.copytree(source, target / name, copy_function=shutil.copyfile)

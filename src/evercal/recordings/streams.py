@@ -71,10 +71,13 @@ def _captured(source: str) -> Iterator[StreamFrame]:
     live = is_live(source)
     capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
     if not capture.isOpened():
-        raise InputError(f"{source}: cannot be opened as a video; check path, address and codec")
+        raise InputError(
+            f"{source}: cannot be opened as a video; check path, address and codec"
+        )
 
     def frames() -> Iterator[StreamFrame]:
-        number, unreadable = 0, 0
+        number = 0
+        unreadable = 0
         try:
             while unreadable < (_MOST_UNREADABLE if live else 1):
                 good, bgr = capture.read()
@@ -82,10 +85,13 @@ def _captured(source: str) -> Iterator[StreamFrame]:
                     unreadable += 1
                     continue
                 arrived = time.monotonic()
-                stamp = time.time() if live else capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+                stamp = (
+                    time.time() if live else capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+                )
                 image = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
                 yield StreamFrame(str(number), stamp, image, arrived)
-                number, unreadable = number + 1, 0
+                number = number + 1
+                unreadable = 0
         finally:
             capture.release()
 

@@ -19,7 +19,9 @@ _OF_OPENCV = re.compile(r"^%.*$|!!opencv-[a-z-]+", re.MULTILINE)
 
 
 @contextmanager
-def named_errors(path: Path | str, what: str, remedy: str = "check the path") -> Iterator[None]:
+def named_errors(
+    path: Path | str, what: str, remedy: str = "check the path"
+) -> Iterator[None]:
     """Turn errors while a file is read into an `InputError` that names it.
 
     `what` names the contents of the file. A ValueError is about the contents and already says what
@@ -32,7 +34,9 @@ def named_errors(path: Path | str, what: str, remedy: str = "check the path") ->
     except OSError as error:
         raise InputError(f"{path}: {what} cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: {what} is not a text file; {remedy}, or save text") from None
+        raise InputError(
+            f"{path}: {what} is not a text file; {remedy}, or save text"
+        ) from None
     except (RecursionError, MemoryError):
         raise InputError(f"{path}: {what} is nested too deeply or too large") from None
     except (ValueError, TypeError, OverflowError, EOFError) as error:
@@ -40,7 +44,9 @@ def named_errors(path: Path | str, what: str, remedy: str = "check the path") ->
 
 
 @contextmanager
-def library_errors(what: str, remedies: Mapping[str, str] | None = None) -> Iterator[None]:
+def library_errors(
+    what: str, remedies: Mapping[str, str] | None = None
+) -> Iterator[None]:
     """Turn errors of another library into an `InputError`: damaged files make it raise any type.
 
     `remedies` are of errors by words in them.
@@ -127,9 +133,17 @@ def yaml_documents(text: str) -> list[Any]:
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
             nodes += isinstance(event, yaml.NodeEvent)
-            word, tag = getattr(event, "value", ""), getattr(event, "tag", None)
-            if isinstance(event, yaml.AliasEvent) or word == "<<" or tag or depth > _DEPTH:
-                raise ValueError("it holds references (*name), tags (!name) or nests too deeply")
+            word = getattr(event, "value", "")
+            tag = getattr(event, "tag", None)
+            if (
+                isinstance(event, yaml.AliasEvent)
+                or word == "<<"
+                or tag
+                or depth > _DEPTH
+            ):
+                raise ValueError(
+                    "it holds references (*name), tags (!name) or nests too deeply"
+                )
             require_at_most(nodes, "nodes", "values in YAML")
             require_at_most(len(word), "cell_characters", "characters of a value")
         return list(yaml.load_all(text, loader))
@@ -141,7 +155,9 @@ def few(names: Sequence[str], near: Iterable[str] = (), most: int = 3) -> str:
     """The first names, and the one of `near` that is most like the first."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     like = {name.lower(): f" (nearest: {name})" for name in sorted(near)}
-    best = [like[m] for n in names[:1] for m in get_close_matches(n.lower(), like, 1, 0.7)]
+    best = [
+        like[m] for n in names[:1] for m in get_close_matches(n.lower(), like, 1, 0.7)
+    ]
     return "".join([", ".join(names[:most]), more, *best])
 
 
@@ -158,7 +174,9 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Sorting key that puts `image-2` before `image-10`."""
     parts = re.findall(r"[0-9]+|[^0-9]+", name)
     return tuple(
-        (0, len(p.lstrip("0")), f"{p.lstrip('0')} {p}") if p[0] in "0123456789" else (1, 0, p)
+        (0, len(p.lstrip("0")), f"{p.lstrip('0')} {p}")
+        if p[0] in "0123456789"
+        else (1, 0, p)
         for p in parts
     )
 

@@ -38,7 +38,8 @@ def answer_row(answer: Answer) -> dict[str, object]:
     from evercal.geometry import pose_to_dict
 
     estimate = answer.estimate
-    pose, uncertain = pose_to_dict(estimate.base_from_camera), finite_pose(estimate)
+    pose = pose_to_dict(estimate.base_from_camera)
+    uncertain = finite_pose(estimate)
     if pose is not None and estimate.base_from_camera is not None:
         pose["matrix"] = estimate.base_from_camera.matrix().tolist()
     terms = [{**vars(term), "share": share} for term, share in budget_of(estimate)]
@@ -66,7 +67,9 @@ def answer_row(answer: Answer) -> dict[str, object]:
 def finite_pose(estimate: "PoseEstimate") -> "UncertainPose | None":
     """The pose with its covariance; None without a usable one."""
     uncertain = estimate.uncertain_pose
-    finite = uncertain is not None and all(map(math.isfinite, uncertain.covariance.flat))
+    finite = uncertain is not None and all(
+        map(math.isfinite, uncertain.covariance.flat)
+    )
     return uncertain if finite else None
 
 

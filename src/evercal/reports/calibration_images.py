@@ -47,7 +47,9 @@ class BoardSeen:
 
     def projected(self, camera: Camera) -> Array:
         """Return the (k, 2) pixels of the corners by the calibration."""
-        return camera.project(self.camera_from_board.apply(self.scale * self.view.points_m))
+        return camera.project(
+            self.camera_from_board.apply(self.scale * self.view.points_m)
+        )
 
 
 class ImageFile(NamedTuple):
@@ -83,13 +85,20 @@ def select_images(
     """
     if given:
         uses = {Path(use.name).resolve(): use for use in calibration.images}
-        return _spread([ImageFile(path, uses.get(path.resolve())) for path in given]), ""
+        return _spread(
+            [ImageFile(path, uses.get(path.resolve())) for path in given]
+        ), ""
     if not calibration.images:
-        return [], "No pictures: the calibration names no images; pass some with --images."
+        return (
+            [],
+            "No pictures: the calibration names no images; pass some with --images.",
+        )
     used: list[ImageFile] = []
     rejected: list[ImageFile] = []
     for use in calibration.images:
-        path = next((p for p in (Path(use.name), folder / use.name) if p.is_file()), None)
+        path = next(
+            (p for p in (Path(use.name), folder / use.name) if p.is_file()), None
+        )
         if path is not None:
             (used if use.used else rejected).append(ImageFile(path, use))
     if not used and not rejected:
@@ -122,7 +131,9 @@ def annotate_images(
     """
     camera = calibration.camera
     if camera is None:
-        return AnnotatedImages(missing=("No pictures: the calibration holds no intrinsics.",))
+        return AnnotatedImages(
+            missing=("No pictures: the calibration holds no intrinsics.",)
+        )
     annotated: dict[str, LandmarkPicture] = {}
     missing = []
     for file in files:
@@ -135,7 +146,9 @@ def annotate_images(
         drawn = _with_evidence(calibration, camera, image, board or localizer)
         picture = drawn.image
         if older is not None:
-            picture = draw_axes(picture, camera, older.parent_from_child.inverse(), pale=True)
+            picture = draw_axes(
+                picture, camera, older.parent_from_child.inverse(), pale=True
+            )
         picture = draw_axes(picture, camera, calibration.parent_from_child.inverse())
         summary = "; ".join(filter(None, [_use(file.use), drawn.summary]))
         annotated[str(file.path)] = LandmarkPicture(picture, drawn.landmarks, summary)
@@ -144,10 +157,13 @@ def annotate_images(
         missing.append("No landmarks: pass --store to draw them.")
     if localizer is None:
         return AnnotatedImages(annotated, tuple(missing))
-    scene, digest = _scene_of(calibration, localizer), calibration.source.get("map")
+    scene = _scene_of(calibration, localizer)
+    digest = calibration.source.get("map")
     other = digest is not None and (scene is None or scene.digest != digest)
     still = scene is not None and scene.unit_known and scene.parent_frame == "base"
-    around = Surroundings.of(scene if still and calibration.mount == "eye_to_hand" else None)
+    around = Surroundings.of(
+        scene if still and calibration.mount == "eye_to_hand" else None
+    )
     return AnnotatedImages(annotated, tuple(missing), other, around)
 
 
@@ -201,7 +217,9 @@ def _use(use: ImageUse | None) -> str:
     return "used" if use.used else f"rejected: {use.reason}"
 
 
-def _scene_of(calibration: Calibration, localizer: "LearnedLocalizer") -> SceneMap | None:
+def _scene_of(
+    calibration: Calibration, localizer: "LearnedLocalizer"
+) -> SceneMap | None:
     name, digest = (calibration.source.get(key) for key in ("scene", "map"))
     maps = [scene for scene in localizer.contents.scenes if isinstance(scene, SceneMap)]
     own = [scene for scene in maps if scene.digest == digest]  # also after a rename
@@ -212,7 +230,9 @@ def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:
     """The board in each image of a calibration by `evercal solve`, whose file lies in `folder`."""
     poses = calibration.checks.get("camera_from_board")
     given = Path(str(calibration.source.get("camera_poses", "")))
-    file = next((f for f in (folder / given, given, folder / given.name) if f.is_file()), None)
+    file = next(
+        (f for f in (folder / given, given, folder / given.name) if f.is_file()), None
+    )
     if not isinstance(poses, dict) or file is None:
         return {}
     try:
@@ -220,9 +240,12 @@ def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:
     except InputError:  # poses by other programs have no corners
         return {}
     views = {(file.parent / image.name).resolve(): image.view for image in board.images}
-    scale, seen = float(calibration.checks.get("scale", 1.0)), {}
+    scale = float(calibration.checks.get("scale", 1.0))
+    seen = {}
     for name, pose in poses.items():
-        view = views.get((folder / name).resolve()) or views.get((file.parent / name).resolve())
+        view = views.get((folder / name).resolve()) or views.get(
+            (file.parent / name).resolve()
+        )
         if view is not None:
             camera_from_board = SE3(pose["quaternion_wxyz"], pose["translation_m"])
             seen[name] = BoardSeen(view, camera_from_board, scale)

@@ -30,7 +30,8 @@ from evercal.reports.scene import (
 
 _SHOWN_ELSEWHERE = ("warnings", "left_open", "camera_sigma", "joints_move_mm")
 _LONGEST_CELL = 160
-_VIEW_PX, _BARS_PX = (420, 400), (850, 120)
+_VIEW_PX = (420, 400)
+_BARS_PX = (850, 120)
 
 
 class NamedCalibration(NamedTuple):
@@ -88,7 +89,8 @@ def calibration_page(
     missing = (*images.missing, *_missing(calibration))
     headline, _, details = (calibration.verdict or verdict(calibration)).partition(". ")
     old = None if older is None else older.calibration
-    uncertain, own_map = _has_uncertainty(calibration), calibration.source.get("map")
+    uncertain = _has_uncertainty(calibration)
+    own_map = calibration.source.get("map")
     html = render(
         "calibration.html",
         title=f"{file.name}: {calibration.parent_frame}_from_{calibration.child_frame}",
@@ -103,7 +105,9 @@ def calibration_page(
         deviations=deviation_table(calibration, point_m) if uncertain else None,
         older=older,
         difference=None if old is None else difference(calibration, old),
-        same_map=old is not None and own_map is not None and old.source.get("map") == own_map,
+        same_map=old is not None
+        and own_map is not None
+        and old.source.get("map") == own_map,
         images=images,
         origin=_origin(calibration),
         pictures=[
@@ -113,7 +117,9 @@ def calibration_page(
         landmarks_drawn=any(drawn.landmarks for drawn in images.images.values()),
         boards_drawn=boards,
         store=store,
-        camera_views=camera_views(calibration, images.surroundings) if uncertain else None,
+        camera_views=camera_views(calibration, images.surroundings)
+        if uncertain
+        else None,
         budget=error_budget(calibration),
         camera=camera_table(calibration),
         residuals=residual_chart(calibration),
@@ -155,13 +161,22 @@ def _tiles(calibration: Calibration) -> list[Tile]:
 
 def suitability_table(calibration: Calibration) -> Table:
     """The uses that a calibration serves."""
-    known, best = _level(calibration), tier(calibration)
+    known = _level(calibration)
+    best = tier(calibration)
     serves = ["yes" if known and best and t.mm >= best.mm else "no" for t in TIERS]
     rows = [
-        (t.name, f"{t.mm:g}", f"{t.deg:g}", word) for t, word in zip(TIERS, serves, strict=True)
+        (t.name, f"{t.mm:g}", f"{t.deg:g}", word)
+        for t, word in zip(TIERS, serves, strict=True)
     ]
-    header = ("use", "position error below (mm)", "rotation error below (deg)", "suitable")
-    return Table(header, rows, "A use is suitable if both expected errors lie below its bounds.")
+    header = (
+        "use",
+        "position error below (mm)",
+        "rotation error below (deg)",
+        "suitable",
+    )
+    return Table(
+        header, rows, "A use is suitable if both expected errors lie below its bounds."
+    )
 
 
 def _origin(calibration: Calibration) -> str:
@@ -169,7 +184,11 @@ def _origin(calibration: Calibration) -> str:
         return ""
     pose = calibration.parent_from_child.inverse()
     pixel, outside = origin_in_view(calibration.camera, pose)
-    return f"lies {outside}" if outside else f"projects to pixel ({pixel[0]:.1f}, {pixel[1]:.1f})"
+    return (
+        f"lies {outside}"
+        if outside
+        else f"projects to pixel ({pixel[0]:.1f}, {pixel[1]:.1f})"
+    )
 
 
 def _missing(calibration: Calibration) -> list[str]:
@@ -178,7 +197,8 @@ def _missing(calibration: Calibration) -> list[str]:
         "No uncertainty: the calibration states none.": _has_uncertainty(calibration),
         "No list of images: the calibration holds none.": calibration.images,
         "No error budget: the calibration holds none.": calibration.error_terms,
-        "No repeatability: two halves of the data were not compared.": "repeatability_mm" in checks,
+        "No repeatability: two halves of the data were not compared.": "repeatability_mm"
+        in checks,
         "No held-out error: no data were held out.": "held_out_mm" in checks,
         "No intrinsics: the calibration holds none.": calibration.camera,
     }
@@ -193,7 +213,8 @@ def deviation_table(
     calibration: Calibration, point_m: tuple[float, float, float] | None = None
 ) -> Table:
     """Standard deviations along axes: of the position, the rotation, and a point if given."""
-    parent, child = calibration.parent_frame, calibration.child_frame
+    parent = calibration.parent_frame
+    child = calibration.child_frame
     uncertain = calibration.uncertain_pose
     sigma = np.sqrt(np.diag(calibration.covariance).clip(0))
     position = [*(1000 * sigma[:3]), calibration.sigma_mm]
@@ -206,7 +227,9 @@ def deviation_table(
         axes = 1000 * np.sqrt(np.diag(uncertain.point_covariance(point_m)).clip(0))
         point = ", ".join(f"{value:g}" for value in point_m)
         name = f"point ({point}) m of {child} along the axes of {parent} (mm)"
-        rows.append((name, *(f"{v:.3f}" for v in (*axes, uncertain.point_sigma_mm(point_m)))))
+        rows.append(
+            (name, *(f"{v:.3f}" for v in (*axes, uncertain.point_sigma_mm(point_m))))
+        )
     return Table(("", "x", "y", "z", "root mean square"), rows, "Standard deviations")
 
 
@@ -214,22 +237,35 @@ def error_budget(calibration: Calibration) -> Table:
     """The causes of the uncertainty and their sum."""
     terms = calibration.error_terms
     rows = [
-        (term.name, f"{term.translation_mm:.2f}", f"{term.rotation_deg:.3f}", f"{100 * share:.0f}")
+        (
+            term.name,
+            f"{term.translation_mm:.2f}",
+            f"{term.rotation_deg:.3f}",
+            f"{100 * share:.0f}",
+        )
         for term, share in zip(terms, position_shares(terms), strict=True)
     ]
     if rows:
         total = f"{calibration.sigma_mm:.2f}", f"{calibration.sigma_deg:.3f}"
         rows.append(("all", *total, "100"))
-    header = ("cause", "position (mm)", "rotation (deg)", "share of the position's variance (%)")
+    header = (
+        "cause",
+        "position (mm)",
+        "rotation (deg)",
+        "share of the position's variance (%)",
+    )
     return Table(header, rows, "Error budget: standard deviation per axis by cause")
 
 
 def use_table(calibration: Calibration) -> Table:
     """All images with their use; those of boards with what they contribute."""
-    images, checks = calibration.images, calibration.checks
+    images = calibration.images
+    checks = calibration.checks
     folders = {image.name[: image.name.rfind("/") + 1] for image in images}
     folder = folders.pop() if len(folders) == 1 else ""
-    share, moved = (checks.get(key, {}) for key in ("information_percent", "leave_one_out_mm"))
+    share, moved = (
+        checks.get(key, {}) for key in ("information_percent", "leave_one_out_mm")
+    )
     rows = [
         (
             image.name.removeprefix(folder),
@@ -242,18 +278,28 @@ def use_table(calibration: Calibration) -> Table:
         )
         for image in images
     ]
-    measures = ("residual (mm)", "residual (deg)", "information (%)", "moves position by (mm)")
+    measures = (
+        "residual (mm)",
+        "residual (deg)",
+        "information (%)",
+        "moves position by (mm)",
+    )
     used = sum(image.used for image in images)
-    caption = f"{used} of {len(images)} images used" + (f", all in {folder}" if folder else "")
+    caption = f"{used} of {len(images)} images used" + (
+        f", all in {folder}" if folder else ""
+    )
     return Table(("name", "used", "reason", *measures), rows, caption)
 
 
 def camera_table(calibration: Calibration) -> Table:
     """The intrinsics, with standard deviations where they were estimated."""
-    camera, rows = calibration.camera, []
+    camera = calibration.camera
+    rows = []
     if camera is not None:
         sigma = calibration.checks.get("camera_sigma", {})
-        values = {f"{name} (px)": getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
+        values = {
+            f"{name} (px)": getattr(camera, name) for name in ("fx", "fy", "cx", "cy")
+        }
         values |= dict(zip(COEFFICIENTS[camera.model], camera.distortion, strict=False))
         rows = [
             (name, f"{value:.4f}", _fixed(sigma.get(name.partition(" ")[0]), 4))
@@ -276,7 +322,9 @@ def check_table(calibration: Calibration) -> Table:
 def source_table(name: str, calibration: Calibration) -> Table:
     """What the calibration was made from."""
     source = {"file": name, **calibration.source, "created": calibration.created}
-    rows = [(key.replace("_", " "), _cell(value)) for key, value in source.items() if value]
+    rows = [
+        (key.replace("_", " "), _cell(value)) for key, value in source.items() if value
+    ]
     return Table(("property", "value"), rows)
 
 
@@ -292,7 +340,8 @@ def _fixed(value: float | None, digits: int) -> str:
 
 def camera_views(calibration: Calibration, around: Surroundings) -> Chart:
     """Draw the camera and the ellipsoid of its position, from above and from the side."""
-    pose, parent = calibration.uncertain_pose, calibration.parent_frame
+    pose = calibration.uncertain_pose
+    parent = calibration.parent_frame
     ends = np.stack([np.zeros(3), pose.pose.translation_m])
     extent = float(np.ptp(around.bounds(ends), axis=0).max())
     times = readable_scale([Ellipsoid.of(pose)], 0.07 * extent)
@@ -300,11 +349,14 @@ def camera_views(calibration: Calibration, around: Surroundings) -> Chart:
     half = times * np.sqrt(CHI2_95 * np.diag(pose.covariance)[:3].clip(0))
     seen = np.concatenate([ends, [ends[1] - half, ends[1] + half]])
     width, depth, _ = np.ptp(around.bounds(seen), axis=0)
-    camera, panels = calibration.camera, []
+    camera = calibration.camera
+    panels = []
     view = None if camera is None else Frustum.of(pose.pose, camera)
     for plane in (ABOVE, (int(depth > width), 2)):  # from the wider side
         shape = Shape("area", ellipse(pose, times, plane), "orange", opacity=0.3)
-        panels.append(view_panel(_VIEW_PX, plane, around, seen, view, [shape], (parent, "m")))
+        panels.append(
+            view_panel(_VIEW_PX, plane, around, seen, view, [shape], (parent, "m"))
+        )
     c, b, a = 1000 * np.sqrt(CHI2_95 * variances.clip(0))
     forward = pose.pose.rotation_matrix()[:, 2]
     angle = np.rad2deg(np.arccos(np.clip(abs(axes[:, 2] @ forward), 0.0, 1.0)))
@@ -319,13 +371,20 @@ def camera_views(calibration: Calibration, around: Surroundings) -> Chart:
 def residual_chart(calibration: Calibration) -> Chart | None:
     """Bars of the residuals of all images, cut at twice the largest used one; None without any."""
     images = calibration.images
-    rows = np.array([[i.residual_mm, i.residual_deg] for i in images], np.float64).reshape(-1, 2)
+    rows = np.array(
+        [[i.residual_mm, i.residual_deg] for i in images], np.float64
+    ).reshape(-1, 2)
     if not np.isfinite(rows).any():
         return None
-    used, panels = np.array([image.used for image in images]), []
-    numbers, end = np.arange(1.0, len(images) + 1), max(len(images), 5) + 0.6
-    width, below = 0.8 * _BARS_PX[0] / (end - 0.4), "number of the image in the table"
-    for values, unit, label in zip(np.nan_to_num(rows).T, ("mm", "deg"), ("", below), strict=True):
+    used = np.array([image.used for image in images])
+    panels = []
+    numbers = np.arange(1.0, len(images) + 1)
+    end = max(len(images), 5) + 0.6
+    width = 0.8 * _BARS_PX[0] / (end - 0.4)
+    below = "number of the image in the table"
+    for values, unit, label in zip(
+        np.nan_to_num(rows).T, ("mm", "deg"), ("", below), strict=True
+    ):
         typical = float(values[used].max(initial=0.0))
         top = max(min(1.1 * float(values.max()), 2 * typical or math.inf), 1e-3)
         ends = np.column_stack([numbers, values])
@@ -337,4 +396,7 @@ def residual_chart(calibration: Calibration) -> Chart | None:
         ]
         limits = np.array([[0.4, 0.0], [end, top]])
         panels.append(Panel(_BARS_PX, limits, (label, f"residual ({unit})"), shapes))
-    return panels, "Residual of each image; rejected ones are striped, and cut where larger."
+    return (
+        panels,
+        "Residual of each image; rejected ones are striped, and cut where larger.",
+    )

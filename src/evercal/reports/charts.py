@@ -82,19 +82,28 @@ class Panel:
         (width, height), (x, y) = self.size, self.labels
         below = [(words, at, height + 18, 1) for _, at, words in self._ticks(0)]
         beside = [(words, -8, height - at + 4, 2) for _, at, words in self._ticks(1)]
-        return [(y, -52, -12, 0), (x, width / 2, height + 40, 1), *beside, *(below if x else [])]
+        return [
+            (y, -52, -12, 0),
+            (x, width / 2, height + 40, 1),
+            *beside,
+            *(below if x else []),
+        ]
 
     def _ticks(self, axis: int) -> list[tuple[float, float, str]]:
         """Round numbers along an axis, their distance from its lower end in pixels, and words."""
         (low, high), size = self.limits[:, axis].tolist(), self.size[axis]
         coarse = (high - low) / min(max(size // 50, 5), 8)
         power = 10.0 ** np.floor(np.log10(coarse))
-        step = power * next(factor for factor in (1, 2, 5, 10) if factor * power >= coarse)
+        step = power * next(
+            factor for factor in (1, 2, 5, 10) if factor * power >= coarse
+        )
         digits = max(0, -int(np.floor(np.log10(step) + 1e-9)))
         numbers = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
         at = ((numbers - low) / (high - low) * size).round(1)
         # Adding zero makes a positive zero of a negative one. A minus sign is as wide as a digit.
-        words = [f"{n + 0.0:.{digits}f}".replace("-", "\N{MINUS SIGN}") for n in numbers]
+        words = [
+            f"{n + 0.0:.{digits}f}".replace("-", "\N{MINUS SIGN}") for n in numbers
+        ]
         return list(zip(numbers.tolist(), at.tolist(), words, strict=True))
 
 
@@ -129,7 +138,8 @@ def paint(image: Image, panel: Panel, left: int, top: int) -> None:
     width, height = panel.size
     large = np.full((_FINER * height, _FINER * width, 3), 255, np.uint8)
     for shape in panel.drawn:
-        pixels, thickness = _FINER * panel.pixels(shape.points), round(_FINER * shape.width)
+        pixels = _FINER * panel.pixels(shape.points)
+        thickness = round(_FINER * shape.width)
         if shape.kind == "dots":
             colour = [255 + shape.opacity * (value - 255) for value in rgb(shape.ink)]
             for centre in pixels.round().astype(int).tolist():

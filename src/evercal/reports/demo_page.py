@@ -71,8 +71,9 @@ class DemoResult:
         detected = sum(camera.bump_detected for camera in self.cameras)
         return {
             position: f"median position error of one image, {degrees:.3f} deg in rotation",
-            _median(camera.error_mm for camera in self.cameras): "median position error of a"
-            " fixed camera after calibration",
+            _median(
+                camera.error_mm for camera in self.cameras
+            ): "median position error of a fixed camera after calibration",
             f"{detected} of {len(self.cameras)} bumps": f"detected: {shift} measured, {true_shift}"
             " true (medians)",
             f"{self.unknown_refused} of {self.unknown_images}": "images of unknown rooms refused",
@@ -87,7 +88,10 @@ class DemoResult:
             "test": scores(self.test).to_dict(),
             "changed": scores(self.changed).to_dict(),
             "fixed_cameras": [asdict(camera) for camera in self.cameras],
-            "unknown_room": {"images": self.unknown_images, "refused": self.unknown_refused},
+            "unknown_room": {
+                "images": self.unknown_images,
+                "refused": self.unknown_refused,
+            },
             "seconds": self.seconds,
         }
 

@@ -20,7 +20,8 @@ MAX_RESIDUAL_PX = 2.0
 """Upper end of the colour scale of residuals, pixels of the working image."""
 PICTURE_PX = 640
 """Width of pictures in reports and videos."""
-AXES_M, _AXES_STEPS = 0.1, 32
+AXES_M = 0.1
+_AXES_STEPS = 32
 _AXES = ((214, 39, 40), (44, 160, 44), (31, 95, 220))
 """x red, y green, z blue."""
 _PALE_AXES = ((237, 158, 158), (160, 212, 160), (154, 183, 239))
@@ -57,19 +58,33 @@ def draw_landmarks(
     The camera is by default that of the estimate, else that of the scene; the pose that of the
     estimate. Residuals are in pixels of the image. Nothing is drawn without a pose or landmarks.
     """
-    large, pose = resized(image, width), base_from_camera or estimate.base_from_camera
-    pixels, points = estimate.pixels, estimate.points_m
-    if pose is None or pixels is None or points is None or estimate.base_from_camera is None:
-        return LandmarkPicture(large, 0, estimate.reason or estimate.status.replace("_", " "))
+    large = resized(image, width)
+    pose = base_from_camera or estimate.base_from_camera
+    pixels = estimate.pixels
+    points = estimate.points_m
+    if (
+        pose is None
+        or pixels is None
+        or points is None
+        or estimate.base_from_camera is None
+    ):
+        return LandmarkPicture(
+            large, 0, estimate.reason or estimate.status.replace("_", " ")
+        )
     scene = next(s for s in localizer.contents.scenes if s.name == estimate.scene)
     whole = camera or estimate.camera or scene.adjusted_camera
     working = whole.short_side_resized(localizer.contents.short_side)
     in_camera = scene.frame.camera_among_points(pose).inverse().apply(points)
     errors = working.project(in_camera) - pixels
-    enlarged, own = large.shape[0] / working.height, image.shape[0] / working.height
+    enlarged = large.shape[0] / working.height
+    own = image.shape[0] / working.height
     residuals = own * np.linalg.norm(errors, axis=1)
     drawn, times = draw_residuals(
-        large, resize_pixels(pixels, enlarged), enlarged * errors, residuals, own * MAX_RESIDUAL_PX
+        large,
+        resize_pixels(pixels, enlarged),
+        enlarged * errors,
+        residuals,
+        own * MAX_RESIDUAL_PX,
     )
     median = float(np.nanmedian(residuals)) if np.isfinite(residuals).any() else np.nan
     count = len(residuals)
@@ -89,7 +104,8 @@ def draw_residuals(
 
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     drawn = np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
-    limits, radius = (0.0, largest), max(2.0, image.shape[1] / 180)
+    limits = (0.0, largest)
+    radius = max(2.0, image.shape[1] / 180)
     visible = (np.abs(pixels) < 1e5).all(axis=1)
     centres = np.round(pixels[visible] * (1 << _FRACTION_BITS)).astype(int).tolist()
     colours = colour_map(residuals, limits)[visible].tolist()
@@ -113,7 +129,9 @@ def overlay_lines(
     for line, colour in zip(lines, colours, strict=True):
         # OpenCV uses 32-bit integers.
         valid = np.asarray((np.abs(line) < 1e6).all(axis=1))
-        fixed = np.round(np.where(valid[:, None], line, 0) * (1 << _FRACTION_BITS)).astype(np.int32)
+        fixed = np.round(
+            np.where(valid[:, None], line, 0) * (1 << _FRACTION_BITS)
+        ).astype(np.int32)
         pieces = [fixed[i : i + 2] for i in np.flatnonzero(valid[:-1] & valid[1:])]
         cv2.polylines(drawn, pieces, False, colour, width, cv2.LINE_AA, _FRACTION_BITS)
     return drawn
@@ -122,7 +140,11 @@ def overlay_lines(
 def exaggeration(vectors: Array) -> int:
     """Factor that makes residual vectors (n, 2) visible, the same for all: 1, 2, 5, 10, ..."""
     lengths = np.linalg.norm(vectors, axis=1)
-    long = float(np.nanpercentile(lengths, 90)) if np.isfinite(lengths).any() else _VECTOR_PX
+    long = (
+        float(np.nanpercentile(lengths, 90))
+        if np.isfinite(lengths).any()
+        else _VECTOR_PX
+    )
     factors = [1, 2, 5, 10, 20, 50, 100]
     return max([factor for factor in factors if factor * long <= _VECTOR_PX], default=1)
 
@@ -137,7 +159,9 @@ def colour_map(values: Array, limits: tuple[float, float]) -> Image:
     steps = np.round(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
     colours = np.full((len(values), 3), _NAN_COLOUR, np.uint8)
     if len(values):
-        colours[finite] = cv2.applyColorMap(steps[:, None], cv2.COLORMAP_VIRIDIS)[finite, 0, ::-1]
+        colours[finite] = cv2.applyColorMap(steps[:, None], cv2.COLORMAP_VIRIDIS)[
+            finite, 0, ::-1
+        ]
     return colours
 
 
@@ -147,7 +171,9 @@ def resized(image: Image, width: int) -> Image:
 
     height = max(1, round(image.shape[0] * width / image.shape[1]))
     method = cv2.INTER_AREA if image.shape[1] > width else cv2.INTER_CUBIC
-    return np.asarray(cv2.resize(image, (width, height), interpolation=method), np.uint8)
+    return np.asarray(
+        cv2.resize(image, (width, height), interpolation=method), np.uint8
+    )
 
 
 def _draw_legend(image: Image, text: str, limits: tuple[float, float]) -> None:
@@ -156,7 +182,8 @@ def _draw_legend(image: Image, text: str, limits: tuple[float, float]) -> None:
     scale = max(0.4, min(0.8, image.shape[1] / 1000))
     words = f"{limits[0]:.3g}  {text}  {limits[1]:.3g}"
     (width, line), _ = cv2.getTextSize(words, _FONT, scale, 1)
-    width, height = width + 2 * _MARGIN, 2 * line + 3 * _MARGIN
+    width = width + 2 * _MARGIN
+    height = 2 * line + 3 * _MARGIN
     if width > image.shape[1] or height > image.shape[0]:
         return
     panel = image[-height:, -width:]
@@ -176,14 +203,18 @@ def origin_in_view(camera: Camera, camera_from_frame: SE3) -> tuple[Array, str]:
     return pixel, "" if inside.all() else "outside the image"
 
 
-def axes_in_view(camera: Camera, camera_from_frame: SE3, length_m: float = AXES_M) -> Array:
+def axes_in_view(
+    camera: Camera, camera_from_frame: SE3, length_m: float = AXES_M
+) -> Array:
     """Project the axes of a frame: (3, n, 2) pixels along x, y and z; NaN where not visible."""
     along = np.linspace(0.0, length_m, _AXES_STEPS + 1)
     points = np.eye(3)[:, None] * along[:, None]
     return camera.project(camera_from_frame.apply(points))
 
 
-def draw_axes(image: Image, camera: Camera, camera_from_frame: SE3, pale: bool = False) -> Image:
+def draw_axes(
+    image: Image, camera: Camera, camera_from_frame: SE3, pale: bool = False
+) -> Image:
     """Draw the axes of a frame into a copy of an image of any size.
 
     If the origin is not visible, the lower left corner shows the directions of the axes instead,

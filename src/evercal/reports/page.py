@@ -50,18 +50,30 @@ class Table:
     def of_records(cls, records: Sequence[Any], caption: str = "") -> Self:
         """One row for each dataclass record, one column for each field."""
         header = [field.name.replace("_", " ") for field in fields(records[0])]
-        return cls(header, [[_cell(*item) for item in vars(r).items()] for r in records], caption)
+        return cls(
+            header,
+            [[_cell(*item) for item in vars(r).items()] for r in records],
+            caption,
+        )
 
     @property
     def columns(self) -> list[int]:
         """Indices of the columns to show."""
         shown = range(len(self.header))
-        return [i for i in shown if not self.rows or not all(_blank(row[i]) for row in self.rows)]
+        return [
+            i
+            for i in shown
+            if not self.rows or not all(_blank(row[i]) for row in self.rows)
+        ]
 
     @property
     def numeric(self) -> set[int]:
         """Indices of the columns that hold only numbers and blanks."""
-        return {i for i in self.columns if self.rows and all(_number(row[i]) for row in self.rows)}
+        return {
+            i
+            for i in self.columns
+            if self.rows and all(_number(row[i]) for row in self.rows)
+        }
 
 
 class Tile(NamedTuple):

@@ -57,7 +57,9 @@ class Frustum:
         high = np.tan(self.fov_rad / 2)
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         plane = signs * [high * self.aspect, high]
-        return self.base_from_camera.apply(depth_m * np.column_stack([plane, np.ones(4)]))
+        return self.base_from_camera.apply(
+            depth_m * np.column_stack([plane, np.ones(4)])
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +94,9 @@ def readable_scale(ellipsoids: list[Ellipsoid], drawn_m: float = DRAWN_M) -> int
 
     Without ellipsoids, that of a standard deviation of 1 mm.
     """
-    longest = max((float(ellipsoid.axes_m[-1]) for ellipsoid in ellipsoids), default=0.001)
+    longest = max(
+        (float(ellipsoid.axes_m[-1]) for ellipsoid in ellipsoids), default=0.001
+    )
     return max([scale for scale in _SCALES if scale * longest <= drawn_m], default=1)
 
 
@@ -110,11 +114,16 @@ class Landmarks3D:
     @classmethod
     def of(cls, scene: SceneMap, most: int = MOST_POINTS) -> Self:
         """All landmarks, or `most` of them, drawn evenly from all keyframes."""
-        keyframes, scale = scene.keyframes, _scale(scene)
-        points, grey, sigma = [np.zeros((0, 3))], [np.zeros(0, np.uint8)], [np.zeros(0)]
+        keyframes = scene.keyframes
+        scale = _scale(scene)
+        points = [np.zeros((0, 3))]
+        grey = [np.zeros(0, np.uint8)]
+        sigma = [np.zeros(0)]
         for i, marks in enumerate(keyframes.landmarks):
             local = marks.surface(keyframes.cameras[i])[0]
-            points.append(scene.frame.points_to_base(keyframes.base_from_camera[i].apply(local)))
+            points.append(
+                scene.frame.points_to_base(keyframes.base_from_camera[i].apply(local))
+            )
             column, row = np.round(marks.pixels).astype(int).T
             grey.append(keyframes.grey(i)[row, column])
             # The error of a depth 1 / d is sigma / d^2; along the ray it is as much longer.
@@ -124,7 +133,9 @@ class Landmarks3D:
         valid = np.flatnonzero(np.isfinite(joined).all(1))
         if len(valid) > most:
             valid = valid[np.linspace(0, len(valid) - 1, most).round().astype(int)]
-        return cls(joined[valid], np.concatenate(grey)[valid], np.concatenate(sigma)[valid])
+        return cls(
+            joined[valid], np.concatenate(grey)[valid], np.concatenate(sigma)[valid]
+        )
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -134,7 +145,9 @@ class Landmarks3D:
         if by == "image":
             return np.repeat(self.grey[:, None], 3, axis=1)
         sigma = np.log(np.maximum(self.sigma_mm, 1e-6))
-        values = np.asarray(self.points_m[:, 2] if by == "height" else sigma, np.float64)
+        values = np.asarray(
+            self.points_m[:, 2] if by == "height" else sigma, np.float64
+        )
         if not len(values):
             return np.zeros((0, 3), np.uint8)
         low, high = np.percentile(values, [2, 98]).tolist()
@@ -158,13 +171,17 @@ class KeyframeView:
 
 def keyframe_views(scene: SceneMap) -> list[KeyframeView]:
     """All keyframes of a scene, with poses among the landmarks as they are shown."""
-    keyframes, scale, views = scene.keyframes, _scale(scene), []
+    keyframes = scene.keyframes
+    scale = _scale(scene)
+    views = []
     for i, camera in enumerate(keyframes.cameras):
-        pose, marks = keyframes.base_from_camera[i], keyframes.landmarks[i]
+        pose = keyframes.base_from_camera[i]
+        marks = keyframes.landmarks[i]
         if scene.frame.similarity is not None:
             pose = scene.frame.similarity.pose(pose)
         image = np.repeat(keyframes.grey(i)[..., None], 3, axis=-1)
-        frustum, depths = Frustum.of(pose, camera), scale / marks.inverse_depth
+        frustum = Frustum.of(pose, camera)
+        depths = scale / marks.inverse_depth
         views.append(KeyframeView(scene.name, i, frustum, camera, image, depths))
     return views
 
@@ -197,7 +214,8 @@ class Surroundings:
         """(2, 3) corners of a box around the keyframes, other points, and the landmarks near by."""
         eyes = [view.base_from_camera.translation_m for view in self.keyframes]
         points = np.concatenate([np.reshape(eyes, (-1, 3)), others])
-        low, high = points.min(0), points.max(0)
+        low = points.min(0)
+        high = points.max(0)
         reach = max(float((high - low).max()), 0.1)
         if len(self.points_m):  # few landmarks lie far behind a window
             far = np.percentile(self.points_m, [2, 98], axis=0)
@@ -235,15 +253,25 @@ def view_panel(
     half = np.array(size) * ((high - low) / size).max() / 2
     limits = (low + high) / 2 + np.stack([-half, half])
     flat = around.points_m[:, plane]
-    shade = np.where(((flat > limits[0]) & (flat < limits[1])).all(axis=1), around.grey // 52, -1)
+    shade = np.where(
+        ((flat > limits[0]) & (flat < limits[1])).all(axis=1), around.grey // 52, -1
+    )
     # Neither ink nor paper.
-    drawn = [Shape("dots", flat[shade == i], "text", 1.9, 0.65 - 0.12 * i) for i in range(5)]
+    drawn = [
+        Shape("dots", flat[shade == i], "text", 1.9, 0.65 - 0.12 * i) for i in range(5)
+    ]
     lines = [(_edges(view, 0.04 * extent), ("blue", 1.2)) for view in around.keyframes]
     axes = 0.08 * extent * np.insert(np.eye(3)[:, None], 0, 0, axis=1)
-    lines += [(axis, (ink, 2.5)) for axis, ink in zip(axes, ("red", "green", "blue"), strict=True)]
+    lines += [
+        (axis, (ink, 2.5))
+        for axis, ink in zip(axes, ("red", "green", "blue"), strict=True)
+    ]
     if view is not None:
         lines.append((_edges(view, 0.08 * extent), ("orange", 2.2)))
-    drawn += [*shapes, *(Shape("line", points[:, plane], *style) for points, style in lines)]
+    drawn += [
+        *shapes,
+        *(Shape("line", points[:, plane], *style) for points, style in lines),
+    ]
     x, y = (f"{'xyz'[axis]} of {names[0][:24]} ({names[1]})" for axis in plane)
     return Panel(size, limits, (x, y), drawn)
 

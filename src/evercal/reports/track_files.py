@@ -10,10 +10,14 @@ from evercal.localization.tracking import TrackedFrame
 from evercal.reports.answers import Answer, answer_row
 
 ENDINGS = (".jsonl", ".tum", ".txt")
-_TUM_HEADER = "# timestamp tx ty tz qx qy qz qw: base_from_camera, in the unit of the map\n"
+_TUM_HEADER = (
+    "# timestamp tx ty tz qx qy qz qw: base_from_camera, in the unit of the map\n"
+)
 
 
-def track_row(frame: TrackedFrame, name: str, unit_known: bool = True) -> dict[str, object]:
+def track_row(
+    frame: TrackedFrame, name: str, unit_known: bool = True
+) -> dict[str, object]:
     """Return a frame as JSON values: the row of `evercal localize --json`, state and time."""
     answer = Answer(Path(name), frame.estimate, frame.estimate.milliseconds, unit_known)
     return {
@@ -36,7 +40,9 @@ class TrackFile(AbstractContextManager["TrackFile"]):
 
     def __init__(self, path: Path):
         if path.suffix.lower() not in ENDINGS:
-            raise InputError(f"{path}: give a file name that ends with {', '.join(ENDINGS)}")
+            raise InputError(
+                f"{path}: give a file name that ends with {', '.join(ENDINGS)}"
+            )
         self._tum = path.suffix.lower() != ".jsonl"
         self._file = path.open("w", encoding="utf-8")
         if self._tum:

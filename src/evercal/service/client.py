@@ -65,7 +65,10 @@ class Client:
 
         Inlier pixels, the estimated intrinsics and the terms of the covariance are not sent.
         """
-        parts: Parts = [("image", _image_part(image, "image.png")), *_json_part("camera", camera)]
+        parts: Parts = [
+            ("image", _image_part(image, "image.png")),
+            *_json_part("camera", camera),
+        ]
         return _estimate(self._ask("POST", "/localize", parts))
 
     def calibrate(
@@ -85,7 +88,11 @@ class Client:
         return Calibration.from_dict(self._ask("POST", "/calibrations", parts))
 
     def check(
-        self, images: "ImageSource", calibration: Calibration, *, camera: Camera | None = None
+        self,
+        images: "ImageSource",
+        calibration: Calibration,
+        *,
+        camera: Camera | None = None,
     ) -> "Shift":
         """Test whether a fixed camera has moved, see `Map.check`.
 
@@ -94,7 +101,9 @@ class Client:
         from evercal.calibration.drift import Shift
 
         parts = [*_image_parts(images), *_json_part("camera", camera)]
-        record = self._ask("POST", "/check", [*parts, *_json_part("calibration", calibration)])
+        record = self._ask(
+            "POST", "/check", [*parts, *_json_part("calibration", calibration)]
+        )
         record.pop("images")
         left_out = tuple(ImageUse(**use) for use in record.pop("left_out"))
         pose = SE3.from_matrix(record.pop("reference_from_now"))
@@ -107,7 +116,9 @@ class Client:
         try:
             answer = self._pool.request(method, self._url + path, fields=parts)
         except urllib3.exceptions.HTTPError as error:
-            reason = " ".join(str(getattr(error, "reason", None) or error).split())[:200]
+            reason = " ".join(str(getattr(error, "reason", None) or error).split())[
+                :200
+            ]
             raise InputError(f"{self._url}: no answer ({reason})") from None
         try:
             content = json.loads(answer.data)
@@ -115,7 +126,9 @@ class Client:
             content = None
         if answer.status >= 400 or content is None:
             error = content.get("error") if isinstance(content, dict) else None
-            raise InputError(error or f"{self._url}: status {answer.status}; is it evercal serve?")
+            raise InputError(
+                error or f"{self._url}: status {answer.status}; is it evercal serve?"
+            )
         return content
 
 
@@ -150,13 +163,24 @@ def _poses_part(poses: str | os.PathLike[str] | SE3) -> Part:
     if isinstance(poses, str | os.PathLike):
         return _image_part(poses, "")
     rows = ((*pose.translation_m, *pose.rotation_wxyz) for pose in poses)
-    lines = ["x,y,z,qw,qx,qy,qz", *(",".join(repr(float(v)) for v in row) for row in rows)]
+    lines = [
+        "x,y,z,qw,qx,qy,qz",
+        *(",".join(repr(float(v)) for v in row) for row in rows),
+    ]
     return "poses.csv", "\n".join(lines).encode()
 
 
 def _estimate(row: Mapping[str, Any]) -> PoseEstimate:
     covariance = row["covariance"]
-    same = ("status", "reason", "scene", "inliers", "inlier_ratio", "support", "parent_frame")
+    same = (
+        "status",
+        "reason",
+        "scene",
+        "inliers",
+        "inlier_ratio",
+        "support",
+        "parent_frame",
+    )
     return PoseEstimate(
         **{key: row[key] for key in same},
         base_from_camera=_pose(row["base_from_camera"]),
@@ -167,4 +191,8 @@ def _estimate(row: Mapping[str, Any]) -> PoseEstimate:
 
 
 def _pose(values: Mapping[str, Any] | None) -> SE3 | None:
-    return None if values is None else SE3(values["quaternion_wxyz"], values["translation_m"])
+    return (
+        None
+        if values is None
+        else SE3(values["quaternion_wxyz"], values["translation_m"])
+    )

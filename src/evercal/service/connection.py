@@ -9,7 +9,9 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from evercal.bounds import RequestBounds
 
 
-def protocols(limits: RequestBounds) -> tuple[type[H11Protocol], type[WebSocketsSansIOProtocol]]:
+def protocols(
+    limits: RequestBounds,
+) -> tuple[type[H11Protocol], type[WebSocketsSansIOProtocol]]:
     """The protocols of a service with limits: of requests, and of streams."""
 
     class Patient:
@@ -53,7 +55,9 @@ def protocols(limits: RequestBounds) -> tuple[type[H11Protocol], type[WebSockets
             super().connection_made(transport)
             self._wait()
             if len(self.connections) > limits.connections:
-                others = [c for c in self.connections if isinstance(c, Connection) and c.waits]
+                others = [
+                    c for c in self.connections if isinstance(c, Connection) and c.waits
+                ]
                 oldest = min(others, key=lambda c: c.latest.when() if c.latest else 0.0)
                 oldest.transport.abort()  # at worst this one
 

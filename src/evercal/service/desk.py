@@ -21,7 +21,9 @@ class Desk:
         """The result of a function, called in a thread."""
         self.waiting += 1
         try:
-            return await asyncio.get_running_loop().run_in_executor(self._pool, work, *args)
+            return await asyncio.get_running_loop().run_in_executor(
+                self._pool, work, *args
+            )
         finally:
             self.waiting -= 1
 

@@ -44,9 +44,13 @@ class Metrics:
             registry=to,
             buckets=(0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 60),
         )
-        self.answers = Counter("evercal_answers", "Located images.", ("status",), registry=to)
+        self.answers = Counter(
+            "evercal_answers", "Located images.", ("status",), registry=to
+        )
         self.scenes = Gauge("evercal_scenes", "Scenes of the map.", registry=to)
-        self.waiting = Gauge("evercal_waiting_images", "Images in the queue.", registry=to)
+        self.waiting = Gauge(
+            "evercal_waiting_images", "Images in the queue.", registry=to
+        )
 
 
 class Guard:
@@ -56,13 +60,19 @@ class Guard:
     those beyond the limits wait at the client.
     """
 
-    def __init__(self, app: App, token: str | None, limits: RequestBounds, metrics: Metrics):
-        self._app, self._limits, self._metrics = app, limits, metrics
+    def __init__(
+        self, app: App, token: str | None, limits: RequestBounds, metrics: Metrics
+    ):
+        self._app = app
+        self._limits = limits
+        self._metrics = metrics
         self._token = None if token is None else token.encode()
         self._bodies: dict[object, int] = {}
         self._streams = 0
 
-    async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
+    async def __call__(
+        self, scope: MutableMapping[str, Any], receive: Receive, send: Send
+    ) -> None:
         """Answer a request."""
         if scope["type"] == "lifespan":
             return await self._app(scope, receive, send)
@@ -70,8 +80,11 @@ class Guard:
         refusal = self._refusal(scope["path"], headers)
         if scope["type"] == "websocket":
             return await self._stream(refusal, scope, receive, send)
-        began, status, ended = time.perf_counter(), 500, False
-        length = int(headers.get(b"content-length", b"0"))  # the server has checked that it is one
+        began = time.perf_counter()
+        status = 500
+        ended = False
+        # The server has checked that it is one.
+        length = int(headers.get(b"content-length", b"0"))
         latest = began + self._limits.wait_s + length / self._limits.bytes_per_s
 
         async def part() -> Message:
@@ -81,7 +94,9 @@ class Guard:
                 message = await asyncio.wait_for(receive(), seconds)
             except TimeoutError:
                 ended = True
-                raise HTTPException(408, "the body did not arrive in time; send it again") from None
+                raise HTTPException(
+                    408, "the body did not arrive in time; send it again"
+                ) from None
             ended = not message.get("more_body", False)
             return message
 
@@ -121,14 +136,18 @@ class Guard:
         if refusal is None and self._streams >= self._limits.streams:
             refusal = 429, "too many streams"
         if refusal is not None:  # the handshake gets status 403
-            return await send({"type": "websocket.close", "code": 1008, "reason": refusal[1]})
+            return await send(
+                {"type": "websocket.close", "code": 1008, "reason": refusal[1]}
+            )
         self._streams += 1
         try:
             await self._app(scope, receive, send)
         finally:
             self._streams -= 1
 
-    def _refusal(self, path: str, headers: dict[bytes, bytes]) -> tuple[int, str] | None:
+    def _refusal(
+        self, path: str, headers: dict[bytes, bytes]
+    ) -> tuple[int, str] | None:
         """Status and reason for refusing a request."""
         if self._token is not None and path not in OPEN and not path.startswith(PAGES):
             given = headers.get(b"authorization", b"")
@@ -142,15 +161,22 @@ class Guard:
             if reason := foreign((host or b"").decode("latin-1"), stated, local=True):
                 return 403, f"{reason}; a token is needed"
         kind = headers.get(b"content-type", b"").lower()
-        if b"charset" in kind and b"utf-8" not in kind:  # some take very long, or break names
+        # Some take very long, or break names.
+        if b"charset" in kind and b"utf-8" not in kind:
             return 415, "send forms in UTF-8"
         if b"transfer-encoding" in headers:
             return 411, "bodies of unknown length are refused; send content-length"
-        length = int(headers.get(b"content-length", b"0"))  # the server has checked that it is one
+        # The server has checked that it is one.
+        length = int(headers.get(b"content-length", b"0"))
         if length > self._limits.body_bytes:
-            return 413, f"body of {str(length)[:20]} bytes; at most {self._limits.body_bytes}"
+            return (
+                413,
+                f"body of {str(length)[:20]} bytes; at most {self._limits.body_bytes}",
+            )
         waits = len(self._bodies) >= self._limits.requests
-        if length and (waits or sum(self._bodies.values()) + length > self._limits.held_bytes):
+        if length and (
+            waits or sum(self._bodies.values()) + length > self._limits.held_bytes
+        ):
             return 429, "too many requests wait; try again"
         return None
 

@@ -36,7 +36,9 @@ def decoded(data: bytes, name: str, limits: RequestBounds) -> np.ndarray:
     """
     width, height = _header_size(data, name)
     if width * height > limits.pixels:
-        raise TooLargeError(f"{name}: {width}x{height} pixels; at most {limits.pixels:,} in all")
+        raise TooLargeError(
+            f"{name}: {width}x{height} pixels; at most {limits.pixels:,} in all"
+        )
     try:
         image = decode_image(np.frombuffer(data, np.uint8))
     except cv2.error:
@@ -52,12 +54,15 @@ class Sent(Sequence[tuple[str, np.ndarray]]):
     def __init__(self, files: Sequence[tuple[str, bytes]], limits: RequestBounds):
         if len(files) > limits.images:
             raise TooLargeError(f"images: {len(files)} given; at most {limits.images}")
-        self._files, self._limits = files, limits
+        self._files = files
+        self._limits = limits
 
     def check_pixels(self) -> None:
         """Refuse more pixels than a request may hold, by the headers of the images."""
         sizes = [_header_size(data, name) for name, data in self._files]
-        if (total := sum(w * h for w, h in sizes)) > (most := self._limits.request_pixels):
+        if (total := sum(w * h for w, h in sizes)) > (
+            most := self._limits.request_pixels
+        ):
             raise TooLargeError(f"images: {total:,} pixels in all; at most {most:,}")
 
     @property
@@ -67,7 +72,11 @@ class Sent(Sequence[tuple[str, np.ndarray]]):
 
     def camera(self, intrinsics: bytes | None) -> Camera | None:
         """The camera in a file of intrinsics, by the size of the first image."""
-        return None if intrinsics is None else camera_of(intrinsics, self[0][1].shape[1::-1])
+        return (
+            None
+            if intrinsics is None
+            else camera_of(intrinsics, self[0][1].shape[1::-1])
+        )
 
     def __len__(self) -> int:
         return len(self._files)
@@ -100,8 +109,14 @@ def camera_of(data: bytes, size: tuple[int, int]) -> Camera:
 def poses_of(data: bytes, ending: str, images: list[str]) -> SE3:
     """(n,) base_from_gripper of n named images, by a pose table whose file had an ending."""
     files = [Path(name) for name in images]
-    ending = ending.lower() if ending.lower() in (".csv", ".txt", ".json", ".tum") else ".csv"
-    return _from_text(data, "robot_poses", ending, lambda path: poses_of_images(path, files)[0])
+    ending = (
+        ending.lower()
+        if ending.lower() in (".csv", ".txt", ".json", ".tum")
+        else ".csv"
+    )
+    return _from_text(
+        data, "robot_poses", ending, lambda path: poses_of_images(path, files)[0]
+    )
 
 
 def calibration_of(data: bytes) -> Calibration:
@@ -109,7 +124,9 @@ def calibration_of(data: bytes) -> Calibration:
     return _from_text(data, "calibration", ".json", read_calibration)
 
 
-def _from_text(data: bytes, name: str, ending: str, read: Callable[[Path], Content]) -> Content:
+def _from_text(
+    data: bytes, name: str, ending: str, read: Callable[[Path], Content]
+) -> Content:
     """Read text that came over the network as a file.
 
     One line for whatever a reader raises, with the name of the request's part.

@@ -18,7 +18,8 @@ class LiveMap:
     """
 
     def __init__(self, path: Path):
-        self._path, self._lock = path, threading.Lock()
+        self._path = path
+        self._lock = threading.Lock()
         self.current = self._opened()
 
     def refresh(self) -> bool:
@@ -32,7 +33,8 @@ class LiveMap:
             try:
                 self.current = self._opened()
             except Exception as error:
-                if not isinstance(error, InputError):  # perhaps for a moment only: try again
+                # Perhaps for a moment only: try again.
+                if not isinstance(error, InputError):
                     self._stamp = None
                 logging.getLogger(__name__).warning(
                     "%s; the last state is served", printable(str(error))

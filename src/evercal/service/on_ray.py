@@ -73,7 +73,8 @@ def serve_on_ray(
     if replicas < 1:
         raise InputError(f"--replicas {replicas}: give a number >= 1")
     options = replace(options, map=options.map.absolute())
-    scenes, stop = Map.open(options.map).scenes, threading.Event()
+    scenes = Map.open(options.map).scenes
+    stop = threading.Event()
     with connected(address) as ray:
         from ray import serve
 
@@ -97,7 +98,9 @@ def serve_on_ray(
             url = url_of(host, options.port)
             # It fails where a Serve that ran before listens elsewhere.
             if Client(url, options.token).scenes != scenes:
-                raise InputError(f"{options.map}: machines of the cluster do not reach this folder")
+                raise InputError(
+                    f"{options.map}: machines of the cluster do not reach this folder"
+                )
             on_ready(url, scenes)
             stop.wait()
         except RuntimeError as error:

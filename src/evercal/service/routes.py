@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from fastapi import APIRouter, Depends, File, Form, Request, Response, UploadFile, WebSocket
+from fastapi import (
+    APIRouter,
+    Depends,
+    File,
+    Form,
+    Request,
+    Response,
+    UploadFile,
+    WebSocket,
+)
 from fastapi.responses import PlainTextResponse, RedirectResponse
 from prometheus_client import generate_latest
 from starlette.websockets import WebSocketDisconnect
@@ -36,7 +45,8 @@ from evercal.service.live_map import LiveMap
 
 router = APIRouter()
 CameraFile = Annotated[
-    UploadFile | None, File(description="Intrinsics: JSON, YAML or a 3x3 matrix as text.")
+    UploadFile | None,
+    File(description="Intrinsics: JSON, YAML or a 3x3 matrix as text."),
 ]
 _NAME = 100
 """Characters of a file name that are kept."""
@@ -66,7 +76,9 @@ def form(one: str, many: str = "") -> Any:
         for name, count in given.items():
             if name not in known:
                 fields = ", ".join(known)
-                raise InputError(f"{name[:_NAME]!r} is no field of this form; it has {fields}")
+                raise InputError(
+                    f"{name[:_NAME]!r} is no field of this form; it has {fields}"
+                )
             if count > 1 and name not in many.split():
                 raise InputError(f"{name}: given {count} times; give it once")
 
@@ -96,11 +108,14 @@ async def localize(
     request: Request, image: UploadFile, camera: CameraFile = None
 ) -> dict[str, Any]:
     """Estimate the camera pose of one image: the row of `evercal localize --json`."""
-    service, name = service_of(request), _name(image, "image")
-    data, intrinsics = await image.read(), await _content(camera)
+    service = service_of(request)
+    name = _name(image, "image")
+    data = await image.read()
+    intrinsics = await _content(camera)
 
     def work() -> dict[str, Any]:
-        localizer, began = service.live.current.localizer, time.perf_counter()
+        localizer = service.live.current.localizer
+        began = time.perf_counter()
         pixels = decoded(data, name, service.limits)
         estimate = localizer.localize(pixels, _camera(intrinsics, pixels))
         milliseconds = 1000 * (time.perf_counter() - began)
@@ -116,7 +131,10 @@ Shots = Annotated[list[UploadFile], File(description="Image files, all of one ca
 
 
 async def _sent(request: Request, images: list[UploadFile]) -> Sent:
-    files = [(_name(image, f"image {i}"), await image.read()) for i, image in enumerate(images)]
+    files = [
+        (_name(image, f"image {i}"), await image.read())
+        for i, image in enumerate(images)
+    ]
     return Sent(files, service_of(request).limits)
 
 
@@ -132,8 +150,10 @@ async def calibrations(
     mount: Annotated[Literal["eye_to_hand", "eye_in_hand"] | None, Form()] = None,
 ) -> dict[str, Any]:
     """Calibrate a camera from its images: the calibration file."""
-    service, sent = service_of(request), await _sent(request, images)
-    table, intrinsics = await _content(robot_poses), await _content(camera)
+    service = service_of(request)
+    sent = await _sent(request, images)
+    table = await _content(robot_poses)
+    intrinsics = await _content(camera)
     ending = "" if robot_poses is None else Path(robot_poses.filename or "").suffix
 
     def work() -> dict[str, Any]:
@@ -149,18 +169,24 @@ async def calibrations(
 async def check(
     request: Request,
     images: Shots,
-    calibration: Annotated[UploadFile, File(description="The calibration file of the camera.")],
+    calibration: Annotated[
+        UploadFile, File(description="The calibration file of the camera.")
+    ],
     camera: CameraFile = None,
 ) -> dict[str, Any]:
     """Test whether a fixed camera has moved: the object of `evercal check --json`."""
-    service, sent = service_of(request), await _sent(request, images)
-    reference, intrinsics = await calibration.read(), await _content(camera)
+    service = service_of(request)
+    sent = await _sent(request, images)
+    reference = await calibration.read()
+    intrinsics = await _content(camera)
 
     def work() -> dict[str, Any]:
         stated = calibration_of(reference)
         sent.check_pixels()
         given = sent.camera(intrinsics)
-        return check_record(drift.check(service.live.current.localizer, sent, stated, given))
+        return check_record(
+            drift.check(service.live.current.localizer, sent, stated, given)
+        )
 
     return await service.desk.run(work)
 
@@ -195,7 +221,9 @@ async def track(socket: WebSocket) -> None:
     the intrinsics of the frames that follow, as `camera` of `/localize`. A frame that cannot be
     used is answered with `{"error": ...}`.
     """
-    service, intrinsics, number = service_of(socket), None, 0
+    service = service_of(socket)
+    intrinsics = None
+    number = 0
     tracker: Tracker | None = None
     tracked: tuple[Localizer, bytes | None] | None = None
 
@@ -203,7 +231,11 @@ async def track(socket: WebSocket) -> None:
         nonlocal tracker, tracked
         localizer = service.live.current.localizer
         image = decoded(data, name, service.limits)
-        if tracker is None or tracked != (localizer, intrinsics):  # the map or the camera changed
+        # The map or the camera changed.
+        if tracker is None or tracked != (
+            localizer,
+            intrinsics,
+        ):
             tracker = Tracker(localizer, _camera(intrinsics, image))
             tracked = (localizer, intrinsics)
         frame = tracker.track(image, time.monotonic())
@@ -215,7 +247,8 @@ async def track(socket: WebSocket) -> None:
             if message.get("text") is not None:
                 intrinsics = message["text"].encode()
                 continue
-            name, number = f"frame {number}", number + 1
+            name = f"frame {number}"
+            number = number + 1
             try:
                 answer = await service.desk.run(row, message["bytes"], name)
             except InputError as error:

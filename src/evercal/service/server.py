@@ -53,10 +53,12 @@ class ServeOptions:
 
 
 def make_app(
-    options: ServeOptions, on_ready: Callable[[tuple[str, ...]], object] = lambda _: None
+    options: ServeOptions,
+    on_ready: Callable[[tuple[str, ...]], object] = lambda _: None,
 ) -> FastAPI:
     """The application; `on_ready` gets the names of the scenes when requests are answered."""
-    live, metrics = LiveMap(options.map), Metrics()
+    live = LiveMap(options.map)
+    metrics = Metrics()
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -72,13 +74,17 @@ def make_app(
                 await polling
             desk.close()
 
-    app = FastAPI(title="evercal", version="1", docs_url=None, redoc_url=None, lifespan=lifespan)
+    app = FastAPI(
+        title="evercal", version="1", docs_url=None, redoc_url=None, lifespan=lifespan
+    )
     # Only for the page, which then can send the token; the guard compares it.
     bearer = [Security(HTTPBearer(auto_error=False))] if options.token else None
     app.include_router(routes.router, dependencies=bearer)
     app.mount(PAGES, StaticFiles(packages=[("fastapi_swagger", "resources")]))
     app.get("/docs", include_in_schema=False)(_page)
-    app.add_middleware(Guard, token=options.token, limits=options.limits, metrics=metrics)  # pyright: ignore[reportArgumentType]
+    app.add_middleware(
+        Guard, token=options.token, limits=options.limits, metrics=metrics
+    )  # pyright: ignore[reportArgumentType]
     for kind in (*_STATUS, HTTPException, RequestValidationError, Exception):
         app.add_exception_handler(kind, _answer)
     return app
@@ -115,7 +121,9 @@ def _answer(_: Request, error: Exception) -> JSONResponse:
     return _line("internal error", 500)
 
 
-def _line(error: object, status: int, headers: Mapping[str, str] | None = None) -> JSONResponse:
+def _line(
+    error: object, status: int, headers: Mapping[str, str] | None = None
+) -> JSONResponse:
     return JSONResponse({"error": routes.one_line(error)}, status, headers)
 
 
@@ -138,7 +146,9 @@ def bound_socket(options: ServeOptions) -> socket.socket:
 def require_token(token: str) -> None:
     """Refuse a token that is easily guessed, or that a header cannot hold."""
     if len(token) < LEAST_TOKEN or not token.isascii() or " " in token:
-        raise InputError(f"token: give at least {LEAST_TOKEN} ASCII characters without spaces")
+        raise InputError(
+            f"token: give at least {LEAST_TOKEN} ASCII characters without spaces"
+        )
 
 
 def url_of(listener: socket.socket) -> str:
@@ -168,7 +178,9 @@ def server_of(app: FastAPI, limits: RequestBounds) -> uvicorn.Server:
     )
 
 
-def serve(options: ServeOptions, on_ready: Callable[[str, tuple[str, ...]], object]) -> None:
+def serve(
+    options: ServeOptions, on_ready: Callable[[str, tuple[str, ...]], object]
+) -> None:
     """Serve a map until SIGTERM or SIGINT; requests under way are answered before.
 
     `on_ready` gets the address and the names of the scenes.

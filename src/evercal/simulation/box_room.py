@@ -44,20 +44,29 @@ class BoxRoom:
     def __init__(self, seed: int, furniture: int | None = None, texture_px: int = 384):
         rng = np.random.default_rng(seed)
         self.seed = seed
-        self.size_m = np.array([rng.uniform(3.0, 5.5), rng.uniform(3.0, 5.5), rng.uniform(2.3, 3)])
+        self.size_m = np.array(
+            [rng.uniform(3.0, 5.5), rng.uniform(3.0, 5.5), rng.uniform(2.3, 3)]
+        )
         self.texture_px = texture_px
         self.surfaces: list[Surface] = []
         x, y, _ = self.size_m
         self.add_box(np.array([-x / 2, -y / 2, 0]), self.size_m, rng, inward=True)
         for _ in range(int(rng.integers(5, 14)) if furniture is None else furniture):
-            size = np.array([rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.4)])
+            size = np.array(
+                [rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.4)]
+            )
             # Along the walls: the middle of the room stays free for cameras.
             side = rng.integers(4)
             centre = rng.uniform(-0.5, 0.5, 2) * (self.size_m[:2] - size[:2])
-            axis, sign = side // 2, 1 - 2 * (side % 2)
-            centre[axis] = sign * (self.size_m[axis] - size[axis]) / 2 * rng.uniform(0.85, 0.999)
+            axis = side // 2
+            sign = 1 - 2 * (side % 2)
+            centre[axis] = (
+                sign * (self.size_m[axis] - size[axis]) / 2 * rng.uniform(0.85, 0.999)
+            )
             height = max(0.0, rng.uniform(-1.0, self.size_m[2] - size[2]))
-            self.add_box(np.array([*(centre - size[:2] / 2), height]), size, rng, inward=False)
+            self.add_box(
+                np.array([*(centre - size[:2] / 2), height]), size, rng, inward=False
+            )
         for _ in range(int(rng.integers(4, 13))):
             self._add_picture(rng)
 
@@ -76,12 +85,18 @@ class BoxRoom:
         while pyramid[-1].shape[0] > 16:
             # pyrDown centres pixel k on 2k instead of 2k + 0.5, which shifts the picture.
             half = pyramid[-1].shape[0] // 2
-            smaller = cv2.resize(pyramid[-1], (half, half), interpolation=cv2.INTER_AREA)
+            smaller = cv2.resize(
+                pyramid[-1], (half, half), interpolation=cv2.INTER_AREA
+            )
             pyramid.append(smaller.astype(np.uint8))
         return tuple(pyramid)
 
     def add_box(
-        self, low: np.ndarray, size: np.ndarray, rng: np.random.Generator, inward: bool = False
+        self,
+        low: np.ndarray,
+        size: np.ndarray,
+        rng: np.random.Generator,
+        inward: bool = False,
     ) -> None:
         """Add a textured box from its lowest corner (3,) and its sides (3,), see `box_faces`."""
         for corner, u, v in box_faces(low, np.diag(size), inward):
@@ -90,32 +105,42 @@ class BoxRoom:
 
     def _add_picture(self, rng: np.random.Generator) -> None:
         wall = self.surfaces[int(rng.integers(4))]
-        length_u, length_v = np.linalg.norm(wall.edge_u_m), np.linalg.norm(wall.edge_v_m)
+        length_u = np.linalg.norm(wall.edge_u_m)
+        length_v = np.linalg.norm(wall.edge_v_m)
         size = rng.uniform(0.3, 1.0, 2)
         u = rng.uniform(0, max(length_u - size[0], 0.01))
         v = rng.uniform(0.3 * length_v, max(length_v - size[1], 0.31 * length_v))
-        unit_u, unit_v = wall.edge_u_m / length_u, wall.edge_v_m / length_v
+        unit_u = wall.edge_u_m / length_u
+        unit_v = wall.edge_v_m / length_v
         corner = wall.corner_m + u * unit_u + v * unit_v + 0.01 * wall.normal
         pyramid = self.texture(rng, calm=False)
-        self.surfaces.append(Surface(corner, unit_u * size[0], unit_v * size[1], pyramid))
+        self.surfaces.append(
+            Surface(corner, unit_u * size[0], unit_v * size[1], pyramid)
+        )
 
     def render(
         self, camera: Camera, base_from_camera: SE3, moving: Sequence[Surface] = ()
     ) -> np.ndarray:
         """Render an image of an ideal pinhole camera; `moving` surfaces are for this image."""
         if camera.distortion:
-            raise ValueError("box rooms are rendered through an ideal pinhole, without distortion")
+            raise ValueError(
+                "box rooms are rendered through an ideal pinhole, without distortion"
+            )
         image = np.zeros((camera.height, camera.width, 3), np.uint8)
         nearness = np.zeros((camera.height, camera.width), np.float32)  # 1 / depth
         camera_from_base = base_from_camera.inverse()
         rotation = camera_from_base.rotation_matrix()
         for surface in (*self.surfaces, *moving):
             corner = camera_from_base.apply(surface.corner_m)
-            edges = np.stack([rotation @ surface.edge_u_m, rotation @ surface.edge_v_m], -1)
+            edges = np.stack(
+                [rotation @ surface.edge_u_m, rotation @ surface.edge_v_m], -1
+            )
             _draw(image, nearness, surface.pyramid, corner, edges, camera)
         return image
 
-    def intersect(self, origin_m: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def intersect(
+        self, origin_m: np.ndarray, rays: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """First intersections (n, 3) of rays, and their depths (n,) in units of the ray length.
 
         Origins (3,) or (n, 3) and directions (n, 3) of any length are in the base frame. Rays that
@@ -156,14 +181,19 @@ class BoxRoom:
         half = self.size_m / 2
 
         def wave(low: float, high: float, cycles: int, deviation: float) -> np.ndarray:
-            change = np.sin(3 * t + walker.uniform(0, 2 * np.pi)) + walker.uniform(-1, 1)
-            return low + (high - low) * _wave(t, cycles, common) + 0.6 * deviation * change
+            change = np.sin(3 * t + walker.uniform(0, 2 * np.pi)) + walker.uniform(
+                -1, 1
+            )
+            return (
+                low + (high - low) * _wave(t, cycles, common) + 0.6 * deviation * change
+            )
 
         x = wave(-0.24 * half[0], 0.24 * half[0], 1, 0.15)
         y = wave(-0.24 * half[1], 0.24 * half[1], 1, 0.15)
         z = wave(0.9, min(1.9, 0.75 * self.size_m[2]), 1, 0.1)
         heading = t + wave(-0.6, 0.6, 2, 0.12)
-        pitch, roll = wave(-0.45, 0.15, 2, 0.05), wave(-0.12, 0.12, 2, 0.05)
+        pitch = wave(-0.45, 0.15, 2, 0.05)
+        roll = wave(-0.12, 0.12, 2, 0.05)
         eye = np.stack([x, y, z], -1)
         target = eye + np.stack([np.cos(heading), np.sin(heading), pitch], -1)
         return SE3.stack([look_at(eye[i], target[i], roll[i]) for i in range(frames)])
@@ -178,7 +208,12 @@ def box_faces(
     points up. `inward` is a box that is seen from inside, with its floor.
     """
     ex, ey, ez = edges
-    faces = [(low, ex, ez), (low + ey + ex, -ex, ez), (low + ex, ey, ez), (low + ey, -ey, ez)]
+    faces = [
+        (low, ex, ez),
+        (low + ey + ex, -ex, ez),
+        (low + ex, ey, ez),
+        (low + ey, -ey, ez),
+    ]
     faces.append((low + ez, ex, ey))
     if inward:
         faces.append((low + ey, ex, -ey))
@@ -190,7 +225,9 @@ def _wave(t: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
     parts = [(k, rng.uniform(0.4, 1) / k, rng.uniform(0, 2 * np.pi)) for k in (1, 2, 3)]
 
     def total(x: np.ndarray) -> np.ndarray:
-        return sum((a * np.sin(k * cycles * x + p) for k, a, p in parts), np.zeros_like(x))
+        return sum(
+            (a * np.sin(k * cycles * x + p) for k, a, p in parts), np.zeros_like(x)
+        )
 
     whole = total(np.linspace(0, 2 * np.pi, 720))
     return (total(t) - whole.min()) / np.ptp(whole)
@@ -203,7 +240,8 @@ def look_at(position_m: np.ndarray, target_m: np.ndarray, roll_rad: float = 0.0)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right = right / np.linalg.norm(right)
     down = np.cross(forward, right)
-    c, s = np.cos(roll_rad), np.sin(roll_rad)
+    c = np.cos(roll_rad)
+    s = np.sin(roll_rad)
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([c * right + s * down, c * down - s * right, forward], -1)
     matrix[:3, 3] = position_m
@@ -233,7 +271,10 @@ def _draw(
     corners = corner + np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ edges.T
     if corners[:, 2].max() < NEAR_M:
         return
-    left, top, right, bottom = 0, 0, camera.width, camera.height
+    left = 0
+    top = 0
+    right = camera.width
+    bottom = camera.height
     if corners[:, 2].min() > NEAR_M:
         pixels = camera.project(corners)
         left, top = np.maximum(np.floor(pixels.min(0)).astype(int), 0)
@@ -245,15 +286,26 @@ def _draw(
     image_from_texture = camera.matrix() @ np.column_stack([edges, corner])
     texture_from_image = np.linalg.inv(image_from_texture)
     v, u = np.mgrid[top:bottom, left:right].astype(np.float32)
-    a, b, w = ((row[0] * u + row[1] * v + row[2]).astype(np.float32) for row in texture_from_image)
+    a, b, w = (
+        (row[0] * u + row[1] * v + row[2]).astype(np.float32)
+        for row in texture_from_image
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        s, t = a / w, b / w
+        s = a / w
+        t = b / w
         front = nearness[top:bottom, left:right]
-        visible = (w > front) & (w < 1 / NEAR_M) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+        visible = (
+            (w > front) & (w < 1 / NEAR_M) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+        )
     if not visible.any():
         return
     # The pyramid level follows from texture pixels per image pixel over the visible area.
-    span = np.ptp(s[visible]) * np.ptp(t[visible]) * pyramid[0].shape[0] ** 2 / visible.sum()
+    span = (
+        np.ptp(s[visible])
+        * np.ptp(t[visible])
+        * pyramid[0].shape[0] ** 2
+        / visible.sum()
+    )
     level = int(np.clip(np.round(0.5 * np.log2(max(span, 1.0))), 0, len(pyramid) - 1))
     texture = pyramid[level]
     height, width = texture.shape[:2]

@@ -20,12 +20,17 @@ from evercal.recordings.images import write_jpeg
 from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
 from evercal.storage import write_bytes, write_json
 
-WRIST_IMAGES, TRIPOD_IMAGES, HELD_IMAGES = 25, 8, 25
+WRIST_IMAGES = 25
+TRIPOD_IMAGES = 8
+HELD_IMAGES = 25
 REACHABLE = 200
 
 
 def record_cell(
-    out: Path, seed: int = 0, wrist_images: int = WRIST_IMAGES, options: CellOptions | None = None
+    out: Path,
+    seed: int = 0,
+    wrist_images: int = WRIST_IMAGES,
+    options: CellOptions | None = None,
 ) -> Iterator[None]:
     """Record a virtual cell into a new folder; yields after each image.
 
@@ -46,16 +51,21 @@ def record_cell(
         yield
     for i in range(TRIPOD_IMAGES):
         cell.robot.move_to(reachable[i])
-        write_jpeg(out / f"tripod/{i:04d}.jpg", cell.tripod_camera.read()[1], JPEG_QUALITY)
+        write_jpeg(
+            out / f"tripod/{i:04d}.jpg", cell.tripod_camera.read()[1], JPEG_QUALITY
+        )
         yield
     cell.hold(True)
-    recorder, views = WristRecorder(out / "held", cell.intrinsics), cell.holding_poses(REACHABLE)
+    recorder = WristRecorder(out / "held", cell.intrinsics)
+    views = cell.holding_poses(REACHABLE)
     for i in spread_poses(views, HELD_IMAGES):
         cell.robot.move_to(views[i])
         recorder.add(cell.tripod_camera.read()[1], cell.robot.base_from_gripper())
         yield
     write_bytes(out / "reachable.csv", pose_rows(reachable).encode())
-    rough = "\n".join(" ".join(f"{x:.9g}" for x in row) for row in nominal_mount().matrix())
+    rough = "\n".join(
+        " ".join(f"{x:.9g}" for x in row) for row in nominal_mount().matrix()
+    )
     write_bytes(out / "rough.txt", (rough + "\n").encode())
     write_json(
         out / "truth.json",

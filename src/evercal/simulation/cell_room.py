@@ -21,11 +21,14 @@ WORK_AREA_M = np.array([0.52, 0.0, 0.04])
 THING_LOW_M, THING_SIZE_M = np.array([-0.08, -0.06, 0.1]), np.array([0.16, 0.12, 0.24])
 """Lowest corner and sides of what the gripper holds, flange frame: the fingers are 10 cm long."""
 
-_TABLE_LOW, _TABLE_HIGH = np.array([-0.35, -0.65]), np.array([1.05, 0.65])
+_TABLE_LOW = np.array([-0.35, -0.65])
+_TABLE_HIGH = np.array([1.05, 0.65])
 _FREE_M = 0.28
 """Distance from the foot of the arm within which no box stands."""
 _LINK_M = 0.1
-_TEXTURE_PX, _TABLE_TEXTURE_PX, _BOX_TEXTURE_PX = 512, 1024, 128
+_TEXTURE_PX = 512
+_TABLE_TEXTURE_PX = 1024
+_BOX_TEXTURE_PX = 128
 
 
 @lru_cache(maxsize=4)
@@ -79,8 +82,11 @@ def thing_surfaces(seed: int, base_from_gripper: SE3) -> list[Surface]:
 
 
 @lru_cache(maxsize=4)
-def _thing(seed: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, ...]]]:
-    rng, edges = np.random.default_rng([seed, 36]), np.diag(THING_SIZE_M)
+def _thing(
+    seed: int,
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, ...]]]:
+    rng = np.random.default_rng([seed, 36])
+    edges = np.diag(THING_SIZE_M)
     bottom = THING_LOW_M + edges[1], edges[0], -edges[1]
     faces = [*box_faces(THING_LOW_M, edges), bottom]
     return [(*face, cell_room(seed).texture(rng, calm=False)) for face in faces]

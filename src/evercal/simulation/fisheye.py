@@ -28,7 +28,8 @@ def fisheye_image(
     side = int(2.2 * large.fx)
     # A border of some pixels beside 90 degrees for the interpolation.
     face = Camera(side, side, side / 2.04, side / 2.04, (side - 1) / 2, (side - 1) / 2)
-    image, best = np.zeros((large.height, large.width, 3), np.uint8), np.zeros(u.shape)
+    image = np.zeros((large.height, large.width, 3), np.uint8)
+    best = np.zeros(u.shape)
     for about_x, about_y in _FACES:
         turn = SE3.exp([0, 0, 0, np.deg2rad(about_x), np.deg2rad(about_y), 0])
         local = rays @ turn.rotation_matrix()
@@ -37,9 +38,12 @@ def fisheye_image(
         mine = nearness > best
         if not mine.any():
             continue
-        source = face.project(np.where(mine[..., None], local, (0.0, 0.0, 1.0))).astype(np.float32)
+        source = face.project(np.where(mine[..., None], local, (0.0, 0.0, 1.0))).astype(
+            np.float32
+        )
         seen = render(face, base_from_camera @ turn)
         warped = cv2.remap(seen, source[..., 0], source[..., 1], cv2.INTER_LINEAR)
-        image[mine], best[mine] = warped[mine], nearness[mine]
+        image[mine] = warped[mine]
+        best[mine] = nearness[mine]
     size = (camera.width, camera.height)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

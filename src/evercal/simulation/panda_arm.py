@@ -30,16 +30,22 @@ HIGH_RAD = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
 HOME_RAD = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 """Franka's ready position."""
 
-_REACHED_M, _REACHED_RAD = 1e-6, 1e-6
-_STEPS, _STARTS = 60, 12
+_REACHED_M = 1e-6
+_REACHED_RAD = 1e-6
+_STEPS = 60
+_STARTS = 12
 
 
 def joint_frames(joints_rad: Array) -> Array:
     """(8, 4, 4) frames of the seven joints and of the flange in the base, for joint angles (7,)."""
-    frames, current = np.zeros((8, 4, 4)), np.eye(4)
+    frames = np.zeros((8, 4, 4))
+    current = np.eye(4)
     for i, (a, d, alpha) in enumerate(LINKS):
         angle = joints_rad[i] if i < 7 else 0.0
-        c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(alpha), np.sin(alpha)
+        c = np.cos(angle)
+        s = np.sin(angle)
+        ca = np.cos(alpha)
+        sa = np.sin(alpha)
         step = np.array(
             [
                 [c, -s, 0, a],
@@ -81,7 +87,8 @@ def joints_for(base_from_gripper: SE3, start_rad: Array, seed: int = 0) -> Array
 
 def _descend(target: SE3, start: Array) -> tuple[Array, float, float]:
     """Joint angles, and the remaining distance in metres and radians."""
-    joints, error = start.copy(), np.full(6, np.inf)
+    joints = start.copy()
+    error = np.full(6, np.inf)
     for _ in range(_STEPS):
         frames = joint_frames(joints)
         flange = SE3.from_matrix(frames[-1])

@@ -41,7 +41,8 @@ def _noise_fill(height: int, width: int, rng: np.random.Generator) -> np.ndarray
 
 
 def _wave_fill(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
-    angle, period = rng.uniform(0, np.pi), rng.uniform(4, 40)
+    angle = rng.uniform(0, np.pi)
+    period = rng.uniform(4, 40)
     v, u = np.mgrid[0:height, 0:width].astype(np.float32)
     along = (u * np.cos(angle) + v * np.sin(angle)) / period
     wave = np.sign(np.sin(2 * np.pi * along))
@@ -54,7 +55,9 @@ def _wave_fill(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
 def _gradient_fill(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
     v, u = np.mgrid[0:height, 0:width].astype(np.float32)
     slope = rng.uniform(-0.3, 0.3, 2)
-    return (slope[0] * (u / width - 0.5) + slope[1] * (v / height - 0.5)).astype(np.float32)
+    return (slope[0] * (u / width - 0.5) + slope[1] * (v / height - 0.5)).astype(
+        np.float32
+    )
 
 
 _FILLS = (_noise_fill, _noise_fill, _gradient_fill, _wave_fill)
@@ -73,10 +76,15 @@ def _leaf_mask(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
         mask[:] = 1
     elif kind == 2:
         angle = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 8)))
-        corners = np.stack([np.cos(angle) * width / 2, np.sin(angle) * height / 2], -1) + centre
+        corners = (
+            np.stack([np.cos(angle) * width / 2, np.sin(angle) * height / 2], -1)
+            + centre
+        )
         cv2.fillPoly(mask, [np.round(corners).astype(np.int32)], 1.0)
     elif kind == 3:
-        box = cv2.boxPoints((centre, (width * 0.8, height * 0.5), float(rng.uniform(0, 180))))
+        box = cv2.boxPoints(
+            (centre, (width * 0.8, height * 0.5), float(rng.uniform(0, 180)))
+        )
         cv2.fillPoly(mask, [np.round(box).astype(np.int32)], 1.0)
     else:
         text = "".join(rng.choice(list(_LETTERS), rng.integers(1, 7)))
@@ -91,25 +99,35 @@ def dead_leaves(
     height: int, width: int, rng: np.random.Generator, leaves: int | None = None
 ) -> np.ndarray:
     """A dead-leaves picture (height, width, 3), RGB uint8; few leaves give a calm one."""
-    tint = rng.uniform(0.2, 0.8, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(0.2, 0.8))
+    tint = (
+        rng.uniform(0.2, 0.8, 3)
+        if rng.random() < 0.5
+        else np.full(3, rng.uniform(0.2, 0.8))
+    )
     picture = np.empty((height, width, 3), np.float32)
     picture[:] = tint + _noise_fill(height, width, rng)[..., None]
     count = int(rng.integers(20, 220)) if leaves is None else leaves
     # Power-law sizes. The largest are painted first, so small leaves stay visible.
-    low, high = 10.0, 0.6 * min(height, width)
+    low = 10.0
+    high = 0.6 * min(height, width)
     u = rng.random(count)
     sizes = np.sort(1.0 / (u / low + (1 - u) / high))[::-1]
     saturation = rng.uniform(0.0, 0.35)
     for size in sizes:
         h = int(np.clip(size * rng.uniform(0.6, 1.6), 4, height - 1))
         w = int(np.clip(size * rng.uniform(0.6, 1.6), 4, width - 1))
-        top, left = rng.integers(-h // 2, height - h // 2), rng.integers(-w // 2, width - w // 2)
+        top = rng.integers(-h // 2, height - h // 2)
+        left = rng.integers(-w // 2, width - w // 2)
         mask = _leaf_mask(h, w, rng)
         fill = _FILLS[rng.integers(len(_FILLS))](h, w, rng)
         colour = rng.uniform(0.02, 0.98) + saturation * rng.uniform(-1, 1, 3)
-        y0, y1 = max(top, 0), min(top + h, height)
-        x0, x1 = max(left, 0), min(left + w, width)
+        y0 = max(top, 0)
+        y1 = min(top + h, height)
+        x0 = max(left, 0)
+        x1 = min(left + w, width)
         window = (slice(y0 - top, y1 - top), slice(x0 - left, x1 - left))
         leaf = (colour + fill[window][..., None]).astype(np.float32)
-        np.copyto(picture[y0:y1, x0:x1], leaf, where=mask[window][..., None].astype(bool))
+        np.copyto(
+            picture[y0:y1, x0:x1], leaf, where=mask[window][..., None].astype(bool)
+        )
     return (np.clip(picture, 0.0, 1.0) * 255).astype(np.uint8)

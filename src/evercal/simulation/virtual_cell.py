@@ -35,7 +35,8 @@ camera within this angle of the flange's back."""
 
 _CENTRE_RAD = np.array([0.0, -0.6, 0.0, -2.2, 0.0, 1.75, 0.785])
 _SPREAD_RAD = np.array([0.8, 0.6, 0.5, 0.5, 0.7, 0.55, 1.2])
-_BLUR_RAD, _MOST_BLUR_STEPS = 0.002, 16
+_BLUR_RAD = 0.002
+_MOST_BLUR_STEPS = 16
 
 
 @dataclass(frozen=True)
@@ -70,15 +71,20 @@ class VirtualCamera:
     """A camera of the cell: on the gripper by gripper_from_camera, or fixed in the base."""
 
     def __init__(self, cell: "VirtualCell", mounted: SE3, on_gripper: bool):
-        self._cell, self._mounted, self._on_gripper = cell, mounted, on_gripper
+        self._cell = cell
+        self._mounted = mounted
+        self._on_gripper = on_gripper
 
     def read(self) -> tuple[float, NDArray[np.uint8]]:
         """Take an image: time in seconds, and (H, W, 3) RGB."""
-        options, stamp = self._cell.options, self._cell.clock.now()
+        options = self._cell.options
+        stamp = self._cell.clock.now()
         ends = stamp - options.exposure_s / 2, stamp + options.exposure_s / 2
         first, last = (self._cell.robot.true_state(time)[1] for time in ends)
         # A joint step moves the image by about a pixel, so that copies join to a smear.
-        steps = int(min(np.ceil(np.abs(first - last).max() / _BLUR_RAD), _MOST_BLUR_STEPS))
+        steps = int(
+            min(np.ceil(np.abs(first - last).max() / _BLUR_RAD), _MOST_BLUR_STEPS)
+        )
         times = np.linspace(*ends, steps + 1) if steps else [stamp]
         images = [self._render(float(time)) for time in times]
         mean = np.asarray(np.mean(images, axis=0), np.float32)
@@ -99,26 +105,36 @@ class VirtualCell:
     def __init__(self, seed: int = 0, options: CellOptions | None = None):
         self.options = options or CellOptions()
         if not 0 <= seed < RESERVED:
-            raise InputError(f"seed {seed}: use 0 to {RESERVED - 1}; higher ones are reserved")
+            raise InputError(
+                f"seed {seed}: use 0 to {RESERVED - 1}; higher ones are reserved"
+            )
         if min(self.options.width, self.options.height) < 64:
-            raise InputError(f"size {self.options.width}x{self.options.height}: at least 64x64")
+            raise InputError(
+                f"size {self.options.width}x{self.options.height}: at least 64x64"
+            )
         rng = np.random.default_rng([seed, 33])
         self.clock = Clock(self.options.realtime)
         self.intrinsics = default_camera(self.options.width, self.options.height)
-        sigma = self.options.arm_noise_mm / 1000, float(np.deg2rad(self.options.arm_noise_deg))
+        sigma = (
+            self.options.arm_noise_mm / 1000,
+            float(np.deg2rad(self.options.arm_noise_deg)),
+        )
         self.robot = VirtualRobot(self.clock, *sigma, seed)
         self.truth = CellTruth(_mount(rng), _tripod(rng))
         self.wrist_camera = VirtualCamera(self, self.truth.gripper_from_camera, True)
         self.tripod_camera = VirtualCamera(self, self.truth.base_from_tripod, False)
         self._holds = False
-        self.seed, self.noise = seed, np.random.default_rng([seed, 34])
+        self.seed = seed
+        self.noise = np.random.default_rng([seed, 34])
 
     def reachable_poses(self, count: int, seed: int = 0) -> SE3:
         """Random gripper poses (count,) from which a nominally mounted camera sees the table."""
         rng = np.random.default_rng([self.seed, 35, seed])
         poses: list[SE3] = []
         while len(poses) < count:
-            gripper = base_from_flange(_CENTRE_RAD + _SPREAD_RAD * rng.uniform(-1, 1, 7))
+            gripper = base_from_flange(
+                _CENTRE_RAD + _SPREAD_RAD * rng.uniform(-1, 1, 7)
+            )
             middle = (gripper @ nominal_mount()).inverse().apply(WORK_AREA_M)
             distance = float(np.linalg.norm(middle))
             ahead = middle[2] > np.cos(np.deg2rad(OFF_AXIS_DEG)) * distance
@@ -134,24 +150,35 @@ class VirtualCell:
     def holding_poses(self, count: int, seed: int = 0) -> SE3:
         """Random gripper poses (count,) at which the fixed camera sees all of the held thing."""
         rng = np.random.default_rng([self.seed, 37, seed])
-        base_from_camera, middle = self.truth.base_from_tripod, base_from_flange(_CENTRE_RAD)
+        base_from_camera = self.truth.base_from_tripod
+        middle = base_from_flange(_CENTRE_RAD)
         corners = THING_LOW_M + THING_SIZE_M * np.indices((2, 2, 2)).reshape(3, 8).T
         image = self.intrinsics.width, self.intrinsics.height
         poses: list[SE3] = []
         while len(poses) < count:
-            gripper = base_from_flange(_CENTRE_RAD + _SPREAD_RAD * rng.uniform(-1, 1, 7))
-            points, turn = gripper.apply(corners), (middle.inverse() @ gripper).log()[3:]
+            gripper = base_from_flange(
+                _CENTRE_RAD + _SPREAD_RAD * rng.uniform(-1, 1, 7)
+            )
+            points = gripper.apply(corners)
+            turn = (middle.inverse() @ gripper).log()[3:]
             pixels = self.intrinsics.project(base_from_camera.inverse().apply(points))
-            to_camera = (gripper.inverse() @ base_from_camera).translation_m - corners.mean(0)
+            to_camera = (
+                gripper.inverse() @ base_from_camera
+            ).translation_m - corners.mean(0)
             seen = ((pixels > 0) & (pixels < image)).all()
-            front = to_camera[2] > -np.cos(np.deg2rad(HIDDEN_DEG)) * np.linalg.norm(to_camera)
+            front = to_camera[2] > -np.cos(np.deg2rad(HIDDEN_DEG)) * np.linalg.norm(
+                to_camera
+            )
             near = np.abs(turn).max() < np.deg2rad(HELD_TURN_DEG)
             if seen and front and near and points[:, 2].min() > 0:
                 poses.append(gripper)
         return SE3.stack(poses)
 
     def render(
-        self, base_from_camera: SE3, joints_rad: np.ndarray, base_from_gripper: SE3 | None = None
+        self,
+        base_from_camera: SE3,
+        joints_rad: np.ndarray,
+        base_from_gripper: SE3 | None = None,
     ) -> NDArray[np.uint8]:
         """An ideal image, (H, W, 3), of a camera at a pose while the arm has joint angles (7,).
 
@@ -177,7 +204,8 @@ def _mount(rng: np.random.Generator) -> SE3:
 
 def _tripod(rng: np.random.Generator) -> SE3:
     side = 1.0 if rng.random() < 0.5 else -1.0
-    low, high = (-0.1, 0.4, 0.6), (0.2, 0.6, 0.8)
+    low = (-0.1, 0.4, 0.6)
+    high = (0.2, 0.6, 0.8)
     position = rng.uniform(low, high) * (1.0, side, 1.0)
     target = WORK_AREA_M + rng.uniform(-1, 1, 3) * (0.08, 0.08, 0.02)
     return look_at(position, target, float(rng.uniform(-0.05, 0.05)))

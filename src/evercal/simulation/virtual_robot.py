@@ -47,8 +47,11 @@ class Motion:
 
     def at(self, now_s: float) -> tuple[np.ndarray, SE3]:
         """Joint angles (7,) and error at a time; the motion is smooth at both ends."""
-        t = np.clip((now_s - self.start_s) / max(self.end_s - self.start_s, 1e-9), 0.0, 1.0)
-        share, start = float(t * t * (3 - 2 * t)), self.start_error
+        t = np.clip(
+            (now_s - self.start_s) / max(self.end_s - self.start_s, 1e-9), 0.0, 1.0
+        )
+        share = float(t * t * (3 - 2 * t))
+        start = self.start_error
         joints = self.start_rad + share * (self.end_rad - self.start_rad)
         return joints, start @ SE3.exp(share * (start.inverse() @ self.end_error).log())
 
@@ -58,9 +61,12 @@ class VirtualRobot:
 
     def __init__(self, clock: Clock, noise_m: float, noise_rad: float, seed: int):
         # Standard deviations of the true pose about the stated one, per axis.
-        self._clock, self._sigma = clock, np.repeat([noise_m, noise_rad], 3)
-        self._rng, self._lock = np.random.default_rng([seed, 32]), threading.Lock()
-        error, now = self._draw(), clock.now()
+        self._clock = clock
+        self._sigma = np.repeat([noise_m, noise_rad], 3)
+        self._rng = np.random.default_rng([seed, 32])
+        self._lock = threading.Lock()
+        error = self._draw()
+        now = clock.now()
         self._motion = Motion(HOME_RAD, HOME_RAD, now, now, error, error)
 
     def base_from_gripper(self) -> SE3:

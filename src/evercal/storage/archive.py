@@ -31,7 +31,9 @@ class ArchiveLimits:
     """Number of entries."""
 
 
-def write_archive(file: str | os.PathLike[str], root: Path, names: Iterable[str]) -> None:
+def write_archive(
+    file: str | os.PathLike[str], root: Path, names: Iterable[str]
+) -> None:
     """Write files of a folder into one zip archive, whole or not at all.
 
     Entries are stored, not compressed: JPEG images and half floats hardly shrink. The same files
@@ -49,7 +51,8 @@ def write_archive(file: str | os.PathLike[str], root: Path, names: Iterable[str]
         for name in names:
             entry = zipfile.ZipInfo(name, _SAME_TIME)
             entry.external_attr = (stat.S_IFREG | 0o644) << 16
-            entry.file_size = (root / name).stat().st_size  # above 2 GiB the header is longer
+            # Above 2 GiB the header is longer.
+            entry.file_size = (root / name).stat().st_size
             with open(root / name, "rb") as source, archive.open(entry, "w") as target:
                 shutil.copyfileobj(source, target, _CHUNK)
 
@@ -64,7 +67,9 @@ def check_archive(file: Path, limits: ArchiveLimits = ArchiveLimits()) -> list[s
         return [e.filename for e in _checked(archive, file, limits) if not e.is_dir()]
 
 
-def extract_archive(file: Path, folder: Path, limits: ArchiveLimits = ArchiveLimits()) -> None:
+def extract_archive(
+    file: Path, folder: Path, limits: ArchiveLimits = ArchiveLimits()
+) -> None:
     """Extract a zip archive into a folder that does not exist yet.
 
     Sizes are checked twice: as the archive states them, and while the files are written.
@@ -87,7 +92,13 @@ def _opened(file: Path, limits: ArchiveLimits) -> Iterator[zipfile.ZipFile]:
         with zipfile.ZipFile(_bounded(file, limits)) as archive:
             yield archive
             return
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError) as error:
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        ValueError,
+        NotImplementedError,
+    ) as error:
         broken = error
     except OSError as error:
         if error.errno != errno.EINVAL:  # a broken offset
@@ -107,21 +118,31 @@ def _bounded(file: Path, limits: ArchiveLimits) -> Path:
     return file
 
 
-def _checked(archive: zipfile.ZipFile, file: Path, limits: ArchiveLimits) -> list[zipfile.ZipInfo]:
+def _checked(
+    archive: zipfile.ZipFile, file: Path, limits: ArchiveLimits
+) -> list[zipfile.ZipInfo]:
     """The entries, if all of them may be extracted."""
-    entries, total = archive.infolist(), 0
+    entries = archive.infolist()
+    total = 0
     files: set[str] = set()
     folders: set[str] = set()
     for entry in entries:
         # `filename` ends at a zero byte, `orig_filename` does not.
-        name, kind = entry.orig_filename, stat.S_IFMT(entry.external_attr >> 16)
+        name = entry.orig_filename
+        kind = stat.S_IFMT(entry.external_attr >> 16)
         path = PurePosixPath(name.removesuffix("/"))
         if not _stays_inside(name):
-            raise InputError(f"{file}: entry {name!r} leaves the folder; nothing was extracted")
+            raise InputError(
+                f"{file}: entry {name!r} leaves the folder; nothing was extracted"
+            )
         if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
-            raise InputError(f"{file}: entry {name!r} is a link or device; only files are allowed")
+            raise InputError(
+                f"{file}: entry {name!r} is a link or device; only files are allowed"
+            )
         if entry.flag_bits & 1:
-            raise InputError(f"{file}: entry {name!r} is encrypted; give an archive without")
+            raise InputError(
+                f"{file}: entry {name!r} is encrypted; give an archive without"
+            )
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise InputError(f"{file}: entry {name!r} is neither stored nor deflated")
         if entry.is_dir():
@@ -133,7 +154,9 @@ def _checked(archive: zipfile.ZipFile, file: Path, limits: ArchiveLimits) -> lis
         folders.update(map(str, path.parents))
         total += entry.file_size
     if files & folders:
-        raise InputError(f"{file}: entry {min(files & folders)!r} is a file and a folder")
+        raise InputError(
+            f"{file}: entry {min(files & folders)!r} is a file and a folder"
+        )
     if total > limits.bytes:
         raise InputError(
             f"{file}: {total / 1e9:.1f} GB when extracted; at most {limits.bytes / 1e9:.1f} GB"
@@ -143,8 +166,15 @@ def _checked(archive: zipfile.ZipFile, file: Path, limits: ArchiveLimits) -> lis
 
 def _stays_inside(name: str) -> bool:
     parts = name.removesuffix("/").split("/")
-    plain = all(part not in ("", ".", "..") and len(part.encode()) <= 255 for part in parts)
-    return plain and not set(name) & {"\\", "\0"} and parts[0][1:2] != ":" and len(name) <= 1024
+    plain = all(
+        part not in ("", ".", "..") and len(part.encode()) <= 255 for part in parts
+    )
+    return (
+        plain
+        and not set(name) & {"\\", "\0"}
+        and parts[0][1:2] != ":"
+        and len(name) <= 1024
+    )
 
 
 def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) -> None:
@@ -153,7 +183,9 @@ def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) -> No
         while data := source.read(_CHUNK):
             left -= len(data)
             if left < 0:
-                raise zipfile.BadZipFile(f"entry {entry.filename!r} is larger than it states")
+                raise zipfile.BadZipFile(
+                    f"entry {entry.filename!r} is larger than it states"
+                )
             target.write(data)
     if left:
         raise zipfile.BadZipFile(f"entry {entry.filename!r} is smaller than it states")

@@ -57,13 +57,16 @@ def write_json(path: str | os.PathLike[str], obj: object) -> None:
     write_bytes(path, (text + "\n").encode())
 
 
-def replace_folder(temporary: str | os.PathLike[str], final: str | os.PathLike[str]) -> None:
+def replace_folder(
+    temporary: str | os.PathLike[str], final: str | os.PathLike[str]
+) -> None:
     """Rename a complete folder, replacing an existing one.
 
     No portable call swaps two folders. An existing `final` is first renamed to a fixed name. After
     a crash between the two renames, `recover_folder` restores it.
     """
-    temporary, final = Path(temporary), Path(final)
+    temporary = Path(temporary)
+    final = Path(final)
     for folder, _, names in os.walk(temporary):
         for name in names:
             _sync(Path(folder) / name)

@@ -61,7 +61,9 @@ class Manifest:
                 if size != record["bytes"]:
                     problems.append(f"{path}: {size} bytes, expected {record['bytes']}")
                 elif sha256_file(path) != record["sha256"]:
-                    problems.append(f"{path}: checksum does not match, its content was changed")
+                    problems.append(
+                        f"{path}: checksum does not match, its content was changed"
+                    )
             except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
                 problems.append(f"{path}: missing")
         return problems
@@ -82,16 +84,22 @@ def write_manifest(
         ValueError: A path that leaves `root`, or a payload that is not JSON.
         FileNotFoundError: One of the files is missing.
     """
-    root, recorded = Path(root), before.files if before else {}
+    root = Path(root)
+    recorded = before.files if before else {}
     records: dict[str, FileRecord] = {}
     for relative in sorted(set(files)):
         if not _stays_inside(relative):
             raise ValueError(f"manifest files lie inside {root}, got {relative!r}")
         path = root / relative
         size = path.stat().st_size
-        records[relative] = recorded.get(relative) or {"sha256": sha256_file(path), "bytes": size}
+        records[relative] = recorded.get(relative) or {
+            "sha256": sha256_file(path),
+            "bytes": size,
+        }
     # Converted to JSON and back, so that the checksum is that of the values that are read.
-    body = json.loads(json.dumps({"payload": payload, "files": records}, allow_nan=False))
+    body = json.loads(
+        json.dumps({"payload": payload, "files": records}, allow_nan=False)
+    )
     write_json(
         root / MANIFEST,
         {"format": _FORMAT, "schema": _SCHEMA, **body, "sha256": _body_sha256(body)},
@@ -123,23 +131,33 @@ def _read(root: Path) -> dict[str, dict]:
     except OSError:
         raise InputError(f"{root}: no {MANIFEST} in it, so it is not a store") from None
     except (ValueError, RecursionError):
-        raise InputError(f"{file}: broken, not valid JSON; restore it from a copy") from None
+        raise InputError(
+            f"{file}: broken, not valid JSON; restore it from a copy"
+        ) from None
     if not isinstance(data, dict) or data.get("format") != _FORMAT:
-        raise InputError(f"{file}: 'format' is not '{_FORMAT}'; this is another program's file")
+        raise InputError(
+            f"{file}: 'format' is not '{_FORMAT}'; this is another program's file"
+        )
     if data.get("schema") != _SCHEMA:
         raise InputError(
             f"{file}: schema {data.get('schema')!r}, this evercal reads {_SCHEMA}; update evercal"
         )
     body = {key: data.get(key) for key in ("payload", "files")}
     if not all(isinstance(value, dict) for value in body.values()):
-        raise InputError(f"{file}: broken, 'payload' or 'files' is no object; restore it")
+        raise InputError(
+            f"{file}: broken, 'payload' or 'files' is no object; restore it"
+        )
     if data.get("sha256") != _body_sha256(body):
         raise InputError(f"{file}: broken, its own checksum does not match; restore it")
     for relative, record in body["files"].items():  # pyright: ignore[reportOptionalMemberAccess]
         if not _stays_inside(relative) or not isinstance(record, dict):
-            raise InputError(f"{file}: broken, entry {relative!r} is no file of this folder")
+            raise InputError(
+                f"{file}: broken, entry {relative!r} is no file of this folder"
+            )
         if not {"sha256", "bytes"} <= record.keys():
-            raise InputError(f"{file}: broken, entry {relative!r} lacks sha256 or bytes")
+            raise InputError(
+                f"{file}: broken, entry {relative!r} lacks sha256 or bytes"
+            )
     return data
 
 

@@ -12,7 +12,10 @@ Content = TypeVar("Content")
 
 
 def of_format(
-    data: object, format: str, version: int, read: Callable[[Mapping[str, Any]], Content]
+    data: object,
+    format: str,
+    version: int,
+    read: Callable[[Mapping[str, Any]], Content],
 ) -> Content:
     """Convert JSON values that state their format and version.
 
@@ -22,7 +25,9 @@ def of_format(
     if not isinstance(data, dict) or data.get("format") != format:
         raise ValueError(f"'format' is not {format!r}")
     if data.get("version") != version:
-        raise ValueError(f"version {data.get('version')!r}; this evercal reads {version}")
+        raise ValueError(
+            f"version {data.get('version')!r}; this evercal reads {version}"
+        )
     try:
         return read(data)
     except KeyError as error:

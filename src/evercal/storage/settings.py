@@ -19,7 +19,8 @@ def lock_settings(path: Path, settings: Mapping[str, object]) -> None:
     before = read_settings(path)
     now = json.loads(json.dumps(settings))
     for key in sorted({*before, *now}):
-        a, b = before.get(key), now.get(key)
+        a = before.get(key)
+        b = now.get(key)
         if a != b:
             raise InputError(
                 f"{path.parent}: was begun with other settings: {key} {a!r}, now it is {b!r}; "
@@ -34,5 +35,7 @@ def read_settings(path: Path) -> dict[str, object]:
         if not isinstance(settings, dict):
             raise ValueError
     except (OSError, ValueError):
-        raise InputError(f"{path}: no settings in JSON; remove the folder and restart") from None
+        raise InputError(
+            f"{path}: no settings in JSON; remove the folder and restart"
+        ) from None
     return settings

@@ -53,9 +53,12 @@ def require_free(root: Path) -> None:
     if not root.exists():
         return
     if not root.is_dir() or not all(
-        path.name == STAGES or path.name.startswith((*_NETWORKS, ".")) for path in root.iterdir()
+        path.name == STAGES or path.name.startswith((*_NETWORKS, "."))
+        for path in root.iterdir()
     ):
-        raise InputError(f"store {root}: exists and is not an evercal store; give another path")
+        raise InputError(
+            f"store {root}: exists and is not an evercal store; give another path"
+        )
     _require_no_scenes(root)
 
 
@@ -63,7 +66,9 @@ def _require_no_links(root: Path) -> None:
     """Refuse folders that lie elsewhere: what a change removes there may be another map's."""
     for folder in (root / STAGES, *(root / STAGES).glob("*")):
         if folder.is_symlink():
-            raise InputError(f"store {root}: {folder} is a link; copy the whole map instead")
+            raise InputError(
+                f"store {root}: {folder} is a link; copy the whole map instead"
+            )
 
 
 def _require_no_scenes(root: Path) -> None:
@@ -95,23 +100,33 @@ def _check(root: Path, manifest: Manifest) -> None:
             " new store"
         )
     if schema != SCHEMA:
-        raise InputError(f"store {root}: schema {schema!r} is not {SCHEMA}; update evercal")
+        raise InputError(
+            f"store {root}: schema {schema!r} is not {SCHEMA}; update evercal"
+        )
     if problems := manifest.problems(root):
         raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
     if not isinstance(manifest.payload.get(_MADE, 0), int):
-        raise InputError(f"store {root}: {_MADE!r} in the manifest is not a number; restore it")
+        raise InputError(
+            f"store {root}: {_MADE!r} in the manifest is not a number; restore it"
+        )
     for name in _listed(root, manifest, "networks"):
         if name not in manifest.files:
-            raise InputError(f"store {root}: network {name!r} is not in the manifest; restore it")
+            raise InputError(
+                f"store {root}: network {name!r} is not in the manifest; restore it"
+            )
     for name in _listed(root, manifest, "stages"):
         if not isinstance(name, str) or not _STAGE.fullmatch(name):
-            raise InputError(f"store {root}: stage {name!r} is not a stage's name; restore it")
+            raise InputError(
+                f"store {root}: stage {name!r} is not a stage's name; restore it"
+            )
 
 
 def _listed(root: Path, manifest: Manifest, key: str) -> list[object]:
     names = manifest.payload.get(key, [])
     if not isinstance(names, list):
-        raise InputError(f"store {root}: {key!r} in the manifest is not a list; restore it")
+        raise InputError(
+            f"store {root}: {key!r} in the manifest is not a list; restore it"
+        )
     return names
 
 
@@ -121,9 +136,13 @@ class StageStore(Generic[Contents]):
     Nothing is written before the first stage is added. All stages share the networks.
     """
 
-    def __init__(self, root: Path, contents: Contents, stages: Names = (), networks: Names = ()):
-        self.root, self.contents = root, contents
-        self.stages, self.networks = list(stages), tuple(networks)
+    def __init__(
+        self, root: Path, contents: Contents, stages: Names = (), networks: Names = ()
+    ):
+        self.root = root
+        self.contents = contents
+        self.stages = list(stages)
+        self.networks = tuple(networks)
         resolved = root.resolve()  # one lock, whichever name the store is opened by
         self._lock = FileLock(resolved.parent / f".{resolved.name}.lock")
 
@@ -147,12 +166,16 @@ class StageStore(Generic[Contents]):
                 f"store {self.root}: another process is writing into it; wait until it has finished"
             ) from None
         except OSError as error:
-            raise InputError(f"store {self.root}: cannot be written ({error.strerror})") from error
+            raise InputError(
+                f"store {self.root}: cannot be written ({error.strerror})"
+            ) from error
         try:
             _require_no_links(self.root)
             before = Manifest.read(self.root) if is_store(self.root) else None
             if self.stages != (before.payload["stages"] if before else []):
-                raise InputError(f"store {self.root}: another process has changed it; run it again")
+                raise InputError(
+                    f"store {self.root}: another process has changed it; run it again"
+                )
             if before is None:
                 _require_no_scenes(self.root)
             yield before
@@ -186,7 +209,8 @@ class StageStore(Generic[Contents]):
             superseded: Files of kept stages that are dropped.
         """
         with self._changing() as before:
-            made, new = _made(before), {}
+            made = _made(before)
+            new = {}
             # A folder that the manifest does not list keeps its name.
             names = map(_STAGE.fullmatch, _names(self.root / STAGES))
             first = 1 + max([made, *(int(name[1]) for name in names if name)])
@@ -194,7 +218,9 @@ class StageStore(Generic[Contents]):
                 legal = re.sub(r"[^\w.-]", "_", name)[:60]
                 new[f"{number:04d}-{legal}"] = write
             made = first + len(new) - 1 if new else made
-            self._publish([*kept, *new], new, {**payload, _MADE: made}, before, superseded)
+            self._publish(
+                [*kept, *new], new, {**payload, _MADE: made}, before, superseded
+            )
 
     def replace(self, index: int, write: Write, payload: Mapping[str, object]) -> None:
         """Replace a stage: whole, or not at all.
@@ -213,22 +239,29 @@ class StageStore(Generic[Contents]):
             assert before is not None, "a store with stages has a manifest"
             _check(self.root, before)  # copies get checksums of their own
             stem, _, version = old.partition("~")
-            number, taken = int(version or 1) + 1, _names(self.root / STAGES)
+            number = int(version or 1) + 1
+            taken = _names(self.root / STAGES)
             while f"{stem}~{number}" in taken:
                 number += 1
             stage = f"{stem}~{number}"
             stages = [*self.stages[:index], stage, *self.stages[index + 1 :]]
             settings = {**payload, _MADE: _made(before)}
-            self._publish(stages, {stage: write_copy}, settings, before, lambda _: False)
+            self._publish(
+                stages, {stage: write_copy}, settings, before, lambda _: False
+            )
 
     def reports(self) -> list[dict[str, Any]]:
         """`report.json` of every stage, in order."""
-        return [json.loads((self.folder(name) / REPORT).read_text()) for name in self.stages]
+        return [
+            json.loads((self.folder(name) / REPORT).read_text()) for name in self.stages
+        ]
 
     def size_bytes(self) -> dict[str, int]:
         """Size on disk of every file in the manifest, by relative path."""
         manifest = Manifest.read(self.root)
-        return {file: int(str(record["bytes"])) for file, record in manifest.files.items()}
+        return {
+            file: int(str(record["bytes"])) for file, record in manifest.files.items()
+        }
 
     @contextmanager
     def _changing(self) -> Iterator[Manifest | None]:
@@ -236,7 +269,8 @@ class StageStore(Generic[Contents]):
         networks = self.networks
         with self.writing() as before:
             _tidy(self.root)
-            exists, there = self.root.exists(), _names(self.root)
+            exists = self.root.exists()
+            there = _names(self.root)
             try:
                 yield before
             except BaseException:
@@ -270,12 +304,19 @@ class StageStore(Generic[Contents]):
         files = [*self.networks]
         for stage in new:
             replace_folder(self.folder(f".{stage}"), self.folder(stage))
-            files += [f"{STAGES}/{stage}/{path.name}" for path in self.folder(stage).iterdir()]
+            files += [
+                f"{STAGES}/{stage}/{path.name}" for path in self.folder(stage).iterdir()
+            ]
         for file in before.files if before else ():
             stage, _, name = file.removeprefix(f"{STAGES}/").partition("/")
             if stage in stages and stage not in new and not superseded(name):
                 files.append(file)
-        settings = {"schema": SCHEMA, **payload, "networks": list(self.networks), "stages": stages}
+        settings = {
+            "schema": SCHEMA,
+            **payload,
+            "networks": list(self.networks),
+            "stages": stages,
+        }
         write_manifest(self.root, settings, files, before)
         self.stages = stages
 
@@ -283,7 +324,9 @@ class StageStore(Generic[Contents]):
 def _tidy(root: Path) -> None:
     """Remove what a change has dropped, or has left because it was refused or killed."""
     manifest = Manifest.read(root) if is_store(root) else None
-    stages, files = (manifest.payload["stages"], manifest.files) if manifest else ([], {})
+    stages, files = (
+        (manifest.payload["stages"], manifest.files) if manifest else ([], {})
+    )
     left = {*_journal(root, "new"), *_journal(root, "dropped")}.difference(stages)
     for name in _names(root / STAGES):
         folder = root / STAGES / name

@@ -12,7 +12,9 @@ from evercal.storage.atomic import write_bytes
 
 
 def save_tensors(
-    path: Path, arrays: Mapping[str, NDArray[np.generic]], metadata: dict[str, str] | None = None
+    path: Path,
+    arrays: Mapping[str, NDArray[np.generic]],
+    metadata: dict[str, str] | None = None,
 ) -> None:
     """Write named arrays, whole or not at all."""
     from safetensors.numpy import save
@@ -30,7 +32,9 @@ def load_tensors(path: Path) -> dict[str, NDArray[np.generic]]:
     try:
         return load(path.read_bytes())
     except (OSError, SafetensorError) as error:
-        raise InputError(f"{path}: not readable ({error}); run 'evercal info --check'") from None
+        raise InputError(
+            f"{path}: not readable ({error}); run 'evercal info --check'"
+        ) from None
 
 
 class StoredRows:
@@ -42,7 +46,8 @@ class StoredRows:
     def __init__(self, file: Any, name: str):
         part = file.get_slice(name)
         shape = part.get_shape()
-        self._count, self._rows = shape[0], file.get_tensor(name) if 0 in shape else part
+        self._count = shape[0]
+        self._rows = file.get_tensor(name) if 0 in shape else part
 
     def __len__(self) -> int:
         return self._count
@@ -60,4 +65,6 @@ def open_tensors(path: Path) -> dict[str, StoredRows]:
         file = safe_open(path, "np")
         return {name: StoredRows(file, name) for name in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError) as error:
-        raise InputError(f"{path}: not readable ({error}); run 'evercal info --check'") from None
+        raise InputError(
+            f"{path}: not readable ({error}); run 'evercal info --check'"
+        ) from None

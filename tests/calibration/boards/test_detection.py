@@ -12,7 +12,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.board import Board
-from evercal.calibration.boards.board_poses import BoardPoses, board_poses, read_board_poses
+from evercal.calibration.boards.board_poses import (
+    BoardPoses,
+    board_poses,
+    read_board_poses,
+)
 from evercal.calibration.boards.corners import (
     BoardView,
     board_pose,
@@ -51,7 +55,9 @@ def test_corners_and_poses_match_the_print(board: Board) -> None:
         view = detect(board, pose, seed)
         # The roll of the camera does not change the order of the corners.
         errors.append(view.pixels - CAMERA.project(pose.apply(view.points_m)))
-        metres, radians = pose_distance(board_pose(view, CAMERA).camera_from_board, pose)
+        metres, radians = pose_distance(
+            board_pose(view, CAMERA).camera_from_board, pose
+        )
         assert metres < 0.0006
         assert np.rad2deg(radians) < 0.3
     error = np.concatenate(errors)
@@ -60,9 +66,12 @@ def test_corners_and_poses_match_the_print(board: Board) -> None:
 
 
 def test_images_without_the_board_give_a_reason() -> None:
-    grey, tag = np.full((480, 640, 3), 128, np.uint8), photographed(TAG, view_of(TAG, 1))
+    grey = np.full((480, 640, 3), 128, np.uint8)
+    tag = photographed(TAG, view_of(TAG, 1))
     chessboard = photographed(CHESSBOARD, view_of(CHESSBOARD, 0))
-    part = "inner corners, not 12x9 inner corners; show the whole board, or correct --size"
+    part = (
+        "inner corners, not 12x9 inner corners; show the whole board, or correct --size"
+    )
     for image, board, message in (
         (grey, CHESSBOARD, "no chessboard with 9x6 inner corners"),
         (grey, CHARUCO, "0 corners of the ChArUco board"),
@@ -81,12 +90,27 @@ def test_images_without_the_board_give_a_reason() -> None:
     [
         (lambda: Board("chessboard", 0.03), "size of 3x3 to 200x200"),
         (lambda: Board("chessboard", 0.0, 9, 6), "allowed are 0.5 to 2000 mm"),
-        (lambda: Board("chessboard", 0.025e-3, 9, 6), "is 0.025 mm; allowed are 0.5 to 2000 mm"),
-        (lambda: Board("chessboard", 25.0, 9, 6), "is 25000 mm; .*give millimetres: --square-mm"),
+        (
+            lambda: Board("chessboard", 0.025e-3, 9, 6),
+            "is 0.025 mm; allowed are 0.5 to 2000 mm",
+        ),
+        (
+            lambda: Board("chessboard", 25.0, 9, 6),
+            "is 25000 mm; .*give millimetres: --square-mm",
+        ),
         (lambda: Board("chessboard", 0.025, 900, 6), "got 900x6"),
-        (lambda: Board("aprilgrid", 0.03, 6, 6), "is 0 mm; give --gap-mm: .* Kalibr's tagSpacing"),
-        (lambda: Board("charuco", 0.03, 5, 7, 0.04, "4X4_50"), "markers of a ChArUco board"),
-        (lambda: Board("apriltag", 0.03, dictionary="36h11"), "dictionary '36h11' is not known"),
+        (
+            lambda: Board("aprilgrid", 0.03, 6, 6),
+            "is 0 mm; give --gap-mm: .* Kalibr's tagSpacing",
+        ),
+        (
+            lambda: Board("charuco", 0.03, 5, 7, 0.04, "4X4_50"),
+            "markers of a ChArUco board",
+        ),
+        (
+            lambda: Board("apriltag", 0.03, dictionary="36h11"),
+            "dictionary '36h11' is not known",
+        ),
     ],
 )
 def test_invalid_boards_are_refused(create: Callable[[], Board], message: str) -> None:
@@ -107,14 +131,19 @@ def simulated(
     count: int, noise_px: float = 0.2, camera: Camera = CAMERA
 ) -> tuple[list[BoardView], list[SE3]]:
     """Return views with projected corners, and their poses."""
-    rng, points = np.random.default_rng(0), grid(9, 6)
+    rng = np.random.default_rng(0)
+    points = grid(9, 6)
     poses = [view_of(CHESSBOARD, seed) for seed in range(count)]
-    pixels = [camera.project(p.apply(points)) + rng.normal(0, noise_px, (54, 2)) for p in poses]
+    pixels = [
+        camera.project(p.apply(points)) + rng.normal(0, noise_px, (54, 2))
+        for p in poses
+    ]
     return [BoardView(points, p) for p in pixels], poses
 
 
 def test_covariance_of_a_pose_matches_repeated_views() -> None:
-    pose, points = view_of(CHESSBOARD, 0), grid(9, 6)
+    pose = view_of(CHESSBOARD, 0)
+    points = grid(9, 6)
     rng = np.random.default_rng(1)
     exact = CAMERA.project(pose.apply(points))
     errors = []
@@ -123,7 +152,9 @@ def test_covariance_of_a_pose_matches_repeated_views() -> None:
         estimate = board_pose(noisy, CAMERA, pose).camera_from_board
         rotation = (pose.inverse() @ estimate).log()[3:]
         errors.append([*(estimate.translation_m - pose.translation_m), *rotation])
-    expected = 0.3**2 * board_pose(BoardView(points, exact), CAMERA, pose).unit_covariance
+    expected = (
+        0.3**2 * board_pose(BoardView(points, exact), CAMERA, pose).unit_covariance
+    )
     sampled = np.cov(np.array(errors).T)
     sigma = np.sqrt(np.diag(expected))
     assert np.sqrt(np.diag(sampled)) == pytest.approx(sigma, rel=0.15)
@@ -133,7 +164,9 @@ def test_covariance_of_a_pose_matches_repeated_views() -> None:
 
 def test_pixel_noise_is_estimated_from_all_images() -> None:
     views, poses = simulated(10, 0.25)
-    fitted = [board_pose(view, CAMERA, pose) for view, pose in zip(views, poses, strict=True)]
+    fitted = [
+        board_pose(view, CAMERA, pose) for view, pose in zip(views, poses, strict=True)
+    ]
     assert pixel_sigma(fitted) == pytest.approx(0.25, rel=0.1)
     outlier = replace(fitted[0], residual_px=fitted[0].residual_px + 10)
     assert pixel_sigma([outlier, *fitted[1:]]) == pytest.approx(0.25, rel=0.1)
@@ -142,10 +175,15 @@ def test_pixel_noise_is_estimated_from_all_images() -> None:
 def test_the_best_candidate_of_a_tag_is_returned_even_if_it_faces_the_camera() -> None:
     points = TAG.size_m / 2 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
     facing = SE3.exp([0, 0, 0, 0, 0, -0.9]) @ SE3.exp([0, 0, 0, np.pi, 0, 0])
-    poses = [view_of(TAG, 2), SE3.from_translation(np.array([-0.09, 0.07, 0.32])) @ facing]
+    poses = [
+        view_of(TAG, 2),
+        SE3.from_translation(np.array([-0.09, 0.07, 0.32])) @ facing,
+    ]
     for pose in poses:
         view = BoardView(points, CAMERA.project(pose.apply(points)))
-        metres, radians = pose_distance(board_pose(view, CAMERA).camera_from_board, pose)
+        metres, radians = pose_distance(
+            board_pose(view, CAMERA).camera_from_board, pose
+        )
         assert metres < 1e-5
         assert radians < 1e-3
 
@@ -163,7 +201,8 @@ def test_intrinsics_are_estimated(k1: float) -> None:
 
 def test_false_detections_do_not_count() -> None:
     views, _ = simulated(10, 0.1)
-    plain, rng = calibrate_camera(views, 640, 480).camera, np.random.default_rng(0)
+    plain = calibrate_camera(views, 640, 480).camera
+    rng = np.random.default_rng(0)
     for _ in range(2):
         false = BoardView(views[0].points_m, rng.uniform(0, 480, views[0].pixels.shape))
         found = calibrate_camera([*views, false], 640, 480).camera
@@ -173,9 +212,12 @@ def test_false_detections_do_not_count() -> None:
 
 
 def test_intrinsics_require_five_tilted_views() -> None:
-    with pytest.raises(InputError, match="detected in 3 images, intrinsics take at least 5"):
+    with pytest.raises(
+        InputError, match="detected in 3 images, intrinsics take at least 5"
+    ):
         calibrate_camera(simulated(3)[0], 640, 480)
-    points, rng = grid(9, 6), np.random.default_rng(0)
+    points = grid(9, 6)
+    rng = np.random.default_rng(0)
     exact = CAMERA.project(points + np.array([-0.12, -0.075, 0.5]))
     frontal = [BoardView(points, exact + rng.normal(0, 0.2, (54, 2))) for _ in range(8)]
     with pytest.raises(InputError, match="leave the focal length open"):
@@ -184,7 +226,9 @@ def test_intrinsics_require_five_tilted_views() -> None:
 
 def test_the_file_is_read_back(tmp_path: Path) -> None:
     views, poses = simulated(4)
-    named = {f"image-{i}.png": view for i, view in enumerate(views)} | {"dark.png": "no board"}
+    named = {f"image-{i}.png": view for i, view in enumerate(views)} | {
+        "dark.png": "no board"
+    }
     written = board_poses(CHESSBOARD, CAMERA, named)
     assert [image.name for image in written.images] == list(named)
     written.write(tmp_path / "board.json")
@@ -208,7 +252,10 @@ def test_broken_files_are_refused(tmp_path: Path) -> None:
         ({"board": {"kind": "chessboard"}}, "'board' is invalid"),
         ({"images": [{"name": "a"}]}, "camera_from_board"),
         ({"images": [{**good["images"][0], "covariance": [1.0]}]}, "6x6"),
-        ({"images": [{**good["images"][0], "pixels": [[1.0, 2.0]]}]}, "four corners or more"),
+        (
+            {"images": [{**good["images"][0], "pixels": [[1.0, 2.0]]}]},
+            "four corners or more",
+        ),
     ):
         file.write_text(json.dumps({**good, **change}))
         with pytest.raises(InputError, match=message):
@@ -219,7 +266,8 @@ def test_broken_files_are_refused(tmp_path: Path) -> None:
 
 def test_charuco_boards_of_older_opencv_are_detected() -> None:
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    board = Board("charuco", 0.04, 5, 6, 0.03, "4X4_50")  # patterns differ for even rows
+    # Patterns differ for even rows.
+    board = Board("charuco", 0.04, 5, 6, 0.03, "4X4_50")
     page = cv2.aruco.CharucoBoard((5, 6), 0.04, 0.03, dictionary)
     page.setLegacyPattern(True)
     image = page.generateImage((600, 720), marginSize=40)
@@ -243,7 +291,8 @@ def kalibr_print(pixels_a_bit: int = 12) -> np.ndarray:
     """Return a print of 2x2 tags of 10 bits with gaps of 3 bits, and 5 bits of white around."""
     sheet = np.ones((36, 36), np.uint8)
     for tag, rows in KALIBR_BITS.items():
-        x, y = 8 + 13 * (tag % 2), 8 + 13 * (1 - tag // 2)
+        x = 8 + 13 * (tag % 2)
+        y = 8 + 13 * (1 - tag // 2)
         sheet[y : y + 10, x : x + 10] = 0
         bits = [[row >> (5 - k) & 1 for k in range(6)] for row in rows]
         sheet[y + 2 : y + 8, x + 2 : x + 8] = bits
@@ -267,7 +316,8 @@ def test_a_grid_of_kalibr_has_the_frame_of_kalibr() -> None:
 
 def test_squares_of_kalibr_do_not_move_the_corners_of_a_tag() -> None:
     tag = Board("apriltag", APRILGRID.size_m, dictionary="APRILTAG_36h11", tag=5)
-    grid, alone = [], []
+    grid = []
+    alone = []
     for seed in range(4):
         pose = view_of(APRILGRID, seed)
         whole = detect(APRILGRID, pose, seed)
@@ -285,10 +335,16 @@ def test_squares_of_kalibr_do_not_move_the_corners_of_a_tag() -> None:
 @pytest.mark.parametrize("board", [APRILGRID, ARUCOGRID], ids=lambda b: b.kind)
 def test_the_first_marker_of_a_grid_may_have_any_number(board: Board) -> None:
     printed = replace(board, tag=9)
-    images = {str(seed): photographed(printed, view_of(board, seed)) for seed in range(2)}
-    found, views = find_boards(list(images), images.__getitem__, replace(board, tag=None))
+    images = {
+        str(seed): photographed(printed, view_of(board, seed)) for seed in range(2)
+    }
+    found, views = find_boards(
+        list(images), images.__getitem__, replace(board, tag=None)
+    )
     assert found.tag == 9
-    assert [len(view.pixels) for view in views.values() if isinstance(view, BoardView)] == [48, 48]
+    assert [
+        len(view.pixels) for view in views.values() if isinstance(view, BoardView)
+    ] == [48, 48]
     half = {"": images["0"].copy()}
     half[""][:, :320] = 128  # only some of the markers
     view = find_boards([""], half.__getitem__, printed)[1][""]
@@ -300,20 +356,50 @@ def test_the_first_marker_of_a_grid_may_have_any_number(board: Board) -> None:
 @pytest.mark.parametrize(
     ("printed", "stated", "message"),
     [
-        (CHARUCO, {"columns": 5, "rows": 6}, "markers 0 to 14 are visible, they fit 6x5 squares"),
-        (CHARUCO, {"columns": 4, "rows": 4}, "they fit 6x5 squares, not 4x4; correct --size"),
-        (CHARUCO, {"marker_m": 0.02}, "markers measure 30.* mm beside squares of 40 mm, not 20"),
-        (APRILGRID, {"columns": 3, "rows": 4}, "they fit 4x3 markers from --tag 0, not 3x4"),
-        (ARUCOGRID, {"columns": 4, "rows": 2}, "they fit 4x3 markers from --tag 0, not 4x2"),
-        (ARUCOGRID, {"tag": 5}, "they fit 4x3 .* from --tag 0, not 4x3; correct --size or --tag"),
-        (APRILGRID, {"gap_m": 0.01}, "gaps measure 12.* mm beside markers of 40 mm, not 10"),
+        (
+            CHARUCO,
+            {"columns": 5, "rows": 6},
+            "markers 0 to 14 are visible, they fit 6x5 squares",
+        ),
+        (
+            CHARUCO,
+            {"columns": 4, "rows": 4},
+            "they fit 6x5 squares, not 4x4; correct --size",
+        ),
+        (
+            CHARUCO,
+            {"marker_m": 0.02},
+            "markers measure 30.* mm beside squares of 40 mm, not 20",
+        ),
+        (
+            APRILGRID,
+            {"columns": 3, "rows": 4},
+            "they fit 4x3 markers from --tag 0, not 3x4",
+        ),
+        (
+            ARUCOGRID,
+            {"columns": 4, "rows": 2},
+            "they fit 4x3 markers from --tag 0, not 4x2",
+        ),
+        (
+            ARUCOGRID,
+            {"tag": 5},
+            "they fit 4x3 .* from --tag 0, not 4x3; correct --size or --tag",
+        ),
+        (
+            APRILGRID,
+            {"gap_m": 0.01},
+            "gaps measure 12.* mm beside markers of 40 mm, not 10",
+        ),
         (CHESSBOARD, {"columns": 8}, "(9x6|6x9) inner corners, not 8x6 inner corners"),
     ],
 )
 def test_a_board_of_another_size_is_named_after_a_few_images(
     printed: Board, stated: dict[str, float], message: str
 ) -> None:
-    images = [photographed(printed, view_of(printed, seed), seed) for seed in (0, 1, 3, 4)]
+    images = [
+        photographed(printed, view_of(printed, seed), seed) for seed in (0, 1, 3, 4)
+    ]
     reads: list[str] = []
 
     def read(name: str) -> np.ndarray:
@@ -321,7 +407,9 @@ def test_a_board_of_another_size_is_named_after_a_few_images(
         return images[len(reads) - 1]
 
     wrong = replace(printed, **stated)
-    with pytest.raises(InputError, match="no board in any of 4 images, spread over 40 ") as raised:
+    with pytest.raises(
+        InputError, match="no board in any of 4 images, spread over 40 "
+    ) as raised:
         find_boards([str(i) for i in range(40)], read, wrong)
     assert re.search(message, str(raised.value))
     assert len(reads) == 4
@@ -331,16 +419,26 @@ def test_a_chessboard_at_the_border_is_a_part_of_a_board() -> None:
     image = photographed(CHESSBOARD, view_of(CHESSBOARD, 0))
     cut = find_board(np.ascontiguousarray(image[:, 260:]), CHESSBOARD)
     assert isinstance(cut, str)
-    assert "cut by the border of the image, not 9x6 inner corners; show the whole board" in cut
+    assert (
+        "cut by the border of the image, not 9x6 inner corners; show the whole board"
+        in cut
+    )
 
 
 def test_a_search_ends_after_twenty_images_without_a_board() -> None:
-    grey, shown = np.full((120, 160, 3), 128, np.uint8), photographed(TAG, view_of(TAG, 1))
-    with pytest.raises(InputError, match="no board in any of 20 images, spread over 300 "):
+    grey = np.full((120, 160, 3), 128, np.uint8)
+    shown = photographed(TAG, view_of(TAG, 1))
+    with pytest.raises(
+        InputError, match="no board in any of 20 images, spread over 300 "
+    ):
         find_boards([str(i) for i in range(300)], lambda _: grey, TAG)
     images = [grey] * 9 + [shown]
-    views = find_boards([str(i) for i in range(10)], lambda name: images[int(name)], TAG)[1]
-    assert [isinstance(view, BoardView) for view in views.values()] == [False] * 9 + [True]
+    views = find_boards(
+        [str(i) for i in range(10)], lambda name: images[int(name)], TAG
+    )[1]
+    assert [isinstance(view, BoardView) for view in views.values()] == [False] * 9 + [
+        True
+    ]
 
 
 def test_every_window_of_refinement_stays_between_edges() -> None:

@@ -9,8 +9,12 @@ from evercal.calibration.pose_pairs.solve import solve
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg
 from evercal.simulation.box_room import look_at
 
-LENS = Camera(640, 480, 245.0, 246.0, 322.0, 236.0, (0.03, -0.01, 0.004, -0.001), "fisheye")
-GRID = np.stack(np.meshgrid(np.arange(9), np.arange(7), [0.0]), -1).reshape(-1, 3) * 0.03
+LENS = Camera(
+    640, 480, 245.0, 246.0, 322.0, 236.0, (0.03, -0.01, 0.004, -0.001), "fisheye"
+)
+GRID = (
+    np.stack(np.meshgrid(np.arange(9), np.arange(7), [0.0]), -1).reshape(-1, 3) * 0.03
+)
 
 
 def views_of(
@@ -36,7 +40,9 @@ def test_a_pose_through_a_fisheye_is_exact() -> None:
     rng = np.random.default_rng(0)
     for pose in cameras(10, rng).inverse():
         (view,) = views_of(LENS, SE3.stack([pose]), 0.0, rng)
-        millimetres, degrees = pose_distance_mm_deg(board_pose(view, LENS).camera_from_board, pose)
+        millimetres, degrees = pose_distance_mm_deg(
+            board_pose(view, LENS).camera_from_board, pose
+        )
         assert millimetres < 1e-4
         assert degrees < 1e-4
 
@@ -52,10 +58,8 @@ def test_intrinsics_and_mount_of_a_fisheye_follow_from_a_board(seed: int) -> Non
     pixels = np.stack([x, y], -1)
     off = estimated.project(LENS.unproject(pixels)) - pixels
     assert np.abs(off - off.mean((0, 1))).max() < 0.5
-    mount, base_from_board = (
-        SE3.exp([0.03, -0.05, 0.08, 0.3, 1.0, -0.4]),
-        SE3.exp([0.6, 0, 0.1, 0, 0, 1]),
-    )
+    mount = SE3.exp([0.03, -0.05, 0.08, 0.3, 1.0, -0.4])
+    base_from_board = SE3.exp([0.6, 0, 0.1, 0, 0, 1])
     grippers = base_from_board @ board_from_camera @ mount.inverse()
     poses = SE3.stack([board_pose(view, estimated).camera_from_board for view in views])
     names = tuple(f"{i}.png" for i in range(20))

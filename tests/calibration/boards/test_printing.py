@@ -36,14 +36,20 @@ def test_a_print_is_detected_at_its_size(board: Board, tmp_path: Path) -> None:
 
 def test_the_ruler_is_as_long_as_it_says() -> None:
     page, dpi = drawing(TAG)
-    rows = np.flatnonzero((np.asarray(page)[:, : page.width * 2 // 3] == 0).mean(1) > 0.6)
+    rows = np.flatnonzero(
+        (np.asarray(page)[:, : page.width * 2 // 3] == 0).mean(1) > 0.6
+    )
     dark = np.flatnonzero(~np.asarray(page)[rows[-1]])
     assert (dark[-1] - dark[0]) * 25.4 / dpi == pytest.approx(100, abs=0.2)
 
 
 def test_pdf_files_have_the_size_of_the_paper(tmp_path: Path) -> None:
-    for paper, board, size in (("letter", TAG, [612, 792]), ("a3", CHESSBOARD, [1190.6, 841.9])):
-        write_board(tmp_path / "b.pdf", board, paper)  # the chessboard is wider: landscape
+    for paper, board, size in (
+        ("letter", TAG, [612, 792]),
+        ("a3", CHESSBOARD, [1190.6, 841.9]),
+    ):
+        # The chessboard is wider: landscape.
+        write_board(tmp_path / "b.pdf", board, paper)
         content = (tmp_path / "b.pdf").read_bytes()
         box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", content)
         assert box is not None
@@ -53,9 +59,19 @@ def test_pdf_files_have_the_size_of_the_paper(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("board", "paper", "file", "message"),
     [
-        (Board("chessboard", 0.025, 28, 17), "a4", "b.pdf", "741x479 mm .*; give --paper a1"),
+        (
+            Board("chessboard", 0.025, 28, 17),
+            "a4",
+            "b.pdf",
+            "741x479 mm .*; give --paper a1",
+        ),
         (Board("chessboard", 0.2, 28, 17), "a4", "b.pdf", "make the squares smaller"),
-        (APRILGRID, "a4", "b.pdf", "an aprilgrid is not printed; take the print of Kalibr"),
+        (
+            APRILGRID,
+            "a4",
+            "b.pdf",
+            "an aprilgrid is not printed; take the print of Kalibr",
+        ),
         (TAG, "a9", "b.pdf", "paper 'a9' is not known; use one of a4"),
         (TAG, "a4", "b.svg", r"b.svg: give a file name that ends with .pdf or .png"),
         (

@@ -15,16 +15,24 @@ def calibration_of(
 ) -> Calibration:
     """Return a calibration with typical frame names and three images, one of them unused."""
     parent = "base_link" if mount == "eye_to_hand" else "tool0"
-    images = (ImageUse("a.png", True), ImageUse("b.png", False, "blurred"), ImageUse("c.png", True))
+    images = (
+        ImageUse("a.png", True),
+        ImageUse("b.png", False, "blurred"),
+        ImageUse("c.png", True),
+    )
     covariance = np.diag([1e-6, 2e-6, 3e-6, 1e-8, 2e-8, 3e-8])
-    return Calibration(mount, pose, covariance, parent, "cam/optical-frame", camera, images)
+    return Calibration(
+        mount, pose, covariance, parent, "cam/optical-frame", camera, images
+    )
 
 
 def poses() -> st.SearchStrategy[SE3]:
     """Draw any pose, and often one at gimbal lock or with a rotation of 180 degrees."""
     number = st.floats(-3, 3, allow_subnormal=False)
     unit = st.floats(-1, 1, allow_subnormal=False)
-    quaternions = st.tuples(unit, unit, unit, unit).filter(lambda q: sum(v * v for v in q) > 1e-3)
+    quaternions = st.tuples(unit, unit, unit, unit).filter(
+        lambda q: sum(v * v for v in q) > 1e-3
+    )
     special = st.sampled_from(
         [
             (1.0, 0.0, 0.0, 0.0),

@@ -23,24 +23,31 @@ def test_axes_follow_rep_103() -> None:
     link_from_optical = standard_link_from_optical((0.01, 0.02, 0.03))
     axes = link_from_optical.apply([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
     offset = np.array([0.01, 0.02, 0.03])
-    np.testing.assert_allclose(axes - offset, [[1, 0, 0], [0, -1, 0], [0, 0, -1]], atol=1e-12)
+    np.testing.assert_allclose(
+        axes - offset, [[1, 0, 0], [0, -1, 0], [0, 0, -1]], atol=1e-12
+    )
 
 
 def test_the_covariance_is_propagated_to_the_link() -> None:
     """A lever arm adds the uncertainty of the rotation to that of the translation."""
-    pose, offset = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4]), (0.1, 0.2, -0.3)
+    pose = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
+    offset = (0.1, 0.2, -0.3)
     options = ExportOptions(via="camera_link", via_offset=offset)
     moved = prepare_export(calibration_of(pose), **options).calibration
     assert (moved.parent_frame, moved.child_frame) == ("base_link", "camera_link")
     optical_from_link = standard_link_from_optical(offset).inverse()
-    assert np.max(pose_distance(moved.parent_from_child, pose @ optical_from_link)) < 1e-9
+    assert (
+        np.max(pose_distance(moved.parent_from_child, pose @ optical_from_link)) < 1e-9
+    )
     covariance = calibration_of(pose).covariance
     lever = pose.rotation_matrix() @ cross_matrix(optical_from_link.translation_m)
     expected = covariance[:3, :3] + lever @ covariance[3:, 3:] @ lever.T
     np.testing.assert_allclose(moved.covariance[:3, :3], expected, rtol=1e-9)
     turned = optical_from_link.rotation_matrix().T
     expected = turned @ covariance[3:, 3:] @ turned.T
-    np.testing.assert_allclose(moved.covariance[3:, 3:], expected, rtol=1e-9, atol=1e-20)
+    np.testing.assert_allclose(
+        moved.covariance[3:, 3:], expected, rtol=1e-9, atol=1e-20
+    )
 
 
 def entry(parent: str, child: str, pose: SE3) -> dict:
@@ -80,17 +87,26 @@ def test_transforms_are_chained(tmp_path: Path, kind: str) -> None:
 
 
 def test_exported_and_written_transforms_are_read(tmp_path: Path) -> None:
-    file, calibration = tmp_path / "t.yaml", calibration_of(LINK_FROM_COLOR)
-    for write in (calibration.write, lambda path: calibration.export("transform_stamped", path)):
+    file = tmp_path / "t.yaml"
+    calibration = calibration_of(LINK_FROM_COLOR)
+    for write in (
+        calibration.write,
+        lambda path: calibration.export("transform_stamped", path),
+    ):
         write(file)
-        link_from_optical = read_link_from_optical(file, "base_link", "cam/optical-frame")
+        link_from_optical = read_link_from_optical(
+            file, "base_link", "cam/optical-frame"
+        )
         assert np.max(pose_distance(link_from_optical, LINK_FROM_COLOR)) < 1e-9
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (yaml.safe_dump(entry("camera_link", "other", SE3.identity())), "leads from 'camera_link'"),
+        (
+            yaml.safe_dump(entry("camera_link", "other", SE3.identity())),
+            "leads from 'camera_link'",
+        ),
         ("a: [", "not valid YAML"),
         ("hello", "contains no transform"),
         ("", "contains no transform"),

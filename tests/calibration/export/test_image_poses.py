@@ -33,12 +33,17 @@ def read_colmap(folder: Path) -> Any:
 
 
 @pytest.mark.parametrize("distortion", [*DISTORTIONS, RATIONAL])
-def test_colmap_projects_like_the_camera(tmp_path: Path, distortion: tuple[float, ...]) -> None:
-    camera, pose = camera_with(distortion), SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
+def test_colmap_projects_like_the_camera(
+    tmp_path: Path, distortion: tuple[float, ...]
+) -> None:
+    camera = camera_with(distortion)
+    pose = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
     calibration_of(pose, camera=camera).export("colmap", tmp_path / "model")
     model = read_colmap(tmp_path / "model")
     assert sorted(image.name for image in model.images.values()) == ["a.png", "c.png"]
-    points = pose.apply(np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (20, 3)))
+    points = pose.apply(
+        np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (20, 3))
+    )
     for image in model.images.values():
         camera_from_base = image.cam_from_world()
         pixels = model.cameras[image.camera_id].img_from_cam(camera_from_base * points)
@@ -59,7 +64,9 @@ def test_colmap_of_a_camera_on_the_arm(tmp_path: Path) -> None:
     for image in model.images.values():
         base_from_gripper = random_poses()[names.index(image.name)].matrix()
         expected = np.linalg.inv(base_from_gripper @ ON_ARM.parent_from_child.matrix())
-        np.testing.assert_allclose(image.cam_from_world().matrix(), expected[:3], atol=1e-9)
+        np.testing.assert_allclose(
+            image.cam_from_world().matrix(), expected[:3], atol=1e-9
+        )
 
 
 def test_colmap_does_not_overwrite_a_model(tmp_path: Path) -> None:
@@ -78,14 +85,16 @@ def test_colmap_refuses_blanks_in_names(tmp_path: Path) -> None:
 
 
 def test_nerfstudio_rays_match_the_camera() -> None:
-    camera, pose = camera_with(()), SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
+    camera = camera_with(())
+    pose = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
     meta = json.loads(calibration_of(pose, camera=camera).export("nerfstudio"))
     assert [frame["file_path"] for frame in meta["frames"]] == ["a.png", "c.png"]
     assert (meta["w"], meta["h"], meta["camera_model"]) == (640, 480, "OPENCV")
     pixels = np.random.default_rng(0).uniform(0, 480, (10, 2))
     # nerfstudio adds half a pixel, and its cameras look along -z.
     u, v = np.moveaxis(pixels + 0.5, -1, 0)
-    x, y = (u - meta["cx"]) / meta["fl_x"], -(v - meta["cy"]) / meta["fl_y"]
+    x = (u - meta["cx"]) / meta["fl_x"]
+    y = -(v - meta["cy"]) / meta["fl_y"]
     rays = np.stack([x, y, -np.ones_like(x)], axis=-1)
     for frame in meta["frames"]:
         matrix = np.array(frame["transform_matrix"])
@@ -100,13 +109,22 @@ def test_nerfstudio_distortion_is_its_polynomial(distortion: tuple[float, ...]) 
     calibration = calibration_of(SE3.identity(), camera=camera)
     meta = json.loads(calibration.export("nerfstudio"))
     points = np.random.default_rng(0).uniform([-0.5, -0.4, 1], [0.5, 0.4, 1], (10, 3))
-    x, y = points[:, 0], points[:, 1]
+    x = points[:, 0]
+    y = points[:, 1]
     r2 = x * x + y * y
     k1, k2, k3, k4, p1, p2 = (meta[key] for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
-    u = meta["fl_x"] * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + meta["cx"]
-    v = meta["fl_y"] * (y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)) + meta["cy"]
-    np.testing.assert_allclose(np.stack([u, v], -1) - 0.5, camera.project(points), atol=1e-9)
+    u = (
+        meta["fl_x"] * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x))
+        + meta["cx"]
+    )
+    v = (
+        meta["fl_y"] * (y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y))
+        + meta["cy"]
+    )
+    np.testing.assert_allclose(
+        np.stack([u, v], -1) - 0.5, camera.project(points), atol=1e-9
+    )
 
 
 def test_nerfstudio_refuses_rational_distortion() -> None:
@@ -132,12 +150,17 @@ def test_tum_of_a_camera_on_the_arm(tmp_path: Path) -> None:
     for line, matrix in zip(lines, expected.matrix(), strict=True):
         actual = quaternion_matrix(*line[4:], translation=line[1:4])
         np.testing.assert_allclose(actual, matrix, atol=1e-9)
-    assert np.max(pose_distance(read_robot_poses(tmp_path / "a.tum").poses, expected)) < 1e-12
+    assert (
+        np.max(pose_distance(read_robot_poses(tmp_path / "a.tum").poses, expected))
+        < 1e-12
+    )
 
 
 @pytest.mark.parametrize("name", ["tum", "colmap", "nerfstudio"])
 def test_missing_inputs_are_refused(name: str) -> None:
-    with pytest.raises(InputError, match=f"{name}: .* give the gripper's poses with --robot-poses"):
+    with pytest.raises(
+        InputError, match=f"{name}: .* give the gripper's poses with --robot-poses"
+    ):
         ON_ARM.export(name)
     fixed = calibration_of(SE3.identity())
     with pytest.raises(InputError, match=f"{name} holds the pose of the camera"):
@@ -148,23 +171,34 @@ def test_missing_inputs_are_refused(name: str) -> None:
 
 
 def test_without_images_the_frame_names_the_image() -> None:
-    calibration = replace(calibration_of(SE3.identity()), images=(), child_frame="camera")
+    calibration = replace(
+        calibration_of(SE3.identity()), images=(), child_frame="camera"
+    )
     meta = json.loads(calibration.export("nerfstudio"))
     assert [frame["file_path"] for frame in meta["frames"]] == ["camera.png"]
 
 
-def moveit(robot: RobotPoses | None, target: RobotPoses | None) -> list[dict[str, list[float]]]:
+def moveit(
+    robot: RobotPoses | None, target: RobotPoses | None
+) -> list[dict[str, list[float]]]:
     text = ON_ARM.export("moveit_samples", robot_poses=robot, target_poses=target)
     return yaml.safe_load(text)
 
 
 @pytest.mark.parametrize("named", [False, True])
 def test_moveit_samples_are_pairs_of_matrices(named: bool) -> None:
-    robot, target = random_poses(3, 1), random_poses(3, 2)
-    first, second, order = None, None, [0, 1, 2]
+    robot = random_poses(3, 1)
+    target = random_poses(3, 2)
+    first = None
+    second = None
+    order = [0, 1, 2]
     if named:
-        first, second, order = ("a", "b", "c"), ("c", "a", "b"), [2, 0, 1]
-    samples = moveit(RobotPoses(first, None, robot), RobotPoses(second, None, target[order]))
+        first = ("a", "b", "c")
+        second = ("c", "a", "b")
+        order = [2, 0, 1]
+    samples = moveit(
+        RobotPoses(first, None, robot), RobotPoses(second, None, target[order])
+    )
     assert len(samples) == 3
     for i, sample in enumerate(samples):
         assert sample.keys() == {"effector_wrt_world", "object_wrt_sensor"}
@@ -179,10 +213,15 @@ def test_moveit_samples_are_pairs_of_matrices(named: bool) -> None:
     ("target", "message"),
     [
         (None, r"--robot-poses and the board's poses .* --target-poses"),
-        (RobotPoses(("a", "b", "c"), None, random_poses(3)), "'c' has only one of its two poses"),
+        (
+            RobotPoses(("a", "b", "c"), None, random_poses(3)),
+            "'c' has only one of its two poses",
+        ),
         (RobotPoses(None, None, random_poses(3)), "2 robot poses and 3 target poses"),
     ],
 )
-def test_incomplete_moveit_pairs_are_refused(target: RobotPoses | None, message: str) -> None:
+def test_incomplete_moveit_pairs_are_refused(
+    target: RobotPoses | None, message: str
+) -> None:
     with pytest.raises(InputError, match=message):
         moveit(RobotPoses(("a", "b"), None, random_poses(2)), target)

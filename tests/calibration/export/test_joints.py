@@ -57,7 +57,13 @@ ARM = replace(
     joint_covariance=np.diag([4e-4, 4e-6, 2.5e-7, 9e-6]),
 )
 LEROBOT = {
-    name: {"id": i, "drive_mode": 0, "homing_offset": 100, "range_min": 800, "range_max": 3101}
+    name: {
+        "id": i,
+        "drive_mode": 0,
+        "homing_offset": 100,
+        "range_min": 800,
+        "range_max": 3101,
+    }
     for i, name in enumerate(("pan", "elbow", "wrist", "gripper"), 1)
 }
 
@@ -78,7 +84,9 @@ def file_of(folder: Path, text: str, encoding: str = "utf-8") -> Path:
         (URDF, "utf-8"),
         (URDF.replace("\n", "\r\n"), "utf-8"),
         (
-            URDF.replace('"1.0"?>', '"1.0" encoding="ISO-8859-1"?>').replace("only", "für"),
+            URDF.replace('"1.0"?>', '"1.0" encoding="ISO-8859-1"?>').replace(
+                "only", "für"
+            ),
             "latin-1",
         ),
         (URDF.replace("only", "für"), "utf-8-sig"),
@@ -87,7 +95,8 @@ def file_of(folder: Path, text: str, encoding: str = "utf-8") -> Path:
 def test_reported_values_give_the_poses_of_corrected_ones(
     tmp_path: Path, text: str, encoding: str
 ) -> None:
-    file, new = file_of(tmp_path, text, encoding), tmp_path / "new.urdf"
+    file = file_of(tmp_path, text, encoding)
+    new = tmp_path / "new.urdf"
     ARM.export("corrected_urdf", new, urdf=file)
     values = np.random.default_rng(1).uniform(-1, 1, (20, 4))
     before, after = (RobotModel(path).arm("base", "tip") for path in (file, new))
@@ -104,7 +113,10 @@ def test_the_rest_of_the_urdf_stays(tmp_path: Path) -> None:
     pairs = zip(old.split("\n"), new.split("\n"), strict=True)
     differ = [pair for pair in pairs if pair[0] != pair[1]]
     for was, now in differ:
-        kept = [re.sub(" (rpy|xyz) ?= ?[\"'][-\\d.e ]*[\"']", "", line) for line in (was, now)]
+        kept = [
+            re.sub(" (rpy|xyz) ?= ?[\"'][-\\d.e ]*[\"']", "", line)
+            for line in (was, now)
+        ]
         assert kept[0].replace("<origin/>", "") == kept[1].replace("<origin/>", "")
     # elbow, rail, wrist, and the follower of elbow.
     assert [was.strip()[:13] for was, _ in differ] == [
@@ -114,7 +126,8 @@ def test_the_rest_of_the_urdf_stays(tmp_path: Path) -> None:
 
 def test_offsets_of_zero_leave_the_poses(tmp_path: Path) -> None:
     """Gimbal lock at a pitch of 90 degrees included."""
-    file, new = file_of(tmp_path, URDF.replace("0.2 0.4 0", "0.2 1.5707963267948966 0.3")), tmp_path
+    file = file_of(tmp_path, URDF.replace("0.2 0.4 0", "0.2 1.5707963267948966 0.3"))
+    new = tmp_path
     still = with_joints(*(replace(joint, offset=0.0) for joint in JOINTS))
     still.export("corrected_urdf", new / "new.urdf", urdf=file)
     values = np.random.default_rng(1).uniform(-1, 1, (5, 4))
@@ -147,7 +160,9 @@ def test_a_urdf_of_another_arm_is_refused(
 
 @pytest.mark.parametrize("name", ["joint_offsets", "corrected_urdf", "lerobot"])
 def test_a_calibration_without_joints_says_what_to_record(name: str) -> None:
-    with pytest.raises(InputError, match=f"{name}: .* record joints.csv and a URDF, not"):
+    with pytest.raises(
+        InputError, match=f"{name}: .* record joints.csv and a URDF, not"
+    ):
         calibration_of(SE3.identity()).export(name)
 
 
@@ -157,7 +172,9 @@ def test_missing_options_and_undetermined_joints_are_refused(tmp_path: Path) -> 
     with pytest.raises(InputError, match="--lerobot-motors feetech or dynamixel"):
         ARM.export("lerobot", lerobot_calibration=tmp_path / "arm.json")
     still = with_joints(replace(JOINTS[1], open="move elbow more between the images"))
-    with pytest.raises(InputError, match=r"no offset is determined \(elbow: move elbow more"):
+    with pytest.raises(
+        InputError, match=r"no offset is determined \(elbow: move elbow more"
+    ):
         still.export("corrected_urdf", urdf=file_of(tmp_path, URDF))
 
 
@@ -191,7 +208,9 @@ def test_lerobot_reports_corrected_degrees(tmp_path: Path, motors: Any) -> None:
     assert [*record] == [*LEROBOT]
     for joint in JOINTS:
         if joint.is_angle:
-            before, after = (degrees(r[joint.name], motors, 2300) for r in (LEROBOT, record))
+            before, after = (
+                degrees(r[joint.name], motors, 2300) for r in (LEROBOT, record)
+            )
             # Half a tick.
             assert after - before == pytest.approx(np.rad2deg(joint.offset), abs=0.044)
     assert abs(record["elbow"]["homing_offset"] - 100) == 20
@@ -216,6 +235,9 @@ def test_other_arms_of_lerobot_are_refused(
 ) -> None:
     record = {**LEROBOT, "wrist": {**LEROBOT["wrist"], "homing_offset": homing}}
     (tmp_path / "arm.json").write_text(json.dumps(record))
-    options = {"lerobot_calibration": tmp_path / "arm.json", "lerobot_motors": "feetech"}
+    options = {
+        "lerobot_calibration": tmp_path / "arm.json",
+        "lerobot_motors": "feetech",
+    }
     with pytest.raises(InputError, match=message):
         with_joints(*joints).export("lerobot", **options)

@@ -58,7 +58,8 @@ def shell(text: str) -> Read:
 
 def launch_py(text: str) -> Read:
     """Run the launch file with stand-ins of ROS."""
-    launch, actions = types.ModuleType("launch"), types.ModuleType("launch_ros.actions")
+    launch = types.ModuleType("launch")
+    actions = types.ModuleType("launch_ros.actions")
     launch.LaunchDescription = list  # pyright: ignore[reportAttributeAccessIssue]
     actions.Node = dict  # pyright: ignore[reportAttributeAccessIssue]
     stand_ins = {"launch": launch, "launch_ros": types.ModuleType("launch_ros")}
@@ -68,7 +69,10 @@ def launch_py(text: str) -> Read:
             patch.setitem(sys.modules, name, module)
         exec(compile(text, "x.launch.py", "exec"), namespace)
         (node,) = namespace["generate_launch_description"]()
-    assert (node["package"], node["executable"]) == ("tf2_ros", "static_transform_publisher")
+    assert (node["package"], node["executable"]) == (
+        "tf2_ros",
+        "static_transform_publisher",
+    )
     assert node["name"].isidentifier()
     return flags(node["arguments"])
 
@@ -76,7 +80,10 @@ def launch_py(text: str) -> Read:
 def ros1_launch(text: str) -> Read:
     node = ElementTree.fromstring(text).find("node")
     assert node is not None
-    assert (node.get("pkg"), node.get("type")) == ("tf2_ros", "static_transform_publisher")
+    assert (node.get("pkg"), node.get("type")) == (
+        "tf2_ros",
+        "static_transform_publisher",
+    )
     *words, parent, child = str(node.get("args")).split()
     x, y, z, *rotation = map(float, words)
     return quaternion_matrix(*rotation, translation=(x, y, z)), parent, child
@@ -93,7 +100,11 @@ def stamped(text: str) -> Read:
     message = yaml.safe_load(text)
     assert message.keys() == {"header", "child_frame_id", "transform"}
     assert message["header"].pop("stamp") == {"sec": 0, "nanosec": 0}
-    return of_message(message["transform"]), *message["header"].values(), message["child_frame_id"]
+    return (
+        of_message(message["transform"]),
+        *message["header"].values(),
+        message["child_frame_id"],
+    )
 
 
 def easy_handeye2(text: str) -> Read:
@@ -107,7 +118,9 @@ def easy_handeye2(text: str) -> Read:
     types_of = dict.fromkeys(names, str) | {"freehand_robot_movement": bool}
     assert {key: type(value) for key, value in parameters.items()} == types_of
     # The publisher selects the parent by the type of the calibration.
-    in_hand = {"eye_in_hand": True, "eye_on_base": False}[parameters["calibration_type"]]
+    in_hand = {"eye_in_hand": True, "eye_on_base": False}[
+        parameters["calibration_type"]
+    ]
     parent = parameters["robot_effector_frame" if in_hand else "robot_base_frame"]
     return of_message(message["transform"]), parent, parameters["tracking_base_frame"]
 
@@ -115,15 +128,26 @@ def easy_handeye2(text: str) -> Read:
 def easy_handeye(text: str) -> Read:
     data = yaml.safe_load(text)
     assert data.keys() == {"parameters", "transformation"}
-    given, numbers = data["parameters"], data["transformation"]
+    given = data["parameters"]
+    numbers = data["transformation"]
     # The keyword arguments of its reader.
-    names = {"namespace", "move_group_namespace", "move_group", "eye_on_hand", "robot_base_frame"}
+    names = {
+        "namespace",
+        "move_group_namespace",
+        "move_group",
+        "eye_on_hand",
+        "robot_base_frame",
+    }
     names |= {"robot_effector_frame", "tracking_base_frame", "tracking_marker_frame"}
     assert given.keys() <= names
     assert given["namespace"] == "/evercal/"
-    parent = given["robot_effector_frame" if given["eye_on_hand"] else "robot_base_frame"]
+    parent = given[
+        "robot_effector_frame" if given["eye_on_hand"] else "robot_base_frame"
+    ]
     rotation = (numbers.pop(f"q{axis}") for axis in "xyzw")
-    matrix = quaternion_matrix(*rotation, translation=[numbers.pop(axis) for axis in "xyz"])
+    matrix = quaternion_matrix(
+        *rotation, translation=[numbers.pop(axis) for axis in "xyz"]
+    )
     assert not numbers
     return matrix, parent, given["tracking_base_frame"]
 
@@ -131,7 +155,9 @@ def easy_handeye(text: str) -> Read:
 def urdf(text: str) -> Read:
     joint = ElementTree.fromstring(text)
     parent, child = (str(joint.find(end).get("link")) for end in ("parent", "child"))  # type: ignore[union-attr]
-    robot = f'<robot name="r"><link name="{parent}"/><link name="{child}"/>{text}</robot>'
+    robot = (
+        f'<robot name="r"><link name="{parent}"/><link name="{child}"/>{text}</robot>'
+    )
     model = yourdfpy.URDF.load(io.BytesIO(robot.encode()))
     return model.get_transform(child, parent), parent, child
 
@@ -144,7 +170,8 @@ def read_opencv(text: str) -> dict[str, Any]:
 
 
 def opencv(text: str) -> Read:
-    values, camera_from_parent = read_opencv(text), np.eye(4)
+    values = read_opencv(text)
+    camera_from_parent = np.eye(4)
     camera_from_parent[:3, :3] = cv2.Rodrigues(values["rvec"])[0]
     camera_from_parent[:3, 3:] = values["tvec"]
     return np.linalg.inv(camera_from_parent), "", ""
@@ -161,9 +188,12 @@ def zivid(text: str) -> Read:
     return plain(np.array(record["FloatMatrix"]["Data"]), 1000)
 
 
-def of_rotation(rotation: Rotation, position: list[float], per_metre: float = 1000) -> Read:
+def of_rotation(
+    rotation: Rotation, position: list[float], per_metre: float = 1000
+) -> Read:
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation.as_matrix(), position
+    matrix[:3, :3] = rotation.as_matrix()
+    matrix[:3, 3] = position
     return plain(matrix, per_metre)
 
 
@@ -185,7 +215,9 @@ def abb(text: str) -> Read:
     return of_rotation(Rotation.from_quat(quaternion, scalar_first=True), position)
 
 
-def euler(pattern: str, axes: str, order: tuple[int, int, int]) -> Callable[[str], Read]:
+def euler(
+    pattern: str, axes: str, order: tuple[int, int, int]
+) -> Callable[[str], Read]:
     """Three lengths and three angles; upper case axes turn with the body."""
 
     def read(text: str) -> Read:
@@ -229,12 +261,16 @@ def test_every_format_of_one_pose_has_a_reader() -> None:
 @pytest.mark.parametrize("name", READERS)
 @given(poses(), st.sampled_from(["eye_to_hand", "eye_in_hand"]))
 @settings(max_examples=8)
-def test_the_pose_and_its_frames_are_read_back(name: str, pose: SE3, mount: Mount) -> None:
+def test_the_pose_and_its_frames_are_read_back(
+    name: str, pose: SE3, mount: Mount
+) -> None:
     matrix, parent, child = READERS[name](calibration_of(pose, mount).export(name))
     assert (parent, child) in (("", ""), (parent_of(mount), CHILD))
     # Controllers' files have nine decimals; at gimbal lock scipy's angles are off by 2e-7 rad.
     rotation = pose.rotation_matrix()
-    tolerance = 3e-7 if np.isclose(np.abs(rotation), 1, rtol=0, atol=1e-9).any() else 4e-9
+    tolerance = (
+        3e-7 if np.isclose(np.abs(rotation), 1, rtol=0, atol=1e-9).any() else 4e-9
+    )
     np.testing.assert_allclose(matrix[:3, :3], rotation, atol=tolerance)
     np.testing.assert_allclose(matrix[:3, 3], pose.translation_m, atol=2e-9)
     np.testing.assert_allclose(matrix[3], [0, 0, 0, 1])
@@ -264,11 +300,18 @@ def test_files_of_matrices_are_poses_of_robots(tmp_path: Path) -> None:
     assert (record["parent_frame"], record["child_frame"]) == ("base_link", CHILD)
 
 
-def test_easy_handeye2_has_the_name_of_its_file_and_the_other_frame(tmp_path: Path) -> None:
+def test_easy_handeye2_has_the_name_of_its_file_and_the_other_frame(
+    tmp_path: Path,
+) -> None:
     calibration = calibration_of(SE3.identity())
-    text = calibration.export("easy_handeye2", tmp_path / "cell.calib", robot_frame="flange")
+    text = calibration.export(
+        "easy_handeye2", tmp_path / "cell.calib", robot_frame="flange"
+    )
     parameters = yaml.safe_load(text)["parameters"]
-    assert (parameters["name"], parameters["robot_effector_frame"]) == ("cell", "flange")
+    assert (parameters["name"], parameters["robot_effector_frame"]) == (
+        "cell",
+        "flange",
+    )
 
 
 @pytest.mark.parametrize("count", [0, 4, 5, 8])
@@ -290,7 +333,9 @@ def test_camera_info(tmp_path: Path, count: int) -> None:
     assert np.trim_zeros(read.distortion, "b") == distortion
 
 
-@pytest.mark.parametrize("name", ["/camera", "my camera", "a\nb", "a/", "a//b", '"', "-x", "<"])
+@pytest.mark.parametrize(
+    "name", ["/camera", "my camera", "a\nb", "a/", "a//b", '"', "-x", "<"]
+)
 def test_invalid_frame_names_are_refused(name: str) -> None:
     with pytest.raises(InputError, match="is no name of a tf frame"):
         calibration_of(SE3.identity()).export("urdf", child=name)

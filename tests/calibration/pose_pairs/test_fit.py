@@ -26,12 +26,17 @@ def mean_of(n: int) -> np.ndarray:
 
 
 def system(
-    residual: np.ndarray, directions: dict[str, np.ndarray], known: float = 0.0, prior: float = 0.0
+    residual: np.ndarray,
+    directions: dict[str, np.ndarray],
+    known: float = 0.0,
+    prior: float = 0.0,
 ) -> System:
     """Return the system of a mean of n residuals (n, 6)."""
     n = len(residual)
     information = prior * np.eye(6)
-    return System(residual, mean_of(n), known * mean_of(n), directions, information, np.zeros(6))
+    return System(
+        residual, mean_of(n), known * mean_of(n), directions, information, np.zeros(6)
+    )
 
 
 def test_one_kind_equals_the_sample_variance() -> None:
@@ -68,14 +73,18 @@ def test_known_noise_is_subtracted() -> None:
     levels = estimate_levels(measured)
     assert levels.variance[0] == pytest.approx(16e-6, rel=0.3)
     total = noise_of(measured, levels.variance)
-    assert np.trace(total[0]) / 6 == pytest.approx(values.var(0, ddof=1).mean(), rel=1e-2)
+    assert np.trace(total[0]) / 6 == pytest.approx(
+        values.var(0, ddof=1).mean(), rel=1e-2
+    )
 
 
 def test_levels_maximize_the_restricted_likelihood_with_a_prior() -> None:
     rng = np.random.default_rng(3)
     n = 12
     parts = {"a": mean_of(n), "b": rng.normal(size=(n, 6, 2))}
-    values = rng.normal(0, 0.5, (n, 6)) + (parts["b"] @ rng.normal(size=(n, 2, 1)))[..., 0]
+    values = (
+        rng.normal(0, 0.5, (n, 6)) + (parts["b"] @ rng.normal(size=(n, 2, 1)))[..., 0]
+    )
     measured = system(values, parts, prior=1.0)
     shared = np.tile(np.eye(6), (n, n))  # the prior of the mean, unit covariance
 
@@ -85,7 +94,10 @@ def test_levels_maximize_the_restricted_likelihood_with_a_prior() -> None:
         for i, block in enumerate(noise_of(measured, np.exp(logarithms))):
             covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += block
         error = values.ravel()
-        return float(np.linalg.slogdet(covariance)[1] + error @ np.linalg.solve(covariance, error))
+        return float(
+            np.linalg.slogdet(covariance)[1]
+            + error @ np.linalg.solve(covariance, error)
+        )
 
     best = minimize(loss, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-4}).x
     assert np.log(estimate_levels(measured).variance) == pytest.approx(best, abs=0.02)
@@ -96,8 +108,12 @@ def test_one_estimated_variance_gives_the_f_distribution(freedom: float) -> None
     slope = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])[None]
     uncertainty = np.array([[2 * 0.7**2 / freedom]])
     factor = ellipsoid_factor(0.7 * slope[0], slope, uncertainty)
-    assert factor == pytest.approx(6 * f.ppf(0.95, 6, freedom) / chi2.ppf(0.95, 6), rel=1e-6)
-    assert ellipsoid_factor(np.eye(6), slope, np.zeros((1, 1))) == pytest.approx(1.0, abs=1e-4)
+    assert factor == pytest.approx(
+        6 * f.ppf(0.95, 6, freedom) / chi2.ppf(0.95, 6), rel=1e-6
+    )
+    assert ellipsoid_factor(np.eye(6), slope, np.zeros((1, 1))) == pytest.approx(
+        1.0, abs=1e-4
+    )
 
 
 def test_covariance_and_influence_match_their_definitions() -> None:
@@ -108,23 +124,30 @@ def test_covariance_and_influence_match_their_definitions() -> None:
     assert fit.inliers.all()
     at = equation.system(fit.at)
     normal = at.prior + sum(
-        j.T @ np.linalg.solve(noise, j) for j, noise in zip(at.jacobian, fit.weights, strict=True)
+        j.T @ np.linalg.solve(noise, j)
+        for j, noise in zip(at.jacobian, fit.weights, strict=True)
     )
     assert fit.covariance == pytest.approx(np.linalg.inv(normal), rel=1e-6)
     # Kinds of noise and priors explain the covariance; the information adds up to one.
-    assert sum(fit.contributions.values()) == pytest.approx(fit.covariance[:6, :6], rel=1e-5)
+    assert sum(fit.contributions.values()) == pytest.approx(
+        fit.covariance[:6, :6], rel=1e-5
+    )
     assert 0.9 < fit.information.sum() < 1.0
     without = np.arange(14) != 3
     left_out = refine(equation, fit.at, fit.weights, without)
     moved = left_out.translations[0] - fit.at.translations[0]
-    assert fit.moved[3, :3] == pytest.approx(moved, abs=0.02 * float(np.linalg.norm(moved)))
+    assert fit.moved[3, :3] == pytest.approx(
+        moved, abs=0.02 * float(np.linalg.norm(moved))
+    )
 
 
 def test_one_outlier_is_rejected_by_its_distance() -> None:
     pairs = recording(Setting(poses=15), 2).pairs
     shifted = pairs.camera_from_board.translation_m.copy()
     shifted[4] += 0.02  # ten standard deviations
-    moved = type(pairs.camera_from_board)(pairs.camera_from_board.rotation_wxyz, shifted)
+    moved = type(pairs.camera_from_board)(
+        pairs.camera_from_board.rotation_wxyz, shifted
+    )
     pairs = replace(pairs, camera_from_board=moved)
     equation = pairs.equation("eye_in_hand", Extras.nothing(15))
     fit = robust_fit(equation, agreement(equation, consensus_start(equation).at))

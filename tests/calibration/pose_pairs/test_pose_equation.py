@@ -16,7 +16,9 @@ from evercal.geometry import SE3
 MOUNTS: tuple[Mount, ...] = ("eye_in_hand", "eye_to_hand")
 
 
-def unknowns(parent_from_camera: SE3, fixed_from_board: SE3, extras: int = 0) -> Unknowns:
+def unknowns(
+    parent_from_camera: SE3, fixed_from_board: SE3, extras: int = 0
+) -> Unknowns:
     both = SE3.stack([parent_from_camera, fixed_from_board])
     return Unknowns(both.rotation_matrix(), both.translation_m, np.zeros(extras))
 
@@ -35,16 +37,22 @@ def residuals(pairs: PosePairs, mount: Mount, at: Unknowns) -> np.ndarray:
 
 @settings(max_examples=20)
 @given(st.sampled_from(MOUNTS), st.integers(0, 1000), st.booleans())
-def test_derivatives_match_finite_differences(mount: Mount, seed: int, moving: bool) -> None:
-    simulated, rng = exact(mount, seed), np.random.default_rng(seed)
-    pairs, extras = simulated.pairs, Extras.nothing(6)
+def test_derivatives_match_finite_differences(
+    mount: Mount, seed: int, moving: bool
+) -> None:
+    simulated = exact(mount, seed)
+    rng = np.random.default_rng(seed)
+    pairs = simulated.pairs
+    extras = Extras.nothing(6)
     for name in ("shared depth", "size"):
         extras = extras.with_one(name, rng.normal(size=(6, 6)), 0.1)
     if moving:
         pairs = replace(pairs, velocity=rng.normal(size=(6, 6)))
         extras = extras.with_one("clock", np.zeros((6, 6)), np.inf)
     equation = pairs.equation(mount, extras)
-    at = unknowns(simulated.parent_from_camera, simulated.fixed_from_board, len(extras.names))
+    at = unknowns(
+        simulated.parent_from_camera, simulated.fixed_from_board, len(extras.names)
+    )
     step = np.r_[rng.normal(0, 0.05, 12), np.zeros(len(extras.names))]
     at = at.moved(step)
     system = equation.system(at)
@@ -52,13 +60,19 @@ def test_derivatives_match_finite_differences(mount: Mount, seed: int, moving: b
     assert np.diag(system.prior)[12:14] == pytest.approx([100.0, 100.0])
     step = 1e-6
     for i, unit in enumerate(np.eye(equation.unknowns) * step):
-        ahead, behind = (equation.system(at.moved(sign * unit)).residual for sign in (1, -1))
-        assert np.abs((ahead - behind) / (2 * step) - system.jacobian[:, :, i]).max() < 1e-4
+        ahead, behind = (
+            equation.system(at.moved(sign * unit)).residual for sign in (1, -1)
+        )
+        assert (
+            np.abs((ahead - behind) / (2 * step) - system.jacobian[:, :, i]).max()
+            < 1e-4
+        )
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_velocity_gives_the_derivative_by_time(mount: Mount) -> None:
-    simulated, step = exact(mount, 3), 1e-6
+    simulated = exact(mount, 3)
+    step = 1e-6
     rng = np.random.default_rng(4)
     velocity = rng.normal(size=(6, 6))
     robot = simulated.pairs.base_from_gripper
@@ -78,12 +92,14 @@ def test_velocity_gives_the_derivative_by_time(mount: Mount) -> None:
 
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_noise_directions_match_perturbed_poses(mount: Mount) -> None:
-    simulated, step = exact(mount, 5), 1e-6
+    simulated = exact(mount, 5)
+    step = 1e-6
     at = unknowns(simulated.parent_from_camera, simulated.fixed_from_board)
     directions = equation_of(simulated.pairs, mount).system(at).directions
     small = SE3.exp(np.array([0, 0, 0, step, 0, 0]))
     pairs = simulated.pairs
-    robot, camera = pairs.base_from_gripper, pairs.camera_from_board
+    robot = pairs.base_from_gripper
+    camera = pairs.camera_from_board
     perturbed = {
         "rotation about gripper": replace(pairs, base_from_gripper=robot @ small),
         "rotation about board": replace(pairs, camera_from_board=camera @ small),
@@ -92,7 +108,9 @@ def test_noise_directions_match_perturbed_poses(mount: Mount) -> None:
         residual = residuals(changed, mount, at) / step
         covariance = directions[kind] @ directions[kind].transpose(0, 2, 1)
         # The residual is a combination of the directions, with a length of one radian.
-        length = np.einsum("ni,nij,nj->n", residual, np.linalg.pinv(covariance, 1e-9), residual)
+        length = np.einsum(
+            "ni,nij,nj->n", residual, np.linalg.pinv(covariance, 1e-9), residual
+        )
         assert length == pytest.approx(1.0, abs=1e-3)
         [other] = set(perturbed) - {kind}
         foreign = directions[other] @ directions[other].transpose(0, 2, 1)
@@ -113,5 +131,7 @@ def test_known_noise_matches_sampled_camera_poses() -> None:
     rotation = SE3.exp(np.concatenate([np.zeros((20000, 3)), draws[:, 3:]], 1))
     noisy = SE3((camera @ rotation).rotation_wxyz, camera.translation_m + draws[:, :3])
     robot = pairs.base_from_gripper[np.zeros(20000, dtype=int)]
-    sampled = np.cov(residuals(PosePairs(("",) * 20000, robot, noisy), "eye_in_hand", at).T)
+    sampled = np.cov(
+        residuals(PosePairs(("",) * 20000, robot, noisy), "eye_in_hand", at).T
+    )
     assert sampled == pytest.approx(known[0], abs=0.05 * np.abs(known[0]).max())

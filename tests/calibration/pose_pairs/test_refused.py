@@ -25,7 +25,9 @@ def pairs_of(robot: SE3, mount: Mount, noise: float) -> PosePairs:
     """Simulate the camera poses of given robot poses."""
     truth = recording(replace(EXACT, mount=mount, path="table"), 0)
     fixed_from_parent = robot if mount == "eye_in_hand" else robot.inverse()
-    camera = (fixed_from_parent @ truth.parent_from_camera).inverse() @ truth.fixed_from_board
+    camera = (
+        fixed_from_parent @ truth.parent_from_camera
+    ).inverse() @ truth.fixed_from_board
     setting = Setting(noise_mm=2 * noise, noise_deg=0.2 * noise)
     camera = shaken(camera, setting, np.random.default_rng(1))
     return PosePairs(tuple(f"row {i + 1}" for i in range(len(robot))), robot, camera)
@@ -55,7 +57,9 @@ def degenerate_motions() -> dict[str, tuple[SE3, str]]:
     }
 
 
-@pytest.mark.parametrize(("mount", "noise"), [("eye_in_hand", 0.0), ("eye_to_hand", 1.0)])
+@pytest.mark.parametrize(
+    ("mount", "noise"), [("eye_in_hand", 0.0), ("eye_to_hand", 1.0)]
+)
 @pytest.mark.parametrize("name", degenerate_motions())
 @pytest.mark.parametrize("scale_known", [True, False])
 def test_degenerate_motions_are_refused(
@@ -63,11 +67,16 @@ def test_degenerate_motions_are_refused(
 ) -> None:
     robot, message = degenerate_motions()[name]
     pairs = pairs_of(robot, mount, noise)
-    if name == "rotation" and scale_known:  # a pan-tilt head; the size of its board is stated
-        truth = recording(replace(EXACT, mount=mount, path="table"), 0).parent_from_camera
+    # A pan-tilt head; the size of its board is stated.
+    if name == "rotation" and scale_known:
+        truth = recording(
+            replace(EXACT, mount=mount, path="table"), 0
+        ).parent_from_camera
         calibration = solve(pairs, mount)
         assert calibration.uncertain_pose.squared_mahalanobis(truth) < 16.8
-        assert not noise or "turned about one point" in calibration.checks["warnings"][0]
+        assert (
+            not noise or "turned about one point" in calibration.checks["warnings"][0]
+        )
         return
     with pytest.raises(InputError, match=message):
         solve(pairs, mount, scale_known)
@@ -78,11 +87,16 @@ def test_an_outlier_is_not_a_second_axis() -> None:
     robot = pairs.base_from_gripper
     outlier = robot[-1] @ SE3.exp([0.1, 0, 0, 0.6, 0.3, 0.0])
     with pytest.raises(InputError, match="parallel axes"):
-        solve(replace(pairs, base_from_gripper=SE3.stack([*robot[:-1], outlier])), "eye_in_hand")
+        solve(
+            replace(pairs, base_from_gripper=SE3.stack([*robot[:-1], outlier])),
+            "eye_in_hand",
+        )
 
 
 @pytest.mark.parametrize("distance_m", [0.5, 0.0])
-def test_poses_on_a_sphere_about_the_board_require_a_known_scale(distance_m: float) -> None:
+def test_poses_on_a_sphere_about_the_board_require_a_known_scale(
+    distance_m: float,
+) -> None:
     # All motions rotate about the board. At distance zero its scale changes no residual.
     rotation = Rotation.from_rotvec(np.random.default_rng(3).normal(0, 0.5, (25, 3)))
     camera = pose(rotation, np.tile([0, 0, distance_m], (25, 1)))
@@ -90,17 +104,26 @@ def test_poses_on_a_sphere_about_the_board_require_a_known_scale(distance_m: flo
     robot = truth.fixed_from_board @ (truth.parent_from_camera @ camera).inverse()
     pairs = PosePairs(truth.pairs.names, robot, camera)
     calibration = solve(pairs, "eye_in_hand")
-    assert np.abs(error(calibration.parent_from_child, truth.parent_from_camera)).max() < 1e-6
-    with pytest.raises(InputError, match=r"pure rotation: .* leave the camera's scale open"):
+    assert (
+        np.abs(error(calibration.parent_from_child, truth.parent_from_camera)).max()
+        < 1e-6
+    )
+    with pytest.raises(
+        InputError, match=r"pure rotation: .* leave the camera's scale open"
+    ):
         solve(pairs, "eye_in_hand", scale_known=False)
 
 
 def robot_by(change: Callable[[SE3], SE3]) -> Mistake:
-    return lambda pairs: replace(pairs, base_from_gripper=change(pairs.base_from_gripper))
+    return lambda pairs: replace(
+        pairs, base_from_gripper=change(pairs.base_from_gripper)
+    )
 
 
 def camera_by(change: Callable[[SE3], SE3]) -> Mistake:
-    return lambda pairs: replace(pairs, camera_from_board=change(pairs.camera_from_board))
+    return lambda pairs: replace(
+        pairs, camera_from_board=change(pairs.camera_from_board)
+    )
 
 
 def scaled(factor: float, rows: slice = slice(None)) -> Callable[[SE3], SE3]:
@@ -120,7 +143,9 @@ def one_list(change: Callable[[SE3], SE3]) -> Mistake:
     noise = Setting(noise_mm=1.0, noise_deg=0.1)
     return lambda p: replace(
         p,
-        base_from_gripper=change(shaken(p.camera_from_board, noise, np.random.default_rng(0))),
+        base_from_gripper=change(
+            shaken(p.camera_from_board, noise, np.random.default_rng(0))
+        ),
     )
 
 
@@ -132,11 +157,20 @@ UNUSUAL: dict[str, tuple[Mistake, str]] = {
     "one list": (one_list(lambda p: p), "are one list"),
     "one list in mm": (one_list(scaled(1000)), "are one list"),
     "one inverted list": (one_list(SE3.inverse), "are one list"),
-    "robot shifted from row 12": (robot_by(shifted_from(11)), "shifted by one from row 12 on"),
-    "camera shifted from row 20": (camera_by(shifted_from(18)), "shifted by one from row 19 on"),
+    "robot shifted from row 12": (
+        robot_by(shifted_from(11)),
+        "shifted by one from row 12 on",
+    ),
+    "camera shifted from row 20": (
+        camera_by(shifted_from(18)),
+        "shifted by one from row 19 on",
+    ),
     "two poses": (lambda p: p[np.arange(2)], "^2 pose pairs; .* at least 5"),
     "one pose": (lambda p: p[np.arange(1)], "^1 pose pair; "),
-    "duplicates": (lambda p: p[np.arange(25) % 3], "25 pose pairs hold only 3 different ones"),
+    "duplicates": (
+        lambda p: p[np.arange(25) % 3],
+        "25 pose pairs hold only 3 different ones",
+    ),
     "camera in cm": (camera_by(scaled(100)), "the camera poses look like another unit"),
     "some rows in mm": (
         robot_by(scaled(1000, slice(3, 9))),
@@ -144,7 +178,9 @@ UNUSUAL: dict[str, tuple[Mistake, str]] = {
     ),
     "robot transposed": (robot_by(transposed), "look transposed|--robot-convention"),
     "shuffled rows": (
-        lambda p: replace(p, camera_from_board=p.camera_from_board[np.arange(25) * 7 % 25]),
+        lambda p: replace(
+            p, camera_from_board=p.camera_from_board[np.arange(25) * 7 % 25]
+        ),
         "rotations .* inconsistent: from row .* no other reading .* each row belongs to its image",
     ),
     "stale robot": (
@@ -187,6 +223,8 @@ def test_a_wrong_size_of_the_squares_is_named_and_estimated(mount: Mount) -> Non
     pairs = camera_by(scaled(1.05))(truth.pairs)
     calibration = solve(pairs, mount)
     [warning] = calibration.checks["warnings"]
-    assert re.search(r"4\.\d+ \+- .* smaller .* 22\.\d\d mm|5\.\d+ \+- .* 22\.\d\d mm", warning)
+    assert re.search(
+        r"4\.\d+ \+- .* smaller .* 22\.\d\d mm|5\.\d+ \+- .* 22\.\d\d mm", warning
+    )
     distance = calibration.uncertain_pose.squared_mahalanobis(truth.parent_from_camera)
     assert distance < 16.8

@@ -24,7 +24,14 @@ Z = SE3.exp([0.4, 0.2, 0.0, 1.5, 0.3, 0.2])
 def robot_at(times: np.ndarray, speed: float = 1.0) -> SE3:
     """Return poses of a gripper that sways about all axes."""
     rates = speed * np.array([0.9, 1.3, 1.1, 1.7, 1.2, 0.8])
-    sway = np.sin(np.outer(times, rates) + np.arange(6)) * [0.2, 0.2, 0.1, 0.5, 0.5, 0.5]
+    sway = np.sin(np.outer(times, rates) + np.arange(6)) * [
+        0.2,
+        0.2,
+        0.1,
+        0.5,
+        0.5,
+        0.5,
+    ]
     rotation = Rotation.from_rotvec(sway[:, 3:]) * Rotation.from_euler("x", 3.0)
     return pose(rotation, sway[:, :3] + np.array([0.5, 0.0, 0.5]))
 
@@ -41,7 +48,9 @@ def streams(mount: Mount, offset: float, noise: float) -> tuple[PoseTrack, Camer
     return PoseTrack(stamps, robot_at(stamps)), CameraTrack(names, times, board)
 
 
-@pytest.mark.parametrize(("mount", "offset"), [("eye_in_hand", 0.237), ("eye_to_hand", -0.6)])
+@pytest.mark.parametrize(
+    ("mount", "offset"), [("eye_in_hand", 0.237), ("eye_to_hand", -0.6)]
+)
 def test_offset_and_transform_are_estimated(mount: Mount, offset: float) -> None:
     calibration = solve_with_offset(*streams(mount, offset, 1.0), mount)
     sigma = calibration.checks["time_offset_sigma_s"]
@@ -71,5 +80,7 @@ def test_streams_without_common_time_are_refused() -> None:
     late = replace(camera, stamps_s=camera.stamps_s + 1e6)
     with pytest.raises(InputError, match="hardly overlap in time"):
         solve_with_offset(track, late, "eye_in_hand")
-    with pytest.raises(InputError, match="no image was taken while robot poses were recorded"):
+    with pytest.raises(
+        InputError, match="no image was taken while robot poses were recorded"
+    ):
         interpolated_pairs(track, late)

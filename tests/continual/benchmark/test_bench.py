@@ -14,7 +14,13 @@ import pandas as pd
 import pytest
 
 from evercal.continual import threshold
-from evercal.continual.benchmark.bench import BenchOptions, Step, begin_bench, in_order, run_bench
+from evercal.continual.benchmark.bench import (
+    BenchOptions,
+    Step,
+    begin_bench,
+    in_order,
+    run_bench,
+)
 from evercal.continual.benchmark.results import (
     KEY,
     RESULTS,
@@ -43,14 +49,18 @@ def named(*names: str) -> tuple[Strategy, ...]:
 @pytest.fixture(scope="module")
 def arcs(arcs: Arcs) -> Arcs:
     """The arcs with 18 of their training frames and three of their test frames."""
-    one, two = (replace(scene, train=scene.train[:18], test=scene.test[:18:7]) for scene in arcs)
+    one, two = (
+        replace(scene, train=scene.train[:18], test=scene.test[:18:7]) for scene in arcs
+    )
     return one, two
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _few_negatives() -> Iterator[None]:
     """Negative images that need no rendering."""
-    images = np.random.default_rng(0).integers(0, 256, (2, 120, 160, 3)).astype(np.uint8)
+    images = (
+        np.random.default_rng(0).integers(0, 256, (2, 120, 160, 3)).astype(np.uint8)
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(threshold, "_negative_views", lambda *_: images)
         yield
@@ -61,9 +71,13 @@ def options(arc_stage: StageOptions) -> BenchOptions:
     def stage(seed: int) -> StageOptions:
         fit = replace(arc_stage.fit, iterations=6, batch=64, replay_batch=32)
         encode = replace(arc_stage.encode, views_per_frame=1, seed=seed)
-        return replace(arc_stage, fit=fit, encode=encode, replay_views_per_frame=1, seed=seed)
+        return replace(
+            arc_stage, fit=fit, encode=encode, replay_views_per_frame=1, seed=seed
+        )
 
-    return BenchOptions(stage, named("er", "finetune", "joint"), seeds=(0,), short_side=120)
+    return BenchOptions(
+        stage, named("er", "finetune", "joint"), seeds=(0,), short_side=120
+    )
 
 
 def comparable(out: Path, *strategies: str) -> pd.DataFrame:
@@ -92,9 +106,12 @@ def test_all_learned_scenes_are_evaluated_after_every_stage(
         (name, i, 6) for i, name in enumerate(names, start=1)
     ]
     stages = [(0, "one"), (1, "one"), (1, "two")]
-    expected = [(name, stage, scene) for name in ("er", "finetune") for stage, scene in stages]
+    expected = [
+        (name, stage, scene) for name in ("er", "finetune") for stage, scene in stages
+    ]
     expected += [("joint", 1, "one"), ("joint", 1, "two")]
-    results, frames = read(out), read_frames(out)
+    results = read(out)
+    frames = read_frames(out)
     rows = results[["strategy", "stage", "scene"]]
     assert list(rows.itertuples(index=False, name=None)) == expected
     assert (results["frames"] == 3).all()
@@ -127,7 +144,9 @@ def test_processes_share_the_runs(
     pd.testing.assert_frame_equal(comparable(tmp_path), comparable(complete[0]))
 
 
-def test_options_that_decide_a_result_are_recorded(complete: tuple[Path, list[Step]]) -> None:
+def test_options_that_decide_a_result_are_recorded(
+    complete: tuple[Path, list[Step]],
+) -> None:
     settings = json.loads((complete[0] / SETTINGS).read_text())
     assert settings["fit"]["iterations"] == 6
     assert settings["localize"]["align"] is True
@@ -144,7 +163,8 @@ def test_interruption_does_not_change_results(
     stages: int,
 ) -> None:
     one = replace(options, strategies=named("er"))
-    (tmp_path / "runs" / "er-0" / "stages" / ".0001-one").mkdir(parents=True)  # a commit
+    # A commit.
+    (tmp_path / "runs" / "er-0" / "stages" / ".0001-one").mkdir(parents=True)
     steps = run_bench(arcs, one, tmp_path)
     for _ in range(stages):
         next(steps)
@@ -158,7 +178,8 @@ def two_stages(
     arcs: Arcs, options: BenchOptions, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, BenchOptions]:
     """The folder of a map's benchmark, stopped after its last stage, and the options."""
-    one, out = replace(options, strategies=named("evercal")), tmp_path_factory.mktemp("stages")
+    one = replace(options, strategies=named("evercal"))
+    out = tmp_path_factory.mktemp("stages")
     steps = run_bench(arcs, one, out)
     next(steps)
     next(steps)
@@ -190,7 +211,10 @@ def test_other_settings_and_strategies_are_refused(
             replace(options, strategies=(other,)),
             "strategy 'er' was .*reservoir.*now it is .*sars.*give it another name",
         ),
-        (replace(options, settings={"suite": "other"}), "suite None, now it is 'other'"),
+        (
+            replace(options, settings={"suite": "other"}),
+            "suite None, now it is 'other'",
+        ),
     ):
         with pytest.raises(InputError, match=message):
             next(run_bench(arcs, change, complete[0]))
@@ -205,10 +229,17 @@ def test_strategies_can_be_added(
     more = replace(options, strategies=(*named("er"), row))
     shutil.copytree(complete[0], tmp_path, dirs_exist_ok=True)
     assert begin_bench(arcs, more, tmp_path) == [(0, row)]
-    assert [*json.loads((tmp_path / STRATEGIES).read_text())] == ["er", "finetune", "joint", "er_3"]
+    assert [*json.loads((tmp_path / STRATEGIES).read_text())] == [
+        "er",
+        "finetune",
+        "joint",
+        "er_3",
+    ]
 
 
-def test_single_scene_is_refused(arcs: Arcs, options: BenchOptions, tmp_path: Path) -> None:
+def test_single_scene_is_refused(
+    arcs: Arcs, options: BenchOptions, tmp_path: Path
+) -> None:
     with pytest.raises(InputError, match="two or more"):
         next(run_bench(arcs[:1], options, tmp_path / "new"))
     assert not (tmp_path / "new").exists()
@@ -220,13 +251,19 @@ def test_orders() -> None:
     scenes = [Recording(str(i), (), ()) for i in range(6)]
     assert in_order(scenes, "given", 3) == scenes
     assert in_order(scenes, "reversed", 3) == scenes[::-1]
-    drawn = [tuple(s.name for s in in_order(scenes, "shuffled", seed)) for seed in range(20)]
+    drawn = [
+        tuple(s.name for s in in_order(scenes, "shuffled", seed)) for seed in range(20)
+    ]
     assert all(sorted(order) == [s.name for s in scenes] for order in drawn)
     assert len(set(drawn)) > 15
     for count in (3, 5):
-        orders = [in_order(scenes[:count], "balanced", seed) for seed in range(2 * count)]
+        orders = [
+            in_order(scenes[:count], "balanced", seed) for seed in range(2 * count)
+        ]
         assert orders[0] == scenes[:count]
-        assert len({tuple(scene.name for scene in order) for order in orders}) == 2 * count
+        assert (
+            len({tuple(scene.name for scene in order) for order in orders}) == 2 * count
+        )
         for begun in (0, count):
             for place in range(count):
                 learned = {order[place].name for order in orders[begun : begun + count]}
@@ -243,7 +280,9 @@ def test_backbone_of_the_paper_gets_all_centres_in_advance(
 
     paper = replace(options, stage=stage, strategies=named("sars_spdd", "joint"))
     steps = list(run_bench(arcs, paper, tmp_path))
-    assert [s.strategy for s in steps] == [s.name for s in paper.strategies for _ in arcs]
+    assert [s.strategy for s in steps] == [
+        s.name for s in paper.strategies for _ in arcs
+    ]
     first = NetworkStore.open(tmp_path / "runs" / "first-one-0").contents
     assert len(first.heads[0].centres) == 5
     assert first.scenes[0].cell.side_m == 5.0

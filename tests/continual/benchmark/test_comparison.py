@@ -60,7 +60,16 @@ def test_method_table_shows_means_and_spread() -> None:
     # A frame off by 2 cm has 90 % of the area to 20 cm, other frames nothing.
     assert float(ours[AREA]) == pytest.approx(0.9 * 67.5, abs=0.06)
     # One of 20 frames is in the wrong scene, none has a covariance.
-    cells = ours[["wrong scene %", "refused %", "in 95 % ellipsoid", "memory MB", "heads MB", "s"]]
+    cells = ours[
+        [
+            "wrong scene %",
+            "refused %",
+            "in 95 % ellipsoid",
+            "memory MB",
+            "heads MB",
+            "s",
+        ]
+    ]
     assert cells.tolist() == ["5.0", "0.0", "-", "2.0", "3.0", "21.0"]
     assert methods.loc["theirs", FINAL] == "45.0"
 
@@ -74,7 +83,9 @@ def test_scene_table_shows_accuracy_when_learned_and_at_the_end() -> None:
 def test_contrasts_pair_seeds_and_name_missing_runs() -> None:
     """Ours ends at 65 and 70 %, theirs at 45 and 55 %: 20 and 15 points; t(1) = 25.452 at 99 %."""
     results = pd.concat([OURS, THEIRS, table("theirs", 1, [[16], [10, 12]])])
-    contrasts = contrast_table(run_scores(results), [("ours", "theirs"), ("ours", "joint")])
+    contrasts = contrast_table(
+        run_scores(results), [("ours", "theirs"), ("ours", "joint")]
+    )
     half = 25.452 * 2.5
     bounds = f"{17.5 - half:+.1f} to {17.5 + half:+.1f}"
     row = contrasts.loc["ours - theirs"].tolist()
@@ -86,10 +97,14 @@ def test_contrasts_pair_seeds_and_name_missing_runs() -> None:
 def test_seeds_interval_is_students() -> None:
     """By hand: mean 2, deviation 1, t(2) = 4.3027 at 97.5 %."""
     half = 4.3027 / 3**0.5
-    assert seeds_interval([1.0, 2.0, 3.0]) == pytest.approx((2.0 - half, 2.0 + half), abs=1e-4)
+    assert seeds_interval([1.0, 2.0, 3.0]) == pytest.approx(
+        (2.0 - half, 2.0 + half), abs=1e-4
+    )
     # With three comparisons, t(2) = 7.6488 at 1 - 0.025 / 3.
     half = 7.6488 / 3**0.5
-    assert seeds_interval([1.0, 2.0, 3.0], 3) == pytest.approx((2.0 - half, 2.0 + half), abs=1e-3)
+    assert seeds_interval([1.0, 2.0, 3.0], 3) == pytest.approx(
+        (2.0 - half, 2.0 + half), abs=1e-3
+    )
     assert seeds_interval([0.5, 0.5]) == (0.5, 0.5)
     assert np.isnan(seeds_interval([1.0])).all()
 

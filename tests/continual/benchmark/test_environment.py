@@ -25,7 +25,9 @@ def test_records_of_several_machines_are_kept(
     assert results.read_environments(tmp_path) == {first: record, second: other}
 
 
-def test_without_a_checkout_the_version_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_checkout_the_version_is_recorded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def missing(*_: object, **__: object) -> None:
         raise FileNotFoundError("git")
 

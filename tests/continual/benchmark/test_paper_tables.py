@@ -5,7 +5,12 @@ import itertools
 import pandas as pd
 
 from evercal.continual.benchmark.comparison import run_scores
-from evercal.continual.benchmark.paper_tables import ABLATIONS, ablation_table, latex, paper_table
+from evercal.continual.benchmark.paper_tables import (
+    ABLATIONS,
+    ablation_table,
+    latex,
+    paper_table,
+)
 from evercal.continual.strategies import strategy_named
 
 from .results_by_hand import JOINT, table
@@ -43,7 +48,9 @@ def test_steps_are_differences_of_consecutive_rows() -> None:
 def test_ablation_changes_one_thing_per_step() -> None:
     for steps in ABLATIONS.values():
         for (_, before), (_, after) in itertools.pairwise(steps):
-            one, two = (strategy_named(name).description()["method"] for name in (before, after))
+            one, two = (
+                strategy_named(name).description()["method"] for name in (before, after)
+            )
             assert isinstance(one, dict)
             assert isinstance(two, dict)
             changed = {key for key in one if one[key] != two[key]} - {"weight"}
@@ -54,7 +61,14 @@ def test_ablation_changes_one_thing_per_step() -> None:
 def test_paper_table_has_scenes_means_and_published_numbers() -> None:
     results = pd.concat([runs(icarl=10, sars_spdd=12), JOINT])
     paper = paper_table(results, "i12s")
-    assert list(paper.index) == ["b", "a", "Mean", "TFR", "Mean, published", "TFR, published"]
+    assert list(paper.index) == [
+        "b",
+        "a",
+        "Mean",
+        "TFR",
+        "Mean, published",
+        "TFR, published",
+    ]
     assert paper.loc["a", "icarl"].tolist() == [30.0, 0.573, 50.0]
     assert paper.loc["b", "sars_spdd"].tolist() == [2.0, 0.573, 60.0]
     accuracy = paper.xs("Acc, %", axis=1, level=1)

@@ -24,8 +24,11 @@ from evercal.evaluation.metrics import CHI2_6
 from .results_by_hand import OURS, frame
 
 RUN = {"strategy": "er", "seed": 0}
-FIRST, LAST = OURS[:1], OURS[1:3]
-TESTS = pd.DataFrame([{**RUN, **frame_row(frame("b", str(i), 0.01 * i))} for i in range(3)])
+FIRST = OURS[:1]
+LAST = OURS[1:3]
+TESTS = pd.DataFrame(
+    [{**RUN, **frame_row(frame("b", str(i), 0.01 * i))} for i in range(3)]
+)
 
 
 def stage(number: int) -> StageResults:
@@ -62,7 +65,9 @@ def test_incomplete_last_line_is_removed_and_written_again(tmp_path: Path) -> No
 
 def test_other_tables_are_refused(tmp_path: Path) -> None:
     (tmp_path / RESULTS).write_text("strategy,seed\ner,0\n")
-    with pytest.raises(InputError, match=r"results\.csv: no columns environment, frames"):
+    with pytest.raises(
+        InputError, match=r"results\.csv: no columns environment, frames"
+    ):
         read(tmp_path)
 
 
@@ -70,7 +75,11 @@ def test_frames_are_counted_strictly_below_both_thresholds() -> None:
     frames = [frame("a", "0", 0.049), frame("a", "1", 0.05), frame("a", "2", math.inf)]
     frames.append(replace(frame("a", "3", 0.001), rotation_error_rad=math.radians(5)))
     row = scene_row(frames)
-    assert (row["frames"], row["within_5cm_5deg"], row["within_10cm_10deg"]) == (4, 1, 3)
+    assert (row["frames"], row["within_5cm_5deg"], row["within_10cm_10deg"]) == (
+        4,
+        1,
+        3,
+    )
     assert row["median_mm"] == 50.0
     assert (row["wrong_scene"], row["refused"]) == (1, 0)
     # 75.5 %, 75 %, nothing and 99.5 % of the area to 20 cm
@@ -78,7 +87,9 @@ def test_frames_are_counted_strictly_below_both_thresholds() -> None:
 
 
 def test_outcomes_of_frames_add_up_to_those_of_the_scene() -> None:
-    refused = replace(frame("a", "3", math.inf), status="unknown_scene", found_scene=None)
+    refused = replace(
+        frame("a", "3", math.inf), status="unknown_scene", found_scene=None
+    )
     frames = [
         frame("a", "0", 0.01, CHI2_6 - 0.1),
         frame("a", "1", 0.01, CHI2_6 + 0.1),
@@ -89,6 +100,8 @@ def test_outcomes_of_frames_add_up_to_those_of_the_scene() -> None:
     outcomes = [frame_row(each)["outcome"] for each in frames]
     assert outcomes == ["inside", "outside", "wrong scene", "refused", "no covariance"]
     row = scene_row(frames)
-    counts = [row[key] for key in ("wrong_scene", "refused", "with_covariance", "inside_95")]
+    counts = [
+        row[key] for key in ("wrong_scene", "refused", "with_covariance", "inside_95")
+    ]
     assert counts == [1, 1, 2, 1]
     assert frame_row(refused)["error_mm"] == math.inf

@@ -39,7 +39,10 @@ def test_poses_are_replaced_and_other_frames_dropped(tmp_path: Path) -> None:
     train = [f"seq-02/frame-00000{i}.color.png {LINE}" for i in (2, 0)]
     write(tmp_path, train, [f"seq-01/frame-000000.color.png {LINE}"])
     result = with_sfm_poses(RECORDING, tmp_path, "heads")
-    assert [f.name for f in result.train] == ["seq-02/frame-000000", "seq-02/frame-000002"]
+    assert [f.name for f in result.train] == [
+        "seq-02/frame-000000",
+        "seq-02/frame-000002",
+    ]
     assert result.untracked == 2
     pose = result.test[0].base_from_camera
     assert pose is not None
@@ -55,16 +58,25 @@ def test_poses_are_replaced_and_other_frames_dropped(tmp_path: Path) -> None:
 
 
 def test_frames_of_12_scenes_have_no_sequence(tmp_path: Path) -> None:
-    recording = Recording("apt1-kitchen", (frame("frame-000357"),), (frame("frame-000001"),))
-    (tmp_path / "apt1_kitchen_train.txt").write_text(f"data/frame-000357.color.jpg {LINE}\n")
-    (tmp_path / "apt1_kitchen_test.txt").write_text(f"data/frame-000001.color.jpg {LINE}\n")
+    recording = Recording(
+        "apt1-kitchen", (frame("frame-000357"),), (frame("frame-000001"),)
+    )
+    (tmp_path / "apt1_kitchen_train.txt").write_text(
+        f"data/frame-000357.color.jpg {LINE}\n"
+    )
+    (tmp_path / "apt1_kitchen_test.txt").write_text(
+        f"data/frame-000001.color.jpg {LINE}\n"
+    )
     assert len(with_sfm_poses(recording, tmp_path, "apt1_kitchen").train) == 1
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("seq-01/frame-000000.color.png 1 0 0 0 0 nan 0 500", "line 1 is not 'image qw"),
+        (
+            "seq-01/frame-000000.color.png 1 0 0 0 0 nan 0 500",
+            "line 1 is not 'image qw",
+        ),
         ("seq-01/frame-000000.color.png 1 0 0 0 0 0 0 -5", "line 1 is not 'image qw"),
         (f"seq-07/frame-000000.color.png {LINE}", "no frame of heads is in it"),
     ],
@@ -74,5 +86,7 @@ def test_broken_files_are_refused(tmp_path: Path, line: str, message: str) -> No
     with pytest.raises(InputError, match=rf"heads_test\.txt: {message}"):
         with_sfm_poses(RECORDING, tmp_path, "heads")
     (tmp_path / "heads_test.txt").unlink()
-    with pytest.raises(InputError, match=r"heads_test\.txt: pose file is missing; get the folder"):
+    with pytest.raises(
+        InputError, match=r"heads_test\.txt: pose file is missing; get the folder"
+    ):
         with_sfm_poses(RECORDING, tmp_path, "heads")

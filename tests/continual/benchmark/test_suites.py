@@ -15,22 +15,44 @@ CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 
 
 def test_suites_load_their_scenes_in_order() -> None:
-    assert [scene.name for scene in load_suite("sim-mini")] == ["bedroom", "kitchen", "living"]
+    assert [scene.name for scene in load_suite("sim-mini")] == [
+        "bedroom",
+        "kitchen",
+        "living",
+    ]
     some = load_suite("sim-mini", None, ["living", "bedroom"])
     assert [scene.name for scene in some] == ["bedroom", "living"]
-    sizes = [len(SUITES[name].scenes) for name in ("sim-7", "sim-12", "sim-repeat", "i7s", "i12s")]
+    sizes = [
+        len(SUITES[name].scenes)
+        for name in ("sim-7", "sim-12", "sim-repeat", "i7s", "i12s")
+    ]
     assert sizes == [7, 12, 3, 7, 12]
 
 
 @pytest.mark.parametrize(
     ("load", "message"),
     [
-        (lambda _: load_suite("nonsense"), "suite 'nonsense': unknown; choose one of sim-mini"),
-        (lambda _: load_suite("sim-mini", None, ["attic"]), "scene 'attic': not in suite sim-mini"),
+        (
+            lambda _: load_suite("nonsense"),
+            "suite 'nonsense': unknown; choose one of sim-mini",
+        ),
+        (
+            lambda _: load_suite("sim-mini", None, ["attic"]),
+            "scene 'attic': not in suite sim-mini",
+        ),
         (lambda _: load_suite("real2"), "--data"),
-        (lambda data: load_suite("i7s", data), "chess is missing; get it from https://www.micro"),
-        (lambda data: load_suite("sim-mini", poses=data), "--poses are for i7s and i12s"),
-        (lambda data: load_suite("sim", data), "bedroom is missing; get it from python -m rooms"),
+        (
+            lambda data: load_suite("i7s", data),
+            "chess is missing; get it from https://www.micro",
+        ),
+        (
+            lambda data: load_suite("sim-mini", poses=data),
+            "--poses are for i7s and i12s",
+        ),
+        (
+            lambda data: load_suite("sim", data),
+            "bedroom is missing; get it from python -m rooms",
+        ),
     ],
 )
 def test_unavailable_suites_are_refused(
@@ -67,6 +89,10 @@ def test_regions_share_the_base_frame_and_split_every_frame() -> None:
     assert [scene.train for scene in parts] == [train[:20], train[20:40], train[40:]]
     assert [len(scene.test) for scene in parts] == [1, 2, 1]
     assert parts[0].test == test[2:3]
-    for count, message in ((1, "--parts 1"), (4, "are too few"), (61, "too few for --parts 61")):
+    for count, message in (
+        (1, "--parts 1"),
+        (4, "are too few"),
+        (61, "too few for --parts 61"),
+    ):
         with pytest.raises(InputError, match=message):
             regions(Recording("hall", train, test), count)

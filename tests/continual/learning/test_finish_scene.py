@@ -50,7 +50,8 @@ def test_arguments_of_a_method(
     empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions
 ) -> None:
     method = RecordingMethod()
-    scenes, strategy = empty_scenes("recording"), Strategy("recording", method)
+    scenes = empty_scenes("recording")
+    strategy = Strategy("recording", method)
     heads = []
     for room in rooms:
         scenes = learn(scenes, strategy, room, quick)
@@ -65,19 +66,25 @@ def test_arguments_of_a_method(
         assert (start.teacher is None) == (number == 0)
         if start.teacher is not None:
             before = weights(heads[number - 1])
-            assert all(torch.equal(v, before[k]) for k, v in weights(start.teacher).items())
+            assert all(
+                torch.equal(v, before[k]) for k, v in weights(start.teacher).items()
+            )
         assert end.number == number
         assert end.rows().views == 60
         # These rows are replayed in the next stage, to the last digit.
         remembered = end.remembered().tensors
         for later in method.starts[number + 1 :]:
             again = later.memories[number].tensors
-            assert all(torch.equal(value, again[name]) for name, value in remembered.items())
+            assert all(
+                torch.equal(value, again[name]) for name, value in remembered.items()
+            )
     assert [float(state["number"]) for state in scenes.method_states] == [0, 1, 2]
     for keyframes, room in zip(scenes.keyframes, rooms, strict=True):
         assert keyframes is not None
         selected = stated_poses([room.train[1], room.train[4]])
-        np.testing.assert_allclose(keyframes.base_from_camera.translation_m, selected.translation_m)
+        np.testing.assert_allclose(
+            keyframes.base_from_camera.translation_m, selected.translation_m
+        )
 
 
 @pytest.mark.parametrize("name", STATEFUL)
@@ -94,7 +101,9 @@ def test_states_are_stored_and_count_as_memory(
     states = [value for state in second.method_states for value in state.values()]
     assert len(second.method_states) == 2
     assert all(bool(value.isfinite().all()) for value in states)
-    images = sum(keyframes.bytes for keyframes in second.keyframes if keyframes is not None)
+    images = sum(
+        keyframes.bytes for keyframes in second.keyframes if keyframes is not None
+    )
     assert second.memory_bytes - images == sum(value.nbytes for value in states) > 0
     make_store(tmp_path / "store", [first])
     (stored,) = NetworkStore.open(tmp_path / "store").contents.method_states

@@ -50,7 +50,10 @@ def test_events_are_in_order(
     kinds = [kind for kind, _ in groupby(type(event) for event in events)]
     assert kinds == [Encoding, Progress]
     encodings = [event for event in events if isinstance(event, Encoding)]
-    assert [total for total, _ in groupby(event.total for event in encodings)] == [60, 6]
+    assert [total for total, _ in groupby(event.total for event in encodings)] == [
+        60,
+        6,
+    ]
     for views in (60, 6):
         done = [event.done for event in encodings if event.total == views]
         assert done == sorted(set(done))
@@ -68,7 +71,8 @@ def test_stage_leaves_its_input_unchanged(
 ) -> None:
     scenes = first_stages[name]
     before = [weights(head) for head in scenes.heads]
-    records, keyframes = list(scenes.scenes), list(scenes.keyframes)
+    records = list(scenes.scenes)
+    keyframes = list(scenes.keyframes)
     after = second_stage(scenes, rooms, quick)
     for head, state in zip(scenes.heads, before, strict=True):
         assert_same(weights(head), state)
@@ -78,7 +82,9 @@ def test_stage_leaves_its_input_unchanged(
     assert after.scenes[0].cell == scenes.scenes[0].cell
     assert len(after.keyframes) == len(after.method_states) == 2
     key = "first.0.weight"
-    assert not torch.equal(weights(after.heads[-1])[key], weights(scenes.heads[-1])[key])
+    assert not torch.equal(
+        weights(after.heads[-1])[key], weights(scenes.heads[-1])[key]
+    )
 
 
 @pytest.mark.parametrize("count", [16, 27])
@@ -126,7 +132,8 @@ def test_centres_lie_in_the_cell_of_their_scene(
     for i, scene in enumerate(rooms[:2]):
         centres = head.centres[head.centre_scene == i].double().numpy()
         assert len(centres) == 3
-        cell, positions = after.scenes[i].cell, stated_poses(scene.train).translation_m
+        cell = after.scenes[i].cell
+        positions = stated_poses(scene.train).translation_m
         np.testing.assert_allclose(positions.mean(0), cell.origin_m)
         in_atlas = cell.atlas_from_base.apply(positions)
         assert (centres >= in_atlas.min(0) - 1e-5).all()
@@ -157,7 +164,9 @@ def test_replayed_rows_are_of_old_scenes_and_the_teacher_is_the_old_head(
     penalty = RecordingPenalty()
     circle = LossOptions(schedule="circle", clamp_start_px=50.0)
     options = replace(quick, fit=replace(quick.fit, loss=circle))
-    learn(scenes, Strategy("recorded", Replay("sars_filled", penalty)), rooms[1], options)
+    learn(
+        scenes, Strategy("recorded", Replay("sars_filled", penalty)), rooms[1], options
+    )
     # Replayed rows have the clamp of new ones.
     clamps = [tau_px for *_, tau_px in penalty.calls]
     assert clamps == [clamp_px(circle, i / 8) for i in range(8)]
@@ -167,7 +176,9 @@ def test_replayed_rows_are_of_old_scenes_and_the_teacher_is_the_old_head(
         assert len(rows.scene) == 32
         assert not rows.scene.any()
         with torch.no_grad(), autocast():
-            expected = scenes.heads[0](rows.features.float(), rows.scene, rows.descriptor)
+            expected = scenes.heads[0](
+                rows.features.float(), rows.scene, rows.descriptor
+            )
         torch.testing.assert_close(teacher.points, expected.points)
         assert not teacher.points.requires_grad
         # Augmentation rotates a camera and does not move it.
@@ -187,7 +198,9 @@ def test_training_depends_on_the_seed_only(
     other = second_stage(scenes, rooms, replace(quick, seed=1))
     assert_same(weights(again.heads[0]), weights(same.heads[0]))
     for name in ("code", "first.1.weight"):
-        assert not torch.equal(weights(other.heads[0])[name], weights(same.heads[0])[name])
+        assert not torch.equal(
+            weights(other.heads[0])[name], weights(same.heads[0])[name]
+        )
 
 
 @pytest.mark.parametrize("positions", [1, 2])
@@ -197,14 +210,18 @@ def test_camera_that_only_rotates(
     frames = tuple(
         replace(
             frame,
-            base_from_camera=SE3(posed(frame).rotation_wxyz, np.full(3, float(i % positions))),
+            base_from_camera=SE3(
+                posed(frame).rotation_wxyz, np.full(3, float(i % positions))
+            ),
         )
         for i, frame in enumerate(rooms[0].train)
     )
     recording = replace(rooms[0], train=frames)
     head = learn(empty_scenes(NETWORK.name), NETWORK, recording, quick).heads[0]
     assert len(head.centres) == positions
-    assert all(bool(torch.isfinite(value).all()) for value in head.state_dict().values())
+    assert all(
+        bool(torch.isfinite(value).all()) for value in head.state_dict().values()
+    )
 
 
 def test_replay_prevents_forgetting(
@@ -213,7 +230,8 @@ def test_replay_prevents_forgetting(
     arc_scenes: tuple[LearnedScenes, LearnedScenes],
 ) -> None:
     def median_error_m(scenes: LearnedScenes, recording: Recording) -> float:
-        localizer, errors = NetworkLocalizer(scenes), []
+        localizer = NetworkLocalizer(scenes)
+        errors = []
         for frame in recording.test[::3]:
             estimate = localizer.localize(frame.read_image(), frame.camera)
             pose = estimate.base_from_camera

@@ -19,7 +19,9 @@ from ..stages import EmptyScenes, Rooms, weights
 
 
 @pytest.fixture(scope="module")
-def scenes(empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions) -> LearnedScenes:
+def scenes(
+    empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions
+) -> LearnedScenes:
     """Three rooms, learned with the steps of three stages."""
     events: list[Encoding | Progress] = []
     after = learn_jointly(empty_scenes("joint"), rooms, quick, events.append)
@@ -54,10 +56,14 @@ def test_steps_have_the_rows_of_learning_and_replay(
     learn_jointly(empty_scenes("joint"), rooms[:count], short)
     assert len(batches) == 2 * count
     for batch in batches:
-        assert torch.bincount(batch, minlength=count).tolist() == [rows // count] * count
+        assert (
+            torch.bincount(batch, minlength=count).tolist() == [rows // count] * count
+        )
 
 
-def test_one_head_has_the_centres_of_every_scene(scenes: LearnedScenes, rooms: Rooms) -> None:
+def test_one_head_has_the_centres_of_every_scene(
+    scenes: LearnedScenes, rooms: Rooms
+) -> None:
     assert [record.name for record in scenes.scenes] == ["alpha", "beta", "gamma"]
     assert [head.scenes for head in scenes.heads] == [3]
     assert scenes.keyframes == [None] * 3
@@ -86,6 +92,8 @@ def test_every_scene_is_trained(
     assert bool((change.abs().amax((1, 2)) > 1e-4).all())
     # The whitening is fitted to the rows of all scenes before the first step.
     for name in ("feature_mean", "feature_map"):
-        assert torch.equal(weights(start.heads[0])[name], weights(scenes.heads[0])[name])
+        assert torch.equal(
+            weights(start.heads[0])[name], weights(scenes.heads[0])[name]
+        )
     one = learn_jointly(empty_scenes("joint"), rooms[:1], untrained)
     assert not torch.equal(one.heads[0].feature_mean, start.heads[0].feature_mean)

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 from evercal.continual import threshold
-from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
+from evercal.continual.learning.learn_networks import (
+    NetworkLearnOptions,
+    learn_networks,
+)
 from evercal.continual.learning.stage import Encoding, StageOptions
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.store import NetworkStore, head_bytes
@@ -47,7 +50,8 @@ class Learned:
 def learned(
     options: NetworkLearnOptions, rooms: Rooms, tmp_path_factory: pytest.TempPathFactory
 ) -> Learned:
-    root, events = tmp_path_factory.mktemp("learned") / "store", []
+    root = tmp_path_factory.mktemp("learned") / "store"
+    events = []
     reports = [learn_networks(root, room, options, events.append) for room in rooms[:2]]
     return Learned(root, reports, events)
 
@@ -56,7 +60,9 @@ def test_reports_describe_the_store(learned: Learned) -> None:
     store = NetworkStore.open(learned.root)
     contents = store.contents
     assert [record.name for record in contents.scenes] == ["alpha", "beta"]
-    assert [json.loads(json.dumps(asdict(r))) for r in learned.reports] == store.reports()
+    assert [
+        json.loads(json.dumps(asdict(r))) for r in learned.reports
+    ] == store.reports()
     for report, record, keyframes in zip(
         learned.reports, contents.scenes, contents.keyframes, strict=True
     ):
@@ -75,11 +81,17 @@ def test_reports_describe_the_store(learned: Learned) -> None:
 
 
 def test_bad_input_is_refused_and_leaves_the_store_unchanged(
-    learned: Learned, rooms: Rooms, options: NetworkLearnOptions, tmp_path: Path, tree: Tree
+    learned: Learned,
+    rooms: Rooms,
+    options: NetworkLearnOptions,
+    tmp_path: Path,
+    tree: Tree,
 ) -> None:
-    before, gamma = tree(learned.root), rooms[2]
+    before = tree(learned.root)
+    gamma = rooms[2]
     gripper = [
-        replace(f, base_from_camera=None, base_from_gripper=f.base_from_camera) for f in gamma.train
+        replace(f, base_from_camera=None, base_from_gripper=f.base_from_camera)
+        for f in gamma.train
     ]
     few = replace(gamma, train=gamma.train[:15])
     for recording, change, message in (
@@ -110,7 +122,8 @@ def test_bad_input_is_refused_and_leaves_the_store_unchanged(
 def test_second_writer_is_refused(
     rooms: Rooms, options: NetworkLearnOptions, tmp_path: Path
 ) -> None:
-    store, messages = tmp_path / "store", []
+    store = tmp_path / "store"
+    messages = []
 
     def intrude(_: object) -> None:
         if not messages:

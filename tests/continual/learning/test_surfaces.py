@@ -9,7 +9,11 @@ import pytest
 import torch
 
 from evercal.continual.learning import surfaces
-from evercal.continual.learning.surfaces import frame_depths, shared_depths, surface_points
+from evercal.continual.learning.surfaces import (
+    frame_depths,
+    shared_depths,
+    surface_points,
+)
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, encode_frames
 from evercal.continual.networks.descriptor import GlobalDescriptor
 from evercal.features.encoder import load_encoder
@@ -21,7 +25,8 @@ from evercal.simulation.box_room import BoxRoom
 from ...box_world import box_room_scene
 from ...encoders import BlockMean
 
-SIDE, FRAMES = 120, box_room_scene(3, 4, 1).train
+SIDE = 120
+FRAMES = box_room_scene(3, 4, 1).train
 ROOM = BoxRoom(3)
 PLAN = EncodePlan(views_per_frame=3, cells=60, view=ViewOptions(short_side=SIDE))
 
@@ -41,7 +46,8 @@ def _depths(frames: Sequence[Frame] = FRAMES) -> list[np.ndarray]:
 
 def test_agreed_depths_are_those_of_the_walls() -> None:
     frames = box_room_scene(3, 12, 1).train
-    depths, truth = np.stack(frame_depths(frames, load_encoder(), SIDE)), np.stack(_depths(frames))
+    depths = np.stack(frame_depths(frames, load_encoder(), SIDE))
+    truth = np.stack(_depths(frames))
     known = np.isfinite(depths)
     assert known.mean() > 0.05  # few views of a bare room have parallax
     errors = (np.abs(depths - truth) / truth)[known]
@@ -49,7 +55,10 @@ def test_agreed_depths_are_those_of_the_walls() -> None:
     assert (errors < 0.1).mean() > 0.9
     # Wrong poses agree on little, and a single frame on nothing.
     poses = [frame.base_from_camera for frame in frames]
-    swapped = [replace(f, base_from_camera=poses[(5 * i + 3) % 12]) for i, f in enumerate(frames)]
+    swapped = [
+        replace(f, base_from_camera=poses[(5 * i + 3) % 12])
+        for i, f in enumerate(frames)
+    ]
     wrong = np.stack(frame_depths(swapped, load_encoder(), SIDE))
     assert np.isfinite(wrong).mean() < 0.5 * known.mean()
     assert np.isnan(frame_depths(frames[:1], load_encoder(), SIDE)).all()
@@ -70,7 +79,8 @@ def test_points_project_to_the_pixels_of_their_rows(buffer: FeatureBuffer) -> No
     rows = buffer.rows(torch.arange(len(buffer)))
     matrix = rows.target.camera_from_atlas
     in_camera = torch.einsum("nij,nj->ni", matrix[:, :, :3], points) + matrix[:, :, 3]
-    focal, centre = rows.target.intrinsics[:, :2], rows.target.intrinsics[:, 2:]
+    focal = rows.target.intrinsics[:, :2]
+    centre = rows.target.intrinsics[:, 2:]
     pixels = in_camera[:, :2] / in_camera[:, 2:] * focal + centre
     torch.testing.assert_close(pixels, rows.target.pixels, atol=2e-3, rtol=0)
 
@@ -99,7 +109,9 @@ def test_unknown_depths_give_no_points(buffer: FeatureBuffer) -> None:
     assert torch.equal(unknown, buffer.tensors["view"] % len(FRAMES) == 0)
 
 
-def test_depths_are_shared_by_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_depths_are_shared_by_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls: list[int] = []
 
     def estimate(frames: list[Frame], *_: object) -> list[np.ndarray]:

@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer, open_networks
+from evercal.continual.localizer import (
+    NetworkLocalizeOptions,
+    NetworkLocalizer,
+    open_networks,
+)
 from evercal.errors import InputError
 from evercal.geometry import Camera, pose_distance
 from evercal.simulation.box_room import default_camera
@@ -33,7 +37,9 @@ def test_pose_is_in_the_base_frame_of_its_scene(scene: int) -> None:
     assert estimate.pixels is not None
     assert estimate.points_m is not None
     assert estimate.base_from_camera is not None
-    projected = CAMERA.project(estimate.base_from_camera.inverse().apply(estimate.points_m))
+    projected = CAMERA.project(
+        estimate.base_from_camera.inverse().apply(estimate.points_m)
+    )
     np.testing.assert_allclose(projected, estimate.pixels, atol=0.01)
 
 
@@ -54,7 +60,9 @@ def test_default_camera_is_that_of_the_scene() -> None:
 def test_given_camera_can_have_any_size_and_distortion() -> None:
     world = make_world()
     localizer = NetworkLocalizer(world.scenes)
-    distorted = Camera(320, 240, 262.0, 262.0, 150.0, 130.0, (-0.2, 0.05, 0.001, -0.002))
+    distorted = Camera(
+        320, 240, 262.0, 262.0, 150.0, 130.0, (-0.2, 0.05, 0.001, -0.002)
+    )
     image = world.view(0, distorted)
     for camera in (distorted, distorted.resized(640, 480), distorted.resized(160, 120)):
         world.assert_located(localizer.localize(image, camera), image, "scene-0")
@@ -64,9 +72,13 @@ def test_only_scenes_of_the_image_aspect_ratio_are_tried() -> None:
     portrait = Camera(120, 160, 130.0, 130.0, 60.0, 80.0)
     world = make_world((CAMERA, portrait))
     image = world.view(1, portrait)
-    world.assert_located(NetworkLocalizer(world.scenes).localize(image), image, "scene-1")
+    world.assert_located(
+        NetworkLocalizer(world.scenes).localize(image), image, "scene-1"
+    )
     assert world.head.scenes_asked == [1]
-    with pytest.raises(InputError, match=r"image 160x90.*scene-0 160x120.*scene-1 120x160"):
+    with pytest.raises(
+        InputError, match=r"image 160x90.*scene-0 160x120.*scene-1 120x160"
+    ):
         NetworkLocalizer(world.scenes).localize(np.zeros((90, 160, 3), np.uint8))
 
 
@@ -93,7 +105,8 @@ def test_image_with_few_patches_fails() -> None:
 
 def test_scenes_have_their_own_threshold() -> None:
     world = make_world(threshold=0.5)
-    low, high = world.view(0, correct=0.35), world.view(0, correct=0.75)
+    low = world.view(0, correct=0.35)
+    high = world.view(0, correct=0.75)
     localizer = NetworkLocalizer(world.scenes)
     assert localizer.localize(high).status == "ok"
     estimate = localizer.localize(low)
@@ -122,14 +135,22 @@ def test_candidates_are_chosen_by_prototypes() -> None:
     world = make_world((CAMERA,) * 4)
     image = world.view(2)
 
-    def candidates(descriptor: list[float], options: NetworkLocalizeOptions) -> list[int]:
+    def candidates(
+        descriptor: list[float], options: NetworkLocalizeOptions
+    ) -> list[int]:
         world.describe(image, descriptor)
         world.head.scenes_asked.clear()
         NetworkLocalizer(world.scenes, options).localize(image)
         return list(world.head.scenes_asked)
 
     options = NetworkLocalizeOptions
-    descriptor = [0.6, 0.5, 0.4, 0.3]  # length 0.927: cosines 0.647, 0.539, 0.431, 0.323
+    # Length 0.927: cosines 0.647, 0.539, 0.431, 0.323.
+    descriptor = [
+        0.6,
+        0.5,
+        0.4,
+        0.3,
+    ]
     assert candidates(descriptor, options(candidates=9, margin=2.0)) == [0, 1, 2, 3]
     assert candidates(descriptor, options(candidates=3, margin=2.0)) == [0, 1, 2]
     assert candidates(descriptor, options(candidates=9, margin=0.12)) == [0, 1]
@@ -145,7 +166,9 @@ def test_candidate_with_the_most_support_wins() -> None:
     world = make_world((CAMERA,) * 3)
     image = world.view(2)
     world.describe(image, [1.0, 0.9, 0.95, 0])  # most similar to scene 0
-    world.assert_located(NetworkLocalizer(world.scenes).localize(image), image, "scene-2")
+    world.assert_located(
+        NetworkLocalizer(world.scenes).localize(image), image, "scene-2"
+    )
     assert world.head.scenes_asked == [0, 2, 1]
     one = NetworkLocalizer(world.scenes, NetworkLocalizeOptions(candidates=1))
     assert one.localize(image).inlier_ratio < 0.1
@@ -186,7 +209,12 @@ def test_pose_moves_to_the_cell_of_another_camera_at_most_once() -> None:
     side = np.cross(axis, [0, 0, 1.0])
     # A plane that CAMERA views from a metre away, 0.2 m inside the second cell; `long` from two.
     rays = CAMERA.unproject(patch_centres(CAMERA))
-    points = boundary + 1.2 * axis + rays[:, :1] * side + rays[:, 1:2] * np.array([0, 0, -1.0])
+    points = (
+        boundary
+        + 1.2 * axis
+        + rays[:, :1] * side
+        + rays[:, 1:2] * np.array([0, 0, -1.0])
+    )
     world.head.points[0, int(image[0, 0, 0])] = torch.from_numpy(points).float()
     estimate = NetworkLocalizer(world.scenes).localize(image)
     assert len(world.head.scenes_asked) == 2

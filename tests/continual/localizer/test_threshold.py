@@ -43,7 +43,10 @@ def fit(world: World, monkeypatch: pytest.MonkeyPatch) -> Fit:
 def frames(world: World, shares: np.ndarray) -> list[Frame]:
     """Views with given shares of correct patches."""
     images = [world.view(0, correct=share) for share in shares]
-    return [Frame(str(i), image, CAMERA, world.pose(image)) for i, image in enumerate(images)]
+    return [
+        Frame(str(i), image, CAMERA, world.pose(image))
+        for i, image in enumerate(images)
+    ]
 
 
 def ratios(world: World, images: list[np.ndarray]) -> list[float]:
@@ -55,8 +58,10 @@ def test_threshold_lies_a_sixth_above_the_negatives(world: World, fit: Fit) -> N
     held_out = frames(world, np.linspace(0.9, 0.5, 21))
     negatives = [world.view(0, correct=share) for share in np.linspace(0.1, 0.2, 21)]
     record = fit(held_out, negatives)
-    positive, negative = ratios(world, [f.read_image() for f in held_out]), ratios(world, negatives)
-    top, low = np.quantile(negative, 0.95), np.quantile(positive, 0.05)
+    positive = ratios(world, [f.read_image() for f in held_out])
+    negative = ratios(world, negatives)
+    top = np.quantile(negative, 0.95)
+    low = np.quantile(positive, 0.05)
     assert record.inlier_threshold == pytest.approx(top + (low - top) / 6)
     assert max(negative) < record.inlier_threshold < min(positive)
     assert world.scenes.scenes[0].inlier_threshold == 0.9
@@ -67,15 +72,20 @@ def test_negatives_are_rejected_even_if_positives_have_fewer_inliers(
 ) -> None:
     negatives = [world.view(0, correct=0.4) for _ in range(8)]
     record = fit(frames(world, np.full(8, 0.2)), negatives)
-    assert record.inlier_threshold == pytest.approx(np.quantile(ratios(world, negatives), 0.95))
+    assert record.inlier_threshold == pytest.approx(
+        np.quantile(ratios(world, negatives), 0.95)
+    )
 
 
 @pytest.mark.parametrize(("factor", "expected"), [(3.0, 9.0), (0.2, 1.0)])
 def test_scaled_covariances_match_the_errors(
     factor: float, expected: float, world: World, fit: Fit
 ) -> None:
-    rng, held_out = np.random.default_rng(0), []
-    unfitted = replace(world.scenes.scenes[0], inlier_threshold=0.0, covariance_scale=1.0)
+    rng = np.random.default_rng(0)
+    held_out = []
+    unfitted = replace(
+        world.scenes.scenes[0], inlier_threshold=0.0, covariance_scale=1.0
+    )
     localizer = NetworkLocalizer(replace(world.scenes, scenes=[unfitted]))
     for i in range(80):
         image = world.view(0, noise_m=0.005)
@@ -97,11 +107,19 @@ def test_views_of_other_rooms_are_rejected(
 ) -> None:
     scenes = replace(arc_scenes[0], scenes=list(arc_scenes[0].scenes))
     scenes.scenes[0] = fit_threshold(scenes, arcs[0].test[:8])
-    localizer, camera = NetworkLocalizer(scenes), default_camera(160, 120)
-    statuses = [localizer.localize(frame.read_image()).status for frame in arcs[0].test[8:]]
+    localizer = NetworkLocalizer(scenes)
+    camera = default_camera(160, 120)
+    statuses = [
+        localizer.localize(frame.read_image()).status for frame in arcs[0].test[8:]
+    ]
     assert statuses.count("ok") >= 0.9 * len(statuses)
     room = BoxRoom(77, texture_px=96)
-    views = [room.render(camera, room.random_view(np.random.default_rng(i))) for i in range(10)]
-    views.append(np.random.default_rng(0).integers(0, 256, (120, 160, 3)).astype(np.uint8))
+    views = [
+        room.render(camera, room.random_view(np.random.default_rng(i)))
+        for i in range(10)
+    ]
+    views.append(
+        np.random.default_rng(0).integers(0, 256, (120, 160, 3)).astype(np.uint8)
+    )
     statuses = [localizer.localize(view).status for view in views]
     assert statuses.count("ok") <= 1

@@ -66,16 +66,22 @@ class ExactHead(Head):
         # With condition `descriptor`, the output does not depend on the scene's index.
         coded = self.options.condition == "code"
         points = {
-            key[1]: value for key, value in self.points.items() if key[0] == scene or not coded
+            key[1]: value
+            for key, value in self.points.items()
+            if key[0] == scene or not coded
         }
         levels = (255 * features[:, 0]).round().int().tolist()
-        noise = torch.randn(len(levels), 3, generator=torch.Generator().manual_seed(0)) * 3
+        noise = (
+            torch.randn(len(levels), 3, generator=torch.Generator().manual_seed(0)) * 3
+        )
         rows = [
             points[level][i] if level in points and i < len(points[level]) else noise[i]
             for i, level in enumerate(levels)
         ]
         zero = torch.zeros(len(rows), 1)
-        return HeadOutput(zero, zero[..., None].expand(-1, -1, 3), torch.stack(rows), zero)
+        return HeadOutput(
+            zero, zero[..., None].expand(-1, -1, 3), torch.stack(rows), zero
+        )
 
 
 @dataclass
@@ -102,7 +108,8 @@ class World:
         asked for the scene, or for `predicted_for`.
         """
         width, height = size or (camera.width, camera.height)
-        level, self.levels = self.levels, self.levels + 1
+        level = self.levels
+        self.levels = self.levels + 1
         rng = np.random.default_rng(level)
         pose = room().random_view(rng)
         scale = SHORT_SIDE / min(width, height)
@@ -114,7 +121,9 @@ class World:
         points[wrong] = rng.normal(0, 5, 3)
         index = scene if predicted_for is None else predicted_for
         atlas_from_base = self.scenes.scenes[scene].cell.atlas_from_base
-        self.head.points[index, level] = torch.from_numpy(atlas_from_base.apply(points)).float()
+        self.head.points[index, level] = torch.from_numpy(
+            atlas_from_base.apply(points)
+        ).float()
         descriptor = [0.0] * 4
         descriptor[scene] = 1.0
         self.poses[level] = pose
@@ -131,7 +140,9 @@ class World:
         descriptors = cast(LevelDescriptor, self.scenes.descriptor).descriptors
         descriptors[int(image[0, 0, 0])] = descriptor
 
-    def assert_located(self, estimate: PoseEstimate, image: np.ndarray, scene: str) -> None:
+    def assert_located(
+        self, estimate: PoseEstimate, image: np.ndarray, scene: str
+    ) -> None:
         """Assert that an estimate is the true pose in a scene."""
         assert (estimate.status, estimate.reason, estimate.scene) == ("ok", "", scene)
         assert estimate.base_from_camera is not None
@@ -142,20 +153,31 @@ class World:
 
 def patch_centres(camera: Camera) -> np.ndarray:
     """(n, 2) pixels of the centres of all patches."""
-    rows, columns = camera.height // 8, camera.width // 8
-    return np.array([(8 * j + 3.5, 8 * i + 3.5) for i in range(rows) for j in range(columns)])
+    rows = camera.height // 8
+    columns = camera.width // 8
+    return np.array(
+        [(8 * j + 3.5, 8 * i + 3.5) for i in range(rows) for j in range(columns)]
+    )
 
 
 def make_world(
-    cameras: tuple[Camera, ...] = (CAMERA, CAMERA), condition: str = "code", threshold: float = 0.0
+    cameras: tuple[Camera, ...] = (CAMERA, CAMERA),
+    condition: str = "code",
+    threshold: float = 0.0,
 ) -> World:
     """Scenes `scene-0`, `scene-1`, ... whose prototypes are unit vectors."""
-    head, atlas, records = ExactHead(condition), Atlas(), []
+    head = ExactHead(condition)
+    atlas = Atlas()
+    records = []
     for i, camera in enumerate(cameras):
         head.grow(torch.zeros(1, 3), 0)
         cell = atlas.place(np.array([[0.0, 0, 1], [1, 1, 1]]) + 0.3 * i)
-        record = SceneRecord(f"scene-{i}", camera, cell, torch.eye(4)[i : i + 1].half(), 100)
+        record = SceneRecord(
+            f"scene-{i}", camera, cell, torch.eye(4)[i : i + 1].half(), 100
+        )
         records.append(replace(record, inlier_threshold=threshold))
     descriptor = cast(GlobalDescriptor, LevelDescriptor())
-    scenes = LearnedScenes(BlockMean(), descriptor, "evercal_network", SHORT_SIDE, [head], records)
+    scenes = LearnedScenes(
+        BlockMean(), descriptor, "evercal_network", SHORT_SIDE, [head], records
+    )
     return World(scenes, head)

@@ -10,7 +10,8 @@ from evercal.continual.networks.head import Head, HeadOptions, HeadOutput, fresh
 from evercal.continual.networks.loss import Target
 from evercal.geometry import SE3
 
-DEPTH_M, FOCAL_PX = 2.0, 100.0
+DEPTH_M = 2.0
+FOCAL_PX = 100.0
 
 
 def rows(count: int, scene: int = 0) -> Rows:
@@ -29,7 +30,9 @@ def off_by(pixels: float) -> list[float]:
     return [pixels / FOCAL_PX * DEPTH_M, 0.0, DEPTH_M]
 
 
-def head_output(points: list[list[float]], hidden: list[list[float]] | None = None) -> HeadOutput:
+def head_output(
+    points: list[list[float]], hidden: list[list[float]] | None = None
+) -> HeadOutput:
     """Create a head's output with given points (camera frame, metres)."""
     where = torch.tensor(points, requires_grad=True)
     zero = torch.zeros(len(points), 2)
@@ -37,7 +40,9 @@ def head_output(points: list[list[float]], hidden: list[list[float]] | None = No
     return HeadOutput(zero, torch.zeros(len(points), 1, 3), where, activations)
 
 
-def wave_buffer(scene: int, views: int = 4, shift_px: float = 0.0, few: int = 0) -> FeatureBuffer:
+def wave_buffer(
+    scene: int, views: int = 4, shift_px: float = 0.0, few: int = 0
+) -> FeatureBuffer:
     """Points in front of a camera; their features are waves of them, the same in every scene.
 
     So two scenes whose pixels differ by `shift_px` contradict one another. With `few`, a view shows
@@ -51,8 +56,12 @@ def wave_buffer(scene: int, views: int = 4, shift_px: float = 0.0, few: int = 0)
     buffer = FeatureBuffer(scene, SE3.identity())
     buffer.extend(
         {
-            "features": normalize(torch.cat([points.sin(), points.cos(), points], 1)).half(),
-            "pixels": 100 * points[:, :2] / points[:, 2:] + 50 + torch.tensor([shift_px, 0.0]),
+            "features": normalize(
+                torch.cat([points.sin(), points.cos(), points], 1)
+            ).half(),
+            "pixels": 100 * points[:, :2] / points[:, 2:]
+            + 50
+            + torch.tensor([shift_px, 0.0]),
             "view": torch.arange(views, dtype=torch.int32).repeat_interleave(50),
             "intrinsics": torch.tensor([[100.0, 100, 50, 50]] * views),
             "camera_from_atlas": torch.eye(4)[None, :3].repeat(views, 1, 1),
@@ -76,7 +85,9 @@ def head_at_cameras(buffers: list[FeatureBuffer]) -> Head:
     head = fresh_head(48, 6, HeadOptions(width=32), seed=0)
     for buffer in buffers:
         matrix = buffer.tensors["camera_from_atlas"][:3].double()
-        head.grow((-matrix[:, :, :3].mT @ matrix[:, :, 3:])[..., 0].float(), seed=buffer.scene)
+        head.grow(
+            (-matrix[:, :, :3].mT @ matrix[:, :, 3:])[..., 0].float(), seed=buffer.scene
+        )
     return head
 
 
@@ -100,4 +111,6 @@ def flat(head: Head) -> Tensor:
 
 def flat_of(head: Head, named: dict[str, Tensor]) -> Tensor:
     """Concatenate tensors by parameter name, in the order of `flat`."""
-    return torch.cat([named[name].flatten() for name, _ in head.named_parameters()]).clone()
+    return torch.cat(
+        [named[name].flatten() for name, _ in head.named_parameters()]
+    ).clone()

@@ -31,7 +31,11 @@ def test_controls_add_nothing_to_training() -> None:
     ("condition", "offsets"), [("code", "per_centre"), ("descriptor", "shared")]
 )
 def test_new_head_starts_from_the_shared_weights_of_the_last(
-    condition: str, offsets: str, empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions
+    condition: str,
+    offsets: str,
+    empty_scenes: EmptyScenes,
+    rooms: Rooms,
+    quick: StageOptions,
 ) -> None:
     """Without training, the second head differs from the first only in the scene's parameters."""
     isolation = STRATEGIES["isolation"]
@@ -51,5 +55,7 @@ def test_new_head_starts_from_the_shared_weights_of_the_last(
     for scenes in (same, trained):
         after = weights(scenes.heads[0])
         assert all(torch.equal(value, before[name]) for name, value in after.items())
-    assert not torch.equal(weights(trained.heads[1])["first.1.weight"], before["first.1.weight"])
+    assert not torch.equal(
+        weights(trained.heads[1])["first.1.weight"], before["first.1.weight"]
+    )
     assert [first.head_for(0)[1], trained.head_for(1)[1]] == [0, 0]

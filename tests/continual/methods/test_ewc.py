@@ -26,7 +26,9 @@ def tied(head: Head, importance: float, shift: float = 0.0) -> dict[str, Tensor]
     }
 
 
-def cost(method: ElasticWeightConsolidation, head: Head, states: list[MethodState]) -> float:
+def cost(
+    method: ElasticWeightConsolidation, head: Head, states: list[MethodState]
+) -> float:
     actual = method.begin(stage_start(head, [], states=states)).regularizer()
     return 0.0 if actual is None else float(actual.detach())
 
@@ -58,13 +60,18 @@ def test_rows_of_later_scenes_are_free() -> None:
 @pytest.fixture
 def finished() -> FinishedScene:
     """The second of two scenes after training."""
-    head, buffer = wave_head(2), wave_buffer(1)
+    head = wave_head(2)
+    buffer = wave_buffer(1)
     list(HeadTrainer(head, [buffer], OPTIONS, 0).run())
     return FinishedScene(head, 1, lambda: buffer, lambda: buffer)
 
 
 def importances(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    actual = {k.removeprefix("importance."): v for k, v in state.items() if k.startswith("imp")}
+    actual = {
+        k.removeprefix("importance."): v
+        for k, v in state.items()
+        if k.startswith("imp")
+    }
     return {name: value.double() for name, value in actual.items()}
 
 
@@ -72,16 +79,24 @@ def test_unused_parameters_have_no_importance(finished: FinishedScene) -> None:
     state = ElasticWeightConsolidation().after_scene(finished)
     actual = importances(state)
     count = sum(value.numel() for value in actual.values())
-    assert sum(float(v.sum()) for v in actual.values()) / count == pytest.approx(1, rel=0.02)
+    assert sum(float(v.sum()) for v in actual.values()) / count == pytest.approx(
+        1, rel=0.02
+    )
     assert all(bool((value >= 0).all()) for value in actual.values())
     assert float(actual["code"][0].abs().max()) == 0.0 < float(actual["code"][1].max())
     own = finished.head.centre_scene == 1
-    assert float(actual["logit"][~own].abs().max()) == 0.0 < float(actual["logit"][own].max())
+    assert (
+        float(actual["logit"][~own].abs().max())
+        == 0.0
+        < float(actual["logit"][own].max())
+    )
     for name, value in finished.head.named_parameters():
         torch.testing.assert_close(state[f"anchor.{name}"], value.detach().half())
 
 
-def test_fisher_information_is_the_mean_squared_gradient(finished: FinishedScene) -> None:
+def test_fisher_information_is_the_mean_squared_gradient(
+    finished: FinishedScene,
+) -> None:
     """All rows of the image are equal, so every draw has the same gradient."""
     buffer = wave_buffer(1, views=1, few=1)
     scene = replace(finished, rows=lambda: buffer)
@@ -90,6 +105,8 @@ def test_fisher_information_is_the_mean_squared_gradient(finished: FinishedScene
     points = finished.head(row.features.float(), 1, row.descriptor).points
     loss, _ = reprojection_loss(points, row.target, 5.0, LossOptions())
     named = dict(finished.head.named_parameters())
-    exact = torch.autograd.grad(loss.mean(), list(named.values()), materialize_grads=True)
+    exact = torch.autograd.grad(
+        loss.mean(), list(named.values()), materialize_grads=True
+    )
     for (name, _), slope in zip(named.items(), exact, strict=True):
         torch.testing.assert_close(actual[name], slope.square(), rtol=1e-3, atol=1e-7)

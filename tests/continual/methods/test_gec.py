@@ -12,10 +12,23 @@ from evercal.continual.methods.method import FinishedScene, MethodState
 from evercal.continual.networks.buffer import diffused
 from evercal.continual.networks.head import HeadOptions
 from evercal.continual.networks.hooks import ProposedStep
-from evercal.continual.networks.loss import LossOptions, fixed_clamp_loss, reprojection_loss
+from evercal.continual.networks.loss import (
+    LossOptions,
+    fixed_clamp_loss,
+    reprojection_loss,
+)
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer, one_cycle
 
-from .by_hand import flat, flat_of, head_output, off_by, rows, stage_start, wave_buffer, wave_head
+from .by_hand import (
+    flat,
+    flat_of,
+    head_output,
+    off_by,
+    rows,
+    stage_start,
+    wave_buffer,
+    wave_head,
+)
 
 # Shampoo trains the square matrices, AdamW with decay the rest, both with momentum.
 OPTIONS = FitOptions(iterations=14, batch=64, replay_batch=64, peak_rate=1e-2)
@@ -23,7 +36,8 @@ OPTIONS = FitOptions(iterations=14, batch=64, replay_batch=64, peak_rate=1e-2)
 
 def slow_nearest(changes: np.ndarray, g: np.ndarray, most: np.ndarray) -> np.ndarray:
     """Search all sets of active constraints for the nearest allowed change."""
-    best, actual = np.inf, None
+    best = np.inf
+    actual = None
     for count in range(min(len(g), len(changes)) + 1):
         for active in itertools.combinations(range(len(g)), count):
             a = g[list(active)]
@@ -33,7 +47,8 @@ def slow_nearest(changes: np.ndarray, g: np.ndarray, most: np.ndarray) -> np.nda
             if count:
                 u -= a.T @ np.linalg.solve(a @ a.T, a @ changes - most[list(active)])
             if (g @ u <= most + 1e-9).all() and np.linalg.norm(u - changes) < best:
-                best, actual = float(np.linalg.norm(u - changes)), u
+                best = float(np.linalg.norm(u - changes))
+                actual = u
     assert actual is not None
     return actual
 
@@ -46,8 +61,10 @@ def nearest(changes: np.ndarray, g: np.ndarray, most: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(15))
 def test_nearest_change_equals_search_over_active_sets(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    count, size = 1 + seed % 5, 7
-    changes, g = rng.normal(size=size), rng.normal(size=(count, size))
+    count = 1 + seed % 5
+    size = 7
+    changes = rng.normal(size=size)
+    g = rng.normal(size=(count, size))
     # Gradient lengths differ by orders of magnitude.
     g *= 10.0 ** rng.uniform(-4, 4, (count, 1))
     most = rng.uniform(-1, 1, count) * np.linalg.norm(g, axis=1) * (seed % 3 > 0)
@@ -65,21 +82,29 @@ def test_parallel_constraints_have_a_solution(seed: int) -> None:
     changes = 3 * along + rng.normal(size=5)
     tightest = min(-0.1, 0.2, 0.25, 0.1)
     excess = changes @ along / (along @ along) - tightest
-    np.testing.assert_allclose(nearest(changes, g, most), changes - excess * along, atol=1e-6)
+    np.testing.assert_allclose(
+        nearest(changes, g, most), changes - excess * along, atol=1e-6
+    )
 
 
 def test_constraint_without_a_gradient_is_ignored() -> None:
-    changes, g = np.array([1.0, 2.0]), np.array([[0.0, 0.0], [0.0, 1.0]])
-    np.testing.assert_allclose(nearest(changes, g, np.array([-1.0, 0.0])), [1.0, 0.0], atol=1e-8)
+    changes = np.array([1.0, 2.0])
+    g = np.array([[0.0, 0.0], [0.0, 1.0]])
+    np.testing.assert_allclose(
+        nearest(changes, g, np.array([-1.0, 0.0])), [1.0, 0.0], atol=1e-8
+    )
     np.testing.assert_allclose(nearest(changes, g[:1], np.array([-1.0])), changes)
 
 
 def test_applied_step_satisfies_every_constraint() -> None:
     """A new scene contradicts two remembered ones."""
     method = EpisodicConstraint(alpha=0.5, warm_steps=0)
-    head, proposals = wave_head(3), []
+    head = wave_head(3)
+    proposals = []
     memories = [wave_buffer(i, shift_px=3.0 * i) for i in range(2)]
-    states: list[MethodState] = [{"reference": torch.tensor(20.0 - 9 * i)} for i in range(2)]
+    states: list[MethodState] = [
+        {"reference": torch.tensor(20.0 - 9 * i)} for i in range(2)
+    ]
     hooks = method.begin(stage_start(head, memories, states=states))
     edit = hooks.edit_step
 
@@ -89,15 +114,20 @@ def test_applied_step_satisfies_every_constraint() -> None:
 
     hooks.edit_step = recorded  # type: ignore[method-assign]
     new = wave_buffer(2, shift_px=-12.0)
-    before, active = flat(head), 0
+    before = flat(head)
+    active = 0
     for _ in HeadTrainer(head, [new], OPTIONS, 0, hooks).run():
-        proposed, after = proposals[-1], flat(head)
-        wanted, taken = flat_of(head, proposed.changes), after - before
+        proposed = proposals[-1]
+        after = flat(head)
+        wanted = flat_of(head, proposed.changes)
+        taken = after - before
         g = torch.stack([flat_of(head, dict(one)) for one in proposed.constraints])
         h = proposed.losses - 1.05 * torch.tensor([20.0, 11.0])
         most = -0.5 * 0.03 * one_cycle(OPTIONS, proposed.step) / OPTIONS.peak_rate * h
         allowed = slow_nearest(*(v.double().numpy() for v in (wanted, g, most)))
-        np.testing.assert_allclose(taken.numpy(), allowed, atol=1e-4 * float(wanted.norm()))
+        np.testing.assert_allclose(
+            taken.numpy(), allowed, atol=1e-4 * float(wanted.norm())
+        )
         active += bool((g @ wanted > most).any())
         before = after
     assert 3 < active <= len(proposals) == OPTIONS.iterations
@@ -105,19 +135,26 @@ def test_applied_step_satisfies_every_constraint() -> None:
 
 def test_constraint_gradients_are_of_the_remembered_losses() -> None:
     """Constraint gradients equal the gradients of the loss on the replayed rows."""
-    head, method = wave_head(3), EpisodicConstraint()
+    head = wave_head(3)
+    method = EpisodicConstraint()
     memories = [wave_buffer(i, shift_px=3.0 * i) for i in range(2)]
     states: list[MethodState] = [{"reference": torch.tensor(1.0)}] * 2
     hooks = method.begin(stage_start(head, memories, states=states))
-    before, records, parts = copy.deepcopy(head), [], []
+    before = copy.deepcopy(head)
+    records = []
+    parts = []
     replayed = hooks.replayed
     hooks.replayed = lambda *words: parts.append(replayed(*words)) or parts[-1]  # type: ignore
     hooks.edit_step = lambda proposed: records.append(copy.deepcopy(proposed))  # type: ignore
     next(HeadTrainer(head, [wave_buffer(2)], OPTIONS, 0, hooks).run())
-    for part, loss, g in zip(parts[0], records[0].losses, records[0].constraints, strict=True):
+    for part, loss, g in zip(
+        parts[0], records[0].losses, records[0].constraints, strict=True
+    ):
         points = before(part.features.float(), part.scene, part.descriptor).points
         cost, _ = reprojection_loss(points, part.target, 50.0, LossOptions())
-        exact = torch.autograd.grad(cost.mean(), list(before.parameters()), materialize_grads=True)
+        exact = torch.autograd.grad(
+            cost.mean(), list(before.parameters()), materialize_grads=True
+        )
         slope = torch.cat([one.flatten() for one in exact])
         assert float(loss) == pytest.approx(float(cost.detach().mean()), rel=0.02)
         actual = flat_of(head, g)
@@ -137,7 +174,8 @@ def proposed_of(
 def edited(
     method: EpisodicConstraint, proposed: ProposedStep, references: list[float]
 ) -> list[float]:
-    g, change = torch.stack([one["w"] for one in proposed.constraints]), proposed.changes["w"]
+    g = torch.stack([one["w"] for one in proposed.constraints])
+    change = proposed.changes["w"]
     actual = method.edit_step(change, g, proposed, torch.tensor(references))
     return [round(float(value), 6) for value in actual]
 
@@ -149,7 +187,10 @@ def test_episodic_constraint_by_hand() -> None:
     proposed = proposed_of([5.0, 1.0], [0.3, 0.3])
     assert edited(gec, proposed, [2.0, 2.0]) == [-0.145, 0.055]
     # A sufficient fall, and an allowed rise, are not edited.
-    assert edited(gec, proposed_of([5.0, 1.0], [-0.2, 0.05]), [2.0, 2.0]) == [-0.2, 0.05]
+    assert edited(gec, proposed_of([5.0, 1.0], [-0.2, 0.05]), [2.0, 2.0]) == [
+        -0.2,
+        0.05,
+    ]
     # Half the learning rate halves the bound; the slack is relative to the reference.
     assert edited(gec, proposed_of([5.0], [0.3], schedule=0.5), [2.0]) == [-0.0725]
     slack = EpisodicConstraint(alpha=1.0, eta=0.1, slack=0.5, longest=9.0)
@@ -166,7 +207,8 @@ def test_first_steps_are_plain_replay() -> None:
     memories = [wave_buffer(i) for i in range(2)]
     reference: list[MethodState] = [{"reference": torch.tensor(1.0)}] * 2
     hooks = EpisodicConstraint().begin(stage_start(head, memories, states=reference))
-    output, some = head_output([off_by(3.0), off_by(1.0)]), rows(2)
+    output = head_output([off_by(3.0), off_by(1.0)])
+    some = rows(2)
     costs = []
     for step in range(7):
         cost = hooks.cost(output, some, 1.0)
@@ -181,7 +223,9 @@ def test_first_steps_are_plain_replay() -> None:
 
 
 def test_reference_is_the_loss_of_replayed_rows() -> None:
-    head, trained, replayed = wave_head(2), wave_buffer(1), wave_buffer(1, shift_px=20.0)
+    head = wave_head(2)
+    trained = wave_buffer(1)
+    replayed = wave_buffer(1, shift_px=20.0)
     scene = FinishedScene(head, 1, lambda: trained, lambda: replayed)
     actual = float(EpisodicConstraint().after_scene(scene)["reference"])
 
@@ -200,7 +244,8 @@ def test_reference_is_the_loss_of_replayed_rows() -> None:
 
 def test_reference_includes_descriptor_noise() -> None:
     options = HeadOptions(16, 1, "descriptor", centres="fixed", whiten=False)
-    head, buffer = wave_head(2, options), wave_buffer(1)
+    head = wave_head(2, options)
+    buffer = wave_buffer(1)
     references = []
     for diffusion in (0.0, 5.0):
         scene = FinishedScene(head, 1, lambda: buffer, lambda: buffer, diffusion)

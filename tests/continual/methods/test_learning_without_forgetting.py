@@ -5,7 +5,9 @@ import copy
 import pytest
 import torch
 
-from evercal.continual.methods.learning_without_forgetting import LearningWithoutForgetting
+from evercal.continual.methods.learning_without_forgetting import (
+    LearningWithoutForgetting,
+)
 from evercal.continual.networks.buffer import join
 from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
@@ -49,7 +51,8 @@ def test_cost_by_hand() -> None:
     output = student(rows.features.float(), rows.scene, rows.descriptor)
     actual = hooks.cost(output, rows, 0.3)
     assert actual is not None
-    assert float(actual.detach()) == pytest.approx(0.0, abs=0.5)  # some processors use bfloat16
+    # Some processors use bfloat16.
+    assert float(actual.detach()) == pytest.approx(0.0, abs=0.5)
     away = HeadOutput(output.logits, output.offsets, output.points + 0.3, output.hidden)
     actual = hooks.cost(away, rows, 0.3)
     assert actual is not None

@@ -41,7 +41,9 @@ def test_views_contradicted_by_new_rows_are_selected(
     rows = buffer.rows(torch.nonzero(buffer.tensors["view"] == harmed)[:, 0])
     rows.target.pixels = rows.target.pixels + torch.tensor([6.0, 0.0])
     actual = [
-        MIR.interfered_views(head, rows, buffer, 5e-4, torch.Generator().manual_seed(seed)).tolist()
+        MIR.interfered_views(
+            head, rows, buffer, 5e-4, torch.Generator().manual_seed(seed)
+        ).tolist()
         for seed in range(5)
     ]
     assert all(len(set(views)) == MIR.chosen for views in actual)
@@ -52,14 +54,17 @@ def test_views_contradicted_by_new_rows_are_selected(
 
 
 def test_only_selected_views_are_replayed(learnable: Learnable) -> None:
-    old, new = learnable(0, views=24)[0], learnable(1)[0]
+    old = learnable(0, views=24)[0]
+    new = learnable(1)[0]
     captured: list[set[tuple[float, ...]]] = []  # every view has its own descriptor
 
     def hooks_for(head: Head) -> TrainingHooks:
         hooks = MIR.begin(stage_start(head, [old], replay_rows=60))
         replayed = hooks.replayed
 
-        def watched(fresh: Rows, step: int, rate: float, generator: torch.Generator) -> list[Rows]:
+        def watched(
+            fresh: Rows, step: int, rate: float, generator: torch.Generator
+        ) -> list[Rows]:
             parts = replayed(fresh, step, rate, generator)
             captured.append({tuple(row) for row in parts[0].descriptor.tolist()})
             assert len(parts[0].scene) == 60

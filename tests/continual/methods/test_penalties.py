@@ -24,20 +24,27 @@ PX_PER_M = 50.0
 
 
 def cost(
-    penalty: Penalty, student: HeadOutput, teacher: HeadOutput | None, some: object, at: float
+    penalty: Penalty,
+    student: HeadOutput,
+    teacher: HeadOutput | None,
+    some: object,
+    at: float,
 ) -> float:
     return float(penalty(student, teacher, some, at).detach())  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("tau", [100.0, 10.0, 1.0])
 def test_reprojection_costs_the_loss_of_new_rows(tau: float) -> None:
-    actual = cost(Reprojection(), head_output([off_by(3.0), off_by(0.0)]), None, rows(2), tau)
+    actual = cost(
+        Reprojection(), head_output([off_by(3.0), off_by(0.0)]), None, rows(2), tau
+    )
     assert actual == pytest.approx(tau * math.tanh(3.0 / tau) / 2, rel=1e-5)
 
 
 def test_old_output_by_hand() -> None:
     # The student is 3 px (6 cm) right of the target, the teacher 2 px (4 cm) left.
-    student, teacher = head_output([off_by(3.0)]), head_output([off_by(-2.0)])
+    student = head_output([off_by(3.0)])
+    teacher = head_output([off_by(-2.0)])
     for px_per_m in (PX_PER_M, 25.0):
         actual = cost(OldOutput(px_per_m), student, teacher, rows(1), 1.0)
         assert actual == pytest.approx(math.tanh(3.0) + px_per_m * 0.10, rel=1e-5)
@@ -49,7 +56,9 @@ def test_teacher_bounds_only_a_worse_student() -> None:
     teacher = head_output([off_by(1.0), off_by(2.0)])
     truth = (math.tanh(3.0) + math.tanh(1.0)) / 2
     expected = 0.5 * truth + 0.5 * PX_PER_M * 0.04 / 2
-    assert cost(BoundedByTeacher(), student, teacher, rows(2), 1.0) == pytest.approx(expected)
+    assert cost(BoundedByTeacher(), student, teacher, rows(2), 1.0) == pytest.approx(
+        expected
+    )
 
 
 def test_relations_by_hand() -> None:
@@ -60,11 +69,15 @@ def test_relations_by_hand() -> None:
     near = 1 / (1 + math.exp(-1 / 0.2))
     # Probabilities of row 0: teacher (near, far), student (1/2, 1/2). Row 1: swapped.
     row_0 = near * math.log(2 * near) + (1 - near) * math.log(2 * (1 - near))
-    row_1 = near * math.log(near / (1 - near)) + (1 - near) * math.log((1 - near) / near)
+    row_1 = near * math.log(near / (1 - near)) + (1 - near) * math.log(
+        (1 - near) / near
+    )
     row_2 = -0.5 * (math.log(2 * near) + math.log(2 * (1 - near)))
     actual = cost(Relations(), student, teacher, rows(3), 1.0)
     assert actual == pytest.approx((row_0 + row_1 + row_2) / 3, rel=1e-4)
-    assert cost(Relations(), teacher, teacher, rows(3), 1.0) == pytest.approx(0, abs=1e-6)
+    assert cost(Relations(), teacher, teacher, rows(3), 1.0) == pytest.approx(
+        0, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("scene", [0, 3])
@@ -76,7 +89,9 @@ def test_relations_cover_every_remembered_scene(scene: int) -> None:
     teacher = head_output(right, activations.tolist())
     moved = activations.clone()
     moved[700 * scene : 700 * (scene + 1), 0] += 2.0
-    actual = cost(Relations(), head_output(right, moved.tolist()), teacher, rows(2800), 1.0)
+    actual = cost(
+        Relations(), head_output(right, moved.tolist()), teacher, rows(2800), 1.0
+    )
     assert actual > 1e-2
     # Each scene has a quarter of the 512 compared rows.
     student = head_output(right, activations.tolist())
@@ -96,20 +111,28 @@ def test_anchored_reprojection_by_hand() -> None:
     student = head_output([off_by(3.0), off_by(0.0)])
     expected = 5 * math.tanh(3.0 / 5) / 2 + PX_PER_M * 0.06 / 2
     for tau_px in (100.0, 1.0):  # the clamp is fixed
-        assert cost(penalty, student, teacher, rows(2), tau_px) == pytest.approx(expected)
+        assert cost(penalty, student, teacher, rows(2), tau_px) == pytest.approx(
+            expected
+        )
 
 
 def test_accurate_teacher_constrains_the_depth() -> None:
-    student, right = head_output([[0.0, 0.0, DEPTH_M + 0.1]]), head_output([off_by(0.0)])
+    student = head_output([[0.0, 0.0, DEPTH_M + 0.1]])
+    right = head_output([off_by(0.0)])
     penalty = AnchoredReprojection()
-    assert cost(penalty, student, right, rows(1), 0.0) == pytest.approx(PX_PER_M * 0.1, rel=1e-5)
+    assert cost(penalty, student, right, rows(1), 0.0) == pytest.approx(
+        PX_PER_M * 0.1, rel=1e-5
+    )
     wrong = head_output([off_by(20.0)])
     assert cost(penalty, student, wrong, rows(1), 0.0) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_teacher_behind_the_camera_is_ignored() -> None:
-    behind = head_output([[0.0, 0.0, -DEPTH_M]])  # division by its depth gives the target pixel
-    actual = cost(AnchoredReprojection(), head_output([off_by(0.0)]), behind, rows(1), 0.0)
+    # Division by its depth gives the target pixel.
+    behind = head_output([[0.0, 0.0, -DEPTH_M]])
+    actual = cost(
+        AnchoredReprojection(), head_output([off_by(0.0)]), behind, rows(1), 0.0
+    )
     assert actual == pytest.approx(0.0, abs=1e-6)
 
 
@@ -122,9 +145,12 @@ def output(centres: int, generator: torch.Generator) -> HeadOutput:
 
 def test_distillation_is_spdd_with_a_scale() -> None:
     generator = torch.Generator().manual_seed(0)
-    teacher, student = output(6, generator), output(8, generator)
+    teacher = output(6, generator)
+    student = output(8, generator)
     expected = float(spdd_loss(student, teacher, SpddOptions()).total)
-    assert cost(Distillation(), student, teacher, rows(5), 0.7) == pytest.approx(expected)
+    assert cost(Distillation(), student, teacher, rows(5), 0.7) == pytest.approx(
+        expected
+    )
     ten = cost(Distillation(scale=10.0), student, teacher, rows(5), 0.7)
     assert ten == pytest.approx(10 * expected, rel=1e-6)
     # Without the first two terms it is the L1 distance of the points.

@@ -46,12 +46,16 @@ class Short(Penalty):
         return student.points.abs().mean()
 
 
-def hooks_for(head: Head, memories: list[FeatureBuffer], penalty: Penalty, strength: float):
+def hooks_for(
+    head: Head, memories: list[FeatureBuffer], penalty: Penalty, strength: float
+):
     method = PreconditionedReplay(penalty=penalty, strength=strength)
     return method.begin(stage_start(head, memories, replay_rows=128))
 
 
-def edited(hooks: TrainingHooks, head: Head, changes: dict[str, Tensor]) -> dict[str, Tensor]:
+def edited(
+    hooks: TrainingHooks, head: Head, changes: dict[str, Tensor]
+) -> dict[str, Tensor]:
     zero = {name: torch.zeros_like(value) for name, value in head.named_parameters()}
     proposed = ProposedStep(zero | changes, torch.zeros(0), [], 0, 1.0)
     hooks.edit_step(proposed)
@@ -61,7 +65,8 @@ def edited(hooks: TrainingHooks, head: Head, changes: dict[str, Tensor]) -> dict
 @pytest.mark.parametrize("scenes", [1, 2])
 def test_changes_are_damped_by_the_formula(learnable: Learnable, scenes: int) -> None:
     buffers = [learnable(scene)[0] for scene in range(scenes)]
-    head, strength = head_at_cameras(buffers), 3.0
+    head = head_at_cameras(buffers)
+    strength = 3.0
     captured: list[Tensor] = []
     first = head.first[0]
     assert isinstance(first, torch.nn.Linear)
@@ -74,18 +79,27 @@ def test_changes_are_damped_by_the_formula(learnable: Learnable, scenes: int) ->
     expected = torch.linalg.inv(torch.eye(48) + strength * moment)
     change = torch.randn(32, 48, generator=torch.Generator().manual_seed(2))
     bias = torch.ones(32)
-    actual = edited(hooks, head, {"first.0.weight": change.clone(), "first.0.bias": bias.clone()})
+    actual = edited(
+        hooks, head, {"first.0.weight": change.clone(), "first.0.bias": bias.clone()}
+    )
     damped = actual["first.0.weight"]
-    torch.testing.assert_close(damped.double(), change.double() @ expected, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(
+        damped.double(), change.double() @ expected, atol=1e-4, rtol=1e-4
+    )
     torch.testing.assert_close(actual["first.0.bias"], bias)
     # The main input direction is damped more than the least used one.
     _, axes = torch.linalg.eigh(moment)
-    selected = [float((damped.double() @ a).norm() / (change.double() @ a).norm()) for a in axes.T]
+    selected = [
+        float((damped.double() @ a).norm() / (change.double() @ a).norm())
+        for a in axes.T
+    ]
     assert selected[-1] < 0.3 < 0.9 < selected[0]
 
 
 @pytest.mark.parametrize("strength", [0.0, 0.5])
-def test_parameters_of_remembered_scenes_are_fixed(learnable: Learnable, strength: float) -> None:
+def test_parameters_of_remembered_scenes_are_fixed(
+    learnable: Learnable, strength: float
+) -> None:
     buffers = [learnable(scene)[0] for scene in range(3)]
     head = head_at_cameras(buffers)
     before = {name: value.clone() for name, value in head.state_dict().items()}
@@ -96,7 +110,9 @@ def test_parameters_of_remembered_scenes_are_fixed(learnable: Learnable, strengt
     for name in ("logit", "logit_bias", "offset", "offset_bias"):
         own[name] = head.centre_scene < 2
     for name, held in own.items():
-        changed = (after[name] != before[name]).flatten(1 if after[name].ndim > 1 else 0)
+        changed = (after[name] != before[name]).flatten(
+            1 if after[name].ndim > 1 else 0
+        )
         changed = changed.any(1) if changed.ndim > 1 else changed
         assert not changed[held].any()
         assert changed[~held].any()
@@ -105,7 +121,9 @@ def test_parameters_of_remembered_scenes_are_fixed(learnable: Learnable, strengt
 
 def test_shared_centres_are_trained() -> None:
     """With fixed centres, all scenes share the centres of the first stage."""
-    options = HeadOptions(width=16, condition="descriptor", centres="fixed", whiten=False)
+    options = HeadOptions(
+        width=16, condition="descriptor", centres="fixed", whiten=False
+    )
     head = wave_head(1, options)
     head.grow(torch.zeros(0, 3), seed=1)
     assert owned_rows(head, [wave_buffer(0)]) == {}

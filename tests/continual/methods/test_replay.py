@@ -48,7 +48,9 @@ def test_weight_applies_per_scene_or_in_total(scenes: int, every_scene: bool) ->
     assert float(cost) == pytest.approx(0.3 * (scenes if every_scene else 1))
 
 
-@pytest.mark.parametrize(("scenes", "each"), [(1, 60), (2, 30), (3, 20), (4, 15), (7, 8), (90, 1)])
+@pytest.mark.parametrize(
+    ("scenes", "each"), [(1, 60), (2, 30), (3, 20), (4, 15), (7, 8), (90, 1)]
+)
 def test_replayed_rows_are_divided_among_scenes(scenes: int, each: int) -> None:
     memories = [wave_buffer(i % 4) for i in range(scenes)]
     start = stage_start(wave_head(4), memories, replay_rows=60)
@@ -56,7 +58,9 @@ def test_replayed_rows_are_divided_among_scenes(scenes: int, each: int) -> None:
     for step in range(3):
         parts = drawn(hooks, step)
         assert [len(part.scene) for part in parts] == [each] * scenes
-        assert [set(part.scene.tolist()) for part in parts] == [{i % 4} for i in range(scenes)]
+        assert [set(part.scene.tolist()) for part in parts] == [
+            {i % 4} for i in range(scenes)
+        ]
     assert sum(len(part.scene) for part in drawn(hooks)) <= max(60, scenes)
 
 
@@ -72,7 +76,8 @@ def test_teacher_runs_only_if_needed() -> None:
     assert start.teacher is not None
     calls = []
     start.teacher.register_forward_hook(lambda *_: calls.append(1))
-    output, some = head_output([off_by(1.0)] * 2), wave_buffer(0).rows(torch.arange(2))
+    output = head_output([off_by(1.0)] * 2)
+    some = wave_buffer(0).rows(torch.arange(2))
     for penalty, times in ((Reprojection(), 0), (OldOutput(), 1)):
         hooks = Replay(penalty=penalty).begin(start)
         assert isinstance(hooks, ReplayHooks)

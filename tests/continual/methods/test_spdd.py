@@ -38,18 +38,26 @@ def softmax(values, temperature):
 
 def slow_terms(student, teacher, active, temperature):
     """Compute the terms in plain loops, for per-centre offsets; -inf masks a centre."""
-    zs, zt = student.logits.tolist(), teacher.logits.tolist()
-    ds, dt = student.offsets.tolist(), teacher.offsets.tolist()
-    rows, old = len(zt), len(zt[0])
+    zs = student.logits.tolist()
+    zt = teacher.logits.tolist()
+    ds = student.offsets.tolist()
+    dt = teacher.offsets.tolist()
+    rows = len(zt)
+    old = len(zt[0])
     prior = metric = output = 0.0
     for n in range(rows):
         alive = [k for k in range(old) if -INF not in (zt[n][k], zs[n][k])]
         best = sorted(alive, key=lambda k: -zt[n][k])[:active]
         p = softmax([zt[n][k] for k in best], temperature)
         q = softmax([zs[n][k] for k in best] + zs[n][old:], temperature)
-        prior += temperature**2 * sum(a * math.log(a / b) for a, b in zip(p, q, strict=False))
+        prior += temperature**2 * sum(
+            a * math.log(a / b) for a, b in zip(p, q, strict=False)
+        )
         metric += sum(abs(ds[n][k][i] - dt[n][k][i]) for k in best for i in range(3))
-        output += sum(abs(a - b) for a, b in zip(student.points[n], teacher.points[n], strict=True))
+        output += sum(
+            abs(a - b)
+            for a, b in zip(student.points[n], teacher.points[n], strict=True)
+        )
     return prior / rows, metric / rows, float(output) / rows
 
 
@@ -82,7 +90,8 @@ def test_two_rows_by_hand():
     p = 1 / (1 + math.exp(-0.5))
     first = p * math.log(p / 0.5) + (1 - p) * math.log((1 - p) / 0.5)
     # Row 2: teacher 3.5 against 3 -> sigmoid(0.25); student 1.5 against 3 -> sigmoid(-0.75).
-    p, q = 1 / (1 + math.exp(-0.25)), 1 / (1 + math.exp(0.75))
+    p = 1 / (1 + math.exp(-0.25))
+    q = 1 / (1 + math.exp(0.75))
     second = p * math.log(p / q) + (1 - p) * math.log((1 - p) / (1 - q))
     prior = 4 * (first + second) / 2
     metric = ((0.5 + 0.25 + 1.0) + (1.0 + 0.5)) / 2
@@ -90,13 +99,16 @@ def test_two_rows_by_hand():
     assert terms.prior.item() == pytest.approx(prior, rel=1e-12)
     assert terms.metric.item() == pytest.approx(metric, rel=1e-12)
     assert terms.output.item() == pytest.approx(output, rel=1e-12)
-    assert terms.total.item() == pytest.approx(2 * prior + 3 * metric + 5 * output, rel=1e-12)
+    assert terms.total.item() == pytest.approx(
+        2 * prior + 3 * metric + 5 * output, rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("new", [0, 1, 5])
 @pytest.mark.parametrize(("active", "temperature"), [(1, 1.0), (3, 0.5), (50, 2.0)])
 def test_terms_match_a_slow_reference(new, active, temperature):
-    teacher, student = random_output(6, 9, 0), random_output(6, 9 + new, 1)
+    teacher = random_output(6, 9, 0)
+    student = random_output(6, 9 + new, 1)
     options = SpddOptions(active_centres=active, temperature=temperature)
     terms = spdd_loss(student, teacher, options)
     expected = slow_terms(student, teacher, active, temperature)
@@ -125,7 +137,9 @@ def test_probability_of_a_new_centre_is_charged():
     spdd_loss(student, teacher, options).prior.backward()
     gradient = student.logits.grad
     assert gradient is not None
-    assert (gradient[:, 8] > 0).all()  # gradient descent lowers the logit of the new centre
+    assert (
+        gradient[:, 8] > 0
+    ).all()  # gradient descent lowers the logit of the new centre
 
 
 def test_shared_offsets():
@@ -139,10 +153,13 @@ def test_shared_offsets():
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("new", [0, 2])
 def test_gradients(new, shared):
-    teacher, start = random_output(3, 6, 12, shared), random_output(3, 6 + new, 13, shared)
+    teacher = random_output(3, 6, 12, shared)
+    start = random_output(3, 6 + new, 13, shared)
 
     def total(logits, offsets, points):
-        return spdd_loss(head_output(logits, offsets, points), teacher, SpddOptions(1, 2, 3)).total
+        return spdd_loss(
+            head_output(logits, offsets, points), teacher, SpddOptions(1, 2, 3)
+        ).total
 
     leaves = [x.requires_grad_() for x in (start.logits, start.offsets, start.points)]
     assert torch.autograd.gradcheck(total, leaves)
@@ -152,7 +169,8 @@ def test_gradients(new, shared):
 @pytest.mark.parametrize("temperature", [0.1, 2.0])
 def test_masked_centres_give_finite_gradients(dtype, temperature):
     """Row 0 masks one active centre in the student, row 1 all but one, row 2 all of them."""
-    teacher, student = random_output(3, 6, 16), random_output(3, 8, 17)
+    teacher = random_output(3, 6, 16)
+    student = random_output(3, 8, 17)
     student.logits[0, teacher.logits[0].argmax()] = -INF
     teacher.logits[1] = tensor([-INF, -INF, 1.0, -INF, -INF, -INF])
     teacher.logits[2] = -INF
@@ -161,7 +179,9 @@ def test_masked_centres_give_finite_gradients(dtype, temperature):
         output.logits, output.offsets, output.points = (
             x.to(dtype) for x in (output.logits, output.offsets, output.points)
         )
-    leaves = [x.requires_grad_() for x in (student.logits, student.offsets, student.points)]
+    leaves = [
+        x.requires_grad_() for x in (student.logits, student.offsets, student.points)
+    ]
     terms = spdd_loss(student, teacher, SpddOptions(temperature=temperature))
     terms.total.backward()
     assert math.isfinite(terms.total.item())
@@ -175,12 +195,15 @@ def test_masked_centres_give_finite_gradients(dtype, temperature):
 
 @pytest.mark.parametrize("who", ["teacher", "student", "both"])
 def test_masked_centre_equals_missing_centre(who):
-    teacher, student = random_output(3, 7, 18), random_output(3, 9, 19)
+    teacher = random_output(3, 7, 18)
+    student = random_output(3, 9, 19)
     teacher.logits[:, 4] = 20.0  # the largest logit
     keep = [k for k in range(9) if k != 4]
     without = spdd_loss(
         head_output(student.logits[:, keep], student.offsets[:, keep], student.points),
-        head_output(teacher.logits[:, keep[:6]], teacher.offsets[:, keep[:6]], teacher.points),
+        head_output(
+            teacher.logits[:, keep[:6]], teacher.offsets[:, keep[:6]], teacher.points
+        ),
         SpddOptions(),
     )
     if who != "student":
@@ -193,12 +216,15 @@ def test_masked_centre_equals_missing_centre(who):
 
 @pytest.mark.parametrize("centres", [1, 2, 3, 49, 50, 51, 80])
 def test_at_most_fifty_centres_are_active(centres):
-    teacher, student = random_output(3, centres, 22), random_output(3, centres, 23)
+    teacher = random_output(3, centres, 22)
+    student = random_output(3, centres, 23)
     student.offsets.requires_grad_()
     terms = spdd_loss(student, teacher, SpddOptions())
     actual = terms.prior.item(), terms.metric.item(), terms.output.item()
     detached = head_output(student.logits, student.offsets.detach(), student.points)
-    assert actual == pytest.approx(slow_terms(detached, teacher, 50, 2.0), rel=1e-10, abs=1e-12)
+    assert actual == pytest.approx(
+        slow_terms(detached, teacher, 50, 2.0), rel=1e-10, abs=1e-12
+    )
     terms.metric.backward()
     assert student.offsets.grad is not None
     active = (student.offsets.grad.abs().sum(2) > 0).sum(1)

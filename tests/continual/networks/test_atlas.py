@@ -20,12 +20,15 @@ from evercal.errors import InputError
 def random_scene(rng: np.random.Generator) -> np.ndarray:
     """Draw (n, 3) camera positions of a scene of 3 cm to 50 m, anywhere in its base frame."""
     span = 10.0 ** rng.uniform(-1.5, 1.7, 3)
-    return rng.uniform(-1, 1, (int(rng.integers(1, 40)), 3)) * span + rng.normal(0, 30, 3)
+    return rng.uniform(-1, 1, (int(rng.integers(1, 40)), 3)) * span + rng.normal(
+        0, 30, 3
+    )
 
 
 def filled(seed: int, count: int) -> tuple[Atlas, list[np.ndarray]]:
     rng = np.random.default_rng(seed)
-    atlas, scenes = Atlas(), [random_scene(rng) for _ in range(count)]
+    atlas = Atlas()
+    scenes = [random_scene(rng) for _ in range(count)]
     for scene in scenes:
         atlas.place(scene)
     return atlas, scenes
@@ -64,8 +67,13 @@ def test_cell_contains_the_cameras_of_its_scene(seed: int) -> None:
 def test_scene_gets_the_first_free_point_of_the_spiral() -> None:
     atlas, scenes = filled(3, 6)
     for i, scene in enumerate(scenes):
-        side = max(5.0, 2 * max(scene[:, k].max() - scene[:, k].min() for k in range(3)))
-        places = (Cell((float(x), float(y), 0.0), side, (0.0, 0.0, 0.0)) for x, y, _ in spiral())
+        side = max(
+            5.0, 2 * max(scene[:, k].max() - scene[:, k].min() for k in range(3))
+        )
+        places = (
+            Cell((float(x), float(y), 0.0), side, (0.0, 0.0, 0.0))
+            for x, y, _ in spiral()
+        )
         wanted = next(
             place
             for place in places
@@ -95,7 +103,10 @@ def test_scene_at_a_position() -> None:
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 7, 9, 10, 12, 16, 17, 19, 30])
 def test_paper_grid_follows_glace(count: int) -> None:
     g = next(g for g in range(1, 100) if g * g >= count)
-    expected = [(-5 * (math.ceil(Fraction(i + 1, g)) - 1), -5 * (i % g), 0) for i in range(count)]
+    expected = [
+        (-5 * (math.ceil(Fraction(i + 1, g)) - 1), -5 * (i % g), 0)
+        for i in range(count)
+    ]
     grid = paper_grid(count)
     assert [tuple(row) for row in grid] == expected
     assert len(set(expected)) == count
@@ -111,7 +122,9 @@ def test_paper_grid_follows_glace(count: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_combined_centres_lie_among_the_cameras(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    scenes = [rng.uniform(-1, 1, (n, 3)) + rng.normal(0, 30, 3) for n in (30, 3, 40, 25, 20)]
+    scenes = [
+        rng.uniform(-1, 1, (n, 3)) + rng.normal(0, 30, 3) for n in (30, 3, 40, 25, 20)
+    ]
     centres = np.array(combined_centres(scenes, 15, seed))
     assert len(centres) == 15
     assert combined_centres(scenes, 15, seed) == tuple(map(tuple, centres))
@@ -120,7 +133,9 @@ def test_combined_centres_lie_among_the_cameras(seed: int) -> None:
     for positions in scenes:
         in_atlas = atlas.place(positions).atlas_from_base.apply(positions)
         # Scenes are 5 m apart and 2 m wide, so each centre is a mean of one scene's cameras.
-        inside = (centres >= in_atlas.min(0) - 1e-9) & (centres <= in_atlas.max(0) + 1e-9)
+        inside = (centres >= in_atlas.min(0) - 1e-9) & (
+            centres <= in_atlas.max(0) + 1e-9
+        )
         shares.append(inside.all(1).sum())
     assert sum(shares) == 15
     assert min(shares) >= 1

@@ -10,7 +10,12 @@ import torch
 from torch import Tensor
 
 from evercal.continual.networks import buffer as module
-from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, encode_frames, join
+from evercal.continual.networks.buffer import (
+    EncodePlan,
+    FeatureBuffer,
+    encode_frames,
+    join,
+)
 from evercal.continual.networks.descriptor import GlobalDescriptor, described
 from evercal.continual.networks.loss import reprojection_error
 from evercal.features.encoder import Encoder
@@ -27,7 +32,9 @@ CAMERAS = (
 )
 # The buffer must support any pose of the base frame, not only a translation.
 ATLAS_FROM_BASE = SE3.exp([10.0, -5.0, 0.3, 0.2, -0.4, 1.1])
-PLAN = EncodePlan(views_per_frame=3, cells=40, seed=5, view=ViewOptions(short_side=120, gamma=0.0))
+PLAN = EncodePlan(
+    views_per_frame=3, cells=40, seed=5, view=ViewOptions(short_side=120, gamma=0.0)
+)
 
 Filled = Callable[..., FeatureBuffer]
 
@@ -35,12 +42,17 @@ Filled = Callable[..., FeatureBuffer]
 @pytest.fixture(scope="session")
 def frames(box: BoxRoom, shoot) -> list[Frame]:
     rng = np.random.default_rng(2)
-    return [shoot(CAMERAS[i % 3 if i < 3 else 0], box.random_view(rng)) for i in range(7)]
+    return [
+        shoot(CAMERAS[i % 3 if i < 3 else 0], box.random_view(rng)) for i in range(7)
+    ]
 
 
 @pytest.fixture
 def filled(
-    frames: list[Frame], block_mean: Encoder, describe: GlobalDescriptor, device: torch.device
+    frames: list[Frame],
+    block_mean: Encoder,
+    describe: GlobalDescriptor,
+    device: torch.device,
 ) -> Filled:
     """Images are encoded on the CPU; rows are drawn on the device of the test."""
 
@@ -56,7 +68,9 @@ def filled(
 def camera_of(target: module.Target, row: int) -> tuple[Camera, SE3]:
     """Return the ideal camera of a row and `atlas_from_camera`."""
     fx, fy, cx, cy = (float(value) for value in target.intrinsics[row])
-    matrix = np.vstack([target.camera_from_atlas[row].cpu().double().numpy(), [0, 0, 0, 1]])
+    matrix = np.vstack(
+        [target.camera_from_atlas[row].cpu().double().numpy(), [0, 0, 0, 1]]
+    )
     return Camera(400, 400, fx, fy, cx, cy), SE3.from_matrix(matrix).inverse()
 
 
@@ -65,7 +79,8 @@ def test_point_of_a_cell_projects_to_its_pixel(
 ) -> None:
     """Cell -> ray of the frame's camera -> point of the room -> atlas -> target of the row."""
     buffer = filled()
-    start, checked = 0, 0
+    start = 0
+    checked = 0
     for number in range(PLAN.views_per_frame):
         for position, frame in enumerate(frames):
             rng = np.random.default_rng([PLAN.seed, number, position])
@@ -76,18 +91,26 @@ def test_point_of_a_cell_projects_to_its_pixel(
                 rays = small.unproject(cell_centres(small.height, small.width, 8))
             else:
                 view = augmented_view(frame, 8, PLAN.view, rng)
-                selected = np.sort(rng.permutation(np.flatnonzero(view.valid))[: PLAN.cells])
-                rays = replace(small, distortion=()).unproject(view.cell_pixels)[selected]
+                selected = np.sort(
+                    rng.permutation(np.flatnonzero(view.valid))[: PLAN.cells]
+                )
+                rays = replace(small, distortion=()).unproject(view.cell_pixels)[
+                    selected
+                ]
             pose = frame.base_from_camera
             assert pose is not None
-            points, _ = box.intersect(pose.translation_m, rays @ pose.rotation_matrix().T)
+            points, _ = box.intersect(
+                pose.translation_m, rays @ pose.rotation_matrix().T
+            )
             atlas = ATLAS_FROM_BASE.apply(points)
             rows = buffer.rows(torch.arange(start, start + len(selected)))
             start += len(selected)
             assert (rows.scene == 4).all()
             ideal, atlas_from_camera = camera_of(rows.target, 0)
             captured = ideal.project(atlas_from_camera.inverse().apply(atlas))
-            np.testing.assert_allclose(rows.target.pixels.cpu().numpy(), captured, atol=1e-2)
+            np.testing.assert_allclose(
+                rows.target.pixels.cpu().numpy(), captured, atol=1e-2
+            )
             checked += len(selected)
     assert start == checked == len(buffer)
     assert buffer.views == PLAN.views_per_frame * len(frames)
@@ -98,14 +121,14 @@ def test_feature_belongs_to_the_cell_of_its_target(
 ) -> None:
     """A rendering by the row's camera shows the cell's grey value at the row's pixel."""
     buffer = filled(replace(PLAN, view=replace(PLAN.view, zoom=1.1)))
-    actual, expected = [], []
+    actual = []
+    expected = []
     views = buffer.tensors["view"]
     for view in range(buffer.views):
         rows = buffer.rows(torch.nonzero(views == view)[:, 0])
         ideal, atlas_from_camera = camera_of(rows.target, 0)
-        ideal = replace(
-            ideal, cx=ideal.cx + 60, cy=ideal.cy + 60
-        )  # barrel distortion has a wider view
+        # Barrel distortion has a wider view.
+        ideal = replace(ideal, cx=ideal.cx + 60, cy=ideal.cy + 60)
         image = box.render(ideal, ATLAS_FROM_BASE.inverse() @ atlas_from_camera)
         grey = cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (9, 9))
         where = (rows.target.pixels.cpu().numpy() + 60)[:, None].astype(np.float32)
@@ -126,7 +149,9 @@ def test_rows_have_the_descriptor_of_their_image(
         _, expected = described(block_mean(view.grey), describe)
         own = rows.descriptor[buffer.tensors["view"] == position]
         assert len(own) == len(view.valid)
-        torch.testing.assert_close(own.cpu(), expected.expand_as(own), atol=2e-3, rtol=0)
+        torch.testing.assert_close(
+            own.cpu(), expected.expand_as(own), atol=2e-3, rtol=0
+        )
 
 
 def same(a: FeatureBuffer, b: FeatureBuffer) -> bool:
@@ -177,13 +202,17 @@ def test_draws_are_reproducible_and_cover_the_buffer(filled: Filled) -> None:
     _, counts = torch.unique(first.target.pixels, dim=0, return_counts=True)
     every = torch.unique(buffer.tensors["pixels"], dim=0)
     assert len(counts) > 0.99 * len(every)
-    assert not torch.equal(buffer.draw(50, seeded).target.pixels, first.target.pixels[:50])
+    assert not torch.equal(
+        buffer.draw(50, seeded).target.pixels, first.target.pixels[:50]
+    )
 
 
 def test_part_and_join_are_inverse(filled: Filled) -> None:
     buffer = filled(replace(PLAN, views_per_frame=1))
     rows = buffer.draw(30, torch.Generator().manual_seed(1))
-    again = join([rows.part(slice(0, 7)), rows.part(slice(7, 8)), rows.part(slice(8, None))])
+    again = join(
+        [rows.part(slice(0, 7)), rows.part(slice(7, 8)), rows.part(slice(8, None))]
+    )
     for name in ("features", "scene", "descriptor"):
         assert torch.equal(getattr(again, name), getattr(rows, name))
     for name in ("pixels", "intrinsics", "camera_from_atlas"):
@@ -199,14 +228,18 @@ def test_corrected_rows_follow_an_ideal_pinhole() -> None:
         "features": torch.zeros(60, 1).half(),
         "pixels": torch.zeros(60, 2),
         "view": torch.arange(3, dtype=torch.int32).repeat_interleave(20),
-        "intrinsics": torch.tensor([[300.0, 310, 160, 120], [150, 150, 80, 60], [90, 90, 0, 0]]),
+        "intrinsics": torch.tensor(
+            [[300.0, 310, 160, 120], [150, 150, 80, 60], [90, 90, 0, 0]]
+        ),
         "camera_from_atlas": torch.eye(4)[None, :3].repeat(3, 1, 1),
         "descriptors": torch.ones(3, 2),
     }
     buffer.extend(rows)
     each = torch.arange(60)
     # Pixels of the points in the corrected camera.
-    captured, _ = reprojection_error(points, buffer.rows(each).target, correction.expand(60, 5))
+    captured, _ = reprojection_error(
+        points, buffer.rows(each).target, correction.expand(60, 5)
+    )
     buffer = FeatureBuffer(0, SE3.identity())
     buffer.extend({**rows, "pixels": captured})
     assert reprojection_error(points, buffer.rows(each).target)[0].abs().max() > 3

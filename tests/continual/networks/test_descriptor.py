@@ -24,8 +24,12 @@ def tiny() -> GlobalDescriptor:
 
 def by_hand(descriptor: GlobalDescriptor, features: np.ndarray) -> np.ndarray:
     """Map one image's (inputs, cells) features to (width,), cell by cell in double precision."""
-    w = {k: v.double().squeeze(-1).squeeze(-1).numpy() for k, v in descriptor.state_dict().items()}
-    weights, values = [], []
+    w = {
+        k: v.double().squeeze(-1).squeeze(-1).numpy()
+        for k, v in descriptor.state_dict().items()
+    }
+    weights = []
+    values = []
     for cell in features.T:
         lifted = np.maximum(w["lift.weight"] @ cell + w["lift.bias"], 0)
         weights.append(np.exp(w["attention.weight"] @ lifted + w["attention.bias"]))
@@ -34,7 +38,9 @@ def by_hand(descriptor: GlobalDescriptor, features: np.ndarray) -> np.ndarray:
     pooled = share.T @ np.array(values)
     pooled /= np.linalg.norm(pooled, axis=1, keepdims=True)
     projection = descriptor.project.weight.detach().double().numpy()
-    whole = projection @ pooled.ravel() + descriptor.project.bias.detach().double().numpy()
+    whole = (
+        projection @ pooled.ravel() + descriptor.project.bias.detach().double().numpy()
+    )
     return whole / np.linalg.norm(whole)
 
 

@@ -26,7 +26,11 @@ def test_auto_is_the_current_cuda_device_if_there_is_one(gpus) -> None:
     assert device_of("auto") == device_of() == device_of("cpu") == torch.device("cpu")
     gpus(2)
     assert device_of("auto") == device_of("cuda") == torch.device("cuda", 1)
-    assert device_of("cuda:0") == device_of(torch.device("cuda", 0)) == torch.device("cuda", 0)
+    assert (
+        device_of("cuda:0")
+        == device_of(torch.device("cuda", 0))
+        == torch.device("cuda", 0)
+    )
     assert device_of("cpu") == device_of(torch.device("cpu")) == torch.device("cpu")
 
 
@@ -40,7 +44,9 @@ def test_auto_is_the_current_cuda_device_if_there_is_one(gpus) -> None:
         ("", 0, "use auto, cpu or cuda"),
     ],
 )
-def test_missing_devices_are_refused_in_one_line(gpus, name: str, count: int, message: str) -> None:
+def test_missing_devices_are_refused_in_one_line(
+    gpus, name: str, count: int, message: str
+) -> None:
     gpus(count)
     with pytest.raises(InputError, match=message) as refused:
         device_of(name)

@@ -14,13 +14,17 @@ from evercal.geometry import SE3
 SHAPES = [
     HeadOptions(width=12, condition="code", offsets="per_centre"),
     HeadOptions(width=12, condition="code", offsets="shared"),
-    HeadOptions(width=12, condition="descriptor", offsets="per_centre", centres="fixed"),
+    HeadOptions(
+        width=12, condition="descriptor", offsets="per_centre", centres="fixed"
+    ),
 ]
 CPU = torch.device("cpu")
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), device="cpu")
+    return torch.randn(
+        *shape, generator=torch.Generator().manual_seed(seed), device="cpu"
+    )
 
 
 def head_of(options: HeadOptions, device: torch.device) -> Head:
@@ -41,7 +45,9 @@ def buffer_of(device: torch.device, scene: int = 1) -> FeatureBuffer:
         {
             "features": random(40, 7).half(),
             "pixels": 20 * random(40, 2, seed=1) + 50,
-            "view": torch.arange(2, dtype=torch.int32, device="cpu").repeat_interleave(20),
+            "view": torch.arange(2, dtype=torch.int32, device="cpu").repeat_interleave(
+                20
+            ),
             "intrinsics": torch.tensor([[100.0, 100, 50, 50]] * 2, device="cpu"),
             "camera_from_atlas": matrix,
             "descriptors": torch.nn.functional.normalize(random(2, 4, seed=3)),
@@ -55,7 +61,9 @@ def drawn(buffers: list[FeatureBuffer]) -> Rows:
     generator = torch.Generator().manual_seed(1)
     plain = buffer_of(buffers[0].device)
     plain.known = None
-    return join([*(buffer.draw(16, generator) for buffer in buffers), plain.draw(8, generator)])
+    return join(
+        [*(buffer.draw(16, generator) for buffer in buffers), plain.draw(8, generator)]
+    )
 
 
 def everything(rows: Rows) -> dict[str, Tensor]:
@@ -74,12 +82,20 @@ def step(head: Head, rows: Rows, scene: Tensor | int) -> dict[str, Tensor]:
     """Compute loss and error of rows, and the gradient of every parameter, in fp32."""
     output = head(rows.features.float(), scene, rows.descriptor)
     correction = 0.01 * rows.features[:, :5].float()
-    loss, error = reprojection_loss(output.points, rows.target, 7.0, LossOptions(), correction)
+    loss, error = reprojection_loss(
+        output.points, rows.target, 7.0, LossOptions(), correction
+    )
     loss.mean().backward()
-    gradients = {name: p.grad for name, p in head.named_parameters() if p.grad is not None}
+    gradients = {
+        name: p.grad for name, p in head.named_parameters() if p.grad is not None
+    }
     assert {"logit", "offset", "first.0.weight"} <= gradients.keys()
     assert error.isfinite().float().mean() > 0.5
-    return gradients | {"loss": loss.detach(), "error": error, "points": output.points.detach()}
+    return gradients | {
+        "loss": loss.detach(),
+        "error": error,
+        "points": output.points.detach(),
+    }
 
 
 @pytest.mark.gpu
@@ -87,20 +103,28 @@ def test_rows_are_equal_on_every_device(cuda: torch.device) -> None:
     expected = everything(drawn([buffer_of(CPU), buffer_of(CPU, 2)]))
     for name, value in everything(drawn([buffer_of(cuda), buffer_of(cuda, 2)])).items():
         assert value.device == cuda, name
-        assert torch.equal(value.cpu().nan_to_num(-7), expected[name].nan_to_num(-7)), name
+        assert torch.equal(value.cpu().nan_to_num(-7), expected[name].nan_to_num(-7)), (
+            name
+        )
     assert torch.isnan(expected["stored"]).any()
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("options", SHAPES)
-def test_step_is_equal_on_every_device(options: HeadOptions, cuda: torch.device) -> None:
+def test_step_is_equal_on_every_device(
+    options: HeadOptions, cuda: torch.device
+) -> None:
     for scene in (None, 1):
         actual = []
         for where in (CPU, cuda):
             rows = drawn([buffer_of(where), buffer_of(where, 2)])
-            actual.append(step(head_of(options, where), rows, rows.scene if scene is None else 1))
+            actual.append(
+                step(head_of(options, where), rows, rows.scene if scene is None else 1)
+            )
         for name, expected in actual[0].items():
             value = actual[1][name]
             assert value.device == cuda, name
             size = float(expected[expected.isfinite()].abs().max()) + 1e-6
-            torch.testing.assert_close(value.cpu(), expected, atol=1e-3 * size, rtol=1e-3)
+            torch.testing.assert_close(
+                value.cpu(), expected, atol=1e-3 * size, rtol=1e-3
+            )

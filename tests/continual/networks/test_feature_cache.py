@@ -17,7 +17,8 @@ class Counting:
     """The eight rows of each cell added up, times a weight; counts the encoded images."""
 
     def __init__(self, weight: float = 3.0):
-        self.weight, self.captured = weight, 0
+        self.weight = weight
+        self.captured = 0
 
     def __call__(self, grey: NDArray[np.float32]) -> NDArray[np.float32]:
         self.captured += 1
@@ -66,7 +67,9 @@ def test_truncated_file_is_replaced(tmp_path: Path) -> None:
         assert counting.captured == 2
 
 
-def test_full_disk_only_stops_caching(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_only_stops_caching(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plain, _ = made()
     encoder, _ = made(folder=tmp_path)
     encoder(IMAGES[0])
@@ -79,6 +82,8 @@ def test_full_disk_only_stops_caching(tmp_path: Path, monkeypatch: pytest.Monkey
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", full)
         actual = [encoder(image) for image in IMAGES[:4]]
-    np.testing.assert_allclose(actual, [plain(image) for image in IMAGES[:4]], atol=1e-3)
+    np.testing.assert_allclose(
+        actual, [plain(image) for image in IMAGES[:4]], atol=1e-3
+    )
     assert len(tries) == 3
     assert len([path for path in tmp_path.rglob("*") if path.is_file()]) == 1

@@ -8,10 +8,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.networks.head import Head, HeadOptions, fresh_head, homogeneous_scale
+from evercal.continual.networks.head import (
+    Head,
+    HeadOptions,
+    fresh_head,
+    homogeneous_scale,
+)
 from evercal.errors import InputError
 
-FEATURES, DESCRIPTOR, CENTRES = 7, 5, 3
+FEATURES = 7
+DESCRIPTOR = 5
+CENTRES = 3
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
@@ -46,7 +53,9 @@ def test_whitening_centres_scales_and_half_decorrelates() -> None:
     head = Head(FEATURES, DESCRIPTOR, HeadOptions(width=12))
     head.whiten(rows)
     white = ((rows - head.feature_mean) @ head.feature_map).double()
-    torch.testing.assert_close(white.mean(0), torch.zeros(FEATURES).double(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        white.mean(0), torch.zeros(FEATURES).double(), atol=1e-5, rtol=0
+    )
     assert abs(float(white.std()) - 1) < 1e-3
 
     def condition(x: Tensor) -> float:
@@ -74,10 +83,13 @@ def test_scale_in_closed_form() -> None:
     torch.testing.assert_close(homogeneous_scale(raw), expected)
 
 
-def by_hand(head: Head, feature: np.ndarray, scene: int, descriptor: np.ndarray) -> np.ndarray:
+def by_hand(
+    head: Head, feature: np.ndarray, scene: int, descriptor: np.ndarray
+) -> np.ndarray:
     """Compute one row's point (3,), layer by layer in double precision."""
     w = {key: value.double().numpy() for key, value in head.state_dict().items()}
-    coded, layer = head.options.condition == "code", 0
+    coded = head.options.condition == "code"
+    layer = 0
 
     def linear(name: str, x: np.ndarray) -> np.ndarray:
         nonlocal layer
@@ -107,7 +119,8 @@ def by_hand(head: Head, feature: np.ndarray, scene: int, descriptor: np.ndarray)
         y = linear(f"last.{i}", y)
     assert layer == head.layers
 
-    total, weight = np.zeros(3), 0.0
+    total = np.zeros(3)
+    weight = 0.0
     beta = math.log(2) / 0.75
     for k, centre in enumerate(w["centres"]):
         if coded and w["centre_scene"][k] != scene:
@@ -124,12 +137,15 @@ def by_hand(head: Head, feature: np.ndarray, scene: int, descriptor: np.ndarray)
 @pytest.mark.parametrize("options", SHAPES)
 def test_points_match_a_slow_reference(options: HeadOptions) -> None:
     head = grown(options, 3)
-    features, descriptors = random(9, FEATURES, seed=1), random(9, DESCRIPTOR, seed=2)
+    features = random(9, FEATURES, seed=1)
+    descriptors = random(9, DESCRIPTOR, seed=2)
     scene = torch.arange(9) % 3
     with torch.no_grad():
         points = head(features, scene, descriptors).points.numpy()
     for i in range(9):
-        twin = by_hand(head, features[i].double().numpy(), i % 3, descriptors[i].double().numpy())
+        twin = by_hand(
+            head, features[i].double().numpy(), i % 3, descriptors[i].double().numpy()
+        )
         np.testing.assert_allclose(points[i], twin, atol=1e-5)
 
 
@@ -138,7 +154,8 @@ def test_points_match_a_slow_reference(options: HeadOptions) -> None:
 def test_new_scenes_do_not_change_the_output_for_old_scenes(
     options: HeadOptions, rows: int
 ) -> None:
-    head, features = grown(options, 2), random(rows, FEATURES, seed=1)
+    head = grown(options, 2)
+    features = random(rows, FEATURES, seed=1)
     mixed = torch.arange(rows) % 2
     with torch.no_grad():
         before = [head(features, scene, None).points for scene in (0, 1)]
@@ -157,7 +174,8 @@ def test_new_scenes_do_not_change_the_output_for_old_scenes(
 
 @pytest.mark.parametrize("options", CODED)
 def test_scene_index_and_scene_tensor_agree(options: HeadOptions) -> None:
-    head, features = grown(options, 3), random(50, FEATURES, seed=1)
+    head = grown(options, 3)
+    features = random(50, FEATURES, seed=1)
     for scene in range(3):
         own = head.centre_scene == scene
         with torch.no_grad():
@@ -170,8 +188,10 @@ def test_scene_index_and_scene_tensor_agree(options: HeadOptions) -> None:
 
 
 def test_with_a_descriptor_the_scene_index_is_ignored() -> None:
-    head, features = grown(SHAPES[3], 3), random(30, FEATURES, seed=1)
-    first, second = random(30, DESCRIPTOR, seed=2), random(30, DESCRIPTOR, seed=3)
+    head = grown(SHAPES[3], 3)
+    features = random(30, FEATURES, seed=1)
+    first = random(30, DESCRIPTOR, seed=2)
+    second = random(30, DESCRIPTOR, seed=3)
     with torch.no_grad():
         points = head(features, 0, first).points
         assert torch.equal(head(features, 2, first).points, points)
@@ -182,13 +202,16 @@ def test_with_a_descriptor_the_scene_index_is_ignored() -> None:
 
 def test_centres_are_added_in_fp32_under_autocast() -> None:
     """At 5 km the resolution of bfloat16 is 32 m, so only the offset may be in bfloat16."""
-    head, features = grown(SHAPES[0], 1), random(30, FEATURES, seed=1)
+    head = grown(SHAPES[0], 1)
+    features = random(30, FEATURES, seed=1)
     head.centres += torch.tensor([5000.0, 0.0, 0.0])
     with torch.no_grad():
         exact = head(features, 0, None).points
         with torch.autocast("cpu", torch.bfloat16):
             mixed = head(features, 0, None)
-    assert mixed.points.dtype == mixed.logits.dtype == mixed.offsets.dtype == torch.float32
+    assert (
+        mixed.points.dtype == mixed.logits.dtype == mixed.offsets.dtype == torch.float32
+    )
     torch.testing.assert_close(mixed.points, exact, atol=0.2, rtol=0)
 
 
@@ -206,7 +229,9 @@ def test_fixed_centres_need_the_descriptor() -> None:
 
 def test_fresh_head_depends_on_its_seed_only() -> None:
     before = torch.random.get_rng_state()
-    first, again, other = (fresh_head(FEATURES, DESCRIPTOR, SHAPES[1], seed=s) for s in (1, 1, 2))
+    first, again, other = (
+        fresh_head(FEATURES, DESCRIPTOR, SHAPES[1], seed=s) for s in (1, 1, 2)
+    )
     assert torch.equal(torch.random.get_rng_state(), before)
     assert torch.equal(first.offset, again.offset)
     assert not torch.equal(first.offset, other.offset)

@@ -40,7 +40,9 @@ def scattered(seed: int, count: int = 200) -> tuple[SE3, np.ndarray, np.ndarray]
     return poses, in_camera, poses.apply(in_camera)
 
 
-def straight(in_camera: list[list[float]], pixels: list[list[float]]) -> tuple[Tensor, Target]:
+def straight(
+    in_camera: list[list[float]], pixels: list[list[float]]
+) -> tuple[Tensor, Target]:
     """Create points and targets of a camera at the origin of the atlas."""
     poses = SE3.identity((len(pixels),))
     return torch.tensor(in_camera), target(np.array(pixels), poses)
@@ -49,9 +51,13 @@ def straight(in_camera: list[list[float]], pixels: list[list[float]]) -> tuple[T
 def test_error_matches_the_camera_model() -> None:
     poses, in_camera, atlas = scattered(0)
     pixels = np.random.default_rng(1).uniform(0, 320, (200, 2))
-    residual, actual = reprojection_error(torch.from_numpy(atlas).float(), target(pixels, poses))
+    residual, actual = reprojection_error(
+        torch.from_numpy(atlas).float(), target(pixels, poses)
+    )
     np.testing.assert_allclose(actual.numpy(), in_camera, atol=1e-4)
-    np.testing.assert_allclose(residual.numpy(), CAMERA.project(in_camera) - pixels, atol=2e-2)
+    np.testing.assert_allclose(
+        residual.numpy(), CAMERA.project(in_camera) - pixels, atol=2e-2
+    )
 
 
 def test_camera_correction_matches_opencv() -> None:
@@ -67,16 +73,27 @@ def test_camera_correction_matches_opencv() -> None:
         distortion=(correction[3], correction[4], 0.0, 0.0),
     )
     pixels = np.zeros((200, 2))
-    points, where = torch.from_numpy(atlas).float(), target(pixels, poses)
-    residual, _ = reprojection_error(points, where, torch.tensor([correction]).expand(200, -1))
-    np.testing.assert_allclose(residual.numpy(), corrected.project(in_camera), atol=2e-2)
+    points = torch.from_numpy(atlas).float()
+    where = target(pixels, poses)
+    residual, _ = reprojection_error(
+        points, where, torch.tensor([correction]).expand(200, -1)
+    )
+    np.testing.assert_allclose(
+        residual.numpy(), corrected.project(in_camera), atol=2e-2
+    )
     none, _ = reprojection_error(points, where, torch.zeros(200, 5))
     plain, _ = reprojection_error(points, where)
     torch.testing.assert_close(none, plain)
 
 
 def test_circle_schedule_falls_from_51_to_1() -> None:
-    for progress, tau in [(0.0, 51.0), (0.6, 41.0), (0.8, 31.0), (0.96, 15.0), (1.0, 1.0)]:
+    for progress, tau in [
+        (0.0, 51.0),
+        (0.6, 41.0),
+        (0.8, 31.0),
+        (0.96, 15.0),
+        (1.0, 1.0),
+    ]:
         assert clamp_px(ACE, progress) == pytest.approx(tau)
     # A circle: (tau - 1)^2 / 50^2 + t^2 = 1.
     for t in np.linspace(0, 1, 21):
@@ -90,17 +107,23 @@ def test_exponential_schedule_halves_in_equal_steps() -> None:
 
 
 def test_loss_of_valid_rows_in_closed_form() -> None:
-    cx, cy = CAMERA.cx, CAMERA.cy
+    cx = CAMERA.cx
+    cy = CAMERA.cy
     pixels = [[cx, cy], [cx + 3, cy], [cx - 3, cy + 4], [cx + 100, cy - 200]]
     points, where = straight([[0.0, 0.0, 2.0]] * 4, pixels)
     loss, error = reprojection_loss(points, where, TAU, OPTIONS)
     expected = [TAU * math.tanh(e / TAU) for e in (0, 3, 7, 300)]
     np.testing.assert_allclose(loss.numpy(), expected, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(error.numpy(), [0, 3, 5, math.hypot(100, 200)], rtol=1e-5)
+    np.testing.assert_allclose(
+        error.numpy(), [0, 3, 5, math.hypot(100, 200)], rtol=1e-5
+    )
 
 
 def test_invalid_rows_are_attracted_to_the_proxy_depth() -> None:
-    cx, cy, fx, fy = CAMERA.cx, CAMERA.cy, CAMERA.fx, CAMERA.fy
+    cx = CAMERA.cx
+    cy = CAMERA.cy
+    fx = CAMERA.fx
+    fy = CAMERA.fy
     pixel = [cx + 0.1 * fx, cy - 0.2 * fy]  # the ray (0.1, -0.2, 1)
     in_camera = [
         [0.3, 0.0, -2.0],  # behind the camera
@@ -115,7 +138,9 @@ def test_invalid_rows_are_attracted_to_the_proxy_depth() -> None:
     np.testing.assert_allclose(loss.numpy(), expected, rtol=1e-5)
     assert torch.isinf(error).all()
     at_proxy, there = straight([proxy.tolist()], [pixel])
-    loss, error = reprojection_loss(at_proxy, there, TAU, replace(OPTIONS, proxy_depth_m=10.0))
+    loss, error = reprojection_loss(
+        at_proxy, there, TAU, replace(OPTIONS, proxy_depth_m=10.0)
+    )
     assert float(loss) < 1e-3
     assert float(error) < 1e-3
 
@@ -138,17 +163,25 @@ def test_step_against_the_gradient_lowers_the_loss(kind: str) -> None:
     assert torch.isfinite(gradient).all()
     length = gradient.norm(dim=-1, keepdim=True)
     assert (length > 0).all()
-    after, _ = reprojection_loss(points - 1e-3 * gradient / length, where, 50.0, OPTIONS)
-    assert (after < loss).float().mean() > 0.98  # a step can cross a kink of the L1 norm
+    after, _ = reprojection_loss(
+        points - 1e-3 * gradient / length, where, 50.0, OPTIONS
+    )
+    assert (
+        after < loss
+    ).float().mean() > 0.98  # a step can cross a kink of the L1 norm
     truth = torch.from_numpy(atlas).float()
     assert float(reprojection_loss(truth, where, 50.0, OPTIONS)[0].max()) < 0.05
 
 
 def test_surface_loss_is_the_logarithm_of_the_distance_in_pixels() -> None:
     matrix = torch.eye(4)[:3].repeat(3, 1, 1)
-    target = Target(torch.zeros(3, 2), torch.tensor([[200.0, 200.0, 0.0, 0.0]] * 3), matrix)
+    target = Target(
+        torch.zeros(3, 2), torch.tensor([[200.0, 200.0, 0.0, 0.0]] * 3), matrix
+    )
     known = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 4.0], [torch.nan] * 3])
-    points = known.nan_to_num() + torch.tensor([[0.1, 0.0, 0.0], [0.1, 0.2, -0.3], [1.0] * 3])
+    points = known.nan_to_num() + torch.tensor(
+        [[0.1, 0.0, 0.0], [0.1, 0.2, -0.3], [1.0] * 3]
+    )
     points.requires_grad_()
     loss = surface_loss(points, known, target, 20.0)
     # 0.1 m at 2 m are 10 px, 0.6 m at 4 m are 30 px; a row without a known point has no loss.
@@ -159,5 +192,6 @@ def test_surface_loss_is_the_logarithm_of_the_distance_in_pixels() -> None:
     assert float(gradient[2].abs().max()) == 0
     # The scale does not fall below that of swept depths.
     torch.testing.assert_close(
-        surface_loss(points, known, target, 1.0)[0], 5 * torch.log1p(torch.tensor(10.0) / 5)
+        surface_loss(points, known, target, 1.0)[0],
+        5 * torch.log1p(torch.tensor(10.0) / 5),
     )

@@ -5,12 +5,18 @@ from __future__ import annotations
 import pytest
 import torch
 
-from evercal.continual.networks.precision import VARIABLE, autocast, fast_bfloat16, has_bfloat16
+from evercal.continual.networks.precision import (
+    VARIABLE,
+    autocast,
+    fast_bfloat16,
+    has_bfloat16,
+)
 from evercal.errors import InputError
 
 
 def test_autocast_uses_the_reported_precision(device: torch.device) -> None:
-    layer, rows = torch.nn.Linear(4, 3).to(device), torch.randn(5, 4).to(device)
+    layer = torch.nn.Linear(4, 3).to(device)
+    rows = torch.randn(5, 4).to(device)
     with autocast(device):
         inside = layer(rows)
     assert inside.dtype == (torch.bfloat16 if fast_bfloat16(device) else torch.float32)
@@ -36,14 +42,18 @@ def test_missing_cuda_device_has_no_bfloat16(monkeypatch: pytest.MonkeyPatch) ->
     has_bfloat16.cache_clear()
 
 
-@pytest.mark.parametrize(("precision", "bfloat16"), [("float32", False), ("bfloat16", True)])
+@pytest.mark.parametrize(
+    ("precision", "bfloat16"), [("float32", False), ("bfloat16", True)]
+)
 def test_environment_sets_the_precision(
     precision: str, bfloat16: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(VARIABLE, precision)
     assert fast_bfloat16() == bfloat16
     with autocast():
-        assert (torch.nn.Linear(4, 3)(torch.ones(1, 4)).dtype == torch.bfloat16) == bfloat16
+        assert (
+            torch.nn.Linear(4, 3)(torch.ones(1, 4)).dtype == torch.bfloat16
+        ) == bfloat16
     for automatic in ("auto", ""):
         monkeypatch.setenv(VARIABLE, automatic)
         assert fast_bfloat16() == has_bfloat16("cpu")

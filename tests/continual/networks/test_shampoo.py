@@ -24,13 +24,18 @@ def test_inverse_root_inverts_the_square() -> None:
     root = inverse_root(moment)
     mean = moment.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
     whole = root @ (moment / mean) @ root
-    torch.testing.assert_close(whole, torch.eye(16).expand(2, -1, -1), atol=5e-3, rtol=0)
+    torch.testing.assert_close(
+        whole, torch.eye(16).expand(2, -1, -1), atol=5e-3, rtol=0
+    )
     torch.testing.assert_close(inverse_root(1e-20 * moment), root)
 
 
-def test_double_precision_is_tried_if_single_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_double_precision_is_tried_if_single_fails(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     a = torch.randn(2, 60, 16, generator=torch.Generator().manual_seed(1))
-    expected, eigh = inverse_root(a.mT @ a), torch.linalg.eigh
+    expected = inverse_root(a.mT @ a)
+    eigh = torch.linalg.eigh
 
     def failing(matrices: torch.Tensor) -> object:
         if matrices.dtype == torch.float32:
@@ -52,7 +57,8 @@ def test_steps_follow_the_definition() -> None:
     start = torch.eye(24)
     matrix = torch.nn.Parameter(start.clone())
     optimiser = OneSidedShampoo([{"params": [matrix]}], 0.05, 0.1)
-    expected, momentum = start.double(), torch.zeros(24, 24).double()
+    expected = start.double()
+    momentum = torch.zeros(24, 24).double()
     moment = root = torch.zeros(24, 24).double()
     for number, gradient in enumerate(_gradients(steps)):
         matrix.grad = gradient
@@ -64,7 +70,11 @@ def test_steps_follow_the_definition() -> None:
         moment = new if number == 0 else DECAY * moment + (1 - DECAY) * new
         if number % EVERY == 0:
             values, vectors = torch.linalg.eigh(moment)
-            root = vectors @ torch.diag((values / values.mean() + FLOOR) ** -0.5) @ vectors.T
+            root = (
+                vectors
+                @ torch.diag((values / values.mean() + FLOOR) ** -0.5)
+                @ vectors.T
+            )
         change = direction @ root
         change *= 24**0.5 / change.norm()
         expected = expected * (1 - 0.05 * 0.1) - 0.05 * change
@@ -78,7 +88,9 @@ def test_matrices_are_independent() -> None:
     both = OneSidedShampoo([{"params": matrices}], 0.05, 0.1)
     one = OneSidedShampoo([{"params": [alone]}], 0.05, 0.1)
     for gradient in gradients:
-        matrices[0].grad, matrices[1].grad, alone.grad = gradient, -gradient, gradient
+        matrices[0].grad = gradient
+        matrices[1].grad = -gradient
+        alone.grad = gradient
         both.step()
         one.step()
     torch.testing.assert_close(matrices[0], alone, atol=1e-6, rtol=1e-5)

@@ -17,7 +17,8 @@ from evercal.features.views import cell_centres
 from evercal.geometry import SE3, Camera
 
 CAMERA = Camera(160, 120, 131.0, 128.0, 79.5, 59.5)
-CHANNELS, DESCRIPTOR = 48, 6
+CHANNELS = 48
+DESCRIPTOR = 6
 ATLAS_FROM_BASE = SE3.exp([5.0, -5.0, 0.0, 0.0, 0.0, 0.7])
 OPTIONS = FitOptions(
     iterations=20,
@@ -35,7 +36,8 @@ class Replayed(TrainingHooks):
     """Replays thirty rows of each buffer with a given loss."""
 
     def __init__(self, memories: list[FeatureBuffer], penalty: Cost):
-        self.memories, self.penalty = memories, penalty
+        self.memories = memories
+        self.penalty = penalty
 
     def replayed(
         self, fresh: Rows, step: int, rate: float, generator: torch.Generator
@@ -51,7 +53,10 @@ def head_for(buffers: list[FeatureBuffer], options: HeadOptions | None = None) -
     for buffer in buffers:
         matrix = buffer.tensors["camera_from_atlas"].double().numpy()
         atlas_from_camera = SE3.from_matrix(matrix).inverse()
-        head.grow(torch.from_numpy(atlas_from_camera.translation_m[:3]).float(), seed=buffer.scene)
+        head.grow(
+            torch.from_numpy(atlas_from_camera.translation_m[:3]).float(),
+            seed=buffer.scene,
+        )
     return head
 
 
@@ -98,18 +103,22 @@ def test_replay_cost_is_minimised_on_even_shares(learnable: Learnable) -> None:
 
     before = mean_logit()
     options = replace(OPTIONS, iterations=60, peak_rate=1e-2)
-    list(HeadTrainer(head, buffers[2:], options, 0, Replayed(buffers[:2], penalty)).run())
+    list(
+        HeadTrainer(head, buffers[2:], options, 0, Replayed(buffers[:2], penalty)).run()
+    )
     assert abs(mean_logit() + 3) < 0.3 < abs(before + 3)
     for scene, _ in captured:
         assert torch.bincount(scene, minlength=3).tolist() == [30, 30, 0]
-    clamps = [clamp_px(options.loss, i / 60) for i in range(60)]  # clamps of the new rows
+    # Clamps of the new rows.
+    clamps = [clamp_px(options.loss, i / 60) for i in range(60)]
     assert [tau_px for _, tau_px in captured] == pytest.approx(clamps)
 
 
 def test_descriptor_noise_has_the_stated_size(learnable: Learnable) -> None:
     buffer, _ = learnable()
     selected = buffer.tensors["descriptors"].clone()
-    head, captured = head_for([buffer], HeadOptions(width=16, condition="descriptor")), []
+    head = head_for([buffer], HeadOptions(width=16, condition="descriptor"))
+    captured = []
     head.register_forward_pre_hook(lambda _, inputs: captured.append(inputs[2]))
     options = replace(OPTIONS, iterations=1, batch=4000, diffusion=0.5)
     list(HeadTrainer(head, [buffer], options, 0).run())
@@ -126,8 +135,12 @@ def test_descriptor_noise_has_the_stated_size(learnable: Learnable) -> None:
 
 def test_wrong_intrinsics_are_corrected_if_allowed(learnable: Learnable) -> None:
     """The true focal length is 4 % longer than stated, and there is barrel distortion."""
-    true = replace(CAMERA, fx=CAMERA.fx * 1.04, fy=CAMERA.fy * 1.04, distortion=(-0.1, 0, 0, 0))
-    options = FitOptions(batch=512, peak_rate=5e-3, intrinsics_rate=1.0, loss=OPTIONS.loss)
+    true = replace(
+        CAMERA, fx=CAMERA.fx * 1.04, fy=CAMERA.fy * 1.04, distortion=(-0.1, 0, 0, 0)
+    )
+    options = FitOptions(
+        batch=512, peak_rate=5e-3, intrinsics_rate=1.0, loss=OPTIONS.loss
+    )
     rays = torch.from_numpy(true.unproject(cell_centres(120, 160, 8))).float()
     for correctable, steps in ((True, 250), (False, 20)):
         buffer, _ = learnable(views=20, lens=true, correctable=correctable)
@@ -167,18 +180,24 @@ class StepRecorder(Replayed):
         self.last = copy.deepcopy(proposed)
 
 
-def test_proposed_changes_sum_to_the_change_of_the_weights(learnable: Learnable) -> None:
+def test_proposed_changes_sum_to_the_change_of_the_weights(
+    learnable: Learnable,
+) -> None:
     """Holds for AdamW with decay and Shampoo with momentum."""
     buffers = [learnable(scene)[0] for scene in range(3)]
     head = head_for(buffers)
     first = {name: value.detach().clone() for name, value in head.named_parameters()}
-    hooks = StepRecorder(buffers[:2], lambda output, rows, tau_px: output.points.abs().mean())
+    hooks = StepRecorder(
+        buffers[:2], lambda output, rows, tau_px: output.points.abs().mean()
+    )
     list(HeadTrainer(head, buffers[2:], OPTIONS, 0, hooks).run())
     assert hooks.distance.keys() == first.keys()
     for name, value in head.named_parameters():
         moved = value.detach().double() - first[name].double()
         torch.testing.assert_close(hooks.distance[name], moved, rtol=0, atol=2e-6)
-    assert any(float(distance.abs().max()) > 1e-3 for distance in hooks.distance.values())
+    assert any(
+        float(distance.abs().max()) > 1e-3 for distance in hooks.distance.values()
+    )
     shares = [one_cycle(OPTIONS, step) / OPTIONS.peak_rate for step in range(20)]
     assert hooks.schedules == pytest.approx(shares)
 
@@ -190,10 +209,15 @@ def test_constraints_are_not_minimised(learnable: Learnable) -> None:
     def nothing(output: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
         return 0 * output.points.sum()
 
-    watched, plain = head_for(buffers), head_for(buffers)
+    watched = head_for(buffers)
+    plain = head_for(buffers)
     hooks = StepRecorder(buffers[:2], nothing)
     next(HeadTrainer(watched, buffers[2:], OPTIONS, 0, hooks).run())
-    next(HeadTrainer(plain, buffers[2:], OPTIONS, 0, Replayed(buffers[:2], nothing)).run())
+    next(
+        HeadTrainer(
+            plain, buffers[2:], OPTIONS, 0, Replayed(buffers[:2], nothing)
+        ).run()
+    )
     for name, value in watched.named_parameters():
         torch.testing.assert_close(value, plain.get_parameter(name), rtol=0, atol=1e-6)
     assert hooks.last is not None

@@ -25,7 +25,11 @@ def captured(
     options = replace(quick, fit=replace(quick.fit, iterations=60))
     scenes = learn(empty_scenes("finetune"), STRATEGIES["finetune"], rooms[0], options)
     buffer = FeatureBuffer(0, scenes.scenes[0].cell.atlas_from_base)
-    list(encode_frames(buffer, rooms[0].train, quick.encode, scenes.encoder, scenes.descriptor))
+    list(
+        encode_frames(
+            buffer, rooms[0].train, quick.encode, scenes.encoder, scenes.descriptor
+        )
+    )
     head = scenes.heads[0].eval()
     return FrameStatistics(rooms[0].train, head, lambda: buffer, 5), head, buffer
 
@@ -45,7 +49,8 @@ def test_features_are_means_over_a_frame(
 
 
 def test_neighbouring_frames_share_parts(
-    captured: tuple[FrameStatistics, Head, FeatureBuffer], monkeypatch: pytest.MonkeyPatch
+    captured: tuple[FrameStatistics, Head, FeatureBuffer],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     candidates, _, _ = captured
     monkeypatch.setattr("evercal.continual.selection.frame_statistics.RELIABLE_PX", 1e3)
@@ -76,7 +81,9 @@ def test_gradient_predicts_the_change_of_the_loss(
     def loss() -> float:
         with torch.no_grad():
             points = head(rows.features.float(), 0, rows.descriptor).points
-            return float(reprojection_loss(points, rows.target, 5.0, LossOptions())[0].mean())
+            return float(
+                reprojection_loss(points, rows.target, 5.0, LossOptions())[0].mean()
+            )
 
     selected = head.logit.data
     part = torch.from_numpy(gradient[: head.logit.numel()]).float().view_as(head.logit)
@@ -86,7 +93,9 @@ def test_gradient_predicts_the_change_of_the_loss(
         head.logit.data = selected + share * step * part
         losses.append(loss())
     head.logit.data = selected
-    assert losses[0] - losses[1] == pytest.approx(step * float(part.norm()) ** 2, rel=0.1)
+    assert losses[0] - losses[1] == pytest.approx(
+        step * float(part.norm()) ** 2, rel=0.1
+    )
 
 
 def test_fixed_centres_all_have_gradients(
@@ -103,12 +112,16 @@ def test_fixed_centres_all_have_gradients(
     later = FeatureBuffer(1, buffer.atlas_from_base)
     later.extend(dict(buffer.tensors))
     gradients = FrameStatistics(rooms[0].train, head, lambda: later, 5).gradients()
-    assert gradients.shape == (len(rooms[0].train), head.logit.numel() + head.offset.numel())
+    assert gradients.shape == (
+        len(rooms[0].train),
+        head.logit.numel() + head.offset.numel(),
+    )
     assert np.abs(gradients).max() > 0
 
 
 def test_draws_depend_on_seed_and_scene(rooms: Rooms) -> None:
-    head, buffer = Head(4, 4, HeadOptions()), FeatureBuffer(0, SE3.identity())
+    head = Head(4, 4, HeadOptions())
+    buffer = FeatureBuffer(0, SE3.identity())
 
     def drawn(seed: int, scene: int) -> float:
         frames = FrameStatistics(rooms[1].train, head, lambda: buffer, seed, scene)

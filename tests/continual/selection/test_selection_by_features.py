@@ -18,7 +18,9 @@ def rng(seed: int = 0) -> np.random.Generator:
 
 def test_reservoir_is_uniform() -> None:
     runs = 4000
-    selected = np.concatenate([select_reservoir(20, 5, rng(seed)) for seed in range(runs)])
+    selected = np.concatenate(
+        [select_reservoir(20, 5, rng(seed)) for seed in range(runs)]
+    )
     share = np.bincount(selected, minlength=20) / runs
     # Five standard deviations of a share of 1/4.
     assert np.abs(share - 0.25).max() < 5 * np.sqrt(0.25 * 0.75 / runs)
@@ -42,7 +44,9 @@ def test_herding_matches_a_slow_reference() -> None:
     for _ in range(8):
         left = [i for i in range(30) if i not in selected]
         gaps = [
-            np.linalg.norm(mean - sum(unit[k] for k in [*selected, i]) / (len(selected) + 1))
+            np.linalg.norm(
+                mean - sum(unit[k] for k in [*selected, i]) / (len(selected) + 1)
+            )
             for i in left
         ]
         selected.append(left[int(np.argmin(gaps))])
@@ -54,7 +58,9 @@ def test_leverage_by_hand() -> None:
     features = np.array([[2.0, 0.0], [2.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
     assert leverage_scores(features, 2) == pytest.approx([1 / 3, 1 / 3, 1 / 3, 1.0])
     # With rank one, only the strongest direction (norm sqrt 12) counts.
-    assert leverage_scores(features, 1) == pytest.approx([1 / 3, 1 / 3, 1 / 3, 0.0], abs=1e-12)
+    assert leverage_scores(features, 1) == pytest.approx(
+        [1 / 3, 1 / 3, 1 / 3, 0.0], abs=1e-12
+    )
 
 
 def test_leverage_sums_to_the_rank_and_is_rotation_invariant() -> None:
@@ -63,7 +69,9 @@ def test_leverage_sums_to_the_rank_and_is_rotation_invariant() -> None:
     for rank in (1, 5, 12, 99):
         scores = leverage_scores(features, rank)
         assert scores.sum() == pytest.approx(min(rank, 12))
-        np.testing.assert_allclose(leverage_scores(features @ rotation, rank), scores, atol=1e-9)
+        np.testing.assert_allclose(
+            leverage_scores(features @ rotation, rank), scores, atol=1e-9
+        )
 
 
 def test_coverage_selects_frames_with_new_parts() -> None:

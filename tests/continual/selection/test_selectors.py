@@ -15,7 +15,8 @@ class SyntheticFrames(FrameStatistics):
     """Frames of a moving camera, with synthetic outputs of a head."""
 
     def __init__(self, positions: np.ndarray, quaternions: np.ndarray):
-        camera, image = Camera(8, 8, 8, 8, 3.5, 3.5), np.zeros((8, 8, 3), np.uint8)
+        camera = Camera(8, 8, 8, 8, 3.5, 3.5)
+        image = np.zeros((8, 8, 3), np.uint8)
         frames = [
             Frame(f"{i}", image, camera, SE3(quaternions[i], positions[i]))
             for i in range(len(positions))
@@ -39,7 +40,9 @@ class SyntheticFrames(FrameStatistics):
 def test_selection_is_sorted_and_within_capacity(name: str, count: int) -> None:
     rng = np.random.default_rng(count)
     positions = np.cumsum(rng.normal(0, 0.05, (count, 3)), axis=0)
-    rotations = np.array([1.0, 0, 0, 0]) + np.cumsum(rng.normal(0, 0.1, (count, 4)), axis=0)
+    rotations = np.array([1.0, 0, 0, 0]) + np.cumsum(
+        rng.normal(0, 0.1, (count, 4)), axis=0
+    )
     quaternions = rotations / np.linalg.norm(rotations, axis=1, keepdims=True)
     capacity = count // 10
     selected = SELECTORS[name](SyntheticFrames(positions, quaternions), capacity)

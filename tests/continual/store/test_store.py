@@ -28,7 +28,9 @@ STRATEGIES = pytest.mark.parametrize("strategy", ["evercal_network", "isolation"
 def stored(head: Head) -> dict[str, Tensor]:
     """State of a head with the precision of the file: half, except for its centres."""
     return {
-        name: value if name == "centres" or not value.is_floating_point() else value.half().float()
+        name: value
+        if name == "centres" or not value.is_floating_point()
+        else value.half().float()
         for name, value in head.state_dict().items()
     }
 
@@ -37,32 +39,44 @@ def stored(head: Head) -> dict[str, Tensor]:
 def test_store_opens_as_it_was_written(
     strategy: str, three_stages: Stages, tmp_path: Path, make_store: MakeStore
 ) -> None:
-    store, scenes = make_store(tmp_path, three_stages[strategy]), three_stages[strategy][-1]
+    store = make_store(tmp_path, three_stages[strategy])
+    scenes = three_stages[strategy][-1]
     reopened = NetworkStore.open(tmp_path)
     assert reopened.stages == store.stages
     assert [report["seconds"] for report in reopened.reports()] == [1.5] * 3
     contents = reopened.contents
-    assert (contents.strategy, contents.short_side) == (scenes.strategy, scenes.short_side)
+    assert (contents.strategy, contents.short_side) == (
+        scenes.strategy,
+        scenes.short_side,
+    )
     for a, b in zip(contents.heads, scenes.heads, strict=True):
         assert a.options == b.options
         assert not a.training
         state = stored(b)
         assert a.state_dict().keys() == state.keys()
-        assert all(torch.equal(value, state[name]) for name, value in a.state_dict().items())
+        assert all(
+            torch.equal(value, state[name]) for name, value in a.state_dict().items()
+        )
     for a, b in zip(contents.scenes, scenes.scenes, strict=True):
         assert torch.equal(a.prototypes, b.prototypes)
         others = [f.name for f in fields(a) if f.name != "prototypes"]
-        assert [getattr(a, name) for name in others] == [getattr(b, name) for name in others]
+        assert [getattr(a, name) for name in others] == [
+            getattr(b, name) for name in others
+        ]
     for a, b in zip(contents.keyframes, scenes.keyframes, strict=True):
         assert (a is None) == (b is None)
         if a is not None and b is not None:
-            one, two = a.to_tensors(), b.to_tensors()
+            one = a.to_tensors()
+            two = b.to_tensors()
             assert one.keys() == two.keys()
             for name, value in one.items():
                 torch.testing.assert_close(value, two[name], rtol=0, atol=1e-15)
     features = scenes.encoder(GREY)
     np.testing.assert_allclose(contents.encoder(GREY), features, atol=1e-6)
-    again = described(features, contents.descriptor), described(features, scenes.descriptor)
+    again = (
+        described(features, contents.descriptor),
+        described(features, scenes.descriptor),
+    )
     torch.testing.assert_close(*again, rtol=0, atol=1e-6)
 
 
@@ -70,13 +84,20 @@ def test_store_opens_as_it_was_written(
     ("strategy", "heads"), [("evercal_network", [3]), ("isolation", [1, 2, 3])]
 )
 def test_of_a_shared_head_only_the_newest_file_remains(
-    strategy: str, heads: list[int], three_stages: Stages, tmp_path: Path, make_store: MakeStore
+    strategy: str,
+    heads: list[int],
+    three_stages: Stages,
+    tmp_path: Path,
+    make_store: MakeStore,
 ) -> None:
     store = make_store(tmp_path, three_stages[strategy])
     files = sorted(tmp_path.rglob("head.safetensors"))
-    assert [path.parent.name[:4] for path in files] == [f"{number:04d}" for number in heads]
+    assert [path.parent.name[:4] for path in files] == [
+        f"{number:04d}" for number in heads
+    ]
     counted = head_bytes(store.contents.heads[-1])
-    assert counted < files[-1].stat().st_size < counted + 3000  # the file adds its header
+    # The file adds its header.
+    assert counted < files[-1].stat().st_size < counted + 3000
     assert verify(tmp_path) == []
 
 

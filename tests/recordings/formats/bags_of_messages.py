@@ -19,7 +19,8 @@ from evercal.recordings import ReadOptions, load_recording
 
 KINDS = ("ros1", "sqlite3", "mcap")
 START_NS = 1_700_000_000_123_456_789
-WIDTH, HEIGHT = 32, 24
+WIDTH = 32
+HEIGHT = 24
 # Not at the times of the transforms; the last two are after the last pose of the arm.
 SHOTS = (0.0, 0.013, 0.5, 0.987, 1.711, 2.0, 2.05, 2.5)
 BASE_FROM_SHOULDER = SE3.exp([0.1, 0.2, 0.3, 0.0, 0.0, 0.5])
@@ -29,7 +30,9 @@ TOOL_FROM_OPTICAL = SE3.exp([0.02, -0.05, 0.03, 0.3, -0.2, 1.2])
 def shoulder_from_tool(seconds: float) -> SE3:
     """Turns about a slanted axis and moves on a line, both steadily."""
     rotation = Rotation.from_rotvec(np.array([0.6, -0.3, 0.8]) * seconds)
-    return SE3(rotation.as_quat(scalar_first=True), np.array([0.4, 0.1, 0.5]) + 0.2 * seconds)
+    return SE3(
+        rotation.as_quat(scalar_first=True), np.array([0.4, 0.1, 0.5]) + 0.2 * seconds
+    )
 
 
 def picture(number: int) -> np.ndarray:
@@ -48,7 +51,9 @@ class Bag:
     messages: list[tuple[str, str, int, Any]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.store = get_typestore(Stores.ROS1_NOETIC if self.kind == "ros1" else Stores.LATEST)
+        self.store = get_typestore(
+            Stores.ROS1_NOETIC if self.kind == "ros1" else Stores.LATEST
+        )
         if self.kind == "ros1":  # rosbags has the common messages only
             text = "geometry_msgs/TransformStamped[] transforms"
             self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
@@ -62,7 +67,9 @@ class Bag:
     def header(self, seconds: float | None, frame: str) -> Any:
         """Stamped at the bag's start and some seconds, or with zero."""
         ns = 0 if seconds is None else START_NS + round(seconds * 1e9)
-        stamp = self.make("builtin_interfaces/msg/Time", sec=ns // 10**9, nanosec=ns % 10**9)
+        stamp = self.make(
+            "builtin_interfaces/msg/Time", sec=ns // 10**9, nanosec=ns % 10**9
+        )
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
     def add(self, topic: str, kind: str, seconds: float, **fields: Any) -> None:
@@ -110,7 +117,8 @@ class Bag:
 
     def compressed(self, seconds: float, topic: str, data: bytes, what: str) -> None:
         """An image file."""
-        head, content = self.header(seconds, "camera_optical"), np.frombuffer(data, np.uint8)
+        head = self.header(seconds, "camera_optical")
+        content = np.frombuffer(data, np.uint8)
         kind = "sensor_msgs/msg/CompressedImage"
         self.add(topic, kind, seconds, header=head, format=what, data=content)
 
@@ -142,7 +150,8 @@ class Bag:
     def joints(self, seconds: float, values: dict[str, float],
                topic: str = "/joint_states") -> None:  # fmt: skip
         """A joint state."""
-        numbers, none = np.array(list(values.values())), np.empty(0)
+        numbers = np.array(list(values.values()))
+        none = np.empty(0)
         self.add(topic, "sensor_msgs/msg/JointState", seconds, header=self.header(seconds, ""),
                  name=list(values), position=numbers, velocity=none, effort=none)  # fmt: skip
 
@@ -155,9 +164,15 @@ class Bag:
             writing: Any = Writer1(path)
         else:
             path = root / "wave"
-            plugin = StoragePlugin.MCAP if self.kind == "mcap" else StoragePlugin.SQLITE3
+            plugin = (
+                StoragePlugin.MCAP if self.kind == "mcap" else StoragePlugin.SQLITE3
+            )
             writing = Writer2(path, version=9, storage_plugin=plugin)
-        encode = self.store.serialize_ros1 if self.kind == "ros1" else self.store.serialize_cdr
+        encode = (
+            self.store.serialize_ros1
+            if self.kind == "ros1"
+            else self.store.serialize_cdr
+        )
         links: dict[tuple[str, str], Any] = {}
         with writing as writer:
             for topic, kind, ns, message in ordered:
@@ -170,7 +185,9 @@ class Bag:
 
 def arm(bag: Bag, first: float = 0.0, last: float = 2.0, rate: float = 25.0) -> Bag:
     """tf of an arm: world and stand and camera are static, the tool moves."""
-    bag.tf(0.0, "world", "base_link", SE3.exp([9.0, 9.0, 9.0, 1.0, 0.0, 0.0]), static=True)
+    bag.tf(
+        0.0, "world", "base_link", SE3.exp([9.0, 9.0, 9.0, 1.0, 0.0, 0.0]), static=True
+    )
     bag.tf(0.0, "base_link", "shoulder", BASE_FROM_SHOULDER, static=True)
     bag.tf(0.0, "tool0", "camera_optical", TOOL_FROM_OPTICAL, static=True)
     for i in range(round((last - first) * rate) + 1):

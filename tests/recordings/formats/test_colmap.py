@@ -12,7 +12,9 @@ from evercal.recordings.formats import generic
 
 from ..checks import refused, with_orientation
 
-pycolmap: Any = pytest.importorskip("pycolmap", reason="the extra 'colmap' is not installed")
+pycolmap: Any = pytest.importorskip(
+    "pycolmap", reason="the extra 'colmap' is not installed"
+)
 
 MODELS = {
     "SIMPLE_PINHOLE": [50, 31, 25],
@@ -20,7 +22,20 @@ MODELS = {
     "SIMPLE_RADIAL": [50, 31, 25, -0.1],
     "RADIAL": [50, 31, 25, -0.1, 0.02],
     "OPENCV": [50, 52, 31, 25, -0.1, 0.02, 0.003, -0.002],
-    "FULL_OPENCV": [50, 52, 31, 25, -0.1, 0.02, 0.003, -0.002, 0.01, 0.05, -0.02, 0.004],
+    "FULL_OPENCV": [
+        50,
+        52,
+        31,
+        25,
+        -0.1,
+        0.02,
+        0.003,
+        -0.002,
+        0.01,
+        0.05,
+        -0.02,
+        0.004,
+    ],
     "SIMPLE_FISHEYE": [40, 31, 25],
     "FISHEYE": [40, 42, 31, 25],
     "SIMPLE_RADIAL_FISHEYE": [40, 31, 25, 0.05],
@@ -29,7 +44,8 @@ MODELS = {
     "FOV": [40, 42, 31, 25, 0.9],
     "EUCM": [40, 42, 31, 25, 0.6, 1.1],
 }
-WIDTH, HEIGHT = 64, 48
+WIDTH = 64
+HEIGHT = 48
 
 
 def camera_from_world(i: int) -> SE3:
@@ -57,7 +73,9 @@ def make(root: Path, model: str = "PINHOLE", kind: str = "bin", images: int = 4,
         write_image(root / "images" / name, np.full((HEIGHT, WIDTH, 3), i, np.uint8))
     for point in np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3)):
         reconstruction.add_point3D(point, pycolmap.Track())
-    write_image(root / "images" / "sub" / "lost.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    write_image(
+        root / "images" / "sub" / "lost.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    )
     (root / folder).mkdir(parents=True, exist_ok=True)
     (reconstruction.write_binary if kind == "bin" else reconstruction.write_text)(
         str(root / folder)
@@ -70,17 +88,25 @@ def make(root: Path, model: str = "PINHOLE", kind: str = "bin", images: int = 4,
 def test_projections_agree_with_colmap(model: str, kind: str, tmp_path: Path) -> None:
     written = make(tmp_path, model, kind)
     recording = load_recording(tmp_path)
-    assert [frame.name for frame in recording.train] == [f"sub/image-{i}.png" for i in range(8, 12)]
+    assert [frame.name for frame in recording.train] == [
+        f"sub/image-{i}.png" for i in range(8, 12)
+    ]
     assert (recording.test, recording.untracked) == ((), 1)
     for i, frame in enumerate(recording.train):
         assert frame.base_from_camera is not None
         assert int(frame.read_image().mean()) == i
-        assert max(pose_distance(frame.base_from_camera.inverse(), camera_from_world(i))) < 1e-7
+        assert (
+            max(pose_distance(frame.base_from_camera.inverse(), camera_from_world(i)))
+            < 1e-7
+        )
         theirs = written.find_image_with_name(frame.name)
         for point in written.points3D.values():
             expected = theirs.project_point(point.xyz)
             # COLMAP counts from the image's corner, this program from its first pixel's centre.
-            ours = frame.camera.project(frame.base_from_camera.inverse().apply(point.xyz)) + 0.5
+            ours = (
+                frame.camera.project(frame.base_from_camera.inverse().apply(point.xyz))
+                + 0.5
+            )
             np.testing.assert_allclose(ours, expected, atol=1e-6)
     assert "are those of COLMAP" in recording.notes[0]
 
@@ -97,18 +123,26 @@ def test_model_in_any_usual_folder_is_read(folder: str, tmp_path: Path) -> None:
 def test_one_of_several_models_is_read(tmp_path: Path) -> None:
     make(tmp_path, images=4, folder="sparse/0")
     make(tmp_path, images=6, folder="sparse/1")
-    make(tmp_path, "OPENCV", images=7, folder="distorted/sparse/0")  # from before undistortion
+    # From before undistortion.
+    make(tmp_path, "OPENCV", images=7, folder="distorted/sparse/0")
     recording = load_recording(tmp_path)
     assert len(recording.train) == 6
     assert recording.train[0].camera.distortion == ()
-    assert recording.notes[1] == "took model 1, the one with the most images (0: 4, 1: 6)"
+    assert (
+        recording.notes[1] == "took model 1, the one with the most images (0: 4, 1: 6)"
+    )
 
 
 @pytest.mark.parametrize(
     ("model", "params"),
-    [("THIN_PRISM_FISHEYE", [50, 50, 31, 25, *[0] * 8]), ("DIVISION", [50, 50, 31, 25, 0.1])],
+    [
+        ("THIN_PRISM_FISHEYE", [50, 50, 31, 25, *[0] * 8]),
+        ("DIVISION", [50, 50, 31, 25, 0.1]),
+    ],
 )
-def test_other_models_are_refused_by_name(model: str, params: list[float], tmp_path: Path) -> None:
+def test_other_models_are_refused_by_name(
+    model: str, params: list[float], tmp_path: Path
+) -> None:
     make(tmp_path, model, params=params)
     refused(f"{model} is not supported.*image_undistorter", load_recording, tmp_path)
 

@@ -59,7 +59,9 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
     # From files this time: images are copied, not encoded again.
     generic.write(tmp_path / "b", read)
     assert_same(recording, load_recording(tmp_path / "b"))
-    assert (tmp_path / "a/scene.json").read_bytes() == (tmp_path / "b/scene.json").read_bytes()
+    assert (tmp_path / "a/scene.json").read_bytes() == (
+        tmp_path / "b/scene.json"
+    ).read_bytes()
 
 
 def test_depth_and_joint_angles_are_written(tmp_path: Path) -> None:
@@ -67,7 +69,9 @@ def test_depth_and_joint_angles_are_written(tmp_path: Path) -> None:
     depth = tmp_path / "depth.png"
     depth.write_bytes(b"any bytes: depth is copied, not decoded")
     frame = dataclasses.replace(first, depth=depth, joints_rad=(0.1, -0.2, 0.3))
-    generic.write(tmp_path / "a", Recording("arm", (frame, make_recording().train[1]), ()))
+    generic.write(
+        tmp_path / "a", Recording("arm", (frame, make_recording().train[1]), ())
+    )
     read = load_recording(tmp_path / "a").train
     copied = tmp_path / "a/depth/000000.png"
     assert read[0].depth == copied
@@ -99,7 +103,9 @@ def numbered(folder: Path, count: int) -> Recording:
     for i in range(count):
         path = folder / f"{i:06d}.png"
         write_image(path, np.full((3, 4, 3), i, np.uint8))
-        frames.append(Frame(str(i), path, Camera(4, 3, 4.0, 4.0, 1.5, 1.0), SE3.identity()))
+        frames.append(
+            Frame(str(i), path, Camera(4, 3, 4.0, 4.0, 1.5, 1.0), SE3.identity())
+        )
     return Recording("x", tuple(frames), ())
 
 
@@ -111,7 +117,9 @@ def test_source_images_are_never_overwritten(tmp_path: Path) -> None:
     recording = numbered(tmp_path / "source" / "images", 4)
     fewer = replace(recording, train=recording.train[::2])
     # In place, where image 1 would become image 2.
-    with pytest.raises(InputError, match=r"000001\.png: already there; give a new folder"):
+    with pytest.raises(
+        InputError, match=r"000001\.png: already there; give a new folder"
+    ):
         generic.write(tmp_path / "source", fewer)
     # Through hard links that an earlier copy left, whether its scene.json was removed ...
     out = tmp_path / "out"
@@ -132,9 +140,16 @@ def test_failed_copies_name_the_source_or_the_target(tmp_path: Path) -> None:
     recording = numbered(tmp_path / "source", 1)
     (tmp_path / "out/images").mkdir(parents=True)
     (tmp_path / "out/images/000000.png").symlink_to(tmp_path / "nowhere/000000.png")
-    refused(r"images/000000\.png: cannot be written \(", generic.write, tmp_path / "out", recording)
+    refused(
+        r"images/000000\.png: cannot be written \(",
+        generic.write,
+        tmp_path / "out",
+        recording,
+    )
     (tmp_path / "source/000000.png").unlink()
-    with pytest.raises(InputError, match=r"source/000000\.png: cannot be copied \(No such file"):
+    with pytest.raises(
+        InputError, match=r"source/000000\.png: cannot be copied \(No such file"
+    ):
         generic.write(tmp_path / "other", recording)
 
 
@@ -169,10 +184,22 @@ BREAKS = [
     ((*FIRST, "split"), "val", "'train' or 'test', got 'val'"),
     ((*FIRST, "name"), "shot/1", "'shot/1' comes twice"),
     ((*FIRST, "base_from_camera"), [1, 2], "frame 0: 'base_from_camera'"),
-    ((*FIRST, "base_from_camera", "translation_m"), [1, 2], "'translation_m' is 3 numbers"),
-    ((*FIRST, "base_from_camera", "translation_m"), [1, 2, "3"], "'translation_m' is 3 numbers"),
+    (
+        (*FIRST, "base_from_camera", "translation_m"),
+        [1, 2],
+        "'translation_m' is 3 numbers",
+    ),
+    (
+        (*FIRST, "base_from_camera", "translation_m"),
+        [1, 2, "3"],
+        "'translation_m' is 3 numbers",
+    ),
     ((*FIRST, "base_from_camera", "quaternion_wxyz"), [0, 0, 0, 0], "has length 1"),
-    ((*FIRST, "base_from_gripper"), {"translation_m": [0, 0, 0]}, "'quaternion_wxyz' is 4"),
+    (
+        (*FIRST, "base_from_gripper"),
+        {"translation_m": [0, 0, 0]},
+        "'quaternion_wxyz' is 4",
+    ),
     ((*FIRST, "base_from_camera", "translation_m"), [10**400, 0, 0], "too large"),
     (FIRST, "frame", "frame 0: is an object"),
 ]
@@ -205,8 +232,14 @@ def test_other_files_are_refused(tmp_path: Path, name: str, text: str) -> None:
 def test_formats_are_recognised(tmp_path: Path) -> None:
     generic.write(tmp_path / "a", make_recording())
     assert load_recording(tmp_path / "a", format="generic", name="lab").name == "lab"
-    refused("use one of generic, 7scenes", load_recording, tmp_path / "a", format="gopro")
+    refused(
+        "use one of generic, 7scenes", load_recording, tmp_path / "a", format="gopro"
+    )
     refused("no such folder", load_recording, tmp_path / "b")
     refused("a file, not a folder", load_recording, tmp_path / "a/scene.json")
     (tmp_path / "empty").mkdir()
-    refused(r"no known scene format; expected scene\.json", load_recording, tmp_path / "empty")
+    refused(
+        r"no known scene format; expected scene\.json",
+        load_recording,
+        tmp_path / "empty",
+    )

@@ -21,10 +21,15 @@ from ..checks import assert_pose, refused
 
 av: Any = pytest.importorskip("av", reason="the extra 'lerobot' is not installed")
 pa: Any = pytest.importorskip("pyarrow", reason="the extra 'lerobot' is not installed")
-pq: Any = pytest.importorskip("pyarrow.parquet", reason="the extra 'lerobot' is not installed")
+pq: Any = pytest.importorskip(
+    "pyarrow.parquet", reason="the extra 'lerobot' is not installed"
+)
 
-WRIST, FRONT = "observation.images.wrist", "observation.images.front"
-EPISODES, LENGTH, FPS = 3, 7, 10
+WRIST = "observation.images.wrist"
+FRONT = "observation.images.front"
+EPISODES = 3
+LENGTH = 7
+FPS = 10
 URDF = """<robot name="planar"><link name="base"/><link name="upper"/><link name="tip"/>
   <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
     <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
@@ -41,7 +46,10 @@ def picture(episode: int, number: int) -> np.ndarray:
 
 def pose(episode: int, number: int) -> SE3:
     half = 0.05 * number
-    return SE3(np.array([np.cos(half), 0, 0, np.sin(half)]), np.array([0.1 * number, episode, 0.5]))
+    return SE3(
+        np.array([np.cos(half), 0, 0, np.sin(half)]),
+        np.array([0.1 * number, episode, 0.5]),
+    )
 
 
 def joints(episode: int, number: int) -> list[float]:
@@ -52,9 +60,13 @@ def write_video(path: Path, images: list[np.ndarray], codec: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=FPS, options={"crf": "10"})
-        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        stream.width = 96
+        stream.height = 64
+        stream.pix_fmt = "yuv420p"
         for image in images:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            container.mux(
+                stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24"))
+            )
         container.mux(stream.encode())
 
 
@@ -65,7 +77,9 @@ def write_rows(path: Path, episodes: range, images: bool) -> None:
     ee = [[*p.translation_m, *p.rotation_wxyz[1:], p.rotation_wxyz[0]] for p in poses]
     columns: dict[str, Any] = {
         "observation.state": pa.array(state, pa.list_(pa.float32(), 2)),
-        "observation.ee": pa.array([[float(v) for v in r] for r in ee], pa.list_(pa.float32(), 7)),
+        "observation.ee": pa.array(
+            [[float(v) for v in r] for r in ee], pa.list_(pa.float32(), 7)
+        ),
         "timestamp": pa.array([n / FPS for _, n in rows], pa.float32()),
         "frame_index": pa.array([n for _, n in rows]),
         "episode_index": pa.array([e for e, _ in rows]),
@@ -84,8 +98,13 @@ def write_rows(path: Path, episodes: range, images: bool) -> None:
 
 def make(root: Path, version: str, kind: str = "video", codec: str = "libx264") -> Path:
     """A dataset of three episodes of seven frames with two cameras."""
-    image = {"dtype": kind, "shape": [64, 96, 3], "names": ["height", "width", "channels"]}
-    state, ee = ["shoulder.pos", "reach.pos"], ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    image = {
+        "dtype": kind,
+        "shape": [64, 96, 3],
+        "names": ["height", "width", "channels"],
+    }
+    state = ["shoulder.pos", "reach.pos"]
+    ee = ["x", "y", "z", "qx", "qy", "qz", "qw"]
     features: dict[str, Any] = {
         "observation.state": {"dtype": "float32", "shape": [2], "names": state},
         "observation.ee": {"dtype": "float32", "shape": [7], "names": ee},
@@ -102,10 +121,18 @@ def make(root: Path, version: str, kind: str = "video", codec: str = "libx264") 
         info["video_path"] = (
             "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
         )
-        parts = [(range(e, e + 1), f"chunk-{e // 2:03d}", f"episode_{e:06d}") for e in range(3)]
+        parts = [
+            (range(e, e + 1), f"chunk-{e // 2:03d}", f"episode_{e:06d}")
+            for e in range(3)
+        ]
     else:  # two episodes in the first file, one in the second
-        info["video_path"] = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-        parts = [(range(2), "chunk-000", "file-000"), (range(2, 3), "chunk-000", "file-001")]
+        info["video_path"] = (
+            "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+        )
+        parts = [
+            (range(2), "chunk-000", "file-000"),
+            (range(2, 3), "chunk-000", "file-001"),
+        ]
         prefix = f"videos/{WRIST}"
         listed = [
             {
@@ -159,8 +186,12 @@ def test_datasets_are_read(version: str, kind: str, codec: str, tmp_path: Path) 
     ]
     where = [divmod(i, LENGTH) for i in range(EPISODES * LENGTH)]
     with ThreadPoolExecutor(3) as pool:  # in any order
-        images = list(pool.map(lambda frame: frame.read_image(), recording.train[::-1]))[::-1]
-    for frame, image, (episode, number) in zip(recording.train, images, where, strict=True):
+        images = list(
+            pool.map(lambda frame: frame.read_image(), recording.train[::-1])
+        )[::-1]
+    for frame, image, (episode, number) in zip(
+        recording.train, images, where, strict=True
+    ):
         assert frame.camera == Camera(96, 64, 80, 80, 47.5, 31.5)
         off = np.abs(image[8:24, 8:40].mean((0, 1)) - picture(episode, number)[16, 16])
         assert off.max() < (5 if kind == "video" else 1e-9)  # frames differ by 10
@@ -173,7 +204,9 @@ def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
     root = make(tmp_path / "wave", "v2.1", "image")
     (root / "arm.urdf").write_text(URDF)
     for convention, unit in ((None, 1.0), ("rad", 1.0), ("deg", np.pi / 180)):
-        read = options(root, urdf=root / "arm.urdf", pose_convention=convention, every=4)
+        read = options(
+            root, urdf=root / "arm.urdf", pose_convention=convention, every=4
+        )
         recording = load_recording(root, options=read)
         assert len(recording.train) == 6
         for i, frame in enumerate(recording.train):
@@ -182,7 +215,9 @@ def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
             expected = turn @ SE3.exp([0.5 + reach, 0, 0, 0, 0, 0])
             assert_pose(frame.base_from_gripper, expected, 1e-6)
     urdf = root / "arm.urdf"
-    refuses("grad: joint angles are rad or deg", root, urdf=urdf, pose_convention="grad")
+    refuses(
+        "grad: joint angles are rad or deg", root, urdf=urdf, pose_convention="grad"
+    )
     refuses("--base-frame goes with --urdf only", root, base_frame="base")
     change_names(root, ["shoulder.pos", "shoulder"], "observation.state")
     refuses(r"state: 'shoulder' comes twice", root, urdf=urdf)
@@ -199,17 +234,25 @@ def test_poses_in_a_given_convention(tmp_path: Path) -> None:
     for convention, feature, message in (
         ("xyzw", None, r"observation\.state: "),
         ("martian", "observation.ee", "martian"),
-        ("xyzw", "observation.hand", r"no feature 'observation\.hand'; --gripper-frame is one of"),
+        (
+            "xyzw",
+            "observation.hand",
+            r"no feature 'observation\.hand'; --gripper-frame is one of",
+        ),
     ):
         refuses(message, root, pose_convention=convention, gripper_frame=feature)
 
 
 def test_one_of_two_arms_is_selected(tmp_path: Path) -> None:
-    root, parts = make(tmp_path / "wave", "v2.1", "image"), ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    root = make(tmp_path / "wave", "v2.1", "image")
+    parts = ["x", "y", "z", "qx", "qy", "qz", "qw"]
     sides = [f"{side}_ee.{part}" for side in ("left", "right") for part in parts]
-    for file in root.glob("data/*/*.parquet"):  # a second pose behind the first, 5 m above it
+    # A second pose behind the first, 5 m above it.
+    for file in root.glob("data/*/*.parquet"):
         read = pq.read_table(file)
-        both = [[*r, *r[:2], r[2] + 5, *r[3:]] for r in read["observation.ee"].to_pylist()]
+        both = [
+            [*r, *r[:2], r[2] + 5, *r[3:]] for r in read["observation.ee"].to_pylist()
+        ]
         column = pa.array(both, pa.list_(pa.float32(), 14))
         where = read.schema.get_field_index("observation.ee")
         pq.write_table(read.set_column(where, "observation.ee", column), file)
@@ -219,7 +262,10 @@ def test_one_of_two_arms_is_selected(tmp_path: Path) -> None:
         assert frame.base_from_gripper is not None
         assert frame.base_from_gripper.translation_m[2] == pytest.approx(height)
     for names, message in (
-        (sides, r"observation\.ee: holds several poses .*--gripper-frame left_ee or right_ee"),
+        (
+            sides,
+            r"observation\.ee: holds several poses .*--gripper-frame left_ee or right_ee",
+        ),
         ({"left": parts, "right": parts}, "--gripper-frame left or right"),
         (parts * 2, r"holds several poses .*; give names that tell them apart"),
         (parts, r"observation\.ee: has 14 numbers and 7 names"),
@@ -239,7 +285,9 @@ def change_names(root: Path, names: Any, feature: str = "observation.ee") -> Non
 
 def test_embedded_images_are_copied(tmp_path: Path) -> None:
     root = make(tmp_path / "wave", "v3.0", "image")
-    generic.write(tmp_path / "out", load_recording(root, options=options(root, every=5)))
+    generic.write(
+        tmp_path / "out", load_recording(root, options=options(root, every=5))
+    )
     image = load_recording(tmp_path / "out").train[3].read_image()
     np.testing.assert_array_equal(image, picture(2, 1))
 
@@ -252,12 +300,17 @@ def change(root: Path, **values: Any) -> None:
 def test_missing_options_and_files_are_named(tmp_path: Path) -> None:
     root = make(tmp_path / "wave", "v2.1")
     for changed, message in (
-        ({"image_topic": None}, r"2 cameras; name one with --image-topic: observation\.images\.w"),
+        (
+            {"image_topic": None},
+            r"2 cameras; name one with --image-topic: observation\.images\.w",
+        ),
         ({"image_topic": "top"}, "no picture in 'top'"),
         ({"camera": None}, "hold no intrinsics; give them with --camera"),
         ({"image_topic": FRONT}, "video is missing; download it too"),
     ):
-        refused(message, load_recording, root, options=replace(options(root), **changed))
+        refused(
+            message, load_recording, root, options=replace(options(root), **changed)
+        )
     (root / "data/chunk-001/episode_000002.parquet").unlink()
     notes = load_recording(root, options=options(root)).notes
     assert notes[-1] == "2 of 3 episodes are in the folder"
@@ -296,10 +349,22 @@ def test_other_versions_and_features_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "path", "message"),
     [
-        ("video_path", "../other/{video_key}.mp4", "'video_path' stays inside the folder"),
-        ("video_path", "/tmp/{video_key}.mp4", "'video_path' is a path relative to the folder"),
+        (
+            "video_path",
+            "../other/{video_key}.mp4",
+            "'video_path' stays inside the folder",
+        ),
+        (
+            "video_path",
+            "/tmp/{video_key}.mp4",
+            "'video_path' is a path relative to the folder",
+        ),
         ("data_path", "../../data.parquet", "'data_path' stays inside the folder"),
-        ("video_path", "{nothing}.mp4", "does not describe the dataset .KeyError: 'nothing'"),
+        (
+            "video_path",
+            "{nothing}.mp4",
+            "does not describe the dataset .KeyError: 'nothing'",
+        ),
     ],
 )
 def test_paths_outside_the_dataset_are_refused(
@@ -336,4 +401,9 @@ def test_depth_is_no_picture(key: str, tmp_path: Path) -> None:
     (root / "data/chunk-000/._file-000.parquet").write_bytes(b"\0\5\x16\7")
     assert load_recording(root, options=options).train
     options = ReadOptions(camera=tmp_path / "lens.txt", image_topic=cameras[1])
-    refused(f"no picture in '{cameras[1]}'; .*{cameras[0]}$", load_recording, root, options=options)
+    refused(
+        f"no picture in '{cameras[1]}'; .*{cameras[0]}$",
+        load_recording,
+        root,
+        options=options,
+    )

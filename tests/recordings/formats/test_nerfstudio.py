@@ -21,7 +21,9 @@ LENS = {"fl_x": 40.0, "fl_y": 42.0, "cx": 13.0, "cy": 17.5, "w": 24, "h": 36,
         "k1": 0.05, "k2": -0.02, "p1": 0.003, "p2": -0.002}  # fmt: skip
 
 
-def look(eye: np.ndarray, target: np.ndarray, up: tuple[float, float, float]) -> np.ndarray:
+def look(
+    eye: np.ndarray, target: np.ndarray, up: tuple[float, float, float]
+) -> np.ndarray:
     """OpenGL's camera in the world: columns right, up, backward and where it stands."""
     back = (eye - target) / np.linalg.norm(eye - target)
     right = np.cross(up, back)
@@ -31,28 +33,41 @@ def look(eye: np.ndarray, target: np.ndarray, up: tuple[float, float, float]) ->
     return matrix
 
 
-def gl_pixel(matrix: np.ndarray, intrinsics: dict[str, float], point: np.ndarray) -> np.ndarray:
+def gl_pixel(
+    matrix: np.ndarray, intrinsics: dict[str, float], point: np.ndarray
+) -> np.ndarray:
     """Pixel of a point, x to the right and y down from the image's corner.
 
     The camera looks along -z with y up; distortion is Brown's model in the plane z = 1, y down.
     """
     x, y, z = np.linalg.solve(matrix, np.append(point, 1.0))[:3]
     assert z < 0
-    u, v = x / -z, -y / -z
+    u = x / -z
+    v = -y / -z
     r2 = u * u + v * v
     radial = (
-        1 + intrinsics["k1"] * r2 + intrinsics["k2"] * r2 * r2 + intrinsics.get("k3", 0.0) * r2**3
+        1
+        + intrinsics["k1"] * r2
+        + intrinsics["k2"] * r2 * r2
+        + intrinsics.get("k3", 0.0) * r2**3
     )
-    p1, p2 = intrinsics["p1"], intrinsics["p2"]
+    p1 = intrinsics["p1"]
+    p2 = intrinsics["p2"]
     du = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
     dv = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
     return np.array(
-        [intrinsics["fl_x"] * du + intrinsics["cx"], intrinsics["fl_y"] * dv + intrinsics["cy"]]
+        [
+            intrinsics["fl_x"] * du + intrinsics["cx"],
+            intrinsics["fl_y"] * dv + intrinsics["cy"],
+        ]
     )
 
 
 def write(
-    root: Path, frames: list[dict[str, Any]], size: tuple[int, int] = (24, 36), **top: Any
+    root: Path,
+    frames: list[dict[str, Any]],
+    size: tuple[int, int] = (24, 36),
+    **top: Any,
 ) -> Path:
     for frame in frames:
         image = root / frame["file_path"]
@@ -70,7 +85,11 @@ def ring(count: int = 5) -> list[np.ndarray]:
 
 def entries(matrices: list[np.ndarray], **more: Any) -> list[dict[str, Any]]:
     return [
-        {"file_path": f"images/frame_{i:05d}.png", "transform_matrix": m.tolist(), **more}
+        {
+            "file_path": f"images/frame_{i:05d}.png",
+            "transform_matrix": m.tolist(),
+            **more,
+        }
         for i, m in enumerate(matrices)
     ]
 
@@ -82,7 +101,9 @@ def pixel_of(frame: Frame, point: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_projections_agree_with_the_documented_formulas(shared: bool, tmp_path: Path) -> None:
+def test_projections_agree_with_the_documented_formulas(
+    shared: bool, tmp_path: Path
+) -> None:
     matrices = ring()
     if shared:
         write(tmp_path, entries(matrices), camera_model="OPENCV", **LENS)
@@ -123,7 +144,9 @@ def test_an_applied_transform_is_undone(
         entry = {"file_path": "a.png", "transform_matrix": new.tolist()}
         frame = nerfstudio._frame(Path(), data, entry, undo, divide)
         expected = gl_pixel(matrix, LENS, np.array(point))
-        np.testing.assert_allclose(pixel_of(frame, np.array(point)), expected, atol=1e-6)
+        np.testing.assert_allclose(
+            pixel_of(frame, np.array(point)), expected, atol=1e-6
+        )
 
 
 def test_test_filenames_are_test_frames(tmp_path: Path) -> None:
@@ -143,7 +166,9 @@ def test_downscaled_images_get_scaled_cameras(tmp_path: Path) -> None:
     assert (frame.camera.width, frame.camera.height) == (12, 18)
     point = np.array([0.2, -0.1, 0.3])
     # From the corner, every pixel coordinate is simply half.
-    np.testing.assert_allclose(pixel_of(frame, point), gl_pixel(matrices[1], LENS, point) / 2)
+    np.testing.assert_allclose(
+        pixel_of(frame, point), gl_pixel(matrices[1], LENS, point) / 2
+    )
 
 
 def test_names_without_ending_are_read(tmp_path: Path) -> None:
@@ -160,7 +185,10 @@ def test_names_without_ending_are_read(tmp_path: Path) -> None:
     [
         ({"camera_angle_x": 0.5}, (12 / np.tan(0.25), 12 / np.tan(0.25))),
         ({"camera_angle_y": 0.5}, (18 / np.tan(0.25), 18 / np.tan(0.25))),
-        ({"camera_angle_x": 0.4, "camera_angle_y": 0.5}, (12 / np.tan(0.2), 18 / np.tan(0.25))),
+        (
+            {"camera_angle_x": 0.4, "camera_angle_y": 0.5},
+            (12 / np.tan(0.2), 18 / np.tan(0.25)),
+        ),
         ({"fl_x": 40.0, "camera_angle_y": 0.5}, (40.0, 18 / np.tan(0.25))),
     ],
 )
@@ -177,7 +205,9 @@ def one(matrix: np.ndarray) -> list[dict[str, Any]]:
     return [{"file_path": "a.png", "transform_matrix": matrix.tolist()}]
 
 
-@pytest.mark.parametrize("stated", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+@pytest.mark.parametrize(
+    "stated", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}]
+)
 def test_a_fisheye_has_k1_to_k4(tmp_path: Path, stated: dict[str, Any]) -> None:
     terms = {"k1": 0.1, "k2": -0.02, "k3": 0.003, "k4": 1e-4, "p1": 0.0, "p2": 0.0}
     write(tmp_path, entries(ring(2)), **{**LENS, **terms, **stated})
@@ -186,24 +216,36 @@ def test_a_fisheye_has_k1_to_k4(tmp_path: Path, stated: dict[str, Any]) -> None:
 
 
 BREAKS: list[tuple[dict[str, Any], str]] = [
-    ({"camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR' is not supported, only"),
+    (
+        {"camera_model": "EQUIRECTANGULAR"},
+        "camera_model 'EQUIRECTANGULAR' is not supported, only",
+    ),
     ({"is_fisheye": True, "p1": 0.1}, "with p1 and p2 0 for"),
     ({"k4": 0.1}, "with k4 0 for OPENCV"),
     ({"distortion_params": [0.1] * 4}, "distortion is k1, k2, k3, k4, p1, p2"),
     ({"distortion_params": [0.1, 0, 0, 0, 0, 0]}, "also as 'distortion_params', got"),
     ({"test_frames": {}}, "'frames' is a list"),
     ({"fl_x": None, "fl_y": None}, "'fl_x' is missing, and so are"),
-    ({"fl_x": None, "camera_angle_x": 28.0}, "'camera_angle_x' is between 0 and pi radians"),
+    (
+        {"fl_x": None, "camera_angle_x": 28.0},
+        "'camera_angle_x' is between 0 and pi radians",
+    ),
     ({"fl_x": 0}, "fx is finite"),
     ({"w": None}, "'w' is missing"),
-    ({"test_filenames": ["frame_00001.png"]}, "names 'frame_00001.png', which is no frame"),
+    (
+        {"test_filenames": ["frame_00001.png"]},
+        "names 'frame_00001.png', which is no frame",
+    ),
     ({"fl_x": "wide"}, "'fl_x' is a number"),
     ({"fl_x": -3}, "fx is finite"),
     ({"w": 36, "h": 24}, "is 24x36, transforms.json says 36x24 .the image was rotated"),
     ({"w": 30}, "is 24x36, transforms.json says 30x36 .cropped"),
     ({"applied_scale": 0}, "'applied_scale' is > 0"),
     ({"applied_transform": [[1, 0], [0, 1]]}, "'applied_transform' is 4x4 or 3x4"),
-    ({"applied_transform": np.diag([1.0, 1, -1, 1]).tolist()}, "'applied_transform': .*reflection"),
+    (
+        {"applied_transform": np.diag([1.0, 1, -1, 1]).tolist()},
+        "'applied_transform': .*reflection",
+    ),
     ({"applied_transform": np.diag([1.0, 0, 1, 1]).tolist()}, "cannot be undone"),
     ({"frames": []}, "'frames' is a list with at least one frame"),
     ({"frames": [3]}, "frame 0: an object with 'file_path'"),
@@ -216,7 +258,9 @@ BREAKS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("change", "message"), BREAKS)
-def test_broken_files_are_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_broken_files_are_refused(
+    change: dict[str, Any], message: str, tmp_path: Path
+) -> None:
     write(tmp_path, entries(ring(2)), **LENS)
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
@@ -226,18 +270,31 @@ def test_broken_files_are_refused(change: dict[str, Any], message: str, tmp_path
 
 
 def test_distortion_params_are_k1_k2_k3_k4_p1_p2(tmp_path: Path) -> None:
-    plain = {key: value for key, value in LENS.items() if key not in ("k1", "k2", "p1", "p2")}
-    params = [0.05, -0.02, 0.01, 0.0, 0.003, -0.002]  # nerfstudio's get_distortion_params
+    plain = {
+        key: value for key, value in LENS.items() if key not in ("k1", "k2", "p1", "p2")
+    }
+    # Nerfstudio's get_distortion_params.
+    params = [
+        0.05,
+        -0.02,
+        0.01,
+        0.0,
+        0.003,
+        -0.002,
+    ]
     write(tmp_path / "top", entries(ring(1)), **plain, distortion_params=params)
     write(tmp_path / "frame", entries(ring(1), distortion_params=params), **plain)
     write(tmp_path / "named", entries(ring(1)), **LENS, k3=0.01)
-    cameras = [load_recording(tmp_path / n).train[0].camera for n in ("top", "frame", "named")]
+    cameras = [
+        load_recording(tmp_path / n).train[0].camera for n in ("top", "frame", "named")
+    ]
     assert cameras[0] == cameras[1] == cameras[2]
 
 
 def test_bad_frames_are_left_out(tmp_path: Path) -> None:
     frames = entries(ring(4))
-    frames[1]["is_bad"], frames[2]["is_bad"] = True, False
+    frames[1]["is_bad"] = True
+    frames[2]["is_bad"] = False
     write(tmp_path, frames, **LENS, test_filenames=["images/frame_00001.png"])
     recording = load_recording(tmp_path)
     assert [frame.name[-5] for frame in recording.train] == ["0", "2", "3"]
@@ -251,7 +308,9 @@ def test_blender_has_a_file_for_each_split(tmp_path: Path) -> None:
         frames = entries(ring(count))
         for i, frame in enumerate(frames):
             frame["file_path"] = f"./{split}/r_{i}.5"  # without ending, with a dot
-            write_image(made(tmp_path / split / f"r_{i}.5.png"), np.zeros((36, 24, 3), np.uint8))
+            write_image(
+                made(tmp_path / split / f"r_{i}.5.png"), np.zeros((36, 24, 3), np.uint8)
+            )
         file = tmp_path / f"transforms_{split}.json"
         file.write_text(json.dumps({**angle, "frames": frames}))
     recording = load_recording(tmp_path)
@@ -267,17 +326,31 @@ def made(file: Path) -> Path:
 
 
 @pytest.mark.parametrize("folder", ["undistorted_images", "resized_undistorted_images"])
-def test_scannetpp_keeps_images_beside_the_folder_of_the_file(folder: str, tmp_path: Path) -> None:
+def test_scannetpp_keeps_images_beside_the_folder_of_the_file(
+    folder: str, tmp_path: Path
+) -> None:
     frames = [
-        {"file_path": f"DSC{i:05d}.JPG", "transform_matrix": matrix.tolist(), "is_bad": i == 1}
+        {
+            "file_path": f"DSC{i:05d}.JPG",
+            "transform_matrix": matrix.tolist(),
+            "is_bad": i == 1,
+        }
         for i, matrix in enumerate(ring(5))
     ]
     for i in range(5):
-        write_image(made(tmp_path / "dslr" / folder / f"{i}.png"), np.zeros((36, 24, 3), np.uint8))
+        write_image(
+            made(tmp_path / "dslr" / folder / f"{i}.png"),
+            np.zeros((36, 24, 3), np.uint8),
+        )
         (tmp_path / "dslr" / folder / f"{i}.png").rename(
             tmp_path / "dslr" / folder / f"DSC{i:05d}.JPG"
         )
-    data = {**LENS, "camera_model": "PINHOLE", "frames": frames[:3], "test_frames": frames[3:]}
+    data = {
+        **LENS,
+        "camera_model": "PINHOLE",
+        "frames": frames[:3],
+        "test_frames": frames[3:],
+    }
     file = made(tmp_path / "dslr" / "nerfstudio" / "transforms_undistorted.json")
     file.write_text(json.dumps(data))
     file.with_name("transforms.json").write_text(
@@ -285,8 +358,14 @@ def test_scannetpp_keeps_images_beside_the_folder_of_the_file(folder: str, tmp_p
     )
     for root in (tmp_path, file, file.parent):
         recording = load_recording(root)
-        assert [frame.name for frame in recording.train] == ["DSC00000.JPG", "DSC00002.JPG"]
-        assert [frame.name for frame in recording.test] == ["DSC00003.JPG", "DSC00004.JPG"]
+        assert [frame.name for frame in recording.train] == [
+            "DSC00000.JPG",
+            "DSC00002.JPG",
+        ]
+        assert [frame.name for frame in recording.test] == [
+            "DSC00003.JPG",
+            "DSC00004.JPG",
+        ]
         assert recording.untracked == 1
     refused("OPENCV_FISHEYE", load_recording, file.with_name("transforms.json"))
 
@@ -307,7 +386,9 @@ def test_images_are_taken_as_stored_unless_only_upright_ones_fit(
     text = (tmp_path / "transforms.json").read_text().replace(".png", ".jpg")
     (tmp_path / "transforms.json").write_text(text)
     read = load_recording(tmp_path)
-    assert [f.read_image().shape for f in (*read.train, *read.test)] == [(36, 24, 3)] * 2
+    assert [f.read_image().shape for f in (*read.train, *read.test)] == [
+        (36, 24, 3)
+    ] * 2
 
 
 def test_paths_of_windows_are_read(tmp_path: Path) -> None:

@@ -53,8 +53,13 @@ def test_bags_are_read(kind: str, tmp_path: Path) -> None:
             metres, radians = pose_distance(frame.base_from_gripper, expected)
             assert metres < 1e-9
             assert radians < 1e-7
-        assert recording.notes[0].startswith("2 of 8 images were taken outside the recorded poses")
-        assert recording.notes[1] == "poses of the gripper are those of tool0 in base_link, from tf"
+        assert recording.notes[0].startswith(
+            "2 of 8 images were taken outside the recorded poses"
+        )
+        assert (
+            recording.notes[1]
+            == "poses of the gripper are those of tool0 in base_link, from tf"
+        )
         assert "tf also has the camera (camera_optical)" in recording.notes[2]
 
 
@@ -64,7 +69,9 @@ def test_old_ros2_bags_without_definitions_are_read(tmp_path: Path) -> None:
         database.execute("DROP TABLE message_definitions")
         database.execute("UPDATE schema SET schema_version = 3")
     database.close()
-    np.testing.assert_array_equal(load_recording(path).train[4].read_image(), picture(4))
+    np.testing.assert_array_equal(
+        load_recording(path).train[4].read_image(), picture(4)
+    )
 
 
 def test_binned_images_have_smaller_intrinsics(tmp_path: Path) -> None:
@@ -72,18 +79,26 @@ def test_binned_images_have_smaller_intrinsics(tmp_path: Path) -> None:
     bag.image(1.0, "/camera/image_raw", picture(0))
     bag.info("/camera/camera_info", focal=60.0, size=(64, 48), binning=2)
     [frame] = load_recording(bag.write(tmp_path)).train
-    assert frame.camera == Camera(64, 48, 60, 60, 15, 11, CAMERA.distortion).resized(32, 24)
+    assert frame.camera == Camera(64, 48, 60, 60, 15, 11, CAMERA.distortion).resized(
+        32, 24
+    )
 
 
 def test_every_second_image_is_taken(tmp_path: Path) -> None:
     path = recorded_bag("ros1").write(tmp_path)
     recording = load_recording(path, options=ReadOptions(every=2))
     assert [frame.name for frame in recording.train] == ["000000", "000002", "000004"]
-    refused("--every 0: give a number >= 1", load_recording, path, options=ReadOptions(every=0))
+    refused(
+        "--every 0: give a number >= 1",
+        load_recording,
+        path,
+        options=ReadOptions(every=0),
+    )
 
 
 def test_compressed_images_are_read_by_threads_and_copied(tmp_path: Path) -> None:
-    bag, files = arm(Bag("mcap")), []
+    bag = arm(Bag("mcap"))
+    files = []
     for i, at in enumerate(SHOTS):
         ending = ".jpg" if i % 2 else ".png"
         data = cv2.imencode(ending, picture(i)[:, :, ::-1])[1].tobytes()
@@ -99,18 +114,24 @@ def test_compressed_images_are_read_by_threads_and_copied(tmp_path: Path) -> Non
         off = np.abs(image.astype(int) - picture(i % 6).astype(int))
         assert np.median(off) <= 1 if i % 2 else off.max() == 0
     generic.write(tmp_path / "out", recording)
-    for (ending, data), frame in zip(files, load_recording(tmp_path / "out").train, strict=False):
+    for (ending, data), frame in zip(
+        files, load_recording(tmp_path / "out").train, strict=False
+    ):
         assert isinstance(frame.image, Path)
         assert frame.image.suffix == ending
         assert frame.image.read_bytes() == data
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_images_may_be_read_while_messages_are_iterated(kind: str, tmp_path: Path) -> None:
+def test_images_may_be_read_while_messages_are_iterated(
+    kind: str, tmp_path: Path
+) -> None:
     frames = load_recording(recorded_bag(kind).write(tmp_path)).train
     image = frames[0].image
     assert isinstance(image, BagImage)
-    with ThreadPoolExecutor(1) as pool:  # a deadlock would be in a thread with a time limit
+    with ThreadPoolExecutor(
+        1
+    ) as pool:  # a deadlock would be in a thread with a time limit
         for i, _ in enumerate(image.bag.messages(["/cam/image_raw"])):
             pixels = pool.submit(frames[i % 6].read_image).result(timeout=5)
             np.testing.assert_array_equal(pixels, picture(i % 6))
@@ -118,12 +139,16 @@ def test_images_may_be_read_while_messages_are_iterated(kind: str, tmp_path: Pat
 
 def bayer(pattern: str, rgb: tuple[int, int, int]) -> np.ndarray:
     """What a sensor with this filter sees of one colour."""
-    tile = np.array([rgb["rgb".index(letter)] for letter in pattern], np.uint8).reshape(2, 2)
+    tile = np.array([rgb["rgb".index(letter)] for letter in pattern], np.uint8).reshape(
+        2, 2
+    )
     return np.tile(tile, (12, 16))
 
 
 COLOUR = (200, 120, 40)
-YUV = cv2.cvtColor(np.full((1, 1, 3), COLOUR, np.uint8), cv2.COLOR_RGB2YUV)[0, 0].tolist()
+YUV = cv2.cvtColor(np.full((1, 1, 3), COLOUR, np.uint8), cv2.COLOR_RGB2YUV)[
+    0, 0
+].tolist()
 ENCODINGS = {
     "rgb8": np.full((24, 32, 3), COLOUR, np.uint8),
     "bgr8": np.full((24, 32, 3), COLOUR[::-1], np.uint8),
@@ -148,8 +173,12 @@ def test_encodings_are_decoded(encoding: str, tmp_path: Path) -> None:
     expected = np.full((24, 32, 3), COLOUR)
     if encoding.startswith("yuv"):
         # BT.601: R = 1.164 (Y - 16) + 1.596 (V - 128), and so on.
-        y, u, v = 1.164 * (124 - 16), 94 - 128, 178 - 128
-        expected[:] = np.round([y + 1.596 * v, y - 0.813 * v - 0.391 * u, y + 2.018 * u])
+        y = 1.164 * (124 - 16)
+        u = 94 - 128
+        v = 178 - 128
+        expected[:] = np.round(
+            [y + 1.596 * v, y - 0.813 * v - 0.391 * u, y + 2.018 * u]
+        )
     assert np.abs(image.astype(int) - expected).max() <= 2
 
 
@@ -163,7 +192,9 @@ def test_grey_images_of_8_and_16_bits_are_decoded(tmp_path: Path) -> None:
 
 def test_rectified_images_use_the_projection_matrix(tmp_path: Path) -> None:
     bag = single(topic="/cam/image_rect_color", kind="ros1")
-    assert load_recording(bag.write(tmp_path)).train[0].camera == Camera(32, 24, 28, 28, 16, 12)
+    assert load_recording(bag.write(tmp_path)).train[0].camera == Camera(
+        32, 24, 28, 28, 16, 12
+    )
 
 
 def test_images_without_stamps_use_the_time_of_recording(tmp_path: Path) -> None:
@@ -175,18 +206,34 @@ def test_images_without_stamps_use_the_time_of_recording(tmp_path: Path) -> None
 
 
 def test_missing_topics_are_named(tmp_path: Path) -> None:
-    whole, parts = recorded_bag("mcap"), {}
+    whole = recorded_bag("mcap")
+    parts = {}
     topics = {"images": "/cam/image_raw", "tf": "/tf", "info": "/cam/camera_info"}
     for missing, topic in topics.items():
-        messages = [m for m in whole.messages if m[0] != topic and not m[0].startswith(f"{topic}_")]
+        messages = [
+            m
+            for m in whole.messages
+            if m[0] != topic and not m[0].startswith(f"{topic}_")
+        ]
         parts[missing] = refusal(Bag("mcap", messages), tmp_path / missing)
     assert "no images in it" in parts["images"]
-    assert "holds /cam/camera_info (sensor_msgs/CameraInfo), /tf (tf2_msgs/TF" in parts["images"]
-    assert "no tf in it, so there are no gripper poses; record /tf and /tf_static" in parts["tf"]
-    assert "no camera_info for /cam/image_raw (/cam/camera_info is expected" in parts["info"]
+    assert (
+        "holds /cam/camera_info (sensor_msgs/CameraInfo), /tf (tf2_msgs/TF"
+        in parts["images"]
+    )
+    assert (
+        "no tf in it, so there are no gripper poses; record /tf and /tf_static"
+        in parts["tf"]
+    )
+    assert (
+        "no camera_info for /cam/image_raw (/cam/camera_info is expected"
+        in parts["info"]
+    )
     camera_file = tmp_path / "camera.txt"
     camera_file.write_text("31 0 15\n0 31 11\n0 0 1\n")
-    recording = load_recording(tmp_path / "info" / "wave", options=ReadOptions(camera=camera_file))
+    recording = load_recording(
+        tmp_path / "info" / "wave", options=ReadOptions(camera=camera_file)
+    )
     assert recording.train[0].camera == Camera(32, 24, 31, 31, 15, 11)
 
 
@@ -208,7 +255,9 @@ def test_several_image_topics_need_a_choice(tmp_path: Path) -> None:
     np.testing.assert_array_equal(recording.train[0].read_image(), picture(9))
     message = "no images on topic '/no'; images are on /cam/image_raw"
     assert message in refusal_of(path / "wave", image_topic="/no")
-    bag.messages = [m for m in bag.messages if m[0] not in ("/cam/image_raw", "/left/image_raw")]
+    bag.messages = [
+        m for m in bag.messages if m[0] not in ("/cam/image_raw", "/left/image_raw")
+    ]
     message = refusal(bag, tmp_path / "b")
     assert "no pictures (/depth/image_raw: encoding '16UC1' holds depth" in message
 
@@ -219,24 +268,36 @@ def test_several_image_topics_need_a_choice(tmp_path: Path) -> None:
         ({"focal": 0.0}, "K is all zeros: the camera is not calibrated; give --camera"),
         ({"model": "fov"}, "a camera of model fov has omega"),
         ({"size": (64, 48)}, "is for images of 64x48, /cam/image_raw is 32x24"),
-        ({"encoding": "nv21"}, "encoding 'nv21' is not supported; use one of rgb8, bgr8"),
+        (
+            {"encoding": "nv21"},
+            "encoding 'nv21' is not supported; use one of rgb8, bgr8",
+        ),
     ],
 )
-def test_unusable_messages_are_refused(made: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_unusable_messages_are_refused(
+    made: dict[str, Any], message: str, tmp_path: Path
+) -> None:
     assert message in refusal(single(**made), tmp_path)
 
 
 def test_damaged_bags_are_refused(tmp_path: Path) -> None:
     path = recorded_bag("ros1").write(tmp_path)
     other = next(recorded_bag("mcap").write(tmp_path / "mcap").glob("*.mcap"))
-    for file, way in ((path, "rosbag reindex"), (other, "mcap recover FILE -o NEW.mcap")):
+    for file, way in (
+        (path, "rosbag reindex"),
+        (other, "mcap recover FILE -o NEW.mcap"),
+    ):
         whole = file.read_bytes()
         file.write_bytes(whole[: len(whole) // 2])
         refused(f"rosbags cannot read it .*{way}", load_recording, file)
 
 
-@pytest.mark.parametrize("form", ["bayer_rggb8; jpeg compressed ", "bayer_rggb8; png compressed "])
-def test_a_mosaic_in_a_compressed_image_becomes_a_picture(form: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "form", ["bayer_rggb8; jpeg compressed ", "bayer_rggb8; png compressed "]
+)
+def test_a_mosaic_in_a_compressed_image_becomes_a_picture(
+    form: str, tmp_path: Path
+) -> None:
     """The publisher of ROS 1 leaves it in both, that of ROS 2 in PNG only."""
     ending = ".jpg" if "jpeg" in form else ".png"
     options = [cv2.IMWRITE_JPEG_QUALITY, 100] if ending == ".jpg" else []
@@ -244,7 +305,9 @@ def test_a_mosaic_in_a_compressed_image_becomes_a_picture(form: str, tmp_path: P
     image = read_one_compressed(data, form, tmp_path)
     off = np.abs(image[4:-4, 4:-4].astype(int) - COLOUR)
     assert off.max() < 8
-    converted = cv2.imencode(".png", np.full((24, 32, 3), COLOUR[::-1], np.uint8))[1].tobytes()
+    converted = cv2.imencode(".png", np.full((24, 32, 3), COLOUR[::-1], np.uint8))[
+        1
+    ].tobytes()
     for stated in (form, f"{form}bgr8"):
         colour = read_one_compressed(converted, stated, tmp_path / stated[-5:])
         np.testing.assert_array_equal(colour[0, 0], COLOUR)
@@ -276,4 +339,6 @@ def test_a_message_without_an_image_is_left_out(tmp_path: Path) -> None:
     bag.info("/cam/camera_info")
     read = load_recording(bag.write(tmp_path))
     assert len(read.train) == 5  # of six with a pose
-    assert "1 of 8 images are missing or unreadable and left out: message 0" in read.notes
+    assert (
+        "1 of 8 images are missing or unreadable and left out: message 0" in read.notes
+    )

@@ -44,7 +44,9 @@ def test_frames_are_in_the_order_of_the_split_files(kitchen: Path) -> None:
     assert [frame.name for frame in recording.train] == [
         f"seq-0{sequence}/frame-00000{i}" for sequence in (2, 1) for i in range(3)
     ]
-    assert [frame.name for frame in recording.test] == [f"seq-03/frame-00000{i}" for i in range(3)]
+    assert [frame.name for frame in recording.test] == [
+        f"seq-03/frame-00000{i}" for i in range(3)
+    ]
     assert recording.untracked == 0
     frame = recording.train[1]
     assert frame.base_from_camera is not None
@@ -54,9 +56,13 @@ def test_frames_are_in_the_order_of_the_split_files(kitchen: Path) -> None:
 
 
 def test_camera_is_the_default_or_that_of_the_intrinsics_file(kitchen: Path) -> None:
-    assert seven_scenes.load(kitchen).train[0].camera == Camera(64, 48, 52.5, 52.5, 31.5, 23.5)
+    assert seven_scenes.load(kitchen).train[0].camera == Camera(
+        64, 48, 52.5, 52.5, 31.5, 23.5
+    )
     (kitchen / "camera-intrinsics.txt").write_text("51 0 30\n0 52 23.5\n0 0 1\n")
-    assert seven_scenes.load(kitchen).test[0].camera == Camera(64, 48, 51.0, 52.0, 30.0, 23.5)
+    assert seven_scenes.load(kitchen).test[0].camera == Camera(
+        64, 48, 51.0, 52.0, 30.0, 23.5
+    )
 
 
 def test_untracked_frames_are_left_out_and_counted(kitchen: Path) -> None:
@@ -94,7 +100,9 @@ m_calibrationColorIntrinsic = 116 0 65.5 0 0 114 47.5 0 0 0 1 0 0 0 0 1
 m_calibrationColorExtrinsic = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1
 m_frames.size = 5
 """
-SPLIT = "sequence0 [frames=2]  [start=0 ; end=1]\nsequence1 [frames=3]  [start=2 ; end=4]\n"
+SPLIT = (
+    "sequence0 [frames=2]  [start=0 ; end=1]\nsequence1 [frames=3]  [start=2 ; end=4]\n"
+)
 
 
 def write(root: Path) -> Path:
@@ -104,7 +112,9 @@ def write(root: Path) -> Path:
     (root / "split.txt").write_text(SPLIT)
     for i in range(5):
         stem = root / "data" / f"frame-{i:06d}"
-        write_image(stem.with_suffix(".color.jpg"), np.full((48, 64, 3), 40 * i, np.uint8))
+        write_image(
+            stem.with_suffix(".color.jpg"), np.full((48, 64, 3), 40 * i, np.uint8)
+        )
         matrix = SE3.exp([1.0, i, 0.0, 0.1 * i, 0.2, 0.3]).matrix()
         if i == 3:
             matrix[:] = -np.inf
@@ -141,7 +151,9 @@ def test_suite_loads_scenes_and_names_missing_ones(apartment: Path) -> None:
     write(data / "apt1" / "living")
     scenes = load_suite("i12s", data, ["apt1/living", "apt1/kitchen"])
     assert [recording.name for recording in scenes] == ["apt1-kitchen", "apt1-living"]
-    refused("apt2/bed is missing; get it from https://graphics", load_suite, "i12s", data)
+    refused(
+        "apt2/bed is missing; get it from https://graphics", load_suite, "i12s", data
+    )
 
 
 POSE = "seq-02/frame-000002.pose.txt"
@@ -157,19 +169,39 @@ SEVEN = [
     (POSE, b"1 2 3", r"frame-000002\.pose\.txt: expected.*got 3"),
     (POSE, b"x " * 16, r"frame-000002\.pose\.txt: expected"),
     (POSE, b"", r"frame-000002\.pose\.txt: expected"),
-    (POSE, b"2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", r"frame-000002\.pose\.txt: the left 3x3 block"),
+    (
+        POSE,
+        b"2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1",
+        r"frame-000002\.pose\.txt: the left 3x3 block",
+    ),
     ("seq-0*/*.png", b"no image", r"color\.png: not a readable image"),
     ("seq-02/frame-000000.color.jpg", b"", "'frame-000000' comes twice; keep its"),
     ("camera-intrinsics.txt", b"525 525", r"camera-intrinsics\.txt: expected a 3x3"),
-    ("camera-intrinsics.txt", b"0 0 0 0 0 0 0 0 1", r"camera-intrinsics\.txt: camera fx"),
+    (
+        "camera-intrinsics.txt",
+        b"0 0 0 0 0 0 0 0 1",
+        r"camera-intrinsics\.txt: camera fx",
+    ),
 ]
 TWELVE = [
     ("split.txt", None, r"split\.txt: .*is missing"),
     ("split.txt", b"sequence0 frames=2", r"split\.txt: the first line holds no"),
-    ("split.txt", b"sequence0 [frames=9]", r"split\.txt: 9 test frames, but .* has 5 images"),
+    (
+        "split.txt",
+        b"sequence0 [frames=9]",
+        r"split\.txt: 9 test frames, but .* has 5 images",
+    ),
     ("info.txt", b"m_colorWidth = 128", r"info\.txt: needs m_colorWidth"),
-    ("info.txt", INFO.replace("116 0 65.5", "wide").encode(), r"info\.txt: needs m_colorWidth"),
-    ("data/frame-000002.pose.txt", b"1 0 0", r"frame-000002\.pose\.txt: expected a 4x4"),
+    (
+        "info.txt",
+        INFO.replace("116 0 65.5", "wide").encode(),
+        r"info\.txt: needs m_colorWidth",
+    ),
+    (
+        "data/frame-000002.pose.txt",
+        b"1 0 0",
+        r"frame-000002\.pose\.txt: expected a 4x4",
+    ),
     ("data/frame-000002.pose.txt", None, r"frame-000002\.pose\.txt: .*is missing"),
     ("data/*.jpg", None, "no images"),
 ]
@@ -180,7 +212,11 @@ TWELVE = [
     [*(("kitchen", *row) for row in SEVEN), *(("apartment", *row) for row in TWELVE)],
 )
 def test_broken_files_are_refused(
-    request: pytest.FixtureRequest, scene: str, file: str, content: bytes | None, message: str
+    request: pytest.FixtureRequest,
+    scene: str,
+    file: str,
+    content: bytes | None,
+    message: str,
 ) -> None:
     root = request.getfixturevalue(scene)
     for path in list(root.glob(file)) or [root / file]:
@@ -189,13 +225,17 @@ def test_broken_files_are_refused(
 
 
 def test_missing_folders_are_refused(kitchen: Path) -> None:
-    for folder, message in ((kitchen / "seq-02", "seq-02"), (kitchen, "no such folder")):
+    for folder, message in (
+        (kitchen / "seq-02", "seq-02"),
+        (kitchen, "no such folder"),
+    ):
         shutil.rmtree(folder)
         refused(message, load_recording, kitchen)
 
 
 def test_blank_lines_of_a_calibration_cost_nothing(apartment: Path) -> None:
-    info, before = apartment / "info.txt", load_recording(apartment)
+    info = apartment / "info.txt"
+    before = load_recording(apartment)
     info.write_text("\n" * 100_000 + info.read_text())
     began = time.process_time()
     assert load_recording(apartment).train[0].camera == before.train[0].camera

@@ -33,7 +33,9 @@ def write_poses(file: Path, poses: SE3) -> None:
                header="x_m,y_m,z_m,rotvec_x,rotvec_y,rotvec_z")  # fmt: skip
 
 
-def make_folder(root: Path, names: Sequence[str], poses: SE3 | None, folder: str = ".") -> Path:
+def make_folder(
+    root: Path, names: Sequence[str], poses: SE3 | None, folder: str = "."
+) -> Path:
     (root / folder).mkdir(parents=True, exist_ok=True)
     for i, name in enumerate(names):
         write_image(root / folder / name, np.full((24, 32, 3), i + 1, np.uint8))
@@ -52,7 +54,9 @@ def assert_paired(recording: Recording, names: Sequence[str], poses: SE3) -> Non
 
 
 @pytest.mark.parametrize("folder", [".", "images", "rgb"])
-def test_rows_without_names_are_paired_in_natural_order(tmp_path: Path, folder: str) -> None:
+def test_rows_without_names_are_paired_in_natural_order(
+    tmp_path: Path, folder: str
+) -> None:
     names = [f"image-{i}.png" for i in range(1, 13)]  # image-10 comes after image-9
     poses = some_poses(12)
     recording = load_recording(make_folder(tmp_path / "wave", names, poses, folder))
@@ -87,9 +91,19 @@ TIMES = 1305031102.0 + SECONDS
         (["a.png", "b.png"], ("1", "2"), None, "names no image of"),
         (["7.25.png", "8.25.png"], ("7", "9"), None, "names no image of"),
         (["a.png", "b.png"], ("a.png", "a.png"), None, r"'a\.png' comes twice"),
-        (["image-1.png", "image-10.png", "image-2.png"], None, None, "is given after image-10"),
+        (
+            ["image-1.png", "image-10.png", "image-2.png"],
+            None,
+            None,
+            "is given after image-10",
+        ),
         # Frame numbers are not times, even if the clock of the robot starts at 0.
-        (["000001.png", "000002.png"], None, TIMES[:3], r"3 poses for 2 images.*stamps\.csv"),
+        (
+            ["000001.png", "000002.png"],
+            None,
+            TIMES[:3],
+            r"3 poses for 2 images.*stamps\.csv",
+        ),
         (["20240115_000001.png"], None, SECONDS, r"11 poses for 1 images.*stamps\.csv"),
         (["20240115000001.png"], None, SECONDS, r"11 poses for 1 images.*stamps\.csv"),
         (["9.25.png", "9.5.png"], None, SECONDS, "are the clocks the same"),
@@ -97,17 +111,29 @@ TIMES = 1305031102.0 + SECONDS
     ],
 )
 def test_images_that_cannot_be_paired_are_refused(
-    images: list[str], names: tuple[str, ...] | None, stamps: np.ndarray | None, message: str
+    images: list[str],
+    names: tuple[str, ...] | None,
+    stamps: np.ndarray | None,
+    message: str,
 ) -> None:
     count = len(images) if stamps is None else len(stamps)
     rows = RobotPoses(names, stamps, some_poses(count))
-    refused(message, pair_images, [Path(image) for image in images], rows, None, Path("p.csv"))
+    refused(
+        message,
+        pair_images,
+        [Path(image) for image in images],
+        rows,
+        None,
+        Path("p.csv"),
+    )
 
 
 def test_frame_numbers_and_folders_are_paired_in_order() -> None:
     rows = RobotPoses(None, TIMES[:3], some_poses(3))
     for images in (["0.png", "1.png", "2.png"], ["b/1.png", "b/2.png", "a/1.png"]):
-        paired, notes = pair_images([Path(image) for image in images], rows, None, Path("p"))
+        paired, notes = pair_images(
+            [Path(image) for image in images], rows, None, Path("p")
+        )
         assert None not in paired
         assert "in order" in notes[0]
 
@@ -116,7 +142,9 @@ def test_poses_are_interpolated_at_times_in_image_names() -> None:
     screw = np.array([0.01, 0, 0, 0, 0.02, 0])
     poses = SE3.exp(np.outer(np.arange(11), screw))
     images = [Path(f"{TIMES[0] + t:.6f}.png") for t in (-0.1, 0.25, 0.5, 0.975)]
-    paired, notes = pair_images(images, RobotPoses(None, TIMES, poses), None, Path("p.tum"))
+    paired, notes = pair_images(
+        images, RobotPoses(None, TIMES, poses), None, Path("p.tum")
+    )
     assert paired[0] is None
     assert notes[1].startswith("1 image taken outside the recorded poses")
     for pose, at in zip(paired[1:], (2.5, 5.0, 9.75), strict=True):
@@ -132,7 +160,9 @@ def test_poses_are_interpolated_at_times_in_a_stamps_file(tmp_path: Path) -> Non
         "stamp_s,x_m,y_m,z_m,rotvec_x,rotvec_y,rotvec_z\n"
         "0.0,0,0,0,0,0,0\n0.1,1,0,0,0,0,0\n0.2,2,0,0,0,0,0\n"
     )
-    (tmp_path / "stamps.csv").write_text("image,stamp_ns\nimages/y.png,150000000\nx.png,50000000\n")
+    (tmp_path / "stamps.csv").write_text(
+        "image,stamp_ns\nimages/y.png,150000000\nx.png,50000000\n"
+    )
     first, second = load_recording(tmp_path).train
     assert first.base_from_gripper is not None
     assert second.base_from_gripper is not None
@@ -150,7 +180,14 @@ def test_times_in_names() -> None:
         (("10.png", "10.5"), [10.0, 10.5]),
     ):
         assert times_in_names(names) == pytest.approx(times, abs=1e-6)
-    for name in ("0000000123.png", "12.png", "frame-1.5.png", "-1.5.png", "1e3.png", "nan.png"):
+    for name in (
+        "0000000123.png",
+        "12.png",
+        "frame-1.5.png",
+        "-1.5.png",
+        "1e3.png",
+        "nan.png",
+    ):
         assert times_in_names([name]) is None
 
 
@@ -165,11 +202,17 @@ def test_natural_order_of_mixed_names(tmp_path: Path) -> None:
 def test_camera_file_is_chosen_and_must_fit_the_images(tmp_path: Path) -> None:
     make_folder(tmp_path, ["1.png", "2.png"], some_poses(2))
     (tmp_path / "camera.json").rename(tmp_path / "other.json")
-    refused(r"no camera file in it; name the file .* --camera", load_recording, tmp_path)
-    recording = load_recording(tmp_path, options=ReadOptions(camera=tmp_path / "other.json"))
+    refused(
+        r"no camera file in it; name the file .* --camera", load_recording, tmp_path
+    )
+    recording = load_recording(
+        tmp_path, options=ReadOptions(camera=tmp_path / "other.json")
+    )
     assert recording.train[0].camera == CAMERA
     (tmp_path / "camera.txt").write_text("30 0 15\n0 31 11\n0 0 1\n")
-    assert load_recording(tmp_path).train[0].camera == Camera(32, 24, 30.0, 31.0, 15.0, 11.0)
+    assert load_recording(tmp_path).train[0].camera == Camera(
+        32, 24, 30.0, 31.0, 15.0, 11.0
+    )
     (tmp_path / "camera.txt").unlink()
     wide = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
     (tmp_path / "camera.json").write_text(json.dumps(wide.to_dict()))
@@ -212,7 +255,9 @@ def table(root: Path) -> None:
     (root / "camera.json").unlink()
     (root / "camera.txt").write_text(LENS_TEXT)
     rows = quaternions(CAMERA_POSES)
-    np.savetxt(root / "base_from_camera.csv", rows, delimiter=",", header="x,y,z,qw,qx,qy,qz")
+    np.savetxt(
+        root / "base_from_camera.csv", rows, delimiter=",", header="x,y,z,qw,qx,qy,qz"
+    )
 
 
 def tum(root: Path) -> None:
@@ -225,7 +270,9 @@ def tum(root: Path) -> None:
         f"{1305031102.1 + i + d:.4f} {' '.join(map(str, row))}"
         for i, row in enumerate(rows) for d in (-0.01, 0.01)
     ]  # fmt: skip
-    comments = "# ground truth trajectory\n# file: 'a.bag'\n# timestamp tx ty tz qx qy qz qw\n"
+    comments = (
+        "# ground truth trajectory\n# file: 'a.bag'\n# timestamp tx ty tz qx qy qz qw\n"
+    )
     (root / "groundtruth.txt").write_text(comments + "\n".join(lines))
 
 
@@ -270,7 +317,9 @@ def ace(root: Path) -> None:
         names = [f"seq-01-frame-{i:06d}" for i in part]
         make_folder(root / split, [f"{name}.color.png" for name in names], None, "rgb")
         poses = CAMERA_POSES[np.array(part)]
-        matrix_files(root / split / "poses", [f"{name}.pose.txt" for name in names], poses)
+        matrix_files(
+            root / split / "poses", [f"{name}.pose.txt" for name in names], poses
+        )
         (root / split / "calibration").mkdir()
         for name in names:
             file = root / split / "calibration" / f"{name}.calibration.txt"
@@ -280,14 +329,18 @@ def ace(root: Path) -> None:
 def record3d(root: Path) -> None:
     """Quaternion, then position, OpenGL's axes, and a matrix column after column."""
     make_folder(root, [f"{i}.png" for i in range(4)], None, "rgb")
-    rows = quaternions(SE3.from_matrix(CAMERA_POSES.matrix() @ GL))[:, [4, 5, 6, 3, 0, 1, 2]]
+    rows = quaternions(SE3.from_matrix(CAMERA_POSES.matrix() @ GL))[
+        :, [4, 5, 6, 3, 0, 1, 2]
+    ]
     data = {"w": 32, "h": 24, "dw": 16, "dh": 12, "fps": 60, "cameraType": 1,
             "K": PLAIN.matrix().T.ravel().tolist(), "poses": rows.tolist()}  # fmt: skip
     (root / "metadata").write_text(json.dumps(data))
 
 
 @pytest.mark.parametrize("write", [table, tum, euroc, scannet, ace, record3d])
-def test_folders_of_camera_poses_are_read(tmp_path: Path, write: Callable[[Path], object]) -> None:
+def test_folders_of_camera_poses_are_read(
+    tmp_path: Path, write: Callable[[Path], object]
+) -> None:
     write(tmp_path)
     recording = load_recording(tmp_path)
     assert len(recording.test) == (2 if write is ace else 0)
@@ -318,10 +371,17 @@ def test_cameras_of_single_images_are_read(tmp_path: Path) -> None:
     assert cameras == [PLAIN, Camera(32, 24, 33.5, 33.5, 15.5, 11.5)]
     file.unlink()
     refused("lacks the file of an image", load_recording, tmp_path / "ace")
-    own = ReadOptions(camera=tmp_path / "ace/train/calibration/seq-01-frame-000000.calibration.txt")
+    own = ReadOptions(
+        camera=tmp_path / "ace/train/calibration/seq-01-frame-000000.calibration.txt"
+    )
     assert load_recording(tmp_path / "ace", options=own).train[1].camera == PLAIN
     gone = ReadOptions(camera=tmp_path / "gone.txt")
-    refused("gone.txt: camera file is missing", load_recording, tmp_path / "ace", options=gone)
+    refused(
+        "gone.txt: camera file is missing",
+        load_recording,
+        tmp_path / "ace",
+        options=gone,
+    )
     record3d(tmp_path / "phone")
     metadata = tmp_path / "phone" / "metadata"
     data = json.loads(metadata.read_text())
@@ -338,11 +398,15 @@ def test_broken_camera_poses_are_refused(tmp_path: Path) -> None:
     refused("pose: .*rotation", load_recording, tmp_path / "scannet")
     for file in (tmp_path / "scannet" / "pose").glob("*.txt"):
         file.write_text("-inf " * 16)
-    refused("all poses in its files are inf or nan", load_recording, tmp_path / "scannet")
+    refused(
+        "all poses in its files are inf or nan", load_recording, tmp_path / "scannet"
+    )
     sensor = tmp_path / "euroc/mav0/cam0/sensor.yaml"
     text = sensor.read_text()
     sensor.write_text(text.replace("T_BS", "T_CB"))
-    refused(r"sensor\.yaml: 'T_BS' is a list of numbers", load_recording, tmp_path / "euroc")
+    refused(
+        r"sensor\.yaml: 'T_BS' is a list of numbers", load_recording, tmp_path / "euroc"
+    )
     sensor.unlink()
     refused(r"sensor\.yaml: camera file is missing", load_recording, tmp_path / "euroc")
     metadata = tmp_path / "record3d" / "metadata"
@@ -357,10 +421,14 @@ def test_broken_camera_poses_are_refused(tmp_path: Path) -> None:
         metadata.rename(tmp_path / "kept")
         refused(message, load_recording, tmp_path / "record3d")
         (tmp_path / "kept").rename(metadata)
-    refused("holds metadata and metadata.json; keep", load_recording, tmp_path / "record3d")
+    refused(
+        "holds metadata and metadata.json; keep", load_recording, tmp_path / "record3d"
+    )
     write_poses(tmp_path / "table" / "base_from_gripper.csv", CAMERA_POSES)
     refused(
-        "holds base_from_gripper.csv and base_from_camera.csv", load_recording, tmp_path / "table"
+        "holds base_from_gripper.csv and base_from_camera.csv",
+        load_recording,
+        tmp_path / "table",
     )
 
 
@@ -368,7 +436,9 @@ def test_the_one_pose_of_a_fixed_camera_is_no_table(tmp_path: Path) -> None:
     make_folder(tmp_path, ["1.png", "2.png"], None)
     np.savetxt(tmp_path / "base_from_camera.txt", np.eye(4))
     assert not wrist.detect(tmp_path)
-    np.savetxt(tmp_path / "base_from_camera.txt", CAMERA_POSES[:2].matrix().reshape(2, 16))
+    np.savetxt(
+        tmp_path / "base_from_camera.txt", CAMERA_POSES[:2].matrix().reshape(2, 16)
+    )
     assert_pose(load_recording(tmp_path).train[1].base_from_camera, CAMERA_POSES[1])
 
 
@@ -393,7 +463,8 @@ def test_broken_stamps_are_refused(tmp_path: Path, text: str, message: str) -> N
 
 
 def test_other_kinds_of_pose_files_are_read(tmp_path: Path) -> None:
-    names, poses = ["1.png", "2.png"], some_poses(2)
+    names = ["1.png", "2.png"]
+    poses = some_poses(2)
     make_folder(tmp_path, names, None)
     np.save(tmp_path / "base_from_gripper.npy", poses.matrix())
     assert_paired(load_recording(tmp_path), names, poses)
@@ -401,6 +472,7 @@ def test_other_kinds_of_pose_files_are_read(tmp_path: Path) -> None:
     rows = np.hstack([1000 * poses.translation_m, poses.log()[:, 3:]])
     numbers = "\n".join(" ".join(f"{v:.12g}" for v in row) for row in rows)
     (tmp_path / "base_from_gripper.txt").write_text(numbers)
-    refused(r"base_from_gripper\.txt", load_recording, tmp_path)  # the convention is missing
+    # The convention is missing.
+    refused(r"base_from_gripper\.txt", load_recording, tmp_path)
     recording = load_recording(tmp_path, options=ReadOptions(pose_convention="ur:mm"))
     assert_paired(recording, names, poses)

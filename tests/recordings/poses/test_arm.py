@@ -29,7 +29,9 @@ def joint(
     limit = '<limit lower="-3" upper="3" effort="1" velocity="1"/>'
     ends = f'<parent link="{links[0]}"/><child link="{links[1]}"/>'
     axis = axis and f'<axis xyz="{axis}"/>'
-    return f'<joint name="{name}" type="{kind}">{ends}{origin}{axis}{limit}{more}</joint>'
+    return (
+        f'<joint name="{name}" type="{kind}">{ends}{origin}{axis}{limit}{more}</joint>'
+    )
 
 
 def robot(folder: Path, *parts: str, links: str = "abcd") -> RobotModel:
@@ -47,7 +49,9 @@ def turned(*, by: float, about: ArrayLike = (0, 0, 1)) -> SE3:
 
 def along() -> SE3:
     """The pose of ALONG, from its definition."""
-    x, y, z = (turned(by=b, about=a) for b, a in zip((0.3, -0.2, 0.5), np.eye(3), strict=True))
+    x, y, z = (
+        turned(by=b, about=a) for b, a in zip((0.3, -0.2, 0.5), np.eye(3), strict=True)
+    )
     return SE3.exp([0.4, 0.1, 0.2, 0, 0, 0]) @ z @ y @ x
 
 
@@ -69,7 +73,8 @@ LONG = (
 def test_slopes_are_those_of_finite_differences(tmp_path: Path, ends: str) -> None:
     arm = robot(tmp_path, *LONG, links="abcdef").arm(*ends)
     values = np.random.default_rng(1).uniform(-1, 1, (5, len(arm.joints)))
-    slopes, step = arm.slopes(values), 1e-6
+    slopes = arm.slopes(values)
+    step = 1e-6
     for i in range(values.shape[1]):
         moved = step * np.eye(values.shape[1])[i]
         change = (arm.poses(values - moved).inverse() @ arm.poses(values + moved)).log()
@@ -100,7 +105,12 @@ def test_without_an_axis_a_joint_turns_about_x(tmp_path: Path) -> None:
     ("parts", "driver", "factor", "constant"),
     [
         ((joint("m", "bc", '<mimic joint="j"/>'), joint("j", "ab")), "j", 1, 0),
-        ((joint("j", "ab"), joint("m", "bc", '<mimic joint="j" multiplier="0"/>')), "j", 0, 0),
+        (
+            (joint("j", "ab"), joint("m", "bc", '<mimic joint="j" multiplier="0"/>')),
+            "j",
+            0,
+            0,
+        ),
         # Beside the chain, and later in the file.
         (
             (
@@ -132,7 +142,9 @@ def test_mimic_joints_follow_their_driver(
     arm = robot(tmp_path, *parts, links="abcde").arm("a", "c")
     assert arm.joints == (driver,)
     first = turned(by=0.3) if driver == "j" else SE3.identity()
-    assert_pose(arm, [0.3], along() @ first @ along() @ turned(by=factor * 0.3 + constant))
+    assert_pose(
+        arm, [0.3], along() @ first @ along() @ turned(by=factor * 0.3 + constant)
+    )
 
 
 QUATERNION = '<origin xyz="1 0 0" quat_xyzw="0 0 0.6 0.8"/>'
@@ -143,10 +155,22 @@ MIMIC = '<mimic joint="{}"/>'
     ("parts", "message"),
     [
         ((joint("j", "ab"), joint("k", "bc", axis="0 0 0")), "joint k has the axis"),
-        ((joint("j", "ab"), joint("k", "bc", kind="planar")), "joint k is planar; not supported"),
-        ((joint("j", "ab"), joint("k", "bc", kind="floating")), "joint k is floating; not supp"),
-        ((joint("j", "ab"), joint("k", "bc", kind="hinge")), "joint k is hinge; not supported"),
-        ((joint("j", "ab"), joint("k", "bc", origin=QUATERNION)), "k is turned by quat_xyzw"),
+        (
+            (joint("j", "ab"), joint("k", "bc", kind="planar")),
+            "joint k is planar; not supported",
+        ),
+        (
+            (joint("j", "ab"), joint("k", "bc", kind="floating")),
+            "joint k is floating; not supp",
+        ),
+        (
+            (joint("j", "ab"), joint("k", "bc", kind="hinge")),
+            "joint k is hinge; not supported",
+        ),
+        (
+            (joint("j", "ab"), joint("k", "bc", origin=QUATERNION)),
+            "k is turned by quat_xyzw",
+        ),
         (
             (joint("j", "ab"), joint("k", "bc", origin=QUATERNION).replace('"', "'")),
             "joint k is turned by quat_xyzw",
@@ -160,18 +184,42 @@ MIMIC = '<mimic joint="{}"/>'
             ),
             "joint k is turned by quat_xyzw",
         ),
-        ((joint("j", "ab"), joint("k", "bc", MIMIC.format("x"))), "k mimics x, which is no moving"),
-        ((joint("j", "ab", kind="fixed"), joint("k", "bc", MIMIC.format("j"))), "no moving joint"),
-        ((joint("j", "ab"), joint("k", "bc", MIMIC.format("k"))), "k mimics k, which mimics it"),
+        (
+            (joint("j", "ab"), joint("k", "bc", MIMIC.format("x"))),
+            "k mimics x, which is no moving",
+        ),
+        (
+            (joint("j", "ab", kind="fixed"), joint("k", "bc", MIMIC.format("j"))),
+            "no moving joint",
+        ),
+        (
+            (joint("j", "ab"), joint("k", "bc", MIMIC.format("k"))),
+            "k mimics k, which mimics it",
+        ),
         (
             (joint("j", "ab", MIMIC.format("k")), joint("k", "bc", MIMIC.format("j"))),
             "joint k mimics j, which mimics it",
         ),
-        ((joint("j", "ab"), joint("k", "cd")), "no joints connect a and c; name others"),
-        ((joint("j", "xb"), joint("k", "bc")), "no joints connect a and c; name others"),
-        ((joint("j", "ab"), joint("k", "bx")), "no joints connect a and c; name others"),
-        ((joint("j", "ab"), joint("k", "bc"), joint("l", "ca")), "above link . form a circle"),
-        ((joint("j", "ad"), joint("k", "bc"), joint("l", "cb")), "above link b form a circle"),
+        (
+            (joint("j", "ab"), joint("k", "cd")),
+            "no joints connect a and c; name others",
+        ),
+        (
+            (joint("j", "xb"), joint("k", "bc")),
+            "no joints connect a and c; name others",
+        ),
+        (
+            (joint("j", "ab"), joint("k", "bx")),
+            "no joints connect a and c; name others",
+        ),
+        (
+            (joint("j", "ab"), joint("k", "bc"), joint("l", "ca")),
+            "above link . form a circle",
+        ),
+        (
+            (joint("j", "ad"), joint("k", "bc"), joint("l", "cb")),
+            "above link b form a circle",
+        ),
     ],
 )
 def test_chains_that_are_not_understood_are_refused_by_name(
@@ -185,12 +233,18 @@ def test_chains_that_are_not_understood_are_refused_by_name(
     [
         ((joint("j", "ab"), joint("j", "bc")), "'j' comes twice; give each link and"),
         (('<link name="a"/>', joint("j", "ab")), "'a' comes twice; give each link"),
-        ((joint("j", "ab"), joint("k", "cb")), "'b' comes twice; a link is below one joint"),
+        (
+            (joint("j", "ab"), joint("k", "cb")),
+            "'b' comes twice; a link is below one joint",
+        ),
         (
             (joint("j", "ab", origin='<origin xyz="0 0 1 0"/>'),),
             "'0 0 1 0' are not three finite numbers",
         ),
-        ((joint("j", "ab", origin='<origin xyz="0 0 nan"/>'),), "'0 0 nan' are not three fin"),
+        (
+            (joint("j", "ab", origin='<origin xyz="0 0 nan"/>'),),
+            "'0 0 nan' are not three fin",
+        ),
         ((joint("j", "ab", axis="0 0 1 0"),), "'0 0 1 0' are not three finite numbers"),
     ],
 )
@@ -221,7 +275,9 @@ def test_parts_outside_the_chain_do_not_matter(tmp_path: Path) -> None:
     assert_pose(arm, [0.4], along() @ turned(by=0.4))
 
 
-def test_offsets_of_the_first_and_the_last_joint_are_not_determined(tmp_path: Path) -> None:
+def test_offsets_of_the_first_and_the_last_joint_are_not_determined(
+    tmp_path: Path,
+) -> None:
     model = robot(tmp_path, *LONG, links="abcdef")
     # j also drives the second joint, so its offset is more than a turn of the base.
     assert model.arm("a", "e").joints == ("j", "s", "w")

@@ -72,16 +72,26 @@ def test_every_kind_gives_the_same_camera(tmp_path: Path) -> None:
     matrix = tmp_path / "k.txt"
     np.savetxt(matrix, CAMERA.matrix(), header="left camera")
     assert read_camera(matrix, (640, 480)) == ideal
-    commas = written(tmp_path, "525.25, 0, 319.5\n0, 526.5, 239.25\n0, 0, 1  # pixels\n")
+    commas = written(
+        tmp_path, "525.25, 0, 319.5\n0, 526.5, 239.25\n0, 0, 1  # pixels\n"
+    )
     assert read_camera(commas, (640, 480)) == ideal
     assert read_camera(written(tmp_path, json.dumps(CAMERA.to_dict()))) == CAMERA
     assert read_camera(written(tmp_path, CALIBRATION)) == CAMERA
     assert read_camera(written(tmp_path, MESSAGE)) == Camera(
-        640, 480, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, (*CAMERA.distortion, 0.0, 0.0, 0.0)
+        640,
+        480,
+        CAMERA.fx,
+        CAMERA.fy,
+        CAMERA.cx,
+        CAMERA.cy,
+        (*CAMERA.distortion, 0.0, 0.0, 0.0),
     )
 
 
-def stored(folder: Path, ending: str = "yml", size: bool = True, **more: object) -> Path:
+def stored(
+    folder: Path, ending: str = "yml", size: bool = True, **more: object
+) -> Path:
     """What cv2.FileStorage writes of the camera."""
     path = folder / f"stored.{ending}"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
@@ -126,13 +136,23 @@ def test_opencv_storage_is_read(tmp_path: Path) -> None:
 def test_ros_files_state_their_distortion(tmp_path: Path) -> None:
     text = CALIBRATION.replace("0.1, -0.02, 0.001, 1e-05, 0.03", "0, 0, 0, 0, 0")
     other = text.replace("distortion_coefficients", "lens")
-    refused("'distortion_coefficients' is missing", read_camera, written(tmp_path, other))
+    refused(
+        "'distortion_coefficients' is missing", read_camera, written(tmp_path, other)
+    )
     assert read_camera(written(tmp_path, text)).distortion == ()
-    assert read_camera(written(tmp_path, other.replace("plumb_bob", "none"))).distortion == ()
+    assert (
+        read_camera(written(tmp_path, other.replace("plumb_bob", "none"))).distortion
+        == ()
+    )
     old = MESSAGE.replace("d:\n", "D:\n").replace("k: [", "K: [")  # ROS 1
     assert read_camera(written(tmp_path, old)).fx == CAMERA.fx
     longer = CALIBRATION.replace("1e-05, 0.03]", "1e-05, 0.03, 0, 0, 0, 0, 0, 0, 0]")
-    assert read_camera(written(tmp_path, longer)).distortion == (*CAMERA.distortion, 0, 0, 0)
+    assert read_camera(written(tmp_path, longer)).distortion == (
+        *CAMERA.distortion,
+        0,
+        0,
+        0,
+    )
 
 
 def test_a_single_number_called_size_is_no_image_size(tmp_path: Path) -> None:
@@ -158,10 +178,18 @@ def test_yaml_cannot_run_code(tmp_path: Path) -> None:
     assert not bait.exists()
 
 
-K, D = CAMERA.matrix().tolist(), list(CAMERA.distortion)
+K = CAMERA.matrix().tolist()
+D = list(CAMERA.distortion)
 FLAT = [value for row in K for value in row]
 SIZE = {"image_width": 640, "image_height": 480}
-REALSENSE = {"fx": 525.25, "fy": 526.5, "ppx": 319.5, "ppy": 239.25, "width": 640, "height": 480}
+REALSENSE = {
+    "fx": 525.25,
+    "fy": 526.5,
+    "ppx": 319.5,
+    "ppy": 239.25,
+    "width": 640,
+    "height": 480,
+}
 FIELDS = [
     {"camera_matrix": K, "dist_coeffs": [D], **SIZE},
     {"camera_matrix": FLAT, "dist_coeff": D, "image_size": [640, 480]},
@@ -281,7 +309,9 @@ Distortion: {K1: 0.1, K2: -0.02, K3: 0, P1: 0.001, P2: 0.00001}
 RADTAN = replace(CAMERA, distortion=CAMERA.distortion[:4])
 
 
-@pytest.mark.parametrize("text", [KALIBR, EUROC, ORB_SLAM, ORB_SLAM.replace("a1.", "a."), VINS])
+@pytest.mark.parametrize(
+    "text", [KALIBR, EUROC, ORB_SLAM, ORB_SLAM.replace("a1.", "a."), VINS]
+)
 def test_camera_files_of_other_programs_are_read(tmp_path: Path, text: str) -> None:
     camera = read_camera(written(tmp_path, text))
     assert camera.coefficients == RADTAN.coefficients
@@ -295,9 +325,13 @@ FISHEYE = replace(CAMERA, distortion=(0.1, -0.02, 0.001, 1e-5), model="fisheye")
     "text",
     [
         KALIBR.replace("radtan", "equidistant"),
-        ORB_SLAM.replace("PinHole", "KannalaBrandt8").replace("p1", "k3").replace("p2", "k4"),
+        ORB_SLAM.replace("PinHole", "KannalaBrandt8")
+        .replace("p1", "k3")
+        .replace("p2", "k4"),
         json.dumps(FISHEYE.to_dict()),
-        MESSAGE.replace("rational_polynomial", "equidistant").replace("- 0.03\n- 0.0\n", "- 0.0\n"),
+        MESSAGE.replace("rational_polynomial", "equidistant").replace(
+            "- 0.03\n- 0.0\n", "- 0.0\n"
+        ),
         json.dumps({"K": FLAT, "D": D[:4], **SIZE, "camera_model": "OPENCV_FISHEYE"}),
         json.dumps({"K": FLAT, "D": [*D[:4], 0], **SIZE, "model": "fisheye"}),
     ],
@@ -319,7 +353,8 @@ def test_a_fisheye_states_its_distortion(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["omni", "eucm", "ds"])
 def test_models_of_kalibr_become_the_nearest_fisheye(tmp_path: Path, kind: str) -> None:
-    own, focal = {"omni": [1.2], "eucm": [0.6, 1.1], "ds": [-0.2, 0.6]}[kind], 300.0
+    own = {"omni": [1.2], "eucm": [0.6, 1.1], "ds": [-0.2, 0.6]}[kind]
+    focal = 300.0
     text = f"""
 cam0:
   camera_model: {kind}
@@ -339,10 +374,17 @@ cam0:
 
 
 def test_the_model_fov_has_one_coefficient(tmp_path: Path) -> None:
-    fields = {"K": [300.0, 300.0, 320.0, 240.0], "distortion_model": "fov", "D": [0.9], **SIZE}
+    fields = {
+        "K": [300.0, 300.0, 320.0, 240.0],
+        "distortion_model": "fov",
+        "D": [0.9],
+        **SIZE,
+    }
     camera = read_camera(written(tmp_path, json.dumps(fields)))
     x = camera.project([np.tan(0.8), 0.0, 1.0])[0]
-    assert x == pytest.approx(320 + 300 * np.arctan(2 * np.tan(0.8) * np.tan(0.45)) / 0.9, abs=0.01)
+    assert x == pytest.approx(
+        320 + 300 * np.arctan(2 * np.tan(0.8) * np.tan(0.45)) / 0.9, abs=0.01
+    )
 
 
 def test_zivid_has_no_size(tmp_path: Path) -> None:
@@ -380,15 +422,26 @@ def test_detected_boards_and_calibrations_are_camera_files(tmp_path: Path) -> No
 def test_of_several_cameras_the_one_of_the_images_is_read(tmp_path: Path) -> None:
     second = KALIBR.replace("cam0", "cam1").replace("525.25", "500")
     file = written(tmp_path, KALIBR + second)
-    refused(r"several cameras: cam0 \(640x480, fx 525\.2\), cam1 \(.*", read_camera, file)
+    refused(
+        r"several cameras: cam0 \(640x480, fx 525\.2\), cam1 \(.*", read_camera, file
+    )
     refused("give a file of the right one", read_camera, file, (640, 480))
     written(tmp_path, KALIBR + second.replace("[640, 480]", "[1280, 960]"))
     assert read_camera(file, (640, 480)) == RADTAN
-    assert read_camera(written(tmp_path, KALIBR + KALIBR.replace("cam0", "cam1"))) == RADTAN
+    assert (
+        read_camera(written(tmp_path, KALIBR + KALIBR.replace("cam0", "cam1")))
+        == RADTAN
+    )
     written(tmp_path, KALIBR + second.replace("radtan", "fov"))
     refused("cam1: a camera of model fov has omega", read_camera, file)
-    stereo = ORB_SLAM.replace("a1.", "a.") + "LEFT.K: [600, 0, 320, 0, 600, 240, 0, 0, 1]\n"
-    refused("outside of these .*, LEFT", read_camera, written(tmp_path, stereo + "LEFT.D: [0]\n"))
+    stereo = (
+        ORB_SLAM.replace("a1.", "a.") + "LEFT.K: [600, 0, 320, 0, 600, 240, 0, 0, 1]\n"
+    )
+    refused(
+        "outside of these .*, LEFT",
+        read_camera,
+        written(tmp_path, stereo + "LEFT.D: [0]\n"),
+    )
 
 
 def test_opencv_stores_a_camera_inside_a_map(tmp_path: Path) -> None:
@@ -409,20 +462,32 @@ def test_opencv_stores_a_camera_inside_a_map(tmp_path: Path) -> None:
 
 
 def test_binned_pixels_shrink_the_intrinsics(tmp_path: Path) -> None:
-    file = written(tmp_path, MESSAGE.replace("roi:", "binning_x: 2\nbinning_y: 2\nroi:"))
-    half = replace(CAMERA, distortion=(*CAMERA.distortion, 0.0, 0.0, 0.0)).resized(320, 240)
+    file = written(
+        tmp_path, MESSAGE.replace("roi:", "binning_x: 2\nbinning_y: 2\nroi:")
+    )
+    half = replace(CAMERA, distortion=(*CAMERA.distortion, 0.0, 0.0, 0.0)).resized(
+        320, 240
+    )
     assert read_camera(file) == read_camera(file, (320, 240)) == half
-    assert read_camera(file, (640, 480)).fx == CAMERA.fx  # of drivers that state the image's size
+    # Of drivers that state the image's size.
+    assert read_camera(file, (640, 480)).fx == CAMERA.fx
 
 
-def test_a_focal_length_alone_has_its_principal_point_in_the_middle(tmp_path: Path) -> None:
+def test_a_focal_length_alone_has_its_principal_point_in_the_middle(
+    tmp_path: Path,
+) -> None:
     assert read_camera(written(tmp_path, "525.25\n"), (640, 480)) == Camera(
         640, 480, 525.25, 525.25, 319.5, 239.5
     )
 
 
 def test_no_distortion_may_be_stated_in_words(tmp_path: Path) -> None:
-    for fields in ({"distortion": None}, {"dist": "none"}, {"model": "none"}, {"model": None}):
+    for fields in (
+        {"distortion": None},
+        {"dist": "none"},
+        {"model": "none"},
+        {"model": None},
+    ):
         file = written(tmp_path, yaml.safe_dump({"K": K, **SIZE, **fields}))
         assert read_camera(file) == CAMERA.pinhole
 
@@ -438,34 +503,58 @@ def test_no_distortion_may_be_stated_in_words(tmp_path: Path) -> None:
         ("a: [1", "not valid YAML"),
         ("{'single': 'quotes'}", "not valid JSON"),
         ('{"width": 640}', "'camera_matrix' is missing, there is width"),
-        ('{"fx": 1, "fy": 1, "cx": 1, "cy": 1, "width": 640}', "'image_height' is missing"),
+        (
+            '{"fx": 1, "fy": 1, "cx": 1, "cy": 1, "width": 640}',
+            "'image_height' is missing",
+        ),
         (CALIBRATION.replace("image_width", "breadth"), "'image_width' is missing"),
         (CALIBRATION.replace("640", "wide"), "image size"),
         (CALIBRATION.replace("640", "0"), "width"),
         (CALIBRATION.replace("plumb_bob", "fov"), "fov"),
         (CALIBRATION.replace("[525.25, 0,", "[525.25,"), "9 numbers, got 8"),
-        (CALIBRATION.replace("[0.1, -0.02,", "[true, -0.02,"), "distortion_coefficients"),
+        (
+            CALIBRATION.replace("[0.1, -0.02,", "[true, -0.02,"),
+            "distortion_coefficients",
+        ),
         (CALIBRATION.replace("0.03]", "0.03, 0.5, 0.5]"), "0, 4, 5 or 8"),
         (MESSAGE.replace("x_offset: 0", "x_offset: 8"), "cut-out"),
         (MESSAGE.replace("525.25", "0.0"), "fx"),
         ({"K": K, "D": D}, "'image_width' is missing .no image size"),
         ({"K": K, "D": D, "width": 640}, "'image_height' is missing"),
-        ({"K": K, "radial": D[:2], **SIZE}, "'radial' is not known and may change the image"),
+        (
+            {"K": K, "radial": D[:2], **SIZE},
+            "'radial' is not known and may change the image",
+        ),
         ({"K": K, "lens": {"data": D}, **SIZE}, "'lens' is not known"),
         ({"K": K, "dc": [D], **SIZE}, "'dc' is not known"),
         ({"K": K, "dist_vec": D, **SIZE}, "'dist_vec' is not known"),
         ({"K": K, "r": D[:2], "D": [0] * 5, **SIZE}, "'r' is not known"),
         ({"K": K, "dist": D, "xi": 1, **SIZE}, "'xi' is not known"),
-        ({"camera": {"K": K, **SIZE}, "tangential": [1e-3, 0]}, "'tangential' is not known"),
+        (
+            {"camera": {"K": K, **SIZE}, "tangential": [1e-3, 0]},
+            "'tangential' is not known",
+        ),
         ({"K": K, "distortion_params": [0.1] * 6, **SIZE}, "0, 4, 5 or 8"),
         ({"K": K, "dist": D, "model": "none", **SIZE}, "'none' is not supported with"),
         ({"intrinsics": [525, 319.5, 526, 239.3], **SIZE}, "9 numbers, got 4"),
-        ({"fx": 4.2, "fy": 4.2, "cx": 320, "cy": 240, **SIZE}, "fx 4.2, .* do not fit 640x480"),
+        (
+            {"fx": 4.2, "fy": 4.2, "cx": 320, "cy": 240, **SIZE},
+            "fx 4.2, .* do not fit 640x480",
+        ),
         ({"fx": 0.82, "fy": 1.1, "cx": 0.5, "cy": 0.5, **SIZE}, "give them in pixels"),
-        ({"fx": 1160, "fy": 1160, "cx": 650, "cy": 480, **SIZE}, "and of this image size"),
+        (
+            {"fx": 1160, "fy": 1160, "cx": 650, "cy": 480, **SIZE},
+            "and of this image size",
+        ),
         ({"K": K, "dist": D, "d": D, **SIZE}, "dist and d are the same; keep one"),
-        ({"K": K, "image_size": [480, 640, 3]}, r"image size \(width, height\) has 2 numbers"),
-        ({**REALSENSE, "coeffs": D, "model": "inverse_brown_conrady"}, "is not supported"),
+        (
+            {"K": K, "image_size": [480, 640, 3]},
+            r"image size \(width, height\) has 2 numbers",
+        ),
+        (
+            {**REALSENSE, "coeffs": D, "model": "inverse_brown_conrady"},
+            "is not supported",
+        ),
         ({**REALSENSE, "coeffs": [0] * 5, "model": "f_theta"}, "is not supported"),
         ({"K": K[:2], **SIZE}, "camera_matrix has 9 numbers, got 6"),
     ],
@@ -473,7 +562,9 @@ def test_no_distortion_may_be_stated_in_words(tmp_path: Path) -> None:
 def test_broken_files_are_refused(
     tmp_path: Path, content: str | dict[str, object], expected: str
 ) -> None:
-    path = written(tmp_path, content if isinstance(content, str) else json.dumps(content))
+    path = written(
+        tmp_path, content if isinstance(content, str) else json.dumps(content)
+    )
     size = (640, 480) if isinstance(content, str) else None
     with pytest.raises(InputError, match=expected) as caught:
         read_camera(path, size)

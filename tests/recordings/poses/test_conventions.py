@@ -24,7 +24,9 @@ Array = NDArray[np.float64]
 
 
 def of_vector(x: float, y: float, z: float) -> Array:
-    return np.asarray(expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])), dtype=np.float64)
+    return np.asarray(
+        expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])), dtype=np.float64
+    )
 
 
 def of_quaternion(w: float, x: float, y: float, z: float) -> Array:
@@ -34,7 +36,8 @@ def of_quaternion(w: float, x: float, y: float, z: float) -> Array:
 def fixed(axes: str, unit: float = 1.0) -> Callable[..., Array]:
     def rotation(*angles: float) -> Array:
         vectors = [
-            unit * a * np.eye(3)["xyz".index(axis)] for axis, a in zip(axes, angles, strict=True)
+            unit * a * np.eye(3)["xyz".index(axis)]
+            for axis, a in zip(axes, angles, strict=True)
         ]
         first, second, third = (of_vector(*vector) for vector in vectors)
         return third @ second @ first
@@ -122,9 +125,9 @@ def test_modifiers_change_unit_direction_and_axes(
     implied = 0.001 if name in MILLIMETRES else 1.0
     scale = {"": implied, ":m": 1.0, ":mm": 0.001}[unit]
     expected_numbers = numbers[0].copy()
-    expected_numbers[{"matrix": [3, 7, 11], "franka": [12, 13, 14]}.get(name, [0, 1, 2])] *= (
-        scale / implied
-    )
+    expected_numbers[
+        {"matrix": [3, 7, 11], "franka": [12, 13, 14]}.get(name, [0, 1, 2])
+    ] *= scale / implied
     np.testing.assert_allclose(twin(name, expected_numbers), expected, atol=1e-12)
 
 
@@ -162,14 +165,20 @@ def rows(name: str) -> Array:
     """Poses as of an arm: half a metre from its base."""
     rng = np.random.default_rng(5)
     translation = rng.uniform(0.2, 0.8, (6, 3))
-    return numbers_from_poses(SE3(rng.normal(size=(6, 4)), translation), pose_convention(name))
+    return numbers_from_poses(
+        SE3(rng.normal(size=(6, 4)), translation), pose_convention(name)
+    )
 
 
 @pytest.mark.parametrize(
     ("written", "read", "remedy"),
     [
         ("wxyz:mm", "wxyz", "look like millimetres; give --robot-convention wxyz:mm"),
-        ("matrix:mm", "matrix", "look like millimetres; give --robot-convention matrix:mm"),
+        (
+            "matrix:mm",
+            "matrix",
+            "look like millimetres; give --robot-convention matrix:mm",
+        ),
         ("franka:mm", "franka:inverse", "give --robot-convention franka:inverse:mm"),
         ("kuka:m", "kuka", "look like metres; give --robot-convention kuka:m"),
         ("rpy:deg", "rpy", "look like degrees; give --robot-convention rpy:deg"),
@@ -177,7 +186,9 @@ def rows(name: str) -> Array:
         ("fanuc:rad", "fanuc", "look like radians; give --robot-convention fanuc:rad"),
     ],
 )
-def test_other_units_are_refused_unless_stated(written: str, read: str, remedy: str) -> None:
+def test_other_units_are_refused_unless_stated(
+    written: str, read: str, remedy: str
+) -> None:
     with (
         pytest.raises(ValueError, match=remedy),
         asking_for("--robot-convention"),
@@ -185,7 +196,9 @@ def test_other_units_are_refused_unless_stated(written: str, read: str, remedy: 
         check_units(rows(written), pose_convention(read))
     stated = remedy.split("--robot-convention ")[1]
     check_units(rows(written), pose_convention(stated))
-    units = {"mm": ":m", "m": ":mm", "deg": ":rad", "rad": ":deg"}[stated.split(":")[-1]]
+    units = {"mm": ":m", "m": ":mm", "deg": ":rad", "rad": ":deg"}[
+        stated.split(":")[-1]
+    ]
     check_units(rows(written), pose_convention(read + units))
 
 
@@ -193,7 +206,9 @@ def test_other_units_are_refused_unless_stated(written: str, read: str, remedy: 
 def test_poses_in_mixed_units_are_named(name: str, factor: float) -> None:
     numbers = rows(name)
     numbers[[1, 4], :3] *= factor
-    with pytest.raises(ValueError, match=r"poses 2, 5 .*millimetres and metres may be mixed"):
+    with pytest.raises(
+        ValueError, match=r"poses 2, 5 .*millimetres and metres may be mixed"
+    ):
         check_units(numbers, CONVENTIONS[name])
 
 
@@ -201,14 +216,38 @@ def test_poses_in_mixed_units_are_named(name: str, factor: float) -> None:
     ("name", "change", "message"),
     [
         ("wxyz", lambda n: n[:, :6], "has 7 numbers .* got 6"),
-        ("wxyz", lambda n: n * np.where(np.arange(7) > 2, 2, 1), "pose 1 .* not of length 1"),
-        ("wxyz", lambda n: np.r_[n[:2], n[2:] * 1.2], r"pose 3 \(and 3 more\): .*length 1"),
+        (
+            "wxyz",
+            lambda n: n * np.where(np.arange(7) > 2, 2, 1),
+            "pose 1 .* not of length 1",
+        ),
+        (
+            "wxyz",
+            lambda n: np.r_[n[:2], n[2:] * 1.2],
+            r"pose 3 \(and 3 more\): .*length 1",
+        ),
         ("ur", lambda n: np.where(np.arange(6) == 4, np.nan, n), "inf or nan"),
-        ("matrix", lambda n: n.reshape(-1, 4, 4).swapaxes(1, 2).reshape(-1, 16), "franka"),
-        ("franka", lambda n: n.reshape(-1, 4, 4).swapaxes(1, 2).reshape(-1, 16), "matrix"),
+        (
+            "matrix",
+            lambda n: n.reshape(-1, 4, 4).swapaxes(1, 2).reshape(-1, 16),
+            "franka",
+        ),
+        (
+            "franka",
+            lambda n: n.reshape(-1, 4, 4).swapaxes(1, 2).reshape(-1, 16),
+            "matrix",
+        ),
         ("matrix", lambda n: n + np.eye(4).ravel() * 0.1, "last row"),
-        ("matrix", lambda n: n * np.where(np.arange(16) % 4 < 3, 1.1, 1), "is no rotation"),
-        ("matrix", lambda n: n * np.where(np.arange(16) % 4 == 0, -1, 1), "is no rotation"),
+        (
+            "matrix",
+            lambda n: n * np.where(np.arange(16) % 4 < 3, 1.1, 1),
+            "is no rotation",
+        ),
+        (
+            "matrix",
+            lambda n: n * np.where(np.arange(16) % 4 == 0, -1, 1),
+            "is no rotation",
+        ),
     ],
 )
 def test_invalid_numbers_are_refused(

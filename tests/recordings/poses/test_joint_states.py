@@ -11,7 +11,11 @@ from hypothesis import strategies as st
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings import ReadOptions, load_recording, write_image
-from evercal.recordings.poses.kinematics import RobotModel, interpolate, read_joint_poses
+from evercal.recordings.poses.kinematics import (
+    RobotModel,
+    interpolate,
+    read_joint_poses,
+)
 
 from ..checks import assert_pose, refused
 
@@ -36,9 +40,11 @@ ANGLES = st.floats(-2.9, 2.9)
 
 def planar(shoulder: float, elbow: float, reach: float) -> SE3:
     """The tip in the base, from the drawing."""
-    a, b = shoulder, shoulder + elbow
+    a = shoulder
+    b = shoulder + elbow
     far = 0.3 + reach
-    x, y = 0.5 * np.cos(a) + far * np.cos(b), 0.5 * np.sin(a) + far * np.sin(b)
+    x = 0.5 * np.cos(a) + far * np.cos(b)
+    y = 0.5 * np.sin(a) + far * np.sin(b)
     return SE3(np.array([np.cos(b / 2), 0, 0, np.sin(b / 2)]), np.array([x, y, 0.1]))
 
 
@@ -71,7 +77,9 @@ def test_any_two_links_can_be_chosen(model: RobotModel) -> None:
     assert model.arm("base", "tip").joints == ("shoulder", "elbow", "reach")
     assert model.arm("upper", "lower").joints == ("elbow",)
     assert model.arm("tip", "lower").joints == ("reach",)
-    pose_in_degrees = model.poses(["elbow"], np.array([[0.7]]), "lower", "upper")[0].poses[0]
+    pose_in_degrees = model.poses(["elbow"], np.array([[0.7]]), "lower", "upper")[
+        0
+    ].poses[0]
     expected = SE3.exp([0.5, 0, 0, 0, 0, 0]) @ SE3.exp([0, 0, 0, 0, 0, 0.7])
     assert max(pose_distance(pose_in_degrees, expected.inverse())) < 1e-9
 
@@ -86,7 +94,9 @@ def panda_flange(q: np.ndarray) -> SE3:
         along_x = SE3.exp([0, 0, 0, alpha[i], 0, 0]).rotation_wxyz
         before = SE3(along_x, np.array([a[i], 0.0, 0.0]))
         about_z = SE3.exp([0, 0, 0, 0, 0, q[i] if i < 7 else 0.0])
-        base_from_joint = base_from_joint @ before @ about_z @ SE3.exp([0, 0, d[i], 0, 0, 0])
+        base_from_joint = (
+            base_from_joint @ before @ about_z @ SE3.exp([0, 0, d[i], 0, 0, 0])
+        )
     return base_from_joint
 
 
@@ -96,9 +106,16 @@ def test_panda_agrees_with_its_published_parameters() -> None:
         files = spec.files("example-robot-data") or []
     except spec.PackageNotFoundError:
         pytest.skip("example-robot-data is not installed")
-    file = next(f for f in files if str(f).endswith("panda_description/urdf/panda.urdf"))
+    file = next(
+        f for f in files if str(f).endswith("panda_description/urdf/panda.urdf")
+    )
     model = RobotModel(Path(file.locate()))
-    refused(r"has 3 ends; name the link with --gripper-frame", model.chosen_links, None, None)
+    refused(
+        r"has 3 ends; name the link with --gripper-frame",
+        model.chosen_links,
+        None,
+        None,
+    )
     joints = model.arm("panda_link0", "panda_link8").joints
     assert joints == tuple(f"panda_joint{i}" for i in range(1, 8))
     q = np.random.default_rng(1).uniform(-1.5, 0.0, (20, 7))
@@ -110,7 +127,9 @@ def test_panda_agrees_with_its_published_parameters() -> None:
     assert max(pose_distance(back, poses.inverse())[0]) < 1e-9
 
 
-def test_folder_with_joints_and_a_urdf_is_a_recording(tmp_path: Path, urdf: Path) -> None:
+def test_folder_with_joints_and_a_urdf_is_a_recording(
+    tmp_path: Path, urdf: Path
+) -> None:
     for i in range(3):
         write_image(tmp_path / f"{i}.png", np.zeros((24, 32, 3), np.uint8))
     (tmp_path / "camera.txt").write_text("30 0 15.5\n0 30 11.5\n0 0 1\n")
@@ -124,24 +143,32 @@ def test_folder_with_joints_and_a_urdf_is_a_recording(tmp_path: Path, urdf: Path
     expected.append(planar(0.5, np.pi / 2, 0.1))
     for frame, pose in zip(recording.train, expected, strict=True):
         assert_pose(frame.base_from_gripper, pose)
-    degrees = ReadOptions(urdf=urdf, pose_convention="deg")  # of the column that does not say
-    pose_in_degrees = load_recording(tmp_path, options=degrees).train[0].base_from_gripper
+    # Of the column that does not say.
+    degrees = ReadOptions(urdf=urdf, pose_convention="deg")
+    pose_in_degrees = (
+        load_recording(tmp_path, options=degrees).train[0].base_from_gripper
+    )
     assert pose_in_degrees is not None
     expected = planar(np.deg2rad(0.25), np.deg2rad(-30), 0.2)
     assert max(pose_distance(pose_in_degrees, expected)) < 1e-7
-    assert recording.notes[0] == "gripper poses are those of tip in base, from planar.urdf"
+    assert (
+        recording.notes[0] == "gripper poses are those of tip in base, from planar.urdf"
+    )
     with pytest.raises(InputError, match="has no link 'hand'; it has base, upper"):
         load_recording(tmp_path, options=ReadOptions(urdf=urdf, gripper_frame="hand"))
 
 
 def test_json_and_csv_agree(tmp_path: Path, model: RobotModel) -> None:
-    names, rows = ["shoulder", "elbow", "reach"], [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]
+    names = ["shoulder", "elbow", "reach"]
+    rows = [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]
     text = "stamp_s," + ",".join(names) + "\n"
     text += "".join(f"{i},{','.join(map(str, row))}\n" for i, row in enumerate(rows))
     (tmp_path / "joints.csv").write_text(text)
     data = {"joint_names": names, "positions": rows, "stamps_s": [0, 1]}
     (tmp_path / "joints.json").write_text(json.dumps(data))
-    one, two = (read_joint_poses(tmp_path / f"joints.{k}", model)[0] for k in ("csv", "json"))
+    one, two = (
+        read_joint_poses(tmp_path / f"joints.{k}", model)[0] for k in ("csv", "json")
+    )
     assert one.stamps_s is not None
     assert two.stamps_s is not None
     assert one.stamps_s.tolist() == two.stamps_s.tolist() == [0, 1]
@@ -183,7 +210,10 @@ def test_wrong_json_is_refused(tmp_path: Path, model: RobotModel, data: str) -> 
     ("rows", "note"),
     [
         ("3.5,9,0\n", "shoulder goes from 3.50 to 3.50, the URDF allows -3.00 to 3.00"),
-        ("0,-170,0\n0,170,0\n", "elbow goes from -170.00 to 170.00, more than two rotations"),
+        (
+            "0,-170,0\n0,170,0\n",
+            "elbow goes from -170.00 to 170.00, more than two rotations",
+        ),
         ("0,100,0\n0,103,0\n", None),
     ],
 )
@@ -200,7 +230,9 @@ def test_angles_beyond_the_limits_are_noted(
 def test_joints_are_not_interpolated_over_gaps() -> None:
     times = np.array([0.0, 0.1, 0.2, 9.0])
     angles = np.array([3.0, -3.0, -2.9, -1.0])  # turns on through pi
-    values, valid = interpolate(times, angles, np.array([-0.1, 0.05, 0.2, 5.0, 9.0, 9.1]))
+    values, valid = interpolate(
+        times, angles, np.array([-0.1, 0.05, 0.2, 5.0, 9.0, 9.1])
+    )
     assert valid.tolist() == [False, True, True, False, True, False]
     assert values[1] == pytest.approx((3.0 + (2 * np.pi - 3.0)) / 2)
 

@@ -13,25 +13,46 @@ from evercal.recordings.poses.row_files import Rows, read_rows
 
 from ..checks import refused
 
-NAMES = ("image", "Image_Name", "img", "file", "filename", "file_path", "path", "name", "frame")
-STAMPS = (("t", 1.0), ("time [s]", 1.0), ("timestamp", 1.0), ("stamp_ms", 1e3), ("Time_NS", 1e9))
+NAMES = (
+    "image",
+    "Image_Name",
+    "img",
+    "file",
+    "filename",
+    "file_path",
+    "path",
+    "name",
+    "frame",
+)
+STAMPS = (
+    ("t", 1.0),
+    ("time [s]", 1.0),
+    ("timestamp", 1.0),
+    ("stamp_ms", 1e3),
+    ("Time_NS", 1e9),
+)
 POSE = {"translation_m": [0.5, 0.0, 0.2], "quaternion_wxyz": [1, 0, 0, 0]}
 
 
 def read_all(root: Path, label: str, cells: list[object]) -> list[RobotPoses | Rows]:
     """Two rows with one label each, in every kind of file."""
     (root / "p.csv").write_text(
-        f"x,y,z,qw,qx,qy,qz,{label}\n" + "".join(f"0.5,0,0.2,1,0,0,0,{c}\n" for c in cells)
+        f"x,y,z,qw,qx,qy,qz,{label}\n"
+        + "".join(f"0.5,0,0.2,1,0,0,0,{c}\n" for c in cells)
     )
     (root / "p.json").write_text(json.dumps([{**POSE, label: cell} for cell in cells]))
-    (root / "r.csv").write_text(f"a,{label}\n" + "".join(f"1,{cell}\n" for cell in cells))
+    (root / "r.csv").write_text(
+        f"a,{label}\n" + "".join(f"1,{cell}\n" for cell in cells)
+    )
     poses = [read_robot_poses(root / name) for name in ("p.csv", "p.json")]
     return [*poses, read_rows(root / "r.csv", "numbers")]
 
 
 def as_lists(root: Path, label: str, cells: list[object]) -> list[RobotPoses | Rows]:
     """The same in lists beside the poses or joint angles."""
-    (root / "p.json").write_text(json.dumps({"poses": [POSE] * len(cells), label: cells}))
+    (root / "p.json").write_text(
+        json.dumps({"poses": [POSE] * len(cells), label: cells})
+    )
     joints = {"joint_names": ["a"], "positions": [[1.0]] * len(cells), label: cells}
     (root / "joints.json").write_text(json.dumps(joints))
     return [read_robot_poses(root / "p.json"), read_joints(root / "joints.json")]
@@ -49,7 +70,9 @@ def test_time_labels_are_recognised(label: str, factor: float, tmp_path: Path) -
     results = read_all(tmp_path, label, [0.5 * factor, 0.25 * factor])
     name, mark, unit = label.partition("_")
     if "[" not in label:
-        results += as_lists(tmp_path, f"{name}s{mark}{unit}", [0.5 * factor, 0.25 * factor])
+        results += as_lists(
+            tmp_path, f"{name}s{mark}{unit}", [0.5 * factor, 0.25 * factor]
+        )
     for read in results:
         assert read.stamps_s is not None
         np.testing.assert_allclose(read.stamps_s, [0.5, 0.25])
@@ -62,7 +85,9 @@ def test_column_of_image_files_may_have_any_name(tmp_path: Path) -> None:
     assert read_robot_poses(tmp_path / "p.csv").names == ("b.png", "a.JPG")
     entries = [{**POSE, "rgb": f"{i}.png", "depth": f"{i}.tif"} for i in range(2)]
     (tmp_path / "p.json").write_text(json.dumps(entries))
-    with pytest.raises(InputError, match=r"p\.json: rgb and depth name image files; call the"):
+    with pytest.raises(
+        InputError, match=r"p\.json: rgb and depth name image files; call the"
+    ):
         read_robot_poses(tmp_path / "p.json")
     results = as_lists(tmp_path, "rgb", ["b.png", "a.png"])
     assert [read.names for read in results] == [("b.png", "a.png")] * 2

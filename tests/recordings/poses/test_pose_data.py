@@ -26,7 +26,8 @@ NAMES = [f"im{i}.png" for i in range(5)]
 _RNG = np.random.default_rng(3)
 ARM = SE3(_RNG.normal(size=(5, 4)), _RNG.uniform(0.2, 0.8, (5, 3)))
 M = ARM.matrix()
-R, T = M[:, :3, :3], M[:, :3, 3]
+R = M[:, :3, :3]
+T = M[:, :3, 3]
 INVERSE = ARM.inverse().matrix()
 
 
@@ -51,15 +52,21 @@ def assert_arm(path: Path, convention: str | None = None, **options: Any) -> Any
     return read
 
 
-def message(row: list[float], names: tuple[str, str] = ("position", "orientation")) -> Any:
-    xyz, xyzw = dict(zip("xyz", row, strict=False)), dict(zip("xyzw", row[3:], strict=True))
+def message(
+    row: list[float], names: tuple[str, str] = ("position", "orientation")
+) -> Any:
+    xyz = dict(zip("xyz", row, strict=False))
+    xyzw = dict(zip("xyzw", row[3:], strict=True))
     return {names[0]: xyz, names[1]: xyzw}
 
 
 MESSAGES = [message(row) for row in numbers("xyzw")]
 TRANSFORMS = [message(row, ("translation", "rotation")) for row in numbers("xyzw")]
 STAMPED = [
-    {"header": {"stamp": {"sec": i, "nanosec": 500_000_000}, "frame_id": "base"}, "pose": each}
+    {
+        "header": {"stamp": {"sec": i, "nanosec": 500_000_000}, "frame_id": "base"},
+        "pose": each,
+    }
     for i, each in enumerate(MESSAGES)
 ]
 DATA: dict[str, Any] = {
@@ -107,19 +114,30 @@ def test_nested_data_is_read_from_json_and_yaml(tmp_path: Path, kind: str) -> No
 
 def test_messages_of_ros_are_read_with_their_times(tmp_path: Path) -> None:
     tf: list[Any] = [
-        {"transforms": [{"header": s["header"], "child_frame_id": "tool0", "transform": t}]}
+        {
+            "transforms": [
+                {"header": s["header"], "child_frame_id": "tool0", "transform": t}
+            ]
+        }
         for s, t in zip(STAMPED, TRANSFORMS, strict=True)
     ]
     for name, documents in (("p.yaml", STAMPED), ("p.txt", STAMPED), ("tf.yaml", tf)):
-        text = "---\n".join(yaml.safe_dump(each, sort_keys=False) for each in documents) + "---\n"
+        text = (
+            "---\n".join(yaml.safe_dump(each, sort_keys=False) for each in documents)
+            + "---\n"
+        )
         (tmp_path / name).write_text(text)
-        np.testing.assert_allclose(assert_arm(tmp_path / name).stamps_s, np.arange(5) + 0.5)
+        np.testing.assert_allclose(
+            assert_arm(tmp_path / name).stamps_s, np.arange(5) + 0.5
+        )
     tf[1]["transforms"][0]["child_frame_id"] = "camera"
     (tmp_path / "p.yaml").write_text(yaml.safe_dump_all(tf))
     refused("holds poses of camera and tool0", read_robot_poses, tmp_path / "p.yaml")
 
 
-def test_the_poses_of_the_camera_are_read_beside_those_of_the_robot(tmp_path: Path) -> None:
+def test_the_poses_of_the_camera_are_read_beside_those_of_the_robot(
+    tmp_path: Path,
+) -> None:
     file = tmp_path / "p.npz"
     board = ARM.inverse()
     parts: dict[str, Any] = {"R_gripper2base": R, "t_gripper2base": T[:, :, None]}
@@ -135,7 +153,9 @@ def test_the_poses_of_the_camera_are_read_beside_those_of_the_robot(tmp_path: Pa
     np.savez(file, R_a=R, t_a=T, R_b=R, t_b=T)
     refused("R_a with t_a and R_b with t_b of its keys", read_robot_poses, file)
     vectors = np.array(numbers("ur"))
-    np.savez(file, rvecs=vectors[:, 3:, None], tvecs=vectors[:, :3, None], mtx=np.eye(3))
+    np.savez(
+        file, rvecs=vectors[:, 3:, None], tvecs=vectors[:, :3, None], mtx=np.eye(3)
+    )
     assert_arm(file, robot=False)
 
 
@@ -145,7 +165,9 @@ def test_samples_of_a_fixed_camera_are_inverse_in_easy_handeye(tmp_path: Path) -
     for stated in ({"calibration_type": "eye_on_base"}, {"eye_on_hand": False}):
         data = {"parameters": stated, "samples": samples}
         (tmp_path / "p.yaml").write_text(yaml.safe_dump(data))
-        refused("gripper_from_base .* wxyz:inverse", read_robot_poses, tmp_path / "p.yaml")
+        refused(
+            "gripper_from_base .* wxyz:inverse", read_robot_poses, tmp_path / "p.yaml"
+        )
         assert_arm(tmp_path / "p.yaml", "wxyz:inverse")
 
 
@@ -222,7 +244,10 @@ def test_the_poses_of_visp_are_read_by_role(tmp_path: Path) -> None:
     assert np.max(pose_distance(camera.poses, ARM[::-1])) < 1e-9
     images = [Path(f"image-{i:03d}.png") for i in range(1, 6)]
     poses, notes = pair_images(images, read, None, tmp_path)
-    assert np.max(pose_distance(SE3.stack([p for p in poses if p is not None]), ARM)) < 1e-9
+    assert (
+        np.max(pose_distance(SE3.stack([p for p in poses if p is not None]), ARM))
+        < 1e-9
+    )
     assert "paired by numbers: franka_pose_fPe_1 with image-001.png" in notes[0]
     images[0] = Path("image-000.png")
     refused("names no image", pair_images, images, read, None, tmp_path)
@@ -239,14 +264,21 @@ ROBODK = {
     "techman": (70, -35, 20),
     "nachi": (20, -35, 70),
     "comau": (-81.79197702162966, 73.72985782780218, 126.69146391665883),
-    "abb": (0.7394199622861923, 0.5814926354071172, -0.1475908708920294, 0.30551819777110445),
+    "abb": (
+        0.7394199622861923,
+        0.5814926354071172,
+        -0.1475908708920294,
+        0.30551819777110445,
+    ),
     "ur:mm": (1.2758617739125704, -0.3238313589608379, 0.6703420921193699),
 }
 
 
 @pytest.mark.parametrize("name", ROBODK)
 def test_conventions_agree_with_robodk(name: str) -> None:
-    expected = poses_from_numbers([400, 31, 553, 20, -35, 70], pose_convention("moving_zyx:mm:deg"))
+    expected = poses_from_numbers(
+        [400, 31, 553, 20, -35, 70], pose_convention("moving_zyx:mm:deg")
+    )
     read = poses_from_numbers([400, 31, 553, *ROBODK[name]], pose_convention(name))
     assert max(pose_distance(read, expected)) < 1e-9
 
@@ -311,7 +343,11 @@ HEADED = [
         np.c_[1000 * T, R.reshape(5, 9)].tolist(),
         None,
     ),
-    ("n,x,y,z,a1,a2,a3", [[i, *row] for i, row in enumerate(numbers("staubli"))], "staubli"),
+    (
+        "n,x,y,z,a1,a2,a3",
+        [[i, *row] for i, row in enumerate(numbers("staubli"))],
+        "staubli",
+    ),
 ]
 
 
@@ -326,7 +362,9 @@ def test_a_stated_convention_wins_over_letters(
 WXYZ = "x,y,z,qw,qx,qy,qz"
 
 
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "latin-1"])
+@pytest.mark.parametrize(
+    "encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "latin-1"]
+)
 def test_encodings_are_recognised(tmp_path: Path, encoding: str) -> None:
     text = table(numbers("kuka"), "X [mm],Y [mm],Z [mm],A [°],B [°],C [°]")
     (tmp_path / "p.csv").write_bytes(text.replace("\n", "\r\n").encode(encoding))

@@ -20,7 +20,9 @@ FLIP = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
 
 
 def stated(frames: tuple[Frame, ...]) -> SE3:
-    return SE3.stack([f.base_from_camera for f in frames if f.base_from_camera is not None])
+    return SE3.stack(
+        [f.base_from_camera for f in frames if f.base_from_camera is not None]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +34,8 @@ def bedroom() -> tuple[Frame, ...]:
 @pytest.fixture(scope="module", autouse=True)
 def matched_once() -> Iterator[None]:
     """Every pair of images is matched once for all tests."""
-    real, cache = pose_evidence.measured_rotation, {}
+    real = pose_evidence.measured_rotation
+    cache = {}
 
     def cached(first: Frame, second: Frame) -> np.ndarray | None:
         key = first.image, second.image
@@ -51,9 +54,14 @@ def test_measured_rotations_agree_with_true_poses(bedroom: tuple[Frame, ...]) ->
     first, second = pairs.T
     assert len(measured) >= 8
     rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
-    off = Rotation.from_rotvec(measured).inv() * rotation[first].inv() * rotation[second]
+    off = (
+        Rotation.from_rotvec(measured).inv() * rotation[first].inv() * rotation[second]
+    )
     assert np.rad2deg(np.median(off.magnitude())) < 1.0
-    assert np.rad2deg(np.median(np.linalg.norm(measured, axis=1))) > pose_evidence.LEAST_DEG
+    assert (
+        np.rad2deg(np.median(np.linalg.norm(measured, axis=1)))
+        > pose_evidence.LEAST_DEG
+    )
 
 
 def reordered(poses: SE3) -> SE3:
@@ -63,17 +71,28 @@ def reordered(poses: SE3) -> SE3:
 
 def as_degrees(poses: SE3) -> SE3:
     """Rotation vectors in degrees read as radians."""
-    rotvec = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True).as_rotvec(degrees=True)
+    rotvec = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True).as_rotvec(
+        degrees=True
+    )
     turned = Rotation.from_rotvec(rotvec).as_quat(scalar_first=True)
     return SE3(turned, poses.translation_m)
 
 
 WRONG: dict[str, tuple[Callable[[SE3], SE3], str]] = {
-    "inverse": (lambda poses: poses.inverse(), "they are camera_from_base, the inverse"),
+    "inverse": (
+        lambda poses: poses.inverse(),
+        "they are camera_from_base, the inverse",
+    ),
     "opengl": (lambda poses: poses @ FLIP, "they are with OpenGL's camera axes"),
-    "both": (lambda poses: (poses @ FLIP).inverse(), "the inverse with OpenGL's camera axes"),
+    "both": (
+        lambda poses: (poses @ FLIP).inverse(),
+        "the inverse with OpenGL's camera axes",
+    ),
     "order": (reordered, "they are with quaternions in another order"),
-    "body": (lambda poses: poses @ GRIPPER_FROM_CAMERA, "those of another frame, at a fixed angle"),
+    "body": (
+        lambda poses: poses @ GRIPPER_FROM_CAMERA,
+        "those of another frame, at a fixed angle",
+    ),
     "degrees": (as_degrees, "are angles in the stated unit and Euler order"),
 }
 
@@ -97,7 +116,10 @@ def test_wrong_gripper_poses_are_reported(bedroom: tuple[Frame, ...]) -> None:
     (warning,) = rotation_warnings(bedroom, reordered(gripper), False)
     assert "with quaternions in another order" in warning
     (warning,) = rotation_warnings(bedroom, as_degrees(gripper), False)
-    assert "are angles in the stated unit" in warning or "the angles in another unit" in warning
+    assert (
+        "are angles in the stated unit" in warning
+        or "the angles in another unit" in warning
+    )
 
 
 def test_still_camera_is_reported(bedroom: tuple[Frame, ...]) -> None:
@@ -118,7 +140,9 @@ def test_images_without_texture_give_no_warning(tmp_path: Path) -> None:
     assert rotation_warnings(frames, poses, True) == []
 
 
-def test_wrist_recordings_are_inspected_by_gripper_poses(bedroom: tuple[Frame, ...]) -> None:
+def test_wrist_recordings_are_inspected_by_gripper_poses(
+    bedroom: tuple[Frame, ...],
+) -> None:
     gripper = stated(bedroom) @ GRIPPER_FROM_CAMERA.inverse()
 
     def warned(poses: SE3) -> tuple[str, ...]:
@@ -131,7 +155,9 @@ def test_wrist_recordings_are_inspected_by_gripper_poses(bedroom: tuple[Frame, .
         return inspection.warnings
 
     assert warned(gripper) == ()
-    (millimetres,) = warned(SE3(gripper.rotation_wxyz, 1000 * gripper.translation_m))[:1]
+    (millimetres,) = warned(SE3(gripper.rotation_wxyz, 1000 * gripper.translation_m))[
+        :1
+    ]
     assert "farther than arms reach; are the poses in millimetres?" in millimetres
     (nowhere,) = warned(SE3(gripper.rotation_wxyz, 1e-6 * gripper.translation_m))
     assert "stand at one point, rotating by" in nowhere
@@ -143,7 +169,9 @@ def test_wrist_recordings_are_inspected_by_gripper_poses(bedroom: tuple[Frame, .
 def test_many_cameras_are_summarised_in_one_line(bedroom: tuple[Frame, ...]) -> None:
     camera = bedroom[0].camera
     frames = tuple(
-        dataclasses.replace(f, camera=dataclasses.replace(camera, fx=camera.fx + i / 10))
+        dataclasses.replace(
+            f, camera=dataclasses.replace(camera, fx=camera.fx + i / 10)
+        )
         for i, f in enumerate(bedroom)
     )
     (line,) = inspect_recording(Recording("phone", frames, ())).cameras

@@ -43,11 +43,15 @@ def plain(row: list[float]) -> str:
 
 
 def kuka(row: list[float]) -> str:
-    return ", ".join(f"{key} {value!r}" for key, value in zip("XYZABC", row, strict=True))
+    return ", ".join(
+        f"{key} {value!r}" for key, value in zip("XYZABC", row, strict=True)
+    )
 
 
 def blocks(matrices: Array) -> str:
-    return "\n\n".join("\n".join(plain(row) for row in matrix) for matrix in matrices.tolist())
+    return "\n\n".join(
+        "\n".join(plain(row) for row in matrix) for matrix in matrices.tolist()
+    )
 
 
 def printed(matrices: Array) -> str:
@@ -60,11 +64,15 @@ FORMS = {
     "ur list": lines(numbers("ur"), lambda _, row: f"p[{', '.join(map(repr, row))}]"),
     "kuka frame": lines(numbers("kuka"), lambda _, row: f"{{{kuka(row)}}}"),
     "kuka e6pos": "&ACCESS RVP\n"
-    + lines(numbers("kuka"), lambda _, row: f"E6POS: {{{kuka(row)}, S 2, T 35, E1 0.0}}"),
+    + lines(
+        numbers("kuka"), lambda _, row: f"E6POS: {{{kuka(row)}, S 2, T 35, E1 0.0}}"
+    ),
     "rows of 16": lines(numbers("matrix"), lambda _, row: plain(row)),
     "rows of 12": lines(numbers("matrix")[:, :12], lambda _, row: plain(row)),
     "columns of 16": lines(numbers("franka"), lambda _, row: plain(row)),
-    "stamp and 12": lines(numbers("matrix")[:, :12], lambda i, row: f"{i}.5 {plain(row)}"),
+    "stamp and 12": lines(
+        numbers("matrix")[:, :12], lambda i, row: f"{i}.5 {plain(row)}"
+    ),
     "4x4 blocks": blocks(MATRICES),
     "3x4 blocks": blocks(MATRICES[:, :3]),
     "4x4 lines": blocks(MATRICES).replace("\n\n", "\n"),
@@ -99,13 +107,17 @@ def test_forms_define_their_poses(tmp_path: Path, form: str) -> None:
 
 @pytest.mark.parametrize("before", ["{}.png ", "{}.png, ", "{}.png = ", "{}.5 "])
 @pytest.mark.parametrize("notation", ["ur", "kuka", "matrix"])
-def test_notations_may_follow_a_name_or_a_stamp(tmp_path: Path, notation: str, before: str) -> None:
+def test_notations_may_follow_a_name_or_a_stamp(
+    tmp_path: Path, notation: str, before: str
+) -> None:
     forms = {
         "ur": lambda row: f"p[{', '.join(map(repr, row))}]",
         "kuka": lambda row: f"{{{kuka(row)}}}",
         "matrix": lambda row: f"[{plain(row)}]",
     }
-    text = lines(numbers(notation), lambda i, row: before.format(i) + forms[notation](row))
+    text = lines(
+        numbers(notation), lambda i, row: before.format(i) + forms[notation](row)
+    )
     (tmp_path / "p.txt").write_text(text)
     read = read_robot_poses(tmp_path / "p.txt")
     assert_arm(read.poses)
@@ -121,12 +133,36 @@ def test_notations_may_follow_a_name_or_a_stamp(tmp_path: Path, notation: str, b
     [
         (FORMS["ur list"], "kuka", "are none of kuka"),
         (FORMS["kuka frame"], "ur", "are none of ur"),
-        (FORMS["ur list"] + "\n" + FORMS["kuka frame"], None, r"mixes the brackets p\[ and {"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", None, "in both orders; give --c matrix .* or franka"),
-        ("1 0 0 5 0 2 0 0 0 0 1 0", None, "12 numbers are rigid transforms in no order; give --c"),
-        (blocks(MATRICES.swapaxes(1, 2)), None, "written column after column; give --c franka"),
-        ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n1 0 0 0", None, "5 rows of 4 numbers are no"),
-        ("[[0.1 0.2 0.3 0.4 0.5 0.6]]", None, "6 columns without a header .* give --c NAME"),
+        (
+            FORMS["ur list"] + "\n" + FORMS["kuka frame"],
+            None,
+            r"mixes the brackets p\[ and {",
+        ),
+        (
+            "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1",
+            None,
+            "in both orders; give --c matrix .* or franka",
+        ),
+        (
+            "1 0 0 5 0 2 0 0 0 0 1 0",
+            None,
+            "12 numbers are rigid transforms in no order; give --c",
+        ),
+        (
+            blocks(MATRICES.swapaxes(1, 2)),
+            None,
+            "written column after column; give --c franka",
+        ),
+        (
+            "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n1 0 0 0",
+            None,
+            "5 rows of 4 numbers are no",
+        ),
+        (
+            "[[0.1 0.2 0.3 0.4 0.5 0.6]]",
+            None,
+            "6 columns without a header .* give --c NAME",
+        ),
     ],
 )
 def test_ambiguous_forms_are_asked_for(
@@ -146,16 +182,26 @@ def test_conventions_of_matrices_take_12_numbers(tmp_path: Path) -> None:
             lines(rows.reshape(5, 12), lambda i, row: f"{i}.png {i}.5 {plain(row)}")
         )
         assert_arm(read_robot_poses(tmp_path / "p.txt", name).poses)
-    with pytest.raises(InputError, match=r"in columns, or rotations .*give the convention franka"):
+    with pytest.raises(
+        InputError, match=r"in columns, or rotations .*give the convention franka"
+    ):
         read_robot_poses(tmp_path / "p.txt")
 
 
 def test_arrays_by_name_are_read(tmp_path: Path) -> None:
     file = tmp_path / "p.npz"
     camera: dict[str, Any] = {"K": np.eye(3), "D": np.zeros((1, 5))}
-    for key, poses in (("any", MATRICES), ("T", MATRICES[:, :3]), ("poses", numbers("franka"))):
+    for key, poses in (
+        ("any", MATRICES),
+        ("T", MATRICES[:, :3]),
+        ("poses", numbers("franka")),
+    ):
         stamps = np.arange(5) * 0.5
-        arrays: dict[str, Any] = {key: poses, "images": np.array(NAMES), "stamps_s": stamps}
+        arrays: dict[str, Any] = {
+            key: poses,
+            "images": np.array(NAMES),
+            "stamps_s": stamps,
+        }
         np.savez(file, **arrays, **camera)
         read = read_robot_poses(file)
         assert_arm(read.poses)
@@ -165,7 +211,9 @@ def test_arrays_by_name_are_read(tmp_path: Path) -> None:
     np.savez(file, one=MATRICES, other=MATRICES, **camera)
     refused(r"one and other of its keys .* call the right one", read_robot_poses, file)
     np.savez(file, robot=MATRICES, gripper=MATRICES, **camera)
-    refused(r"robot and gripper of its keys .* call the right one", read_robot_poses, file)
+    refused(
+        r"robot and gripper of its keys .* call the right one", read_robot_poses, file
+    )
     np.savez(file, board=MATRICES[::-1], base_from_gripper=MATRICES)
     assert_arm(read_robot_poses(file).poses)
     np.savez(file, **camera)
@@ -199,7 +247,9 @@ def test_json_of_3x4_matrices_and_named_numbers_is_read(tmp_path: Path) -> None:
 
 def test_numbers_and_convention_are_returned(tmp_path: Path) -> None:
     file = tmp_path / "p.csv"
-    rows = lines(numbers("kuka"), lambda _, row: ",".join(map(repr, [*row[3:], *row[:3]])))
+    rows = lines(
+        numbers("kuka"), lambda _, row: ",".join(map(repr, [*row[3:], *row[:3]]))
+    )
     file.write_text("A,B,C,X,Y,Z\n" + rows)
     read = read_robot_poses(file, "kuka:inverse")
     assert read.numbers is not None
@@ -228,4 +278,6 @@ def test_opengl_flips_the_axes_of_the_camera(
     stated = flip @ MATRICES if camera_from else MATRICES @ flip
     np.save(tmp_path / "p.npy", np.linalg.inv(stated) if inverse else stated)
     name = "matrix:opengl" + (":inverse" if inverse else "")
-    assert_arm(read_robot_poses(tmp_path / "p.npy", name, camera_from=camera_from).poses)
+    assert_arm(
+        read_robot_poses(tmp_path / "p.npy", name, camera_from=camera_from).poses
+    )

@@ -10,23 +10,32 @@ from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.pose_track import PoseTrack
 
 
-def turning(stamps: np.ndarray, axis: np.ndarray, rate: float, speed: np.ndarray) -> SE3:
+def turning(
+    stamps: np.ndarray, axis: np.ndarray, rate: float, speed: np.ndarray
+) -> SE3:
     """A frame that turns about a fixed axis and moves on a line, both at constant speed."""
-    rotation = Rotation.from_rotvec(np.outer(stamps * rate, axis / np.linalg.norm(axis)))
+    rotation = Rotation.from_rotvec(
+        np.outer(stamps * rate, axis / np.linalg.norm(axis))
+    )
     return SE3(rotation.as_quat(scalar_first=True), np.outer(stamps, speed))
 
 
 @given(
-    st.lists(st.floats(-3, 3), min_size=3, max_size=3).filter(lambda a: np.linalg.norm(a) > 0.1),
+    st.lists(st.floats(-3, 3), min_size=3, max_size=3).filter(
+        lambda a: np.linalg.norm(a) > 0.1
+    ),
     st.floats(-6, 6),
     st.lists(st.floats(0, 1), min_size=1, max_size=8),
 )
 def test_steady_motion_is_interpolated_exactly(
     axis: list[float], rate: float, when: list[float]
 ) -> None:
-    stamps, speed = np.linspace(0, 1, 9), np.array([0.3, -0.2, 0.1])
+    stamps = np.linspace(0, 1, 9)
+    speed = np.array([0.3, -0.2, 0.1])
     shuffled = np.random.default_rng(0).permutation(len(stamps))
-    track = PoseTrack(stamps[shuffled], turning(stamps, np.array(axis), rate, speed)[shuffled])
+    track = PoseTrack(
+        stamps[shuffled], turning(stamps, np.array(axis), rate, speed)[shuffled]
+    )
     poses, valid = track.at(np.array(when))
     assert valid.all()
     expected = turning(np.array(when), np.array(axis), rate, speed)
@@ -36,7 +45,9 @@ def test_steady_motion_is_interpolated_exactly(
 
 
 def test_times_beyond_the_ends_are_invalid() -> None:
-    track = PoseTrack(np.array([1.0, 1.1, 1.2]), SE3.exp(np.arange(18).reshape(3, 6) * 0.01))
+    track = PoseTrack(
+        np.array([1.0, 1.1, 1.2]), SE3.exp(np.arange(18).reshape(3, 6) * 0.01)
+    )
     _, valid = track.at(np.array([0.999, 1.0, 1.15, 1.2, 1.201]))
     assert valid.tolist() == [False, True, True, True, False]
     one = PoseTrack(np.array([2.0]), SE3.identity((1,)))

@@ -13,7 +13,11 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
-from evercal.recordings.poses.conventions import CONVENTIONS, numbers_from_poses, pose_convention
+from evercal.recordings.poses.conventions import (
+    CONVENTIONS,
+    numbers_from_poses,
+    pose_convention,
+)
 from evercal.recordings.poses.robot_poses import read_robot_poses
 
 from ..checks import refused
@@ -97,7 +101,8 @@ def test_lines_of_ros2_topic_echo_csv_are_read(tmp_path: Path) -> None:
     """A PoseStamped: seconds, nanoseconds, frame, position and quaternion."""
     rows = numbers_from_poses(arm(), pose_convention("xyzw")).tolist()
     text = "".join(
-        f"{1700000000 + i},250000000,base,{str(row)[1:-1]}\n" for i, row in enumerate(rows)
+        f"{1700000000 + i},250000000,base,{str(row)[1:-1]}\n"
+        for i, row in enumerate(rows)
     )
     (tmp_path / "p.csv").write_text(text)
     read = read_robot_poses(tmp_path / "p.csv", "xyzw")
@@ -113,7 +118,10 @@ def test_columns_may_be_in_any_order(
 ) -> None:
     header = ["x", "y", "z", "qw", "qx", "qy", "qz", "stamp", "image"]
     numbers = numbers_from_poses(arm(seed), CONVENTIONS["wxyz"])
-    rows = [[*map(repr, row.tolist()), f"{i}.5", f"{i}.png"] for i, row in enumerate(numbers)]
+    rows = [
+        [*map(repr, row.tolist()), f"{i}.5", f"{i}.png"]
+        for i, row in enumerate(numbers)
+    ]
     lines = [",".join(row[k] for k in order) for row in [header, *rows]]
     file = tmp_path_factory.getbasetemp() / "shuffled.csv"
     file.write_text("\n".join(lines))
@@ -129,7 +137,9 @@ def test_columns_may_be_in_any_order(
 def test_tables_without_header_are_read(tmp_path: Path, name: str, extra: str) -> None:
     lines = ["# made by a robot"]
     for i, row in enumerate(numbers_from_poses(arm(), CONVENTIONS[name])):
-        before = {"": "", "name": f"{i}.png ", "stamp": f"{i}.5 "}.get(extra, f"{i}.5 {i}.png ")
+        before = {"": "", "name": f"{i}.png ", "stamp": f"{i}.5 "}.get(
+            extra, f"{i}.5 {i}.png "
+        )
         lines.append(before + " ".join(map(repr, row.tolist())))
     file = tmp_path / "poses.txt"
     file.write_text("\n".join(lines))
@@ -141,9 +151,14 @@ def test_tables_without_header_are_read(tmp_path: Path, name: str, extra: str) -
 
 def test_tum_files_are_read(tmp_path: Path) -> None:
     numbers = numbers_from_poses(arm(), CONVENTIONS["xyzw"])
-    lines = [f"{1.7e9 + i} " + " ".join(map(repr, row.tolist())) for i, row in enumerate(numbers)]
+    lines = [
+        f"{1.7e9 + i} " + " ".join(map(repr, row.tolist()))
+        for i, row in enumerate(numbers)
+    ]
     (tmp_path / "a.tum").write_text("\n".join(lines))
-    (tmp_path / "b.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines))
+    (tmp_path / "b.txt").write_text(
+        "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines)
+    )
     (tmp_path / "c.txt").write_text("# ground truth\n" + "\n".join(lines))
     for name, message in (("a.tum", None), ("b.txt", None), ("c.txt", "tum")):
         read = read_robot_poses(tmp_path / name, message)
@@ -152,21 +167,32 @@ def test_tum_files_are_read(tmp_path: Path) -> None:
         assert read.stamps_s[2] == 1.7e9 + 2
     inverse = read_robot_poses(tmp_path / "c.txt", "tum:inverse")
     assert same(inverse.poses, arm().inverse())
-    refused(r"8 columns without a header .* xyzw, tum, ", read_robot_poses, tmp_path / "c.txt")
+    refused(
+        r"8 columns without a header .* xyzw, tum, ",
+        read_robot_poses,
+        tmp_path / "c.txt",
+    )
 
 
 def test_decimal_commas_are_read(tmp_path: Path) -> None:
     text = table("image,x,y,z,qw,qx,qy,qz", np.array([[0]]), ";").splitlines()[0]
-    (tmp_path / "p.csv").write_text(text + "\na,b.png;0,5;0,25;0,1;1;0;0;0\n", encoding="utf-8-sig")
+    (tmp_path / "p.csv").write_text(
+        text + "\na,b.png;0,5;0,25;0,1;1;0;0;0\n", encoding="utf-8-sig"
+    )
     read = read_robot_poses(tmp_path / "p.csv")
     np.testing.assert_array_equal(read.poses.translation_m, [[0.5, 0.25, 0.1]])
     assert read.names == ("a,b.png",)
 
 
 def test_json_is_read(tmp_path: Path) -> None:
-    file, poses, matrices = tmp_path / "p.json", arm(), arm().matrix()
+    file = tmp_path / "p.json"
+    poses = arm()
+    matrices = arm().matrix()
     objects = [
-        {"translation_m": p.translation_m.tolist(), "quaternion_wxyz": p.rotation_wxyz.tolist()}
+        {
+            "translation_m": p.translation_m.tolist(),
+            "quaternion_wxyz": p.rotation_wxyz.tolist(),
+        }
         for p in poses
     ]
     kuka = numbers_from_poses(poses, CONVENTIONS["kuka"]).tolist()
@@ -186,12 +212,17 @@ def test_json_is_read(tmp_path: Path) -> None:
 
 
 def test_npy_files_are_read(tmp_path: Path) -> None:
-    file, matrices = tmp_path / "p.npy", arm().matrix()
+    file = tmp_path / "p.npy"
+    matrices = arm().matrix()
     np.save(file, matrices[0])
     assert same(read_robot_poses(file).poses, arm()[:1])
     np.save(file, matrices.swapaxes(1, 2))
     assert same(read_robot_poses(file, "franka").poses, arm())
-    refused("written column after column; give the convention franka", read_robot_poses, file)
+    refused(
+        "written column after column; give the convention franka",
+        read_robot_poses,
+        file,
+    )
     for name in ("wxyz", "xyzw", "ur", "kuka", "franka"):
         np.save(file, numbers_from_poses(arm(), CONVENTIONS[name]))
         assert same(read_robot_poses(file, name).poses, arm())
@@ -202,11 +233,27 @@ def test_npy_files_are_read(tmp_path: Path) -> None:
 
 Q = "0.5,0.1,0.2,1,0,0,0"
 REFUSED = [
-    ("x,y,z,rx,ry,rz\n0.5,0,0,0.1,0.2,0.3", None, "give the convention ur .rotation vector., yask"),
-    ("x,y,z,roll,pitch,yaw\n0.5,0,0,0.1,0.2,0.3", None, "give the convention rpy:rad or rpy:deg"),
-    ("x,y,z,a,b,c\n500,0,0,10,20,30", None, "columns a, b, c .* give the convention kuka"),
+    (
+        "x,y,z,rx,ry,rz\n0.5,0,0,0.1,0.2,0.3",
+        None,
+        "give the convention ur .rotation vector., yask",
+    ),
+    (
+        "x,y,z,roll,pitch,yaw\n0.5,0,0,0.1,0.2,0.3",
+        None,
+        "give the convention rpy:rad or rpy:deg",
+    ),
+    (
+        "x,y,z,a,b,c\n500,0,0,10,20,30",
+        None,
+        "columns a, b, c .* give the convention kuka",
+    ),
     ("x,y,z,q1,q2,q3,q4\n" + Q, None, "give the convention abb, wxyz or xyzw"),
-    ("x,y,z,qw,qx,qy,qz,rvec_x,rvec_y,rvec_z\n" + Q + ",0,0,0", None, "names quaternion and"),
+    (
+        "x,y,z,qw,qx,qy,qz,rvec_x,rvec_y,rvec_z\n" + Q + ",0,0,0",
+        None,
+        "names quaternion and",
+    ),
     ("a1,a2,a3,a4,a5,a6,a7\n" + Q, None, "a1, .* name no known pose"),
     ("x,y,z,u,v\n0,0,0,0,0", "kuka", "columns x, y, z, u, v are none of kuka"),
     ("x,y,z,qw,qx,qy,qz\n" + Q, "kuka", "are none of kuka"),
@@ -215,17 +262,41 @@ REFUSED = [
     (Q + ",3,4", "wxyz", "rows have 9 numbers; wxyz takes 7"),
     (Q + "\n1,2", "wxyz", "row 2, column 3: '' is not a finite number"),
     ("x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,1,0,0", None, "row 1, column 'qz': '' is not"),
-    ("x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,1,0,0,none", None, "row 1, column 'qz': 'none' is not a fin"),
+    (
+        "x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,1,0,0,none",
+        None,
+        "row 1, column 'qz': 'none' is not a fin",
+    ),
     ("x,y,z,qw,qx,qy,qz\n500,100,200,1,0,0,0", None, "look like millimetres.* wxyz:mm"),
-    ("x_m,y_m,z_m,qw,qx,qy,qz\n500,100,200,1,0,0,0", None, "look like millimetres.* wxyz:mm"),
-    ("x,y,z,rotvec_x,rotvec_y,rotvec_z\n0.5,0,0,100,20,3", None, "look like degrees.* ur:deg"),
-    ("x_m,y_m,z_m,A,B,C\n500,0,0,100,20,3", "kuka", "look like millimetres; .* kuka:mm"),
+    (
+        "x_m,y_m,z_m,qw,qx,qy,qz\n500,100,200,1,0,0,0",
+        None,
+        "look like millimetres.* wxyz:mm",
+    ),
+    (
+        "x,y,z,rotvec_x,rotvec_y,rotvec_z\n0.5,0,0,100,20,3",
+        None,
+        "look like degrees.* ur:deg",
+    ),
+    (
+        "x_m,y_m,z_m,A,B,C\n500,0,0,100,20,3",
+        "kuka",
+        "look like millimetres; .* kuka:mm",
+    ),
     ("x_m,y,z,qw,qx,qy,qz\n" + Q, None, "x_m, y, z differ in unit"),
-    ("stamp_s,x,y,z,qw,qx,qy,qz\n1.7e18," + Q, None, "not in seconds; call the column stamp_ns"),
+    (
+        "stamp_s,x,y,z,qw,qx,qy,qz\n1.7e18," + Q,
+        None,
+        "not in seconds; call the column stamp_ns",
+    ),
     ("image,x,y,z,qw,qx,qy,qz\na," + Q + "\na," + Q, None, "'a' comes twice"),
     ("x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,nan,0,0,0", None, "'nan' is not a finite"),
     ("x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,1,1,0,0", None, "not of length 1"),
-    ("x,y,z,qw,qx,qy,qz,px,py,pz\n" + Q + ",1,2,3", None, "x and px may both be the position's"),
+    (
+        "x,y,z,qw,qx,qy,qz,px,py,pz\n" + Q + ",1,2,3",
+        None,
+        "x and px may both be the position's",
+    ),
     ("x,y,z,qw,qx,qy,qz,qw,qx,qy,qz\n" + Q + ",1,0,0,0", None, "qw and qw may both be"),
     (
         ",".join(f"{arm}_pos_{i}" for arm in ("left", "right") for i in "xyz")
@@ -242,7 +313,11 @@ REFUSED = [
         "name no known pose",
     ),
     (f"1,5,{Q}\n1,6,{Q}", "wxyz", "rows have 9 numbers"),
-    ("5,1,2,0,0,1,9\n4,1,2,0,0,1,9", "ur", "rows have 7 numbers; ur takes 6 .* that increases"),
+    (
+        "5,1,2,0,0,1,9\n4,1,2,0,0,1,9",
+        "ur",
+        "rows have 7 numbers; ur takes 6 .* that increases",
+    ),
     ("# nothing\n", None, "no line of numbers"),
     (",,,\n", None, "no line of numbers"),
     ("x,y,z,qw,qx,qy,qz\n", None, "no line of numbers"),
@@ -270,12 +345,32 @@ def test_given_convention_overrides_the_header(tmp_path: Path) -> None:
     ("data", "given", "message"),
     [
         ([{"translation_m": [1, 2, 3]}], None, "x_m, y_m, z_m name no known pose"),
-        ([{"translation_m": [1, 2], "quaternion_wxyz": [1, 0, 0, 0]}], None, "no known pose"),
-        ([{"translation_m": [1, 2, "x"], "quaternion_wxyz": [1, 0, 0, 0]}], None, "'x' is not"),
-        ([{"translation_m": [1, 2, 3], "quaternion_wxyz": [1, 0, 0, 0]}], "ur", "are none of ur"),
+        (
+            [{"translation_m": [1, 2], "quaternion_wxyz": [1, 0, 0, 0]}],
+            None,
+            "no known pose",
+        ),
+        (
+            [{"translation_m": [1, 2, "x"], "quaternion_wxyz": [1, 0, 0, 0]}],
+            None,
+            "'x' is not",
+        ),
+        (
+            [{"translation_m": [1, 2, 3], "quaternion_wxyz": [1, 0, 0, 0]}],
+            "ur",
+            "are none of ur",
+        ),
         ([{"matrix": np.eye(4).tolist()}], "kuka", r"got \(1, 4, 4\) for kuka"),
-        ([{"matrix": np.eye(3).tolist()}], None, r"or \(n, k\) numbers, got \(1, 3, 3\)"),
-        ([{"translation_m": [500, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}], None, "millimetres"),
+        (
+            [{"matrix": np.eye(3).tolist()}],
+            None,
+            r"or \(n, k\) numbers, got \(1, 3, 3\)",
+        ),
+        (
+            [{"translation_m": [500, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}],
+            None,
+            "millimetres",
+        ),
         ([], None, "a list of objects"),
         ([1, 2], None, "2 columns without a header"),
         ([[1, 2], {"x": 1}], None, "not of both"),
@@ -291,9 +386,14 @@ def test_broken_json_is_refused(
 
 def test_missing_and_broken_files_are_refused(tmp_path: Path) -> None:
     for name in ("no.csv", "no.json", "no.npy"):
-        refused("file of robot poses is missing; check", read_robot_poses, tmp_path / name)
+        refused(
+            "file of robot poses is missing; check", read_robot_poses, tmp_path / name
+        )
     refused(
-        "no.csv: camera file is missing", read_robot_poses, tmp_path / "no.csv", what="camera file"
+        "no.csv: camera file is missing",
+        read_robot_poses,
+        tmp_path / "no.csv",
+        what="camera file",
     )
     np.save(tmp_path / "o.npy", np.array([{}, {}], dtype=object), allow_pickle=True)
     np.save(tmp_path / "v.npy", np.zeros((2, 3, 4, 5)))

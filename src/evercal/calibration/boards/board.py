@@ -18,7 +18,13 @@ from evercal.errors import InputError
 
 BoardKind = Literal["chessboard", "charuco", "apriltag", "aprilgrid", "arucogrid"]
 
-_LEAST_COUNT = {"chessboard": 3, "charuco": 3, "apriltag": 0, "aprilgrid": 1, "arucogrid": 1}
+_LEAST_COUNT = {
+    "chessboard": 3,
+    "charuco": 3,
+    "apriltag": 0,
+    "aprilgrid": 1,
+    "arucogrid": 1,
+}
 _MOST_COUNT = 200
 _LEAST_M, _MOST_M = 0.0005, 2.0
 """Smallest and largest side of a square or marker: beyond, the unit is wrong."""
@@ -47,13 +53,16 @@ class Board:
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(BoardKind):
-            raise InputError(f"board {self.kind!r} is not known; use one of {get_args(BoardKind)}")
+            raise InputError(
+                f"board {self.kind!r} is not known; use one of {get_args(BoardKind)}"
+            )
         if not _LEAST_M <= self.size_m <= _MOST_M:
             raise InputError(
                 f"the side of a square or tag is {1000 * self.size_m:g} mm; allowed are"
                 f" {1000 * _LEAST_M:g} to {1000 * _MOST_M:g} mm; give millimetres: --square-mm 25"
             )
-        counts, least = (self.columns, self.rows), _LEAST_COUNT[self.kind]
+        counts = (self.columns, self.rows)
+        least = _LEAST_COUNT[self.kind]
         if min(counts) < least or max(counts) > _MOST_COUNT:
             raise InputError(
                 f"a {self.kind} has a size of {least}x{least} to {_MOST_COUNT}x{_MOST_COUNT}, got"

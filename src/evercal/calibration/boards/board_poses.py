@@ -22,14 +22,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.boards.board import Board
-from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma, strays
+from evercal.calibration.boards.corners import (
+    BoardPose,
+    BoardView,
+    board_pose,
+    pixel_sigma,
+    strays,
+)
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
 
 Array = NDArray[np.floating]
 
-FORMAT, VERSION = "evercal-board-poses", 1
+FORMAT = "evercal-board-poses"
+VERSION = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +72,9 @@ class BoardPoses:
     @property
     def detected(self) -> tuple[BoardImage, ...]:
         """Images that show the board."""
-        return tuple(image for image in self.images if image.camera_from_board is not None)
+        return tuple(
+            image for image in self.images if image.camera_from_board is not None
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON values described at the top of this file."""
@@ -105,7 +114,10 @@ def read_board_poses(path: str | os.PathLike[str]) -> BoardPoses:
 
 
 def board_poses(
-    board: Board, camera: Camera, views: Mapping[str, BoardView | str], camera_from: str = "file"
+    board: Board,
+    camera: Camera,
+    views: Mapping[str, BoardView | str],
+    camera_from: str = "file",
 ) -> BoardPoses:
     """Fit the pose of the board in every image; a view may be the reason for a missing board."""
     seen = {name: view for name, view in views.items() if isinstance(view, BoardView)}
@@ -114,7 +126,9 @@ def board_poses(
         with suppress(ValueError):
             fits[name] = board_pose(view, camera)
     seen = {name: seen[name] for name in fits}
-    stray = dict(zip(seen, strays([*seen.values()], [*fits.values()], camera), strict=True))
+    stray = dict(
+        zip(seen, strays([*seen.values()], [*fits.values()], camera), strict=True)
+    )
     left_out = {name: seen[name].pixels[mask].tolist() for name, mask in stray.items()}
     for name in (name for name, mask in stray.items() if mask.any()):
         seen[name] = seen[name][~stray[name]]
@@ -123,9 +137,12 @@ def board_poses(
     images: list[BoardImage] = []
     for name, view in views.items():
         if fit := fits.get(name):
-            pose, covariance = fit.camera_from_board, sigma**2 * fit.unit_covariance
+            pose = fit.camera_from_board
+            covariance = sigma**2 * fit.unit_covariance
             corners = tuple((x, y) for x, y in left_out[name])
-            image = BoardImage(name, seen[name], pose, covariance, fit.rms_px, left_out=corners)
+            image = BoardImage(
+                name, seen[name], pose, covariance, fit.rms_px, left_out=corners
+            )
         else:
             reason = "the detected corners fit no pose of the board"
             image = BoardImage(name, reason=view if isinstance(view, str) else reason)
@@ -148,12 +165,15 @@ def _image_to_dict(image: BoardImage) -> dict[str, Any]:
 
 
 def _image_from_dict(data: Mapping[str, Any]) -> BoardImage:
-    name, pose = str(data["name"]), data["camera_from_board"]
+    name = str(data["name"])
+    pose = data["camera_from_board"]
     if pose is None:
         return BoardImage(name, reason=str(data.get("reason", "no board")))
     covariance = np.asarray(data["covariance"], dtype=np.float64)
     if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
-        raise ValueError(f"'covariance' of {name} must be finite and 6x6, got {covariance.shape}")
+        raise ValueError(
+            f"'covariance' of {name} must be finite and 6x6, got {covariance.shape}"
+        )
     return BoardImage(
         name,
         BoardView(data["points_m"], data["pixels"]),

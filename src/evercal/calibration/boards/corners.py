@@ -42,7 +42,11 @@ class BoardView:
     def __post_init__(self) -> None:
         points = np.asarray(self.points_m, dtype=np.float64)
         pixels = np.asarray(self.pixels, dtype=np.float64)
-        if points.shape[1:] != (3,) or pixels.shape != (len(points), 2) or len(points) < 4:
+        if (
+            points.shape[1:] != (3,)
+            or pixels.shape != (len(points), 2)
+            or len(points) < 4
+        ):
             raise ValueError(
                 f"a view takes four corners or more, points (k, 3) and pixels (k, 2), got shapes"
                 f" {points.shape} and {pixels.shape}"
@@ -138,14 +142,18 @@ def board_pose(
     error = (view.pixels - projected).ravel()
     normal = jacobian.T @ jacobian
     unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    covariance = np.outer(unit, unit) * np.linalg.pinv(normal * np.outer(unit, unit), 1e-12)
+    covariance = np.outer(unit, unit) * np.linalg.pinv(
+        normal * np.outer(unit, unit), 1e-12
+    )
     by_z = by_point @ rotation.as_matrix()[:, 2:]
     by_lens = np.c_[by_camera, (by_z * by_bend[:, None]).reshape(-1, len(BEND))]
     lens_slope = -covariance @ (jacobian.T @ by_lens)
     unexplained = by_lens + jacobian @ lens_slope
     quaternion = rotation.as_quat(canonical=True, scalar_first=True)
     return BoardPose(
-        camera_from_board=SE3(quaternion, np.asarray(translation, dtype=np.float64).ravel()),
+        camera_from_board=SE3(
+            quaternion, np.asarray(translation, dtype=np.float64).ravel()
+        ),
         unit_covariance=(covariance + covariance.T) / 2,
         residual_px=error.reshape(-1, 2),
         lens_slope=lens_slope,
@@ -154,20 +162,29 @@ def board_pose(
     )
 
 
-def _refined(points: Array, pixels: Array, camera: Camera, start: SE3) -> tuple[Array, Array]:
+def _refined(
+    points: Array, pixels: Array, camera: Camera, start: SE3
+) -> tuple[Array, Array]:
     """Rotation vector and translation (3, 1) of the board that fit its corners best."""
     import cv2
 
-    rotvec = Rotation.from_quat(start.rotation_wxyz, scalar_first=True).as_rotvec().reshape(3, 1)
+    rotvec = (
+        Rotation.from_quat(start.rotation_wxyz, scalar_first=True)
+        .as_rotvec()
+        .reshape(3, 1)
+    )
     translation = start.translation_m.reshape(3, 1).copy()
     if camera.model == "pinhole":
         lens = camera.matrix(), lens_vector(camera)[4:]
-        refined = cv2.solvePnPRefineLM(points, pixels, *lens, rotvec.copy(), translation)
+        refined = cv2.solvePnPRefineLM(
+            points, pixels, *lens, rotvec.copy(), translation
+        )
         return np.asarray(refined[0], np.float64), np.asarray(refined[1], np.float64)
     for _ in range(20):  # Gauss and Newton
         projected, by_pose, _ = _projected(points, camera, rotvec, translation)
         step = np.linalg.lstsq(by_pose, (pixels - projected).ravel(), rcond=None)[0]
-        rotvec, translation = rotvec + step[:3, None], translation + step[3:, None]
+        rotvec = rotvec + step[:3, None]
+        translation = translation + step[3:, None]
         if np.abs(step).max() < 1e-10:
             break
     return rotvec, translation
@@ -179,15 +196,24 @@ def _projected(
     """Pixels (k, 2) and their derivatives (2 k, 6) by the pose and (2 k, q) by the intrinsics."""
     import cv2
 
-    matrix, terms = camera.matrix(), lens_vector(camera)[4:]
+    matrix = camera.matrix()
+    terms = lens_vector(camera)[4:]
     if camera.model == "fisheye":
         at = points[:, None].copy()
-        pixels, slopes = cv2.fisheye.projectPoints(at, rotvec, translation, matrix, terms)
+        pixels, slopes = cv2.fisheye.projectPoints(
+            at, rotvec, translation, matrix, terms
+        )
         by_camera, by_pose = np.split(np.asarray(slopes, np.float64)[:, :14], [8], 1)
     else:
-        pixels, slopes, *_ = cv2.projectPoints(points, rotvec, translation, matrix, terms)
+        pixels, slopes, *_ = cv2.projectPoints(
+            points, rotvec, translation, matrix, terms
+        )
         by_pose, by_camera = np.split(np.asarray(slopes, np.float64), [6], 1)
-    return np.reshape(pixels, (-1, 2)).astype(float), by_pose, by_camera[:, : 4 + len(terms)]
+    return (
+        np.reshape(pixels, (-1, 2)).astype(float),
+        by_pose,
+        by_camera[:, : 4 + len(terms)],
+    )
 
 
 def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
@@ -209,9 +235,17 @@ def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
     for solver in solvers:
         found = cv2.solvePnPGeneric(view.points_m, view.pixels, *lens, flags=solver)
         for rotvec, translation in zip(*found[1:3], strict=True):
-            if np.isfinite(rotvec).all() and np.isfinite(translation).all() and translation[2] > 0:
-                quaternion = Rotation.from_rotvec(np.ravel(rotvec)).as_quat(scalar_first=True)
-                poses.append(SE3(quaternion, np.asarray(translation, dtype=np.float64).ravel()))
+            if (
+                np.isfinite(rotvec).all()
+                and np.isfinite(translation).all()
+                and translation[2] > 0
+            ):
+                quaternion = Rotation.from_rotvec(np.ravel(rotvec)).as_quat(
+                    scalar_first=True
+                )
+                poses.append(
+                    SE3(quaternion, np.asarray(translation, dtype=np.float64).ravel())
+                )
     return poses
 
 
@@ -220,11 +254,16 @@ def pixel_sigma(poses: Sequence[BoardPose]) -> float:
     squared = np.array([pose.squared_px for pose in poses])
     freedom = np.array([max(2 * pose.corners - 6, 1) for pose in poses])
     inliers = squared / freedom <= 4 * np.median(squared / freedom) + 1e-12
-    return max(float(np.sqrt(squared[inliers].sum() / freedom[inliers].sum())), _LEAST_PX)
+    return max(
+        float(np.sqrt(squared[inliers].sum() / freedom[inliers].sum())), _LEAST_PX
+    )
 
 
 def strays(
-    views: Sequence[BoardView], poses: Sequence[BoardPose], camera: Camera, bend: Bend | None = None
+    views: Sequence[BoardView],
+    poses: Sequence[BoardPose],
+    camera: Camera,
+    bend: Bend | None = None,
 ) -> list[NDArray[np.bool_]]:
     """Return (k,) of every view: whether a corner leaves its neighbours by many sigma.
 
@@ -234,7 +273,8 @@ def strays(
     usual = np.median([_apart(*both)[1] for both in zip(views, poses, strict=True)])
     stray = []
     for view, fit in zip(views, poses, strict=True):
-        pose, keep = fit, np.ones(fit.corners, dtype=bool)
+        pose = fit
+        keep = np.ones(fit.corners, dtype=bool)
         apart, typical = _apart(view, pose)
         while apart.max() > _STRAY * max(typical, usual):
             keep[np.flatnonzero(keep)[apart.argmax()]] = False
@@ -264,7 +304,8 @@ _USUAL_CENTRE, _USUAL_ASPECT, _ROUGH_FOCAL = 0.1, 0.02, 0.5
 """Standard deviations of the principal point from the middle of the image, in widths, of the ratio
 of both focal lengths from one, and of a rough focal length, relative."""
 _USUAL_DISTORTION = (0.3, 0.5, 2e-3, 2e-3, 0.5, 0.1, 0.1, 0.1)
-_USUAL_FISHEYE, _STATED_FISHEYE = (0.1, 0.1, 0.1, 0.1), (0.01, 0.01, 0.01, 0.01)
+_USUAL_FISHEYE = (0.1, 0.1, 0.1, 0.1)
+_STATED_FISHEYE = (0.01, 0.01, 0.01, 0.01)
 _STATED = 0.005
 """Standard deviation of a stated focal length and principal point, relative to the focal length."""
 _STATED_DISTORTION = (0.02, 0.05, 5e-4, 5e-4, 0.1, 0.02, 0.02, 0.02)
@@ -306,7 +347,9 @@ class LensPrior(NamedTuple):
         return prior
 
     @classmethod
-    def _around(cls, mean: Array, sigma_px: float, sigma_terms: Sequence[float]) -> "LensPrior":
+    def _around(
+        cls, mean: Array, sigma_px: float, sigma_terms: Sequence[float]
+    ) -> "LensPrior":
         sigma = np.r_[np.full(4, sigma_px), sigma_terms][: len(mean)]
         sigma = np.r_[sigma, np.full(len(BEND), _USUAL_BEND)]
         return cls(np.r_[mean, np.zeros(len(BEND))], np.diag(sigma**-2.0))
@@ -321,16 +364,24 @@ class Intrinsics(NamedTuple):
 
 
 def lens_estimate(
-    poses: Sequence[BoardPose], sigma_px: float, camera: Camera, bend: Bend, prior: LensPrior
+    poses: Sequence[BoardPose],
+    sigma_px: float,
+    camera: Camera,
+    bend: Bend,
+    prior: LensPrior,
 ) -> tuple[Array, Array]:
     """Estimate the change (q,) of the intrinsics and the bend that board poses were fitted with.
 
     Also return the information (q, q) of the corners and the prior.
     """
     variance = sigma_px**2
-    information = np.sum([pose.lens_normal for pose in poses], 0) / variance + prior.information
+    information = (
+        np.sum([pose.lens_normal for pose in poses], 0) / variance + prior.information
+    )
     right = np.sum([pose.lens_gradient for pose in poses], 0) / variance
-    right = right + prior.information @ (prior.mean - np.r_[lens_vector(camera), bend.curvature])
+    right = right + prior.information @ (
+        prior.mean - np.r_[lens_vector(camera), bend.curvature]
+    )
     unit = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information * np.outer(unit, unit)
     return unit * np.linalg.lstsq(scaled, unit * right, rcond=1e-13)[0], information
@@ -338,7 +389,9 @@ def lens_estimate(
 
 def lens_vector(camera: Camera) -> Array:
     """Return the intrinsics in the order of `LENS`: 9 or 12, or 8 of a fisheye."""
-    distortion = np.zeros(max(4 if camera.model == "fisheye" else 5, len(camera.distortion)))
+    distortion = np.zeros(
+        max(4 if camera.model == "fisheye" else 5, len(camera.distortion))
+    )
     distortion[: len(camera.distortion)] = camera.distortion
     return np.r_[camera.fx, camera.fy, camera.cx, camera.cy, distortion]
 
@@ -346,12 +399,16 @@ def lens_vector(camera: Camera) -> Array:
 def moved_lens(camera: Camera, bend: Bend, change: Array) -> tuple[Camera, Bend]:
     """Return camera and bend after a (q,) change; ValueError without a positive focal length."""
     curvature = bend.curvature + change[-len(BEND) :]
-    return moved_camera(camera, change[: -len(BEND)]), bend._replace(curvature=curvature)
+    return moved_camera(camera, change[: -len(BEND)]), bend._replace(
+        curvature=curvature
+    )
 
 
 def moved_camera(camera: Camera, change: Array) -> Camera:
     """Return the camera after a change of its intrinsics."""
-    fx, fy, cx, cy, *distortion = (float(value) for value in lens_vector(camera) + change)
+    fx, fy, cx, cy, *distortion = (
+        float(value) for value in lens_vector(camera) + change
+    )
     return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
 
 
@@ -374,7 +431,8 @@ def calibrate_camera(
             f" least {MIN_VIEWS}; check --size, or give --camera"
         )
     camera = _rough(views, width, height, model)
-    prior, bend = LensPrior.usual(camera), Bend.none(views)
+    prior = LensPrior.usual(camera)
+    bend = Bend.none(views)
     open_focal = (
         "the images leave the focal length open{}; tilt the board by 20 to 45 deg in several"
         " directions, or give --camera"
@@ -383,11 +441,16 @@ def calibrate_camera(
     try:
         poses = [board_pose(view, camera) for view in views]
         for _ in range(_ROUNDS):
-            change, information = lens_estimate(poses, pixel_sigma(poses), camera, bend, prior)
+            change, information = lens_estimate(
+                poses, pixel_sigma(poses), camera, bend, prior
+            )
             change = change * min(1.0, 0.2 * camera.fx / np.abs(change[:2]).max())
             camera, bend = moved_lens(camera, bend, change)
             starts = [pose.camera_from_board for pose in poses]
-            poses = [board_pose(v, camera, s, bend) for v, s in zip(views, starts, strict=True)]
+            poses = [
+                board_pose(v, camera, s, bend)
+                for v, s in zip(views, starts, strict=True)
+            ]
             if change @ information @ change < 1e-4:
                 break
         stray = strays(views, poses, camera, bend)
@@ -407,7 +470,9 @@ def calibrate_camera(
 def _consistent(views: Sequence[BoardView], camera: Camera) -> list[BoardView]:
     rms = _misfits(views, camera)
     most = _FALSE * np.median(rms)
-    return [view for view, error in zip(views, rms, strict=True) if error <= most < np.inf]
+    return [
+        view for view, error in zip(views, rms, strict=True) if error <= most < np.inf
+    ]
 
 
 def _misfits(views: Sequence[BoardView], camera: Camera) -> Array:
@@ -441,4 +506,8 @@ def _rough(views: Sequence[BoardView], width: int, height: int, model: Model) ->
     except cv2.error:
         return middle
     focal = float(matrix[0, 0])
-    return replace(middle, fx=focal, fy=focal) if 0.1 * width < focal < 20 * width else middle
+    return (
+        replace(middle, fx=focal, fy=focal)
+        if 0.1 * width < focal < 20 * width
+        else middle
+    )

@@ -47,31 +47,46 @@ def find_boards(
     """
     order = sorted(range(len(names)), key=lambda i: i * (5**0.5 - 1) / 2 % 1)
     found: dict[str, BoardView | str | Markers] = {}
-    settled, views = board, {}
+    settled = board
+    views = {}
     for tried, i in enumerate(order, 1):
-        found[names[i]] = image if isinstance(image := read(names[i]), str) else _look(image, board)
+        found[names[i]] = (
+            image if isinstance(image := read(names[i]), str) else _look(image, board)
+        )
         if tried == len(names) or (tried <= _MANY and tried % _FEW == 0):
             settled, views = _settled(found, board)
             if any(isinstance(view, BoardView) for view in views.values()):
                 continue
-            others = [name for name, view in views.items() if isinstance(view, OtherBoard)]
+            others = [
+                name for name, view in views.items() if isinstance(view, OtherBoard)
+            ]
             if len(others) >= _FEW or tried in (_MANY, len(names)):
                 name = [*others, names[order[0]]][0]
                 part = "" if tried == len(names) else f", spread over {len(names)}"
-                raise InputError(f"no board in any of {tried} images{part} ({name}: {views[name]})")
+                raise InputError(
+                    f"no board in any of {tried} images{part} ({name}: {views[name]})"
+                )
     return settled, {name: views[name] for name in names}
 
 
 def _look(image: Image, board: Board) -> BoardView | str | Markers:
-    find = {"chessboard": _find_chessboard, "charuco": find_charuco, "apriltag": find_tag}
-    return find.get(board.kind, find_markers)(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), board)
+    find = {
+        "chessboard": _find_chessboard,
+        "charuco": find_charuco,
+        "apriltag": find_tag,
+    }
+    return find.get(board.kind, find_markers)(
+        cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), board
+    )
 
 
 def _settled(
     found: dict[str, BoardView | str | Markers], board: Board
 ) -> tuple[Board, dict[str, BoardView | str]]:
     markers = {name: each for name, each in found.items() if isinstance(each, Markers)}
-    views = {name: each for name, each in found.items() if not isinstance(each, Markers)}
+    views = {
+        name: each for name, each in found.items() if not isinstance(each, Markers)
+    }
     return grid_views(markers, board) if markers else (board, views)
 
 
@@ -96,8 +111,12 @@ def _chessboard_candidates(grey: NDArray, size: tuple[int, int]) -> Iterator[Arr
         (cv2.findChessboardCornersSB, 1, normalized),
         (cv2.findChessboardCornersSB, 2, normalized),  # for small or tilted squares
     ]
-    for find, scale, flags in searches[: 3 if grey.shape[1] <= _LARGEST_DOUBLED_PX else 2]:
-        image = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    for find, scale, flags in searches[
+        : 3 if grey.shape[1] <= _LARGEST_DOUBLED_PX else 2
+    ]:
+        image = cv2.resize(
+            grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC
+        )
         detected, pixels = find(image, size, flags=flags)
         if detected:
             yield resize_pixels(pixels.reshape(-1, 2).astype(np.float64), 1 / scale)
@@ -121,7 +140,9 @@ def _no_chessboard(grey: NDArray, board: Board) -> str:
     rows, columns = np.shape(meta)[:2]
     grid = np.reshape(pixels, (rows, columns, 2))
     for _ in range(2):  # beyond the last corners lie the edges of the board
-        grid = np.concatenate([2 * grid[:1] - grid[1:2], grid, 2 * grid[-1:] - grid[-2:-1]])
+        grid = np.concatenate(
+            [2 * grid[:1] - grid[1:2], grid, 2 * grid[-1:] - grid[-2:-1]]
+        )
         grid = grid.transpose(1, 0, 2)
     size = f"{columns}x{rows} inner corners"
     if ((grid < 0) | (grid > np.array(grey.shape[::-1]) - 1)).any():

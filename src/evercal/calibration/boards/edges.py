@@ -25,7 +25,8 @@ def sharpened(grey: NDArray, view: BoardView, board: Board) -> BoardView:
     First in windows around them, then by lines along the edges of the squares, which are longer.
     Windows and edges keep away from markers and from the next corner.
     """
-    points, pixels = view.points_m[:, :2] / board.size_m, view.pixels
+    points = view.points_m[:, :2] / board.size_m
+    pixels = view.pixels
     if cv2.findHomography(points, pixels)[0] is None:
         return view
     share = (board.size_m - board.marker_m) / (2 * board.size_m)
@@ -35,8 +36,13 @@ def sharpened(grey: NDArray, view: BoardView, board: Board) -> BoardView:
     along, down, area = _steps(points, pixels)
     lines = []
     for step in (along, down):
-        free = share * area / np.maximum(np.linalg.norm(step, axis=1), 1e-9) - _EDGE_BLUR_PX
-        reach = np.where(free >= _LEAST_REACH_PX, np.minimum(free, _MOST_REACH_PX), np.nan)
+        free = (
+            share * area / np.maximum(np.linalg.norm(step, axis=1), 1e-9)
+            - _EDGE_BLUR_PX
+        )
+        reach = np.where(
+            free >= _LEAST_REACH_PX, np.minimum(free, _MOST_REACH_PX), np.nan
+        )
         arms = [
             _edges(grey, pixels + sign * 0.08 * step, pixels + sign * 0.5 * step, reach)
             for sign in (-1, 1)
@@ -52,8 +58,11 @@ def _in_windows(grey: NDArray, pixels: Array, free_px: Array) -> Array:
     start = np.ascontiguousarray(pixels, dtype=np.float32)
     refined = start.copy()
     for size in np.unique(half[half >= _SMALLEST_WINDOW_PX]):
-        window, moved = (int(size), int(size)), start[half == size, None].copy()
-        refined[half == size] = cv2.cornerSubPix(grey, moved, window, (-1, -1), stop)[:, 0]
+        window = (int(size), int(size))
+        moved = start[half == size, None].copy()
+        refined[half == size] = cv2.cornerSubPix(grey, moved, window, (-1, -1), stop)[
+            :, 0
+        ]
     lost = np.linalg.norm(refined - start, axis=1) > half
     refined[lost] = start[lost]
     return refined.astype(np.float64)
@@ -69,7 +78,9 @@ def _steps(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
     rows = np.arange(len(points))[:, None]
     x, y = np.moveaxis(points[near] - points[rows], 2, 0)
     terms = np.stack([x, y, x * x, x * y, y * y], -1)
-    along, down, *_ = np.moveaxis(np.linalg.pinv(terms) @ (pixels[near] - pixels[rows]), 1, 0)
+    along, down, *_ = np.moveaxis(
+        np.linalg.pinv(terms) @ (pixels[near] - pixels[rows]), 1, 0
+    )
     return along, down, np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
 
 
@@ -86,7 +97,9 @@ def squares_by_their_sides(grey: NDArray, squares: Array) -> Array:
         reach = np.clip(share * np.linalg.norm(sides, axis=1), 2.0, most)
         ends = corners + end * sides, corners + (1 - end) * sides
         edges = _edges(grey, *ends, reach, 5 * _SAMPLES, outwards=True)
-        before = np.roll(edges.reshape(-1, 4, 5 * _SAMPLES, 2), 1, axis=1).reshape(edges.shape)
+        before = np.roll(edges.reshape(-1, 4, 5 * _SAMPLES, 2), 1, axis=1).reshape(
+            edges.shape
+        )
         lines = _tangents(before, corners), _tangents(edges, corners)
         refined = _crossings(corners, *lines, _LARGEST_TAG_MOVE_PX).reshape(-1, 4, 2)
     return refined
@@ -118,7 +131,9 @@ def _edges(
     # Keep the edge and remove the noise beside it.
     slope = np.where(slope > 0.3 * slope.max(2, keepdims=True), slope, 0.0)
     strength = slope.sum(2)
-    offset = (slope * offsets[:, None]).sum(2) / np.where(strength > 0, strength, np.nan)
+    offset = (slope * offsets[:, None]).sum(2) / np.where(
+        strength > 0, strength, np.nan
+    )
     offset[np.isnan(reach)] = np.nan
     return points + offset[..., None] * across[:, None]
 
@@ -136,12 +151,15 @@ def _tangents(points: Array, corners: Array) -> Array:
     across, along = np.moveaxis(away @ frame, 2, 0)
     unit = np.maximum(np.abs(along).max(1), 1e-9)
     powers = (along / unit[:, None])[..., None] ** np.arange(3)
-    fits, scores = [], []
+    fits = []
+    scores = []
     for degree in (1, 2):
         terms = powers[..., : degree + 1]
         fit = np.linalg.pinv(terms) @ across[..., None]
         left = float(((terms @ fit)[..., 0] - across).var())
-        scores.append(across.size * np.log(left + 1e-12) + fit.size * np.log(across.size))
+        scores.append(
+            across.size * np.log(left + 1e-12) + fit.size * np.log(across.size)
+        )
         fits.append(fit[:, :2, 0].T)
     offset, slope = fits[int(np.argmin(scores))]
     normal = frame[..., 0] - (slope / unit)[:, None] * frame[..., 1]

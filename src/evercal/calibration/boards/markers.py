@@ -79,7 +79,8 @@ class Layout(NamedTuple):
     def cells(self, ids: Ids) -> Plane:
         """Return column + i row of the cells of markers (n,)."""
         number = ids - self.first
-        if self.parity is not None:  # every second square; with even columns, rows alternate
+        # Every second square; with even columns, rows alternate.
+        if self.parity is not None:
             row = 2 * number // self.columns * (1 - self.columns % 2)
             number = 2 * number + (self.parity + row) % 2
         return number % self.columns + 1j * (number // self.columns)
@@ -97,7 +98,11 @@ class Layout(NamedTuple):
         """Return (m,) which steps fit the layout, and the side of a marker in cells."""
         wanted = self.cells(markers.end) - self.cells(markers.start)
         side = float(
-            np.median(np.append(np.abs(wanted) / np.abs(markers.steps), [0.0][: not len(wanted)]))
+            np.median(
+                np.append(
+                    np.abs(wanted) / np.abs(markers.steps), [0.0][: not len(wanted)]
+                )
+            )
         )
         off = np.abs(side * self.on_board(markers.steps) - wanted)
         inside = self.has(markers.start) & self.has(markers.end)
@@ -106,21 +111,28 @@ class Layout(NamedTuple):
 
 def find_markers(grey: NDArray, board: Board) -> Markers:
     """Detect the markers of a board's dictionary, to hundredths of a pixel."""
-    dictionary, parameters = dictionary_of(board), cv2.aruco.DetectorParameters()
+    dictionary = dictionary_of(board)
+    parameters = cv2.aruco.DetectorParameters()
     count = board.columns * board.rows if board.is_grid else 1
     found: dict[int, Array] = {}
     # Kalibr's tags have a border of two cells. With one, OpenCV reads large ones as well, but
     # places their corners one cell inside.
     kalibr = board.kind != "charuco" and board.dictionary.startswith("APRILTAG")
     for border in (2, 1) if kalibr else (1,):
-        parameters.markerBorderBits, read, done = border, dict[int, Array](), False
+        parameters.markerBorderBits = border
+        read = dict[int, Array]()
+        done = False
         for threshold in _THRESHOLDS if board.kind != "charuco" else (7,):
             parameters.adaptiveThreshConstant = threshold
             detector = cv2.aruco.ArucoDetector(dictionary, parameters)
             squares, numbers, _ = detector.detectMarkers(grey)
-            ids = [] if numbers is None else [int(number) for number in np.ravel(numbers)]
+            ids = (
+                [] if numbers is None else [int(number) for number in np.ravel(numbers)]
+            )
             read = {**dict(zip(ids, map(np.asarray, squares), strict=True)), **read}
-            done = len(read) >= count and (board.kind != "apriltag" or board.tag in {None, *read})
+            done = len(read) >= count and (
+                board.kind != "apriltag" or board.tag in {None, *read}
+            )
             if done:
                 break
         found = max(found, read, key=len)
@@ -133,15 +145,21 @@ def find_markers(grey: NDArray, board: Board) -> Markers:
 
 
 def _steps(ids: Ids, corners: Array) -> tuple[Ids, Ids, Plane]:
-    n, near = len(ids), min(_NEAREST, max(len(ids) - 1, 0))
+    n = len(ids)
+    near = min(_NEAREST, max(len(ids) - 1, 0))
     ends = np.pad(corners, ((0, 0), (0, 0), (0, 1)), constant_values=1)
-    middle = np.cross(np.cross(ends[:, 0], ends[:, 2]), np.cross(ends[:, 1], ends[:, 3]))
+    middle = np.cross(
+        np.cross(ends[:, 0], ends[:, 2]), np.cross(ends[:, 1], ends[:, 3])
+    )
     middle = middle / middle[:, 2:]
     apart = np.linalg.norm(middle[:, None] - middle, axis=2)
-    start, end = np.repeat(np.arange(n), near), np.argsort(apart, 1)[:, 1 : near + 1].ravel()
+    start = np.repeat(np.arange(n), near)
+    end = np.argsort(apart, 1)[:, 1 : near + 1].ravel()
     square = np.stack([_SQUARE.real, _SQUARE.imag], 1).astype(np.float32)
     maps = [cv2.getPerspectiveTransform(c.astype(np.float32), square) for c in corners]
-    x, y, depth = np.einsum("nij,nj->in", np.reshape(maps, (-1, 3, 3))[start], middle[end])
+    x, y, depth = np.einsum(
+        "nij,nj->in", np.reshape(maps, (-1, 3, 3))[start], middle[end]
+    )
     return ids[start], ids[end], (x + 1j * y) / depth
 
 
@@ -157,7 +175,9 @@ def find_tag(grey: NDArray, board: Board) -> BoardView | str:
     if len(matches) > 1:
         names = ", ".join(map(str, sorted(tags[k] for k in matches)))
         return f"several tags ({names}); select one with --tag"
-    return BoardView(_in_space(board.size_m * _SQUARE.conj()), markers.corners[matches[0]])
+    return BoardView(
+        _in_space(board.size_m * _SQUARE.conj()), markers.corners[matches[0]]
+    )
 
 
 def _in_space(plane: Plane) -> Array:
@@ -171,11 +191,18 @@ def find_charuco(grey: NDArray, board: Board) -> BoardView | str:
     if wrong:
         return wrong
     size = (board.columns, board.rows)
-    printed = cv2.aruco.CharucoBoard(size, board.size_m, board.marker_m, dictionary_of(board))
+    printed = cv2.aruco.CharucoBoard(
+        size, board.size_m, board.marker_m, dictionary_of(board)
+    )
     printed.setLegacyPattern(layout.parity == 0)
-    found = list(markers.corners[:, None].astype(np.float32)), markers.ids[:, None].astype(np.int32)
+    found = (
+        list(markers.corners[:, None].astype(np.float32)),
+        markers.ids[:, None].astype(np.int32),
+    )
     detector = cv2.aruco.CharucoDetector(printed)
-    pixels, ids = detector.detectBoard(grey, None, None, *found)[:2] if found[0] else (None, None)
+    pixels, ids = (
+        detector.detectBoard(grey, None, None, *found)[:2] if found[0] else (None, None)
+    )
     count = 0 if ids is None or pixels is None else len(ids)
     if count >= _MIN_CORNERS:
         every = np.asarray(printed.getChessboardCorners(), dtype=np.float64)
@@ -194,7 +221,9 @@ def grid_views(
     found: Mapping[str, Markers], board: Board
 ) -> tuple[Board, dict[str, BoardView | str]]:
     """Return the board with its first marker, and the corners in each image or a reason."""
-    pooled = Markers(*(np.concatenate(part) for part in zip(*found.values(), strict=True)))
+    pooled = Markers(
+        *(np.concatenate(part) for part in zip(*found.values(), strict=True))
+    )
     layout, wrong = _layout(pooled, board)
     views: dict[str, BoardView | str] = {}
     for name, markers in found.items():
@@ -202,7 +231,10 @@ def grid_views(
         near = [2 * (bad == k).sum() <= (markers.start == k).sum() for k in markers.ids]
         use = layout.has(markers.ids) & np.array(near, dtype=bool)
         if wrong or not use.any():
-            views[name] = wrong or f"no markers of the grid, {board.dictionary} from {layout.first}"
+            views[name] = (
+                wrong
+                or f"no markers of the grid, {board.dictionary} from {layout.first}"
+            )
             continue
         middle = (board.size_m + board.gap_m) * layout.cells(markers.ids[use])
         around = board.size_m * (layout.on_board(_SQUARE) + 0.5 + 0.5j)
@@ -213,7 +245,9 @@ def grid_views(
 
 def _layout(markers: Markers, board: Board) -> tuple[Layout, str]:
     """Return the layout of markers on a board, and the reason if it is not the stated one."""
-    ids, size, charuco = np.unique(markers.ids), 1000 * board.size_m, board.kind == "charuco"
+    ids = np.unique(markers.ids)
+    size = 1000 * board.size_m
+    charuco = board.kind == "charuco"
     count = board.columns * board.rows // (2 if charuco else 1)
     layout = _best(markers, board, [board.columns], count)
     good, side = layout.fit(markers)
@@ -221,19 +255,24 @@ def _layout(markers: Markers, board: Board) -> tuple[Layout, str]:
         layout = _best(markers, replace(board, tag=None), _COLUMNS, 1 << 30)
         fits = "they lie on no such board"
         if layout.fit(markers)[0].mean() >= _AGREEING:
-            rows = -(-(ids[-1] - layout.first + 1) * (2 if charuco else 1) // layout.columns)
+            rows = -(
+                -(ids[-1] - layout.first + 1) * (2 if charuco else 1) // layout.columns
+            )
             older = ", OpenCV's legacy pattern" if layout.parity == 0 else ""
             older += "" if board.tag is None else f" from --tag {layout.first}"
             fits = f"they fit {layout.columns}x{rows} {'squares' if charuco else 'markers'}{older}"
         return layout, OtherBoard(
             f"markers {ids[0]} to {ids[-1]} are visible, {fits}, not"
-            f" {board.columns}x{board.rows}; correct --size" + " or --tag" * (board.tag is not None)
+            f" {board.columns}x{board.rows}; correct --size"
+            + " or --tag"
+            * (board.tag is not None)
         )
     long = np.linalg.norm(np.diff(markers.corners, axis=1), axis=2)
     few = len(good) < _FEWEST_STEPS or np.median(long) < _LEAST_SIDE_PX
     if few or abs(side / board.marker_share - 1) < _SIZE_OFF:
         return layout, ""
-    gap, marker = size / side - size, size * side
+    gap = size / side - size
+    marker = size * side
     return layout, OtherBoard(
         f"markers measure {marker:.3g} mm beside squares of {size:g} mm, not"
         f" {1000 * board.marker_m:g}; correct --marker-mm"
@@ -247,13 +286,20 @@ def _best(markers: Markers, board: Board, columns: Iterable[int], count: int) ->
     """Return the layout that fits most steps, in doubt the usual one."""
     ids = np.unique(markers.ids).tolist()
     if board.kind == "charuco":  # parity 0 with even rows: OpenCV before 4.6
-        layouts = [Layout(n, count, parity=parity) for n in columns for parity in (1, 0)]
+        layouts = [
+            Layout(n, count, parity=parity) for n in columns for parity in (1, 0)
+        ]
     else:
-        starts = [0, *ids[:3], *range(max(0, ids[-1] - count + 1), ids[0])] if ids else [0]
+        starts = (
+            [0, *ids[:3], *range(max(0, ids[-1] - count + 1), ids[0])] if ids else [0]
+        )
         firsts = dict.fromkeys(starts if board.tag is None else [board.tag])
         turns = [(turn, up) for up in (False, True) for turn in range(4)]
         turns.sort(key=lambda each: each != STYLES[board.kind])
         layouts = [
-            Layout(n, count, first, *turn) for n in columns for first in firsts for turn in turns
+            Layout(n, count, first, *turn)
+            for n in columns
+            for first in firsts
+            for turn in turns
         ]
     return max(layouts, key=lambda layout: layout.fit(markers)[0].sum())

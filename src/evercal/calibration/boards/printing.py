@@ -24,7 +24,9 @@ PAPERS_MM = {
 }
 """Width and height of upright paper, smaller sheets first."""
 FILE_KINDS = (".pdf", ".png")
-_MARGIN_MM, _FOOTER_MM, _RULER_MM = 8.0, 13.0, 100
+_MARGIN_MM = 8.0
+_FOOTER_MM = 13.0
+_RULER_MM = 100
 _DPI = 300.0
 """Approximate resolution; the exact one makes a square a whole number of pixels."""
 
@@ -43,7 +45,8 @@ def board_image(board: Board, unit_px: int) -> NDArray[np.uint8]:
             f"an {board.kind} is not printed; take the print of Kalibr or OpenCV, or print"
             f" --board charuco"
         )
-    dictionary, size = dictionary_of(board), (board.columns, board.rows)
+    dictionary = dictionary_of(board)
+    size = (board.columns, board.rows)
     last = size[0] * size[1] // 2 - 1 if board.kind == "charuco" else board.tag or 0
     if not 0 <= last < len(dictionary.bytesList):
         raise InputError(
@@ -75,11 +78,14 @@ def drawing(board: Board, paper: str = "a4") -> "tuple[Image, float]":
     left = (page.width - picture.shape[1]) // 2
     top = (page.height - round(_FOOTER_MM * per_mm) - picture.shape[0]) // 2
     page.paste(Image.fromarray(picture), (left, top))
-    draw, bottom = ImageDraw.Draw(page), height - _MARGIN_MM
+    draw = ImageDraw.Draw(page)
+    bottom = height - _MARGIN_MM
     bars = [(0, bottom, _RULER_MM, 0.3)]
     bars += [(tick, bottom - 2, 0.2, 2) for tick in range(0, _RULER_MM + 1, 10)]
     for x, y, wide, high in bars:
-        corners = np.array([x + _MARGIN_MM, y, x + _MARGIN_MM + wide, y + high]) * per_mm
+        corners = (
+            np.array([x + _MARGIN_MM, y, x + _MARGIN_MM + wide, y + high]) * per_mm
+        )
         draw.rectangle(corners.round().tolist(), fill=0)
     text_at = (_MARGIN_MM * per_mm, (bottom + 1) * per_mm)
     font = ImageFont.load_default(size=2.5 * per_mm)
@@ -91,7 +97,9 @@ def label(board: Board) -> str:
     """Return the line below a board: the options that detect it."""
     side = f"{1000 * board.size_m:g} mm"
     if board.kind == "chessboard":
-        words = f"chessboard, {board.columns}x{board.rows} inner corners, squares of {side}"
+        words = (
+            f"chessboard, {board.columns}x{board.rows} inner corners, squares of {side}"
+        )
     elif board.kind == "charuco":
         words = (
             f"ChArUco, {board.columns}x{board.rows} squares of {side}, markers of"
@@ -105,7 +113,9 @@ def label(board: Board) -> str:
 def _sheet(board: Board, paper: str, size_mm: NDArray) -> tuple[float, float]:
     """Return width and height of the sheet, turned if the board fits only or better so."""
     if paper not in PAPERS_MM:
-        raise InputError(f"paper {paper!r} is not known; use one of {', '.join(PAPERS_MM)}")
+        raise InputError(
+            f"paper {paper!r} is not known; use one of {', '.join(PAPERS_MM)}"
+        )
     takes = size_mm + np.array([2 * _MARGIN_MM, 2 * _MARGIN_MM + _FOOTER_MM])
 
     def turned(name: str) -> tuple[float, float] | None:
@@ -128,6 +138,8 @@ def _sheet(board: Board, paper: str, size_mm: NDArray) -> tuple[float, float]:
 def write_board(path: Path, board: Board, paper: str = "a4") -> None:
     """Write a board at true size to a PDF or PNG file; the resolution is stored in the file."""
     if path.suffix.lower() not in FILE_KINDS:
-        raise InputError(f"{path}: give a file name that ends with {' or '.join(FILE_KINDS)}")
+        raise InputError(
+            f"{path}: give a file name that ends with {' or '.join(FILE_KINDS)}"
+        )
     page, dpi = drawing(board, paper)
     page.save(path, dpi=(dpi, dpi))

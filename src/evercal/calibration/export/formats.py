@@ -36,33 +36,65 @@ class Format:
 
 
 FORMATS = {
-    "easy_handeye2": Format("tf", to.easy_handeye2, ".calib", "for ~/.ros2/easy_handeye2"),
-    "easy_handeye": Format("tf", to.easy_handeye, ".yaml", "for ~/.ros/easy_handeye of ROS 1"),
-    "moveit_samples": Format("optical", to.moveit, ".yaml", "MoveIt Calibration's pairs", True),
-    "static_transform_publisher": Format("tf", to.command, ".sh", "shell command for ROS 2"),
-    "launch_py": Format("tf", to.launch_py, ".launch.py", "ROS 2 launch file with a tf publisher"),
-    "ros1_launch": Format("tf", to.ros1_launch, ".launch", "ROS 1 launch file, like MoveIt's"),
-    "transform_stamped": Format("tf", to.stamped, ".yaml", "geometry_msgs/TransformStamped"),
+    "easy_handeye2": Format(
+        "tf", to.easy_handeye2, ".calib", "for ~/.ros2/easy_handeye2"
+    ),
+    "easy_handeye": Format(
+        "tf", to.easy_handeye, ".yaml", "for ~/.ros/easy_handeye of ROS 1"
+    ),
+    "moveit_samples": Format(
+        "optical", to.moveit, ".yaml", "MoveIt Calibration's pairs", True
+    ),
+    "static_transform_publisher": Format(
+        "tf", to.command, ".sh", "shell command for ROS 2"
+    ),
+    "launch_py": Format(
+        "tf", to.launch_py, ".launch.py", "ROS 2 launch file with a tf publisher"
+    ),
+    "ros1_launch": Format(
+        "tf", to.ros1_launch, ".launch", "ROS 1 launch file, like MoveIt's"
+    ),
+    "transform_stamped": Format(
+        "tf", to.stamped, ".yaml", "geometry_msgs/TransformStamped"
+    ),
     "camera_info": Format("optical", to.camera_info, ".yaml", "intrinsics for ROS"),
-    "urdf": Format("tf", to.urdf, ".urdf", "fixed joint for a URDF, rpy about fixed axes"),
+    "urdf": Format(
+        "tf", to.urdf, ".urdf", "fixed joint for a URDF, rpy about fixed axes"
+    ),
     "opencv": Format("optical", to.opencv, ".yml", "rvec and tvec, parent to camera"),
     "csv": Format("any", to.csv, ".csv", "4x4 matrix, metres, one matrix row per line"),
     "npy": Format("any", to.npy, ".npy", "4x4 matrix, metres, for numpy"),
-    "json": Format("any", to.as_json, ".json", "matrix, quaternion wxyz, covariance, frames"),
-    "tum": Format("optical", to.tum, ".tum", "stamp, translation, quaternion x y z w", True),
+    "json": Format(
+        "any", to.as_json, ".json", "matrix, quaternion wxyz, covariance, frames"
+    ),
+    "tum": Format(
+        "optical", to.tum, ".tum", "stamp, translation, quaternion x y z w", True
+    ),
     "colmap": Format("optical", to.colmap, "", "a model without points (folder)", True),
     "nerfstudio": Format("optical", to.nerfstudio, ".json", "transforms.json", True),
-    "zivid": Format("any", to.zivid, ".txt", "4x4 matrix in millimetres for Zivid's SDK"),
+    "zivid": Format(
+        "any", to.zivid, ".txt", "4x4 matrix in millimetres for Zivid's SDK"
+    ),
     "ur": Format("any", to.ur, ".txt", "Universal Robots: p[x, y, z, rx, ry, rz]"),
     "kuka": Format("any", to.kuka, ".txt", "KUKA: {X, Y, Z, A, B, C}, mm and degrees"),
     "abb": Format("any", to.abb, ".txt", "ABB: [[x,y,z],[q1,q2,q3,q4]], mm"),
     "fanuc": Format("any", to.fanuc, ".txt", "FANUC: X Y Z W P R, mm and degrees"),
-    "yaskawa": Format("any", to.yaskawa, ".txt", "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"),
-    "staubli": Format("any", to.staubli, ".txt", "Staubli: X Y Z RX RY RZ, mm and degrees"),
+    "yaskawa": Format(
+        "any", to.yaskawa, ".txt", "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"
+    ),
+    "staubli": Format(
+        "any", to.staubli, ".txt", "Staubli: X Y Z RX RY RZ, mm and degrees"
+    ),
     "franka": Format("any", to.franka, ".txt", "Franka: 16 numbers by column, metres"),
-    "joint_offsets": Format("any", arm.joint_offsets, ".json", "offsets of the arm's joints"),
-    "corrected_urdf": Format("any", arm.corrected_urdf, ".urdf", "--urdf with these offsets"),
-    "lerobot": Format("any", arm.lerobot, ".json", "--lerobot-calibration with these offsets"),
+    "joint_offsets": Format(
+        "any", arm.joint_offsets, ".json", "offsets of the arm's joints"
+    ),
+    "corrected_urdf": Format(
+        "any", arm.corrected_urdf, ".urdf", "--urdf with these offsets"
+    ),
+    "lerobot": Format(
+        "any", arm.lerobot, ".json", "--lerobot-calibration with these offsets"
+    ),
 }
 """All formats by name."""
 
@@ -95,13 +127,17 @@ def export_files(
     """
     key = format.strip().lower().replace("-", "_")
     if key not in FORMATS:
-        raise InputError(f"export format {format!r} is not known; use one of {', '.join(FORMATS)}")
+        raise InputError(
+            f"export format {format!r} is not known; use one of {', '.join(FORMATS)}"
+        )
     row = FORMATS[key]
     # easy_handeye2 looks up ~/cell.calib under the name cell.
     name = "evercal" if path is None else Path(path).name.split(".")[0] or "evercal"
     export = prepare_export(calibration, name, **options)
     if row.frame == "optical" and options.get("via") is not None:
-        raise InputError(f"{key} holds the pose of the camera, not of {export.child!r}; omit --via")
+        raise InputError(
+            f"{key} holds the pose of the camera, not of {export.child!r}; omit --via"
+        )
     try:
         content = row.write(export)
     except InputError as error:
@@ -123,7 +159,9 @@ def _write(path: Path, content: Content) -> tuple[Path, ...]:
         path.mkdir(parents=True, exist_ok=True)
     else:
         if not path.absolute().parent.is_dir():
-            raise InputError(f"--out {path}: its folder does not exist; create it first")
+            raise InputError(
+                f"--out {path}: its folder does not exist; create it first"
+            )
         files = {path: content.encode() if isinstance(content, str) else content}
     for file, data in files.items():
         write_bytes(file, data)

@@ -50,7 +50,9 @@ def corrected_urdf(export: Export) -> bytes:
         rotates = model.origins_with({joint.name: 0.0}).get(joint.name, (None, None))[1]
         if rotates != joint.is_angle:
             kind = f"{'revolute' if joint.is_angle else 'prismatic'} joint {joint.name}"
-            raise InputError(f"{file}: has no {kind} with a value of its own; give the arm's URDF")
+            raise InputError(
+                f"{file}: has no {kind} with a value of its own; give the arm's URDF"
+            )
     with library_errors(f"{file}: no usable URDF"):
         return _with_origins(Path(file).read_bytes(), model.origins_with(offsets))
 
@@ -66,12 +68,15 @@ def _with_origins(urdf: bytes, moved: Mapping[str, tuple[SE3, bool]]) -> bytes:
             places.setdefault((path[1][1], tag), parser.CurrentByteIndex)
 
     parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = begin, lambda _: path.pop()
+    parser.StartElementHandler = begin
+    parser.EndElementHandler = lambda _: path.pop()
     parser.Parse(urdf, True)
     # The last first, so that places before it stay.
     for name in sorted(moved, key=lambda name: -places[name, "joint"]):
         part, key = (slice(3, 6), b"rpy") if moved[name][1] else (slice(3), b"xyz")
-        numbers = " ".join(map(repr, pose_numbers(moved[name][0], "rpy")[part].tolist())).encode()
+        numbers = " ".join(
+            map(repr, pose_numbers(moved[name][0], "rpy")[part].tolist())
+        ).encode()
         start = places.get((name, "origin"), places[name, "joint"])
         end = next(_TAG.finditer(urdf, start)).end()
         tag = re.sub(rb"\s%s\s*=\s*(\"[^\"]*\"|'[^']*')" % key, b"", urdf[start:end])
@@ -87,26 +92,39 @@ def lerobot(export: Export) -> str:
     Feetech's position is the encoder's minus the offset, Dynamixel's is the sum. The range stays,
     because zero degrees are in its middle.
     """
-    file, motors = (export.options.get(f"lerobot_{word}") for word in ("calibration", "motors"))
-    determined, sign = _determined(export), {"feetech": -1, "dynamixel": 1}.get(str(motors), 0)
+    file, motors = (
+        export.options.get(f"lerobot_{word}") for word in ("calibration", "motors")
+    )
+    determined = _determined(export)
+    sign = {"feetech": -1, "dynamixel": 1}.get(str(motors), 0)
     if file is None or not sign:
-        raise InputError("give --lerobot-calibration FILE, --lerobot-motors feetech or dynamixel")
+        raise InputError(
+            "give --lerobot-calibration FILE, --lerobot-motors feetech or dynamixel"
+        )
     record = read_json(Path(file), "LeRobot calibration")
     for joint in determined:
         row = record.get(joint.name) if joint.is_angle else None
         if not isinstance(row, dict) or not isinstance(row.get("homing_offset"), int):
-            raise InputError(f"{file}: has no homing_offset of a joint {joint.name} that turns")
-        row["homing_offset"] += sign * round(joint.unit[1] * joint.offset * _LEROBOT_TICKS)
+            raise InputError(
+                f"{file}: has no homing_offset of a joint {joint.name} that turns"
+            )
+        row["homing_offset"] += sign * round(
+            joint.unit[1] * joint.offset * _LEROBOT_TICKS
+        )
         if sign < 0 and abs(row["homing_offset"]) > _FEETECH_MOST:
             what = f"the homing offset of {joint.name} would exceed {_FEETECH_MOST}"
-            raise InputError(f"{file}: {what}; calibrate it in LeRobot with another middle first")
+            raise InputError(
+                f"{file}: {what}; calibrate it in LeRobot with another middle first"
+            )
     return json.dumps(record, indent=4) + "\n"
 
 
 def _determined(export: Export) -> list[JointOffset]:
     """The offsets that are determined, at least one."""
     if not (joints := export.calibration.joints):
-        raise InputError("no offsets of joints; record joints.csv and a URDF, not gripper poses")
+        raise InputError(
+            "no offsets of joints; record joints.csv and a URDF, not gripper poses"
+        )
     if not (determined := [joint for joint in joints if not joint.open]):
         why = "; ".join(f"{joint.name}: {joint.open}" for joint in joints)
         raise InputError(f"no offset is determined ({why})")

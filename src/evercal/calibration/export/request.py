@@ -99,7 +99,9 @@ class Export:
     def camera(self) -> Camera:
         """Intrinsics; raises InputError if the calibration has no intrinsics."""
         if self.calibration.camera is None:
-            raise InputError("intrinsics are required, but this calibration holds no camera")
+            raise InputError(
+                "intrinsics are required, but this calibration holds no camera"
+            )
         return self.calibration.camera
 
     @property
@@ -123,11 +125,18 @@ def prepare_export(
     """Rename the frames, move the pose to the driver's root frame, and read the files."""
     parent = options.get("parent") or calibration.parent_frame
     child = options.get("child") or calibration.child_frame
-    link, other = options.get("via"), options.get("robot_frame")
+    link = options.get("via")
+    other = options.get("robot_frame")
     if parent in (child, link):
-        raise InputError(f"parent and child frame are both called {parent!r}; rename one of them")
+        raise InputError(
+            f"parent and child frame are both called {parent!r}; rename one of them"
+        )
     link_from_optical = _link_from_optical(child, options)
-    for role, frame in {"parent": parent, "child": link or child, "robot": other}.items():
+    for role, frame in {
+        "parent": parent,
+        "child": link or child,
+        "robot": other,
+    }.items():
         if frame is not None and not _FRAME.fullmatch(frame):
             raise InputError(
                 f"{role} frame {frame!r} is no name of a tf frame; use letters, digits, _ . - and"
@@ -136,11 +145,16 @@ def prepare_export(
     calibration = replace(calibration, parent_frame=parent, child_frame=link or child)
     if link is not None:
         moved = calibration.uncertain_pose @ link_from_optical.inverse()
-        pose, covariance = moved.pose, moved.covariance
-        calibration = replace(calibration, parent_from_child=pose, covariance=covariance)
-    robot, target = options.get("robot_poses"), options.get("target_poses")
+        pose = moved.pose
+        covariance = moved.covariance
+        calibration = replace(
+            calibration, parent_from_child=pose, covariance=covariance
+        )
+    robot = options.get("robot_poses")
+    target = options.get("target_poses")
     if robot is not None and not isinstance(robot, RobotPoses):
-        what, convention = "file of robot poses", options.get("convention")
+        what = "file of robot poses"
+        convention = options.get("convention")
         robot = read_robot_poses(robot, convention, what=what, option="--convention")
     if target is not None and not isinstance(target, RobotPoses):
         target = read_robot_poses(target, what="file of target poses", option=None)
@@ -148,8 +162,12 @@ def prepare_export(
 
 
 def _link_from_optical(optical: str, options: ExportOptions) -> SE3:
-    link, file, offset = (options.get(key) for key in ("via", "via_transform", "via_offset"))
-    sources = (file is not None) + (offset is not None) + options.get("via_optical", False)
+    link, file, offset = (
+        options.get(key) for key in ("via", "via_transform", "via_offset")
+    )
+    sources = (
+        (file is not None) + (offset is not None) + options.get("via_optical", False)
+    )
     if link is None and sources:
         raise InputError("name the driver's root frame with --via, such as camera_link")
     if link is not None and sources != 1:
@@ -163,15 +181,21 @@ def _link_from_optical(optical: str, options: ExportOptions) -> SE3:
 
 
 _Transforms = dict[tuple[str, str], SE3]
-_EXPECTED = "give what 'ros2 topic echo --once /tf_static' prints, or a TransformStamped"
+_EXPECTED = (
+    "give what 'ros2 topic echo --once /tf_static' prints, or a TransformStamped"
+)
 
 
-def standard_link_from_optical(offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> SE3:
+def standard_link_from_optical(
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> SE3:
     """Return the pose of an optical frame whose origin lies forward, left, up in the link."""
     return SE3(np.array([0.5, -0.5, 0.5, -0.5]), np.array(offset_m))
 
 
-def read_link_from_optical(path: str | os.PathLike[str], link: str, optical: str) -> SE3:
+def read_link_from_optical(
+    path: str | os.PathLike[str], link: str, optical: str
+) -> SE3:
     """Read the pose of the optical frame in the driver's root frame from YAML or JSON.
 
     That is the output of `ros2 topic echo --once /tf_static`, a TransformStamped, or an object with
@@ -182,11 +206,16 @@ def read_link_from_optical(path: str | os.PathLike[str], link: str, optical: str
         for document in yaml_documents(read_text(Path(path), "transforms")):
             transforms |= _transforms(document)
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: no complete transform ({error}); {_EXPECTED}") from None
+        raise InputError(
+            f"{path}: no complete transform ({error}); {_EXPECTED}"
+        ) from None
     if not transforms:
         raise InputError(f"{path}: contains no transform; {_EXPECTED}")
-    transforms |= {(child, parent): pose.inverse() for (parent, child), pose in transforms.items()}
-    link_from, queue = {link: SE3.identity()}, [link]
+    transforms |= {
+        (child, parent): pose.inverse() for (parent, child), pose in transforms.items()
+    }
+    link_from = {link: SE3.identity()}
+    queue = [link]
     for frame in queue:
         for (parent, child), parent_from_child in transforms.items():
             if parent == frame and child not in link_from:
@@ -205,7 +234,9 @@ def _transforms(data: Any) -> _Transforms:
     if isinstance(data, Mapping) and "transforms" in data:
         data = data["transforms"]
     if isinstance(data, list):
-        return {pair: pose for entry in data for pair, pose in _transforms(entry).items()}
+        return {
+            pair: pose for entry in data for pair, pose in _transforms(entry).items()
+        }
     if isinstance(data, Mapping) and "transform" in data:
         body = data["transform"]
         pair = data["header"]["frame_id"], data["child_frame_id"]
@@ -213,7 +244,8 @@ def _transforms(data: Any) -> _Transforms:
         quaternion = [float(body["rotation"][axis]) for axis in "wxyz"]
     elif isinstance(data, Mapping) and "parent_frame" in data:
         pair = data["parent_frame"], data["child_frame"]
-        translation, quaternion = data["translation_m"], data["quaternion_wxyz"]
+        translation = data["translation_m"]
+        quaternion = data["quaternion_wxyz"]
     else:
         return {}
     if abs(float(np.linalg.norm(quaternion)) - 1.0) > 1e-2:

@@ -206,9 +206,13 @@ def opencv(export: Export) -> str:
 
     camera_from_parent = export.pose.inverse()
     rotation = Rotation.from_quat(camera_from_parent.rotation_wxyz, scalar_first=True)
-    mode = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
+    mode = (
+        cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
+    )
     storage = cv2.FileStorage(".yml", mode)
-    storage.writeComment(f"rvec, tvec take points from {export.parent} to {export.child}, metres")
+    storage.writeComment(
+        f"rvec, tvec take points from {export.parent} to {export.child}, metres"
+    )
     storage.write("rvec", rotation.as_rotvec().reshape(3, 1))
     storage.write("tvec", camera_from_parent.translation_m.reshape(3, 1))
     camera = export.calibration.camera
@@ -232,7 +236,14 @@ def npy(export: Export) -> bytes:
 
 def as_json(export: Export) -> str:
     """Write matrix, quaternion, covariance and frame names; `read_robot_poses` reads them."""
-    names = ("parent_frame", "child_frame", "meaning", "translation_m", "quaternion_wxyz", "matrix")
+    names = (
+        "parent_frame",
+        "child_frame",
+        "meaning",
+        "translation_m",
+        "quaternion_wxyz",
+        "matrix",
+    )
     whole = export.calibration.to_dict()
     record = {name: whole[name] for name in (*names, "covariance")}
     return json.dumps(record, indent=1, allow_nan=False) + "\n"
@@ -241,7 +252,10 @@ def as_json(export: Export) -> str:
 def zivid(export: Export) -> str:
     """Write the 4x4 matrix in millimetres as YAML."""
     rows = np.reshape(export.numbers("matrix:mm"), (4, 4)).tolist()
-    record = {"__version__": {"serializer": 1, "data": 1}, "FloatMatrix": {"Data": rows}}
+    record = {
+        "__version__": {"serializer": 1, "data": 1},
+        "FloatMatrix": {"Data": rows},
+    }
     return _yaml(record, None)
 
 
@@ -262,10 +276,12 @@ def _image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
 
 def tum(export: Export) -> str:
     """Write lines of stamp, translation in metres, quaternion x y z w: base_from_camera."""
-    rows, robot = pose_numbers(_image_poses(export)[1]), export.robot_poses
+    rows = pose_numbers(_image_poses(export)[1])
+    robot = export.robot_poses
     stamps = np.arange(len(rows), dtype=np.float64)
     if not export.in_hand:
-        stamps, rows = stamps[:1], rows[:1]
+        stamps = stamps[:1]
+        rows = rows[:1]
     elif robot is not None and robot.stamps_s is not None:
         stamps = robot.stamps_s
     lines = [" ".join(map(repr, row)) for row in np.c_[stamps, rows].tolist()]
@@ -275,13 +291,15 @@ def tum(export: Export) -> str:
 def colmap(export: Export) -> dict[str, str]:
     """Write a sparse model without points: camera_from_base, quaternion w x y z."""
     camera, (names, poses) = export.camera, _image_poses(export)
-    lines, rows = [], pose_numbers(poses, "wxyz:inverse").tolist()
+    lines = []
+    rows = pose_numbers(poses, "wxyz:inverse").tolist()
     for i, (name, row) in enumerate(zip(names, rows, strict=True)):
         if len(name.split()) != 1:
             raise InputError(f"image name {name!r} contains a blank; rename the image")
         pose = " ".join(map(repr, [*row[3:], *row[:3]]))
         lines += [f"{i + 1} {pose} 1 {name}", ""]
-    model, parameters = "PINHOLE", [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]
+    model = "PINHOLE"
+    parameters = [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]
     if camera.model == "fisheye":
         model = "OPENCV_FISHEYE"
         parameters += camera.distortion
@@ -326,7 +344,8 @@ def nerfstudio(export: Export) -> str:
 
 def moveit(export: Export) -> str:
     """Write the pose pairs that MoveIt Calibration solves: 4x4 matrices by row, metres."""
-    robot, target = export.robot_poses, export.target_poses
+    robot = export.robot_poses
+    target = export.target_poses
     if robot is None or target is None:
         raise InputError(
             "a calibration holds no pose pairs; give the gripper's poses with --robot-poses"
@@ -337,13 +356,18 @@ def moveit(export: Export) -> str:
         single = sorted({*robot.names} ^ {*target.names})
         if single:
             raise InputError(f"{single[0]!r} has only one of its two poses")
-        camera_from_target = target.poses[[target.names.index(name) for name in robot.names]]
+        camera_from_target = target.poses[
+            [target.names.index(name) for name in robot.names]
+        ]
     if len(robot) != len(target):
         raise InputError(
             f"{len(robot)} robot poses and {len(target)} target poses; give one of each for every"
             " image"
         )
-    rows = (pose_numbers(poses, "matrix").tolist() for poses in (robot.poses, camera_from_target))
+    rows = (
+        pose_numbers(poses, "matrix").tolist()
+        for poses in (robot.poses, camera_from_target)
+    )
     names = ("effector_wrt_world", "object_wrt_sensor")
     samples = [dict(zip(names, pair, strict=True)) for pair in zip(*rows, strict=True)]
     return _yaml(samples, None, 1000)

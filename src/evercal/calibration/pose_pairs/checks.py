@@ -25,11 +25,13 @@ from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
 Array = NDArray[np.floating]
 
 _FAR_M = 20.0
-_MIN_ROTATION_DEG, _MIN_SECOND_DEG = 2.0, 1.0
+_MIN_ROTATION_DEG = 2.0
+_MIN_SECOND_DEG = 1.0
 _MIN_TRANSLATION_M = 0.01
 _SAME_LIST = 0.1
 """Differences of robot and camera poses that make them one list, parts of the robot's motion."""
-_STILL_M, _STILL_RAD = 1e-3, np.deg2rad(0.1)
+_STILL_M = 1e-3
+_STILL_RAD = np.deg2rad(0.1)
 _RECORD = "record 15 to 25 poses that differ by 20 to 60 deg about two axes and by 10 cm or more"
 
 
@@ -65,9 +67,11 @@ def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
 
 def require_two_lists(pairs: PosePairs) -> None:
     """Refuse one list of poses in both files, apart from noise, unit, inversion and axes."""
-    camera, about_x = pairs.camera_from_board, SE3.exp([0, 0, 0, np.pi, 0, 0])
+    camera = pairs.camera_from_board
+    about_x = SE3.exp([0, 0, 0, np.pi, 0, 0])
     for robot in (pairs.base_from_gripper, pairs.base_from_gripper.inverse()):
-        length, motion = _median_length(robot), np.median(pose_distance(robot[0], robot), 1)
+        length = _median_length(robot)
+        motion = np.median(pose_distance(robot[0], robot), 1)
         for read in (camera, about_x @ camera, camera @ about_x):
             unit = length / max(_median_length(read), 1e-300)
             same_unit = SE3(read.rotation_wxyz, unit * read.translation_m)
@@ -93,7 +97,9 @@ def require_rotations(
 
     The angles are root mean squares between two poses, about the main and the second axis.
     """
-    rows = np.unique(np.linspace(0, len(base_from_gripper) - 1, 100).round().astype(int))
+    rows = np.unique(
+        np.linspace(0, len(base_from_gripper) - 1, 100).round().astype(int)
+    )
     i, j = np.triu_indices(len(rows), 1)
     motions = base_from_gripper[rows[i]].inverse() @ base_from_gripper[rows[j]]
     rotations = 2.0 * motions.rotation_wxyz[:, 1:]
@@ -196,7 +202,8 @@ def held_out_error(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
         residual = equation[rows[held_out]].system(at).residual.reshape(-1, 2, 3)
         lengths.append(np.linalg.norm(residual, axis=2))
     error = np.concatenate(lengths) * (1000.0, 180 / np.pi)
-    rms, median = np.sqrt((error**2).mean(0)), np.median(error, 0)
+    rms = np.sqrt((error**2).mean(0))
+    median = np.median(error, 0)
     names = ("held_out_mm", "held_out_deg", "held_out_rms_mm", "held_out_rms_deg")
     return dict(zip(names, (*median.tolist(), *rms.tolist()), strict=True))
 
@@ -206,12 +213,16 @@ def repeatability(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
     rows = np.flatnonzero(fit.inliers)
     if len(rows) < _MIN_HALVED:
         return {}
-    halves = (_refined(equation, fit, rows[half::2]).parent_from_camera for half in range(2))
+    halves = (
+        _refined(equation, fit, rows[half::2]).parent_from_camera for half in range(2)
+    )
     millimetres, degrees = pose_distance_mm_deg(*halves)
     return {"repeatability_mm": millimetres, "repeatability_deg": degrees}
 
 
-def _refined(equation: PoseEquation, fit: HandEyeFit, rows: NDArray[np.int64]) -> Unknowns:
+def _refined(
+    equation: PoseEquation, fit: HandEyeFit, rows: NDArray[np.int64]
+) -> Unknowns:
     use = np.zeros(len(equation), dtype=bool)
     use[rows] = True
     return refine(equation, fit.at, fit.weights, use)
@@ -220,7 +231,8 @@ def _refined(equation: PoseEquation, fit: HandEyeFit, rows: NDArray[np.int64]) -
 def left_open(fit: HandEyeFit, parent: str) -> list[str]:
     """Return what the poses determine badly, and which poses to add; one sentence each."""
     position = fit.factor * fit.covariance[:3, :3]
-    total, sentences = float(np.trace(position)), []
+    total = float(np.trace(position))
+    sentences = []
     if 1000 * np.sqrt(total / 3) < _SMALL_MM:
         return []
     for group, remedy in _REMEDIES.items():
@@ -250,21 +262,27 @@ _LARGE_SIZE, _MUCH_BETTER = 0.1, 3.0
 
 
 def with_tested_size(
-    equation: PoseEquation, fit: HandEyeFit, corners: BoardCorners | None, of_board: bool = True
+    equation: PoseEquation,
+    fit: HandEyeFit,
+    corners: BoardCorners | None,
+    of_board: bool = True,
 ) -> tuple[PoseEquation, HandEyeFit, list[str]]:
     """Free the size of the squares, or of a map, if the robot's motions contradict it."""
     # A wrong size looks like noise, so the noise is estimated again with the free size.
     free = replace(equation, extras=equation.extras.without_prior("size"))
     freed = robust_fit(free, agreement(free, fit.at))
     k = equation.extras.names.index("size")
-    off, sigma = float(freed.at.extras[k]), float(freed.sigma[12 + k])
+    off = float(freed.at.extras[k])
+    sigma = float(freed.sigma[12 + k])
     sigma *= float(np.sqrt(1 + _alike(freed)))
     if abs(off) < max(_SIZE_SIGMAS * sigma, SIZE_SIGMA):
         return equation, fit, []
-    if off < -0.5:  # a camera in the point of rotation that sees a board of size zero fits, too
+    # A camera in the point of rotation that sees a board of size zero fits, too.
+    if off < -0.5:
         warning = "the gripper turned about one point, so a wrong size of the board stays hidden"
         return equation, fit, [warning]
-    what, larger = "board" if of_board else "map", "larger" if off > 0 else "smaller"
+    what = "board" if of_board else "map"
+    larger = "larger" if off > 0 else "smaller"
     if abs(off) > _LARGE_SIZE and _misfit(fit) < _MUCH_BETTER * _misfit(freed):
         warning = (
             f"a {100 * abs(off):.0f} % {larger} {what} improves the fit but does not explain the"
@@ -296,7 +314,9 @@ def _alike(fit: HandEyeFit) -> float:
     Together as large as the noise, they move the size as much as all poses with independent noise.
     """
     noise = sum(
-        np.trace(fit.contributions[kind][:3, :3]) for kind in KINDS if kind in fit.contributions
+        np.trace(fit.contributions[kind][:3, :3])
+        for kind in KINDS
+        if kind in fit.contributions
     )
     return float(noise / np.trace(fit.covariance[:3, :3]) * fit.inliers.sum())
 

@@ -86,17 +86,21 @@ class Agreement:
 
 def agreement(equation: PoseEquation, start: Unknowns) -> Agreement:
     """Estimate how well four or more poses agree, from a start of some degrees and centimetres."""
-    n, at = len(equation), start
+    n = len(equation)
+    at = start
     # Median length of a 3-D normal variable, corrected for the degrees of freedom of the fit.
     to_sigma = np.sqrt(n / max(n - 2.0, 1.0)) / np.sqrt(chi2.ppf(0.5, 3))
-    sigma, distance2 = np.zeros(2), np.zeros(n)
+    sigma = np.zeros(2)
+    distance2 = np.zeros(n)
     for _ in range(30):
         system = equation.system(at)
         lengths = np.linalg.norm(system.residual.reshape(n, 2, 3), axis=2)
         sigma = np.maximum(np.median(lengths, 0) * to_sigma, 1e-8)
         distance2 = ((lengths / sigma) ** 2).sum(1)
         weight = (_TAILS + 6) / (_TAILS + distance2)
-        step, length2 = _step(system, weight[:, None, None] * np.diag(np.repeat(sigma**-2.0, 3)))
+        step, length2 = _step(
+            system, weight[:, None, None] * np.diag(np.repeat(sigma**-2.0, 3))
+        )
         at = at.moved(step)
         if length2 < 1e-2:
             break
@@ -107,14 +111,18 @@ def agreement(equation: PoseEquation, start: Unknowns) -> Agreement:
 
 def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
     """Refine the result of `agreement` for at least four sorted poses, and reject outliers."""
-    at, inliers, levels = start.at, start.inliers, None
-    if inliers.sum() < MIN_POSES:  # outliers cannot be detected; all poses widen the covariance
+    at = start.at
+    inliers = start.inliers
+    levels = None
+    # Outliers cannot be detected; all poses widen the covariance.
+    if inliers.sum() < MIN_POSES:
         inliers = np.ones(len(equation), dtype=bool)
     plain = np.diag(np.repeat([start.metres**2, start.radians**2], 3))
     weights = np.broadcast_to(plain, (len(equation), 6, 6))
     for _ in range(_ROUNDS):
         at = refine(equation, at, weights, inliers)
-        used, system = equation[inliers].system(at), equation.system(at)
+        used = equation[inliers].system(at)
+        system = equation.system(at)
         levels = estimate_levels(used, levels)
         weights = noise_of(system, levels.variance)
         information = np.linalg.inv(weights[inliers])
@@ -122,7 +130,10 @@ def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
         distance2 = _distances(system, weights, covariance, inliers)
         freedom = max(6 * int(inliers.sum()) - equation.unknowns, 2)
         selected = distance2 < 6 * f.ppf(1 - _REJECTION / len(inliers), 6, freedom)
-        if selected.sum() < max(MIN_POSES, len(selected) // 2) or (selected == inliers).all():
+        if (
+            selected.sum() < max(MIN_POSES, len(selected) // 2)
+            or (selected == inliers).all()
+        ):
             break
         inliers = selected
     assert levels is not None
@@ -132,7 +143,8 @@ def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
 
 def refine(equation: PoseEquation, at: Unknowns, weights: Array, use: Mask) -> Unknowns:
     """Minimize least squares by Gauss-Newton steps; `weights` (n, 6, 6) are covariances."""
-    selected, information = equation[use], np.linalg.inv(weights[use])
+    selected = equation[use]
+    information = np.linalg.inv(weights[use])
     for _ in range(30):
         step, length2 = _step(selected.system(at), information)
         at = at.moved(step)
@@ -148,7 +160,9 @@ def least_sigma(equation: PoseEquation, fit: HandEyeFit) -> Array:
     """
     system = equation[fit.inliers].system(fit.at)
     information = np.repeat([1e-4, np.deg2rad(0.01)], 3) ** -2.0
-    return np.sqrt(np.diag(normal_inverse(_normal(system, information[:, None] * system.jacobian))))
+    return np.sqrt(
+        np.diag(normal_inverse(_normal(system, information[:, None] * system.jacobian)))
+    )
 
 
 def estimate_levels(system: System, start: NoiseLevels | None = None) -> NoiseLevels:
@@ -161,13 +175,17 @@ def estimate_levels(system: System, start: NoiseLevels | None = None) -> NoiseLe
         variance = np.maximum(start.variance, 1e-6 * (sizes @ start.variance) / sizes)
     weight, weighted, inverse = _weighting(system, spreads, variance)
     for _ in range(_LEVEL_ROUNDS):
-        gradient = np.einsum("nip,ni->p", weighted, system.residual) + system.prior @ system.change
+        gradient = (
+            np.einsum("nip,ni->p", weighted, system.residual)
+            + system.prior @ system.change
+        )
         error = system.residual - system.jacobian @ (inverse @ gradient)
         error = (weight @ error[..., None])[..., 0]
         projector = weight - weighted @ inverse @ weighted.transpose(0, 2, 1)
         forms = np.einsum("ni,knij,nj->k", error, spreads, error)
         expected = np.einsum("nij,knji->k", projector, spreads)
-        before, variance = variance, variance * np.sqrt(forms / expected)
+        before = variance
+        variance = variance * np.sqrt(forms / expected)
         weight, weighted, inverse = _weighting(system, spreads, variance)
         if (sizes * np.abs(variance - before)).max() <= 2e-3 * (sizes * variance).max():
             break
@@ -180,18 +198,27 @@ def _first_levels(system: System) -> Array:
     return np.where(rotations, radians2, metres2) * 2 / len(rotations) + 1e-18
 
 
-def _weighting(system: System, spreads: Array, variance: Array) -> tuple[Array, Array, Array]:
+def _weighting(
+    system: System, spreads: Array, variance: Array
+) -> tuple[Array, Array, Array]:
     weight = np.linalg.inv(system.known + _FLOOR + np.tensordot(variance, spreads, 1))
     weighted = weight @ system.jacobian
     return weight, weighted, normal_inverse(_normal(system, weighted))
 
 
-def _level_uncertainty(spreads: Array, weight: Array, weighted: Array, inverse: Array) -> Array:
+def _level_uncertainty(
+    spreads: Array, weight: Array, weighted: Array, inverse: Array
+) -> Array:
     turned = spreads @ weight
     own = np.einsum("anij,bnji->ab", turned, turned)
     sides = spreads @ weighted
-    shared = np.einsum("anip,nij,bnjq,pq->ab", sides, weight, sides, inverse, optimize=True)
-    grams = np.einsum("nip,anij,njq->apq", weighted, spreads, weighted, optimize=True) @ inverse
+    shared = np.einsum(
+        "anip,nij,bnjq,pq->ab", sides, weight, sides, inverse, optimize=True
+    )
+    grams = (
+        np.einsum("nip,anij,njq->apq", weighted, spreads, weighted, optimize=True)
+        @ inverse
+    )
     gram = own - 2 * shared + np.einsum("apq,bqp->ab", grams, grams)
     unit = 1 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
     scaled = gram * np.outer(unit, unit) + 1e-9 * np.eye(len(gram))
@@ -204,7 +231,9 @@ def noise_of(system: System, variance: Array) -> Array:
 
 
 def _spreads(system: System) -> Array:
-    return np.stack([part @ part.transpose(0, 2, 1) for part in system.directions.values()])
+    return np.stack(
+        [part @ part.transpose(0, 2, 1) for part in system.directions.values()]
+    )
 
 
 def ellipsoid_factor(covariance: Array, slopes: Array, uncertainty: Array) -> float:
@@ -241,14 +270,19 @@ def _step(system: System, information: Array) -> tuple[Array, float]:
     normal = _normal(system, weighted)
     # Scale the unknowns so that the normal equations are well conditioned.
     unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    gradient = np.einsum("nip,ni->p", weighted, system.residual) + system.prior @ system.change
+    gradient = (
+        np.einsum("nip,ni->p", weighted, system.residual) + system.prior @ system.change
+    )
     scaled = normal * np.outer(unit, unit)
     step = -unit * np.linalg.lstsq(scaled, unit * gradient, rcond=1e-13)[0]
     return step, float(step @ normal @ step)
 
 
-def _result(equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels) -> HandEyeFit:
-    system, used = equation.system(at), equation[use].system(at)
+def _result(
+    equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels
+) -> HandEyeFit:
+    system = equation.system(at)
+    used = equation[use].system(at)
     noise = noise_of(system, levels.variance)
     weighted = np.linalg.inv(noise[use]) @ used.jacobian
     covariance = normal_inverse(_normal(used, weighted))
@@ -256,8 +290,12 @@ def _result(equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels
     gain = covariance @ weighted.transpose(0, 2, 1)
     moves = [gain[:, :6] @ part for part in used.directions.values()]
     slopes = np.stack([(move @ move.transpose(0, 2, 1)).sum(0) for move in moves])
-    contributions = dict(zip(used.directions, slopes * levels.variance[:, None, None], strict=True))
-    contributions["known"] = (gain[:, :6] @ used.known @ gain[:, :6].transpose(0, 2, 1)).sum(0)
+    contributions = dict(
+        zip(used.directions, slopes * levels.variance[:, None, None], strict=True)
+    )
+    contributions["known"] = (
+        gain[:, :6] @ used.known @ gain[:, :6].transpose(0, 2, 1)
+    ).sum(0)
     for group in dict.fromkeys(equation.extras.groups):
         own = 12 + equation.extras.indices(group)
         by_prior = covariance[:6, own]
@@ -265,7 +303,8 @@ def _result(equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels
     # Without a pose its residual no longer pulls; the leverage is the share it explains itself.
     leverage = used.jacobian @ gain
     pull = np.linalg.solve(np.eye(6) * (1 + 1e-9) - leverage, used.residual[..., None])
-    moved, information = np.zeros((len(use), 6)), np.zeros(len(use))
+    moved = np.zeros((len(use), 6))
+    information = np.zeros(len(use))
     moved[use] = (gain[:, :6] @ pull)[..., 0]
     information[use] = np.trace(leverage, axis1=1, axis2=2) / equation.unknowns
     return HandEyeFit(
@@ -287,4 +326,6 @@ def _distances(system: System, noise: Array, covariance: Array, use: Mask) -> Ar
     sign = np.where(use, -1.0, 1.0)[:, None, None]
     explained = system.jacobian @ covariance @ system.jacobian.transpose(0, 2, 1)
     spread = (1 + 1e-3) * noise + sign * explained
-    return (system.residual * np.linalg.solve(spread, system.residual[..., None])[..., 0]).sum(1)
+    return (
+        system.residual * np.linalg.solve(spread, system.residual[..., None])[..., 0]
+    ).sum(1)

@@ -64,7 +64,9 @@ class _Reading(NamedTuple):
     mount: Mount
 
 
-def quick_fit(pairs: PosePairs, mount: Mount, scale_known: bool) -> tuple[Agreement, float]:
+def quick_fit(
+    pairs: PosePairs, mount: Mount, scale_known: bool
+) -> tuple[Agreement, float]:
     """Return a robust estimate of X and Z alone, and the scale."""
     blank = Extras.nothing(len(pairs))
     start = consensus_start(pairs.equation(mount, blank), scale_known)
@@ -87,13 +89,17 @@ def require_agreement(
     if _fails(fit) or fit.radians > _DOUBT_RAD:
         readings += _other_conventions(pairs, mount, every=_fails(fit))
     fits = [(quick_fit(r.pairs, r.mount, scale_known)[0], r) for r in readings]
-    better = [(other, r) for other, r in fits if not _fails(other) and _better(other, fit)]
+    better = [
+        (other, r) for other, r in fits if not _fails(other) and _better(other, fit)
+    ]
     if better:
         # Inverted robot poses, inverted camera poses and the other mount obey the same equation.
         least = min(_cost(other) for other, _ in better)
         equal = [(other, r) for other, r in better if _cost(other) < 3 * least]
         corrected, likely = max(equal, key=lambda pair: _plausibility(pair[1], pair[0]))
-        given = "; if --invert or :inverse is given, leave it out" * ("--invert" in likely.message)
+        given = "; if --invert or :inverse is given, leave it out" * (
+            "--invert" in likely.message
+        )
         raise InputError(
             f"{likely.message}{given}; corrected, the poses agree to {_size(corrected)},"
             f" as given to {_size(fit)}"
@@ -118,11 +124,15 @@ def _fails(fit: Agreement) -> bool:
 def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> None:
     """Refuse pairs that agree, but whose geometry fits another reading far better."""
     camera = given.pairs.camera_from_board
-    rays = camera.translation_m / np.linalg.norm(camera.translation_m, axis=1)[:, None].clip(1e-9)
+    rays = camera.translation_m / np.linalg.norm(camera.translation_m, axis=1)[
+        :, None
+    ].clip(1e-9)
     behind = (rays[:, 2] < 0).mean() > _MOST
-    mean, coherent = rays.mean(0), float(np.linalg.norm(rays.mean(0)))
+    mean = rays.mean(0)
+    coherent = float(np.linalg.norm(rays.mean(0)))
     beside = coherent > _COHERENT and mean[2] < _OBLIQUE * coherent
-    x, z = fit.at.parent_from_camera, fit.at.fixed_from_board
+    x = fit.at.parent_from_camera
+    z = fit.at.fixed_from_board
     carried = x if given.mount == "eye_in_hand" else z
     if not (behind or beside or np.linalg.norm(carried.translation_m) > _LONG_M):
         return
@@ -153,12 +163,17 @@ def _better(other: Agreement, fit: Agreement) -> bool:
 
 
 def _plausibility(reading: _Reading, fit: Agreement) -> float:
-    x, z = fit.at.parent_from_camera, fit.at.fixed_from_board
+    x = fit.at.parent_from_camera
+    z = fit.at.fixed_from_board
     usual = (_NEAR_M, _FAR_M) if reading.mount == "eye_in_hand" else (_FAR_M, _NEAR_M)
-    lengths = np.array([np.linalg.norm(x.translation_m), np.linalg.norm(z.translation_m)])
+    lengths = np.array(
+        [np.linalg.norm(x.translation_m), np.linalg.norm(z.translation_m)]
+    )
     ratio = np.log(np.maximum(lengths, 0.03) / usual) / _SPREAD
     board = reading.pairs.camera_from_board.translation_m
-    angle = np.arccos(np.clip(board[:, 2] / np.linalg.norm(board, axis=1).clip(1e-9), -1, 1))
+    angle = np.arccos(
+        np.clip(board[:, 2] / np.linalg.norm(board, axis=1).clip(1e-9), -1, 1)
+    )
     bell = np.exp(-0.5 * (angle / _FIELD_RAD) ** 2) / (_FIELD_RAD * np.sqrt(np.pi / 2))
     seen = np.log((1 - _ANYWHERE) * bell + _ANYWHERE / np.pi)
     return float(_IMAGES * seen.mean() - 0.5 * (ratio**2).sum())
@@ -193,19 +208,27 @@ _SAME_EQUATION: dict[str, _Change] = {
 """Readings that agree as well as the given one."""
 _OTHER_ROBOT: dict[str, _Change] = {
     "the robot poses look inverted (gripper_from_base): invert them (--invert robot), or, if they"
-    " are base_from_gripper, use --mount {other}": lambda robot, camera: (robot.inverse(), camera),
+    " are base_from_gripper, use --mount {other}": lambda robot, camera: (
+        robot.inverse(),
+        camera,
+    ),
     _WRONG_MOUNT: lambda robot, camera: (robot, camera),
     _TRANSPOSED.format("robot"): lambda robot, camera: (_transposed(robot), camera),
 }
 _OTHER_CAMERA: dict[str, _Change] = {
     "the camera poses look inverted (board_from_camera): invert them (--invert camera), or, if they"
-    " are camera_from_board, use --mount {other}": lambda robot, camera: (robot, camera.inverse()),
+    " are camera_from_board, use --mount {other}": lambda robot, camera: (
+        robot,
+        camera.inverse(),
+    ),
     _TRANSPOSED.format("camera"): lambda robot, camera: (robot, _transposed(camera)),
 }
 """Readings in other frames, or with the other mount."""
 
 
-def _readings(pairs: PosePairs, mount: Mount, changes: Mapping[str, _Change]) -> list[_Reading]:
+def _readings(
+    pairs: PosePairs, mount: Mount, changes: Mapping[str, _Change]
+) -> list[_Reading]:
     other: Mount = "eye_to_hand" if mount == "eye_in_hand" else "eye_in_hand"
     readings = []
     for message, change in changes.items():
@@ -220,16 +243,25 @@ def _shifted(pairs: PosePairs, mount: Mount) -> list[_Reading]:
     """Return the pairs without one extra row of either file, where successive angles fit best."""
     if len(pairs) <= MIN_POSES:
         return []
-    whole, readings = np.arange(len(pairs)), []
+    whole = np.arange(len(pairs))
+    readings = []
     sides = {"robot": pairs.base_from_gripper, "camera": pairs.camera_from_board}
     for extra, other in (("robot", "camera"), ("camera", "robot")):
-        turned, same = (pose_distance(p[:-1], p[1:])[1] for p in (sides[extra], sides[other]))
-        before, after = np.abs(turned - same), np.abs(turned[1:] - same[:-1])
-        mean = [np.mean([*before[: max(k - 1, 0)], *after[k:]]) for k in range(len(pairs) - 2)]
+        turned, same = (
+            pose_distance(p[:-1], p[1:])[1] for p in (sides[extra], sides[other])
+        )
+        before = np.abs(turned - same)
+        after = np.abs(turned[1:] - same[:-1])
+        mean = [
+            np.mean([*before[: max(k - 1, 0)], *after[k:]])
+            for k in range(len(pairs) - 2)
+        ]
         k = int(np.argmin(mean))
         rows = {extra: np.delete(whole, k), other: whole[:-1]}
         read = PosePairs(
-            pairs.names[:-1], sides["robot"][rows["robot"]], sides["camera"][rows["camera"]]
+            pairs.names[:-1],
+            sides["robot"][rows["robot"]],
+            sides["camera"][rows["camera"]],
         )
         readings.append(_Reading(_SHIFTED.format(pairs.names[k], extra), read, mount))
     return readings
@@ -237,7 +269,8 @@ def _shifted(pairs: PosePairs, mount: Mount) -> list[_Reading]:
 
 def _other_conventions(pairs: PosePairs, mount: Mount, every: bool) -> list[_Reading]:
     """Return the pairs in other conventions of one file: `every`, or those that agree better."""
-    robot, camera = pairs.base_from_gripper, pairs.camera_from_board
+    robot = pairs.base_from_gripper
+    camera = pairs.camera_from_board
     readings = list[_Reading]()
     for name, part, other, given in (
         ("robot", "base_from_gripper", camera, pairs.robot_numbers),
@@ -252,7 +285,9 @@ def _other_conventions(pairs: PosePairs, mount: Mount, every: bool) -> list[_Rea
                     f" {given.convention.name}; give --{name}-convention {meant[0]}"
                     f" ({CONVENTIONS[pose_convention(meant[0]).base].meaning})"
                 )
-                readings.append(_Reading(message, replace(pairs, **{part: corrected}), mount))
+                readings.append(
+                    _Reading(message, replace(pairs, **{part: corrected}), mount)
+                )
     return readings
 
 
@@ -266,11 +301,15 @@ def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:
             continue
         same_unit = other.metres_per_unit == used.metres_per_unit
         length = "" if same_unit else _LENGTHS[used.metres_per_unit]
-        for angle in ("", "deg" if not other.degrees else "rad") if other.has_angles else ("",):
+        for angle in (
+            ("", "deg" if not other.degrees else "rad") if other.has_angles else ("",)
+        ):
             meant = ":".join(filter(None, (name, length, angle, *kept)))
             try:
                 convention = pose_convention(meant)
-                corrected = poses_from_numbers(given.numbers, convention, given.camera_from)
+                corrected = poses_from_numbers(
+                    given.numbers, convention, given.camera_from
+                )
             except ValueError:  # no rotations in that convention
                 continue
             key = (corrected.rotation_matrix().round(6) + 0.0).tobytes()  # no -0.0
@@ -295,8 +334,15 @@ def _require_unit(pairs: PosePairs, mount: Mount, fit: Agreement) -> None:
     free, scale = quick_fit(pairs, mount, False)
     if free.metres * _BETTER > fit.metres or free.radians > 1.5 * fit.radians + 1e-4:
         return
-    for unit, name in {0.001: "millimetres", 0.01: "centimetres", 0.0254: "inches"}.items():
-        for factor, side, other in ((unit, "camera", "robot"), (1 / unit, "robot", "camera")):
+    for unit, name in {
+        0.001: "millimetres",
+        0.01: "centimetres",
+        0.0254: "inches",
+    }.items():
+        for factor, side, other in (
+            (unit, "camera", "robot"),
+            (1 / unit, "robot", "camera"),
+        ):
             if abs(np.log(scale / factor)) < 0.1:
                 raise InputError(
                     f"the {side} poses look like {name}, the {other}'s like metres; convert them,"
@@ -309,7 +355,8 @@ def _require_unit(pairs: PosePairs, mount: Mount, fit: Agreement) -> None:
 
 
 def _mismatch(pairs: PosePairs) -> str:
-    robot, camera = _angles(pairs.base_from_gripper), _angles(pairs.camera_from_board)
+    robot = _angles(pairs.base_from_gripper)
+    camera = _angles(pairs.camera_from_board)
     differences = np.abs(robot - camera)
     if np.quantile(differences, 0.25) < np.deg2rad(2.0):
         return "rotations of robot and camera agree, but no mount of the camera fits their poses"

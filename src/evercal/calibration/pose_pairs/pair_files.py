@@ -16,7 +16,11 @@ from evercal.recordings.poses.conventions import PoseConvention
 from evercal.recordings.poses.pairing import unpaired
 from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.poses.robot_poses import read_robot_poses
-from evercal.recordings.poses.row_files import same_numbers, times_in_names, without_ending
+from evercal.recordings.poses.row_files import (
+    same_numbers,
+    times_in_names,
+    without_ending,
+)
 from evercal.recordings.text_files import natural_key, read_json
 
 Inverted = Literal["robot", "camera", "both"]
@@ -57,7 +61,8 @@ class _Poses:
     def corners_of(self, rows: NDArray[np.int64]) -> BoardCorners | None:
         if self.board is None:
             return None
-        images, printed = self.board.images, self.board.board
+        images = self.board.images
+        printed = self.board.board
         return BoardCorners(
             self.board.camera,
             tuple(view for row in rows if (view := images[row].view) is not None),
@@ -79,7 +84,8 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
     By names without folder and suffix if both files have them, else by times, else in order; the
     images of `evercal detect` are sorted naturally (image-2 before image-10).
     """
-    robot, camera = _read(files, "robot"), _read(files, "camera")
+    robot = _read(files, "robot")
+    camera = _read(files, "camera")
     notes: list[str] = []
     if robot.names is not None and camera.names is not None:
         rows, notes = _rows_by_name(files, robot.names, camera.names)
@@ -87,14 +93,19 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
         pairs, overlapping = interpolated_pairs(*_streams(robot, camera))
         return pairs, overlapping.corners
     elif len(robot.poses) == len(camera.poses):
-        rows, names = [*range(len(robot.poses))], camera.row_names()
-        notes = [f"robot and camera poses were paired in order, {names[0]} to {names[-1]}"]
+        rows = [*range(len(robot.poses))]
+        names = camera.row_names()
+        notes = [
+            f"robot and camera poses were paired in order, {names[0]} to {names[-1]}"
+        ]
     else:
         raise InputError(
             f"{files.robot}: {len(robot.poses)} poses for {len(camera.poses)} images of"
             f" {files.camera}; give one row per image, or name the images in a column 'image'"
         )
-    paired = [(i, row) for i, row in enumerate(rows) if row is not None and camera.measured[i]]
+    paired = [
+        (i, row) for i, row in enumerate(rows) if row is not None and camera.measured[i]
+    ]
     if not paired:
         raise InputError(f"{files.camera}: no image has both a board and a robot pose")
     images, robots = np.array(paired).T
@@ -112,9 +123,12 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
 
 def read_streams(files: PairFiles) -> tuple[PoseTrack, CameraTrack]:
     """Read robot and camera poses with times of separate clocks, or raise InputError."""
-    robot, camera = _read(files, "robot"), _read(files, "camera")
+    robot = _read(files, "robot")
+    camera = _read(files, "camera")
     if robot.stamps_s is None:
-        raise InputError(f"{files.robot}: has no times; --time-offset takes a column stamp_s")
+        raise InputError(
+            f"{files.robot}: has no times; --time-offset takes a column stamp_s"
+        )
     if camera.stamps_s is None:
         raise InputError(
             f"{files.camera}: has no times; --time-offset takes a column stamp_s, or images named"
@@ -126,7 +140,8 @@ def read_streams(files: PairFiles) -> tuple[PoseTrack, CameraTrack]:
 def _streams(robot: _Poses, camera: _Poses) -> tuple[PoseTrack, CameraTrack]:
     assert robot.stamps_s is not None
     assert camera.stamps_s is not None
-    rows, names = np.flatnonzero(camera.measured), camera.row_names()
+    rows = np.flatnonzero(camera.measured)
+    names = camera.row_names()
     track = CameraTrack(
         tuple(names[row] for row in rows),
         camera.stamps_s[rows],
@@ -141,16 +156,22 @@ def _read(files: PairFiles, role: Literal["robot", "camera"]) -> _Poses:
     path = files.robot if role == "robot" else files.camera
     inverted = files.invert in (role, "both")
     if not path.exists():
-        raise InputError(f"{path}: file of {role} poses is missing; check --{role}-poses")
+        raise InputError(
+            f"{path}: file of {role} poses is missing; check --{role}-poses"
+        )
     if role == "camera" and _is_board_file(path):
         board = read_board_poses(path)
-        images = sorted(board.images, key=lambda image: natural_key(PurePath(image.name).name))
+        images = sorted(
+            board.images, key=lambda image: natural_key(PurePath(image.name).name)
+        )
         board = replace(board, images=tuple(images))
         if not images:
             raise InputError(f"{path}: holds no images; repeat evercal detect")
         names = tuple(image.name for image in images)
         measured = np.array([image.camera_from_board is not None for image in images])
-        poses = SE3.stack([image.camera_from_board or SE3.identity() for image in images])
+        poses = SE3.stack(
+            [image.camera_from_board or SE3.identity() for image in images]
+        )
         poses = poses.inverse() if inverted else poses
         return _Poses(names, times_in_names(names), poses, measured, board=board)
     table = read_robot_poses(
@@ -162,7 +183,8 @@ def _read(files: PairFiles, role: Literal["robot", "camera"]) -> _Poses:
         camera_from=role == "camera" and not inverted,
         robot=role == "robot",
     )
-    stamps, numbers = table.stamps_s, None
+    stamps = table.stamps_s
+    numbers = None
     if role == "camera" and stamps is None and table.names is not None:
         stamps = times_in_names(table.names)
     if table.numbers is not None and table.convention is not None:
@@ -174,7 +196,11 @@ def _read(files: PairFiles, role: Literal["robot", "camera"]) -> _Poses:
 
 def _inverted(convention: PoseConvention) -> PoseConvention:
     words = convention.name.split(":")
-    words = [w for w in words if w != "inverse"] if "inverse" in words else [*words, "inverse"]
+    words = (
+        [w for w in words if w != "inverse"]
+        if "inverse" in words
+        else [*words, "inverse"]
+    )
     return replace(convention, name=":".join(words))
 
 
@@ -191,7 +217,9 @@ def _rows_by_name(
     files: PairFiles, robot: tuple[str, ...], camera: tuple[str, ...]
 ) -> tuple[list[int | None], list[str]]:
     row_of = {without_ending(name): i for i, name in enumerate(robot)}
-    repeated = [name for i, name in enumerate(robot) if row_of[without_ending(name)] != i]
+    repeated = [
+        name for i, name in enumerate(robot) if row_of[without_ending(name)] != i
+    ]
     if repeated:
         raise InputError(
             f"{files.robot}: {repeated[0]!r} comes twice, apart from folder and suffix; give every"

@@ -33,8 +33,10 @@ from evercal.recordings.poses.conventions import PoseConvention
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-_SAME_ROBOT_M, _SAME_ROBOT_RAD = 1e-4, np.deg2rad(0.01)
-_SAME_CAMERA_M, _SAME_CAMERA_RAD = 5e-3, np.deg2rad(0.5)
+_SAME_ROBOT_M = 1e-4
+_SAME_ROBOT_RAD = np.deg2rad(0.01)
+_SAME_CAMERA_M = 5e-3
+_SAME_CAMERA_RAD = np.deg2rad(0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +74,17 @@ class PosePairs:
     """How robot and camera poses were paired."""
 
     def __post_init__(self) -> None:
-        counts = {len(self.names), len(self.base_from_gripper), len(self.camera_from_board)}
+        counts = {
+            len(self.names),
+            len(self.base_from_gripper),
+            len(self.camera_from_board),
+        }
         if self.camera_covariance is not None:
             counts.add(len(self.camera_covariance))
         if len(counts) != 1:
-            raise ValueError(f"names and poses of pose pairs differ in number: {sorted(counts)}")
+            raise ValueError(
+                f"names and poses of pose pairs differ in number: {sorted(counts)}"
+            )
 
     def __len__(self) -> int:
         return len(self.names)
@@ -88,11 +96,20 @@ class PosePairs:
         changed = {name: given[name][rows] for name in each}
         return replace(self, names=tuple(self.names[row] for row in rows), **changed)
 
-    def distinct(self, scale_known: bool = True) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def distinct(
+        self, scale_known: bool = True
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return indices of different pairs, sorted by value, and (n,) the first equal pair."""
-        keys = [*self.base_from_gripper.translation_m.T, *self.camera_from_board.translation_m.T]
-        keys += [*_canonical(self.base_from_gripper).T, *_canonical(self.camera_from_board).T]
-        order, first = np.lexsort(keys[::-1]), np.empty(len(self), dtype=np.int64)
+        keys = [
+            *self.base_from_gripper.translation_m.T,
+            *self.camera_from_board.translation_m.T,
+        ]
+        keys += [
+            *_canonical(self.base_from_gripper).T,
+            *_canonical(self.camera_from_board).T,
+        ]
+        order = np.lexsort(keys[::-1])
+        first = np.empty(len(self), dtype=np.int64)
         first[order] = order[self[order].repeats(scale_known)]
         return order[first[order] == order], first
 
@@ -105,8 +122,12 @@ class PosePairs:
         if len(close) == 0:
             return first
         i, j = np.sort(close, 1).T
-        _, robot_rad = pose_distance(self.base_from_gripper[i], self.base_from_gripper[j])
-        camera_m, camera_rad = pose_distance(self.camera_from_board[i], self.camera_from_board[j])
+        _, robot_rad = pose_distance(
+            self.base_from_gripper[i], self.base_from_gripper[j]
+        )
+        camera_m, camera_rad = pose_distance(
+            self.camera_from_board[i], self.camera_from_board[j]
+        )
         if not scale_known:
             size = np.linalg.norm(self.camera_from_board.translation_m, axis=1)
             camera_m = camera_m / max(float(np.median(size)), 1e-12)
@@ -125,9 +146,11 @@ class PosePairs:
 
     def equation(self, mount: Mount, extras: Extras) -> PoseEquation:
         """Return the equation; the board is fixed in the base for a camera on the arm."""
-        on_arm, robot = mount == "eye_in_hand", self.base_from_gripper
+        on_arm = mount == "eye_in_hand"
+        robot = self.base_from_gripper
         fixed_from_parent = robot if on_arm else robot.inverse()
-        covariance, velocity = self.camera_covariance, self.velocity
+        covariance = self.camera_covariance
+        velocity = self.velocity
         if velocity is not None and not on_arm:
             velocity = _inverse_velocity(robot, velocity)
         return PoseEquation(
@@ -135,7 +158,9 @@ class PosePairs:
             robot_translation=fixed_from_parent.translation_m,
             camera_rotation=self.camera_from_board.rotation_matrix(),
             camera_translation=self.camera_from_board.translation_m,
-            camera_covariance=np.zeros((len(self), 6, 6)) if covariance is None else covariance,
+            camera_covariance=np.zeros((len(self), 6, 6))
+            if covariance is None
+            else covariance,
             extras=extras,
             base_is_fixed=on_arm,
             velocity=velocity,
@@ -183,18 +208,24 @@ class BoardCorners:
 
     def turned(self, view: BoardView) -> list[BoardView]:
         """Return a view with the other corners that may have been taken for its corners."""
-        angles = (90, 180, 270) if self.quarter_turn else (180,) if self.half_turn else ()
+        angles = (
+            (90, 180, 270) if self.quarter_turn else (180,) if self.half_turn else ()
+        )
         middle = Bend.none(self.views).middle
         turns = [Rotation.from_euler("z", angle, degrees=True) for angle in angles]
         return [
-            replace(view, points_m=turn.apply(view.points_m - middle) + middle) for turn in turns
+            replace(view, points_m=turn.apply(view.points_m - middle) + middle)
+            for turn in turns
         ]
 
     def without_strays(self, names: Sequence[str], poses: Sequence[BoardPose]) -> Self:
         """Leave out corners that leave their neighbours by many sigma."""
-        views, left_out = list(self.views), [*self.left_out]
+        views = list(self.views)
+        left_out = [*self.left_out]
         for i, stray in enumerate(strays(self.views, poses, self.camera)):
-            left_out += [f"{names[i]} {x:.0f} {y:.0f}" for x, y in views[i].pixels[stray]]
+            left_out += [
+                f"{names[i]} {x:.0f} {y:.0f}" for x, y in views[i].pixels[stray]
+            ]
             views[i] = views[i][~stray]
         return replace(self, views=tuple(views), left_out=tuple(left_out))
 
@@ -218,14 +249,20 @@ class Measured(NamedTuple):
         variance = self.sigma_px**2
         return replace(
             pairs,
-            camera_from_board=SE3.stack([pose.camera_from_board for pose in self.poses]),
-            camera_covariance=np.stack([variance * pose.unit_covariance for pose in self.poses]),
+            camera_from_board=SE3.stack(
+                [pose.camera_from_board for pose in self.poses]
+            ),
+            camera_covariance=np.stack(
+                [variance * pose.unit_covariance for pose in self.poses]
+            ),
         )
 
     def extras(self, prior: LensPrior, accepted: Mask) -> Extras:
         """Return intrinsics and bend as unknowns; corners of `accepted` (n,) are in their prior."""
         poses = [pose for pose, use in zip(self.poses, accepted, strict=True) if use]
-        change, information = lens_estimate(poses, self.sigma_px, self.camera, self.bend, prior)
+        change, information = lens_estimate(
+            poses, self.sigma_px, self.camera, self.bend, prior
+        )
         slopes = np.stack([pose.lens_slope for pose in self.poses])
         names = (*LENS[self.camera.model][: len(change) - len(BEND)], *BEND)
         return Extras(names, ("intrinsics",) * len(names), slopes, information, change)
@@ -236,7 +273,10 @@ def measured(
 ) -> Measured:
     """Fit the pose of the board in every image from (n,) starts."""
     bend = bend or Bend.none(corners.views)
-    poses = [board_pose(v, camera, s, bend) for v, s in zip(corners.views, starts, strict=True)]
+    poses = [
+        board_pose(v, camera, s, bend)
+        for v, s in zip(corners.views, starts, strict=True)
+    ]
     return Measured(camera, bend, poses, pixel_sigma(poses))
 
 

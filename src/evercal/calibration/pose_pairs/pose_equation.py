@@ -50,7 +50,9 @@ class Unknowns:
         """Return the unknowns after a (12 + q,) step of (translation, rotation) of X, Z, extras."""
         both = step[:12].reshape(2, 6)
         turned = self.rotations @ Rotation.from_rotvec(both[:, 3:]).as_matrix()
-        return Unknowns(turned, self.translations + both[:, :3], self.extras + step[12:])
+        return Unknowns(
+            turned, self.translations + both[:, :3], self.extras + step[12:]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +94,10 @@ class Extras:
 
     def without_prior(self, name: str) -> Self:
         """Free an unknown."""
-        information, k = self.information.copy(), self.names.index(name)
-        information[k], information[:, k] = 0.0, 0.0
+        information = self.information.copy()
+        k = self.names.index(name)
+        information[k] = 0.0
+        information[:, k] = 0.0
         return replace(self, information=information)
 
 
@@ -137,7 +141,9 @@ class PoseEquation:
     add to a camera stamp."""
 
     def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Self:
-        arrays = {k: v[index] for k, v in vars(self).items() if isinstance(v, np.ndarray)}
+        arrays = {
+            k: v[index] for k, v in vars(self).items() if isinstance(v, np.ndarray)
+        }
         extras = replace(self.extras, slopes=self.extras.slopes[index])
         return replace(self, extras=extras, **arrays)
 
@@ -151,7 +157,8 @@ class PoseEquation:
 
     def system(self, at: Unknowns) -> System:
         """Linearize at an estimate."""
-        n, change = len(self), self.extras.slopes @ at.extras
+        n = len(self)
+        change = self.extras.slopes @ at.extras
         board = self.camera_translation + change[:, :3]
         turned = self.camera_rotation @ Rotation.from_rotvec(change[:, 3:]).as_matrix()
         fixed_from_camera = self.robot_rotation @ at.rotations[0]
@@ -170,7 +177,8 @@ class PoseEquation:
         jacobian[:, :3, 6:9] = -np.eye(3)
         jacobian[:, 3:, 9:12] = -slope.transpose(0, 2, 1) @ at.rotations[1]
         by_camera = np.zeros((n, 6, 6))
-        by_camera[:, :3, :3], by_camera[:, 3:, 3:] = fixed_from_camera, fixed_from_camera @ turned
+        by_camera[:, :3, :3] = fixed_from_camera
+        by_camera[:, 3:, 3:] = fixed_from_camera @ turned
         jacobian[:, :, 12:] = by_camera @ self.extras.slopes
         jacobian[:, 3:, 12:] = slope @ jacobian[:, 3:, 12:]
         if self.velocity is not None and "clock" in self.extras.names:
@@ -191,7 +199,8 @@ class PoseEquation:
         """Return (n, 6, c) residuals due to unit errors of each kind, one metre or one radian."""
         # A rotation about a distant point also moves the board. Corners tell a camera's noise.
         n = len(self)
-        board, parent = at.translations[1], self.robot_translation
+        board = at.translations[1]
+        parent = self.robot_translation
         gripper = parent if self.base_is_fixed else np.zeros((n, 3))
         directions = {
             "translation": np.broadcast_to(np.eye(6, 3), (n, 6, 3)),
@@ -201,8 +210,13 @@ class PoseEquation:
             return directions
         ray = board - parent - self.robot_rotation @ at.translations[0]
         depth = np.zeros((n, 6, 1))
-        depth[:, :3, 0] = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
-        return directions | {"depth": depth, "rotation about board": _rotated(np.zeros((n, 3)))}
+        depth[:, :3, 0] = ray / np.maximum(
+            np.linalg.norm(ray, axis=1, keepdims=True), 1e-9
+        )
+        return directions | {
+            "depth": depth,
+            "rotation about board": _rotated(np.zeros((n, 3))),
+        }
 
 
 def _log_slope(rotvec: Array) -> Array:
@@ -213,8 +227,12 @@ def _log_slope(rotvec: Array) -> Array:
     matrix = cross_matrix(rotvec)
     angle2 = (rotvec**2).sum(1)[:, None, None]
     square = matrix @ matrix
-    return np.eye(3) - 0.5 * matrix + (1 / 12 + angle2 / 720 + angle2**2 / 30240) * square
+    return (
+        np.eye(3) - 0.5 * matrix + (1 / 12 + angle2 / 720 + angle2**2 / 30240) * square
+    )
 
 
 def _rotated(lever: Array) -> Array:
-    return np.concatenate([-cross_matrix(lever), np.broadcast_to(np.eye(3), (len(lever), 3, 3))], 1)
+    return np.concatenate(
+        [-cross_matrix(lever), np.broadcast_to(np.eye(3), (len(lever), 3, 3))], 1
+    )

@@ -40,7 +40,9 @@ class Slip(NamedTuple):
     """(p, p) to add to the covariance of the unknowns: they differ before and after the step."""
 
 
-def find_slip(equation: PoseEquation, fit: HandEyeFit, rows: NDArray[np.int64]) -> Slip | None:
+def find_slip(
+    equation: PoseEquation, fit: HandEyeFit, rows: NDArray[np.int64]
+) -> Slip | None:
     """Return the step that explains the residuals best, if noise would not be explained as well.
 
     Args:
@@ -50,9 +52,15 @@ def find_slip(equation: PoseEquation, fit: HandEyeFit, rows: NDArray[np.int64]) 
     """
     order = np.argsort(rows)
     every = np.ones(len(order), dtype=bool)
-    found = [s for use in (every, fit.inliers[order]) for s in _steps(equation, fit, order, use)]
+    found = [
+        s
+        for use in (every, fit.inliers[order])
+        for s in _steps(equation, fit, order, use)
+    ]
     before = min(cost for cost, k, *_ in found if k == 0)
-    kinds = [min((s for s in found if s[2] == first), key=lambda s: s[0]) for first in (0, 6)]
+    kinds = [
+        min((s for s in found if s[2] == first), key=lambda s: s[0]) for first in (0, 6)
+    ]
     after, k, first, change, covariance = min(kinds, key=lambda s: s[0])
     # All other unknowns have priors.
     freedom = 6 * len(order) - 18

@@ -11,9 +11,18 @@ from scipy.spatial.transform import Rotation
 from evercal.calibration.boards.corners import LENS, moved_lens
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, Mount
 from evercal.calibration.located import length_mm_deg
-from evercal.calibration.pose_pairs.checks import held_out_error, left_open, repeatability
+from evercal.calibration.pose_pairs.checks import (
+    held_out_error,
+    left_open,
+    repeatability,
+)
 from evercal.calibration.pose_pairs.fit import HandEyeFit
-from evercal.calibration.pose_pairs.pairs import BoardCorners, Measured, PosePairs, middle_of
+from evercal.calibration.pose_pairs.pairs import (
+    BoardCorners,
+    Measured,
+    PosePairs,
+    middle_of,
+)
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
 from evercal.calibration.verdict import verdict
 from evercal.geometry import SE3, Camera, pose_to_dict
@@ -77,9 +86,14 @@ class PairSolution:
     @property
     def camera_from_board(self) -> SE3:
         """(len(rows),) board poses by the robot's poses and the calibration."""
-        equation, carried = self.equation, self.fit.at.parent_from_camera
-        rotation = Rotation.from_matrix(equation.robot_rotation).as_quat(scalar_first=True)
-        fixed_from_parent = SE3(rotation, np.asarray(equation.robot_translation, np.float64))
+        equation = self.equation
+        carried = self.fit.at.parent_from_camera
+        rotation = Rotation.from_matrix(equation.robot_rotation).as_quat(
+            scalar_first=True
+        )
+        fixed_from_parent = SE3(
+            rotation, np.asarray(equation.robot_translation, np.float64)
+        )
         return (fixed_from_parent @ carried).inverse() @ self.fixed_from_board
 
     def calibration(self, time_offset_s: float | None = None) -> Calibration:
@@ -99,7 +113,8 @@ class PairSolution:
         return replace(calibration, verdict=verdict(calibration))
 
     def _checks(self, time_offset_s: float | None) -> dict[str, Any]:
-        fit, extras = self.fit, self.equation.extras
+        fit = self.fit
+        extras = self.equation.extras
         used = fit.residual[fit.inliers].reshape(-1, 2, 3)
         rms = np.sqrt((used**2).sum(2).mean(0))
         distance = np.linalg.norm(self.equation.camera_translation[fit.inliers], axis=1)
@@ -113,7 +128,9 @@ class PairSolution:
             **repeatability(self.equation, fit),
             "target_m": float(np.median(distance)),
             f"{fixed}_from_board": pose_to_dict(self.fixed_from_board),
-            "leave_one_out_mm": self._by_name(1000 * np.linalg.norm(fit.moved[:, :3], axis=1)),
+            "leave_one_out_mm": self._by_name(
+                1000 * np.linalg.norm(fit.moved[:, :3], axis=1)
+            ),
             "information_percent": self._by_name(100 * fit.information),
             "camera_from_board": {
                 self.pairs.names[i]: pose_to_dict(pose)
@@ -130,9 +147,13 @@ class PairSolution:
         checks |= {"scale": self.board_scale, "scale_sigma": sigma["size"]}
         if self.lens is not None:
             checks["corner_sigma_px"] = self.lens.sigma_px
-            checks["corners_left_out"] = list(self.corners.left_out) if self.corners else []
+            checks["corners_left_out"] = (
+                list(self.corners.left_out) if self.corners else []
+            )
             checks["camera_sigma"] = {
-                name: sigma[name] for name in LENS[self.lens.camera.model] if name in sigma
+                name: sigma[name]
+                for name in LENS[self.lens.camera.model]
+                if name in sigma
             }
         return checks
 
@@ -146,7 +167,9 @@ class PairSolution:
         for i, name in enumerate(self.pairs.names):
             if i not in row_of:
                 other = self.pairs.names[self.first[i]]
-                uses.append(ImageUse(name, False, f"repeats {other}, which adds nothing"))
+                uses.append(
+                    ImageUse(name, False, f"repeats {other}, which adds nothing")
+                )
                 continue
             row = row_of[i]
             mm, deg = length_mm_deg(self.fit.residual[row])
@@ -160,10 +183,16 @@ class PairSolution:
         return tuple(uses)
 
     def _error_terms(self) -> tuple[ErrorTerm, ...]:
-        fit, terms = self.fit, []
+        fit = self.fit
+        terms = []
         for name, cause in _CAUSES.items():
             part = fit.contributions.get(name)
-            if part is not None and np.trace(part) > 1e-6 * np.trace(fit.covariance[:6, :6]):
+            if part is not None and np.trace(part) > 1e-6 * np.trace(
+                fit.covariance[:6, :6]
+            ):
                 terms.append(ErrorTerm.of(cause, part))
         rest = fit.factor * fit.covariance[:6, :6] - sum(fit.contributions.values())
-        return (*terms, ErrorTerm.of("few poses, and errors alike in similar poses", rest))
+        return (
+            *terms,
+            ErrorTerm.of("few poses, and errors alike in similar poses", rest),
+        )

@@ -15,10 +15,21 @@ from evercal.calibration.pose_pairs.checks import (
     widened,
     with_tested_size,
 )
-from evercal.calibration.pose_pairs.fit import HandEyeFit, Mask, agreement, least_sigma, robust_fit
+from evercal.calibration.pose_pairs.fit import (
+    HandEyeFit,
+    Mask,
+    agreement,
+    least_sigma,
+    robust_fit,
+)
 from evercal.calibration.pose_pairs.mistakes import quick_fit, require_agreement
 from evercal.calibration.pose_pairs.pairs import BoardCorners as BoardCorners
-from evercal.calibration.pose_pairs.pairs import Measured, PosePairs, measured, middle_of
+from evercal.calibration.pose_pairs.pairs import (
+    Measured,
+    PosePairs,
+    measured,
+    middle_of,
+)
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation, Unknowns
 from evercal.calibration.pose_pairs.slips import find_slip
 from evercal.calibration.pose_pairs.solution import PairSolution
@@ -94,9 +105,13 @@ def solve_pairs(
         robot = pairs[rows].base_from_gripper
         fixed_from_parent = robot if mount == "eye_in_hand" else robot.inverse()
         at = start.at
-        predicted = (fixed_from_parent @ at.parent_from_camera).inverse() @ at.fixed_from_board
+        predicted = (
+            fixed_from_parent @ at.parent_from_camera
+        ).inverse() @ at.fixed_from_board
         predicted = SE3(predicted.rotation_wxyz, predicted.translation_m / scale)
-        corners, poses = _other_board_poses(corners, lens, rows, ~start.inliers, predicted)
+        corners, poses = _other_board_poses(
+            corners, lens, rows, ~start.inliers, predicted
+        )
         lens = measured(corners, corners.camera, poses)
     problem = _Problem(mount, scale, scale_known, corners, of_board)
     equation, fit, lens = problem.fitted(pairs, rows, start.at, lens)
@@ -134,20 +149,28 @@ class _Problem:
     of_board: bool
 
     def fitted(
-        self, pairs: PosePairs, rows: NDArray[np.int64], start: Unknowns, lens: Measured | None
+        self,
+        pairs: PosePairs,
+        rows: NDArray[np.int64],
+        start: Unknowns,
+        lens: Measured | None,
     ) -> tuple[PoseEquation, HandEyeFit, Measured | None]:
         """Fit all unknowns; with corners, until the intrinsics no longer change."""
-        at, shifts = start, start.translations.copy()
+        at = start
+        shifts = start.translations.copy()
         shifts[1] += at.rotations[1] @ middle_of(self.corners)
-        at, accepted = replace(at, translations=shifts), np.ones(len(pairs), dtype=bool)
+        at = replace(at, translations=shifts)
+        accepted = np.ones(len(pairs), dtype=bool)
         for turn in range(_MOST_LENSES):
             equation = self.equation(pairs, lens, accepted)[rows]
             at = replace(at, extras=np.zeros(len(equation.extras.names)))
             fit = robust_fit(equation, agreement(equation, at))
             if self.corners is None or lens is None:
                 return equation, fit, None
-            before, accepted = accepted, np.isin(np.arange(len(pairs)), rows[fit.inliers])
-            group, at = equation.extras.indices("intrinsics"), fit.at
+            before = accepted
+            accepted = np.isin(np.arange(len(pairs)), rows[fit.inliers])
+            group = equation.extras.indices("intrinsics")
+            at = fit.at
             change = at.extras[group]
             information = equation.extras.information[np.ix_(group, group)]
             # A pose at the threshold of rejection may alternate for ever, and the lens with it.
@@ -166,18 +189,23 @@ class _Problem:
             " 45 deg in several directions, or give --camera to evercal detect"
         )
 
-    def equation(self, pairs: PosePairs, lens: Measured | None, accepted: Mask) -> PoseEquation:
+    def equation(
+        self, pairs: PosePairs, lens: Measured | None, accepted: Mask
+    ) -> PoseEquation:
         """Return the equation with all extras, about the middle of the board.
 
         The corners of `accepted` (n,) images estimate the intrinsics.
         """
         extras = Extras.nothing(len(pairs))
         if self.corners is not None and lens is not None:
-            pairs, extras = lens.applied_to(pairs), lens.extras(self.corners.prior, accepted)
+            pairs = lens.applied_to(pairs)
+            extras = lens.extras(self.corners.prior, accepted)
         # The board's origin is a convention; noise about its middle is the same in any other.
         middle = middle_of(self.corners)
         lever = np.broadcast_to(np.eye(6), (len(pairs), 6, 6)).copy()
-        lever[:, :3, 3:] = -pairs.camera_from_board.rotation_matrix() @ cross_matrix(middle)
+        lever[:, :3, 3:] = -pairs.camera_from_board.rotation_matrix() @ cross_matrix(
+            middle
+        )
         lever[:, :3] *= self.scale
         extras = replace(extras, slopes=lever @ extras.slopes)
         about = pairs.camera_from_board @ SE3.from_translation(middle)
@@ -190,14 +218,19 @@ class _Problem:
             depth = np.pad(length[:, 2:], ((0, 0), (2, 3)))
             extras = extras.with_one("shared depth", depth, SIZE_SIGMA)
         size = np.pad(length, ((0, 0), (0, 3)))
-        extras = extras.with_one("size", size, SIZE_SIGMA if self.scale_known else np.inf)
+        extras = extras.with_one(
+            "size", size, SIZE_SIGMA if self.scale_known else np.inf
+        )
         if pairs.velocity is not None:
             extras = extras.with_one("clock", np.zeros((len(pairs), 6)), np.inf)
         return moved.equation(self.mount, extras)
 
 
 def _lens_warnings(
-    fit: HandEyeFit, equation: PoseEquation, corners: BoardCorners | None, lens: Measured | None
+    fit: HandEyeFit,
+    equation: PoseEquation,
+    corners: BoardCorners | None,
+    lens: Measured | None,
 ) -> list[str]:
     if corners is None or lens is None or not corners.stated:
         return []
@@ -215,11 +248,17 @@ def _lens_warnings(
 
 def _mount_warnings(at: Unknowns, mount: Mount) -> list[str]:
     """The other mount with inverted robot poses obeys the same equation."""
-    both = np.stack([at.parent_from_camera.translation_m, at.fixed_from_board.translation_m])
+    both = np.stack(
+        [at.parent_from_camera.translation_m, at.fixed_from_board.translation_m]
+    )
     camera, board = np.linalg.norm(both, axis=1).tolist()
-    carried, on, other = camera, ("gripper", "base"), "eye_to_hand"
+    carried = camera
+    on = ("gripper", "base")
+    other = "eye_to_hand"
     if mount == "eye_to_hand":
-        carried, on, other = board, ("base", "gripper"), "eye_in_hand"
+        carried = board
+        on = ("base", "gripper")
+        other = "eye_in_hand"
     if carried < max(_REACH_M, _OTHER_MOUNT * min(camera, board)):
         return []
     return [
@@ -240,16 +279,24 @@ def _other_board_poses(
 
     A flat board has two similar poses, and a symmetric board several orders of its corners.
     """
-    views, poses = list(corners.views), [pose.camera_from_board for pose in lens.poses]
+    views = list(corners.views)
+    poses = [pose.camera_from_board for pose in lens.poses]
     for row in np.flatnonzero(outliers):
-        i, nearest = int(rows[row]), np.inf
-        view, old = corners.views[i], lens.poses[i]
+        i = int(rows[row])
+        nearest = np.inf
+        view = corners.views[i]
+        old = lens.poses[i]
         for candidate in (view, *corners.turned(view)):
             pose = board_pose(candidate, lens.camera, predicted[row])
             # All orders of a symmetric board fit; the other poses decide between them.
             _, turn = pose_distance(pose.camera_from_board, predicted[row])
-            if pose.squared_px < 4 * old.squared_px + 0.1 * old.corners and turn < nearest:
-                views[i], poses[i], nearest = candidate, pose.camera_from_board, float(turn)
+            if (
+                pose.squared_px < 4 * old.squared_px + 0.1 * old.corners
+                and turn < nearest
+            ):
+                views[i] = candidate
+                poses[i] = pose.camera_from_board
+                nearest = float(turn)
     return replace(corners, views=tuple(views)), SE3.stack(poses)
 
 
@@ -258,14 +305,17 @@ def _require_determined(
 ) -> None:
     """Check that the inliers alone determine the calibration."""
     require_rotations(used.base_from_gripper)
-    least, size = least_sigma(equation, fit), 12 + equation.extras.names.index("size")
+    least = least_sigma(equation, fit)
+    size = 12 + equation.extras.names.index("size")
     if not scale_known and not max(float(fit.sigma[size]), least[size]) < _SCALE_SIGMA:
         raise InputError(
             "pure rotation: the poses turn about one point and leave the camera's scale open; also"
             " move the gripper by 10 cm or more between poses"
         )
     spread = np.sqrt(np.abs(fit.covariance[:3, :3].trace()))
-    if not (np.isfinite(fit.covariance).all() and spread < 1.0 and least[:3].max() < 0.1):
+    if not (
+        np.isfinite(fit.covariance).all() and spread < 1.0 and least[:3].max() < 0.1
+    ):
         raise InputError(
             "the poses leave the position of the camera open by more than a metre; record 15 to 25"
             " poses that turn by 20 to 60 deg about two axes"

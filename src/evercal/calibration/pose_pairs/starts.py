@@ -37,9 +37,13 @@ def consensus_start(equation: PoseEquation, scale_known: bool = True) -> Start:
     scored = equation[np.unique(np.linspace(0, n - 1, _SCORED).round().astype(int))]
     i, j = np.triu_indices(len(scored), 1)
     triples = _triples(n)
-    sampled = _solve_motions(equation, triples[:, [0, 0, 1]], triples[:, [1, 2, 2]], scale_known)
+    sampled = _solve_motions(
+        equation, triples[:, [0, 0, 1]], triples[:, [1, 2, 2]], scale_known
+    )
     whole = _solve_motions(scored, i[None], j[None], scale_known)
-    rotations, shifts, scales = (np.concatenate(both) for both in zip(sampled, whole, strict=True))
+    rotations, shifts, scales = (
+        np.concatenate(both) for both in zip(sampled, whole, strict=True)
+    )
     # (h, n) board poses in the fixed frame by each hypothesis.
     fixed_from_camera = scored.robot_rotation @ rotations[:, None]
     turned = fixed_from_camera @ scored.camera_rotation
@@ -65,14 +69,18 @@ def _triples(n: int) -> NDArray[np.int64]:
 
 
 def _solve_motions(
-    equation: PoseEquation, first: NDArray[np.int64], second: NDArray[np.int64], scale_known: bool
+    equation: PoseEquation,
+    first: NDArray[np.int64],
+    second: NDArray[np.int64],
+    scale_known: bool,
 ) -> tuple[Array, Array, Array]:
     """Solve A X = X B for h sets of m motions between the poses `first` and `second`, (h, m).
 
     Returns:
         Rotations (h, 3, 3), translations (h, 3) and scales (h,) of `parent_from_camera`.
     """
-    robot, camera = equation.robot_rotation, equation.camera_rotation
+    robot = equation.robot_rotation
+    camera = equation.camera_rotation
     inverse = robot[first].transpose(0, 1, 3, 2)
     rotation_a = inverse @ robot[second]
     rotation_b = camera[first] @ camera[second].transpose(0, 1, 3, 2)
@@ -80,16 +88,21 @@ def _solve_motions(
     translation_a = (inverse @ shift[..., None])[..., 0]
     board = equation.camera_translation
     translation_b = board[first] - (rotation_b @ board[second][..., None])[..., 0]
-    rotations = _nearest(_sine_axes(rotation_a).transpose(0, 2, 1) @ _sine_axes(rotation_b))
-    system, right_side = rotation_a - np.eye(3), -translation_a
+    rotations = _nearest(
+        _sine_axes(rotation_a).transpose(0, 2, 1) @ _sine_axes(rotation_b)
+    )
+    system = rotation_a - np.eye(3)
+    right_side = -translation_a
     rotated = translation_b @ rotations.transpose(0, 2, 1)
     unit = np.sqrt((translation_b**2).mean((1, 2), keepdims=True)) + 1e-300
     if scale_known:
         right_side = right_side + rotated
     else:
         system = np.concatenate([system, -(rotated / unit)[..., None]], -1)
-    h, unknowns = len(system), system.shape[-1]
-    system, right_side = system.reshape(h, -1, unknowns), right_side.reshape(h, -1, 1)
+    h = len(system)
+    unknowns = system.shape[-1]
+    system = system.reshape(h, -1, unknowns)
+    right_side = right_side.reshape(h, -1, 1)
     normal = system.transpose(0, 2, 1) @ system
     ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12
     projected = system.transpose(0, 2, 1) @ right_side
@@ -106,13 +119,16 @@ def _sine_axes(rotations: Array) -> Array:
 def _spread(rotations: Array, translations: Array) -> tuple[Array, Array, Array]:
     """Return the (h,) logarithmic spread of the better half of n boards, and their mean."""
     h, n = translations.shape[:2]
-    half, rows = min(n, (n + 4) // 2), np.arange(h)[:, None]
+    half = min(n, (n + 4) // 2)
+    rows = np.arange(h)[:, None]
     mean_rotation = _nearest(np.median(rotations, 1))
     mean_translation = np.median(translations, 1)
     spread = np.zeros((2, h))
     for _ in range(3):
         metres2 = ((translations - mean_translation[:, None]) ** 2).sum(-1) + _FLOOR**2
-        radians2 = ((rotations - mean_rotation[:, None]) ** 2).sum((-1, -2)) / 2 + _FLOOR**2
+        radians2 = ((rotations - mean_rotation[:, None]) ** 2).sum(
+            (-1, -2)
+        ) / 2 + _FLOOR**2
         # Each distance is divided by its median so that the two can be added.
         ratio = metres2 / np.median(metres2, 1, keepdims=True)
         ratio += radians2 / np.median(radians2, 1, keepdims=True)

@@ -37,11 +37,14 @@ class CameraTrack:
     """Corners of the images, in the same order."""
 
     def __getitem__(self, index: NDArray[np.bool_]) -> "CameraTrack":
-        rows, corners = np.flatnonzero(index), self.corners
+        rows = np.flatnonzero(index)
+        corners = self.corners
         if corners is not None:
             corners = replace(corners, views=tuple(corners.views[row] for row in rows))
         names = tuple(self.names[row] for row in rows)
-        return CameraTrack(names, self.stamps_s[rows], self.camera_from_board[rows], corners)
+        return CameraTrack(
+            names, self.stamps_s[rows], self.camera_from_board[rows], corners
+        )
 
 
 def solve_with_offset(
@@ -69,7 +72,8 @@ def solve_with_offset(
     while True:
         pairs, overlapping = _pairs_at(robot, camera, offset)
         solution = solve_pairs(pairs, mount, scale_known, overlapping.corners)
-        correction, sigma = float(solution.fit.at.extras[-1]), float(solution.fit.sigma[-1])
+        correction = float(solution.fit.at.extras[-1])
+        sigma = float(solution.fit.sigma[-1])
         offset += float(np.clip(correction, -largest_s, largest_s))
         turns += 1
         if abs(correction) < 1e-4 or turns == 6:
@@ -83,7 +87,9 @@ def solve_with_offset(
     return solution.calibration(offset)
 
 
-def interpolated_pairs(robot: PoseTrack, camera: CameraTrack) -> tuple[PosePairs, CameraTrack]:
+def interpolated_pairs(
+    robot: PoseTrack, camera: CameraTrack
+) -> tuple[PosePairs, CameraTrack]:
     """Interpolate robot poses at image times; return the images within the track, too."""
     pairs, overlapping = _pairs_at(robot, camera, 0.0)
     return replace(pairs, velocity=None), overlapping
@@ -101,7 +107,8 @@ def _pairs_at(
             f" {times.max():.3f} s, robot poses at {robot.stamps_s[0]:.3f} to"
             f" {robot.stamps_s[-1]:.3f} s; check that both use the same clock"
         )
-    overlapping, poses = camera[inside], poses[inside]
+    overlapping = camera[inside]
+    poses = poses[inside]
     times = np.asarray(times[inside], dtype=np.float64)
     before, after = (robot.at(times + sign * _HALF_S)[0] for sign in (-1, 1))
     # At the ends of the track the interval is shorter.
@@ -110,8 +117,11 @@ def _pairs_at(
     )
     linear = after.translation_m - before.translation_m
     angular = (after @ before.inverse()).log()[:, 3:]
-    velocity = np.concatenate([linear, angular], 1) / np.maximum(duration, 1e-9)[:, None]
-    names, boards = overlapping.names, overlapping.camera_from_board
+    velocity = (
+        np.concatenate([linear, angular], 1) / np.maximum(duration, 1e-9)[:, None]
+    )
+    names = overlapping.names
+    boards = overlapping.camera_from_board
     return PosePairs(names, poses, boards, velocity=velocity), overlapping
 
 

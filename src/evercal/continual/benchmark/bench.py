@@ -68,7 +68,9 @@ def run_bench(
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
         try:
-            claim = FileLock(runs / f"{strategy.name}-{seed}.claim").acquire(blocking=False)
+            claim = FileLock(runs / f"{strategy.name}-{seed}.claim").acquire(
+                blocking=False
+            )
         except Timeout:  # another process has this run
             continue
         with claim:
@@ -77,7 +79,9 @@ def run_bench(
                 continue
             for stage in run_strategy(strategy, ordered, options, seed, out):
                 results.append(out, stage)
-                yield Step(strategy.name, seed, stage.results, done + stage.stage + 1, total)
+                yield Step(
+                    strategy.name, seed, stage.results, done + stage.stage + 1, total
+                )
             done += len(scenes)
 
 
@@ -92,7 +96,9 @@ def begin_bench(
         lock_settings(out / results.SETTINGS, settings)
         _record_strategies(out, options.strategies)
     stored = results.read(out)
-    runs = [(seed, strategy) for seed in options.seeds for strategy in options.strategies]
+    runs = [
+        (seed, strategy) for seed in options.seeds for strategy in options.strategies
+    ]
     return [run for run in runs if not _complete(run, stored, len(scenes))]
 
 
@@ -100,7 +106,9 @@ def _complete(run: tuple[int, Strategy], stored: Table, scenes: int) -> bool:
     seed, strategy = run
     rows = results.run_of(stored, strategy.name, seed)
     last = rows[rows["stage"] == scenes - 1].groupby("strategy").size()
-    return len(rows) > 0 and all(last.get(name) == scenes for name in rows["strategy"].unique())
+    return len(rows) > 0 and all(
+        last.get(name) == scenes for name in rows["strategy"].unique()
+    )
 
 
 def _record_strategies(out: Path, strategies: Sequence[Strategy]) -> None:
@@ -127,7 +135,10 @@ def in_order(scenes: Sequence[Recording], order: Order, seed: int) -> list[Recor
         turned = [scenes[(i + places) % len(scenes)] for i in range(len(scenes))]
         return turned[::-1] if rounds % 2 else turned
     if order == "shuffled":
-        return [scenes[i] for i in np.random.default_rng([seed, 11]).permutation(len(scenes))]
+        return [
+            scenes[i]
+            for i in np.random.default_rng([seed, 11]).permutation(len(scenes))
+        ]
     return list(scenes)
 
 
@@ -139,7 +150,9 @@ def _settings(scenes: Sequence[Recording], options: BenchOptions) -> dict[str, o
         "networks": [sha256_file(file)[:12] for file in networks],
         "localize": asdict(LocalizeOptions()),
         "localize_networks": asdict(NETWORK_LOCALIZE),
-        "acceptance": {k: v for k, v in vars(acceptance).items() if isinstance(v, float)},
+        "acceptance": {
+            k: v for k, v in vars(acceptance).items() if isinstance(v, float)
+        },
         "order": options.order,
         "short_side": options.short_side,
         "scenes": [[scene.name, len(scene.train), len(scene.test)] for scene in scenes],

@@ -10,8 +10,10 @@ from evercal.continual.benchmark.results import Table
 from evercal.errors import InputError
 from evercal.evaluation.metrics import ContinualScores, continual_scores
 
-COARSE_COLUMN, FINE_COLUMN = "within_5cm_5deg", "within_1cm_1deg"
-FINAL, AREA = "final %", "area to 20 cm"
+COARSE_COLUMN = "within_5cm_5deg"
+FINE_COLUMN = "within_1cm_1deg"
+FINAL = "final %"
+AREA = "area to 20 cm"
 LEGEND = """\
 Accuracy: share of all test frames strictly below 5 cm and 5 deg, mean over scenes.
 final: accuracy after the last stage. last scene: accuracy on the scene learned last.
@@ -42,7 +44,9 @@ def run_scores(results: Table) -> Table:
     Forgetting and memory of joint training are NaN.
     """
     scores = {key: _scores(run) for key, run in _runs(complete_runs(results)).items()}
-    return pd.DataFrame.from_dict(scores, orient="index").rename_axis(["strategy", "seed"])
+    return pd.DataFrame.from_dict(scores, orient="index").rename_axis(
+        ["strategy", "seed"]
+    )
 
 
 def _runs(results: Table) -> dict[tuple[str, int], Table]:
@@ -51,7 +55,9 @@ def _runs(results: Table) -> dict[tuple[str, int], Table]:
 
 
 def _scores(run: Table) -> dict[str, float]:
-    coarse, fine = (continual(matrix(run, name)) for name in (COARSE_COLUMN, FINE_COLUMN))
+    coarse, fine = (
+        continual(matrix(run, name)) for name in (COARSE_COLUMN, FINE_COLUMN)
+    )
     last = run[run["stage"] == run["stage"].max()]
     located = last["with_covariance"].sum()
     jointly = math.isnan(coarse.total_forgetting)
@@ -66,7 +72,9 @@ def _scores(run: Table) -> dict[str, float]:
         "BWT": coarse.backward_transfer,
         "wrong scene %": 100 * float((last["wrong_scene"] / last["frames"]).mean()),
         "refused %": 100 * float((last["refused"] / last["frames"]).mean()),
-        "in 95 % ellipsoid": 100 * last["inside_95"].sum() / located if located else math.nan,
+        "in 95 % ellipsoid": 100 * last["inside_95"].sum() / located
+        if located
+        else math.nan,
         # Joint training needs all frames again.
         "memory MB": math.nan if jointly else last["memory_bytes"].iloc[0] / 1e6,
         "heads MB": last["head_bytes"].iloc[0] / 1e6,
@@ -90,7 +98,8 @@ def continual(accuracies: Table) -> ContinualScores:
     values = accuracies.to_numpy(float)
     if np.isfinite(values[np.tril_indices(len(values))]).all():
         return continual_scores(values)
-    nan, last = math.nan, values[-1]
+    nan = math.nan
+    last = values[-1]
     return ContinualScores(float(last.mean()), nan, nan, nan, float(last[-1]), nan)
 
 
@@ -101,7 +110,8 @@ def method_table(scores: Table) -> Table:
     """
     grouped = scores.groupby(level="strategy", sort=False)
     means = grouped.mean().where(grouped.count().eq(grouped.size(), axis=0))
-    runs, spread = grouped.size(), grouped[FINAL].std()
+    runs = grouped.size()
+    spread = grouped[FINAL].std()
     table = formatted(means)
     table[FINAL] = [
         mean if np.isnan(deviation) else f"{mean} ± {deviation:.1f}"
@@ -116,7 +126,9 @@ def scene_table(results: Table) -> Table:
     rows = []
     for (name, _), run in _runs(complete_runs(results)).items():
         accuracies = matrix(run)
-        ends = zip(accuracies.columns, np.diag(accuracies), accuracies.iloc[-1], strict=True)
+        ends = zip(
+            accuracies.columns, np.diag(accuracies), accuracies.iloc[-1], strict=True
+        )
         rows += [(name, scene, first, end) for scene, first, end in ends]
     cells = pd.DataFrame(rows, columns=["strategy", "scene", "learned", "end"])
     means = cells.groupby(["strategy", "scene"], sort=False)[["learned", "end"]].mean()
@@ -135,7 +147,10 @@ def contrast_table(scores: Table, pairs: Sequence[tuple[str, str]]) -> Table:
     heads = [head for name in (FINAL, AREA) for head in (name, "bounds", "better in")]
     rows = {}
     for ours, theirs in pairs:
-        a, b = (by_name.get(name, scores[:0]).droplevel("strategy") for name in (ours, theirs))
+        a, b = (
+            by_name.get(name, scores[:0]).droplevel("strategy")
+            for name in (ours, theirs)
+        )
         gains = (a - b).dropna()
         cells: list[object] = [len(gains)]
         for name in (FINAL, AREA):
@@ -148,7 +163,9 @@ def contrast_table(scores: Table, pairs: Sequence[tuple[str, str]]) -> Table:
     return pd.DataFrame(list(rows.values()), index, columns=["runs", *heads])
 
 
-def seeds_interval(values: Sequence[float], comparisons: int = 1) -> tuple[float, float]:
+def seeds_interval(
+    values: Sequence[float], comparisons: int = 1
+) -> tuple[float, float]:
     """Estimate a 95 % interval of a mean over runs with other seeds and orders, on the same rooms.
 
     Student's t over the runs. It covers the choice of seed and order, not that of rooms, paths or

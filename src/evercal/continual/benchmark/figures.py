@@ -8,14 +8,25 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+COLOURS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#000000",
+    "#999999",
+)
 _MARKERS = "os^Dv<>P"
 _LINES = ("-", "--", "-.", ":")
 
 
 def new_figure(width: float, height: float) -> Figure:
     """Create an empty white figure; width and height in inches."""
-    return Figure(figsize=(width, height), dpi=150, layout="constrained", facecolor="white")
+    return Figure(
+        figsize=(width, height), dpi=150, layout="constrained", facecolor="white"
+    )
 
 
 def tidy(panel: Axes) -> None:

@@ -68,7 +68,9 @@ def paper_table(results: Table, suite: str = "") -> Table:
     """
     results = comparison.complete_runs(results)
     last = results[results["stage"] == results["stage"].max()]
-    within = comparison.FINE_COLUMN if suite.startswith("sim") else comparison.COARSE_COLUMN
+    within = (
+        comparison.FINE_COLUMN if suite.startswith("sim") else comparison.COARSE_COLUMN
+    )
     cells: Table = pd.DataFrame(
         {
             "t, cm": last["median_mm"] / 10,
@@ -82,10 +84,17 @@ def paper_table(results: Table, suite: str = "") -> Table:
     table = table.reindex(columns=pd.MultiIndex.from_product([names, cells.columns]))
     by_strategy = comparison.run_scores(results)["TFR"].groupby("strategy")
     forgetting = by_strategy.agg(lambda values: values.mean(skipna=False))
-    totals = {"Mean": dict(table.xs("Acc, %", axis=1, level=1).mean()), "TFR": dict(forgetting)}
+    totals = {
+        "Mean": dict(table.xs("Acc, %", axis=1, level=1).mean()),
+        "TFR": dict(forgetting),
+    }
     if suite in PUBLISHED:
-        totals["Mean, published"] = {name: pair[0] for name, pair in PUBLISHED[suite].items()}
-        totals["TFR, published"] = {name: pair[1] for name, pair in PUBLISHED[suite].items()}
+        totals["Mean, published"] = {
+            name: pair[0] for name, pair in PUBLISHED[suite].items()
+        }
+        totals["TFR, published"] = {
+            name: pair[1] for name, pair in PUBLISHED[suite].items()
+        }
     for title, values in totals.items():
         table.loc[title] = math.nan
         for name in names:
@@ -101,7 +110,8 @@ def ablation_table(scores: Table, suite: str = "") -> Table:
     the suite are added if there are any.
     """
     final = scores[comparison.FINAL].groupby("strategy").mean()
-    rows, published = [], PUBLISHED.get(suite)
+    rows = []
+    published = PUBLISHED.get(suite)
     for title, steps in ABLATIONS.items():
         if sum(name in final for _, name in steps) < 2:
             continue
@@ -113,7 +123,9 @@ def ablation_table(scores: Table, suite: str = "") -> Table:
             row = {"ablation": title, "": label, comparison.FINAL: f"{final[name]:.1f}"}
             row |= {"step": step[comparison.FINAL], "95 %": step["bounds"].iloc[0]}
             if published:
-                row["published %"] = f"{published[name][0]:.1f}" if title == "as printed" else ""
+                row["published %"] = (
+                    f"{published[name][0]:.1f}" if title == "as printed" else ""
+                )
             rows.append(row)
     return pd.DataFrame(rows)
 

@@ -18,7 +18,9 @@ from evercal.errors import InputError
 from evercal.storage import write_bytes
 from evercal.storage.settings import read_settings
 
-TABLES, LATEX, FIGURE = "tables.md", "tables.tex", "figure.svg"
+TABLES = "tables.md"
+LATEX = "tables.tex"
+FIGURE = "figure.svg"
 _LINES = 7
 """Strategies of the figure."""
 
@@ -35,13 +37,18 @@ def write_report(folder: Path, reference: str) -> str:
     results = comparison.complete_runs(results)
     scores = comparison.run_scores(results)
     scenes = comparison.scene_table(results).reset_index()
-    methods, ablation = comparison.method_table(scores), ablation_table(scores, suite)
+    methods = comparison.method_table(scores)
+    ablation = ablation_table(scores, suite)
     others = methods.index.drop(reference, errors="ignore")
-    contrasts = comparison.contrast_table(scores, [(reference, name) for name in others])
+    contrasts = comparison.contrast_table(
+        scores, [(reference, name) for name in others]
+    )
     tables = {
         "Strategies, means over runs": methods.reset_index(),
         "Accuracy of each scene: just after learning it -> at the end": scenes,
-        "Differences on common seeds, in points": contrasts[contrasts["runs"] > 0].reset_index(),
+        "Differences on common seeds, in points": contrasts[
+            contrasts["runs"] > 0
+        ].reset_index(),
         "Ablation after Table 4 of the paper": ablation,
     }
     text = "\n\n".join(
@@ -63,13 +70,20 @@ def _figure(results: Table, strategies: Table, path: Path) -> None:
     """Plot the accuracy on each scene while later ones are learned, means over runs."""
     by_strategy = results.groupby("strategy")
     runs = {
-        name: [comparison.matrix(run) for _, run in by_strategy.get_group(name).groupby("seed")]
+        name: [
+            comparison.matrix(run)
+            for _, run in by_strategy.get_group(name).groupby("seed")
+        ]
         for name in strategies
     }
     # With several orders, a panel is the place of a scene in the order.
     orders = {tuple(run.columns) for group in runs.values() for run in group}
     count = len(next(iter(orders)))
-    titles = next(iter(orders)) if len(orders) == 1 else [f"scene {i + 1}" for i in range(count)]
+    titles = (
+        next(iter(orders))
+        if len(orders) == 1
+        else [f"scene {i + 1}" for i in range(count)]
+    )
     figure = new_figure(2.6 * (count + 1), 2.8)
     panels = figure.subplots(1, count + 1, sharex=True, sharey=True)
     stages = np.arange(1, count + 1)
@@ -86,5 +100,7 @@ def _figure(results: Table, strategies: Table, path: Path) -> None:
     figure.supxlabel("scenes learned", fontsize=9)
     figure.supylabel("accuracy (%)", fontsize=9)
     handles, labels = panels[count].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=_LINES, frameon=False)
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=_LINES, frameon=False
+    )
     figure.savefig(path)

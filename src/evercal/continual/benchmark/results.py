@@ -28,8 +28,10 @@ from evercal.storage.settings import read_settings
 
 Table = Any
 """A DataFrame of pandas, whose methods pyright cannot check without stubs."""
-RESULTS, FRAMES = "results.csv", "frames.csv"
-SETTINGS, STRATEGIES = "settings.json", "strategies.json"
+RESULTS = "results.csv"
+FRAMES = "frames.csv"
+SETTINGS = "settings.json"
+STRATEGIES = "strategies.json"
 ENVIRONMENTS = "environments.json"
 UNALIGNED = ":unaligned"
 """Suffix of a strategy for results by the first pose, before landmarks are aligned."""
@@ -44,7 +46,15 @@ WITHIN = {
 KEY = ["strategy", "seed", "stage", "scene"]
 """Columns that identify a row of results.csv."""
 _FRAME_KEY = ["strategy", "seed", "scene", "frame"]
-_REQUIRED = {*KEY, "frames", *WITHIN, "seconds", "memory_bytes", "head_bytes", "environment"}
+_REQUIRED = {
+    *KEY,
+    "frames",
+    *WITHIN,
+    "seconds",
+    "memory_bytes",
+    "head_bytes",
+    "environment",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +79,10 @@ def scene_row(frames: Sequence[metrics.FrameResult]) -> dict[str, object]:
     return {
         "scene": frames[0].scene,
         "frames": len(frames),
-        **{name: int(((metres < m) & (radians < r)).sum()) for name, (m, r) in WITHIN.items()},
+        **{
+            name: int(((metres < m) & (radians < r)).sum())
+            for name, (m, r) in WITHIN.items()
+        },
         "median_mm": round(1000 * float(np.sort(metres)[middle]), 3),
         "median_deg": round(math.degrees(np.sort(radians)[middle]), 4),
         "area_20cm": round(metrics.recall_area(metres), 4),
@@ -108,7 +121,8 @@ def append(folder: Path, stage: StageResults) -> None:
     """Append the rows of a stage that a folder lacks, and flush them to disk."""
     before = read(folder)
     new = stage.results
-    if len(before) and len(new):  # an interrupted call may have stored some rows of the stage
+    # An interrupted call may have stored some rows of the stage.
+    if len(before) and len(new):
         stored = pd.MultiIndex.from_frame(before[KEY])
         new = new[~pd.MultiIndex.from_frame(new[KEY]).isin(stored)]
     with locked(folder):
@@ -168,7 +182,9 @@ def _remove_incomplete_line(folder: Path, path: Path) -> None:
 def record_environment(folder: Path) -> str:
     """Add the record of this process to environments.json and return its key."""
     record = environment()
-    key = hashlib.blake2b(json.dumps(record, sort_keys=True).encode(), digest_size=4).hexdigest()
+    key = hashlib.blake2b(
+        json.dumps(record, sort_keys=True).encode(), digest_size=4
+    ).hexdigest()
     with locked(folder):
         before = read_environments(folder)
         if key not in before:

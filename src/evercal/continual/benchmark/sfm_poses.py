@@ -29,7 +29,8 @@ def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
 
     Files in `folder` begin with `name`, such as chess or apt1_kitchen.
     """
-    splits, lost = [], 0
+    splits = []
+    lost = 0
     for split, frames in (("train", recording.train), ("test", recording.test)):
         file = folder / f"{name}_{split}.txt"
         poses = _read(file)
@@ -43,10 +44,14 @@ def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
             posed.append(replace(frame, camera=camera, base_from_camera=pose))
         if frames and not posed:
             first = _key(frames[0].name)
-            raise InputError(f"{file}: no frame of {recording.name} is in it, such as {first}")
+            raise InputError(
+                f"{file}: no frame of {recording.name} is in it, such as {first}"
+            )
         splits.append(tuple(posed))
         lost += len(frames) - len(posed)
-    return replace(recording, train=splits[0], test=splits[1], untracked=recording.untracked + lost)
+    return replace(
+        recording, train=splits[0], test=splits[1], untracked=recording.untracked + lost
+    )
 
 
 def _key(name: str) -> str:
@@ -56,7 +61,9 @@ def _key(name: str) -> str:
 
 def _read(file: Path) -> dict[str, tuple[SE3, float]]:
     source = "https://github.com/tsattler/visloc_pseudo_gt_limitations"
-    lines = read_text(file, "pose file", f"get the folder pgt/sfm of {source}").splitlines()
+    lines = read_text(
+        file, "pose file", f"get the folder pgt/sfm of {source}"
+    ).splitlines()
     poses = {}
     for number, line in enumerate(filter(str.strip, lines), start=1):
         name, *words = line.split()
@@ -64,7 +71,9 @@ def _read(file: Path) -> dict[str, tuple[SE3, float]]:
             numbers = np.array([float(word) for word in words])
             if len(numbers) != 8 or not np.isfinite(numbers).all() or numbers[7] <= 0:
                 raise ValueError
-            camera_from_base = SE3(numbers[:4] / np.linalg.norm(numbers[:4]), numbers[4:7])
+            camera_from_base = SE3(
+                numbers[:4] / np.linalg.norm(numbers[:4]), numbers[4:7]
+            )
         except ValueError:
             raise InputError(
                 f"{file}: line {number} is not 'image qw qx qy qz tx ty tz focal': {line[:60]!r}"

@@ -19,7 +19,10 @@ from evercal.continual.benchmark.results import (
     scene_row,
 )
 from evercal.continual.learning.learn import finish_scene, learn_jointly
-from evercal.continual.learning.learn_networks import NetworkLearnOptions, learn_networks
+from evercal.continual.learning.learn_networks import (
+    NetworkLearnOptions,
+    learn_networks,
+)
 from evercal.continual.learning.stage import StageOptions
 from evercal.continual.learning.stage_rows import StageRows
 from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer
@@ -71,7 +74,11 @@ class BenchOptions:
 
 
 def run_strategy(
-    strategy: Strategy, scenes: Sequence[Recording], options: BenchOptions, seed: int, out: Path
+    strategy: Strategy,
+    scenes: Sequence[Recording],
+    options: BenchOptions,
+    seed: int,
+    out: Path,
 ) -> Iterator[StageResults]:
     """Learn the scenes in turn and evaluate all scenes learned so far after each.
 
@@ -95,8 +102,11 @@ class _Run:
         seed: int,
         out: Path,
     ):
-        self.strategy, self.scenes, self.out = strategy, scenes, out
-        self.device, self.short_side = device_of(options.device), options.short_side
+        self.strategy = strategy
+        self.scenes = scenes
+        self.out = out
+        self.device = device_of(options.device)
+        self.short_side = options.short_side
         self.stage = _with_centres(options.stage(seed), scenes)
         self.features = out.absolute() / "features"
         self.store = out / "runs" / f"{strategy.name}-{seed}"
@@ -106,17 +116,25 @@ class _Run:
         self.store.with_name(f".{self.store.name}.lock").unlink(missing_ok=True)
 
     def _evaluated(
-        self, localizers: Mapping[str, LearnedLocalizer], number: int, costs: Mapping[str, object]
+        self,
+        localizers: Mapping[str, LearnedLocalizer],
+        number: int,
+        costs: Mapping[str, object],
     ) -> StageResults:
         """Evaluate all scenes learned so far by localizers, by the names of their results."""
-        results, frames = [], []
+        results = []
+        frames = []
         environment = record_environment(self.out)
         for name, localizer in localizers.items():
             run = {"strategy": name, "seed": self.stage.seed, "stage": number}
-            evaluated = evaluate(localizer, {s.name: s for s in self.scenes[: number + 1]})
+            evaluated = evaluate(
+                localizer, {s.name: s for s in self.scenes[: number + 1]}
+            )
             for scene in self.scenes[: number + 1]:
                 of_scene = [frame for frame in evaluated if frame.scene == scene.name]
-                results.append({**run, **scene_row(of_scene), **costs, "environment": environment})
+                results.append(
+                    {**run, **scene_row(of_scene), **costs, "environment": environment}
+                )
                 frames += [{**run, **frame_row(frame)} for frame in of_scene]
         table = pd.DataFrame(frames).drop(columns="stage")
         last = number == len(self.scenes) - 1
@@ -138,8 +156,12 @@ class _MapRun(_Run):
                 size = memory.bytes or f"{100 * memory.share:g}%"
                 scene, report = learn_scene(self.scenes[number], contents, size)
                 opened.commit(scene, asdict(report))
-            name, unaligned = self.strategy.name, LocalizeOptions(align=False)
-            named = {name: Localizer(contents), name + UNALIGNED: Localizer(contents, unaligned)}
+            name = self.strategy.name
+            unaligned = LocalizeOptions(align=False)
+            named = {
+                name: Localizer(contents),
+                name + UNALIGNED: Localizer(contents, unaligned),
+            }
             costs = {
                 "seconds": float(opened.reports()[-1]["seconds"]),
                 "memory_bytes": contents.memory_bytes,
@@ -160,7 +182,9 @@ class _NetworkRun(_Run):
 
     def stages(self) -> Iterator[StageResults]:
         self._begin()
-        for number in range(len(NetworkStore.open(self.store).stages) - 1, len(self.scenes)):
+        for number in range(
+            len(NetworkStore.open(self.store).stages) - 1, len(self.scenes)
+        ):
             if number >= len(NetworkStore.open(self.store).stages):
                 self._learn(self.store, self.scenes[number], self.strategy)
             opened = NetworkStore.open(self.store)
@@ -172,7 +196,9 @@ class _NetworkRun(_Run):
         self._remove()  # an interrupted run starts again
         empty = self._prepared(self._new_store().contents)
         splits = [split_held_out(scene.train) for scene in self.scenes]
-        train = [replace(s, train=t.train) for s, t in zip(self.scenes, splits, strict=True)]
+        train = [
+            replace(s, train=t.train) for s, t in zip(self.scenes, splits, strict=True)
+        ]
         began = time.perf_counter()
         learned = learn_jointly(empty, train, self.stage)
         for number, split in enumerate(splits):
@@ -210,7 +236,8 @@ class _NetworkRun(_Run):
         if is_store(self.store):
             return
         self._remove()  # left by an interrupted commit
-        scene, method = self.scenes[0], self.strategy.method
+        scene = self.scenes[0]
+        method = self.strategy.method
         assert method is not None, "a network has a method"
         shared = self.store.with_name(f"first-{scene.name}-{self.stage.seed}")
         # Another process may be learning it.
@@ -220,7 +247,9 @@ class _NetworkRun(_Run):
         first = NetworkStore.open(shared)
         began = time.perf_counter()
         scenes = self._prepared(first.contents.copy_for_training())
-        scenes.strategy, scenes.keyframes, scenes.method_states = self.strategy.name, [], []
+        scenes.strategy = self.strategy.name
+        scenes.keyframes = []
+        scenes.method_states = []
         train = split_held_out(scene.train).train
 
         @cache
@@ -236,7 +265,9 @@ class _NetworkRun(_Run):
         report["frames_kept"] = scenes.frames_kept
         self._new_store().commit(scenes, report)
 
-    def _located(self, scenes: LearnedScenes, number: int, seconds: float) -> StageResults:
+    def _located(
+        self, scenes: LearnedScenes, number: int, seconds: float
+    ) -> StageResults:
         costs = {
             "seconds": seconds,
             "memory_bytes": scenes.memory_bytes,
@@ -250,6 +281,9 @@ class _NetworkRun(_Run):
 def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOptions:
     if stage.head.centres != "fixed" or stage.fixed_centres_m:
         return stage
-    positions = [stated_poses(split_held_out(scene.train).train).translation_m for scene in scenes]
+    positions = [
+        stated_poses(split_held_out(scene.train).train).translation_m
+        for scene in scenes
+    ]
     centres = combined_centres(positions, stage.head.centres_per_scene, stage.seed)
     return replace(stage, grid_scenes=len(scenes), fixed_centres_m=centres)

@@ -56,7 +56,10 @@ SUITES: dict[str, Suite] = {
         (
             *(f"apt1/{room}" for room in ("kitchen", "living")),
             *(f"apt2/{room}" for room in ("bed", "kitchen", "living", "luke")),
-            *(f"office1/{room}" for room in ("gates362", "gates381", "lounge", "manolis")),
+            *(
+                f"office1/{room}"
+                for room in ("gates362", "gates381", "lounge", "manolis")
+            ),
             *(f"office2/{room}" for room in ("5a", "5b")),
         ),
         "https://graphics.stanford.edu/projects/reloc/",
@@ -65,7 +68,10 @@ SUITES: dict[str, Suite] = {
 
 
 def load_suite(
-    name: str, data: Path | None = None, only: Sequence[str] = (), poses: Path | None = None
+    name: str,
+    data: Path | None = None,
+    only: Sequence[str] = (),
+    poses: Path | None = None,
 ) -> list[Recording]:
     """Load the scenes of a suite in order of learning, by default all.
 
@@ -96,7 +102,9 @@ def load_suite(
             " other scenes with --scenes"
         )
     # Names of scenes have no slashes: apt1/kitchen becomes apt1-kitchen.
-    scenes = [load_recording(data / scene, name=scene.replace("/", "-")) for scene in names]
+    scenes = [
+        load_recording(data / scene, name=scene.replace("/", "-")) for scene in names
+    ]
     if poses is None:
         return scenes
     folders = [scene.replace("/", "_") for scene in names]
@@ -110,7 +118,9 @@ def tuning_split(scene: Recording) -> Recording:
     """
     frames = posed_frames(scene.train)
     tenth = [10 * i // len(frames) for i in range(len(frames))]
-    train = tuple(f for f, part in zip(frames, tenth, strict=True) if part not in (2, 7))
+    train = tuple(
+        f for f, part in zip(frames, tenth, strict=True) if part not in (2, 7)
+    )
     test = tuple(f for f, part in zip(frames, tenth, strict=True) if part in (2, 7))
     if len(train) < MIN_TRAIN_FRAMES:
         raise InputError(
@@ -131,13 +141,16 @@ def regions(scene: Recording, parts: int) -> list[Recording]:
 
     if parts < 2:
         raise InputError(f"--parts {parts}: give at least 2")
-    train, test = posed_frames(scene.train), posed_frames(scene.test)
+    train = posed_frames(scene.train)
+    test = posed_frames(scene.test)
     if len(train) < parts or not test:
         raise InputError(
             f"{scene.name}: {len(train)} training and {len(test)} test frames are too few for"
             f" --parts {parts}"
         )
-    centres, region = kmeans2(_ahead(train), parts, minit="++", rng=np.random.default_rng(0))
+    centres, region = kmeans2(
+        _ahead(train), parts, minit="++", rng=np.random.default_rng(0)
+    )
     nearest, _ = vq(_ahead(test), centres)
     recordings = []
     for number, part in enumerate(dict.fromkeys(region.tolist()), start=1):

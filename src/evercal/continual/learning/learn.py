@@ -17,7 +17,12 @@ from evercal.continual.networks.atlas import Atlas, Cell, camera_clusters
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.head import Head, fresh_head
 from evercal.continual.networks.trainer import HeadTrainer
-from evercal.continual.scenes import LearnedScenes, SceneRecord, corrected_camera, prototypes
+from evercal.continual.scenes import (
+    LearnedScenes,
+    SceneRecord,
+    corrected_camera,
+    prototypes,
+)
 from evercal.continual.selection.frame_statistics import FrameStatistics
 from evercal.mapping.keyframes import store_keyframes
 from evercal.recordings.frame import Frame, Recording, stated_poses
@@ -38,14 +43,18 @@ def learn(
     """
     after = scenes.copy_for_training()
     teacher = copy.deepcopy(after.heads[-1]).eval() if after.heads else None
-    rows, atlas = StageRows(after, options, on_event), after.atlas(options.grid_scenes)
+    rows = StageRows(after, options, on_event)
+    atlas = after.atlas(options.grid_scenes)
     cell, buffer = _begun(rows, atlas, recording, method.head_per_scene)
     head = after.heads[-1]
     if teacher is None:
         _whiten(head, [buffer], options.seed)
     memories = rows.remembered() if method.replays else []
-    states, replayed = scenes.method_states, options.fit.replay_batch
-    hooks = method.begin(StageStart(head, teacher, memories, states, replayed, options.seed))
+    states = scenes.method_states
+    replayed = options.fit.replay_batch
+    hooks = method.begin(
+        StageStart(head, teacher, memories, states, replayed, options.seed)
+    )
     trainer = HeadTrainer(head, [buffer], options.fit, options.seed, hooks)
     for progress in trainer.run():
         on_event(progress)
@@ -66,8 +75,10 @@ def learn_jointly(
     A step has the rows of one that learns a scene and replays others. `start` has no scenes and is
     not changed.
     """
-    after, fit = start.copy_for_training(), options.fit
-    encoder, atlas = StageRows(after, options, on_event), after.atlas(options.grid_scenes)
+    after = start.copy_for_training()
+    fit = options.fit
+    encoder = StageRows(after, options, on_event)
+    atlas = after.atlas(options.grid_scenes)
     begun = [_begun(encoder, atlas, scene) for scene in recordings]
     buffers = [buffer for _, buffer in begun]
     (head,) = after.heads
@@ -77,7 +88,9 @@ def learn_jointly(
     trainer = HeadTrainer(head, buffers, whole, options.seed)
     for progress in trainer.run():
         on_event(progress)
-    for number, (recording, (cell, _)) in enumerate(zip(recordings, begun, strict=True)):
+    for number, (recording, (cell, _)) in enumerate(
+        zip(recordings, begun, strict=True)
+    ):
         after.scenes.append(trained_record(recording, cell, trainer, number))
         after.keyframes.append(None)
         after.method_states.append({})
@@ -88,8 +101,10 @@ def _begun(
     rows: StageRows, atlas: Atlas, recording: Recording, own: bool = False
 ) -> tuple[Cell, FeatureBuffer]:
     """Place a scene in the atlas, grow a head by it, and encode its frames."""
-    after, options = rows.scenes, rows.options
-    frames, number = recording.train, len(atlas.cells)
+    after = rows.scenes
+    options = rows.options
+    frames = recording.train
+    number = len(atlas.cells)
     positions = stated_poses(frames).translation_m
     cell = atlas.place(positions)
     head = _head_to_grow(after, own, options)
@@ -117,7 +132,9 @@ def _new_centres(head: Head, options: StageOptions, positions_m: np.ndarray) -> 
     """(k, 3) centres that a scene adds, from its camera positions (n, 3) in the atlas."""
     if head.options.centres == "grow":
         count = head.options.centres_per_scene
-        return torch.from_numpy(camera_clusters(positions_m, count, options.seed)).float()
+        return torch.from_numpy(
+            camera_clusters(positions_m, count, options.seed)
+        ).float()
     if len(head.centres):
         return torch.zeros(0, 3)
     return torch.tensor(options.fixed_centres_m).reshape(-1, 3)
@@ -127,7 +144,9 @@ def _whiten(head: Head, buffers: Sequence[FeatureBuffer], seed: int) -> None:
     if not head.options.whiten:
         return
     generator = torch.Generator().manual_seed(seed)
-    drawn = [buffer.draw(WHITENING_ROWS // len(buffers), generator) for buffer in buffers]
+    drawn = [
+        buffer.draw(WHITENING_ROWS // len(buffers), generator) for buffer in buffers
+    ]
     head.whiten(torch.cat([rows.features for rows in drawn]))
 
 
@@ -146,10 +165,13 @@ def finish_scene(
     newest = len(scenes.scenes) - 1
     head, local = scenes.head_for(newest)
     statistics = FrameStatistics(frames, head, rows, options.seed, newest)
-    selected = method.select(statistics, options.memory.capacity(frames, scenes.short_side))
+    selected = method.select(
+        statistics, options.memory.capacity(frames, scenes.short_side)
+    )
     keyframes = None
     if selected is not None:
-        chosen, refined = [frames[i] for i in selected], scenes.scenes[-1].refined_camera
+        chosen = [frames[i] for i in selected]
+        refined = scenes.scenes[-1].refined_camera
         if refined is not None:  # replay uses the camera as training corrected it
             chosen = [replace(frame, camera=refined) for frame in chosen]
         keyframes = store_keyframes(chosen, scenes.short_side)
@@ -161,10 +183,14 @@ def finish_scene(
     scenes.method_states.append(method.after_scene(finished))
 
 
-def trained_record(scene: Recording, cell: Cell, trainer: HeadTrainer, number: int) -> SceneRecord:
+def trained_record(
+    scene: Recording, cell: Cell, trainer: HeadTrainer, number: int
+) -> SceneRecord:
     """The record of a scene after training; its rows are in the trainer's buffer `number`."""
-    buffer, options = trainer.buffers[number], trainer.options
-    camera, refined = scene.train[0].camera, None
+    buffer = trainer.buffers[number]
+    options = trainer.options
+    camera = scene.train[0].camera
+    refined = None
     if options.intrinsics_rate > 0 and options.iterations > 0 and buffer.correctable:
         refined = corrected_camera(camera, trainer.correction[number].detach())
     spread = prototypes(buffer.tensors["descriptors"][: len(scene.train)])

@@ -15,7 +15,12 @@ from evercal.continual.strategies import Strategy, strategy_named
 from evercal.continual.threshold import fit_threshold
 from evercal.errors import InputError
 from evercal.learning.scene import LearnReport
-from evercal.recordings.frame import Frame, Recording, lacks_camera_poses, posed_recording
+from evercal.recordings.frame import (
+    Frame,
+    Recording,
+    lacks_camera_poses,
+    posed_recording,
+)
 from evercal.recordings.held_out import named_recording, require_frames, split_held_out
 from evercal.storage.stages import is_store
 
@@ -56,11 +61,17 @@ class NetworkLearnOptions:
         return replace(stage, head=replace(stage.head, centres_per_scene=self.centres))
 
     def opened(
-        self, store: Path, strategy: Strategy, stage: StageOptions, frames: Sequence[Frame]
+        self,
+        store: Path,
+        strategy: Strategy,
+        stage: StageOptions,
+        frames: Sequence[Frame],
     ) -> NetworkStore:
         """Open the store of a strategy or make it; `frames` are those of the scene to learn."""
         if stage.memory.auto:
-            raise InputError("memory auto: only a map selects its keyframes; give a share or bytes")
+            raise InputError(
+                "memory auto: only a map selects its keyframes; give a share or bytes"
+            )
         if not is_store(store):
             side = self.short_side or short_side(self.preset, frames)
             return NetworkStore.create(store, strategy.name, side, self.encoder)
@@ -74,7 +85,8 @@ class NetworkLearnOptions:
                 f"strategy {strategy.name!r}: the store was made with {opened.contents.strategy!r};"
                 " use that one or start a new store"
             )
-        heads, method = opened.contents.heads, strategy.method
+        heads = opened.contents.heads
+        method = strategy.method
         shared = method is not None and not method.head_per_scene and heads
         if shared and self.centres not in (None, heads[-1].options.centres_per_scene):
             raise InputError(
@@ -86,7 +98,10 @@ class NetworkLearnOptions:
 
 
 def learn_networks(
-    store: Path, recording: Recording, options: NetworkLearnOptions, on_event: OnEvent = unobserved
+    store: Path,
+    recording: Recording,
+    options: NetworkLearnOptions,
+    on_event: OnEvent = unobserved,
 ) -> LearnReport:
     """Learn a scene into a store; an interrupted call leaves the store at its last scene.
 
@@ -97,7 +112,8 @@ def learn_networks(
         on_event: called with every event, for progress bars.
     """
     began = time.perf_counter()
-    named, stage = options.strategy, options.stage_options()
+    named = options.strategy
+    stage = options.stage_options()
     strategy = named if isinstance(named, Strategy) else strategy_named(named)
     if strategy.method is None or strategy.jointly:
         raise InputError(
@@ -107,7 +123,9 @@ def learn_networks(
     opened = options.opened(store, strategy, stage, recording.train)
     with opened.writing():
         contents = opened.contents.to(device_of(options.device))
-        recording = named_recording(recording, None, [record.name for record in contents.scenes])
+        recording = named_recording(
+            recording, None, [record.name for record in contents.scenes]
+        )
         if lacks_camera_poses(recording):
             raise InputError(
                 f"scene {recording.name!r}: only gripper poses are stated, and strategy"

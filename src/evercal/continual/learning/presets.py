@@ -11,7 +11,9 @@ from evercal.continual.networks.trainer import FitOptions
 from evercal.recordings import Frame
 
 
-def _ours(width: int, steps: int, rows: int, views: int, replay_views: int = 4) -> StageOptions:
+def _ours(
+    width: int, steps: int, rows: int, views: int, replay_views: int = 4
+) -> StageOptions:
     """Our network; `rows` are new in a step, and half as many are replayed."""
     return StageOptions(
         head=HeadOptions(width),

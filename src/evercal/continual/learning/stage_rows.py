@@ -18,34 +18,46 @@ class StageRows:
     options: StageOptions
     on_event: OnEvent = unobserved
 
-    def of_scene(self, local: int, cell: Cell, frames: Sequence[Frame]) -> FeatureBuffer:
+    def of_scene(
+        self, local: int, cell: Cell, frames: Sequence[Frame]
+    ) -> FeatureBuffer:
         """Encode the training frames of a scene; `local` is its index in the head.
 
         The camera can be corrected if the frames share one without distortion.
         """
         one = all(frame.camera == frames[0].camera for frame in frames)
         correctable = one and not frames[0].camera.distortion
-        buffer = FeatureBuffer(local, cell.atlas_from_base, correctable, self.scenes.device)
+        buffer = FeatureBuffer(
+            local, cell.atlas_from_base, correctable, self.scenes.device
+        )
         return self._encoded(buffer, frames, self.options.encode)
 
     def of_keyframes(self, number: int) -> FeatureBuffer:
         """Encode a scene's keyframes for replay; the first views are not augmented."""
-        scenes, keyframes = self.scenes, self.scenes.keyframes[number]
+        scenes = self.scenes
+        keyframes = self.scenes.keyframes[number]
         assert keyframes is not None, "a method that uses keyframes selects some"
         cell, (_, local) = scenes.scenes[number].cell, scenes.head_for(number)
         buffer = FeatureBuffer(local, cell.atlas_from_base, device=scenes.device)
-        plan = replace(self.options.encode, views_per_frame=self.options.replay_views_per_frame)
+        plan = replace(
+            self.options.encode, views_per_frame=self.options.replay_views_per_frame
+        )
         return self._encoded(buffer, keyframes.frames(), plan)
 
     def remembered(self) -> list[FeatureBuffer]:
         """Encode the keyframes of all scenes that have some: one buffer per scene."""
-        return [self.of_keyframes(i) for i, kept in enumerate(self.scenes.keyframes) if kept]
+        return [
+            self.of_keyframes(i) for i, kept in enumerate(self.scenes.keyframes) if kept
+        ]
 
     def _encoded(
         self, buffer: FeatureBuffer, frames: Sequence[Frame], plan: EncodePlan
     ) -> FeatureBuffer:
-        scenes, total = self.scenes, len(frames) * plan.views_per_frame
+        scenes = self.scenes
+        total = len(frames) * plan.views_per_frame
         plan = replace(plan, view=replace(plan.view, short_side=scenes.short_side))
-        for done in encode_frames(buffer, frames, plan, scenes.encoder, scenes.descriptor):
+        for done in encode_frames(
+            buffer, frames, plan, scenes.encoder, scenes.descriptor
+        ):
             self.on_event(Encoding(done, total))
         return buffer

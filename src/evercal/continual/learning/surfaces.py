@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evercal.continual.networks.buffer import FeatureBuffer
-from evercal.continual.networks.feature_cache import encoder_key, read_cached, write_cached
+from evercal.continual.networks.feature_cache import (
+    encoder_key,
+    read_cached,
+    write_cached,
+)
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3
 from evercal.mapping.pose_check import depth_scale, matched_pairs
@@ -38,7 +42,8 @@ def frame_depths(
     features = [prepared.features(i) for i in range(len(prepared))]
     pairs = matched_pairs(prepared, encoder.vlad(features))
     prepared.depth_scale = depth_scale(prepared, pairs)
-    swept, sources = [], []
+    swept = []
+    sources = []
     for i in range(len(prepared)):
         inverse, near = prepared.swept(i, SOURCE_VIEWS)
         swept.append(1 / inverse.astype(np.float64))
@@ -66,7 +71,11 @@ def _at_pixels(
     depths: NDArray[np.float64], pixels: NDArray[np.float64], stride: int
 ) -> NDArray[np.float64]:
     """Depths (n,) of the cells nearest to pixels (n, 2); NaN outside the grid."""
-    cell = np.nan_to_num((pixels - (stride - 1) / 2) / stride, nan=-9.0).round().astype(int)
+    cell = (
+        np.nan_to_num((pixels - (stride - 1) / 2) / stride, nan=-9.0)
+        .round()
+        .astype(int)
+    )
     inside = ((cell >= 0) & (cell < depths.shape[::-1])).all(1)
     column, row = cell[inside].T
     known = np.full(len(pixels), np.nan)
@@ -85,7 +94,9 @@ def shared_depths(
         return frame_depths(frames, encoder, short_side)
     key = hashlib.blake2b(digest_size=16)
     for frame, pose in zip(frames, stated_poses(frames).matrix(), strict=True):
-        key.update(f"{frame.name} {frame.camera} {short_side}".encode() + pose.tobytes())
+        key.update(
+            f"{frame.name} {frame.camera} {short_side}".encode() + pose.tobytes()
+        )
     key.update(encoder_key(encoder).encode())
     path = cache / f"depths-{key.hexdigest()}.npy"
     if (cached := read_cached(path)) is not None:
@@ -109,13 +120,17 @@ def surface_points(
     its frame, along its own ray; the point is NaN where the depth is unknown.
     """
     tensors = {name: value.cpu() for name, value in buffer.tensors.items()}
-    starts, points = buffer.starts.tolist(), np.full((len(buffer), 3), np.nan)
+    starts = buffer.starts.tolist()
+    points = np.full((len(buffer), 3), np.nan)
     for number, four in enumerate(tensors["intrinsics"].numpy()):
-        frame, depth = frames[number % len(frames)], depths[number % len(frames)]
+        frame = frames[number % len(frames)]
+        depth = depths[number % len(frames)]
         assert frame.base_from_camera is not None, "training frames are posed"
         where = slice(*starts[number : number + 2])
         pixels = tensors["pixels"][where].double().numpy()
-        ray = np.concatenate([(pixels - four[2:]) / four[:2], np.ones((len(pixels), 1))], 1)
+        ray = np.concatenate(
+            [(pixels - four[2:]) / four[:2], np.ones((len(pixels), 1))], 1
+        )
         camera = frame.camera.short_side_resized(stride * min(depth.shape))
         known = _at_pixels(depth, camera.project(ray), stride)
         pose: SE3 = buffer.atlas_from_base @ frame.base_from_camera

@@ -38,13 +38,16 @@ class ElasticWeightConsolidation(Method):
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
         """Return `anchor.NAME` and `importance.NAME` of every parameter, half precision."""
         importances = scaled_to_mean_one(fisher_information(scene, self.images))
-        anchors = {f"anchor.{k}": _half(v.detach()) for k, v in scene.head.named_parameters()}
+        anchors = {
+            f"anchor.{k}": _half(v.detach()) for k, v in scene.head.named_parameters()
+        }
         return anchors | {f"importance.{k}": _half(v) for k, v in importances.items()}
 
 
 class _TiedWeights(TrainingHooks):
     def __init__(self, method: ElasticWeightConsolidation, start: StageStart):
-        self.method, self._head = method, start.head
+        self.method = method
+        self._head = start.head
         # Of each earlier scene, by parameter name: anchor and importance of the first rows.
         named = list(start.head.named_parameters())
         self._ties = [
@@ -59,7 +62,9 @@ class _TiedWeights(TrainingHooks):
         for name, value in self._head.named_parameters():
             for tie in self._ties:
                 anchor, importance = tie[name]
-                cost = cost + (importance * (value[: len(anchor)] - anchor).square()).sum()
+                cost = (
+                    cost + (importance * (value[: len(anchor)] - anchor).square()).sum()
+                )
         count = sum(value.numel() for value in self._head.parameters())
         return self.method.strength * (0.5 / count * cost)
 
@@ -74,7 +79,9 @@ def fisher_information(scene: FinishedScene, images: int) -> dict[str, Tensor]:
     drawn = torch.randperm(buffer.views, generator=generator, device="cpu")[:images]
     for number in drawn.tolist():
         start, end = starts[number : number + 2]
-        some = torch.randint(end - start, (IMAGE_ROWS,), generator=generator, device="cpu")
+        some = torch.randint(
+            end - start, (IMAGE_ROWS,), generator=generator, device="cpu"
+        )
         rows = buffer.rows(start + some)
         loss, _ = fixed_clamp_loss(scene.output(rows).points, rows.target)
         gradients = torch.autograd.grad(loss.mean(), values, materialize_grads=True)

@@ -96,8 +96,11 @@ class _ConstraintHooks(MemoryHooks):
 
     def __init__(self, method: EpisodicConstraint, start: StageStart):
         super().__init__(start)
-        self._method, self._steps = method, 0
-        references = [start.states[memory.scene]["reference"] for memory in self.memories]
+        self._method = method
+        self._steps = 0
+        references = [
+            start.states[memory.scene]["reference"] for memory in self.memories
+        ]
         self._references = torch.stack(references)
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:

@@ -38,16 +38,20 @@ class LearningWithoutForgetting(Method):
 
 class _DistillationHooks(TrainingHooks):
     def __init__(self, method: LearningWithoutForgetting, teacher: Head, rows: int):
-        self.method, self._teacher = method, teacher
+        self.method = method
+        self._teacher = teacher
         self._each = max(1, rows // teacher.scenes)
 
     def replayed(
         self, fresh: Rows, step: int, rate: float, generator: torch.Generator
     ) -> list[Rows]:
         # New rows once more, one part with the index of each earlier scene.
-        parts, count = [], len(fresh.scene)
+        parts = []
+        count = len(fresh.scene)
         for scene in range(self._teacher.scenes):
-            drawn = torch.randint(count, (self._each,), generator=generator, device="cpu")
+            drawn = torch.randint(
+                count, (self._each,), generator=generator, device="cpu"
+            )
             part = fresh.part(drawn.to(fresh.scene.device))
             part.scene = torch.full_like(part.scene, scene)
             parts.append(part)

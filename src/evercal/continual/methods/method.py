@@ -90,7 +90,9 @@ class FineTuning(Method):
 class Isolation(Method):
     """A head per scene, initialised from the last one; scenes share no weights."""
 
-    citation: ClassVar[str] = "after ESAC (Brachmann and Rother, ICCV 2019): an expert per scene"
+    citation: ClassVar[str] = (
+        "after ESAC (Brachmann and Rother, ICCV 2019): an expert per scene"
+    )
     head_per_scene: ClassVar[bool] = True
 
 

@@ -23,7 +23,9 @@ class MaximallyInterferedRetrieval(Replay):
     each remembered scene.
     """
 
-    citation: ClassVar[str] = "Aljundi et al., Maximally interfered retrieval, NeurIPS 2019"
+    citation: ClassVar[str] = (
+        "Aljundi et al., Maximally interfered retrieval, NeurIPS 2019"
+    )
     candidates: int = 48
     """Candidate views per scene."""
     chosen: int = 8
@@ -41,16 +43,26 @@ class MaximallyInterferedRetrieval(Replay):
         return _MirHooks(self, start) if start.memories else TrainingHooks()
 
     def interfered_views(
-        self, head: Head, fresh: Rows, memory: FeatureBuffer, rate: float, generator: Generator
+        self,
+        head: Head,
+        fresh: Rows,
+        memory: FeatureBuffer,
+        rate: float,
+        generator: Generator,
     ) -> Tensor:
         """Select the views (k,) of a remembered scene that a step on new rows harms most.
 
         The head is not changed. `rate` is the root mean square change of each parameter in the
         virtual step.
         """
-        drawn = torch.randperm(memory.views, generator=generator, device="cpu")[: self.candidates]
-        start, sizes = memory.starts[drawn, None], memory.starts.diff()[drawn, None]
-        offsets = torch.rand(len(drawn), self.view_rows, generator=generator, device="cpu")
+        drawn = torch.randperm(memory.views, generator=generator, device="cpu")[
+            : self.candidates
+        ]
+        start = memory.starts[drawn, None]
+        sizes = memory.starts.diff()[drawn, None]
+        offsets = torch.rand(
+            len(drawn), self.view_rows, generator=generator, device="cpu"
+        )
         index = (start + offsets * sizes).long()
         rows = memory.rows(index.clamp(max=len(memory) - 1).flatten())
         moved = copy.deepcopy(head)
@@ -77,18 +89,26 @@ class MaximallyInterferedRetrieval(Replay):
 class _MirHooks(ReplayHooks):
     def __init__(self, method: MaximallyInterferedRetrieval, start: StageStart):
         super().__init__(method, start)
-        self._options, self._head, self._views = method, start.head, list[Tensor]()
+        self._options = method
+        self._head = start.head
+        self._views = list[Tensor]()
 
-    def replayed(self, fresh: Rows, step: int, rate: float, generator: Generator) -> list[Rows]:
+    def replayed(
+        self, fresh: Rows, step: int, rate: float, generator: Generator
+    ) -> list[Rows]:
         if step % self._options.every_steps == 0 or not self._views:
             self._views = [
-                self._options.interfered_views(self._head, fresh, memory, rate, generator)
+                self._options.interfered_views(
+                    self._head, fresh, memory, rate, generator
+                )
                 for memory in self.memories
             ]
         rows = []
         for memory, views in zip(self.memories, self._views, strict=True):
             view = memory.tensors["view"]
             where = torch.nonzero(torch.isin(view, views.to(view.device)))[:, 0]
-            drawn = torch.randint(len(where), (self.each,), generator=generator, device="cpu")
+            drawn = torch.randint(
+                len(where), (self.each,), generator=generator, device="cpu"
+            )
             rows.append(memory.rows(where[drawn.to(where.device)]))
         return rows

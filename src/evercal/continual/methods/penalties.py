@@ -9,7 +9,11 @@ from torch import Tensor
 from evercal.continual.methods.spdd import SpddOptions, spdd_loss
 from evercal.continual.networks.buffer import Rows
 from evercal.continual.networks.head import HeadOutput
-from evercal.continual.networks.loss import LossOptions, fixed_clamp_loss, reprojection_loss
+from evercal.continual.networks.loss import (
+    LossOptions,
+    fixed_clamp_loss,
+    reprojection_loss,
+)
 
 PX_PER_M = 50.0
 """Weight of a distance in scene coordinates, pixels per metre. One metre sideways at a depth of 5 m
@@ -30,7 +34,9 @@ class Penalty:
         assert teacher is not None or not self.needs_teacher
         return self._loss(student, teacher or student, rows, tau_px)
 
-    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
+    def _loss(
+        self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
+    ) -> Tensor:
         raise NotImplementedError
 
 
@@ -39,7 +45,9 @@ def _distance_m(student: HeadOutput, teacher: HeadOutput) -> Tensor:
 
 
 def _reprojection(student: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
-    return reprojection_loss(student.points, rows.target, tau_px, LossOptions())[0].mean()
+    return reprojection_loss(student.points, rows.target, tau_px, LossOptions())[
+        0
+    ].mean()
 
 
 @dataclass(frozen=True)
@@ -48,7 +56,9 @@ class Reprojection(Penalty):
 
     needs_teacher: ClassVar[bool] = False
 
-    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
+    def _loss(
+        self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
+    ) -> Tensor:
         return _reprojection(student, rows, tau_px)
 
 
@@ -63,7 +73,9 @@ class OldOutput(Penalty):
     px_per_m: float = PX_PER_M
     """Weight of the distance, pixels per metre."""
 
-    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
+    def _loss(
+        self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
+    ) -> Tensor:
         distance = _distance_m(student, teacher).mean()
         return _reprojection(student, rows, tau_px) + self.px_per_m * distance
 
@@ -79,12 +91,16 @@ class BoundedByTeacher(Penalty):
     px_per_m: float = PX_PER_M
     """Weight of the distance to the teacher's points, pixels per metre."""
 
-    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
+    def _loss(
+        self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
+    ) -> Tensor:
         _, error = fixed_clamp_loss(student.points, rows.target)
         _, bound = fixed_clamp_loss(teacher.points, rows.target)
         distance = _distance_m(student, teacher)
         bounded = torch.where(error > bound, distance, 0.0).mean()
-        return 0.5 * _reprojection(student, rows, tau_px) + 0.5 * self.px_per_m * bounded
+        return (
+            0.5 * _reprojection(student, rows, tau_px) + 0.5 * self.px_per_m * bounded
+        )
 
 
 @dataclass(frozen=True)
@@ -102,10 +118,13 @@ class Relations(Penalty):
     temperature: float = 0.2
     """Temperature of the softmax over cosines (no unit)."""
 
-    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
+    def _loss(
+        self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
+    ) -> Tensor:
         # Rows are ordered by scene, so an even spacing covers all scenes.
         count = len(student.hidden)
-        few, device = min(count, self.related_rows), student.hidden.device
+        few = min(count, self.related_rows)
+        device = student.hidden.device
         chosen = torch.linspace(0, count - 1, few, device=device).round().long()
 
         def similarity(hidden: Tensor) -> Tensor:
@@ -114,7 +133,8 @@ class Relations(Penalty):
             logits = (unit @ unit.T / self.temperature)[others].view(len(unit), -1)
             return logits.log_softmax(-1)
 
-        old, new = similarity(teacher.hidden.detach()), similarity(student.hidden)
+        old = similarity(teacher.hidden.detach())
+        new = similarity(student.hidden)
         divergence = (old.exp() * (old - new)).sum(-1).mean()
         return _reprojection(student, rows, tau_px) + divergence
 
@@ -135,7 +155,9 @@ class AnchoredReprojection(Penalty):
     teacher_limit_px: float = 10.0
     """Reprojection error below which the teacher's point is used."""
 
-    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
+    def _loss(
+        self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
+    ) -> Tensor:
         cost, _ = fixed_clamp_loss(student.points, rows.target, self.clamp_px)
         _, error = fixed_clamp_loss(teacher.points, rows.target, self.clamp_px)
         distance = _distance_m(student, teacher)
@@ -155,5 +177,7 @@ class Distillation(Penalty):
     scale: float = 1.0
     """Pixels per metre and per nat; the paper's value is 1."""
 
-    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
+    def _loss(
+        self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
+    ) -> Tensor:
         return self.scale * spdd_loss(student, teacher, self.options).total

@@ -76,20 +76,30 @@ def owned_rows(head: Head, memories: Sequence[FeatureBuffer]) -> dict[str, Tenso
     """Return the rows owned by remembered scenes, by parameter name; empty for shared centres."""
     if head.options.centres != "grow":
         return {}
-    scenes = torch.tensor([memory.scene for memory in memories], device=head.centre_scene.device)
+    scenes = torch.tensor(
+        [memory.scene for memory in memories], device=head.centre_scene.device
+    )
     owned = {"code": scenes}
     if head.options.offsets == "per_centre":
         centres = torch.nonzero(torch.isin(head.centre_scene, scenes))[:, 0]
-        owned |= dict.fromkeys(("logit", "logit_bias", "offset", "offset_bias"), centres)
+        owned |= dict.fromkeys(
+            ("logit", "logit_bias", "offset", "offset_bias"), centres
+        )
     return owned
 
 
-def input_moments(head: Head, memories: Sequence[FeatureBuffer], seed: int) -> dict[str, Tensor]:
+def input_moments(
+    head: Head, memories: Sequence[FeatureBuffer], seed: int
+) -> dict[str, Tensor]:
     """Sum second moments (inputs, inputs) of layers over scenes, by the name of the weight.
 
     The mean of the diagonal is 1 per scene; the moments are double.
     """
-    names = {m: f"{name}.weight" for name, m in head.named_modules() if isinstance(m, nn.Linear)}
+    names = {
+        m: f"{name}.weight"
+        for name, m in head.named_modules()
+        if isinstance(m, nn.Linear)
+    }
     moments: dict[str, Tensor] = {}
 
     def accumulate(layer: nn.Module, inputs: tuple[Tensor, ...], _: Tensor) -> None:

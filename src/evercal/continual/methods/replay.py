@@ -51,7 +51,9 @@ class MemoryHooks(TrainingHooks):
 class Replay(EpisodicMemory):
     """Replays keyframes (Chaudhry et al., On tiny episodic memories, 2019)."""
 
-    citation: ClassVar[str] = "Vitter 1985; Chaudhry et al., On tiny episodic memories, 2019"
+    citation: ClassVar[str] = (
+        "Vitter 1985; Chaudhry et al., On tiny episodic memories, 2019"
+    )
     penalty: Penalty = field(default_factory=Reprojection)
     weight: float = 1.0
     """Weight of the penalty, the mean over the rows of all remembered scenes."""

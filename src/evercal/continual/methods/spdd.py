@@ -50,7 +50,9 @@ class SpddTerms:
     total: Tensor
 
 
-def spdd_loss(student: HeadOutput, teacher: HeadOutput, options: SpddOptions) -> SpddTerms:
+def spdd_loss(
+    student: HeadOutput, teacher: HeadOutput, options: SpddOptions
+) -> SpddTerms:
     """Compute the distillation loss of a student against a teacher on the same rows.
 
     The active set A of a row contains its M_a highest teacher logits. A centre that either head
@@ -71,7 +73,9 @@ def spdd_loss(student: HeadOutput, teacher: HeadOutput, options: SpddOptions) ->
     shared = student.offsets.shape[1] < student.logits.shape[1]
     rows, old = teacher.logits.shape
     teacher_logits = teacher.logits.detach()
-    masked = torch.isneginf(teacher_logits) | torch.isneginf(student.logits.detach()[:, :old])
+    masked = torch.isneginf(teacher_logits) | torch.isneginf(
+        student.logits.detach()[:, :old]
+    )
     count = min(options.active_centres, old)
     best = teacher_logits.masked_fill(masked, -torch.inf).topk(count, dim=1)
     dead = torch.isneginf(best.values)
@@ -81,12 +85,16 @@ def spdd_loss(student: HeadOutput, teacher: HeadOutput, options: SpddOptions) ->
         metric = (student.offsets - teacher.offsets.detach()).abs()
     else:
         index = best.indices[:, :, None].expand(-1, -1, 3)
-        gap = student.offsets.gather(1, index) - teacher.offsets.detach().gather(1, index)
+        gap = student.offsets.gather(1, index) - teacher.offsets.detach().gather(
+            1, index
+        )
         metric = gap.masked_fill(dead[:, :, None], 0.0).abs()
     output = (student.points - teacher.points.detach()).abs()
 
     scale = 1.0 / max(rows, 1)
-    prior, metric, output = prior.sum() * scale, metric.sum() * scale, output.sum() * scale
+    prior = prior.sum() * scale
+    metric = metric.sum() * scale
+    output = output.sum() * scale
     total = (
         options.prior_weight * prior
         + options.metric_weight * metric
@@ -100,7 +108,9 @@ def _prior(
 ) -> Tensor:
     dead = torch.isneginf(best.values)
     target = _log_softmax(best.values / temperature)
-    logits = torch.cat([student_logits.gather(1, best.indices), student_logits[:, old:]], dim=1)
+    logits = torch.cat(
+        [student_logits.gather(1, best.indices), student_logits[:, old:]], dim=1
+    )
     # A centre that only one head masks must not take part in either softmax.
     excluded = torch.isneginf(logits)
     excluded[:, : dead.shape[1]] |= dead

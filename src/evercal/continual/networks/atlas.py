@@ -56,7 +56,8 @@ class Atlas:
                     f"atlas: the paper layout is full with {self.expected} scenes; expect more"
                     " scenes, or use the open layout"
                 )
-            centre, side = paper_grid(self.expected)[len(self.cells)], MIN_CELL_M
+            centre = paper_grid(self.expected)[len(self.cells)]
+            side = MIN_CELL_M
         else:
             centre = next(c for c in spiral() if self._free(c, side))
         cell = Cell(tuple(centre.tolist()), side, tuple(origin.tolist()))
@@ -97,7 +98,9 @@ def combined_centres(
     each scene's base frame; `count` is K of the paper.
     """
     atlas = Atlas(len(positions_m))
-    in_atlas = [atlas.place(scene).atlas_from_base.apply(scene) for scene in positions_m]
+    in_atlas = [
+        atlas.place(scene).atlas_from_base.apply(scene) for scene in positions_m
+    ]
     means = camera_clusters(np.concatenate(in_atlas), count, seed)
     return tuple((x, y, z) for x, y, z in means.tolist())
 
@@ -105,12 +108,15 @@ def combined_centres(
 def spiral() -> Iterator[np.ndarray]:
     """Yield the points of an endless square spiral around the origin, 5 m apart."""
     x = y = 0
-    dx, dy, leg = 1, 0, 1
+    dx = 1
+    dy = 0
+    leg = 1
     while True:
         for _ in range(2):
             for _ in range(leg):
                 yield np.array([x, y, 0.0]) * MIN_CELL_M
-                x, y = x + dx, y + dy
+                x = x + dx
+                y = y + dy
             dx, dy = -dy, dx
         leg += 1
 

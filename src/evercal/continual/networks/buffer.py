@@ -65,8 +65,10 @@ class FeatureBuffer:
         correctable: bool = False,
         device: torch.device | str = "cpu",
     ):
-        self.scene, self.atlas_from_base = scene, atlas_from_base
-        self.correctable, self.device = correctable, torch.device(device)
+        self.scene = scene
+        self.atlas_from_base = atlas_from_base
+        self.correctable = correctable
+        self.device = torch.device(device)
         self.views = 0
         self.known: Tensor | None = None
         """(rows, 3) known points, on the buffer's device, see `Rows.known`."""
@@ -79,11 +81,15 @@ class FeatureBuffer:
         `encoded` are features (cells, channels) and a descriptor (width,) on any device.
         """
         features, descriptor = (values.cpu() for values in encoded)
-        camera_from_atlas = (self.atlas_from_base @ view.base_from_camera).inverse().matrix()[:3]
+        camera_from_atlas = (
+            (self.atlas_from_base @ view.base_from_camera).inverse().matrix()[:3]
+        )
         part = {
             "features": features[keep].half(),
             "pixels": torch.tensor(view.cell_pixels, device="cpu")[keep],
-            "view": torch.full((int(keep.sum()),), self.views, dtype=torch.int32, device="cpu"),
+            "view": torch.full(
+                (int(keep.sum()),), self.views, dtype=torch.int32, device="cpu"
+            ),
             "intrinsics": torch.from_numpy(view.intrinsics)[None],
             "camera_from_atlas": torch.from_numpy(camera_from_atlas)[None].float(),
             "descriptors": descriptor[None].float(),
@@ -102,7 +108,9 @@ class FeatureBuffer:
         if self._merged is None:
             names = self._parts[0]
             self._merged = {
-                name: torch.cat([part[name].cpu() for part in self._parts]).to(self.device)
+                name: torch.cat([part[name].cpu() for part in self._parts]).to(
+                    self.device
+                )
                 for name in names
             }
             self._parts = [self._merged]  # one copy in memory
@@ -121,7 +129,8 @@ class FeatureBuffer:
 
     def correct_lens(self, correction: Tensor) -> None:
         """Undistort the pixels and correct the intrinsics; see `reprojection_error`."""
-        t, view = self.tensors, self.tensors["view"].long()
+        t = self.tensors
+        view = self.tensors["view"].long()
         focal, dx, dy, k1, k2 = correction.to(t["pixels"]).unbind()
         scale = t["intrinsics"][:, :2]
         focals = scale * (1 + focal)
@@ -131,20 +140,25 @@ class FeatureBuffer:
         for _ in range(UNDISTORT_STEPS):
             radius2 = (plane * plane).sum(-1, keepdim=True).clamp(max=MAX_RADIUS2)
             plane = distorted / (1 + k1 * radius2 + k2 * radius2 * radius2)
-        pixels, intrinsics = plane * focals[view] + centres[view], torch.cat([focals, centres], -1)
+        pixels = plane * focals[view] + centres[view]
+        intrinsics = torch.cat([focals, centres], -1)
         self._merged = {**t, "pixels": pixels, "intrinsics": intrinsics}
         self._parts = [self._merged]
 
     def draw(self, count: int, generator: torch.Generator) -> Rows:
         """Draw `count` random rows with replacement, equal on every device."""
-        return self.rows(torch.randint(len(self), (count,), generator=generator, device="cpu"))
+        return self.rows(
+            torch.randint(len(self), (count,), generator=generator, device="cpu")
+        )
 
     def rows(self, index: Tensor) -> Rows:
         """Return the rows at `index` (n,), which may be on any device."""
         t = self.tensors
         index = index.to(t["view"].device)
         view = t["view"][index].long()
-        target = Target(t["pixels"][index], t["intrinsics"][view], t["camera_from_atlas"][view])
+        target = Target(
+            t["pixels"][index], t["intrinsics"][view], t["camera_from_atlas"][view]
+        )
         scene = torch.full((len(index),), self.scene, device=index.device)
         known = None if self.known is None else self.known[index].float()
         return Rows(t["features"][index], scene, t["descriptors"][view], target, known)
@@ -157,7 +171,9 @@ def join(parts: Sequence[Rows]) -> Rows:
     if any(part.known is not None for part in parts):
         nan = torch.full((1, 3), torch.nan, device=parts[0].scene.device)
         parts = [
-            replace(part, known=nan.expand(len(part.scene), 3)) if part.known is None else part
+            replace(part, known=nan.expand(len(part.scene), 3))
+            if part.known is None
+            else part
             for part in parts
         ]
     return _combined(parts, torch.cat)
@@ -168,8 +184,12 @@ def diffused(rows: Rows, deviation: float, generator: torch.Generator) -> Rows:
 
     The generator is on the device of the rows.
     """
-    noise = torch.randn(rows.descriptor.shape, generator=generator, device=generator.device)
-    descriptor = F.normalize(rows.descriptor + deviation * noise.to(rows.descriptor), dim=-1)
+    noise = torch.randn(
+        rows.descriptor.shape, generator=generator, device=generator.device
+    )
+    descriptor = F.normalize(
+        rows.descriptor + deviation * noise.to(rows.descriptor), dim=-1
+    )
     return replace(rows, descriptor=descriptor)
 
 
@@ -197,13 +217,17 @@ def encode_frames(
     Pass 0 shows the frames unchanged, later passes augmented. A view and its cells depend only on
     (seed, pass, frame).
     """
-    for visit, (position, frame) in product(range(plan.views_per_frame), enumerate(frames)):
+    for visit, (position, frame) in product(
+        range(plan.views_per_frame), enumerate(frames)
+    ):
         rng = np.random.default_rng([plan.seed, visit, position])
         if visit == 0:
             view = frame_view(frame, encoder.stride, plan.view)
         else:
             view = augmented_view(frame, encoder.stride, plan.view, rng)
-        some = rng.permutation(np.flatnonzero(view.valid))[: plan.cells if visit else None]
+        some = rng.permutation(np.flatnonzero(view.valid))[
+            : plan.cells if visit else None
+        ]
         keep = np.zeros(len(view.valid), bool)
         keep[some] = True
         encoded = described(encoder(view.grey), descriptor)

@@ -28,7 +28,12 @@ class GlobalDescriptor(nn.Module):
     def __init__(self, inputs: int, maps: int = 8, hidden: int = 64, width: int = 128):
         super().__init__()
         self.width = width
-        self.settings = {"inputs": inputs, "maps": maps, "hidden": hidden, "width": width}
+        self.settings = {
+            "inputs": inputs,
+            "maps": maps,
+            "hidden": hidden,
+            "width": width,
+        }
         self.lift = nn.Conv2d(inputs, hidden, 1)
         self.value = nn.Conv2d(hidden, hidden, 1)
         self.attention = nn.Conv2d(hidden, maps, 1)
@@ -80,14 +85,20 @@ def load_descriptor(path: Path = DESCRIPTOR_FILE) -> Descriptor:
             settings = json.loads((file.metadata() or {})["descriptor"])
             state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
         pooled = settings.pop("layout", None) == PooledDescriptor.__name__
-        descriptor = PooledDescriptor(**settings) if pooled else GlobalDescriptor(**settings)
+        descriptor = (
+            PooledDescriptor(**settings) if pooled else GlobalDescriptor(**settings)
+        )
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
-        raise InputError(f"descriptor {path}: not an evercal descriptor ({error!r})") from error
+        raise InputError(
+            f"descriptor {path}: not an evercal descriptor ({error!r})"
+        ) from error
     try:
         descriptor.load_state_dict(state)
     except RuntimeError as error:
         first = str(error).splitlines()[1].strip()  # line 0 is the class of the module
-        raise InputError(f"descriptor {path}: not an evercal descriptor: {first}") from error
+        raise InputError(
+            f"descriptor {path}: not an evercal descriptor: {first}"
+        ) from error
     return descriptor.eval()
 
 
@@ -111,7 +122,9 @@ def descriptor_for(encoder_file: Path, inputs: int) -> Descriptor:
 
 
 @torch.inference_mode()
-def described(features: NDArray[np.float32], descriptor: Descriptor) -> tuple[Tensor, Tensor]:
+def described(
+    features: NDArray[np.float32], descriptor: Descriptor
+) -> tuple[Tensor, Tensor]:
     """Convert the features (rows, columns, channels) of an image, and describe it.
 
     Returns features (rows * columns, channels) and descriptor (width,), on the descriptor's device.

@@ -112,15 +112,24 @@ class Head(nn.Module):
 
     @classmethod
     def from_state(
-        cls, features: int, descriptor: int, options: HeadOptions, state: Mapping[str, Tensor]
+        cls,
+        features: int,
+        descriptor: int,
+        options: HeadOptions,
+        state: Mapping[str, Tensor],
     ) -> "Head":
         """Build a head from a `state_dict()` in half or single precision."""
-        head = fresh_head(features, descriptor, options, seed=0).to(state["code"].device)
-        state = {name: v.float() if v.dtype == torch.half else v for name, v in state.items()}
+        head = fresh_head(features, descriptor, options, seed=0).to(
+            state["code"].device
+        )
+        state = {
+            name: v.float() if v.dtype == torch.half else v for name, v in state.items()
+        }
         # The shapes of these depend on the number of scenes, so they are taken from the state.
         for name in ("code", "logit", "logit_bias", "offset", "offset_bias"):
             setattr(head, name, nn.Parameter(state[name].clone()))
-        head.centres, head.centre_scene = state["centres"].clone(), state["centre_scene"].clone()
+        head.centres = state["centres"].clone()
+        head.centre_scene = state["centre_scene"].clone()
         head.load_state_dict(state)
         counts = torch.bincount(head.centre_scene, minlength=head.scenes)
         head._owned = [0, *counts.cumsum(0).tolist()]
@@ -132,7 +141,11 @@ class Head(nn.Module):
         state["code"] = state["code"][:0]
         if self.options.centres == "grow":
             owned = ["logit", "logit_bias", "centres", "centre_scene"]
-            owned += ["offset", "offset_bias"] if self.options.offsets == "per_centre" else []
+            owned += (
+                ["offset", "offset_bias"]
+                if self.options.offsets == "per_centre"
+                else []
+            )
             state |= {name: state[name][:0] for name in owned}
         return Head.from_state(self.features, self.descriptor, self.options, state)
 
@@ -187,10 +200,13 @@ class Head(nn.Module):
         on every device.
         """
         generator = torch.Generator().manual_seed(seed)
-        width, count = self.options.width, len(centres)
+        width = self.options.width
+        count = len(centres)
 
         def draw(*shape: int, scale: float) -> Tensor:
-            return (torch.rand(*shape, generator=generator, device="cpu") * 2 - 1) * scale
+            return (
+                torch.rand(*shape, generator=generator, device="cpu") * 2 - 1
+            ) * scale
 
         bound = 1 / math.sqrt(width)
         self.code = _append(self.code, draw(1, self.layers, width, scale=0.2))
@@ -198,7 +214,9 @@ class Head(nn.Module):
         self.logit_bias = _append(self.logit_bias, self.logit_bias.new_zeros(count))
         if self.options.offsets == "per_centre":
             self.offset = _append(self.offset, draw(count, 4, width, scale=bound))
-            self.offset_bias = _append(self.offset_bias, self.offset_bias.new_zeros(count, 4))
+            self.offset_bias = _append(
+                self.offset_bias, self.offset_bias.new_zeros(count, 4)
+            )
         scene = torch.full((count,), self.scenes - 1, device=self.device)
         self.centres = torch.cat([self.centres, centres.to(self.centres)])
         self.centre_scene = torch.cat([self.centre_scene, scene])
@@ -215,7 +233,9 @@ class Head(nn.Module):
         with torch.autocast(hidden.device.type, enabled=False):
             return self.decode(hidden.float(), scene)
 
-    def hidden(self, features: Tensor, scene: Tensor | int, descriptor: Tensor | None) -> Tensor:
+    def hidden(
+        self, features: Tensor, scene: Tensor | int, descriptor: Tensor | None
+    ) -> Tensor:
         """Return the (n, width) activations of the last hidden layer; see `forward`."""
         if self.options.whiten:
             features = (features - self.feature_mean) @ self.feature_map
@@ -225,7 +245,9 @@ class Head(nn.Module):
             features = features * math.sqrt(self.features)
         if self.options.condition == "code":
             return self._trunk(features, self._add_code(scene))
-        assert descriptor is not None, "condition 'descriptor' needs the image descriptors"
+        assert descriptor is not None, (
+            "condition 'descriptor' needs the image descriptors"
+        )
         x = torch.cat([descriptor.to(features.dtype), features], dim=-1)
         return self._trunk(x, None)
 
@@ -234,15 +256,20 @@ class Head(nn.Module):
             return lambda z, layer: z.add_(self.code[scene, layer].to(z.dtype))
         # A product with one-hot rows, because the gradient of indexing is slow.
         one_hot = F.one_hot(scene, self.scenes)
-        return lambda z, layer: z.addmm_(one_hot.to(z.dtype), self.code[:, layer].to(z.dtype))
+        return lambda z, layer: z.addmm_(
+            one_hot.to(z.dtype), self.code[:, layer].to(z.dtype)
+        )
 
-    def _trunk(self, x: Tensor, add_code: Callable[[Tensor, int], Tensor] | None) -> Tensor:
+    def _trunk(
+        self, x: Tensor, add_code: Callable[[Tensor, int], Tensor] | None
+    ) -> Tensor:
         number = iter(range(self.layers))
         activation = F.gelu if self.options.activation == "gelu" else F.relu
 
         def through(layers: nn.Module, y: Tensor) -> Tensor:
             for linear in layers.children():
-                z, i = linear(y), next(number)
+                z = linear(y)
+                i = next(number)
                 y = activation(z if add_code is None else add_code(z, i))
             return y
 
@@ -262,7 +289,8 @@ class Head(nn.Module):
         if coded and not isinstance(scene, int):
             logits = logits.masked_fill(self.centre_scene != scene[:, None], -torch.inf)
         which = rows if self.options.offsets == "per_centre" else slice(None)
-        offset, bias = self.offset[which].flatten(0, 1), self.offset_bias[which].flatten()
+        offset = self.offset[which].flatten(0, 1)
+        bias = self.offset_bias[which].flatten()
         raw = F.linear(hidden, offset, bias).unflatten(-1, (-1, 4))
         offsets = raw[..., :3] / homogeneous_scale(raw[..., 3:])
         share = logits.softmax(-1)

@@ -47,7 +47,10 @@ class Target:
 def clamp_px(options: LossOptions, progress: float) -> float:
     """Return the soft clamp tau at `progress` in [0, 1]."""
     if options.schedule == "exponential":
-        return options.clamp_start_px * (options.clamp_end_px / options.clamp_start_px) ** progress
+        return (
+            options.clamp_start_px
+            * (options.clamp_end_px / options.clamp_start_px) ** progress
+        )
     q = 1.0 - math.sqrt(max(0.0, 1.0 - progress * progress))
     return options.clamp_start_px * (1.0 - q) + options.clamp_end_px
 
@@ -66,7 +69,9 @@ def reprojection_error(
     plane = in_camera[:, :2] / depth
     if correction is not None:
         radius2 = (plane * plane).sum(-1, keepdim=True).clamp(max=MAX_RADIUS2)
-        radial = 1.0 + correction[:, 3:4] * radius2 + correction[:, 4:5] * radius2 * radius2
+        radial = (
+            1.0 + correction[:, 3:4] * radius2 + correction[:, 4:5] * radius2 * radius2
+        )
         plane = plane * radial * (1.0 + correction[:, :1]) + correction[:, 1:3]
     projected = plane * target.intrinsics[:, :2] + target.intrinsics[:, 2:]
     return projected - target.pixels, in_camera
@@ -97,15 +102,20 @@ def reprojection_loss(
     depth = in_camera[:, 2]
     valid = (depth > MIN_DEPTH_M) & (depth < MAX_DEPTH_M) & (error < MAX_ERROR_PX)
     robust = tau * torch.tanh(error / tau)
-    focal, centre = target.intrinsics[:, :2], target.intrinsics[:, 2:]
-    ray = torch.cat([(target.pixels - centre) / focal, torch.ones_like(error)[:, None]], -1)
+    focal = target.intrinsics[:, :2]
+    centre = target.intrinsics[:, 2:]
+    ray = torch.cat(
+        [(target.pixels - centre) / focal, torch.ones_like(error)[:, None]], -1
+    )
     proxy = (ray * options.proxy_depth_m - in_camera).abs().sum(-1)
     loss = torch.where(valid, robust, proxy)
     pixels = torch.where(valid, residual.detach().norm(dim=-1), torch.inf)
     return loss, pixels
 
 
-def surface_loss(points: Tensor, known: Tensor, target: Target, tau_px: float) -> Tensor:
+def surface_loss(
+    points: Tensor, known: Tensor, target: Target, tau_px: float
+) -> Tensor:
     """Compute the robust distance (n,) of points from known ones, in pixels at their depth.
 
     With e the L1 distance along the axes of the camera, times the focal length over the known
@@ -118,8 +128,11 @@ def surface_loss(points: Tensor, known: Tensor, target: Target, tau_px: float) -
     known = torch.where(has_point[:, None], known, points.detach())
     matrix = target.camera_from_atlas
     gap = _rotated(matrix[:, :, :3], points - known).abs().sum(-1)
-    depth = (_rotated(matrix[:, :, :3], known) + matrix[:, :, 3])[:, 2].clamp(min=MIN_DEPTH_M)
-    error, scale = gap * target.intrinsics[:, 0] / depth, max(tau_px, SURFACE_PX)
+    depth = (_rotated(matrix[:, :, :3], known) + matrix[:, :, 3])[:, 2].clamp(
+        min=MIN_DEPTH_M
+    )
+    error = gap * target.intrinsics[:, 0] / depth
+    scale = max(tau_px, SURFACE_PX)
     return torch.where(has_point, scale * torch.log1p(error / scale), 0.0)
 
 

@@ -14,7 +14,9 @@ import torch
 from evercal.errors import InputError
 
 VARIABLE = "EVERCAL_PRECISION"
-AUTO, BFLOAT16, FLOAT32 = "auto", "bfloat16", "float32"
+AUTO = "auto"
+BFLOAT16 = "bfloat16"
+FLOAT32 = "float32"
 
 
 def fast_bfloat16(device: torch.device | str = "cpu") -> bool:
@@ -24,7 +26,9 @@ def fast_bfloat16(device: torch.device | str = "cpu") -> bool:
         raise InputError(
             f"{VARIABLE}: {precision!r} is not a precision; set it to auto, bfloat16 or float32"
         )
-    return precision == BFLOAT16 or (precision == AUTO and has_bfloat16(torch.device(device).type))
+    return precision == BFLOAT16 or (
+        precision == AUTO and has_bfloat16(torch.device(device).type)
+    )
 
 
 @lru_cache(maxsize=4)

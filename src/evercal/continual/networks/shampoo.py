@@ -26,7 +26,9 @@ class OneSidedShampoo(torch.optim.Optimizer):
     singular values by about the rate; the decoupled weight decay is relative to it.
     """
 
-    def __init__(self, groups: Iterable[Mapping[str, object]], rate: float, weight_decay: float):
+    def __init__(
+        self, groups: Iterable[Mapping[str, object]], rate: float, weight_decay: float
+    ):
         super().__init__(map(dict, groups), {"lr": rate, "weight_decay": weight_decay})
 
     @torch.no_grad()
@@ -49,7 +51,9 @@ class OneSidedShampoo(torch.optim.Optimizer):
         state["momentum"].lerp_(gradients, 1 - MOMENTUM)
         direction = gradients.lerp(state["momentum"], MOMENTUM)
         moment = direction.mT @ direction
-        state["moment"] = state["moment"].lerp_(moment, 1 - DECAY) if "moment" in state else moment
+        state["moment"] = (
+            state["moment"].lerp_(moment, 1 - DECAY) if "moment" in state else moment
+        )
         if int(state["step"]) % EVERY == 0:
             state["root"] = inverse_root(state["moment"])
         state["step"] += 1
@@ -64,7 +68,9 @@ def inverse_root(moments: Tensor) -> Tensor:
     c is the mean eigenvalue; steps do not depend on it.
     """
     mean = moments.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None].clamp(min=1e-30)
-    scaled = moments / mean + FLOOR * torch.eye(moments.shape[-1], device=moments.device)
+    scaled = moments / mean + FLOOR * torch.eye(
+        moments.shape[-1], device=moments.device
+    )
     try:
         values, vectors = torch.linalg.eigh(scaled)
     except RuntimeError:  # LinAlgError, which torch does not export

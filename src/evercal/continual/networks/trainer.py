@@ -11,7 +11,12 @@ from evercal.continual.networks.buffer import FeatureBuffer, Rows, diffused, joi
 from evercal.continual.networks.device import tf32
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
-from evercal.continual.networks.loss import LossOptions, clamp_px, reprojection_loss, surface_loss
+from evercal.continual.networks.loss import (
+    LossOptions,
+    clamp_px,
+    reprojection_loss,
+    surface_loss,
+)
 from evercal.continual.networks.precision import autocast
 from evercal.continual.networks.shampoo import OneSidedShampoo
 
@@ -85,10 +90,15 @@ class HeadTrainer:
         seed: int,
         hooks: TrainingHooks | None = None,
     ):
-        self.head, self.buffers = head, buffers
-        self.options, self.seed, self.step = options, seed, 0
+        self.head = head
+        self.buffers = buffers
+        self.options = options
+        self.seed = seed
+        self.step = 0
         self.hooks = TrainingHooks() if hooks is None else hooks
-        self.correction = torch.nn.Parameter(torch.zeros(len(buffers), 5, device=head.device))
+        self.correction = torch.nn.Parameter(
+            torch.zeros(len(buffers), 5, device=head.device)
+        )
         correctable = [[float(buffer.correctable)] for buffer in buffers]
         self._correctable = torch.tensor(correctable, device=head.device)
         self._optimisers = _optimisers(head, self.correction, options)
@@ -103,7 +113,8 @@ class HeadTrainer:
         self.head.eval()
 
     def _train_step(self) -> Progress:
-        options, rate = self.options, one_cycle(self.options, self.step)
+        options = self.options
+        rate = one_cycle(self.options, self.step)
         rows, fresh = self._rows(rate)
         for optimiser in self._optimisers:
             for group in optimiser.param_groups:
@@ -115,9 +126,12 @@ class HeadTrainer:
         with autocast(self.head.device):
             output = self.head(rows.features.float(), scene, rows.descriptor)
         tau_px = clamp_px(options.loss, self.step / options.iterations)
-        costs, errors = self._fresh_costs(output.points[:fresh], rows.part(slice(0, fresh)), tau_px)
+        costs, errors = self._fresh_costs(
+            output.points[:fresh], rows.part(slice(0, fresh)), tau_px
+        )
         loss = costs.mean()
-        replayed, remembered = output.part(slice(fresh, None)), rows.part(slice(fresh, None))
+        replayed = output.part(slice(fresh, None))
+        remembered = rows.part(slice(fresh, None))
         more = [self.hooks.regularizer()]
         if fresh < len(rows.scene):
             more.append(self.hooks.cost(replayed, remembered, tau_px))
@@ -143,12 +157,19 @@ class HeadTrainer:
             parts = [diffused(part, self.options.diffusion, noise) for part in parts]
         return join(parts), fresh * share
 
-    def _fresh_costs(self, points: Tensor, rows: Rows, tau_px: float) -> tuple[Tensor, Tensor]:
-        options, correction = self.options, None
+    def _fresh_costs(
+        self, points: Tensor, rows: Rows, tau_px: float
+    ) -> tuple[Tensor, Tensor]:
+        options = self.options
+        correction = None
         if options.intrinsics_rate > 0 and tau_px < CORRECTION_FROM_PX:
             share = len(points) // len(self.buffers)
-            correction = (self.correction * self._correctable).repeat_interleave(share, 0)
-        costs, errors = reprojection_loss(points, rows.target, tau_px, options.loss, correction)
+            correction = (self.correction * self._correctable).repeat_interleave(
+                share, 0
+            )
+        costs, errors = reprojection_loss(
+            points, rows.target, tau_px, options.loss, correction
+        )
         if rows.known is not None:
             surface = surface_loss(points, rows.known, rows.target, tau_px)
             costs = costs + options.surface_weight * surface
@@ -156,11 +177,16 @@ class HeadTrainer:
 
     def _gradients(self, loss: Tensor) -> dict[str, Tensor]:
         names, values = zip(*self.head.named_parameters(), strict=True)
-        gradients = torch.autograd.grad(loss, values, retain_graph=True, materialize_grads=True)
+        gradients = torch.autograd.grad(
+            loss, values, retain_graph=True, materialize_grads=True
+        )
         return dict(zip(names, gradients, strict=True))
 
     def _take_step(
-        self, losses: Sequence[Tensor], constraints: list[dict[str, Tensor]], schedule: float
+        self,
+        losses: Sequence[Tensor],
+        constraints: list[dict[str, Tensor]],
+        schedule: float,
     ) -> None:
         named = dict(self.head.named_parameters()) if self.hooks.edits_steps else {}
         before = {name: value.detach().clone() for name, value in named.items()}
@@ -170,9 +196,13 @@ class HeadTrainer:
             return
         with torch.no_grad():
             empty = torch.zeros(0, device=self.head.device)
-            values = torch.stack([loss.detach() for loss in losses]) if losses else empty
+            values = (
+                torch.stack([loss.detach() for loss in losses]) if losses else empty
+            )
             changes = {name: value - before[name] for name, value in named.items()}
-            self.hooks.edit_step(ProposedStep(changes, values, constraints, self.step, schedule))
+            self.hooks.edit_step(
+                ProposedStep(changes, values, constraints, self.step, schedule)
+            )
             for name, value in named.items():
                 value.copy_(before[name] + changes[name])
 
@@ -180,7 +210,9 @@ class HeadTrainer:
 def _optimisers(
     head: Head, correction: torch.nn.Parameter, options: FitOptions
 ) -> list[torch.optim.Optimizer]:
-    hidden, decay, plain = [], [], []
+    hidden = []
+    decay = []
+    plain = []
     for name, parameter in head.named_parameters():
         if name.startswith(("code", "logit")):
             plain.append(parameter)
@@ -188,7 +220,8 @@ def _optimisers(
             hidden.append(parameter)
         else:
             decay.append(parameter)
-    rate, weight_decay = options.peak_rate, options.weight_decay
+    rate = options.peak_rate
+    weight_decay = options.weight_decay
     groups = [
         {"params": decay, "share": 1.0},
         {"params": plain, "share": 1.0, "weight_decay": 0.0},
@@ -208,8 +241,11 @@ def one_cycle(options: FitOptions, step: int) -> float:
     """
     rise = max(1.0, options.warm_share * options.iterations)
     if step < rise:
-        low, high, share = options.peak_rate / 25, options.peak_rate, 1 - step / rise
+        low = options.peak_rate / 25
+        high = options.peak_rate
+        share = 1 - step / rise
     else:
-        low, high = 0.0, options.peak_rate
+        low = 0.0
+        high = options.peak_rate
         share = (step - rise) / max(1.0, options.iterations - rise)
     return low + (high - low) * 0.5 * (1 + math.cos(math.pi * share))

@@ -39,7 +39,10 @@ class FrameStatistics:
         """(n, 3) camera positions in the base frame."""
         self.quaternions_wxyz = poses.rotation_wxyz
         """(n, 4) camera orientations."""
-        self._head, self._rows, self._seed, self._scene = head, rows, seed, scene
+        self._head = head
+        self._rows = rows
+        self._seed = seed
+        self._scene = scene
 
     def __len__(self) -> int:
         return len(self.positions_m)
@@ -64,7 +67,9 @@ class FrameStatistics:
         return self._buffer.rows(torch.arange(start, end, device="cpu"))
 
     def _hidden(self, rows: Rows) -> Tensor:
-        return self._head.hidden(rows.features.float(), self._buffer.scene, rows.descriptor)
+        return self._head.hidden(
+            rows.features.float(), self._buffer.scene, rows.descriptor
+        )
 
     @torch.no_grad()
     def features(self) -> np.ndarray:
@@ -84,7 +89,9 @@ class FrameStatistics:
         reliable = []
         for i in range(len(self)):
             rows = self._rows_of(i)
-            points = self._head.decode(self._hidden(rows).float(), self._buffer.scene).points
+            points = self._head.decode(
+                self._hidden(rows).float(), self._buffer.scene
+            ).points
             _, error = fixed_clamp_loss(points, rows.target)
             reliable.append(points[error < RELIABLE_PX].double().cpu().numpy())
         every = np.concatenate(reliable)
@@ -101,14 +108,19 @@ class FrameStatistics:
 
         Fixed centres belong to no scene; with them, gradients are by all logits and offsets.
         """
-        head, generator = self._head, torch.Generator().manual_seed(self._seed)
+        head = self._head
+        generator = torch.Generator().manual_seed(self._seed)
         parameters = (head.logit, head.offset)
         shared_centres = head.options.centres != "grow"
-        own = torch.nonzero(shared_centres | (head.centre_scene == self._buffer.scene))[:, 0]
+        own = torch.nonzero(shared_centres | (head.centre_scene == self._buffer.scene))[
+            :, 0
+        ]
         gradients = []
         for i in range(len(self)):
             start, end = self._starts[i : i + 2]
-            drawn = torch.randint(start, end, (GRADIENT_ROWS,), generator=generator, device="cpu")
+            drawn = torch.randint(
+                start, end, (GRADIENT_ROWS,), generator=generator, device="cpu"
+            )
             rows = self._buffer.rows(drawn)
             with torch.no_grad():
                 hidden = self._hidden(rows).float()

@@ -37,7 +37,9 @@ def select_herding(features: np.ndarray, capacity: int) -> np.ndarray:
     """
     unit = _unit(features)
     mean = unit.mean(0) if len(unit) else np.zeros(features.shape[1])
-    free, total, selected = np.ones(len(unit), dtype=bool), np.zeros(unit.shape[1]), []
+    free = np.ones(len(unit), dtype=bool)
+    total = np.zeros(unit.shape[1])
+    selected = []
     for taken in range(1, min(capacity, len(unit)) + 1):
         gap = np.linalg.norm(mean - (total + unit) / taken, axis=1)
         chosen = int(np.where(free, gap, np.inf).argmin())
@@ -53,7 +55,9 @@ def leverage_scores(features: np.ndarray, rank: int) -> np.ndarray:
     The scores sum to the rank. FedCBDR prints the full left factor, whose rows all have norm 1; the
     thin one is used here.
     """
-    left, values, _ = np.linalg.svd(np.asarray(features, np.float64), full_matrices=False)
+    left, values, _ = np.linalg.svd(
+        np.asarray(features, np.float64), full_matrices=False
+    )
     used = int((values > values.max(initial=0) * 1e-9).sum())
     return (left[:, : min(rank, used)] ** 2).sum(1)
 
@@ -98,7 +102,9 @@ def select_coverage(
     return np.sort(np.array(selected, dtype=np.int64))
 
 
-def select_gradients(gradients: np.ndarray, capacity: int, rng: np.random.Generator) -> np.ndarray:
+def select_gradients(
+    gradients: np.ndarray, capacity: int, rng: np.random.Generator
+) -> np.ndarray:
     """Gradient-based sample selection, greedy (GSS, Aljundi et al., NeurIPS 2019, Algorithm 2).
 
     A frame's score c is one plus its largest cosine with a few buffered frames. Frames are appended
@@ -120,7 +126,8 @@ def select_gradients(gradients: np.ndarray, capacity: int, rng: np.random.Genera
             total = scores.sum()
             slot = int(rng.choice(len(selected), p=scores / total)) if total > 0 else 0
             if rng.random() * (scores[slot] + score) < scores[slot]:
-                selected[slot], scores[slot] = frame, score
+                selected[slot] = frame
+                scores[slot] = score
     return np.sort(np.array(selected, dtype=np.int64))
 
 
@@ -135,10 +142,14 @@ Select = Callable[[FrameStatistics, int], np.ndarray]
 SELECTORS: dict[str, Select] = {
     "reservoir": lambda f, capacity: select_reservoir(len(f), capacity, f.rng()),
     "herding": lambda f, capacity: select_herding(f.features(), capacity),
-    "coverage": lambda f, capacity: select_coverage(f.visible_parts(), capacity, f.rng()),
+    "coverage": lambda f, capacity: select_coverage(
+        f.visible_parts(), capacity, f.rng()
+    ),
     "leverage": lambda f, capacity: select_leverage(f.features(), capacity, f.rng()),
     "gradients": lambda f, capacity: select_gradients(f.gradients(), capacity, f.rng()),
-    "sars": lambda f, capacity: select_sars(f.positions_m, f.quaternions_wxyz, capacity),
+    "sars": lambda f, capacity: select_sars(
+        f.positions_m, f.quaternions_wxyz, capacity
+    ),
     "sars_filled": lambda f, capacity: select_sars(
         f.positions_m, f.quaternions_wxyz, capacity, SarsOptions(fill=True)
     ),

@@ -20,7 +20,12 @@ from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import as_stored, files_in
 from evercal.recordings.poses.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import library_errors, named_errors, natural_key, path_inside
+from evercal.recordings.text_files import (
+    library_errors,
+    named_errors,
+    natural_key,
+    path_inside,
+)
 
 USES = ("metres",)
 
@@ -46,25 +51,35 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     metric = options is not None and options.metres
     models = {folder: _model(folder) for folder in _models(root)}
     if not models:
-        raise InputError(f"{root}: no COLMAP model; expected cameras and images (.bin or .txt)")
+        raise InputError(
+            f"{root}: no COLMAP model; expected cameras and images (.bin or .txt)"
+        )
     folder = max(models, key=lambda folder: models[folder].num_reg_images())
-    model, notes = models[folder], [frame_note("COLMAP", metric)]
+    model = models[folder]
+    notes = [frame_note("COLMAP", metric)]
     if len(models) > 1:
         sizes = ", ".join(f"{f.name}: {m.num_reg_images()}" for f, m in models.items())
-        notes.append(f"took model {folder.name}, the one with the most images ({sizes})")
+        notes.append(
+            f"took model {folder.name}, the one with the most images ({sizes})"
+        )
     cameras = {key: _camera(folder, camera) for key, camera in model.cameras.items()}
     posed = [image for image in model.images.values() if image.has_pose]
     posed.sort(key=lambda image: natural_key(image.name))
     if not posed:
-        raise InputError(f"{folder}: no image has a pose; reconstruct with more overlap")
+        raise InputError(
+            f"{folder}: no image has a pose; reconstruct with more overlap"
+        )
     images = _image_folder(root, folder, [image.name for image in posed])
     frames = [
-        Frame(i.name, as_stored(images / i.name), cameras[i.camera_id], _pose(folder, i))
+        Frame(
+            i.name, as_stored(images / i.name), cameras[i.camera_id], _pose(folder, i)
+        )
         for i in posed
     ]
     files = files_in(images, glob="**/*")
     total = max(len(model.images), len(files) if images != root else 0)
-    name, lost = root.resolve().name, total - len(frames)
+    name = root.resolve().name
+    lost = total - len(frames)
     return Recording(name, tuple(frames), (), lost, notes=tuple(notes), metric=metric)
 
 
@@ -82,7 +97,10 @@ def _models(root: Path) -> list[Path]:
 
 def _is_model(folder: Path) -> bool:
     names = ("cameras", "images")
-    kinds = [all((folder / (name + end)).is_file() for name in names) for end in (".bin", ".txt")]
+    kinds = [
+        all((folder / (name + end)).is_file() for name in names)
+        for end in (".bin", ".txt")
+    ]
     return any(kinds)
 
 
@@ -119,7 +137,9 @@ def _require_ends(folder: Path) -> None:
         with file.open("rb") as stream:
             count = int.from_bytes(stream.read(8), "little")
         if size < 8 or count > (size - 8) / 8:  # no entry is shorter
-            raise InputError(f"{file}: {size} bytes, too few for what it lists; copy it again")
+            raise InputError(
+                f"{file}: {size} bytes, too few for what it lists; copy it again"
+            )
     seconds = _LEAST_S + sum(sizes.values()) / _SLOWEST_BYTES_PER_S
     if sizes and status_of(_READ, str(folder), seconds=seconds) is None:
         raise InputError(
@@ -138,8 +158,13 @@ def _camera(folder: Path, camera: Any) -> Camera:
     names = ["k1" if name == "k" else name for name in names]
     named = dict(zip(names, map(float, camera.params), strict=True))
     focal = named.get("fx", named.get("f", 0.0)), named.get("fy", named.get("f", 0.0))
-    centre = named["cx"] - 0.5, named["cy"] - 0.5  # COLMAP counts from the image's corner
-    size, kind = (int(camera.width), int(camera.height)), name.lower()
+    # COLMAP counts from the image's corner.
+    centre = (
+        named["cx"] - 0.5,
+        named["cy"] - 0.5,
+    )
+    size = (int(camera.width), int(camera.height))
+    kind = name.lower()
     with named_errors(folder, "COLMAP model"):
         if kind in RADIAL_MODELS:
             own = [named[key] for key in RADIAL_MODELS[kind].parameters]
@@ -161,4 +186,6 @@ def _pose(folder: Path, image: Any) -> SE3:
 def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:
     beside = (parent / "images" for parent in folder.resolve().parents[:3])
     places = (root / "images", root, *beside)
-    return max(places, key=lambda place: sum((place / name).is_file() for name in names))
+    return max(
+        places, key=lambda place: sum((place / name).is_file() for name in names)
+    )

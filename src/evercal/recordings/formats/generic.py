@@ -46,7 +46,9 @@ def load(root: Path) -> Recording:
     with named_errors(file, "scene file"):
         frames = of_format(data, _FORMAT, _VERSION, partial(_frames, root))
     name = data.get("name")
-    train, test = (tuple(f for s, f in frames if s == split) for split in ("train", "test"))
+    train, test = (
+        tuple(f for s, f in frames if s == split) for split in ("train", "test")
+    )
     return Recording(
         name if isinstance(name, str) and name else root.resolve().name,
         train,
@@ -57,8 +59,11 @@ def load(root: Path) -> Recording:
     )
 
 
-def _frames(root: Path, data: Mapping[str, Any]) -> list[tuple[Literal["train", "test"], Frame]]:
-    entries, notes = data.get("frames"), data.get("notes", [])
+def _frames(
+    root: Path, data: Mapping[str, Any]
+) -> list[tuple[Literal["train", "test"], Frame]]:
+    entries = data.get("frames")
+    notes = data.get("notes", [])
     if not isinstance(entries, list) or not entries:
         raise ValueError("'frames' is a list with at least one frame")
     if not isinstance(data.get("untracked", 0), int):
@@ -67,7 +72,8 @@ def _frames(root: Path, data: Mapping[str, Any]) -> list[tuple[Literal["train", 
         raise ValueError(f"'unit' is 'metres' or 'unknown', got {data['unit']!r}")
     if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
         raise ValueError(f"'notes' is a list of sentences, got {notes!r}")
-    cameras, frames = _cameras(data.get("cameras")), []
+    cameras = _cameras(data.get("cameras"))
+    frames = []
     for i, entry in enumerate(entries):
         with naming(f"frame {i}"):
             frames.append(_frame(root, entry, cameras))
@@ -91,7 +97,8 @@ def write(
         on_frame: Called after every frame, for progress bars.
     """
     with SceneWriter(root, recording.name, link) as writer:
-        writer.untracked, writer.notes = recording.untracked, recording.notes
+        writer.untracked = recording.untracked
+        writer.notes = recording.notes
         writer.metric = recording.metric
         for i, frame in enumerate((*recording.train, *recording.test)):
             writer.add(frame, "train" if i < len(recording.train) else "test")
@@ -106,7 +113,9 @@ class SceneWriter:
     and errors are those of `write`.
     """
 
-    def __init__(self, root: str | os.PathLike[str], name: str, link: bool = False) -> None:
+    def __init__(
+        self, root: str | os.PathLike[str], name: str, link: bool = False
+    ) -> None:
         self.untracked = 0
         self.notes: tuple[str, ...] = ()
         self.metric = True
@@ -132,7 +141,9 @@ class SceneWriter:
             "format": _FORMAT,
             "version": _VERSION,
             "name": self._name,
-            "cameras": {number: camera.to_dict() for camera, number in self._cameras.items()},
+            "cameras": {
+                number: camera.to_dict() for camera, number in self._cameras.items()
+            },
             "frames": list(self._entries.values()),
             "untracked": self.untracked,
         }
@@ -145,7 +156,9 @@ class SceneWriter:
     def add(self, frame: Frame, split: Literal["train", "test"]) -> None:
         """Write the frame's image and collect its entry of scene.json."""
         if frame.name in self._entries:
-            raise InputError(f"frame {frame.name!r}: already written; frame names are unique")
+            raise InputError(
+                f"frame {frame.name!r}: already written; frame names are unique"
+            )
         # The counter keeps names like 'a/b' and 'a_b' apart and the folder in recorded order.
         stem = f"{len(self._entries):06d}"
         entry: dict[str, object] = {
@@ -199,7 +212,9 @@ class SceneWriter:
         """Path of a new file: writing to an old one could write through its hard links."""
         path = self._root / relative
         if path.exists():
-            raise InputError(f"{path}: already there; give a new folder, or remove this one")
+            raise InputError(
+                f"{path}: already there; give a new folder, or remove this one"
+            )
         try:
             yield path
         except OSError as error:
@@ -207,7 +222,9 @@ class SceneWriter:
 
 
 def _cameras(data: object) -> dict[str, Camera]:
-    if not isinstance(data, dict) or not all(isinstance(c, dict) for c in data.values()):
+    if not isinstance(data, dict) or not all(
+        isinstance(c, dict) for c in data.values()
+    ):
         raise ValueError("'cameras' is an object of objects, got something else")
     cameras = {}
     for number, camera in data.items():
@@ -221,7 +238,8 @@ def _frame(
 ) -> tuple[Literal["train", "test"], Frame]:
     if not isinstance(entry, dict):
         raise ValueError(f"is an object, got {entry!r}")
-    camera, split = entry.get("camera"), entry.get("split")
+    camera = entry.get("camera")
+    split = entry.get("split")
     image = path_inside(entry.get("image"), "'image'")
     optional: dict[str, Any] = {}
     if (depth := entry.get("depth")) is not None:
@@ -236,7 +254,9 @@ def _frame(
     for key in ("base_from_camera", "base_from_gripper"):
         with naming(repr(key)):
             optional[key] = _pose(entry.get(key))
-    return split, Frame(str(entry.get("name", image)), root / image, cameras[camera], **optional)
+    return split, Frame(
+        str(entry.get("name", image)), root / image, cameras[camera], **optional
+    )
 
 
 def _pose(data: Any) -> SE3 | None:
@@ -251,6 +271,10 @@ def _pose(data: Any) -> SE3 | None:
 
 
 def _numbers(value: object, count: int, name: str) -> list[float]:
-    if not isinstance(value, list) or len(value) != count or not all(map(is_real, value)):
+    if (
+        not isinstance(value, list)
+        or len(value) != count
+        or not all(map(is_real, value))
+    ):
         raise ValueError(f"'{name}' is {count} numbers, got {value!r}")
     return [float(v) for v in value]

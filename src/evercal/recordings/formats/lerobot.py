@@ -31,7 +31,11 @@ from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, decode_image, files_in, image_file
 from evercal.recordings.poses.camera_file import read_camera_of_size
-from evercal.recordings.poses.conventions import asking_for, checked_poses, pose_convention
+from evercal.recordings.poses.conventions import (
+    asking_for,
+    checked_poses,
+    pose_convention,
+)
 from evercal.recordings.poses.kinematics import RobotModel, in_radians
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import number_array
@@ -45,11 +49,21 @@ from evercal.recordings.text_files import (
 )
 
 Array = NDArray[np.float64]
-USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
+USES = (
+    "camera",
+    "image_topic",
+    "base_frame",
+    "gripper_frame",
+    "urdf",
+    "pose_convention",
+)
 INFO = Path("meta") / "info.json"
 _STATE = "observation.state"
 # Names of the numbers of a pose, by convention.
-_PARTS = {"xyzw": ("x", "y", "z", "qx", "qy", "qz", "qw"), "ur": ("x", "y", "z", "wx", "wy", "wz")}
+_PARTS = {
+    "xyzw": ("x", "y", "z", "qx", "qy", "qz", "qw"),
+    "ur": ("x", "y", "z", "wx", "wy", "wz"),
+}
 
 
 def detect(root: Path) -> bool:
@@ -70,31 +84,47 @@ def _load(root: Path, options: ReadOptions) -> Recording:
     info = _info(root)
     key = _camera_key(root, info, options.image_topic)
     if options.camera is None:
-        raise InputError(f"{root}: LeRobot datasets hold no intrinsics; give them with --camera")
+        raise InputError(
+            f"{root}: LeRobot datasets hold no intrinsics; give them with --camera"
+        )
     shape = [int(n) for n in info["features"][key]["shape"]]
-    height, width = shape[1:3] if shape[0] == 3 else shape[:2]  # some state channels first
+    # Some state channels first.
+    height, width = shape[1:3] if shape[0] == 3 else shape[:2]
     camera = read_camera_of_size(options.camera, (width, height), key)
     column = _pose_feature(root, info, options)
     rows, values = _rows(root, column)
     stated, notes = _feature_poses(root, info, column, values, options)
     names = [f"episode_{row.episode:06d}/{row.number:06d}" for row in rows]
     frames = tuple(
-        Frame(name, image, camera, None, stated.poses[i], joints_rad=stated.joints_of(i))
-        for i, (name, image) in enumerate(zip(names, _images(root, info, key, rows), strict=True))
+        Frame(
+            name, image, camera, None, stated.poses[i], joints_rad=stated.joints_of(i)
+        )
+        for i, (name, image) in enumerate(
+            zip(names, _images(root, info, key, rows), strict=True)
+        )
     )
-    here, total = len({row.episode for row in rows}), int(info.get("total_episodes", 0))
+    here = len({row.episode for row in rows})
+    total = int(info.get("total_episodes", 0))
     if here < total:
         notes.append(f"{here} of {total} episodes are in the folder")
     frames[0].read_image()
-    return Recording(root.resolve().name, frames, (), notes=tuple(notes), arm=stated.arm)
+    return Recording(
+        root.resolve().name, frames, (), notes=tuple(notes), arm=stated.arm
+    )
 
 
 def _info(root: Path) -> dict[str, Any]:
     info: dict[str, Any] = read_json(root / INFO, "LeRobot dataset")
-    version, features = str(info["codebase_version"]), info["features"]
+    version = str(info["codebase_version"])
+    features = info["features"]
     if not version.startswith(("v2.", "v3.")):
-        raise InputError(f"{root / INFO}: version {version}; this evercal reads v2 and v3")
-    if not all(isinstance(f, dict) for f in features.values()) or not float(info["fps"]) > 0:
+        raise InputError(
+            f"{root / INFO}: version {version}; this evercal reads v2 and v3"
+        )
+    if (
+        not all(isinstance(f, dict) for f in features.values())
+        or not float(info["fps"]) > 0
+    ):
         raise ValueError("'features' is an object of objects and 'fps' a number > 0")
     for name in ("data_path", "video_path"):
         if info.get(name) is not None:
@@ -103,15 +133,23 @@ def _info(root: Path) -> dict[str, Any]:
 
 
 def _camera_key(root: Path, info: Mapping[str, Any], wanted: str | None) -> str:
-    keys = [k for k, f in info["features"].items() if f.get("dtype") in ("video", "image")]
+    keys = [
+        k for k, f in info["features"].items() if f.get("dtype") in ("video", "image")
+    ]
     # Stated in `info`, in older versions under other names.
-    keys = [k for k in keys if not re.search(r"is_depth_map'\W+True", str(info["features"][k]))]
+    keys = [
+        k
+        for k in keys
+        if not re.search(r"is_depth_map'\W+True", str(info["features"][k]))
+    ]
     if wanted is None and len(keys) == 1:
         return keys[0]
     if wanted in keys:
         return str(wanted)
     what = f"no picture in {wanted!r}" if wanted else f"{len(keys)} cameras"
-    raise InputError(f"{root}: {what}; name one with --image-topic: {', '.join(keys) or 'none'}")
+    raise InputError(
+        f"{root}: {what}; name one with --image-topic: {', '.join(keys) or 'none'}"
+    )
 
 
 class _Row(NamedTuple):
@@ -130,11 +168,15 @@ class _Row(NamedTuple):
 def _rows(root: Path, column: str) -> tuple[list[_Row], Array]:
     files = files_in(root / "data", (".parquet",), "*/*")
     if not files:
-        raise InputError(f"{root / 'data'}: no parquet files; download the data folder too")
+        raise InputError(
+            f"{root / 'data'}: no parquet files; download the data folder too"
+        )
     rows: list[_Row] = []
     parts = []
     for file in files:
-        *cells, poses = _columns(file, ["episode_index", "frame_index", "timestamp", column])
+        *cells, poses = _columns(
+            file, ["episode_index", "frame_index", "timestamp", column]
+        )
         for i, (episode, number, seconds) in enumerate(zip(*cells, strict=True)):
             rows.append(_Row(episode, number, seconds, file, i))
         with named_errors(file, column):
@@ -155,9 +197,13 @@ def _images(
     videos = Videos(float(info["fps"]))
     starts = _video_starts(root, info, key, {row.episode for row in rows})
     if lost := sorted({row.episode for row in rows} - starts.keys()):
-        raise InputError(f"{root / 'meta' / 'episodes'}: episode {lost[0]} is not listed")
+        raise InputError(
+            f"{root / 'meta' / 'episodes'}: episode {lost[0]} is not listed"
+        )
     places = [(row, *starts[row.episode]) for row in rows]
-    return [VideoFrame(videos, path, start + row.seconds) for row, path, start in places]
+    return [
+        VideoFrame(videos, path, start + row.seconds) for row, path, start in places
+    ]
 
 
 def _video_starts(
@@ -175,7 +221,9 @@ def _video_starts(
 
     if str(info["codebase_version"]).startswith("v2"):
         size = int(info.get("chunks_size", 1000))
-        return {i: (video(episode_chunk=i // size, episode_index=i), 0.0) for i in episodes}
+        return {
+            i: (video(episode_chunk=i // size, episode_index=i), 0.0) for i in episodes
+        }
     parts = ("chunk_index", "file_index", "from_timestamp")
     names = ["episode_index", *(f"videos/{key}/{part}" for part in parts)]
     return {
@@ -229,7 +277,9 @@ class _Embedded(StoredImage):
     def _content(self) -> bytes:
         with _parquet(self.path) as table:
             groups = range(table.num_row_groups)
-            ends = np.cumsum([table.metadata.row_group(group).num_rows for group in groups])
+            ends = np.cumsum(
+                [table.metadata.row_group(group).num_rows for group in groups]
+            )
             group = int(np.searchsorted(ends, self.row, side="right"))
             cell = _row_group(self.path, group, self.key)[self.row - int(ends[group])]
         if cell["bytes"]:
@@ -247,17 +297,27 @@ def _pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> 
         column = options.gripper_frame or _STATE
         if column not in features:
             names = ", ".join(features)
-            raise InputError(f"{root}: no feature {column!r}; --gripper-frame is one of {names}")
+            raise InputError(
+                f"{root}: no feature {column!r}; --gripper-frame is one of {names}"
+            )
         return column
-    observed = {key: _names(info, key) for key in features if key.startswith("observation")}
+    observed = {
+        key: _names(info, key) for key in features if key.startswith("observation")
+    }
     keys = [key for key, names in observed.items() if _convention_of(names)]
     if options.gripper_frame is not None:
-        keys = [key for key in keys if options.gripper_frame in (key, *_arms(observed[key]))]
+        keys = [
+            key for key in keys if options.gripper_frame in (key, *_arms(observed[key]))
+        ]
     if _STATE in keys or len(keys) == 1:
         return _STATE if _STATE in keys else keys[0]
     if keys:
-        raise InputError(f"{root}: gripper poses are in {' and '.join(keys)}; give --gripper-frame")
-    named = {key: names for key, names in observed.items() if names and "image" not in key}
+        raise InputError(
+            f"{root}: gripper poses are in {' and '.join(keys)}; give --gripper-frame"
+        )
+    named = {
+        key: names for key, names in observed.items() if names and "image" not in key
+    }
     listed = "; ".join(f"{key}: {', '.join(names)}" for key, names in named.items())
     raise InputError(
         f"{root}: no feature holds a pose (x, y, z and qx, qy, qz, qw or wx, wy, wz), there are"
@@ -267,14 +327,19 @@ def _pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> 
 
 
 def _feature_poses(
-    root: Path, info: Mapping[str, Any], column: str, values: Array, options: ReadOptions
+    root: Path,
+    info: Mapping[str, Any],
+    column: str,
+    values: Array,
+    options: ReadOptions,
 ) -> tuple[RobotPoses, list[str]]:
     names = _names(info, column)
     if options.urdf is not None:
         return _joint_poses(root, names, values, options)
     if options.base_frame is not None:
         raise InputError(f"{root}: --base-frame goes with --urdf only; leave it out")
-    count, notes = values.shape[1], []
+    count = values.shape[1]
+    notes = []
     with named_errors(f"{root}: {column}", "poses"), asking_for("--pose-convention"):
         if options.pose_convention is not None:
             convention = pose_convention(options.pose_convention)
@@ -287,7 +352,8 @@ def _feature_poses(
             raise ValueError(f"has {count} numbers and {len(names)} names")
         else:
             name, columns = _pose_columns(names, options.gripper_frame)
-            convention, numbers = pose_convention(name), values[:, columns]
+            convention = pose_convention(name)
+            numbers = values[:, columns]
         poses = checked_poses(numbers, convention)
     notes = [f"gripper poses are {column}: {convention.meaning}", *notes]
     return RobotPoses(None, None, poses), notes
@@ -297,7 +363,8 @@ def _joint_poses(
     root: Path, names: list[str], stated: Array, options: ReadOptions
 ) -> tuple[RobotPoses, list[str]]:
     assert options.urdf is not None
-    unit, count = options.pose_convention, stated.shape[1]
+    unit = options.pose_convention
+    count = stated.shape[1]
     source = f"{root}: {_STATE}"
     if len(names) != count:
         raise InputError(f"{source} has {count} numbers and {len(names)} names")
@@ -317,14 +384,20 @@ def _pose_columns(names: list[str], arm: str | None) -> tuple[str, list[int]]:
     last = [name.rpartition(".")[2] for name in chosen]
     if any(last.count(part) > 1 for part in _PARTS[convention]):
         which = " or ".join(filter(None, arms))
-        remedy = f"--gripper-frame {which}" if which else "names that tell them apart in info.json"
+        remedy = (
+            f"--gripper-frame {which}"
+            if which
+            else "names that tell them apart in info.json"
+        )
         raise ValueError(f"holds several poses ({', '.join(names)}); give {remedy}")
     return convention, [last.index(part) for part in _PARTS[convention]]
 
 
 def _convention_of(names: list[str]) -> str | None:
     last = [name.rpartition(".")[2] for name in names]
-    return next((c for c, parts in _PARTS.items() if all(p in last for p in parts)), None)
+    return next(
+        (c for c, parts in _PARTS.items() if all(p in last for p in parts)), None
+    )
 
 
 def _arms(names: list[str]) -> list[str]:
@@ -339,7 +412,8 @@ def _of_arm(names: list[str], arm: str) -> list[str]:
 
 def _names(info: Mapping[str, Any], column: str) -> list[str]:
     names = info["features"].get(column, {}).get("names") or []
-    if isinstance(names, dict):  # {"motors": [...]}, or several arms with the same names
+    # {"motors": [...]}, or several arms with the same names.
+    if isinstance(names, dict):
         groups = {key: group for key, group in names.items() if isinstance(group, list)}
         names = [
             f"{key}.{name}" if len(groups) > 1 else name

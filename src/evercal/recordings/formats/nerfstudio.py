@@ -20,10 +20,22 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import IMAGE_ENDINGS, as_stored, first_size, image_size, is_readable
+from evercal.recordings.images import (
+    IMAGE_ENDINGS,
+    as_stored,
+    first_size,
+    image_size,
+    is_readable,
+)
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import is_real, named_errors, naming, read_json, refuse_repeated
+from evercal.recordings.text_files import (
+    is_real,
+    named_errors,
+    naming,
+    read_json,
+    refuse_repeated,
+)
 
 FILE = "transforms.json"
 # The first one there is read. ScanNet++ keeps undistorted images beside those of the fisheye lens.
@@ -53,7 +65,9 @@ def frame_note(file: str, metric: bool) -> str:
 
 def detect(root: Path) -> bool:
     """Whether `root` holds, or is, a transforms.json or a file of that kind."""
-    named = root.name.startswith("transforms") and root.suffix == ".json" and root.is_file()
+    named = (
+        root.name.startswith("transforms") and root.suffix == ".json" and root.is_file()
+    )
     return named or any((root / name).is_file() for name in _FILES)
 
 
@@ -63,13 +77,22 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     files = [root / name for name in _FILES if (root / name).is_file()] or [root / FILE]
     file = root if root.is_file() else files[0]
     frames, test, bad = _frames(file)
-    splits = ("val", "test") if file.name == "transforms_train.json" and root.is_dir() else ()
-    for other in filter(Path.is_file, (root / f"transforms_{split}.json" for split in splits)):
+    splits = (
+        ("val", "test")
+        if file.name == "transforms_train.json" and root.is_dir()
+        else ()
+    )
+    for other in filter(
+        Path.is_file, (root / f"transforms_{split}.json" for split in splits)
+    ):
         more, _, left_out = _frames(other)
-        frames, bad = [*frames, *more], bad + left_out
+        frames = [*frames, *more]
+        bad = bad + left_out
         test |= {frame.name for frame in more}
     with named_errors(file, "nerfstudio file"):
-        refuse_repeated((frame.name for frame in frames), "keep one entry for each image")
+        refuse_repeated(
+            (frame.name for frame in frames), "keep one entry for each image"
+        )
     notes = [f"{bad} frames are marked as bad and left out"] if bad else []
     return Recording(
         (root if root.is_dir() else file.parent).resolve().name,
@@ -86,21 +109,28 @@ def _frames(file: Path) -> tuple[list[Frame], set[str], int]:
     data = read_json(file, "nerfstudio file", "export it again")
     with named_errors(file, "nerfstudio file"):
         undo, scale = _applied(data)
-        entries, tested = data.get("frames"), data.get("test_frames", [])
+        entries = data.get("frames")
+        tested = data.get("test_frames", [])
         if not isinstance(entries, list) or not isinstance(tested, list) or not entries:
             raise ValueError("'frames' is a list with at least one frame")
-        root, first = file.parent, entries[0]
+        root = file.parent
+        first = entries[0]
         if isinstance(first, dict) and "file_path" in first:
             kind = "undistorted_images" if "undistorted" in file.name else "images"
             folders = (root, root.parent / kind, root.parent / f"resized_{kind}")
             name = str(first["file_path"])
-            root = next((each for each in folders if _image(each, name).is_file()), root)
+            root = next(
+                (each for each in folders if _image(each, name).is_file()), root
+            )
             # Without a stated image size, that of the first image is taken.
             if not {"w", "h"} & {*data, *first}:
-                names = [each.get("file_path") for each in entries if isinstance(each, dict)]
+                names = [
+                    each.get("file_path") for each in entries if isinstance(each, dict)
+                ]
                 width, height = first_size([_image(root, str(each)) for each in names])
                 data |= {"w": width, "h": height}
-        every, frames = [*entries, *tested], []
+        every = [*entries, *tested]
+        frames = []
         bad = [isinstance(each, dict) and bool(each.get("is_bad")) for each in every]
         for i, entry in ((i, entry) for i, entry in enumerate(every) if not bad[i]):
             with naming(f"frame {i}"):
@@ -124,7 +154,9 @@ def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
         return SE3.from_matrix(matrix / size, _TOLERANCE).inverse(), scale * size
 
 
-def _frame(root: Path, data: Mapping[str, object], entry: object, undo: SE3, scale: float) -> Frame:
+def _frame(
+    root: Path, data: Mapping[str, object], entry: object, undo: SE3, scale: float
+) -> Frame:
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise ValueError("an object with 'file_path' and 'transform_matrix'")
     name = entry["file_path"]
@@ -140,7 +172,9 @@ def _image(root: Path, name: str) -> Path:
     image = root / PureWindowsPath(name).as_posix()
     if image.suffix.lower() in IMAGE_ENDINGS:
         return image
-    return next((f for e in IMAGE_ENDINGS if (f := Path(f"{image}{e}")).is_file()), image)
+    return next(
+        (f for e in IMAGE_ENDINGS if (f := Path(f"{image}{e}")).is_file()), image
+    )
 
 
 def _camera(data: Mapping[str, object]) -> Camera:
@@ -152,21 +186,30 @@ def _camera(data: Mapping[str, object]) -> Camera:
         )
     fisheye = model == "OPENCV_FISHEYE" or bool(data.get("is_fisheye"))
     own = [_number(data, key, 0.0) for key in _LENS]
-    lens = number_array(data.get("distortion_params", own), "'distortion_params'").tolist()
+    lens = number_array(
+        data.get("distortion_params", own), "'distortion_params'"
+    ).tolist()
     none = [4, 5] if fisheye else [3]
-    if len(lens) != len(own) or any(lens[i] for i in none) or (any(own) and lens != own):
+    if (
+        len(lens) != len(own)
+        or any(lens[i] for i in none)
+        or (any(own) and lens != own)
+    ):
         zeros = " and ".join(_LENS[i] for i in none)
         raise ValueError(
             f"distortion is {', '.join(_LENS)}, with {zeros} 0 for {model}, also as"
             f" 'distortion_params', got {lens}"
         )
-    width, height = _number(data, "w"), _number(data, "h")
-    fx, fy = _focal(data, "x", width), _focal(data, "y", height)
+    width = _number(data, "w")
+    height = _number(data, "h")
+    fx = _focal(data, "x", width)
+    fy = _focal(data, "y", height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None:
         raise ValueError("'fl_x' is missing, and so are 'fl_y' and 'camera_angle_x'")
     # Half a pixel: the file counts from the image's corner.
-    cx, cy = _number(data, "cx", width / 2) - 0.5, _number(data, "cy", height / 2) - 0.5
+    cx = _number(data, "cx", width / 2) - 0.5
+    cy = _number(data, "cy", height / 2) - 0.5
     distortion = tuple(lens[i] for i in ((0, 1, 2, 3) if fisheye else (0, 1, 4, 5, 2)))
     size: Any = width, height  # whole numbers, checked when constructed
     kind = "fisheye" if fisheye else "pinhole"
@@ -180,7 +223,9 @@ def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
         return None
     angle = _number(data, f"camera_angle_{axis}")
     if not 0 < angle < math.pi:
-        raise ValueError(f"'camera_angle_{axis}' is between 0 and pi radians, got {angle}")
+        raise ValueError(
+            f"'camera_angle_{axis}' is between 0 and pi radians, got {angle}"
+        )
     return size / 2 / math.tan(angle / 2)
 
 
@@ -214,15 +259,20 @@ def _resized(file: Path, frames: list[Frame]) -> list[Frame]:
 
 
 def _test_names(root: Path, data: Mapping[str, object], frames: list[str]) -> set[str]:
-    name_of, test = {_image(root, name): name for name in frames}, set()
+    name_of = {_image(root, name): name for name in frames}
+    test = set()
     for key in ("val_filenames", "test_filenames"):
         names = data.get(key, [])
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        if not isinstance(names, list) or not all(
+            isinstance(name, str) for name in names
+        ):
             raise ValueError(f"{key!r} is a list of file names")
         # A test frame under another name would be learned from.
         other = [name for name in names if _image(root, name) not in name_of]
         if other:
-            raise ValueError(f"{key!r} names {other[0]!r}, which is no frame; correct the name")
+            raise ValueError(
+                f"{key!r} names {other[0]!r}, which is no frame; correct the name"
+            )
         test |= {name_of[_image(root, name)] for name in names}
     return test
 
@@ -234,7 +284,9 @@ def _matrix(value: object, name: str) -> NDArray[np.float64]:
     return matrix
 
 
-def _number(data: Mapping[str, object], name: str, default: float | None = None) -> float:
+def _number(
+    data: Mapping[str, object], name: str, default: float | None = None
+) -> float:
     value: Any = data.get(name, default)
     if not is_real(value) or not math.isfinite(value):
         what = "is missing" if value is None else f"is a number, got {value!r}"

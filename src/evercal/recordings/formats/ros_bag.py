@@ -17,11 +17,27 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.formats.bags.file import CAMERA_INFO, COMPRESSED, IMAGE, BagFile, is_bag
+from evercal.recordings.formats.bags.file import (
+    CAMERA_INFO,
+    COMPRESSED,
+    IMAGE,
+    BagFile,
+    is_bag,
+)
 from evercal.recordings.formats.bags.poses import plain_name, poses_at_images
 from evercal.recordings.frame import Frame, Recording, lost_images
-from evercal.recordings.images import StoredImage, as_rgb, decode_image, image_file, is_readable
-from evercal.recordings.poses.camera_file import camera_from_fields, check_size, read_camera_of_size
+from evercal.recordings.images import (
+    StoredImage,
+    as_rgb,
+    decode_image,
+    image_file,
+    is_readable,
+)
+from evercal.recordings.poses.camera_file import (
+    camera_from_fields,
+    check_size,
+    read_camera_of_size,
+)
 from evercal.recordings.poses.pose_track import MAX_GAP_S
 from evercal.recordings.read_options import ReadOptions
 from evercal.recordings.text_files import named_errors
@@ -61,18 +77,24 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     poses = poses_at_images(bag, stamps, shots[0].frame_id, options)
     frames = []
     for i in np.flatnonzero(poses.valid).tolist():
-        pose, joints = poses.stated.poses[i], poses.stated.joints_of(i)
+        pose = poses.stated.poses[i]
+        joints = poses.stated.joints_of(i)
         of_camera, of_gripper = (pose, None) if poses.of_camera else (None, pose)
         name = f"{i:06d}"
-        frames.append(Frame(name, shots[i], camera, of_camera, of_gripper, joints_rad=joints))
+        frames.append(
+            Frame(name, shots[i], camera, of_camera, of_gripper, joints_rad=joints)
+        )
     lost = len(shots) - len(frames)
     if lost:
         notes.append(
             f"{lost} of {len(shots)} images were taken outside the recorded poses or in a gap of"
             f" more than {MAX_GAP_S:g} s in which the gripper moved"
         )
-    notes, arm = [*notes, *poses.notes], poses.stated.arm
-    return Recording(root.resolve().stem, tuple(frames), (), lost, notes=tuple(notes), arm=arm)
+    notes = [*notes, *poses.notes]
+    arm = poses.stated.arm
+    return Recording(
+        root.resolve().stem, tuple(frames), (), lost, notes=tuple(notes), arm=arm
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,23 +138,39 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
     for topic in topics:
         first = bag.first(topic)
         of_pixels = bag.kinds[topic] == IMAGE
-        reasons[topic] = unsupported(first.encoding if of_pixels else _pixels_in(first.format))
+        reasons[topic] = unsupported(
+            first.encoding if of_pixels else _pixels_in(first.format)
+        )
     pictures = [topic for topic, reason in reasons.items() if reason is None]
     if len(pictures) != 1:
         refused = "; ".join(f"{t}: {reason}" for t, reason in reasons.items() if reason)
-        what = f"images on {len(pictures)} topics" if pictures else f"no pictures ({refused})"
-        raise InputError(f"{bag.path}: {what}; give --image-topic: {', '.join(pictures or topics)}")
+        what = (
+            f"images on {len(pictures)} topics"
+            if pictures
+            else f"no pictures ({refused})"
+        )
+        raise InputError(
+            f"{bag.path}: {what}; give --image-topic: {', '.join(pictures or topics)}"
+        )
     return pictures[0]
 
 
 def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
-    shots, bad = [], []
+    shots = []
+    bad = []
     for message in bag.messages([topic]):
         frame_id = plain_name(message.content.header.frame_id)
         if bag.kinds[topic] == COMPRESSED and not is_readable(message.content.data):
             bad.append(len(shots))
         shots.append(
-            BagImage(bag, topic, message.logged_ns, message.repeat, message.stamp_ns, frame_id)
+            BagImage(
+                bag,
+                topic,
+                message.logged_ns,
+                message.repeat,
+                message.stamp_ns,
+                frame_id,
+            )
         )
     notes = []
     if 0 < 2 * len(bad) <= len(shots):  # else the first one is refused with its format
@@ -140,7 +178,9 @@ def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
         shots = [shot for i, shot in enumerate(shots) if i not in bad]
     if all(shot.stamp_ns == 0 for shot in shots):
         shots = [replace(shot, stamp_ns=shot.logged_ns) for shot in shots]
-        notes.append(f"images on {topic} carry no stamps; the times of recording were taken")
+        notes.append(
+            f"images on {topic} carry no stamps; the times of recording were taken"
+        )
     return sorted(shots, key=lambda shot: shot.stamp_ns), notes
 
 
@@ -159,7 +199,9 @@ def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> Camera
         )
     message = bag.first(beside)
     with named_errors(f"{bag.path}: {beside}", "camera_info"):
-        camera = _camera(message, size, image.rpartition("/")[2].startswith("image_rect"))
+        camera = _camera(
+            message, size, image.rpartition("/")[2].startswith("image_rect")
+        )
     check_size(f"{bag.path}: {beside}", camera, size, image_topic)
     return camera
 
@@ -167,7 +209,9 @@ def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> Camera
 def _camera(message: Any, image_size: tuple[int, int], rectified: bool) -> Camera:
     # ROS 1 writes K, D and P, ROS 2 k, d and p.
     k, d, p = (
-        np.asarray(getattr(message, name, getattr(message, name.upper(), []))).reshape(-1).tolist()
+        np.asarray(getattr(message, name, getattr(message, name.upper(), [])))
+        .reshape(-1)
+        .tolist()
         for name in ("k", "d", "p")
     )
     if not any(k):
@@ -177,7 +221,9 @@ def _camera(message: Any, image_size: tuple[int, int], rectified: bool) -> Camer
         if len(p) != 12 or not any(p):
             raise ValueError("P is missing, which rectified images need; give --camera")
         data = {"k": [*p[:3], *p[4:7], *p[8:11]], "d": [], "distortion_model": ""}
-    data["roi"] = {name: int(getattr(message.roi, name)) for name in ("x_offset", "y_offset")}
+    data["roi"] = {
+        name: int(getattr(message.roi, name)) for name in ("x_offset", "y_offset")
+    }
     sizes = ("width", "height", "binning_x", "binning_y")
     data |= {name: int(getattr(message, name)) for name in sizes}
     return camera_from_fields(data, image_size)
@@ -198,11 +244,15 @@ def image_of(message: Any) -> NDArray[np.uint8]:
     if reason is not None:
         raise ValueError(reason)
     size, channels, _ = _ENCODINGS[message.encoding]
-    height, width, step = int(message.height), int(message.width), int(message.step)
+    height = int(message.height)
+    width = int(message.width)
+    step = int(message.step)
     line = width * channels * size
     data = np.asarray(message.data, dtype=np.uint8).reshape(-1)
     if step < line or data.size < height * step or not line * height:
-        raise ValueError(f"{width}x{height} {message.encoding}, step {step}, but {data.size} bytes")
+        raise ValueError(
+            f"{width}x{height} {message.encoding}, step {step}, but {data.size} bytes"
+        )
     # Rows may be padded, which the package rosbags-image ignores.
     pixels = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :line])
     if size == 2:
@@ -242,4 +292,10 @@ def _pixels_in(form: str) -> str:
     """
     before, _, how = form.partition(";")
     converted = not how or how.partition("compressed")[2].strip()
-    return "16UC1" if "compressedDepth" in form else "rgb8" if converted else before.strip()
+    return (
+        "16UC1"
+        if "compressedDepth" in form
+        else "rgb8"
+        if converted
+        else before.strip()
+    )

@@ -29,20 +29,29 @@ def detect(root: Path) -> bool:
     """Whether `root` looks like this format, even if it is damaged."""
     if not root.is_dir():
         return False
-    return any((root / split).is_file() for split in _SPLITS) or any(root.glob("seq-*/"))
+    return any((root / split).is_file() for split in _SPLITS) or any(
+        root.glob("seq-*/")
+    )
 
 
 def load(root: Path) -> Recording:
     """Read split files and poses, and the size of one image; no other image is opened."""
     splits = [_sequences(root, name) for name in _SPLITS]
-    shared = sorted({folder.name for folder in splits[0]} & {folder.name for folder in splits[1]})
+    shared = sorted(
+        {folder.name for folder in splits[0]} & {folder.name for folder in splits[1]}
+    )
     if shared:
-        raise InputError(f"{root}: {shared[0]} is in both {_SPLITS[0]} and {_SPLITS[1]}; keep one")
+        raise InputError(
+            f"{root}: {shared[0]} is in both {_SPLITS[0]} and {_SPLITS[1]}; keep one"
+        )
     images = [
-        [image for folder in folders for image in colour_images(folder)] for folders in splits
+        [image for folder in folders for image in colour_images(folder)]
+        for folders in splits
     ]
     if not (images[0] or images[1]):
-        raise InputError(f"{root}: {_SPLITS[0]} and {_SPLITS[1]} are empty; name a sequence in one")
+        raise InputError(
+            f"{root}: {_SPLITS[0]} and {_SPLITS[1]} are empty; name a sequence in one"
+        )
     camera = _camera(root, images[0] + images[1])
     train, test = (tracked_frames(split, camera, folders=True) for split in images)
     untracked = len(images[0]) + len(images[1]) - len(train) - len(test)
@@ -51,15 +60,21 @@ def load(root: Path) -> Recording:
 
 def _sequences(root: Path, split: str) -> list[Path]:
     file = root / split
-    text = read_text(file, "split file", "write lines like 'sequence1' for the seq-XX folders")
+    text = read_text(
+        file, "split file", "write lines like 'sequence1' for the seq-XX folders"
+    )
     folders = []
     for line in filter(None, map(str.strip, text.splitlines())):
         match = re.fullmatch(r"(?:sequence|seq-?)?(\d+)", line, re.IGNORECASE)
         if match is None:
-            raise InputError(f"{file}: cannot read line {line!r}; a line looks like 'sequence1'")
+            raise InputError(
+                f"{file}: cannot read line {line!r}; a line looks like 'sequence1'"
+            )
         folder = root / f"seq-{int(match[1]):02d}"
         if not folder.is_dir():
-            raise InputError(f"{file}: line {line!r} names {folder.name}, which is not in {root}")
+            raise InputError(
+                f"{file}: line {line!r} names {folder.name}, which is not in {root}"
+            )
         folders.append(folder)
     return folders
 
@@ -79,9 +94,13 @@ def colour_images(folder: Path) -> list[Path]:
     """Colour images of a folder, sorted by name."""
     images = files_in(folder, (".color.png", ".color.jpg", ".color.jpeg"))
     if not images:
-        raise InputError(f"{folder}: no images; expected frame-XXXXXX.color.png or .jpg")
+        raise InputError(
+            f"{folder}: no images; expected frame-XXXXXX.color.png or .jpg"
+        )
     with named_errors(folder, "images"):
-        refuse_repeated([_frame_name(i.name) for i in images], "keep its .png or its .jpg")
+        refuse_repeated(
+            [_frame_name(i.name) for i in images], "keep its .png or its .jpg"
+        )
     return images
 
 
@@ -113,7 +132,12 @@ def read_numbers(file: Path, count: int, what: str) -> NDArray[np.float64]:
     """Read the `count` numbers of a matrix from a small text file."""
     # float() on the words: np.loadtxt takes longer per file than reading the file.
     # Windows prints -1.#INF, 1.#QNAN and -nan(ind).
-    words = ["nan" if {*w} & {*"#("} else w for w in read_text(file, f"{what} matrix").split()]
+    words = [
+        "nan" if {*w} & {*"#("} else w
+        for w in read_text(file, f"{what} matrix").split()
+    ]
     if len(words) != count or not all(map(is_number, words)):
-        raise InputError(f"{file}: expected a {what} matrix of {count} numbers, got {len(words)}")
+        raise InputError(
+            f"{file}: expected a {what} matrix of {count} numbers, got {len(words)}"
+        )
     return np.array([float(word) for word in words])

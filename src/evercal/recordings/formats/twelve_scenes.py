@@ -26,8 +26,12 @@ def load(root: Path) -> Recording:
     images = colour_images(root / "data")
     split = _test_count(root, len(images))
     camera = _camera(root, images)
-    train, test = (tracked_frames(part, camera) for part in (images[split:], images[:split]))
-    return Recording(root.resolve().name, train, test, len(images) - len(train) - len(test))
+    train, test = (
+        tracked_frames(part, camera) for part in (images[split:], images[:split])
+    )
+    return Recording(
+        root.resolve().name, train, test, len(images) - len(train) - len(test)
+    )
 
 
 def _test_count(root: Path, frames: int) -> int:
@@ -37,7 +41,9 @@ def _test_count(root: Path, frames: int) -> int:
     if match is None:
         raise InputError(f"{file}: the first line holds no '[frames=N]'")
     if int(match[1]) > frames:
-        raise InputError(f"{file}: {match[1]} test frames, but {root / 'data'} has {frames} images")
+        raise InputError(
+            f"{file}: {match[1]} test frames, but {root / 'data'} has {frames} images"
+        )
     return int(match[1])
 
 

@@ -33,7 +33,8 @@ class VideoFrame(StoredImage):
 
 class _Open:
     def __init__(self, container: Any) -> None:
-        self.container, self.stream = container, container.streams.video[0]
+        self.container = container
+        self.stream = container.streams.video[0]
         self.stream.thread_type = "AUTO"
         self.frames: Any = None
         self.last: Any = None
@@ -43,19 +44,26 @@ class _Open:
         if self.last is None or not -half < seconds - self.last.time < _READ_AHEAD_S:
             start = max(0, round(seconds / self.stream.time_base))
             self.container.seek(start, stream=self.stream, backward=True)
-            self.frames, self.last = self.container.decode(self.stream), None
+            self.frames = self.container.decode(self.stream)
+            self.last = None
         while self.last is None or self.last.time < seconds - half:
             self.last = next(self.frames, None)
             if self.last is None:
                 return None
-        return self.last.to_ndarray(format="rgb24") if self.last.time <= seconds + half else None
+        return (
+            self.last.to_ndarray(format="rgb24")
+            if self.last.time <= seconds + half
+            else None
+        )
 
 
 class Videos:
     """Cache of open videos with `fps` frames per second; threads may share it."""
 
     def __init__(self, fps: float) -> None:
-        self._av = optional_module("av", "reading videos of datasets needs PyAV", "lerobot")
+        self._av = optional_module(
+            "av", "reading videos of datasets needs PyAV", "lerobot"
+        )
         self._half = 0.5 / fps
         self._open: OrderedDict[Path, _Open] = OrderedDict()
         self._lock = threading.Lock()
@@ -77,5 +85,7 @@ class Videos:
                 text = " ".join(str(error).split())[:200]
                 raise InputError(f"{path}: video cannot be decoded: {text}") from None
         if image is None:
-            raise InputError(f"{path}: no frame at {seconds:.3f} s; the video is cut off")
+            raise InputError(
+                f"{path}: no frame at {seconds:.3f} s; the video is cut off"
+            )
         return np.ascontiguousarray(image, dtype=np.uint8)

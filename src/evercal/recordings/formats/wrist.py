@@ -22,7 +22,11 @@ from evercal.recordings.poses import camera_file
 from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
 from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
 from evercal.recordings.poses.pairing import pair_images, pair_joints
-from evercal.recordings.poses.robot_poses import POSE_ENDINGS, RobotPoses, read_robot_poses
+from evercal.recordings.poses.robot_poses import (
+    POSE_ENDINGS,
+    RobotPoses,
+    read_robot_poses,
+)
 from evercal.recordings.poses.row_files import number_array, read_rows, same_numbers
 from evercal.recordings.read_options import ReadOptions, flag
 from evercal.recordings.text_files import named_errors, read_json, refuse_repeated
@@ -43,6 +47,7 @@ class Layout(NamedTuple):
     """Convention of the poses, if they do not define it."""
 
 
+# EuRoC.
 LAYOUTS = (
     Layout("groundtruth.txt", "rgb", convention="tum:m"),  # TUM RGB-D
     # ScanNet's SensReader, and ACE with the same in test.
@@ -50,8 +55,12 @@ LAYOUTS = (
     Layout("train/poses", "train/rgb", "train/calibration", "matrix:m"),
     Layout("metadata", "rgb", "metadata"),  # Record3D
     Layout("metadata.json", "rgb", "metadata.json"),
-    Layout("state_groundtruth_estimate0/data.csv", "cam0/data", "cam0/sensor.yaml"),  # EuRoC
-    Layout("mav0/state_groundtruth_estimate0/data.csv", "mav0/cam0/data", "mav0/cam0/sensor.yaml"),
+    Layout("state_groundtruth_estimate0/data.csv", "cam0/data", "cam0/sensor.yaml"),
+    Layout(
+        "mav0/state_groundtruth_estimate0/data.csv",
+        "mav0/cam0/data",
+        "mav0/cam0/sensor.yaml",
+    ),
 )
 _POSES = tuple(f"base_from_gripper{ending}" for ending in POSE_ENDINGS)
 _CAMERA_POSES = tuple(f"base_from_camera{ending}" for ending in POSE_ENDINGS)
@@ -72,20 +81,29 @@ def detect(root: Path) -> bool:
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
     """Read poses, intrinsics and sizes of images; no image is opened whole."""
-    options, layouts = options or ReadOptions(), _layouts(root)
+    options = options or ReadOptions()
+    layouts = _layouts(root)
     if not layouts:
         expected = ", ".join(_POSES + _JOINTS + _CAMERA_POSES)
         raise InputError(f"{root}: no gripper poses; expected {expected}")
     if len(layouts) > 1:
         names = " and ".join(layout.poses for layout in layouts)
-        raise InputError(f"{root}: holds {names}; keep the one with the poses of the images")
+        raise InputError(
+            f"{root}: holds {names}; keep the one with the poses of the images"
+        )
     test = Layout._make(path and path.replace("train/", "test/") for path in layouts[0])
     split = dict.fromkeys((layouts[0], test))
-    read = [_frames(root, part, options) for part in split if (root / part.poses).exists()]
+    read = [
+        _frames(root, part, options) for part in split if (root / part.poses).exists()
+    ]
     train, test = (*(part.train for part in read), ())[:2]
     notes = tuple(note for part in read for note in part.notes)
     return replace(
-        read[0], train=train, test=test, untracked=sum(p.untracked for p in read), notes=notes
+        read[0],
+        train=train,
+        test=test,
+        untracked=sum(p.untracked for p in read),
+        notes=notes,
     )
 
 
@@ -102,19 +120,24 @@ def _layouts(root: Path) -> list[Layout]:
 def _frames(root: Path, layout: Layout, options: ReadOptions) -> Recording:
     """A recording of the frames with a pose, all for training."""
     images = _images(root, [layout.images] if layout.images else _FOLDERS)
-    source, file = root / layout.poses, root / layout.camera
+    source = root / layout.poses
+    file = root / layout.camera
     rows, notes = _rows(root, source, options, layout.convention)
     stamps = _stamps(root)
     poses, more = pair_images(images, rows, stamps, source)
     joints = pair_joints(images, rows, stamps, source)
     if file.name == "sensor.yaml":
         with named_errors(file, "camera file"):
-            numbers = camera_file.numbers_of(camera_file.fields_of(file).get("T_BS"), "T_BS", 16)
+            numbers = camera_file.numbers_of(
+                camera_file.fields_of(file).get("T_BS"), "T_BS", 16
+            )
             body_from_camera = SE3.from_matrix(np.reshape(numbers, (4, 4)))
         poses = [pose and pose @ body_from_camera for pose in poses]
     own = file if layout.camera and file.exists() else None
     cameras = _cameras(root, options.camera or own, images)
-    owner = "base_from_gripper" if layout.poses in _POSES + _JOINTS else "base_from_camera"
+    owner = (
+        "base_from_gripper" if layout.poses in _POSES + _JOINTS else "base_from_camera"
+    )
     split = layout.images.rpartition("rgb")[0]
     frames = tuple(
         replace(
@@ -122,11 +145,16 @@ def _frames(root: Path, layout: Layout, options: ReadOptions) -> Recording:
             **{owner: pose},
             joints_rad=None if values is None else tuple(values.tolist()),
         )
-        for image, camera, pose, values in zip(images, cameras, poses, joints, strict=True)
+        for image, camera, pose, values in zip(
+            images, cameras, poses, joints, strict=True
+        )
         if pose is not None
     )
-    lost, notes = len(images) - len(frames), [*notes, *more]
-    return Recording(root.resolve().name, frames, (), lost, notes=tuple(notes), arm=rows.arm)
+    lost = len(images) - len(frames)
+    notes = [*notes, *more]
+    return Recording(
+        root.resolve().name, frames, (), lost, notes=tuple(notes), arm=rows.arm
+    )
 
 
 def _rows(
@@ -142,21 +170,29 @@ def _rows(
             numbers = np.roll(number_array(numbers, "'poses'"), 3, axis=-1)
             names = tuple(map(str, range(len(numbers))))
             return RobotPoses(names, None, poses_from_numbers(numbers, _RECORD3D)), []
-    unused = [n for n in ("urdf", "base_frame", "gripper_frame") if getattr(options, n) is not None]
+    unused = [
+        n
+        for n in ("urdf", "base_frame", "gripper_frame")
+        if getattr(options, n) is not None
+    ]
     if unused:
         raise InputError(
             f"{flag(unused[0])}: {file} holds poses already; leave the option out, or give"
             f" joint angles in joints.csv instead"
         )
     convention = options.pose_convention or convention
-    return read_robot_poses(file, convention, what="file of poses", option="--pose-convention"), []
+    return read_robot_poses(
+        file, convention, what="file of poses", option="--pose-convention"
+    ), []
 
 
 def _urdf(root: Path, joints: Path) -> Path:
     files = files_in(root, (".urdf",))
     if len(files) != 1:
         number = f"{len(files)} URDF files" if files else "no URDF"
-        raise InputError(f"{root}: {joints.name} needs a URDF, {number} is beside it; give --urdf")
+        raise InputError(
+            f"{root}: {joints.name} needs a URDF, {number} is beside it; give --urdf"
+        )
     return files[0]
 
 
@@ -172,10 +208,16 @@ def _cameras(root: Path, file: Path | None, images: Sequence[Path]) -> list[Came
     """Of each image, from a file for all or from a folder of one for each."""
     if file is not None and file.is_dir():
         files = files_in(file, (".txt",))
-        if not same_numbers([own.name for own in files], [image.name for image in images]):
-            raise InputError(f"{file}: lacks the file of an image; give one for all with --camera")
+        if not same_numbers(
+            [own.name for own in files], [image.name for image in images]
+        ):
+            raise InputError(
+                f"{file}: lacks the file of an image; give one for all with --camera"
+            )
         return [
-            camera_file.read_camera_of_size(own, first_size([image, *images]), image.name)
+            camera_file.read_camera_of_size(
+                own, first_size([image, *images]), image.name
+            )
             for own, image in zip(files, images, strict=True)
         ]
     if file is None:
@@ -192,7 +234,9 @@ def _cameras(root: Path, file: Path | None, images: Sequence[Path]) -> list[Came
     with named_errors(file, "camera file"):
         fields = camera_file.fields_of(file) if file.name.startswith("metadata") else {}
         each = fields.get("perFrameIntrinsicCoeffs") or []  # of Record3D
-        own = [camera_file.camera_from_fields({**fields, "K": numbers}) for numbers in each]
+        own = [
+            camera_file.camera_from_fields({**fields, "K": numbers}) for numbers in each
+        ]
     return own if len(own) == len(images) else [camera] * len(images)
 
 

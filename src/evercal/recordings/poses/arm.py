@@ -74,7 +74,8 @@ class Arm:
 
     def _frames(self, values: Array) -> list[Array]:
         """(n, 4, 4) frames after each joint, and that of the gripper."""
-        frame, frames = np.tile(np.eye(4), (len(values), 1, 1)), []
+        frame = np.tile(np.eye(4), (len(values), 1, 1))
+        frames = []
         for motion in self.chain:
             moved = np.tile(np.eye(4), (len(values), 1, 1))
             steps = (motion.factor * values[:, motion.value] + motion.constant)[:, None]

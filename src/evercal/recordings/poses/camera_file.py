@@ -35,9 +35,16 @@ _MODELS = {
     **{name: name for name in RADIAL_MODELS}, "doublesphere": "ds", "atan": "fov",
 }  # fmt: skip
 _SUPPORTED = ("brown", "none", "zero", "fisheye")
-_MODEL_KEYS = ("distortionmodel", "model", "cameramodel", "modeltype", "projectionmodel")
+_MODEL_KEYS = (
+    "distortionmodel",
+    "model",
+    "cameramodel",
+    "modeltype",
+    "projectionmodel",
+)
 _LENGTHS = (0, 4, 5, 8)
-_COEFFICIENTS, _FISHEYE = COEFFICIENTS["pinhole"], COEFFICIENTS["fisheye"]
+_COEFFICIENTS = COEFFICIENTS["pinhole"]
+_FISHEYE = COEFFICIENTS["fisheye"]
 _ALIASES = {
     "camera_matrix": (
         "cameramatrix", "intrinsicmatrix", "cameraintrinsics", "intrinsics", "intrinsic",
@@ -53,7 +60,15 @@ _ALIASES = {
 }  # fmt: skip
 _LENS = ("distortion_coefficients", *_COEFFICIENTS)
 _ROS = ("rectificationmatrix", "projectionmatrix", "header", "roi", "p", "r")
-_KNOWN = {*_ALIASES, *_LENS, *_MODEL_KEYS, *_ROS[:4], "binningx", "binningy", "fisheyemodel"}
+_KNOWN = {
+    *_ALIASES,
+    *_LENS,
+    *_MODEL_KEYS,
+    *_ROS[:4],
+    "binningx",
+    "binningy",
+    "fisheyemodel",
+}
 _HARMLESS = re.compile(
     r"error|rms|repro|resid|std|dev|sigma|covar|uncert|fps|rate|freq|square|board|marker|pattern"
     r"|chess|tag|count|num|frames|images|views|points|flags|date|time|stamp|version|serial|index"
@@ -68,7 +83,9 @@ _EXPECTED = (
 )
 
 
-def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> Camera:
+def read_camera(
+    path: str | os.PathLike[str], size: tuple[int, int] | None = None
+) -> Camera:
     """Read the intrinsics of one camera.
 
     `size` is (width, height) of the images in pixels, for files without one.
@@ -94,7 +111,9 @@ def check_size(source: str, camera: Camera, size: tuple[int, int], images: str) 
         )
 
 
-def camera_from_fields(data: Mapping[str, Any], size: tuple[int, int] | None = None) -> Camera:
+def camera_from_fields(
+    data: Mapping[str, Any], size: tuple[int, int] | None = None
+) -> Camera:
     """Build a camera from the fields of a file, or of a ROS message.
 
     The camera may stand inside other fields. Of several, the only one of the images' size is taken.
@@ -109,8 +128,12 @@ def camera_from_fields(data: Mapping[str, Any], size: tuple[int, int] | None = N
     fitting = {c for c in cameras.values() if size in (None, (c.width, c.height))}
     choice = fitting or {*cameras.values()}
     if len(choice) > 1:
-        each = (f"{n} ({c.width}x{c.height}, fx {c.fx:.1f})" for n, c in cameras.items())
-        raise ValueError(f"holds several cameras: {_listed(each)}; give a file of the right one")
+        each = (
+            f"{n} ({c.width}x{c.height}, fx {c.fx:.1f})" for n, c in cameras.items()
+        )
+        raise ValueError(
+            f"holds several cameras: {_listed(each)}; give a file of the right one"
+        )
     return choice.pop()
 
 
@@ -119,7 +142,9 @@ def _undotted(data: Mapping[str, Any]) -> dict[str, Any]:
     groups: dict[str, dict[str, Any]] = {"": {}, "Camera": {}}
     for key, value in data.items():
         group, _, name = str(key).rpartition(".")
-        groups.setdefault(group, {})["camera_model" if key == "Camera.type" else name] = value
+        groups.setdefault(group, {})[
+            "camera_model" if key == "Camera.type" else name
+        ] = value
     return {**groups.pop(""), **groups.pop("Camera"), **groups}
 
 
@@ -147,16 +172,23 @@ def _entries(
 
 
 def _camera(data: Mapping[str, Any], size: tuple[int, int] | None) -> Camera:
-    fields, ros = _fields(data), not {_plain(key) for key in data}.isdisjoint(_ROS)
+    fields = _fields(data)
+    ros = not {_plain(key) for key in data}.isdisjoint(_ROS)
     roi = data.get("roi")
     if isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset")):
-        raise ValueError(f"the image is a cut-out (roi {roi}); give the whole image's camera_info")
-    models = {_model_kind(fields[key]): fields[key] for key in _MODEL_KEYS if key in fields}
+        raise ValueError(
+            f"the image is a cut-out (roi {roi}); give the whole image's camera_info"
+        )
+    models = {
+        _model_kind(fields[key]): fields[key] for key in _MODEL_KEYS if key in fields
+    }
     fisheye = "fisheye" in models or bool(fields.get("fisheyemodel"))
     if radial := next((kind for kind in models if kind in RADIAL_MODELS), None):
         return _of_radial_model(radial, fields, _size(fields, data, size))
     required = (ros or fisheye or "distortionmodel" in fields) and "none" not in models
-    distortion = _distortion(fields, data, required, _FISHEYE if fisheye else _COEFFICIENTS)
+    distortion = _distortion(
+        fields, data, required, _FISHEYE if fisheye else _COEFFICIENTS
+    )
     for kind in models.keys() - {"brown", "fisheye"}:
         if kind not in _SUPPORTED or any(distortion):
             raise ValueError(
@@ -173,7 +205,8 @@ def _camera(data: Mapping[str, Any], size: tuple[int, int] | None) -> Camera:
     if size != (camera.width, camera.height):
         by = [max(1, int(fields.get(f"binning{axis}") or 1)) for axis in "xy"]
         camera = camera.resized(camera.width // by[0], camera.height // by[1])
-    wide, high = camera.width, camera.height
+    wide = camera.width
+    high = camera.height
     inside = 0 <= camera.cx <= wide and 0 <= camera.cy <= high
     if min(camera.fx, camera.fy) < wide / 10 or not inside:
         raise ValueError(
@@ -183,12 +216,16 @@ def _camera(data: Mapping[str, Any], size: tuple[int, int] | None) -> Camera:
     return camera
 
 
-def _of_radial_model(kind: str, fields: Mapping[str, Any], size: tuple[Any, Any]) -> Camera:
+def _of_radial_model(
+    kind: str, fields: Mapping[str, Any], size: tuple[Any, Any]
+) -> Camera:
     """As Kalibr states it: parameters before the focal lengths, or the one of `fov` after them."""
-    numbers, lens = numbers_of(fields.get("camera_matrix"), "intrinsics"), "distortion_coefficients"
+    numbers = numbers_of(fields.get("camera_matrix"), "intrinsics")
+    lens = "distortion_coefficients"
     terms = numbers_of(fields.get(lens, []), lens)
     if kind == "fov":
-        numbers, terms = [*terms, *numbers], []
+        numbers = [*terms, *numbers]
+        terms = []
     names = (*RADIAL_MODELS[kind].parameters, "fx", "fy", "cx", "cy")
     if len(numbers) != len(names) or any(terms):
         raise ValueError(
@@ -196,7 +233,8 @@ def _of_radial_model(kind: str, fields: Mapping[str, Any], size: tuple[Any, Any]
             f" and {terms}; rectify the images or calibrate an equidistant model"
         )
     *own, fx, fy, cx, cy = numbers
-    width, height = int(size[0]), int(size[1])
+    width = int(size[0])
+    height = int(size[1])
     return nearest_fisheye(kind, own, (width, height), (fx, fy), (cx, cy))[0]
 
 
@@ -215,7 +253,9 @@ def _refuse_unknown(data: Mapping[str, Any]) -> None:
         cells = np.ravel(np.array(value, dtype=object)).tolist()
         rows: list[Any] = value if isinstance(value, list) else []
         whole = (9, 12, 16) if _plain(key) == "p" else (9, 16)
-        matrix = len(cells) in whole or (rows[2:] and all(np.size(row) > 2 for row in rows))
+        matrix = len(cells) in whole or (
+            rows[2:] and all(np.size(row) > 2 for row in rows)
+        )
         if all(map(is_number, cells)) and any(map(float, cells)) and not matrix:
             raise ValueError(
                 f"{key!r} is not known and may change the image; name distortion k1, k2, p1, p2,"
@@ -236,7 +276,8 @@ def fields_of(path: Path, size: tuple[int, int] | None = None) -> Mapping[str, A
     words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
     if all(map(is_number, words)):
         if len(words) == 1 and size is not None:
-            cx, cy = (size[0] - 1) / 2, (size[1] - 1) / 2
+            cx = (size[0] - 1) / 2
+            cy = (size[1] - 1) / 2
             words = [words[0], "0", str(cx), "0", words[0], str(cy), "0", "0", "1"]
         return {"camera_matrix": [float(word) for word in words]}
     try:
@@ -263,7 +304,8 @@ def _of_xml(text: str) -> dict[str, Any]:
 
 
 def _xml_value(element: Any) -> Any:
-    data, words = element.find("data"), (element.text or "").split()
+    data = element.find("data")
+    words = (element.text or "").split()
     if data is not None:
         return {"data": (data.text or "").split()}
     if len(element):
@@ -308,18 +350,25 @@ def _matrix(fields: Mapping[str, Any], data: Mapping[str, Any]) -> np.ndarray:
     missing = [name for name in names if name not in fields]
     if missing:
         what = f"camera {missing[0]!r}" if len(missing) < 4 else "'camera_matrix'"
-        raise ValueError(f"{what} is missing, there is {_listed(data) or 'nothing'}; {_EXPECTED}")
+        raise ValueError(
+            f"{what} is missing, there is {_listed(data) or 'nothing'}; {_EXPECTED}"
+        )
     fx, fy, cx, cy = numbers_of([fields[name] for name in names], "fx, fy, cx, cy", 4)
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
 def _distortion(
-    fields: Mapping[str, Any], data: Mapping[str, Any], required: bool, names: Sequence[str]
+    fields: Mapping[str, Any],
+    data: Mapping[str, Any],
+    required: bool,
+    names: Sequence[str],
 ) -> list[float]:
     name = "distortion_coefficients"
     stated = [key for key in names if key in fields]
     if other := [key for key in _COEFFICIENTS if fields.get(key) and key not in names]:
-        raise ValueError(f"a fisheye has {_listed(names)}, got {_listed(other)}; leave others out")
+        raise ValueError(
+            f"a fisheye has {_listed(names)}, got {_listed(other)}; leave others out"
+        )
     numbers: list[float] = []
     if name in fields:
         nothing = str(fields[name]).lower() in ("none", "null")
@@ -333,7 +382,10 @@ def _distortion(
             f" lens distortion"
         )
     # Longer models add terms that are mostly zero and can then be dropped.
-    while len(numbers) not in (_LENGTHS if len(names) > 4 else (0, 4)) and numbers[-1] == 0:
+    while (
+        len(numbers) not in (_LENGTHS if len(names) > 4 else (0, 4))
+        and numbers[-1] == 0
+    ):
         numbers.pop()
     return numbers
 
@@ -350,7 +402,9 @@ def _size(
     elif not isinstance(stated, list | tuple):  # a number called `size` is not one
         stated = size if len(missing) == 2 else None
     if stated is None:
-        raise ValueError(f"{missing[0]!r} is missing (no image size), there is {_listed(data)}")
+        raise ValueError(
+            f"{missing[0]!r} is missing (no image size), there is {_listed(data)}"
+        )
     width, height = numbers_of(list(stated), "image size (width, height)", 2)
     return width, height
 

@@ -24,10 +24,15 @@ from evercal.geometry.se3 import SE3
 Array = NDArray[np.float64]
 
 _FAR_M = 10.0  # largest distance of a gripper from its base, metres
-_NEAR_M = 0.01  # smallest distance of a gripper from its base, metres, for at least one pose
+_NEAR_M = (
+    0.01  # smallest distance of a gripper from its base, metres, for at least one pose
+)
 _LARGEST_DEG = 361.0
-_TOLERANCE = 1e-2  # error of a quaternion's length, or of R^T R, if printed with three digits
-_OPENGL_FROM_OPENCV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))  # its own inverse
+_TOLERANCE = (
+    1e-2  # error of a quaternion's length, or of R^T R, if printed with three digits
+)
+# Its own inverse.
+_OPENGL_FROM_OPENCV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -72,7 +77,8 @@ class ConventionError(ValueError):
     """A convention is missing or does not fit the numbers; `remedy` names others."""
 
     def __init__(self, problem: str, remedy: str) -> None:
-        self.problem, self.remedy = problem, remedy
+        self.problem = problem
+        self.remedy = remedy
         super().__init__(f"{problem}; give the convention {remedy}")
 
 
@@ -95,13 +101,25 @@ CONVENTIONS = {
         PoseConvention("abb", "wxyz", "X Y Z q1 q2 q3 q4, millimetres, q1 is w", 0.001),
         PoseConvention("ur", "vector", "x y z rx ry rz, metres, rotation vector"),
         PoseConvention("rpy", "xyz", "x y z roll pitch yaw, metres, radians, as URDF"),
-        PoseConvention("kuka", "ZYX", "X Y Z A B C, mm, degrees, A about z", 0.001, True),
-        PoseConvention("fanuc", "xyz", "X Y Z W P R, mm, degrees, W about x", 0.001, True),
-        PoseConvention("yaskawa", "xyz", "X Y Z Rx Ry Rz, mm, degrees, fixed axes", 0.001, True),
-        PoseConvention("staubli", "XYZ", "X Y Z RX RY RZ, mm, degrees, moving axes", 0.001, True),
-        PoseConvention("kawasaki", "ZYZ", "X Y Z O A T, mm, degrees, about z y z", 0.001, True),
+        PoseConvention(
+            "kuka", "ZYX", "X Y Z A B C, mm, degrees, A about z", 0.001, True
+        ),
+        PoseConvention(
+            "fanuc", "xyz", "X Y Z W P R, mm, degrees, W about x", 0.001, True
+        ),
+        PoseConvention(
+            "yaskawa", "xyz", "X Y Z Rx Ry Rz, mm, degrees, fixed axes", 0.001, True
+        ),
+        PoseConvention(
+            "staubli", "XYZ", "X Y Z RX RY RZ, mm, degrees, moving axes", 0.001, True
+        ),
+        PoseConvention(
+            "kawasaki", "ZYZ", "X Y Z O A T, mm, degrees, about z y z", 0.001, True
+        ),
         PoseConvention("matrix", "rows", "4x4 or 3x4 matrix row after row, metres"),
-        PoseConvention("franka", "columns", "matrix column after column, metres (O_T_EE)"),
+        PoseConvention(
+            "franka", "columns", "matrix column after column, metres (O_T_EE)"
+        ),
     )
 }
 """All conventions by name, without modifiers."""
@@ -146,10 +164,14 @@ def pose_convention(name: str) -> PoseConvention:
     for modifier in modifiers:
         if not any(modifier in kind for kind in kinds):
             known = ", ".join(word for kind in kinds for word in kind)
-            raise ValueError(f"pose convention {name!r}: {modifier!r} is not one of {known}")
+            raise ValueError(
+                f"pose convention {name!r}: {modifier!r} is not one of {known}"
+            )
         convention = replace(convention, **UNITS.get(modifier, {}))
     if any(sum(word in kind for word in modifiers) > 1 for kind in kinds):
-        raise ValueError(f"pose convention {name!r} repeats a modifier; give each kind once")
+        raise ValueError(
+            f"pose convention {name!r} repeats a modifier; give each kind once"
+        )
     return convention
 
 
@@ -168,7 +190,10 @@ def poses_from_numbers(
             f"a pose as {convention.name!r} has {' or '.join(map(str, convention.counts))} numbers"
             f" ({convention.meaning}), got {numbers.shape[-1] if numbers.ndim else 1}"
         )
-    _refuse(~np.isfinite(numbers).all(-1), "a number is inf or nan; leave untracked poses out")
+    _refuse(
+        ~np.isfinite(numbers).all(-1),
+        "a number is inf or nan; leave untracked poses out",
+    )
     if convention.is_matrix:
         poses = _from_matrices(numbers, convention)
     else:
@@ -180,7 +205,9 @@ def poses_from_numbers(
     return _OPENGL_FROM_OPENCV @ poses if camera_from else poses @ _OPENGL_FROM_OPENCV
 
 
-def checked_poses(numbers: Array, convention: PoseConvention, camera_from: bool = False) -> SE3:
+def checked_poses(
+    numbers: Array, convention: PoseConvention, camera_from: bool = False
+) -> SE3:
     """`poses_from_numbers` of (n, k) numbers of plausible size; ValueError for others."""
     poses = poses_from_numbers(numbers, convention, camera_from)
     check_units(numbers, convention)
@@ -195,7 +222,8 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
     poses = poses @ _OPENGL_FROM_OPENCV if convention.has("opengl") else poses
     poses = poses.inverse() if convention.has("inverse") else poses
     translation = poses.translation_m / convention.metres_per_unit
-    layout, degrees = convention.layout, convention.degrees
+    layout = convention.layout
+    degrees = convention.degrees
     if convention.is_matrix:
         matrix = poses.matrix()
         matrix[..., :3, 3] = translation
@@ -214,7 +242,9 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
 def matrix_convention(numbers: Array) -> PoseConvention:
     """`matrix` or `franka`, whichever makes rigid transforms of (n, 12 or 16) numbers."""
     orders = [CONVENTIONS[name] for name in ("matrix", "franka")]
-    rigid = [order for order in orders if _rigid(_matrices(numbers, order.layout)).all()]
+    rigid = [
+        order for order in orders if _rigid(_matrices(numbers, order.layout)).all()
+    ]
     if len(rigid) == 1 and (rigid[0].name == "matrix" or numbers.shape[-1] == 16):
         return rigid[0]
     problem = f"rows of {numbers.shape[-1]} numbers are rigid transforms in"
@@ -238,10 +268,14 @@ def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
             at = _matrices(numbers, convention.layout)[..., 3]
         _check_lengths(np.linalg.norm(at[..., :3], axis=-1), convention)
     angles = np.abs(numbers[..., 3:]) if convention.has_angles else np.zeros(0)
-    angles = np.linalg.norm(angles, axis=-1) if convention.layout == "vector" else angles
+    angles = (
+        np.linalg.norm(angles, axis=-1) if convention.layout == "vector" else angles
+    )
     largest = float(angles.max(initial=0.0))
     if convention.degrees and largest > _LARGEST_DEG:
-        raise ValueError(f"angles up to {largest:.4g} deg; do columns hold {convention.meaning}?")
+        raise ValueError(
+            f"angles up to {largest:.4g} deg; do columns hold {convention.meaning}?"
+        )
     if convention.has_angles and not convention.has("rad", "deg"):
         degrees = largest > 2 * np.pi + 1e-6
         if largest > 0 and degrees != convention.degrees:
@@ -270,8 +304,12 @@ def _check_lengths(lengths: Array, convention: PoseConvention) -> None:
 
 def _other_unit(unit: str, problem: str, convention: PoseConvention) -> ConventionError:
     other = {"m": "mm", "mm": "m", "rad": "deg", "deg": "rad"}[unit]
-    base = ":".join(word for word in convention.name.split(":") if word not in (unit, other))
-    name = {"m": "metres", "mm": "millimetres", "rad": "radians", "deg": "degrees"}[unit]
+    base = ":".join(
+        word for word in convention.name.split(":") if word not in (unit, other)
+    )
+    name = {"m": "metres", "mm": "millimetres", "rad": "radians", "deg": "degrees"}[
+        unit
+    ]
     remedy = f"{base}:{unit} (or {base}:{other} if the unit is right as it is)"
     return ConventionError(f"{problem} {name}", remedy)
 
@@ -280,7 +318,9 @@ def _rotations(numbers: Array, convention: PoseConvention) -> Rotation:
     if convention.layout == "vector":
         return Rotation.from_rotvec(numbers, degrees=convention.degrees)
     if convention.has_angles:
-        return Rotation.from_euler(convention.layout, numbers, degrees=convention.degrees)
+        return Rotation.from_euler(
+            convention.layout, numbers, degrees=convention.degrees
+        )
     length = np.linalg.norm(numbers, axis=-1)
     _refuse(
         np.abs(length - 1.0) > _TOLERANCE,
@@ -299,15 +339,20 @@ def _matrices(numbers: Array, layout: str) -> Array:
 
 
 def _rigid(matrices: Array) -> NDArray[np.bool_]:
-    block, last = matrices[..., :3, :3], matrices[..., 3:, :]
-    drift = np.abs(np.swapaxes(block, -1, -2) @ block - np.eye(3)).max((-1, -2), initial=0.0)
+    block = matrices[..., :3, :3]
+    last = matrices[..., 3:, :]
+    drift = np.abs(np.swapaxes(block, -1, -2) @ block - np.eye(3)).max(
+        (-1, -2), initial=0.0
+    )
     homogeneous = np.abs(last - (0.0, 0.0, 0.0, 1.0)).max((-1, -2), initial=0.0) < 1e-6
     return (drift < _TOLERANCE) & (np.linalg.det(block) > 0) & homogeneous
 
 
 def _from_matrices(numbers: Array, convention: PoseConvention) -> SE3:
     matrices = _matrices(numbers, convention.layout)
-    stated, other = ("matrix", "franka") if convention.layout == "rows" else ("franka", "matrix")
+    stated, other = (
+        ("matrix", "franka") if convention.layout == "rows" else ("franka", "matrix")
+    )
     broken = ~_rigid(matrices)
     if broken.any() and _rigid(_matrices(numbers, CONVENTIONS[other].layout)).all():
         remedy = ":".join([other, *convention.name.split(":")[1:]])

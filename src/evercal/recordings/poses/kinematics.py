@@ -33,7 +33,9 @@ _MOVING = ("revolute", "continuous", "prismatic")
 _LARGEST_RAD = 4 * np.pi
 _UNITS = ("deg", "rad", "m")
 _STILL_RAD = 0.001
-_JSON = "an object with 'joint_names', 'positions' and optionally 'images' or 'stamps_s'"
+_JSON = (
+    "an object with 'joint_names', 'positions' and optionally 'images' or 'stamps_s'"
+)
 
 
 class RobotModel:
@@ -47,20 +49,26 @@ class RobotModel:
         if not self.path.is_file():
             raise InputError(f"{path}: no such URDF file")
         if self.path.suffix == ".xacro":
-            raise InputError(f"{path}: is a macro file; make a URDF of it with 'xacro' first")
+            raise InputError(
+                f"{path}: is a macro file; make a URDF of it with 'xacro' first"
+            )
         # Its scene graph fails where a part of no interest is wrong.
         plain = ("load_meshes", "load_collision_meshes", "build_scene_graph")
         with library_errors(f"{path}: no usable URDF"):
             if "</robot" not in read_text(self.path, "URDF"):
                 # Else the parts before a cut would be read as the whole.
                 raise ValueError("it does not end with </robot>, so a part is missing")
-            self._urdf = yourdfpy.URDF.load(str(self.path), **dict.fromkeys(plain, False))
+            self._urdf = yourdfpy.URDF.load(
+                str(self.path), **dict.fromkeys(plain, False)
+            )
             self.links = tuple(link.name for link in self._urdf.robot.links)
             joints = self._urdf.robot.joints
             self._joint_above = {joint.child: joint for joint in joints}
             for names in (self.links, [joint.name for joint in joints]):
                 refuse_repeated(names, "give each link and each joint its own name")
-            refuse_repeated((joint.child for joint in joints), "a link is below one joint at most")
+            refuse_repeated(
+                (joint.child for joint in joints), "a link is below one joint at most"
+            )
             roots = [link for link in self.links if link not in self._joint_above]
             self.base_link = [*roots, *self.links][0]
             # Of the readers pinocchio alone heeds quat_xyzw, and yourdfpy does not keep it.
@@ -122,9 +130,12 @@ class RobotModel:
 
     def arm(self, base: str, gripper: str) -> Arm:
         """The chain between two links; its joint values are those that others do not mimic."""
-        up, down = self._ancestors(base), self._ancestors(gripper)
+        up = self._ancestors(base)
+        down = self._ancestors(gripper)
         if (up[-1].parent if up else base) != (down[-1].parent if down else gripper):
-            raise InputError(f"{self.path}: no joints connect {base} and {gripper}; name others")
+            raise InputError(
+                f"{self.path}: no joints connect {base} and {gripper}; name others"
+            )
         steps = [(joint, True) for joint in up if joint not in down]
         steps += [(joint, False) for joint in reversed(down) if joint not in up]
         names: list[str] = []
@@ -132,14 +143,17 @@ class RobotModel:
         before = np.eye(4)
         for joint, backwards in steps:
             if joint.type not in (*_MOVING, "fixed"):
-                raise InputError(f"{self.path}: joint {joint.name} is {joint.type}; not supported")
+                raise InputError(
+                    f"{self.path}: joint {joint.name} is {joint.type}; not supported"
+                )
             origin = self._origin(joint)
             before = before if backwards else before @ origin
             if joint.type in _MOVING:
                 name, factor, constant = self._driver(joint)
                 names += [] if name in names else [name]
                 axis = -self._axis(joint) if backwards else self._axis(joint)
-                rotates, value = joint.type != "prismatic", names.index(name)
+                rotates = joint.type != "prismatic"
+                value = names.index(name)
                 chain.append(Motion(before, axis, rotates, value, factor, constant))
                 before = np.eye(4)
             before = before @ np.linalg.inv(origin) if backwards else before
@@ -156,9 +170,13 @@ class RobotModel:
         for joint in self._urdf.robot.joints:
             name, factor, _ = self._driver(joint)
             if joint.type in _MOVING and name in offsets:
-                step, rotates = factor * offsets[name], joint.type != "prismatic"
+                step = factor * offsets[name]
+                rotates = joint.type != "prismatic"
                 motion = np.kron((0, step) if rotates else (step, 0), self._axis(joint))
-                moved[joint.name] = SE3.from_matrix(self._origin(joint)) @ SE3.exp(motion), rotates
+                moved[joint.name] = (
+                    SE3.from_matrix(self._origin(joint)) @ SE3.exp(motion),
+                    rotates,
+                )
         return moved
 
     def _origin(self, joint: Any) -> Array:
@@ -171,18 +189,26 @@ class RobotModel:
         """(3,) unit vector."""
         length = np.linalg.norm(joint.axis)
         if not 0 < length < np.inf:
-            raise InputError(f"{self.path}: joint {joint.name} has the axis {joint.axis}")
+            raise InputError(
+                f"{self.path}: joint {joint.name} has the axis {joint.axis}"
+            )
         return joint.axis / length
 
     def _driver(self, joint: Any) -> tuple[str, float, float]:
         """Name of the value that moves a joint, and factor and constant of its motion."""
-        factor, constant, passed = 1.0, 0.0, [joint.name]
+        factor = 1.0
+        constant = 0.0
+        passed = [joint.name]
         while joint.mimic is not None:
             constant += factor * joint.mimic.offset
             factor *= joint.mimic.multiplier
             other = self._urdf.joint_map.get(joint.mimic.joint)
             if other is None or other.name in passed or other.type not in _MOVING:
-                why = "mimics it" if joint.mimic.joint in passed else "is no moving joint of it"
+                why = (
+                    "mimics it"
+                    if joint.mimic.joint in passed
+                    else "is no moving joint of it"
+                )
                 raise InputError(
                     f"{self.path}: joint {joint.name} mimics {joint.mimic.joint}, which {why};"
                     " correct the URDF"
@@ -204,7 +230,9 @@ class RobotModel:
             covered = f"joint {name} goes from {column.min():.2f} to {column.max():.2f}"
             if joint.type == "continuous" and np.ptp(column) > _LARGEST_RAD:
                 notes.append(f"{covered}, more than two rotations; are these degrees?")
-            lower, upper = (getattr(joint.limit, end, None) for end in ("lower", "upper"))
+            lower, upper = (
+                getattr(joint.limit, end, None) for end in ("lower", "upper")
+            )
             if joint.type == "continuous" or lower is None or upper is None:
                 continue
             if column.min() < lower - 0.1 or column.max() > upper + 0.1:
@@ -216,13 +244,17 @@ class RobotModel:
 
     def _ancestors(self, link: str) -> list[Any]:
         if link not in self.links:
-            raise InputError(f"{self.path}: has no link {link!r}; it has {', '.join(self.links)}")
+            raise InputError(
+                f"{self.path}: has no link {link!r}; it has {', '.join(self.links)}"
+            )
         joints = []
         while link in self._joint_above:
             joints.append(self._joint_above[link])
             link = joints[-1].parent
             if len(joints) > len(self.links):
-                raise InputError(f"{self.path}: the joints above link {link} form a circle")
+                raise InputError(
+                    f"{self.path}: the joints above link {link} form a circle"
+                )
         return joints
 
 
@@ -240,11 +272,16 @@ def read_joint_poses(
     rows = read_joints(path)
     base, gripper = model.chosen_links(base, gripper)
     if not model.arm(base, gripper).joints:
-        raise InputError(f"{model.path}: no joint moves {gripper} against {base}; name other links")
-    names, units = [], []
+        raise InputError(
+            f"{model.path}: no joint moves {gripper} against {base}; name other links"
+        )
+    names = []
+    units = []
     for column in rows.columns:
         plain, _, ending = column.rpartition("_")
-        stated = ending in _UNITS and not model.has_joint(column) and model.has_joint(plain)
+        stated = (
+            ending in _UNITS and not model.has_joint(column) and model.has_joint(plain)
+        )
         names.append(plain if stated else column)
         units.append(ending if stated else unit)
     with named_errors(path, "joint angles"):
@@ -261,7 +298,9 @@ def in_radians(
     other = next((unit for unit in units if unit not in (None, *_UNITS)), None)
     if other is not None:
         raise InputError(f"--pose-convention {other}: joint angles are rad or deg")
-    degrees = [u == "deg" and model.rotates(name) for u, name in zip(units, names, strict=True)]
+    degrees = [
+        u == "deg" and model.rotates(name) for u, name in zip(units, names, strict=True)
+    ]
     return np.where(degrees, np.deg2rad(values), values)
 
 
@@ -290,7 +329,11 @@ def read_joints(path: Path) -> Rows:
         columns = tuple(str(name) for name in data["joint_names"])
         values = np.array(data["positions"], dtype=np.float64)
         lists = {key: value for key, value in data.items() if isinstance(value, list)}
-        names, times, _ = row_labels([*lists], [*lists.values()], len(values), plural=True)
+        names, times, _ = row_labels(
+            [*lists], [*lists.values()], len(values), plural=True
+        )
         if values.shape != (len(values), len(columns)) or not np.isfinite(values).all():
-            raise ValueError("'positions' are rows of finite numbers, one for each joint")
+            raise ValueError(
+                "'positions' are rows of finite numbers, one for each joint"
+            )
         return Rows(names, times, columns, values)

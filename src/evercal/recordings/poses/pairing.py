@@ -13,14 +13,22 @@ from evercal.recordings.poses.kinematics import interpolate
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import is_number, same_numbers, times_in_names
-from evercal.recordings.text_files import few, named_errors, natural_key, refuse_repeated
+from evercal.recordings.text_files import (
+    few,
+    named_errors,
+    natural_key,
+    refuse_repeated,
+)
 
 Pairing = tuple[list[SE3 | None], list[str]]
 """The pose of each image, if it has one, and notes."""
 
 
 def pair_images(
-    images: Sequence[Path], rows: RobotPoses, stamps_s: Mapping[str, float] | None, file: Path
+    images: Sequence[Path],
+    rows: RobotPoses,
+    stamps_s: Mapping[str, float] | None,
+    file: Path,
 ) -> Pairing:
     """Find the pose of every image.
 
@@ -35,7 +43,11 @@ def pair_images(
     if times is not None and rows.stamps_s is not None:
         return _by_time(times, PoseTrack(rows.stamps_s, rows.poses), file)
     if len(rows.poses) != len(images):
-        how = "an image column" if rows.stamps_s is None else "a stamps.csv (image, stamp_s)"
+        how = (
+            "an image column"
+            if rows.stamps_s is None
+            else "a stamps.csv (image, stamp_s)"
+        )
         raise InputError(
             f"{file}: {len(rows.poses)} poses for {len(images)} images in {images[0].parent}; give"
             f" each image a row, or add {how} to pair them"
@@ -48,15 +60,22 @@ def pair_images(
                 f"{file}: {after.name} is given after {before.name}, so the order of the rows is"
                 f" ambiguous; give the folder, or name the images in a column image"
             )
-    first, last = images[0].name, images[-1].name
-    return list(rows.poses), [f"images and poses were paired in order, {first} to {last}"]
+    first = images[0].name
+    last = images[-1].name
+    return list(rows.poses), [
+        f"images and poses were paired in order, {first} to {last}"
+    ]
 
 
 def pair_joints(
-    images: Sequence[Path], rows: RobotPoses, stamps_s: Mapping[str, float] | None, file: Path
+    images: Sequence[Path],
+    rows: RobotPoses,
+    stamps_s: Mapping[str, float] | None,
+    file: Path,
 ) -> list[NDArray[np.float64] | None]:
     """Joint values (k,) of every image, paired as its pose; None without any."""
-    values, times = rows.joints, rows.stamps_s
+    values = rows.joints
+    times = rows.stamps_s
     if values is None:
         return [None] * len(images)
     if rows.names is not None:
@@ -65,7 +84,9 @@ def pair_joints(
     at = None if times is None else _image_times(images, stamps_s)
     if at is None or times is None:
         return list(values)
-    return list(np.stack([interpolate(times, column, at)[0] for column in values.T], axis=1))
+    return list(
+        np.stack([interpolate(times, column, at)[0] for column in values.T], axis=1)
+    )
 
 
 def poses_of_images(
@@ -74,10 +95,14 @@ def poses_of_images(
     """Read (n,) base_from_gripper of n images, with notes, for the commands with `--convention`."""
     rows = read_robot_poses(file, convention, option="--convention")
     poses, notes = pair_images(images, rows, None, file)
-    missing = [image.name for image, pose in zip(images, poses, strict=True) if pose is None]
+    missing = [
+        image.name for image, pose in zip(images, poses, strict=True) if pose is None
+    ]
     if missing:
         alone = few(missing, {*(rows.names or ())} - {image.name for image in images})
-        raise InputError(f"{file}: has no pose for {alone}; add it or leave the image out")
+        raise InputError(
+            f"{file}: has no pose for {alone}; add it or leave the image out"
+        )
     return SE3.stack([pose for pose in poses if pose is not None]), notes
 
 
@@ -85,13 +110,15 @@ def _by_name(
     images: Sequence[Path], names: Sequence[str], file: Path
 ) -> tuple[list[int | None], list[str]]:
     """Number of each image's row, and notes."""
-    keys, files = [PureWindowsPath(name).name for name in names], [image.name for image in images]
+    keys = [PureWindowsPath(name).name for name in names]
+    files = [image.name for image in images]
     with named_errors(file, "poses"):
         refuse_repeated(keys, "give every image one row")
     by_name = {key: number for number, key in enumerate(keys)}
     # A table may omit the ending.
     paired = [by_name.pop(i.name, by_name.pop(i.stem, None)) for i in images]
-    if len(by_name) == len(keys):  # such as frame-1.color.png and frame-1.pose, but not 1.5.png
+    # Such as frame-1.color.png and frame-1.pose, but not 1.5.png.
+    if len(by_name) == len(keys):
         heads = [[name.partition(".")[0] for name in part] for part in (files, keys)]
         if all(len({*part}) == len(part) and not is_number(part[0]) for part in heads):
             by_name = {head: number for number, head in enumerate(heads[1])}
@@ -116,14 +143,17 @@ def unpaired(images: Sequence[str], rows: Sequence[str], file: str) -> list[str]
         count = _count(len(images), "image")
         notes.append(f"{count} without a row in {file}: {few(images, rows)}")
     if rows:
-        notes.append(f"{_count(len(rows), 'row')} of {file} without an image: {few(rows)}")
+        notes.append(
+            f"{_count(len(rows), 'row')} of {file} without an image: {few(rows)}"
+        )
     return notes
 
 
 def _by_time(times: NDArray[np.float64], track: PoseTrack, file: Path) -> Pairing:
     poses, valid = track.at(times)
     if not valid.any():
-        first, last = track.stamps_s[0], track.stamps_s[-1]
+        first = track.stamps_s[0]
+        last = track.stamps_s[-1]
         raise InputError(
             f"{file}: no image was taken while poses were recorded: images at {times.min():.3f} to"
             f" {times.max():.3f} s, poses at {first:.3f} to {last:.3f} s; are the clocks the same?"
@@ -146,7 +176,9 @@ def _image_times(
     times = [stamps_s.get(i.name, stamps_s.get(i.stem)) for i in images]
     if None in times:
         missing = images[times.index(None)]
-        raise InputError(f"{missing}: stamps.csv has no row for it; add one for every image")
+        raise InputError(
+            f"{missing}: stamps.csv has no row for it; add one for every image"
+        )
     return np.array(times, dtype=np.float64)
 
 

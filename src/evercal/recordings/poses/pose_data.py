@@ -14,7 +14,11 @@ from numpy.typing import NDArray
 
 from evercal.bounds import require_at_most
 from evercal.recordings.images import IMAGE_ENDINGS
-from evercal.recordings.poses.conventions import ConventionError, PoseConvention, pose_convention
+from evercal.recordings.poses.conventions import (
+    ConventionError,
+    PoseConvention,
+    pose_convention,
+)
 from evercal.recordings.poses.pose_table import (
     HEADERS,
     PoseTable,
@@ -22,7 +26,12 @@ from evercal.recordings.poses.pose_table import (
     named_numbers,
     plain_numbers,
 )
-from evercal.recordings.poses.row_files import name_and_unit, number_array, row_labels, text_cells
+from evercal.recordings.poses.row_files import (
+    name_and_unit,
+    number_array,
+    row_labels,
+    text_cells,
+)
 
 Array = NDArray[np.float64]
 Columns = Mapping[str, Any]
@@ -44,10 +53,18 @@ _INVERSE = re.compile("base2gripper|gripper_from_base|cam2target|board_from_came
 _WIDTHS = (6, 7, 8, 12, 13, 16, 17)
 """Numbers of a pose, possibly after a stamp."""
 _MATRICES = ((4, 4), (3, 4))
-_LISTS = {"translation_m": ("x_m", "y_m", "z_m"), "xyz": "xyz", "rpy": ("roll", "pitch", "yaw")}
+_LISTS = {
+    "translation_m": ("x_m", "y_m", "z_m"),
+    "xyz": "xyz",
+    "rpy": ("roll", "pitch", "yaw"),
+}
 """Columns of lists."""
-_ROTATION = re.compile(r"(?:rotation_matri(?:x|ces)|rotations?|rot|rmats?|rvecs?|rotvecs?|r)(_.*)?")
-_TRANSLATION = re.compile(r"(?:translation_vectors?|translations?|tvecs?|positions?|pos|t)(_.*)?")
+_ROTATION = re.compile(
+    r"(?:rotation_matri(?:x|ces)|rotations?|rot|rmats?|rvecs?|rotvecs?|r)(_.*)?"
+)
+_TRANSLATION = re.compile(
+    r"(?:translation_vectors?|translations?|tvecs?|positions?|pos|t)(_.*)?"
+)
 
 
 def pose_data(data: Any, given: PoseConvention | None, robot: bool = True) -> PoseTable:
@@ -58,32 +75,47 @@ def pose_data(data: Any, given: PoseConvention | None, robot: bool = True) -> Po
     data = _plain(data)
     if isinstance(data, Mapping):
         return _of_object(data, given, robot)
-    if not isinstance(data, list) or len({isinstance(each, Mapping) for each in data}) != 1:
-        raise ValueError("poses are a list of objects, or of lists of numbers, not of both")
+    if (
+        not isinstance(data, list)
+        or len({isinstance(each, Mapping) for each in data}) != 1
+    ):
+        raise ValueError(
+            "poses are a list of objects, or of lists of numbers, not of both"
+        )
     if not isinstance(data[0], Mapping):
         numbers = _first(number_array(data, "a list of poses"), _MATRICES)
         if numbers.shape[-2:] == (6, 1):  # ViSP's vectors of poses
-            numbers, given = numbers.reshape(-1, 6), given or pose_convention("ur")
+            numbers = numbers.reshape(-1, 6)
+            given = given or pose_convention("ur")
         single = numbers.ndim == 1 or numbers.shape in _MATRICES
         return plain_numbers(numbers[None] if single else numbers, given)
-    if all(isinstance(entry.get("transforms"), list) for entry in data):  # messages of /tf
+    # Messages of /tf.
+    if all(isinstance(entry.get("transforms"), list) for entry in data):
         data = [each for entry in data for each in entry["transforms"]]
     rows = [_flat(entry) for entry in data]
     keys = dict.fromkeys(key for row in rows for key in row)
     require_at_most(len(keys), "columns", "keys")
     require_at_most(len(keys) * len(rows), "numbers", "values")
-    columns = _of_role({key: [row.get(key) for row in rows] for key in keys}, given, robot)
+    columns = _of_role(
+        {key: [row.get(key) for row in rows] for key in keys}, given, robot
+    )
     frames = sorted({str(frame) for frame in columns.get("child_frame_id", ())})
     if frames[1:]:
-        raise ValueError(f"it holds poses of {' and '.join(frames)}; keep those of one frame")
+        raise ValueError(
+            f"it holds poses of {' and '.join(frames)}; keep those of one frame"
+        )
     table = _of_arrays(columns, given, plural=False)
     if table is None:
-        rows = [_cells({key: columns[key][i] for key in columns}) for i in range(len(rows))]
+        rows = [
+            _cells({key: columns[key][i] for key in columns}) for i in range(len(rows))
+        ]
         words = [*dict.fromkeys(word for row in rows for word in row)]
         require_at_most(len(words) * len(rows), "numbers", "values")
         cells = text_cells([str(row.get(word)) for word in words] for row in rows)
         table = _labelled(named_numbers(words, cells, given), columns, plural=False)
-    return table._replace(fixed="quaternion_wxyz" in columns and "matrix" not in columns)
+    return table._replace(
+        fixed="quaternion_wxyz" in columns and "matrix" not in columns
+    )
 
 
 def _of_object(data: Columns, given: PoseConvention | None, robot: bool) -> PoseTable:
@@ -91,15 +123,26 @@ def _of_object(data: Columns, given: PoseConvention | None, robot: bool) -> Pose
     numbered = len(stems) == 1 and not stems & data.keys()
     if data and (numbered or all(key.lower().endswith(IMAGE_ENDINGS) for key in data)):
         return pose_data([*data.values()], given, robot)._replace(names=tuple(data))
-    kind = data["parameters"] if isinstance(data.get("parameters"), Mapping) and robot else {}
-    fixed = kind.get("calibration_type") == "eye_on_base" or kind.get("eye_on_hand") is False
+    kind = (
+        data["parameters"]
+        if isinstance(data.get("parameters"), Mapping) and robot
+        else {}
+    )
+    fixed = (
+        kind.get("calibration_type") == "eye_on_base"
+        or kind.get("eye_on_hand") is False
+    )
     if fixed and not (given and given.has("inverse")):
-        problem = "easy_handeye states gripper_from_base for a fixed camera (eye_to_hand)"
+        problem = (
+            "easy_handeye states gripper_from_base for a fixed camera (eye_to_hand)"
+        )
         raise ConventionError(problem, "wxyz:inverse in place of --invert")
     columns = _of_role(data, given, robot)
     inner = [key for key in columns if key in _KEYS and len(_shape(columns[key])) < 2]
     if len(inner) == 1:
-        return _labelled(pose_data(columns[inner[0]], given, robot), columns, plural=True)
+        return _labelled(
+            pose_data(columns[inner[0]], given, robot), columns, plural=True
+        )
     nested = any(_shape(value)[1:] for value in columns.values())
     table = _of_arrays(columns, given, plural=True) if nested else None
     if table is not None:
@@ -107,7 +150,9 @@ def _of_object(data: Columns, given: PoseConvention | None, robot: bool) -> Pose
     if has_position([*_cells(_flat(columns))]):
         return pose_data([columns], given, robot)
     lists = [[*v.values()] if isinstance(v, Mapping) else v for v in columns.values()]
-    if not has_position([*columns]) or not all(isinstance(each, list) for each in lists):
+    if not has_position([*columns]) or not all(
+        isinstance(each, list) for each in lists
+    ):
         raise _unclear([], data)
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
     return pose_data(rows, given, robot)
@@ -126,14 +171,22 @@ def _of_role(columns: Columns, given: PoseConvention | None, robot: bool) -> Col
     own = {match[1] or match[2] or "pose": columns[key] for key, match in found.items()}
     inverse = [key for key in columns if _INVERSE.search(key)]
     if inverse and not own and not (given and given.has("inverse")):
-        raise ConventionError(f"{inverse[0]} is the inverse of the pose", "such as matrix:inverse")
+        raise ConventionError(
+            f"{inverse[0]} is the inverse of the pose", "such as matrix:inverse"
+        )
     if len(own) < len(found):
         raise _unclear([*found], columns)
-    others = {key: columns[key] for key in columns if not any(r.fullmatch(key) for r in _ROLES)}
+    others = {
+        key: columns[key]
+        for key in columns
+        if not any(r.fullmatch(key) for r in _ROLES)
+    }
     return others | own if own else columns
 
 
-def _of_arrays(columns: Columns, given: PoseConvention | None, plural: bool) -> PoseTable | None:
+def _of_arrays(
+    columns: Columns, given: PoseConvention | None, plural: bool
+) -> PoseTable | None:
     """Poses of a key that holds arrays, or of keys for rotations and translations."""
     shapes = {key: _shape(value) for key, value in columns.items()}
     keys = [key for key in columns if key in _KEYS and len(shapes[key]) > 1]
@@ -146,15 +199,23 @@ def _of_arrays(columns: Columns, given: PoseConvention | None, plural: bool) -> 
         if (t := _TRANSLATION.fullmatch(plain[second])) and r[1] == t[1]
     ]
     for key in plain:
-        table = len(shapes[key]) == 2 and shapes[key][1] in _WIDTHS and "joint" not in key.lower()
+        table = (
+            len(shapes[key]) == 2
+            and shapes[key][1] in _WIDTHS
+            and "joint" not in key.lower()
+        )
         matrices = shapes[key][-2:] in _MATRICES or shapes[key][:2] in _MATRICES
         keys += [key] if matrices or (table and plural) else []
     if len(keys) + len(parts) > 1:
         raise _unclear(keys + [f"{r} with {t}" for r, t in parts], columns)
-    labels = {key: columns[key] for key in columns if key not in (*keys, *sum(parts, ()))}
+    labels = {
+        key: columns[key] for key in columns if key not in (*keys, *sum(parts, ()))
+    }
     if parts:
         return _labelled(_composed(columns, *parts[0], given), labels, plural)
-    return _labelled(pose_data(columns[keys[0]], given), labels, plural) if keys else None
+    return (
+        _labelled(pose_data(columns[keys[0]], given), labels, plural) if keys else None
+    )
 
 
 def _composed(
@@ -168,7 +229,9 @@ def _composed(
     prefix, ends = kinds.get(width, ("rotvec_" if "vec" in rotation else "r", "xyz"))
     words = [f"{axis}_{unit}" for axis in "xyz"] + [prefix + end for end in ends]
     numbers = np.concatenate([second, _rows(first, width)], -1)
-    return named_numbers(words, text_cells([map(repr, row) for row in numbers.tolist()]), given)
+    return named_numbers(
+        words, text_cells([map(repr, row) for row in numbers.tolist()]), given
+    )
 
 
 def _rows(array: Array, width: int) -> Array:
@@ -189,7 +252,9 @@ def _first(array: Array, shapes: tuple[tuple[int, int], ...]) -> Array:
 
 def _labelled(table: PoseTable, columns: Columns, plural: bool) -> PoseTable:
     lists = {key: value for key, value in columns.items() if len(_shape(value)) == 1}
-    names, stamps, _ = row_labels([*lists], [*lists.values()], len(table.numbers), plural)
+    names, stamps, _ = row_labels(
+        [*lists], [*lists.values()], len(table.numbers), plural
+    )
     stamps = stamps if table.stamps_s is None else table.stamps_s
     return table._replace(names=table.names or names, stamps_s=stamps)
 
@@ -197,7 +262,11 @@ def _labelled(table: PoseTable, columns: Columns, plural: bool) -> PoseTable:
 def _plain(data: Any) -> Any:
     """Matrices of OpenCV and ViSP (rows, cols, data) as nested lists, and keys as text."""
     if isinstance(data, Mapping) and {"rows", "cols", "data"} <= data.keys():
-        return number_array(data["data"], "data").reshape(data["rows"], data["cols"]).tolist()
+        return (
+            number_array(data["data"], "data")
+            .reshape(data["rows"], data["cols"])
+            .tolist()
+        )
     if isinstance(data, Mapping):
         return {str(key): _plain(value) for key, value in data.items()}
     nested = isinstance(data, list) and any(isinstance(each, Mapping) for each in data)
@@ -234,4 +303,8 @@ def _cells(row: Columns) -> dict[str, object]:
 
 def _shape(value: object) -> tuple[int, ...]:
     """Lengths of nested lists, by the first of each: all are compared when numbers are read."""
-    return (len(value), *_shape(value[0] if value else None)) if isinstance(value, list) else ()
+    return (
+        (len(value), *_shape(value[0] if value else None))
+        if isinstance(value, list)
+        else ()
+    )

@@ -20,21 +20,27 @@ Array = NDArray[np.float64]
 
 PAIRS = 16  # number of image pairs that are compared
 LEAST_PAIRS = 6  # matched pairs below which there is no verdict
-LEAST_DEG, BEST_DEG = 5.0, 12.0  # smallest and best stated rotation between the images of a pair
+LEAST_DEG = 5.0
+BEST_DEG = 12.0  # smallest and best stated rotation between the images of a pair
 MOST_FRAMES_APART = 30  # largest distance between the images of a pair, frames
-LEAST_MATCHES = 40  # feature matches, and inliers of them, below which a pair is dropped
+LEAST_MATCHES = (
+    40  # feature matches, and inliers of them, below which a pair is dropped
+)
 LONG_SIDE = 640  # longer side of the images that are matched, pixels
 AGREE_DEG = 2.0  # difference up to which rotations agree
 STILL_DEG = 1.0  # median measured rotation below which the images stand still
 BETTER = 3.0  # factor by which another reading must fit better to be named
 CLOSE_DEG = 0.5  # margin within which further readings are named with the best
 # Stricter for grippers: the free fixed rotation lets wrong readings fit better.
-GRIPPER_AGREE_DEG, GRIPPER_BETTER = 1.0, 2.0
+GRIPPER_AGREE_DEG = 1.0
+GRIPPER_BETTER = 2.0
 # OpenGL's camera axes (right, up, backward) from OpenCV's (right, down, forward).
 _GL = Rotation.from_euler("x", 180, degrees=True)
 
 
-def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> list[str]:
+def rotation_warnings(
+    frames: Sequence[Frame], poses: SE3, of_camera: bool
+) -> list[str]:
     """Describe contradictions between stated rotations and the images, in sentences.
 
     (n,) frames are in recorded order, (n,) poses base_from_camera or else base_from_gripper.
@@ -43,16 +49,23 @@ def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> l
     if len(measured) < LEAST_PAIRS:
         return []
     owner = "camera" if of_camera else "gripper"
-    if not of_camera and np.rad2deg(np.median(np.linalg.norm(measured, axis=1))) < STILL_DEG:
+    if (
+        not of_camera
+        and np.rad2deg(np.median(np.linalg.norm(measured, axis=1))) < STILL_DEG
+    ):
         return [
             "the gripper rotates and the images hardly do; does the camera stand still, or are the"
             " angles in another unit than stated?"
         ]
     stated, readings = _readings(poses, pairs, of_camera)
     # Between gripper and camera is a fixed rotation that is not known.
-    error_of, better = (_error_deg, BETTER) if of_camera else (_fitted_error_deg, GRIPPER_BETTER)
+    error_of, better = (
+        (_error_deg, BETTER) if of_camera else (_fitted_error_deg, GRIPPER_BETTER)
+    )
     error = error_of(measured, stated)
-    errors = {reading: error_of(measured, vectors) for reading, vectors in readings.items()}
+    errors = {
+        reading: error_of(measured, vectors) for reading, vectors in readings.items()
+    }
     improved = min(errors.values()) < error / better
     if error < (AGREE_DEG if of_camera or not improved else GRIPPER_AGREE_DEG):
         return []
@@ -66,7 +79,9 @@ def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> l
     least = min(errors.values())
     if least < min(AGREE_DEG, error / better):
         fitting = [reading for reading, e in errors.items() if e < least + CLOSE_DEG]
-        return [f"{problem}; the poses fit ({least:.1f} deg) if they are {', or '.join(fitting)}"]
+        return [
+            f"{problem}; the poses fit ({least:.1f} deg) if they are {', or '.join(fitting)}"
+        ]
     return [
         f"{problem}; do poses and images belong together, are angles in the stated unit and Euler"
         f" order, and are the intrinsics right?"
@@ -82,7 +97,9 @@ def _readings(
     swapped = Rotation.from_quat(poses.rotation_wxyz)
     stated = (rotation[first].inv() * rotation[second]).as_rotvec()
     inverse = (rotation[first] * rotation[second].inv()).as_rotvec()
-    readings = {f"{'camera' if of_camera else 'gripper'}_from_base, the inverse": inverse}
+    readings = {
+        f"{'camera' if of_camera else 'gripper'}_from_base, the inverse": inverse
+    }
     if of_camera:
         readings["with OpenGL's camera axes (right, up, backward)"] = _GL.apply(stated)
         readings["the inverse with OpenGL's camera axes"] = _GL.apply(inverse)
@@ -90,9 +107,13 @@ def _readings(
     return stated, readings | {"with quaternions in another order": another_order}
 
 
-def measured_pairs(frames: Sequence[Frame], poses: SE3) -> tuple[NDArray[np.intp], Array]:
+def measured_pairs(
+    frames: Sequence[Frame], poses: SE3
+) -> tuple[NDArray[np.intp], Array]:
     """(n, 2) frames of the pairs that match, and (n, 3) `measured_rotation` of each."""
-    measured = [((i, j), measured_rotation(frames[i], frames[j])) for i, j in _pairs(poses)]
+    measured = [
+        ((i, j), measured_rotation(frames[i], frames[j])) for i, j in _pairs(poses)
+    ]
     pairs = [pair for pair, vector in measured if vector is not None]
     vectors = [vector for _, vector in measured if vector is not None]
     return np.array(pairs, np.intp).reshape(-1, 2), np.array(vectors)
@@ -103,15 +124,23 @@ def measured_rotation(first: Frame, second: Frame) -> Array | None:
     features = [_features(frame) for frame in (first, second)]
     if min(len(rays) for rays, _ in features) < LEAST_MATCHES:
         return None
-    neighbours = cv2.BFMatcher(cv2.NORM_L2).knnMatch(features[0][1], features[1][1], k=2)
-    matches = [m[0] for m in neighbours if len(m) == 2 and m[0].distance < 0.75 * m[1].distance]
+    neighbours = cv2.BFMatcher(cv2.NORM_L2).knnMatch(
+        features[0][1], features[1][1], k=2
+    )
+    matches = [
+        m[0] for m in neighbours if len(m) == 2 and m[0].distance < 0.75 * m[1].distance
+    ]
     if len(matches) < LEAST_MATCHES:
         return None
     a = features[0][0][[m.queryIdx for m in matches]]
     b = features[1][0][[m.trainIdx for m in matches]]
-    threshold = 1.5 / (first.camera.fx * min(1.0, LONG_SIDE / max(first.camera.width, 1)))
+    threshold = 1.5 / (
+        first.camera.fx * min(1.0, LONG_SIDE / max(first.camera.width, 1))
+    )
     cv2.setRNGSeed(0)
-    matrix, inliers = cv2.findEssentialMat(a, b, np.eye(3), cv2.RANSAC, 0.999, threshold)
+    matrix, inliers = cv2.findEssentialMat(
+        a, b, np.eye(3), cv2.RANSAC, 0.999, threshold
+    )
     if matrix is None or matrix.shape != (3, 3) or int(inliers.sum()) < LEAST_MATCHES:
         return None
     _, second_from_first, _, _ = cv2.recoverPose(matrix, a, b, np.eye(3), mask=inliers)
@@ -124,8 +153,12 @@ def _features(frame: Frame) -> tuple[Array, NDArray[np.float32]]:
     camera = frame.camera
     scale = LONG_SIDE / max(camera.width, camera.height)
     if scale < 1:
-        camera = camera.resized(round(camera.width * scale), round(camera.height * scale))
-        image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        camera = camera.resized(
+            round(camera.width * scale), round(camera.height * scale)
+        )
+        image = cv2.resize(
+            image, (camera.width, camera.height), interpolation=cv2.INTER_AREA
+        )
     sift = cv2.SIFT_create(1500)  # pyright: ignore[reportAttributeAccessIssue]
     points, descriptors = sift.detectAndCompute(image, None)
     if descriptors is None:
@@ -147,7 +180,11 @@ def _pairs(poses: SE3) -> list[tuple[int, int]]:
     for i, first in enumerate(firsts):
         later = np.arange(first + 1, min(first + 1 + MOST_FRAMES_APART, len(poses)))
         degrees = np.rad2deg((rotation[first].inv() * rotation[later]).magnitude())
-        best = np.argmin(np.abs(degrees - BEST_DEG)) if i % 2 else np.argmax(degrees > LEAST_DEG)
+        best = (
+            np.argmin(np.abs(degrees - BEST_DEG))
+            if i % 2
+            else np.argmax(degrees > LEAST_DEG)
+        )
         if degrees[best] > LEAST_DEG:
             pairs.append((int(first), int(later[best])))
     return pairs

@@ -66,12 +66,15 @@ class Columns(NamedTuple):
     def names(self, index: int) -> set[str]:
         """Possible names of one column."""
         prefixes = self.prefixes.split(",")
-        by_index = {f"{p}{index}" for p in prefixes if self.ends == "xyz" and p.endswith("_")}
+        by_index = {
+            f"{p}{index}" for p in prefixes if self.ends == "xyz" and p.endswith("_")
+        }
         return {prefix + self.ends[index] for prefix in prefixes} | by_index
 
     def ordered(self, columns: list[int], convention: PoseConvention) -> list[int]:
         """Columns of this rotation in the order of a convention; none if they do not hold it."""
-        layout, stated = convention.layout.lower(), convention.base in self.conventions
+        layout = convention.layout.lower()
+        stated = convention.base in self.conventions
         generic = convention.base.startswith(("fixed_", "moving_"))
         if layout == "columns" and stated:
             return np.reshape(columns, (-1, 4)).T.ravel().tolist()
@@ -88,7 +91,8 @@ _DOWN = [str(4 * column + row) for row in range(4) for column in range(4)]
 _GRID_3 = [f"{row}{column}" for row in range(3) for column in range(3)]
 _ANGLES = ("ur", "yaskawa", "staubli", "fanuc", "rpy")
 _ORDERS = ("abb", "wxyz", "xyzw", "tum")
-_Q, _R = "q,q_,quat,quat_,quaternion_,orientation_,rotation_,q_rs_", "r,r_,rot_,rotation_"
+_Q = "q,q_,quat,quat_,quaternion_,orientation_,rotation_,q_rs_"
+_R = "r,r_,rot_,rotation_"
 HEADERS = {
     "position": Columns(",t,t_,p,p_,pos_,position_,translation_,tvec_,p_rs_r_", "xyz"),
     "quaternion": Columns(_Q, "wxyz", ("wxyz", *_ORDERS), axes="wxyz"),
@@ -115,7 +119,20 @@ HEADERS = {
 }  # fmt: skip
 """Columns of a position and of rotations; definite rotations come first."""
 _COMMENTS = ("#", "%", "//")
-_INDICES = ("", "index", "idx", "id", "no", "nr", "i", "n", "number", "row", "pose", "sample")
+_INDICES = (
+    "",
+    "index",
+    "idx",
+    "id",
+    "no",
+    "nr",
+    "i",
+    "n",
+    "number",
+    "row",
+    "pose",
+    "sample",
+)
 """Columns that only count."""
 _WORD = r'[^\s\[\](){}=,;:"]'
 _NOTATIONS = {
@@ -158,19 +175,29 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     if _is_header(words):
         rows = rows[1:]
     else:
-        words = table_cells([line.lstrip("#%/ ") for line in comments[-1:]]).ravel().tolist()
+        words = (
+            table_cells([line.lstrip("#%/ ") for line in comments[-1:]])
+            .ravel()
+            .tolist()
+        )
     if not len(rows):
         raise ValueError("no line of numbers in it")
     if len(words) == rows.shape[1] and _is_header(words):
         return named_numbers(words, rows, given)
-    same = [i for i, cell in enumerate(rows[0]) if {cell} == {*rows[1:, i]} and not is_number(cell)]
+    same = [
+        i
+        for i, cell in enumerate(rows[0])
+        if {cell} == {*rows[1:, i]} and not is_number(cell)
+    ]
     rows = np.delete(rows, same, axis=1)  # such as a frame
     texts = [i for i, cell in enumerate(rows[0].tolist()) if not is_number(cell)]
     numbers = cell_numbers(np.delete(rows, texts[:1], axis=1))
     if texts or numbers.shape[1] != 4:
         names = tuple(rows[:, texts[0]].tolist()) if texts else None
         return plain_numbers(numbers, given, names)
-    whole = (numbers == (0, 0, 0, 1)).all(1).any() or (given and given.layout == "columns")
+    whole = (numbers == (0, 0, 0, 1)).all(1).any() or (
+        given and given.layout == "columns"
+    )
     height = 3 if len(numbers) % 3 == 0 and not whole else 4
     if len(numbers) % height:
         raise ValueError(f"{len(numbers)} rows of 4 numbers are no 4x4 or 3x4 matrices")
@@ -182,7 +209,9 @@ def has_position(words: Sequence[str]) -> bool:
     return "position" in _groups(words)
 
 
-def named_numbers(words: Sequence[str], rows: Cells, given: PoseConvention | None) -> PoseTable:
+def named_numbers(
+    words: Sequence[str], rows: Cells, given: PoseConvention | None
+) -> PoseTable:
     """Numbers of rows (n, k) whose columns have names."""
     require_at_most(len(words), "columns", "columns")
     groups = _groups(words)
@@ -213,7 +242,9 @@ def named_numbers(words: Sequence[str], rows: Cells, given: PoseConvention | Non
     )
 
 
-def _in_units(convention: PoseConvention, words: Sequence[str], *known: str) -> PoseConvention:
+def _in_units(
+    convention: PoseConvention, words: Sequence[str], *known: str
+) -> PoseConvention:
     """The convention in the unit that columns state, unless its own name has one."""
     units = {name_and_unit(word)[1] for word in words}
     if len(units) > 1:
@@ -227,7 +258,9 @@ def _in_units(convention: PoseConvention, words: Sequence[str], *known: str) -> 
     return convention if convention.has(*known) else replace(convention, **UNITS[unit])
 
 
-def plain_numbers(numbers: Array, given: PoseConvention | None, names: Names = None) -> PoseTable:
+def plain_numbers(
+    numbers: Array, given: PoseConvention | None, names: Names = None
+) -> PoseTable:
     """Matrices (n, 4, 4) or (n, 3, 4), or numbers (n, k) or with stamps (n, 1 + k)."""
     if numbers.ndim != 2:
         given = given or pose_convention("matrix")
@@ -248,7 +281,8 @@ def plain_numbers(numbers: Array, given: PoseConvention | None, names: Names = N
         )
     ros = width - 2 in given.counts and not (numbers[:, :2] // [4e9, 1e9]).any()
     if ros and not (numbers[:, :2] % 1).any() and numbers[:, 0].min() > 1e9:
-        numbers, width = np.c_[numbers[:, :2] @ [1, 1e-9], numbers[:, 2:]], width - 1
+        numbers = np.c_[numbers[:, :2] @ [1, 1e-9], numbers[:, 2:]]
+        width = width - 1
     count = next((count for count in given.counts if 0 <= width - count <= 1), 0)
     stamps = in_unit(numbers[:, 0]) if count and width > count else None
     # A misplaced number shows in quaternions and matrices, but not in angles.
@@ -266,9 +300,13 @@ def _without_brackets(
 ) -> tuple[list[str], PoseConvention | None]:
     """Lines of a table without brackets, and the convention that a robot's notation defines."""
     text = "\n".join(lines)
-    kinds = [kind for kind, (pattern, _) in _NOTATIONS.items() if re.search(pattern, text)]
+    kinds = [
+        kind for kind, (pattern, _) in _NOTATIONS.items() if re.search(pattern, text)
+    ]
     if len(kinds) > 1:
-        raise ValueError(f"it mixes the brackets {' and '.join(sorted(kinds))}; use one notation")
+        raise ValueError(
+            f"it mixes the brackets {' and '.join(sorted(kinds))}; use one notation"
+        )
     if not kinds:
         return _without_lists(lines), given
     pattern, header = _NOTATIONS[kinds[0]]
@@ -281,7 +319,8 @@ def _without_brackets(
             )
     found = re.findall(pattern, text)
     words = [word for word, *_ in found]
-    named = all(words) and (len(found) == 1 or len({*words}) > 1)  # else a type, such as E6POS
+    # Else a type, such as E6POS.
+    named = all(words) and (len(found) == 1 or len({*words}) > 1)
     rows = []
     for word, first, second in found:
         row = f"{first},{second}" if second else first
@@ -290,12 +329,15 @@ def _without_brackets(
             row = ",".join(values.get(key, "") for key in header.split(","))
         rows.append(f"{word},{row}" if named else row)
     label = "" if not named else "stamp," if is_number(words[0]) else "image,"
-    return [label + header, *rows], given or (pose_convention("kuka") if kinds[0] == "{" else None)
+    return [label + header, *rows], given or (
+        pose_convention("kuka") if kinds[0] == "{" else None
+    )
 
 
 def _without_lists(lines: list[str]) -> list[str]:
     """Lines without the brackets of numpy, Python and robots' functions, such as XY(...)."""
-    lines = [re.sub(r"^[^\[\]]*[:=]\s*(?=$|\[\[)", "", line) for line in lines]  # titles
+    # Titles.
+    lines = [re.sub(r"^[^\[\]]*[:=]\s*(?=$|\[\[)", "", line) for line in lines]
     lines = [line for line in lines if line]
     cut = next((s for s in ";,\t" if s in "".join(lines[:1])), " ")
     label = re.compile(r"^([^\s,;:=]+)\s*(?::\s|=)\s*(?=[-+.\d])")  # P1 = 412.0
@@ -303,7 +345,8 @@ def _without_lists(lines: list[str]) -> list[str]:
     if not lines or not re.search(r"((?<!\w)\[|[({])\s*[-+.\d]", lines[0]):
         return lines
     text = re.sub(r"\b\w+\(", "(", "\n".join(lines))
-    text = re.sub(r"\[[^\[\]]*\]", lambda row: row[0].replace("\n", " "), text)  # wrapped by numpy
+    # Wrapped by numpy.
+    text = re.sub(r"\[[^\[\]]*\]", lambda row: row[0].replace("\n", " "), text)
     return re.sub(r'[\[\](){},;="]|:(?=\s)', " ", text).splitlines()
 
 
@@ -318,11 +361,18 @@ def _groups(words: Sequence[str]) -> _Groups:
     if groups := _matched(names, words):
         return groups
     ends = [f"_{x}" for x in HEADERS["position"].names(0)]
-    starts = {name.removesuffix(x[1:]) for name in names for x in ends if name.endswith(x)}
-    rests = {s: [n[len(s) :] if n.startswith(s) else "" for n in names] for s in sorted(starts)}
+    starts = {
+        name.removesuffix(x[1:]) for name in names for x in ends if name.endswith(x)
+    }
+    rests = {
+        s: [n[len(s) :] if n.startswith(s) else "" for n in names]
+        for s in sorted(starts)
+    }
     found = {s: groups for s in rests if len(groups := _matched(rests[s], words)) > 1}
     if len(found) > 1:
-        raise ValueError(f"it holds poses of {' and '.join(found)}; keep the columns of one")
+        raise ValueError(
+            f"it holds poses of {' and '.join(found)}; keep the columns of one"
+        )
     return next(iter(found.values()), {})
 
 
@@ -339,7 +389,9 @@ def _matched(names: Sequence[str], words: Sequence[str]) -> _Groups:
             continue
         for repeated in (candidates for candidates in found if len(candidates) > 1):
             which = " and ".join(words[column] for column in repeated)
-            raise ValueError(f"the columns {which} may both be the {key}'s; keep those of the pose")
+            raise ValueError(
+                f"the columns {which} may both be the {key}'s; keep those of the pose"
+            )
         groups[key] = columns
     return groups
 
@@ -347,13 +399,19 @@ def _matched(names: Sequence[str], words: Sequence[str]) -> _Groups:
 def _defined(groups: _Groups, words: Sequence[str]) -> str:
     rotations = [key for key in groups if key != "position"]
     stated = {key: name_and_unit(words[groups[key][0]])[1] for key in rotations}
-    sure = [k for k in rotations if not HEADERS[k].ask or (k == "roll pitch yaw" and stated[k])]
+    sure = [
+        k
+        for k in rotations
+        if not HEADERS[k].ask or (k == "roll pitch yaw" and stated[k])
+    ]
     conventions = [HEADERS[key].conventions[0] for key in sure]
     whole = sure and len(groups[sure[0]]) in pose_convention(conventions[0]).counts
     if len(sure) == 1 and ("position" in groups or whole):
         return conventions[0]
     if sure[1:]:
-        raise ConventionError(f"the header names {' and '.join(sure)}", " or ".join(conventions))
+        raise ConventionError(
+            f"the header names {' and '.join(sure)}", " or ".join(conventions)
+        )
     if rotations and not sure:
         columns = ", ".join(words[column] for column in groups[rotations[0]])
         problem = f"columns {columns} do not define a rotation"

@@ -27,7 +27,9 @@ class PoseTrack:
     def __post_init__(self) -> None:
         stamps = np.asarray(self.stamps_s, dtype=np.float64)
         if stamps.ndim != 1 or not stamps.size or stamps.shape != self.poses.shape:
-            raise ValueError(f"a track takes n >= 1 times and poses, got {stamps.shape}")
+            raise ValueError(
+                f"a track takes n >= 1 times and poses, got {stamps.shape}"
+            )
         # np.unique keeps the first of equal times, so the order is reversed.
         _, last = np.unique(stamps[::-1], return_index=True)
         order = len(stamps) - 1 - last
@@ -50,12 +52,17 @@ class PoseTrack:
         metres, radians = pose_distance(self.poses[after - 1], self.poses[after])
         still = (metres < STILL_M) & (np.rad2deg(radians) < STILL_DEG)
         rotations = Rotation.from_quat(self.poses.rotation_wxyz, scalar_first=True)
-        position = [np.interp(inside, self.stamps_s, axis) for axis in self.poses.translation_m.T]
+        position = [
+            np.interp(inside, self.stamps_s, axis)
+            for axis in self.poses.translation_m.T
+        ]
         quaternion = Slerp(self.stamps_s, rotations)(inside).as_quat(scalar_first=True)
         return SE3(quaternion, np.stack(position, axis=-1)), valid & (close | still)
 
 
-def times_around(times_s: Array, stamps_s: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def times_around(
+    times_s: Array, stamps_s: Array
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Index of the time after each stamp, and whether no long gap is around it."""
     after = np.searchsorted(times_s, stamps_s).clip(1, len(times_s) - 1)
     short = times_s[after] - times_s[after - 1] <= MAX_GAP_S

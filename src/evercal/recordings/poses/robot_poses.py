@@ -25,9 +25,25 @@ from evercal.recordings.poses.conventions import (
 from evercal.recordings.poses.pose_data import pose_data
 from evercal.recordings.poses.pose_table import PoseTable, read_pose_table
 from evercal.recordings.poses.row_files import Names, arrays_as_lists
-from evercal.recordings.text_files import documents, named_errors, read_text, refuse_repeated
+from evercal.recordings.text_files import (
+    documents,
+    named_errors,
+    read_text,
+    refuse_repeated,
+)
 
-POSE_ENDINGS = (".csv", ".json", ".jsonl", ".yaml", ".yml", ".npy", ".npz", ".mat", ".tum", ".txt")
+POSE_ENDINGS = (
+    ".csv",
+    ".json",
+    ".jsonl",
+    ".yaml",
+    ".yml",
+    ".npy",
+    ".npz",
+    ".mat",
+    ".tum",
+    ".txt",
+)
 _YAML = re.compile(
     r"(?:\s*#.*\n)*(?:%YAML|---\s*\n|(?:- )?[A-Za-z_]\w*:(?:\s*\n\s*(?:- )?[A-Za-z_]\w*:"
     r"| \{\s*[a-z]))"
@@ -101,7 +117,9 @@ def read_robot_poses(
         return RobotPoses(table.names, table.stamps_s, poses, *stated)
 
 
-def read_last_robot_pose(path: str | os.PathLike[str], convention: str | None = None) -> SE3:
+def read_last_robot_pose(
+    path: str | os.PathLike[str], convention: str | None = None
+) -> SE3:
     """Read the last complete row of a table or of JSON lines that another program appends to.
 
     A row is complete once its line break is written. Long files are read at both ends only.
@@ -118,7 +136,10 @@ def read_last_robot_pose(path: str | os.PathLike[str], convention: str | None = 
             raise ValueError("no complete line of a pose in it yet")
         if ending != ".json":
             # The first line is the header, or a row and perhaps the only one.
-            last = [*lines[: first + 1], *(last if last != lines[first : first + 1] else [])]
+            last = [
+                *lines[: first + 1],
+                *(last if last != lines[first : first + 1] else []),
+            ]
         return _poses(_table("\n".join(last), ending, _given(path, convention)))[-1]
 
 
@@ -135,39 +156,55 @@ def _given(path: Path, convention: str | None) -> PoseConvention | None:
     return None if convention is None else pose_convention(convention)
 
 
-def _file(path: Path, given: PoseConvention | None, what: str, robot: bool) -> PoseTable:
+def _file(
+    path: Path, given: PoseConvention | None, what: str, robot: bool
+) -> PoseTable:
     ending = path.suffix.lower()
     if ending in (".npy", ".npz", ".mat"):
         return pose_data(arrays_as_lists(path), given, robot)
     return _table(read_text(path, what), ending, given, robot)
 
 
-def _folder(path: Path, given: PoseConvention | None, what: str, robot: bool) -> PoseTable:
+def _folder(
+    path: Path, given: PoseConvention | None, what: str, robot: bool
+) -> PoseTable:
     """Poses of files that are named alike, in the order of the numbers in their names."""
     kinds: dict[str, list[Path]] = {}
     for file in files_in(path, POSE_ENDINGS):
         kinds.setdefault(re.sub(r"\d+", "N", file.name), []).append(file)
     several = {kind: files for kind, files in kinds.items() if len(files) > 1} or kinds
     # ViSP's poses of the end effector and of the object in the camera.
-    own = [kind for kind in several if ("fPe" if robot else "cPo") in kind] or [*several]
+    own = [kind for kind in several if ("fPe" if robot else "cPo") in kind] or [
+        *several
+    ]
     if len(own) != 1:
         found = " and ".join(own) or f"no file of {', '.join(POSE_ENDINGS)}"
-        raise ValueError(f"the folder holds {found}; give a folder of one file for each pose")
+        raise ValueError(
+            f"the folder holds {found}; give a folder of one file for each pose"
+        )
     tables: dict[str, PoseTable] = {}
     for file in several[own[0]]:
         with named_errors(file, what):
-            if file.suffix.lower() == ".txt" and _UNTRACKED.search(read_text(file, what)):
+            if file.suffix.lower() == ".txt" and _UNTRACKED.search(
+                read_text(file, what)
+            ):
                 continue
             table = tables[file.stem] = _file(file, given, what, robot)
             if len(table.numbers) != 1:
-                raise ValueError("holds several poses, in a folder of one file for each pose")
+                raise ValueError(
+                    "holds several poses, in a folder of one file for each pose"
+                )
     if not tables:
-        raise ValueError("all poses in its files are inf or nan; give those of tracked images")
+        raise ValueError(
+            "all poses in its files are inf or nan; give those of tracked images"
+        )
     numbers = np.concatenate([table.numbers for table in tables.values()])
     return PoseTable(numbers, next(iter(tables.values())).convention, tuple(tables))
 
 
-def _table(text: str, ending: str, given: PoseConvention | None, robot: bool = True) -> PoseTable:
+def _table(
+    text: str, ending: str, given: PoseConvention | None, robot: bool = True
+) -> PoseTable:
     is_json = ending in (".json", ".jsonl")
     if is_json or ending in (".yaml", ".yml") or _YAML.match(text):
         data = [each for each in documents(text, is_json) if each is not None]

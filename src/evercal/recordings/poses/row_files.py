@@ -38,7 +38,8 @@ _UNIT = re.compile(
 _SHORT = {"deg": "deg", "rad": "rad", "mil": "mm", "met": "m", "inc": "inch"}
 """Units by the first three letters of their names."""
 _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
-_EARLIEST_S, _LATEST_S = 1e9, 4e9  # 2001 and 2096 in seconds since 1970
+_EARLIEST_S = 1e9
+_LATEST_S = 4e9  # 2001 and 2096 in seconds since 1970
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$")
 
 
@@ -61,7 +62,8 @@ def read_rows(path: Path, contents: str) -> Rows:
         cells = table_cells([line for line in text.splitlines() if line[:1] != "#"])
         if len(cells) < 2 or all(map(is_number, cells[0])):
             raise ValueError(f"needs a line of column names, then rows of {contents}")
-        header, rows = cells[0].tolist(), cells[1:]
+        header = cells[0].tolist()
+        rows = cells[1:]
         names, stamps, others = row_labels(header, rows.T.tolist(), len(rows))
         columns = tuple(header[i] for i in others)
         return Rows(names, stamps, columns, cell_numbers(rows[:, others], columns))
@@ -84,13 +86,17 @@ def table_cells(lines: Sequence[str]) -> Cells:
     # The bound below on the length of a cell is stricter, and names its place.
     csv.field_size_limit(max(csv.field_size_limit(), bounds().text_bytes))
     # A cell whose quote is never closed swallows the line after the last one.
-    rows = csv.reader(chain(stripped, ["end"]), delimiter=separator, skipinitialspace=True)
+    rows = csv.reader(
+        chain(stripped, ["end"]), delimiter=separator, skipinitialspace=True
+    )
     cells: list[list[str]] = []
     for row in rows:
         width = len(cells[0]) if cells else len(row)
         _require_few_cells(width, len(lines))  # lines of one row come together
         if len(row) > width:
-            raise ValueError(f"no table: line {rows.line_num} has {len(row)} cells, not {width}")
+            raise ValueError(
+                f"no table: line {rows.line_num} has {len(row)} cells, not {width}"
+            )
         if row:
             cells.append([*row, *[""] * (width - len(row))])
     if cells.pop()[:1] != ["end"]:
@@ -108,7 +114,9 @@ def table_cells(lines: Sequence[str]) -> Cells:
 
 def _separator(line: str) -> str:
     words = line.split()
-    if words[1:] and all("," not in word or _DECIMAL_COMMA.match(word) for word in words):
+    if words[1:] and all(
+        "," not in word or _DECIMAL_COMMA.match(word) for word in words
+    ):
         return next((s for s in (";", "\t") if s in line), " ")
     return next((s for s in (";", ",", "\t") if s in line), " ")
 
@@ -148,11 +156,16 @@ def name_and_unit(cell: str) -> tuple[str, str | None]:
     match = _UNIT.search(re.sub("[°º]", " deg", name))
     unit = match.group(1) if match else None
     name = match.string[: match.start()] if match else name
-    return re.sub(r"[\s./\[]+", "_", name.rstrip("]")), _SHORT.get((unit or "")[:3], unit)
+    return re.sub(r"[\s./\[]+", "_", name.rstrip("]")), _SHORT.get(
+        (unit or "")[:3], unit
+    )
 
 
 def row_labels(
-    words: Sequence[str], columns: Sequence[Sequence[object]], count: int, plural: bool = False
+    words: Sequence[str],
+    columns: Sequence[Sequence[object]],
+    count: int,
+    plural: bool = False,
 ) -> tuple[Names, Array | None, list[int]]:
     """Image names and seconds of `count` rows, None if missing, and indices of other columns."""
     plain = [name_and_unit(word)[0] for word in words]
@@ -164,7 +177,8 @@ def row_labels(
         files = [
             i
             for i, column in enumerate(columns)
-            if column and all(str(cell).lower().endswith(IMAGE_ENDINGS) for cell in column)
+            if column
+            and all(str(cell).lower().endswith(IMAGE_ENDINGS) for cell in column)
         ]
         if len(files) > 1:
             found = " and ".join(words[i] for i in files)
@@ -172,10 +186,16 @@ def row_labels(
         name = files[0] if files else None
     for i in (i for i in (name, stamp) if i is not None):
         if len(columns[i]) != count:
-            raise ValueError(f"{words[i]!r} holds {len(columns[i])} entries for {count} poses")
+            raise ValueError(
+                f"{words[i]!r} holds {len(columns[i])} entries for {count} poses"
+            )
         if None in columns[i]:
-            raise ValueError(f"some poses have {words[i]!r}, others lack it; give it to all poses")
-    others = [i for i, word in enumerate(plain) if word not in _NAMES + _STAMPS and i != name]
+            raise ValueError(
+                f"some poses have {words[i]!r}, others lack it; give it to all poses"
+            )
+    others = [
+        i for i, word in enumerate(plain) if word not in _NAMES + _STAMPS and i != name
+    ]
     names = None if name is None else tuple(map(str, columns[name]))
     stamps = None
     if stamp is not None:
@@ -189,7 +209,9 @@ def number_array(values: object, what: str) -> Array:
     try:
         return np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{what} is made of numbers and has the same shape everywhere") from None
+        raise ValueError(
+            f"{what} is made of numbers and has the same shape everywhere"
+        ) from None
 
 
 def arrays_as_lists(path: Path) -> Any:
@@ -216,7 +238,9 @@ def _matlab(file: IO[bytes]) -> dict[str, Any]:
     from scipy.io import loadmat, whosmat
 
     kinds = re.compile("double|single|u?int(8|16|32|64)")
-    shapes = {name: shape for name, shape, kind in whosmat(file) if kinds.fullmatch(kind)}
+    shapes = {
+        name: shape for name, shape, kind in whosmat(file) if kinds.fullmatch(kind)
+    }
     require_at_most(sum(map(math.prod, shapes.values())), "numbers", "numbers")
     file.seek(0)
     loaded = loadmat(file, variable_names=[*shapes])
@@ -232,7 +256,9 @@ def _require_few_numbers(file: IO[bytes]) -> None:
     shape, _, dtype = read(file)
     if dtype.hasobject:
         raise ValueError("Python objects; save arrays of numbers")
-    require_at_most(math.prod(shape) * max(dtype.itemsize, 8) // 8, "numbers", "numbers")
+    require_at_most(
+        math.prod(shape) * max(dtype.itemsize, 8) // 8, "numbers", "numbers"
+    )
 
 
 def in_unit(stamps: Array, unit: str | None = None) -> Array:
@@ -284,6 +310,8 @@ def without_ending(name: str) -> str:
 
 def same_numbers(first: Sequence[str], second: Sequence[str]) -> bool:
     """Whether names of two kinds end in the same numbers, as pose_1 and image-001.png."""
-    numbers = [re.findall(r"(\d+)\D*$", without_ending(name)) for name in (*first, *second)]
+    numbers = [
+        re.findall(r"(\d+)\D*$", without_ending(name)) for name in (*first, *second)
+    ]
     plain = [int(each[0]) if each else -1 for each in numbers]
     return -1 not in plain and plain[: len(first)] == plain[len(first) :]

@@ -23,10 +23,13 @@ class Tasks:
     """Runs one task at a time in a thread, and calls `changed` when there is something to show."""
 
     def __init__(self, changed: Callable[[], Any]):
-        self._changed, self._running = changed, threading.Lock()
+        self._changed = changed
+        self._running = threading.Lock()
         self.stop = threading.Event()
         """Asks the running task to stop after its present step."""
-        self.message, self.failed, self.progress = "", False, 0.0
+        self.message = ""
+        self.failed = False
+        self.progress = 0.0
 
     @property
     def busy(self) -> bool:
@@ -38,13 +41,16 @@ class Tasks:
         if not self._running.acquire(blocking=False):
             return False
         self.stop.clear()
-        self.message, self.failed, self.progress = what, False, 0.0
+        self.message = what
+        self.failed = False
+        self.progress = 0.0
         threading.Thread(target=self._run, args=(task,), daemon=True).start()
         return True
 
     def step(self, what: str, done: float, total: float) -> None:
         """Report progress from inside a task."""
-        self.message, self.progress = what, min(done / total, 1.0) if total else 0.0
+        self.message = what
+        self.progress = min(done / total, 1.0) if total else 0.0
         self._changed()
 
     def _run(self, task: Callable[[], str]) -> None:
@@ -52,10 +58,12 @@ class Tasks:
         try:
             self.message = task()
         except (InputError, OSError) as error:
-            self.message, self.failed = " ".join(str(error).split()), True
+            self.message = " ".join(str(error).split())
+            self.failed = True
         except Exception as error:
             logging.getLogger(__name__).exception("a task of the studio failed")
-            self.message, self.failed = f"internal error, {type(error).__name__}: {error}", True
+            self.message = f"internal error, {type(error).__name__}: {error}"
+            self.failed = True
         self._running.release()
         self._changed()
 
@@ -64,23 +72,37 @@ class Controls:
     """The panel."""
 
     def __init__(self, server: viser.ViserServer, studio: Studio, tasks: Tasks):
-        self._gui, self._studio, self._tasks = server.gui, studio, tasks
+        self._gui = server.gui
+        self._studio = studio
+        self._tasks = tasks
         self._view: NextViews | None = None
         self._updates: list[Callable[[], None]] = []
         """Calls that bring single controls up to date."""
         gui = self._gui
         gui.main_panel.dock_right()
         given = studio.connection.devices.cameras
-        self._camera = gui.add_dropdown("Camera", [n for n, w in _CAMERAS.items() if w in given])
+        self._camera = gui.add_dropdown(
+            "Camera", [n for n, w in _CAMERAS.items() if w in given]
+        )
         self._picture = gui.add_image(np.zeros((3, 4, 3), np.uint8))
         self._keep(gui.add_html(""), content=self._message)
         bar = gui.add_progress_bar(0.0, animated=True)
         self._keep(bar, visible=lambda: tasks.busy, value=lambda: 100 * tasks.progress)
         tabs = gui.add_tab_group()
-        steps = self._connect, self._samples, self._learn, self._fixed, self._hold, self._export
+        steps = (
+            self._connect,
+            self._samples,
+            self._learn,
+            self._fixed,
+            self._hold,
+            self._export,
+        )
         for (title, state), add in zip(STEPS.items(), steps, strict=True):
             with tabs.add_tab(title):
-                self._keep(gui.add_html(""), content=lambda state=state: chip_html(*state(studio)))
+                self._keep(
+                    gui.add_html(""),
+                    content=lambda state=state: chip_html(*state(studio)),
+                )
                 add()
 
     @property
@@ -99,7 +121,10 @@ class Controls:
         connection = self._studio.connection
         if self.which in connection.images:
             self._picture.image = connection.images[self.which]
-        rows = [(f"{name}: no data", problem) for name, problem in connection.problems.items()]
+        rows = [
+            (f"{name}: no data", problem)
+            for name, problem in connection.problems.items()
+        ]
         if connection.base_from_gripper is not None:
             x, y, z = 1000 * connection.base_from_gripper.translation_m
             rows.append(("gripper", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"))
@@ -109,38 +134,49 @@ class Controls:
         self._arrives = self._gui.add_html("")
 
     def _samples(self, which: Which = "wrist") -> None:
-        studio, gui, tasks = self._studio, self._gui, self._tasks
+        studio = self._studio
+        gui = self._gui
+        tasks = self._tasks
         take, move = ("T", "M") if which == "wrist" else (None, None)
         self._button("Take sample", lambda: studio.take_sample(which), take)
         if studio.can_move:
             self._button("Move there", lambda: studio.move_on(which), move)
             self._button(
-                "Record by itself", lambda: studio.record(tasks.step, tasks.stop.is_set, which)
+                "Record by itself",
+                lambda: studio.record(tasks.step, tasks.stop.is_set, which),
             )
             gui.add_button("Stop", color="red").on_click(lambda _: tasks.stop.set())
         self._keep(gui.add_html(""), content=lambda: self._coverage(which))
         sample: Any = gui.add_dropdown("Sample", ("-",))
 
         def names() -> tuple[str, ...]:
-            return tuple(frame.name for frame in reversed(studio.recorders[which].frames))
+            return tuple(
+                frame.name for frame in reversed(studio.recorders[which].frames)
+            )
 
         def show_names() -> None:
             if (shown := names() or ("-",)) != sample.options:
-                sample.options, sample.value = shown, shown[0]  # the one taken last
+                sample.options = shown
+                sample.value = shown[0]  # the one taken last
 
         self._updates.append(show_names)
         self._button("Remove", lambda: studio.remove(sample.value, which=which))
         self._button(
-            "Remove the bad ones", lambda: studio.remove(*studio.bad_samples(which), which=which)
+            "Remove the bad ones",
+            lambda: studio.remove(*studio.bad_samples(which), which=which),
         )
         self._button("Remove all", lambda: studio.remove(*names(), which=which))
 
     def _learn(self) -> None:
-        self._button("Learn the recording", lambda: self._studio.learn(self._tasks.step))
+        self._button(
+            "Learn the recording", lambda: self._studio.learn(self._tasks.step)
+        )
         self._keep(self._gui.add_html(""), content=lambda: self._numbers("wrist"))
 
     def _fixed(self) -> None:
-        studio, gui, step = self._studio, self._gui, self._tasks.step
+        studio = self._studio
+        gui = self._gui
+        step = self._tasks.step
         moves = studio.can_move
         move = gui.add_checkbox("Move the arm between images", moves, visible=moves)
 
@@ -165,7 +201,8 @@ class Controls:
         camera = self._gui.add_dropdown("Calibration", tuple(_CAMERAS))
         format = self._gui.add_dropdown("Format", tuple(FORMATS))
         self._button(
-            "Export file", lambda: self._studio.export(_CAMERAS[camera.value], format.value)
+            "Export file",
+            lambda: self._studio.export(_CAMERAS[camera.value], format.value),
         )
 
     def _keep(self, handle: Any, **properties: Callable[[], Any]) -> None:
@@ -191,7 +228,8 @@ class Controls:
         return chip_html(kind, tasks.message) if tasks.message else ""
 
     def _coverage(self, which: Which) -> str:
-        covered, rows = self._studio.coverage(which), []
+        covered = self._studio.coverage(which)
+        rows = []
         axes = [(axis, "°", ROTATION_DEG) for axis in covered.rotations]
         axes += [(axis, " mm", POSITION_MM) for axis in covered.positions]
         for axis, unit, wanted in axes:
@@ -200,14 +238,23 @@ class Controls:
         if which == "wrist" and self._view is not None:
             x, y, z = 1000 * self._view.poses[0].translation_m
             now, then = self._view.sigma_mm[:2]
-            rows.append(("next view (amber)", f"gripper at {x:+.0f} {y:+.0f} {z:+.0f} mm"))
+            rows.append(
+                ("next view (amber)", f"gripper at {x:+.0f} {y:+.0f} {z:+.0f} mm")
+            )
             rows.append(("expected 1 sigma", f"{now:.3f} mm → {then:.3f} mm"))
-        bad = [(row.name, "; ".join(row.problems)) for row in covered.samples if row.problems]
+        bad = [
+            (row.name, "; ".join(row.problems))
+            for row in covered.samples
+            if row.problems
+        ]
         return rows_html(rows + bad)
 
     def _numbers(self, which: Which) -> str:
         if (found := self._studio.calibrations.get(which)) is None:
             return ""
         return rows_html(
-            [*calibration_rows(found), ("file", str(self._studio.calibration_file(which)))]
+            [
+                *calibration_rows(found),
+                ("file", str(self._studio.calibration_file(which))),
+            ]
         )

@@ -92,7 +92,9 @@ class Connection:
         camera = self.devices.cameras.get(which)
         if camera is None:
             option = "camera" if which == "wrist" else "fixed"
-            raise InputError(f"no {which} camera was given; restart with --{option} SOURCE")
+            raise InputError(
+                f"no {which} camera was given; restart with --{option} SOURCE"
+            )
         with self._lock:
             self.images[which] = camera.read()[1]
         self.problems.pop(which, None)
@@ -101,9 +103,13 @@ class Connection:
     def sample(self, which: Which = "wrist") -> tuple[Image, SE3]:
         """Read an image, of a fixed camera one of a held thing, and the pose of the gripper."""
         self.devices.hold(which == "fixed")
-        before, image, after = self._pose(), self.image(which), self._pose()
+        before = self._pose()
+        image = self.image(which)
+        after = self._pose()
         if _moved(before, after):
-            raise InputError("the arm moved while the image was taken; let it stand still")
+            raise InputError(
+                "the arm moved while the image was taken; let it stand still"
+            )
         return image, after
 
     def _pose(self) -> SE3:

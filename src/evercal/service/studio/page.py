@@ -14,7 +14,13 @@ from evercal.reports.overlay import resized
 from evercal.reports.scene import THUMBNAIL_PX, Frustum
 from evercal.service.studio.controls import Controls, Tasks
 from evercal.service.studio.studio import Studio
-from evercal.service.viewer.drawing import DrawnMap, add_base, add_calibrations, add_frustum, place
+from evercal.service.viewer.drawing import (
+    DrawnMap,
+    add_base,
+    add_calibrations,
+    add_frustum,
+    place,
+)
 from evercal.service.viewer.html import AMBER, BLUE, GREEN, RED
 from evercal.service.viewer.page import start_server
 
@@ -30,9 +36,12 @@ class StudioPage:
     """A page that is being served; `close` ends it."""
 
     def __init__(self, studio: Studio, host: str, port: int):
-        self.studio, self.tasks = studio, Tasks(self._progressed)
+        self.studio = studio
+        self.tasks = Tasks(self._progressed)
         self.server = start_server(host, port, "evercal studio")
-        self._closed, self._lock, self._refreshed = threading.Event(), threading.RLock(), 0.0
+        self._closed = threading.Event()
+        self._lock = threading.RLock()
+        self._refreshed = 0.0
         studio.watched = self.watched
         self.controls = Controls(self.server, studio, self.tasks)
         self._drawing = _Drawing(self.server, studio)
@@ -72,14 +81,17 @@ class StudioPage:
 
     def _run(self) -> None:
         """Show live images while the page is open somewhere; a task takes its own images."""
-        connection, complete = self.studio.connection, False
+        connection = self.studio.connection
+        complete = False
         while not self._closed.wait(_LIVE_S):
             if not self.server.get_clients():
                 continue
             try:
                 which = self.controls.which
                 wanted = connection.devices.live and not self.tasks.busy
-                connection.look(which if wanted or which not in connection.images else None)
+                connection.look(
+                    which if wanted or which not in connection.images else None
+                )
                 with self._lock, self.server.atomic():
                     self.controls.show_live()
                     self._drawing.show_live()
@@ -94,7 +106,8 @@ class _Drawing:
     """The scene of the page."""
 
     def __init__(self, server: viser.ViserServer, studio: Studio):
-        self._server, self._studio = server, studio
+        self._server = server
+        self._studio = studio
         self._samples: dict[str, viser.CameraFrustumHandle] = {}
         self._drawn: tuple[object, ...] = ()
         self._gripper = add_base(server, 3.0)
@@ -104,12 +117,14 @@ class _Drawing:
         server.scene.add_label("/next/label", "next view")
         self._live.visible = False
         camera = server.initial_camera
-        camera.position, camera.look_at = (1.15, -0.8, 0.85), (0.35, 0.0, 0.3)
+        camera.position = (1.15, -0.8, 0.85)
+        camera.look_at = (0.35, 0.0, 0.3)
 
     def show_live(self) -> None:
         """Draw arm and camera where they are."""
         connection = self._studio.connection
-        gripper, arm = connection.base_from_gripper, connection.devices.arm
+        gripper = connection.base_from_gripper
+        arm = connection.devices.arm
         if gripper is None:
             return
         place(self._gripper, gripper)
@@ -125,14 +140,17 @@ class _Drawing:
 
     def show_samples(self, next_view: NextViews | None) -> None:
         """Draw the samples, the bad ones in red, and the next view."""
-        frames, bad = self._studio.recorders["wrist"].frames, self._studio.bad_samples()
+        frames = self._studio.recorders["wrist"].frames
+        bad = self._studio.bad_samples()
         for name in self._samples.keys() - {frame.name for frame in frames}:
             self._samples.pop(name).remove()
         for frame in frames:
-            name, gripper = frame.name, frame.base_from_gripper
+            name = frame.name
+            gripper = frame.base_from_gripper
             assert gripper is not None, "a wrist recording"
             if name not in self._samples:
-                node, frustum = f"/samples/{name}", Frustum.of(gripper, frame.camera)
+                node = f"/samples/{name}"
+                frustum = Frustum.of(gripper, frame.camera)
                 image = frame.read_image()
                 drawn = add_frustum(self._server, node, frustum, _SIZE_M, GREEN, image)
                 self._samples[name] = drawn
@@ -143,11 +161,15 @@ class _Drawing:
     def show_results(self) -> None:
         """Draw the map and the calibrations, if they have changed."""
         studio = self._studio
-        found = {str(which): calibration for which, calibration in studio.calibrations.items()}
+        found = {
+            str(which): calibration
+            for which, calibration in studio.calibrations.items()
+        }
         drawn = (studio.cell.scenes, *found.values())
         if drawn == self._drawn:
             return
-        shown, self._drawn = None, drawn
+        shown = None
+        self._drawn = drawn
         if studio.cell.scenes:
             scenes = studio.cell.localizer.contents.scenes
             shown = DrawnMap(self._server, scenes)

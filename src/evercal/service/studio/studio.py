@@ -47,9 +47,11 @@ class Studio:
     """
 
     def __init__(self, devices: Devices, out: Path, map: Path | None = None):
-        self.connection, self.out = Connection(devices), out
+        self.connection = Connection(devices)
+        self.out = out
         out.mkdir(parents=True, exist_ok=True)
-        self.cell, self.thing = Map.open(map or out / "map"), Map.open(out / "thing")
+        self.cell = Map.open(map or out / "map")
+        self.thing = Map.open(out / "thing")
         self.mount = devices.rough
         """gripper_from_camera, rough or calibrated; None if nothing is known."""
         self.watched: Callable[[], bool] = lambda: True
@@ -93,7 +95,8 @@ class Studio:
 
     def samples_changed(self, which: Which = "wrist") -> bool:
         """Whether samples were added or removed since they were learned."""
-        found, table = self.calibrations.get(which), self._table_sha256(which)
+        found = self.calibrations.get(which)
+        table = self._table_sha256(which)
         return found is None or table is None or found.source.get(_TABLE) != table
 
     def _table_sha256(self, which: Which) -> str | None:
@@ -108,7 +111,9 @@ class Studio:
     def coverage(self, which: Which = "wrist") -> Coverage:
         """What the samples cover."""
         mount = self.mount if which == "wrist" else None
-        return coverage([_measured(frame) for frame in self.recorders[which].frames], mount)
+        return coverage(
+            [_measured(frame) for frame in self.recorders[which].frames], mount
+        )
 
     def bad_samples(self, which: Which = "wrist") -> list[str]:
         """Names of the samples with problems."""
@@ -120,7 +125,10 @@ class Studio:
         It is one of the reachable poses, else one near those of the samples.
         """
         rows = self.coverage().samples
-        poses = [_measured(frame).base_from_gripper for frame in self.recorders["wrist"].frames]
+        poses = [
+            _measured(frame).base_from_gripper
+            for frame in self.recorders["wrist"].frames
+        ]
         good = [pose for pose, row in zip(poses, rows, strict=True) if not row.problems]
         if not good:
             return None
@@ -180,13 +188,17 @@ class Studio:
         return "There is no next view." if pose is None else self.move_to(pose)
 
     def record(
-        self, on_step: OnStep, stopping: Callable[[], bool] = lambda: False, which: Which = "wrist"
+        self,
+        on_step: OnStep,
+        stopping: Callable[[], bool] = lambda: False,
+        which: Which = "wrist",
     ) -> str:
         """Move from one best view to the next and take samples until nothing is missing."""
         if which == "wrist" and not self.recorders[which].frames:
             self.take_sample()
         while not stopping():
-            reached, pose = self.coverage(which), self.next_pose(which)
+            reached = self.coverage(which)
+            pose = self.next_pose(which)
             good = sum(not row.problems for row in reached.samples)
             if not reached.missing or pose is None or good >= 2 * IMAGES:
                 break
@@ -204,10 +216,13 @@ class Studio:
 
         The scene that the studio learned before is replaced once the new one is in the map.
         """
-        folder, table = self.recording(which), self._table_sha256(which)
-        cell, old = self.cell, self.scene
+        folder = self.recording(which)
+        table = self._table_sha256(which)
+        cell = self.cell
+        old = self.scene
         if which == "fixed":
-            cell, old = self.thing, next(iter(self.thing.scenes), None)
+            cell = self.thing
+            old = next(iter(self.thing.scenes), None)
         scene = _free_name(folder.name, cell.scenes)
         learn = cell.learn if which == "wrist" else cell.eye_to_hand
         learn(folder, name=scene, on_progress=on_step)
@@ -220,7 +235,8 @@ class Studio:
 
     def take_fixed(self) -> str:
         """Take an image of the fixed camera."""
-        image, folder = self.connection.image("fixed"), self.out / "fixed"
+        image = self.connection.image("fixed")
+        folder = self.out / "fixed"
         folder.mkdir(exist_ok=True)
         number = max((int(path.stem) for path in self.fixed_images), default=-1) + 1
         write_jpeg(folder / f"{number:04d}.jpg", image, JPEG_QUALITY)
@@ -248,23 +264,32 @@ class Studio:
         if not files:
             raise InputError("no image of the fixed camera yet; take one first")
         on_step("locating images", 0, len(files))
-        found = self.cell.calibrate(files, camera=self._fixed_intrinsics(), mount="eye_to_hand")
-        self._keep("fixed", replace(found, source={**found.source, "store": str(self.cell.path)}))
+        found = self.cell.calibrate(
+            files, camera=self._fixed_intrinsics(), mount="eye_to_hand"
+        )
+        self._keep(
+            "fixed",
+            replace(found, source={**found.source, "store": str(self.cell.path)}),
+        )
         return f"Calibrated the fixed camera; wrote {self.calibration_file('fixed')}."
 
     def check_fixed(self) -> str:
         """Test with a new image whether the fixed camera has moved."""
-        reference, image = self._made("fixed"), self.connection.image("fixed")
+        reference = self._made("fixed")
+        image = self.connection.image("fixed")
         shift = self.cell.check([image], reference)
         size = f"{shift.translation_mm:.2f} mm and {shift.rotation_deg:.3f} deg"
         if not shift.moved:
             return f"The camera has not moved: it is within {size} of its calibration."
         sure = f"{100 * shift.confidence:.1f} %"
-        return f"The camera has moved by {size} (confidence {sure}). Calibrate it again."
+        return (
+            f"The camera has moved by {size} (confidence {sure}). Calibrate it again."
+        )
 
     def export(self, which: Which, format: str) -> str:
         """Export a calibration in a format of `evercal export`."""
-        calibration, folder = self._made(which), self.out / "export"
+        calibration = self._made(which)
+        folder = self.out / "export"
         folder.mkdir(exist_ok=True)
         # Formats share endings; easy_handeye2 looks files up by their name.
         name = which if format == "easy_handeye2" else f"{which}_{format}"
@@ -277,7 +302,9 @@ class Studio:
 
     def _require_watched(self) -> None:
         if not self.watched():
-            raise InputError("the arm moves only while a browser shows the studio; open its page")
+            raise InputError(
+                "the arm moves only while a browser shows the studio; open its page"
+            )
 
     def _made(self, which: Which) -> Calibration:
         if which not in self.calibrations:
@@ -299,20 +326,26 @@ def _around(recorded: SE3, good: SE3, gripper_from_camera: SE3 | None) -> SE3:
     """Poses (n,) near recorded ones that look at the same point."""
     mount = SE3.identity() if gripper_from_camera is None else gripper_from_camera
     point_m = looked_at(good @ mount)
-    rng, cameras = np.random.default_rng(len(recorded)), recorded @ mount
+    rng = np.random.default_rng(len(recorded))
+    cameras = recorded @ mount
     start = cameras[rng.integers(len(cameras), size=_CANDIDATES)]
     turns, closer = np.zeros((2, _CANDIDATES, 6))
     turns[:, 3:] = rng.uniform(-_TURN_RAD, _TURN_RAD, (_CANDIDATES, 3))
     distance = np.linalg.norm(start.translation_m - point_m, axis=1)
     closer[:, 2] = distance * rng.uniform(-_NEARER, _NEARER, _CANDIDATES)
     closer[:, 5] = rng.uniform(-_ROLL_RAD, _ROLL_RAD, _CANDIDATES)
-    there, back = SE3.from_translation(point_m), SE3.from_translation(-point_m)
+    there = SE3.from_translation(point_m)
+    back = SE3.from_translation(-point_m)
     return there @ SE3.exp(turns) @ back @ start @ SE3.exp(closer) @ mount.inverse()
 
 
 def _free_name(name: str, taken: tuple[str, ...]) -> str:
     numbered = (f"{name}-{number}" for number in range(2, len(taken) + 2))
-    return name if name not in taken else next(free for free in numbered if free not in taken)
+    return (
+        name
+        if name not in taken
+        else next(free for free in numbered if free not in taken)
+    )
 
 
 _NO_FIXED = "No fixed camera was given; restart with --fixed SOURCE, or go on."
@@ -333,11 +366,15 @@ def _record(studio: Studio) -> State:
         return "waits", "No camera on the gripper was given; go on to 'or Hold'."
     if not studio.connection.complete:
         return "waits", "Connect the camera and the robot first."
-    return "to do", "Move the arm until the camera sees the work area; take the first sample."
+    return (
+        "to do",
+        "Move the arm until the camera sees the work area; take the first sample.",
+    )
 
 
 def _learn(studio: Studio) -> State:
-    found, covered = studio.calibrations.get("wrist"), studio.coverage()
+    found = studio.calibrations.get("wrist")
+    covered = studio.coverage()
     if found is not None and not studio.samples_changed():
         return "done", found.verdict
     if not covered.ready:
@@ -348,11 +385,15 @@ def _learn(studio: Studio) -> State:
 
 
 def _fixed(studio: Studio) -> State:
-    images, found = len(studio.fixed_images), studio.calibrations.get("fixed")
+    images = len(studio.fixed_images)
+    found = studio.calibrations.get("fixed")
     if found is not None:
         return "done", found.verdict.replace("--camera", "--fixed-intrinsics")
     if not studio.cell.scenes:
-        return "waits", "Learn the scene first, or let the gripper hold something: see 'or Hold'."
+        return (
+            "waits",
+            "Learn the scene first, or let the gripper hold something: see 'or Hold'.",
+        )
     if studio.connection.devices.fixed_camera is None:
         return "waits", _NO_FIXED
     if not images:
@@ -361,7 +402,8 @@ def _fixed(studio: Studio) -> State:
 
 
 def _hold(studio: Studio) -> State:
-    found, covered = studio.calibrations.get("fixed"), studio.coverage("fixed")
+    found = studio.calibrations.get("fixed")
+    covered = studio.coverage("fixed")
     if found is not None and not studio.samples_changed("fixed"):
         return "done", found.verdict
     if studio.connection.devices.fixed_camera is None:

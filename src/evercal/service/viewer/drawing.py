@@ -57,14 +57,21 @@ def place(node: viser.SceneNodeHandle, base_from_node: SE3 | None) -> None:
     """Move a node of the scene; None hides it."""
     node.visible = base_from_node is not None
     if base_from_node is not None:
-        node.wxyz, node.position = base_from_node.rotation_wxyz, base_from_node.translation_m
+        node.wxyz = base_from_node.rotation_wxyz
+        node.position = base_from_node.translation_m
 
 
 def add_base(server: viser.ViserServer, side_m: float) -> viser.FrameHandle:
     """Add the axes of the robot base and a floor; returns the hidden node of the gripper."""
-    server.scene.add_frame("/base", axes_length=0.05 * side_m, axes_radius=0.0015 * side_m)
+    server.scene.add_frame(
+        "/base", axes_length=0.05 * side_m, axes_radius=0.0015 * side_m
+    )
     server.scene.add_label("/base/label", "robot base")
-    lines = {"cell_size": 0.1, "cell_color": (60, 66, 76), "section_color": (80, 87, 99)}
+    lines = {
+        "cell_size": 0.1,
+        "cell_color": (60, 66, 76),
+        "section_color": (80, 87, 99),
+    }
     server.scene.add_grid("/floor", side_m, side_m, shadow_opacity=0.0, **lines)
     return server.scene.add_frame(GRIPPER, show_axes=False, visible=False)
 
@@ -113,8 +120,11 @@ class DrawnMap:
         for name, cloud in self._clouds.items():
             cloud.colors = self.landmarks[name].colours(by)
 
-    def _add(self, server: viser.ViserServer, name: str, on_keyframe: OnKeyframe | None) -> None:
-        landmarks, node = self.landmarks[name], f"/map/{name.replace('/', '_')}"
+    def _add(
+        self, server: viser.ViserServer, name: str, on_keyframe: OnKeyframe | None
+    ) -> None:
+        landmarks = self.landmarks[name]
+        node = f"/map/{name.replace('/', '_')}"
         self._nodes[name] = server.scene.add_frame(node, show_axes=False)
         self._clouds[name] = server.scene.add_point_cloud(
             f"{node}/landmarks",
@@ -128,7 +138,9 @@ class DrawnMap:
             return
         for view in self.keyframes[name]:
             keyframe = f"{node}/keyframes/{view.number}"
-            camera = add_frustum(server, keyframe, view.frustum, self.frustum_m, GREY, view.image)
+            camera = add_frustum(
+                server, keyframe, view.frustum, self.frustum_m, GREY, view.image
+            )
             camera.on_click(lambda event, view=view: on_keyframe(view, event.client))
             self._cameras.append(camera)
 
@@ -144,7 +156,9 @@ def add_calibrations(
 
     Where no map is drawn, they are in the base.
     """
-    scale = readable_scale([Ellipsoid.of(c.uncertain_pose) for c in calibrations.values()])
+    scale = readable_scale(
+        [Ellipsoid.of(c.uncertain_pose) for c in calibrations.values()]
+    )
     for name, found in calibrations.items():
         ellipsoid = Ellipsoid.of(found.uncertain_pose)
         base = drawn.node(found.source.get("scene")) if drawn else "/base"
@@ -166,7 +180,10 @@ def add_calibrations(
 
 
 def add_arm(
-    server: viser.ViserServer, path: Path, gripper: viser.FrameHandle, links: Sequence[str]
+    server: viser.ViserServer,
+    path: Path,
+    gripper: viser.FrameHandle,
+    links: Sequence[str],
 ) -> list[viser.GuiSliderHandle[float]]:
     """Add an arm at the robot base, and a slider for each joint, which are returned.
 
@@ -181,18 +198,25 @@ def add_arm(
         shown = ViserUrdf(server, path, root_node_name="/robot")
     except Exception as error:  # trimesh raises many types for broken meshes
         text = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise InputError(f"{path}: cannot be drawn ({text}); check its meshes") from None
-    limits, sliders = shown.get_actuated_joint_limits(), []
+        raise InputError(
+            f"{path}: cannot be drawn ({text}); check its meshes"
+        ) from None
+    limits = shown.get_actuated_joint_limits()
+    sliders = []
 
     def move() -> None:
         values = np.array([slider.value for slider in sliders])
         shown.update_cfg(values)
         if link is not None:
-            place(gripper, model.poses(tuple(limits), values[None], None, link)[0].poses[0])
+            place(
+                gripper,
+                model.poses(tuple(limits), values[None], None, link)[0].poses[0],
+            )
 
     with server.gui.add_folder("Arm", expand_by_default=False):
         for name, (low, high) in limits.items():
-            least, most = -np.pi if low is None else low, np.pi if high is None else high
+            least = -np.pi if low is None else low
+            most = np.pi if high is None else high
             start = min(max(0.0, least), most)
             sliders.append(server.gui.add_slider(name, least, most, 0.01, start))
             sliders[-1].on_update(lambda _: move())

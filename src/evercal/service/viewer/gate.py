@@ -37,9 +37,12 @@ def gated(key: str, local: bool) -> Iterator[None]:
         key: First part of the path of every request.
         local: Whether only names of this machine are right.
     """
-    opened, serve = [], websockets.asyncio.server.serve
+    opened = []
+    serve = websockets.asyncio.server.serve
 
-    def gated_serve(handler: Any, *address: Any, process_request: Any, **options: Any) -> Any:
+    def gated_serve(
+        handler: Any, *address: Any, process_request: Any, **options: Any
+    ) -> Any:
         def process(connection: ServerConnection, request: Request) -> Response | None:
             if reason := refusal(request, key, local):
                 return connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
@@ -55,4 +58,6 @@ def gated(key: str, local: bool) -> Iterator[None]:
     finally:
         websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
     if not opened:  # it would be open to everyone
-        raise InputError("this version of viser opens its server otherwise; see constraints.txt")
+        raise InputError(
+            "this version of viser opens its server otherwise; see constraints.txt"
+        )

@@ -6,10 +6,21 @@ from html import escape
 from evercal.calibration.calibration import Calibration
 from evercal.reports.scene import Ellipsoid
 
-GREEN, AMBER, RED, GREY = (22, 163, 74), (217, 119, 6), (220, 38, 38), (107, 114, 128)
-BLUE, MAGENTA = (37, 99, 235), (192, 38, 211)
+GREEN = (22, 163, 74)
+AMBER = (217, 119, 6)
+RED = (220, 38, 38)
+GREY = (107, 114, 128)
+BLUE = (37, 99, 235)
+MAGENTA = (192, 38, 211)
 Colour = tuple[int, int, int]
-_COLOURS = {"waits": GREY, "to do": BLUE, "working": BLUE, "failed": RED, "lost": RED, "ended": RED}
+_COLOURS = {
+    "waits": GREY,
+    "to do": BLUE,
+    "working": BLUE,
+    "failed": RED,
+    "lost": RED,
+    "ended": RED,
+}
 """Of states; those of all others are green."""
 _TEXT = "padding:2px 12px 6px;font-size:0.85em;line-height:1.4;overflow-wrap:anywhere"
 
@@ -29,7 +40,11 @@ def rows_html(rows: Sequence[tuple[str, str]]) -> str:
         f"<td>{escape(value)}</td></tr>"
         for name, value in rows
     )
-    return f'<div style="{_TEXT}"><table style="width:100%">{cells}</table></div>' if rows else ""
+    return (
+        f'<div style="{_TEXT}"><table style="width:100%">{cells}</table></div>'
+        if rows
+        else ""
+    )
 
 
 def calibration_rows(calibration: Calibration) -> list[tuple[str, str]]:
@@ -39,6 +54,9 @@ def calibration_rows(calibration: Calibration) -> list[tuple[str, str]]:
     return [
         ("mount", "on the gripper" if calibration.mount == "eye_in_hand" else "fixed"),
         (f"in {calibration.parent_frame}", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"),
-        ("1 sigma per axis", f"{calibration.sigma_mm:.2g} mm, {calibration.sigma_deg:.2g}°"),
+        (
+            "1 sigma per axis",
+            f"{calibration.sigma_mm:.2g} mm, {calibration.sigma_deg:.2g}°",
+        ),
         ("principal axes", f"{principal} mm"),
     ]

@@ -39,19 +39,24 @@ class Page:
         urdf: Path | None = None,
         address: tuple[str, int] = ("127.0.0.1", 0),
     ):
-        self._localizer, self._closed = localizer, threading.Event()
+        self._localizer = localizer
+        self._closed = threading.Event()
         given = {str(path): read_calibration(path) for path in calibrations}
         self.server = start_server(*address, "evercal view")
         try:
-            scenes, server = localizer.contents.scenes, self.server
+            scenes = localizer.contents.scenes
+            server = self.server
             self.map = drawing.DrawnMap(server, scenes, self.look_through)
             gripper = drawing.add_base(server, 2.5 * self.map.extent_m)
-            default, size_m = scenes[0].adjusted_camera, self.map.frustum_m
+            default = scenes[0].adjusted_camera
+            size_m = self.map.frustum_m
             drawing.add_calibrations(server, given, self.map, default, size_m)
             self._begin_behind(scenes[0].name)
             self._add_controls(given)
             if urdf is not None:
-                hands = [c.parent_frame for c in given.values() if c.mount == "eye_in_hand"]
+                hands = [
+                    c.parent_frame for c in given.values() if c.mount == "eye_in_hand"
+                ]
                 drawing.add_arm(server, urdf, gripper, hands)
         except BaseException:
             self.close()
@@ -68,7 +73,9 @@ class Page:
         height, width = camera.read()[1].shape[:2]
         given = None if intrinsics is None else read_camera(intrinsics, (width, height))
         tracker = Tracker(self._localizer, given)
-        threading.Thread(target=self._track, args=(camera, tracker), daemon=True).start()
+        threading.Thread(
+            target=self._track, args=(camera, tracker), daemon=True
+        ).start()
 
     def look_through(self, view: KeyframeView, client: viser.ClientHandle) -> None:
         """Show a visitor what a keyframe shows: its image stands behind its landmarks."""
@@ -76,9 +83,15 @@ class Page:
         centre_m, width_m, height_m = backdrop(view)
         with client.atomic():
             client.scene.add_image(
-                _THROUGH, view.image, width_m, height_m, wxyz=pose.rotation_wxyz, position=centre_m
+                _THROUGH,
+                view.image,
+                width_m,
+                height_m,
+                wxyz=pose.rotation_wxyz,
+                position=centre_m,
             )
-            client.camera.position, client.camera.wxyz = pose.translation_m, pose.rotation_wxyz
+            client.camera.position = pose.translation_m
+            client.camera.wxyz = pose.rotation_wxyz
             client.camera.fov = view.frustum.fov_rad
         self.map.show_keyframes(False)  # they stand before the landmarks
 
@@ -87,23 +100,34 @@ class Page:
         first = self.server.initial_camera
         with client.atomic():
             client.scene.remove_by_name(_THROUGH)
-            client.camera.up_direction, client.camera.fov = (0.0, 0.0, 1.0), first.fov
-            client.camera.position, client.camera.look_at = first.position, first.look_at
+            client.camera.up_direction = (0.0, 0.0, 1.0)
+            client.camera.fov = first.fov
+            client.camera.position = first.position
+            client.camera.look_at = first.look_at
         self.map.show_keyframes(True)
 
     def _begin_behind(self, scene: str) -> None:
-        poses = SE3.stack([view.frustum.base_from_camera for view in self.map.keyframes[scene]])
+        poses = SE3.stack(
+            [view.frustum.base_from_camera for view in self.map.keyframes[scene]]
+        )
         ahead = poses.rotation_matrix()[:, :, 2].mean(0) * (1, 1, 0)
-        camera, middle = self.server.initial_camera, poses.translation_m.mean(0)
-        camera.position = middle + self.map.extent_m * (np.array([0, 0, 0.4]) - 0.6 * ahead)
+        camera = self.server.initial_camera
+        middle = poses.translation_m.mean(0)
+        camera.position = middle + self.map.extent_m * (
+            np.array([0, 0, 0.4]) - 0.6 * ahead
+        )
         camera.look_at = middle
 
     def _add_controls(self, given: dict[str, Calibration]) -> None:
-        gui, drawn = self.server.gui, self.map
+        gui = self.server.gui
+        drawn = self.map
         keyframes = sum(map(len, drawn.keyframes.values()))
         landmarks = sum(map(len, drawn.landmarks.values()))
         with gui.add_folder("Map"):
-            counts = [("keyframes", f"{keyframes}, click one"), ("landmarks", f"{landmarks:,}")]
+            counts = [
+                ("keyframes", f"{keyframes}, click one"),
+                ("landmarks", f"{landmarks:,}"),
+            ]
             gui.add_html(rows_html(counts))
             scene = gui.add_dropdown("Scene", tuple(drawn.keyframes))
             colour = gui.add_dropdown("Colour", get_args(ColourBy))
@@ -117,9 +141,14 @@ class Page:
 
     def _track(self, camera: StreamCamera, tracker: Tracker) -> None:
         """Show where a camera is, while the page is open somewhere."""
-        server, scenes = self.server, self._localizer.contents.scenes
-        frustum = Frustum.of(SE3.identity(), tracker.camera or scenes[0].adjusted_camera)
-        node = drawing.add_frustum(server, "/live", frustum, 1.3 * self.map.frustum_m, GREEN)
+        server = self.server
+        scenes = self._localizer.contents.scenes
+        frustum = Frustum.of(
+            SE3.identity(), tracker.camera or scenes[0].adjusted_camera
+        )
+        node = drawing.add_frustum(
+            server, "/live", frustum, 1.3 * self.map.frustum_m, GREEN
+        )
         drawing.place(node, None)
         with server.gui.add_folder("Live"):
             text = server.gui.add_html("")
@@ -155,11 +184,14 @@ class Page:
 
 def backdrop(view: KeyframeView) -> tuple[np.ndarray, float, float]:
     """Centre, width and height of a keyframe's image as a plane behind nearly all landmarks."""
-    depth = 1.05 * float(np.percentile(view.depths_m, 98)) if len(view.depths_m) else 1.0
+    depth = (
+        1.05 * float(np.percentile(view.depths_m, 98)) if len(view.depths_m) else 1.0
+    )
     camera = view.camera
     middle = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
     ahead = np.append((middle - (camera.cx, camera.cy)) / (camera.fx, camera.fy), 1.0)
-    width, height = depth * camera.width / camera.fx, depth * camera.height / camera.fy
+    width = depth * camera.width / camera.fx
+    height = depth * camera.height / camera.fy
     return view.frustum.base_from_camera.apply(depth * ahead), width, height
 
 
@@ -186,7 +218,11 @@ def start_server(host: str, port: int, label: str) -> _Server:
     """An empty page with z up, for those who know its address."""
     listening_socket(host, port).close()  # viser alone would take the next free port
     key = secrets.token_urlsafe(16)
-    with gated(key, is_local(host)), contextlib.redirect_stdout(io.StringIO()):  # viser prints
+    # Viser prints.
+    with (
+        gated(key, is_local(host)),
+        contextlib.redirect_stdout(io.StringIO()),
+    ):
         server = _Server(host, port, label=label, verbose=False)
     server.key = key
     server.gui.configure_theme(

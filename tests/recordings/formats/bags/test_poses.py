@@ -43,7 +43,9 @@ def test_frames_can_be_chosen(tmp_path: Path) -> None:
         assert max(pose_distance(frame.base_from_camera, expected)) < 1e-7
     # The other way round, through the shared ancestor of two side branches.
     options = ReadOptions(base_frame="camera_optical", gripper_frame="world")
-    optical_from_world = load_recording(path, options=options).train[0].base_from_gripper
+    optical_from_world = (
+        load_recording(path, options=options).train[0].base_from_gripper
+    )
     world_from_base = SE3.exp([9.0, 9.0, 9.0, 1.0, 0.0, 0.0])
     base_from_optical = BASE_FROM_SHOULDER @ shoulder_from_tool(0) @ TOOL_FROM_OPTICAL
     assert optical_from_world is not None
@@ -82,9 +84,13 @@ def test_joint_states_with_a_urdf_replace_tf(tmp_path: Path) -> None:
         assert frame.base_from_gripper is not None
         expected = SE3.exp([1, 0, 0, 0, 0, 0]) @ SE3.exp([0, 0, 0, 0, 0, at])
         assert max(pose_distance(frame.base_from_gripper, expected)) < 1e-7
-    refused(r"no tf in it.*give the robot's --urdf for /joint_states", load_recording, path)
+    refused(
+        r"no tf in it.*give the robot's --urdf for /joint_states", load_recording, path
+    )
     urdf.write_text(urdf.read_text().replace('"turn"', '"wheel"'))
-    with pytest.raises(InputError, match=r"no values for joint wheel, .* given are finger, turn"):
+    with pytest.raises(
+        InputError, match=r"no values for joint wheel, .* given are finger, turn"
+    ):
         load_recording(path, options=ReadOptions(urdf=urdf))
 
 
@@ -104,7 +110,9 @@ def test_joint_on_several_topics_needs_a_pose_topic(tmp_path: Path) -> None:
         " --pose-topic"
     ) in refusal(bag, tmp_path, urdf=urdf)
     path = tmp_path / "wave"
-    recording = load_recording(path, options=ReadOptions(urdf=urdf, pose_topic="/joint_states"))
+    recording = load_recording(
+        path, options=ReadOptions(urdf=urdf, pose_topic="/joint_states")
+    )
     pose = recording.train[0].base_from_gripper
     assert_pose(pose, SE3.exp([1, 0, 0, 0, 0, 0]) @ SE3.exp([0] * 5 + [1.0]), 1e-7)
     with pytest.raises(
@@ -115,22 +123,39 @@ def test_joint_on_several_topics_needs_a_pose_topic(tmp_path: Path) -> None:
 
 def test_frame_on_several_topics_needs_a_pose_topic(tmp_path: Path) -> None:
     bag = recorded_bag("mcap")
-    bag.tf(0.0, "base_link", "shoulder", BASE_FROM_SHOULDER, static=True, robot="/left")  # agrees
+    # Agrees.
+    bag.tf(0.0, "base_link", "shoulder", BASE_FROM_SHOULDER, static=True, robot="/left")
     bag.tf(0.0, "tool0", "finger", SE3.identity(), static=True)
-    bag.tf(0.0, "tool0", "finger", SE3.exp([1, 0, 0, 0, 0, 0]), static=True, robot="/left")
+    bag.tf(
+        0.0, "tool0", "finger", SE3.exp([1, 0, 0, 0, 0, 0]), static=True, robot="/left"
+    )
     assert len(load_recording(bag.write(tmp_path / "static")).train) == 6
-    expected_message = "tf tool0 -> finger is on several topics, /left/tf, /tf; choose one"
-    assert expected_message in refusal_of(tmp_path / "static/wave", gripper_frame="finger")
+    expected_message = (
+        "tf tool0 -> finger is on several topics, /left/tf, /tf; choose one"
+    )
+    assert expected_message in refusal_of(
+        tmp_path / "static/wave", gripper_frame="finger"
+    )
     for i in range(51):
-        bag.tf(i / 25, "shoulder", "tool0", shoulder_from_tool(i / 25 + 0.3), robot="/left")
-    expected_message = "tf shoulder -> tool0 is on several topics, /left/tf, /tf; choose one"
+        bag.tf(
+            i / 25, "shoulder", "tool0", shoulder_from_tool(i / 25 + 0.3), robot="/left"
+        )
+    expected_message = (
+        "tf shoulder -> tool0 is on several topics, /left/tf, /tf; choose one"
+    )
     assert expected_message in refusal(bag, tmp_path / "moving")
     for topic, late in (("/tf", 0.0), ("/left/tf", 0.3)):
-        recording = load_recording(tmp_path / "moving/wave", options=ReadOptions(pose_topic=topic))
+        recording = load_recording(
+            tmp_path / "moving/wave", options=ReadOptions(pose_topic=topic)
+        )
         pose = recording.train[0].base_from_gripper
         assert_pose(pose, BASE_FROM_SHOULDER @ shoulder_from_tool(late), 1e-7)
-    expected_message = "no transforms on topic '/right/tf'; transforms are on /left/tf, /tf"
-    assert expected_message in refusal_of(tmp_path / "moving/wave", pose_topic="/right/tf")
+    expected_message = (
+        "no transforms on topic '/right/tf'; transforms are on /left/tf, /tf"
+    )
+    assert expected_message in refusal_of(
+        tmp_path / "moving/wave", pose_topic="/right/tf"
+    )
 
 
 def test_ambiguous_frames_are_refused(tmp_path: Path) -> None:
@@ -138,9 +163,13 @@ def test_ambiguous_frames_are_refused(tmp_path: Path) -> None:
     path = bag.write(tmp_path)
     message = "--base-frame table: no such frame in tf; it has world, base_link"
     assert message in refusal_of(path, base_frame="table")
-    assert "--gripper-frame hand: no such frame" in refusal_of(path, gripper_frame="hand")
+    assert "--gripper-frame hand: no such frame" in refusal_of(
+        path, gripper_frame="hand"
+    )
     bag.tf(0.0, "base_link", "base", SE3.identity(), static=True)
-    assert "--base-frame (it may be base_link or base); tf has" in refusal(bag, tmp_path / "ur")
+    assert "--base-frame (it may be base_link or base); tf has" in refusal(
+        bag, tmp_path / "ur"
+    )
     odd = Bag("mcap")
     odd.tf(0.0, "map", "phone", SE3.identity())
     odd.image(0.0, "/cam/image_raw", picture(0))
@@ -151,9 +180,19 @@ def test_ambiguous_frames_are_refused(tmp_path: Path) -> None:
 
 def test_broken_trees_of_frames_are_refused(tmp_path: Path) -> None:
     for name, parent, child, message in (
-        ("apart", "elsewhere", "flange", "tf has no chain between 'base_link' and 'flange'"),
+        (
+            "apart",
+            "elsewhere",
+            "flange",
+            "tf has no chain between 'base_link' and 'flange'",
+        ),
         ("circle", "camera_optical", "world", "tf has a cycle"),
-        ("two", "world", "tool0", "tf frame 'tool0' has several parents, shoulder, world"),
+        (
+            "two",
+            "world",
+            "tool0",
+            "tf frame 'tool0' has several parents, shoulder, world",
+        ),
     ):
         bag = recorded_bag("mcap")
         bag.tf(0.1, parent, child, SE3.identity())

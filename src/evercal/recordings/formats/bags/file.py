@@ -12,8 +12,10 @@ from evercal.recordings.images import files_in
 from evercal.recordings.text_files import few, library_errors
 
 _FILES = (".bag", ".mcap", ".db3")
-IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-CAMERA_INFO, JOINT_STATE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+JOINT_STATE = "sensor_msgs/msg/JointState"
 _REMEDIES = {
     "not indexed": "; repair it with 'rosbag reindex'",
     "end magic": "; its recorder did not end, restore it with 'mcap recover FILE -o NEW.mcap'",
@@ -62,7 +64,9 @@ class BagFile:
         parts = _parts(path)
         ends = {part.suffix for part in parts}
         if len(ends) > 1:
-            raise InputError(f"{path}: holds several kinds of bags ({', '.join(ends)}); name one")
+            raise InputError(
+                f"{path}: holds several kinds of bags ({', '.join(ends)}); name one"
+            )
         with library_errors(f"{path}: rosbags cannot read it", _REMEDIES):
             self._reader = highlevel.AnyReader(parts, default_typestore=types)
             self._reader.open()
@@ -77,15 +81,22 @@ class BagFile:
         """Names of the topics of some types, sorted."""
         return sorted(topic for topic, kind in self.kinds.items() if kind in kinds)
 
-    def require_topic(self, wanted: str | None, topics: Sequence[str], what: str) -> None:
+    def require_topic(
+        self, wanted: str | None, topics: Sequence[str], what: str
+    ) -> None:
         """Refuse a topic that is none of `topics`, which hold `what`."""
         if wanted is not None and wanted not in topics:
             there = ", ".join(topics) or "no topic"
-            raise InputError(f"{self.path}: no {what} on topic {wanted!r}; {what} are on {there}")
+            raise InputError(
+                f"{self.path}: no {what} on topic {wanted!r}; {what} are on {there}"
+            )
 
     def contents(self) -> str:
         """List of the topics, for messages."""
-        words = [f"{t} ({kind.replace('/msg', '')})" for t, kind in sorted(self.kinds.items())]
+        words = [
+            f"{t} ({kind.replace('/msg', '')})"
+            for t, kind in sorted(self.kinds.items())
+        ]
         return few(words, most=30) or "nothing"
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
@@ -103,7 +114,9 @@ class BagFile:
         """Content of the first message of a topic that holds some."""
         for message in self.messages([topic]):
             return message.content
-        raise InputError(f"{self.path}: damaged: {topic} has no message, although some are listed")
+        raise InputError(
+            f"{self.path}: damaged: {topic} has no message, although some are listed"
+        )
 
     def message(self, topic: str, logged_ns: int, repeat: int) -> Message:
         """Read one message."""
@@ -111,10 +124,15 @@ class BagFile:
             for message in self._messages([topic], logged_ns, logged_ns + 1):
                 if message.repeat == repeat:
                     return message
-        raise InputError(f"{self.path}: a message of {topic} is gone; load the bag again")
+        raise InputError(
+            f"{self.path}: a message of {topic} is gone; load the bag again"
+        )
 
     def _messages(
-        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+        self,
+        topics: Collection[str],
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
     ) -> Iterator[Message]:
         links = [link for link in self._reader.connections if link.topic in topics]
         if not links:
@@ -142,6 +160,9 @@ def _parts(path: Path) -> list[Path]:
     if path.is_file():
         return [path] if path.suffix in _FILES else []
     metadata = path / "metadata.yaml"
-    if metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()[:1000]:
+    if (
+        metadata.is_file()
+        and b"rosbag2_bagfile_information" in metadata.read_bytes()[:1000]
+    ):
         return [path]
     return [part for part in files_in(path, _FILES) if part.is_file()]

@@ -17,7 +17,15 @@ from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
 
 Array = NDArray[np.float64]
-_BASES = ("base_link", "base", "panda_link0", "fr3_link0", "fer_link0", "lbr_link_0", "link_base")
+_BASES = (
+    "base_link",
+    "base",
+    "panda_link0",
+    "fr3_link0",
+    "fer_link0",
+    "lbr_link_0",
+    "link_base",
+)
 _GRIPPERS = (
     "tool0", "flange", "ee_link", "panda_hand", "fr3_hand", "fer_hand", "lbr_link_ee", "link_eef",
     "gripper_link", "tool_link",
@@ -54,13 +62,15 @@ class _TfTree:
     """Transforms, added in any order; `topic` is used if several topics move one frame."""
 
     def __init__(self, source: str, topic: str | None = None) -> None:
-        self._source, self._topic = source, topic
+        self._source = source
+        self._topic = topic
         self._edges: dict[str, dict[str, _Edge]] = {}  # by child and topic
 
     def add(self, transform: _Transform, topic: str) -> None:
         """Add a transform of a topic; /tf_static belongs to /tf."""
         length = float(np.linalg.norm(transform.quaternion))
-        parent, child = plain_name(transform.parent), plain_name(transform.child)
+        parent = plain_name(transform.parent)
+        child = plain_name(transform.child)
         if not (abs(length - 1) < 1e-2 and np.isfinite(transform.translation).all()):
             raise InputError(
                 f"{self._source}: tf {parent} -> {child}: quaternion (w x y z)"
@@ -73,15 +83,25 @@ class _TfTree:
 
     def frames(self) -> tuple[str, ...]:
         """All frames, parents before children."""
-        parents = {p for topics in self._edges.values() for e in topics.values() for p in e.parents}
-        return tuple(sorted({*parents, *self._edges}, key=lambda f: (len(self._chain(f)), f)))
+        parents = {
+            p
+            for topics in self._edges.values()
+            for e in topics.values()
+            for p in e.parents
+        }
+        return tuple(
+            sorted({*parents, *self._edges}, key=lambda f: (len(self._chain(f)), f))
+        )
 
     def connected(self, a: str, b: str) -> bool:
         return self._chain(a)[-1] == self._chain(b)[-1]
 
-    def a_from_b(self, a: str, b: str, stamps_s: Array) -> tuple[SE3, NDArray[np.bool_]]:
+    def a_from_b(
+        self, a: str, b: str, stamps_s: Array
+    ) -> tuple[SE3, NDArray[np.bool_]]:
         """Interpolate (n,) poses of frame b in frame a, and whether each is valid."""
-        up, down = self._chain(a), self._chain(b)
+        up = self._chain(a)
+        down = self._chain(b)
         for child in (frame for frame in (*up, *down) if frame in self._edges):
             self._refuse_ambiguous(child)
         if up[-1] != down[-1]:
@@ -104,14 +124,20 @@ class _TfTree:
     def _edge(self, child: str) -> _Edge:
         topics = self._edges[child]
         moving = [topic for topic, edge in topics.items() if edge.moving]
-        return topics[self._topic if self._topic in topics else (moving or [*topics])[0]]
+        return topics[
+            self._topic if self._topic in topics else (moving or [*topics])[0]
+        ]
 
     def _refuse_ambiguous(self, child: str) -> None:
-        topics, edge = self._edges[child], self._edge(child)
+        topics = self._edges[child]
+        edge = self._edge(child)
         others = [] if self._topic in topics else [*topics.values()]
         moving = sum(bool(other.moving) for other in others)
         # Equal static transforms agree, and one moving topic takes precedence over static ones.
-        last = [np.r_[e.transforms[-1].translation, e.transforms[-1].quaternion] for e in others]
+        last = [
+            np.r_[e.transforms[-1].translation, e.transforms[-1].quaternion]
+            for e in others
+        ]
         agree = moving == 1 or (
             not moving and all(np.allclose(last[0], x, atol=1e-6) for x in last)
         )
@@ -133,7 +159,9 @@ class _TfTree:
         _, _, stamps, quaternions, translations = zip(*edge.transforms, strict=True)
         poses = SE3(np.array(quaternions), np.array(translations))
         if not edge.moving:
-            return poses[np.zeros(len(stamps_s), int)], np.ones(len(stamps_s), dtype=bool)
+            return poses[np.zeros(len(stamps_s), int)], np.ones(
+                len(stamps_s), dtype=bool
+            )
         return PoseTrack(np.array(stamps), poses).at(stamps_s)
 
     def _chain(self, frame: str) -> list[str]:
@@ -181,7 +209,11 @@ def poses_at_images(
     of_camera = gripper == camera_frame
     owner = "the camera" if of_camera else "the gripper"
     notes = [f"poses of {owner} are those of {gripper} in {base}, from tf"]
-    if not of_camera and camera_frame in tree.frames() and tree.connected(base, camera_frame):
+    if (
+        not of_camera
+        and camera_frame in tree.frames()
+        and tree.connected(base, camera_frame)
+    ):
         notes.append(
             f"tf also has the camera ({camera_frame}), which is not used; to use it, give"
             f" --gripper-frame {camera_frame}"
@@ -198,15 +230,19 @@ def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[_TfTree, list[f
             f"{bag.path}: no tf in it, so there are no gripper poses; record /tf and"
             f" /tf_static{instead}. It holds {bag.contents()}"
         )
-    bag.require_topic(wanted, [t for t in topics if not t.endswith("tf_static")], "transforms")
-    tree, times = _TfTree(str(bag.path), wanted), []
+    bag.require_topic(
+        wanted, [t for t in topics if not t.endswith("tf_static")], "transforms"
+    )
+    tree = _TfTree(str(bag.path), wanted)
+    times = []
     for message in bag.messages(topics):
         for entry in message.content.transforms:
             stamp = None
             if not message.topic.endswith("tf_static"):
                 stamp = message.seconds(entry.header, zero_ns)
                 times.append(stamp)
-            t, q = entry.transform.translation, entry.transform.rotation
+            t = entry.transform.translation
+            q = entry.transform.rotation
             frames = entry.header.frame_id, entry.child_frame_id
             link = _Transform(*frames, stamp, (q.w, q.x, q.y, q.z), (t.x, t.y, t.z))
             tree.add(link, message.topic.removesuffix("_static"))
@@ -225,12 +261,18 @@ def _frame(
         return plain_name(wanted)
     names = [name for name in usual if name in frames]
     if len(names) != 1:
-        which = f"it may be {' or '.join(names)}" if names else "no frame has a usual name"
-        raise InputError(f"{bag.path}: give {option} ({which}); tf has {', '.join(frames)}")
+        which = (
+            f"it may be {' or '.join(names)}" if names else "no frame has a usual name"
+        )
+        raise InputError(
+            f"{bag.path}: give {option} ({which}); tf has {', '.join(frames)}"
+        )
     return names[0]
 
 
-def _refuse_times(bag: BagFile, stamps: Array, times: Sequence[float], what: str) -> NoReturn:
+def _refuse_times(
+    bag: BagFile, stamps: Array, times: Sequence[float], what: str
+) -> NoReturn:
     covered = f"{min(times):.1f} to {max(times):.1f} s" if len(times) else "no time"
     raise InputError(
         f"{bag.path}: no image has a pose: images were taken at {stamps.min():.1f} to"
@@ -251,7 +293,8 @@ def _from_joints(
     bag.require_topic(options.pose_topic, topics, "joint states")
     tracks = _joint_tracks(bag, topics, zero_ns)
     needed = model.arm(base, gripper).joints
-    values, valid = np.zeros((len(stamps), len(tracks))), np.ones(len(stamps), dtype=bool)
+    values = np.zeros((len(stamps), len(tracks)))
+    valid = np.ones(len(stamps), dtype=bool)
     times: Sequence[float] = ()
     for column, (name, track) in enumerate(tracks.items()):
         if name not in needed:
@@ -263,7 +306,9 @@ def _from_joints(
             )
         topic = options.pose_topic if options.pose_topic in track else next(iter(track))
         times, positions = zip(*track[topic], strict=True)
-        values[:, column], here = interpolate(np.array(times), np.array(positions), stamps)
+        values[:, column], here = interpolate(
+            np.array(times), np.array(positions), stamps
+        )
         valid &= here
     moved, notes = model.poses([*tracks], values, base, gripper, bag.path)
     if not valid.any():
@@ -275,9 +320,13 @@ def _joint_tracks(
     bag: BagFile, topics: Sequence[str], zero_ns: int
 ) -> dict[str, dict[str, list[tuple[float, float]]]]:
     """By joint and topic: pairs of seconds after `zero_ns` and position."""
-    tracks: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
+    tracks: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(
+        lambda: defaultdict(list)
+    )
     for message in bag.messages(topics):
         stamp = message.seconds(message.content.header, zero_ns)
-        for name, position in zip(message.content.name, message.content.position, strict=False):
+        for name, position in zip(
+            message.content.name, message.content.position, strict=False
+        ):
             tracks[name][message.topic].append((stamp, float(position)))
     return tracks
