@@ -24,7 +24,7 @@ from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3, Camera
 from evercal.map import Map
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.poses.arm import Arm, Motion
+from evercal.robot.arm import Arm, Motion
 from evercal.simulation import panda_arm
 from evercal.simulation.box_room import look_at
 from evercal.simulation.cell_room import WORK_AREA_M, cell_room

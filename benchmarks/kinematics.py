@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tyro.conf import Positional
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.kinematics import RobotModel
+from evercal.typing import Array
 
-Array = NDArray[np.float64]
 SETS = 20
 """Random joint values of each robot."""
 
@@ -62,11 +61,10 @@ def run(files: Annotated[tuple[Path, ...], Positional]) -> None:
             )
             continue
         rng = np.random.default_rng(len(arms))
-        values = {
-            name: rng.uniform(-2, 2, SETS)
-            for arm in arms.values()
-            for name in arm.joints
-        }
+        values = dict[str, Array]()
+        for arm in arms.values():
+            for name in arm.joints:
+                values[name] = rng.uniform(-2, 2, SETS)
         cells = []
         for reader in (by_pin, by_urchin):
             try:

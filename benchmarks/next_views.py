@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.rows import Row, save, show
@@ -28,8 +27,9 @@ from evercal.localization.pose_refinement import linearise
 from evercal.simulation.box_room import default_camera
 from evercal.simulation.cell_room import WORK_AREA_M
 from evercal.simulation.virtual_cell import VirtualCell, nominal_mount
+from evercal.typing import Array, IntArray
 
-Order = Callable[["Trial"], NDArray[np.int64]]
+Order = Callable[["Trial"], IntArray]
 
 FIRST = 3
 """Random poses that every order starts with."""
@@ -47,20 +47,20 @@ class Trial:
     """(n,) base_from_gripper."""
     mount: SE3
     """The true gripper_from_camera."""
-    image: NDArray[np.floating]
+    image: Array
     """(n, 6, 6) covariance of the camera pose that an image at each pose gives."""
     rng: np.random.Generator
-    start: NDArray[np.int64]
+    start: IntArray
     """(FIRST,) poses that every order starts with."""
 
     @property
-    def weights(self) -> NDArray[np.floating]:
+    def weights(self) -> Array:
         """(n, 6, 6) inverse covariance of the residual at each pose."""
         to_camera = self.mount.inverse().adjoint()
         return np.linalg.inv(to_camera @ GRIPPER_NOISE @ to_camera.T + self.image)
 
     @property
-    def added(self) -> NDArray[np.floating]:
+    def added(self) -> Array:
         """(n, 12, 12) information of each pose at the truth."""
         jacobian = wrist_jacobian(self.reachable, self.mount, WORK_AREA_M)
         return np.swapaxes(jacobian, 1, 2) @ self.weights @ jacobian
@@ -79,9 +79,7 @@ def trial(seed: int, pool: int) -> Trial:
     )
 
 
-def seen_covariance(
-    base_from_camera: SE3, points_m: NDArray[np.floating]
-) -> NDArray[np.floating]:
+def seen_covariance(base_from_camera: SE3, points_m: Array) -> Array:
     """(6, 6) covariance of a camera pose from the points that the camera sees."""
     camera = default_camera(640, 480)
     pixels = camera.project(base_from_camera.inverse().apply(points_m))
@@ -93,13 +91,13 @@ def seen_covariance(
     return np.linalg.inv(slopes @ slopes.T + 1e-9 * np.eye(6)) * PIXEL_PX**2
 
 
-def random_order(draw: Trial) -> NDArray[np.int64]:
+def random_order(draw: Trial) -> IntArray:
     """Any pose that was not used."""
     rest = np.setdiff1d(np.arange(len(draw.reachable)), draw.start)
     return np.concatenate([draw.start, draw.rng.permutation(rest)])[:LONGEST]
 
 
-def farthest_order(draw: Trial) -> NDArray[np.int64]:
+def farthest_order(draw: Trial) -> IntArray:
     """The pose whose rotation differs most from all used ones."""
     chosen = draw.start.tolist()
     gap = np.full(len(draw.reachable), np.inf)
@@ -111,27 +109,27 @@ def farthest_order(draw: Trial) -> NDArray[np.int64]:
     return np.array(chosen)
 
 
-def planned(draw: Trial, mount: SE3 | None) -> NDArray[np.int64]:
+def planned(draw: Trial, mount: SE3 | None) -> IntArray:
     """The poses of `next_views` after the first ones; it knows a rough mount, or none."""
     used = draw.reachable[draw.start]
     chosen = next_views(used, draw.reachable, LONGEST - FIRST, mount)
     return np.concatenate([draw.start, chosen.index])
 
 
-def covariances(draw: Trial, order: NDArray[np.int64]) -> NDArray[np.floating]:
+def covariances(draw: Trial, order: IntArray) -> Array:
     """(n, 6, 6) of gripper_from_camera after each pose, at the truth, without a prior."""
     added = np.cumsum(draw.added[order], 0)
     weak = np.diag([1e-2, 1e-2, 1e-2, 1e-4, 1e-4, 1e-4, *np.repeat([1e-4, 1e-6], 3)])
     return np.linalg.inv(added + weak)[:, :6, :6]
 
 
-def reached(draw: Trial, order: NDArray[np.int64], sigma_mm: float) -> int:
+def reached(draw: Trial, order: IntArray, sigma_mm: float) -> int:
     """Poses after which the deviation of the position is below a limit."""
     sigmas = [axis_deviation(covariance)[0] for covariance in covariances(draw, order)]
     return next((i + 1 for i, sigma in enumerate(sigmas) if sigma <= sigma_mm), LONGEST)
 
 
-def simulated_mm(draw: Trial, order: NDArray[np.int64], draws: int) -> float:
+def simulated_mm(draw: Trial, order: IntArray, draws: int) -> float:
     """Root mean square error of the position per axis, from drawn noise and nonlinear estimates."""
     grippers = draw.reachable[order]
     views = len(order)
@@ -150,9 +148,7 @@ def simulated_mm(draw: Trial, order: NDArray[np.int64], draws: int) -> float:
     return 1000 * float(np.sqrt(np.mean(np.square(errors))))
 
 
-def _estimate(
-    mount: SE3, stated: SE3, measured: SE3, weights: NDArray[np.floating]
-) -> SE3:
+def _estimate(mount: SE3, stated: SE3, measured: SE3, weights: Array) -> SE3:
     """Gauss-Newton from the truth; the weights are those of the model."""
     scene = SE3.from_translation(WORK_AREA_M)
     for _ in range(5):

@@ -4,9 +4,9 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.features.encoder import Encoder, load_encoder
+from evercal.typing import Float32Array, Image
 
 STEM = (4, 3, 1), (4, 3, 1), (4, 2, 2), (4, 3, 1), (8, 2, 2)
 TINY = 2, STEM, (3, 1, 3), 1, 8
@@ -23,7 +23,7 @@ class BlockMean(Encoder):
         self.stride = 8
         self.width = 1
 
-    def __call__(self, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def __call__(self, grey: Image) -> Float32Array:
         rows, columns = (side // 8 for side in grey.shape)
         blocks = grey[: 8 * rows, : 8 * columns].reshape(rows, 8, columns, 8)
         return blocks.mean((1, 3), dtype=np.float32)[..., None] / 255

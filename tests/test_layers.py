@@ -21,6 +21,7 @@ from evercal.recordings.formats import generic
 ORDER = (
     "geometry",
     "storage",
+    "robot",
     "recordings",
     "features",
     "mapping",
@@ -37,7 +38,7 @@ ORDER = (
     "cli",
 )
 """Folders, and the module map.py."""
-FOR_ALL = ("bounds", "cluster", "errors", "processes", "progress")
+FOR_ALL = ("bounds", "cluster", "errors", "processes", "progress", "typing")
 FACES = ("__init__", "__main__")
 """Modules of the root that may import everything."""
 PRODUCT = ORDER[: ORDER.index("simulation")]

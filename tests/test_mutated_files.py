@@ -30,8 +30,8 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.map import Map
 from evercal.recordings import ReadOptions, load_recording, read_image, write_image
+from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.formats import generic
-from evercal.recordings.poses.camera_file import read_camera
 from evercal.recordings.poses.robot_poses import read_robot_poses
 from evercal.recordings.samples import CELL
 from evercal.storage.manifest import write_manifest

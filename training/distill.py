@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import torch
 import tyro
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -23,6 +22,7 @@ from evercal.features.encoder import WEIGHTS, load_encoder
 from evercal.features.vlad import fit_centroids
 from evercal.storage.atomic import write_bytes
 from evercal.storage.tensors import save_tensors
+from evercal.typing import Image
 from training.furnished import cached_furnished_views
 from training.network import SHIPPED, TEACHER, LocalEncoder, from_onnx, onnx_bytes
 from training.pairs import (
@@ -42,7 +42,7 @@ COMPARED = 256
 FURNISHED, BOXES, LEAVES = 4, 2, 2
 """Images of each kind in a step."""
 
-Images = NDArray[np.uint8]
+Images = Image
 
 
 class Pictures(NamedTuple):

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 from evercal.errors import InputError
 from evercal.mapping.store import MapStore
 from evercal.recordings.frame import Mount, Recording
+from evercal.typing import PathLike
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
     from evercal.mapping.manage import Merged, OnClash
     from evercal.mapping.refresh import RefreshOptions
     from evercal.progress import OnProgress
-
-PathLike = str | os.PathLike[str]
 
 
 class Map:

@@ -7,32 +7,32 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.features.encoder import WEIGHTS, Encoder, load_encoder
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
 from evercal.storage.tensors import save_tensors
+from evercal.typing import Float32Array, Image
 
 from ..encoders import tiny_encoder, tiny_onnx
 
 TEACHER_FILE = WEIGHTS / "encoder-1.onnx"
 
 
-def image(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
+def image(height: int, width: int, seed: int = 0) -> Image:
     return (
         np.random.default_rng(seed).integers(0, 256, (height, width)).astype(np.uint8)
     )
 
 
-def blocks(grey: NDArray[np.float32], stride: int = 8) -> NDArray[np.float32]:
+def blocks(grey: Float32Array, stride: int = 8) -> Float32Array:
     """Rows of each cell, added up."""
     rows, columns = (side // stride for side in grey.shape)
     return grey.reshape(rows, stride, columns, stride).sum(1) + 1
 
 
-def others(grey: NDArray[np.float32]) -> NDArray[np.float32]:
+def others(grey: Float32Array) -> Float32Array:
     """Features of another function."""
     return blocks(grey) ** 2
 

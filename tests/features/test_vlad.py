@@ -2,18 +2,17 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
 from evercal.features.vlad import (
     CENTROIDS,
     WIDTH,
-    Array,
     Vlad,
     fit_centroids,
     similar_pairs,
 )
+from evercal.typing import Array
 
 from ..encoders import tiny_encoder
 
@@ -60,7 +59,7 @@ def test_centroids_of_separate_clusters_are_their_means() -> None:
     assert (similarity.max(0) > 0.98).mean() > 0.5
 
 
-def by_hand(rows: Array, centroids: Array) -> NDArray[np.float64]:
+def by_hand(rows: Array, centroids: Array) -> Array:
     """Unit sums of the differences from each centroid, one after the other."""
     sums = np.zeros(centroids.shape)
     for row in rows.astype(float):

@@ -7,7 +7,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from evercal.geometry import SE3, Camera, pose_distance
@@ -19,8 +18,7 @@ from evercal.mapping.landmarks import Landmarks
 from evercal.mapping.patches import cut_patches, image_pyramid, to_level
 from evercal.mapping.scene_map import MapContents
 from evercal.recordings.frame import Recording
-
-Array = NDArray[np.floating]
+from evercal.typing import Array
 
 CAMERA = Camera(320, 240, 290.0, 280.0, 161.0, 118.0)
 POSE = SE3.exp(np.array([0.4, -0.3, 1.2, 0.3, -0.5, 0.2]))

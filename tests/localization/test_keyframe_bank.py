@@ -8,11 +8,11 @@ from threading import Barrier
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from evercal.features.encoder import Encoder
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.mapping.scene_map import MapContents
+from evercal.typing import Float32Array, Image
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def several(hall_map: MapContents) -> MapContents:
     return MapContents(hall_map.encoder, hall_map.short_side, scenes)
 
 
-def features(seed: int, contents: MapContents) -> NDArray[np.float32]:
+def features(seed: int, contents: MapContents) -> Float32Array:
     drawn = np.random.default_rng(seed).normal(size=(300, contents.encoder.width))
     return (drawn / np.linalg.norm(drawn, axis=1, keepdims=True)).astype(np.float32)
 
@@ -101,7 +101,7 @@ class Counted(Encoder):
         self.barrier: Barrier | None = None
         self.calls = 0
 
-    def __call__(self, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def __call__(self, grey: Image) -> Float32Array:
         self.calls += 1
         if self.barrier is not None:
             self.barrier.wait()

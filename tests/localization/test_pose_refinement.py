@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import exp1
 
@@ -26,8 +25,8 @@ from evercal.localization.pose_refinement import (
     linearise,
     minimise,
 )
+from evercal.typing import Array
 
-Array = NDArray[np.floating]
 CAMERA = Camera(640, 480, 520.0, 500.0, 322.0, 238.0)
 POSE = SE3.exp(np.array([0.4, -0.3, 1.2, 0.3, -0.5, 0.2]))
 NEAR = POSE @ SE3.exp(np.array([0.03, -0.02, 0.04, 0.02, -0.02, 0.01]))

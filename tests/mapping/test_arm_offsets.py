@@ -12,7 +12,7 @@ from evercal.mapping.arm_offsets import ArmOffsets
 from evercal.mapping.build import MapOptions
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment
 from evercal.recordings.frame import Frame, Mount
-from evercal.recordings.poses.arm import Arm, Motion
+from evercal.robot.arm import Arm, Motion
 from tests.mapping.test_bundle_adjustment import CAMERA, FRAMES, world
 
 X, Y, Z = np.eye(3)

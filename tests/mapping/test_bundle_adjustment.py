@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import scipy.optimize
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError
@@ -31,8 +30,8 @@ from evercal.mapping.bundle_equations import (
     StatedFrames,
 )
 from evercal.simulation.box_room import look_at
+from evercal.typing import Array
 
-Array = NDArray[np.floating]
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 FRAMES = 30
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry.camera import Camera
@@ -15,8 +14,8 @@ from evercal.mapping.landmarks import (
     project_surface,
     slopes,
 )
+from evercal.typing import Array
 
-Array = NDArray[np.floating]
 PLAIN = Camera(320, 240, 262.0, 259.0, 161.0, 118.0)
 DISTORTED = Camera(320, 240, 262.0, 259.0, 161.0, 118.0, (-0.2, 0.06, 0.001, -0.002))
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from evercal.mapping.patches import (
     SIDE,
@@ -19,8 +18,8 @@ from evercal.mapping.patches import (
     to_level,
     whitening,
 )
+from evercal.typing import Array
 
-Array = NDArray[np.floating]
 Picture = Callable[[Array], Array]
 HEIGHT = 120
 WIDTH = 160

@@ -20,9 +20,9 @@ from evercal.calibration.calibration import read_calibration
 from evercal.calibration.export.request import read_link_from_optical
 from evercal.errors import InputError
 from evercal.recordings import read_image, read_robot_poses, write_image
+from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.images import as_rgb
-from evercal.recordings.poses.camera_file import read_camera
-from evercal.recordings.text_files import natural_key
+from evercal.storage.text_files import natural_key
 
 Read = Callable[[Path], object]
 HEADER = "image,x,y,z,qw,qx,qy,qz\n"

@@ -18,9 +18,9 @@ from evercal.recordings import (
     read_robot_poses,
     write_image,
 )
+from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.formats import lerobot, wrist
 from evercal.recordings.formats.lerobot import _pose_feature
-from evercal.recordings.poses.camera_file import read_camera
 from evercal.recordings.poses.kinematics import read_joints
 
 from .checks import assert_pose

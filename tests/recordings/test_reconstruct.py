@@ -5,7 +5,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
@@ -14,6 +13,7 @@ from evercal.recordings.images import write_image
 from evercal.recordings.reconstruct import _moving, reconstruct
 from evercal.recordings.samples import sample_rooms
 from evercal.recordings.streams import StreamFrame
+from evercal.typing import Array
 
 from .checks import refused
 
@@ -62,7 +62,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def apart(a: Array, b: Array) -> Array:
     """Distances of points (n, 3) after the best similarity (Umeyama 1991)."""
     a = a - a.mean(0)
     b = b - b.mean(0)

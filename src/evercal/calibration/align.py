@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -26,11 +25,11 @@ from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.mapping.map_frame import MapFrame, Similarity
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import Picture
+from evercal.typing import Array, Image
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
 
-Array = NDArray[np.float64]
 LEAST_IMAGES = 5
 
 
@@ -161,7 +160,7 @@ def align_by_points(
     localizer: "Localizer",
     scene: str,
     points: Mapping[str, Array],
-    picks: Sequence[tuple[str, NDArray[np.uint8], Mapping[str, Array]]],
+    picks: Sequence[tuple[str, Image, Mapping[str, Array]]],
     scale_known: bool = True,
 ) -> MapAlignment:
     """Estimate the base frame from touched points.

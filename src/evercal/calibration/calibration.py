@@ -13,21 +13,20 @@ repeat other values for their readers.
 """
 
 import itertools
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_distance
 from evercal.recordings.frame import Mount
-from evercal.recordings.text_files import read_text
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
+from evercal.storage.text_files import read_text
+from evercal.typing import Array, PathLike
 
 FORMAT = "evercal-calibration"
 VERSION = 1
@@ -55,7 +54,7 @@ class ErrorTerm:
     rotation_deg: float
 
     @classmethod
-    def of(cls, name: str, covariance: NDArray[np.floating]) -> Self:
+    def of(cls, name: str, covariance: Array) -> Self:
         """The term of a covariance (6, 6), metres and radians; rounding below zero counts as 0."""
         variance = np.maximum(np.diag(covariance), 0.0)
         return cls(name, *axis_deviation(np.diag(variance)))
@@ -101,7 +100,7 @@ class Calibration:
     mount: Mount
     """`eye_to_hand`: the camera stands still. `eye_in_hand`: the gripper carries it."""
     parent_from_child: SE3
-    covariance: NDArray[np.float64]
+    covariance: Array
     """(6, 6) of (translation in the parent frame, metres; rotation about child axes, radians)."""
     parent_frame: str = "base"
     """`base` for eye_to_hand, `gripper` for eye_in_hand, or the robot's names of them."""
@@ -124,9 +123,7 @@ class Calibration:
     joints: tuple[JointOffset, ...] = ()
     """Offsets of the k joints of the arm, if its joint values were stated. The transform is that of
     an arm that moves with them."""
-    joint_covariance: NDArray[np.float64] = field(
-        default_factory=lambda: np.zeros((0, 0))
-    )
+    joint_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """(k, k) of the offsets."""
 
     def __post_init__(self) -> None:
@@ -245,25 +242,23 @@ class Calibration:
             created=str(data.get("created", "")),
         )
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: PathLike) -> None:
         """Write the file atomically."""
         write_json(path, self.to_dict())
 
-    def export(
-        self, format: str, path: str | os.PathLike[str] | None = None, **options: Any
-    ) -> str:
+    def export(self, format: str, path: PathLike | None = None, **options: Any) -> str:
         """Export to a format of other programs and return the text, see `export_files`."""
         from evercal.calibration.export.formats import export_files
 
         return export_files(self, format, path, **options).text
 
 
-def read_calibration(path: str | os.PathLike[str]) -> Calibration:
+def read_calibration(path: PathLike) -> Calibration:
     """Read a calibration file."""
     return read_record(path, "calibration file", Calibration.from_dict)
 
 
-def read_transform(path: str | os.PathLike[str]) -> SE3:
+def read_transform(path: PathLike) -> SE3:
     """Read a rigid transform from a calibration file or from a 4x4 matrix as text."""
     text = read_text(Path(path), "file")
     if text.lstrip().startswith("{"):
@@ -316,7 +311,7 @@ class Rig:
             ],
         }
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: PathLike) -> None:
         """Write the file atomically."""
         write_json(path, self.to_dict())
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.calibration.held_again import LEAST_IMAGES, held_again
@@ -28,11 +27,10 @@ from evercal.calibration.located import (
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, axis_deviation
 from evercal.recordings.images import Picture
+from evercal.typing import Array
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
-
-Array = NDArray[np.float64]
 
 
 CONFIDENCE = 0.99

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, ErrorTerm, Mount, largest_term
 from evercal.calibration.held_again import held_again
@@ -37,24 +36,18 @@ from evercal.localization.intrinsics import STATED, cameras_in_scenes
 from evercal.recordings.image_files import image_files
 from evercal.recordings.images import Picture, as_rgb, pixels_of
 from evercal.recordings.poses.pairing import poses_of_images
+from evercal.typing import Array, IntArray, PathLike
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
 
-Array = NDArray[np.float64]
 CONTRADICTED_PX = 1.0
 """Stated intrinsics are replaced if the estimate moves rays by more than this, in pixels."""
 SPOT_M, SPOT_RAD = 0.1, np.deg2rad(10.0)
 """Views closer than this observe the same landmarks, so they share their errors."""
 
 
-ImageSource = (
-    str
-    | os.PathLike[str]
-    | np.ndarray
-    | Sequence[str | os.PathLike[str]]
-    | Sequence[np.ndarray]
-)
+ImageSource = PathLike | np.ndarray | Sequence[PathLike] | Sequence[np.ndarray]
 """A folder, an image file or an array (H, W, 3), or several files or arrays."""
 
 
@@ -76,7 +69,7 @@ class Images:
         cls,
         source: ImageSource,
         camera: Camera | None = None,
-        robot_poses: str | os.PathLike[str] | SE3 | None = None,
+        robot_poses: PathLike | SE3 | None = None,
         convention: str | None = None,
     ) -> Self:
         """Take images from files or arrays, see `Map.calibrate`."""
@@ -307,7 +300,7 @@ def _by_cause(used: Sequence[ImagePose], spots: int = 1) -> tuple[ErrorTerm, ...
     )
 
 
-def _spots(poses: Sequence[SE3]) -> NDArray[np.int64]:
+def _spots(poses: Sequence[SE3]) -> IntArray:
     centres: list[SE3] = []
     numbers = []
     for pose in poses:

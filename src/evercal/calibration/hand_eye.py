@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.calibration import (
     Calibration,
@@ -44,6 +43,7 @@ from evercal.recordings.frame import (
     stated_grippers,
 )
 from evercal.recordings.held_out import require_frames
+from evercal.typing import Array
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
@@ -311,13 +311,13 @@ class Step(NamedTuple):
 
     before: int
     """Number of the first element after it."""
-    size: NDArray[np.float64]
+    size: Array
     """(6,) metres and radians."""
     share: float
     """Share of the sum of squares that it explains."""
 
 
-def largest_step(values: NDArray[np.float64]) -> Step | None:
+def largest_step(values: Array) -> Step | None:
     """The step that explains most of deviations (n, 6), metres and radians; None by chance."""
     from scipy import stats
 

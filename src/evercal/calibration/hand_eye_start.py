@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -33,10 +32,8 @@ from evercal.mapping.selection import spread_poses
 from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, Mount, stated_grippers
-from evercal.recordings.poses.arm import Arm
-
-Array = NDArray[np.float64]
-
+from evercal.robot.arm import Arm
+from evercal.typing import Array, BoolArray, Float32Array, Image
 
 FRAMES, PARTNERS = 120, 6
 """Maximum number of frames, and number of most similar frames that each is matched to."""
@@ -200,7 +197,7 @@ def solve_pairs(
     )
 
 
-def _refuse_disagreement(agree: NDArray[np.bool_]) -> None:
+def _refuse_disagreement(agree: BoolArray) -> None:
     if agree.sum() < max(LEAST_PAIRS, LEAST_SHARE * len(agree)):
         raise InputError(
             f"the gripper's motion and the images agree in only {agree.sum()} of {len(agree)} pairs"
@@ -363,9 +360,9 @@ def image_pairs(
     on_progress: OnProgress = lambda *_: None,
 ) -> list[ImagePair]:
     """Similar frames with enough matches, without those that stand still before a fixed camera."""
-    images: list[NDArray[np.uint8]] = []
+    images: list[Image] = []
     cameras: list[Camera] = []
-    features: list[NDArray[np.float32]] = []
+    features: list[Float32Array] = []
     fixed = mount == "eye_to_hand"
     for frame in frames:
         image = frame.read_image()

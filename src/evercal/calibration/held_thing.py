@@ -22,6 +22,7 @@ from evercal.calibration.hand_eye_start import (
 from evercal.geometry import SE3
 from evercal.recordings.frame import Frame
 from evercal.recordings.masks import without
+from evercal.typing import Array, BoolArray, IntArray
 
 PATCH_PX, SAME, STILL_IN, LEAST_CONTRAST = 9, 0.8, 2, 2.0
 """Side of a patch; correlation of equal patches; other images that show a patch where it stands
@@ -65,7 +66,7 @@ def moving_parts(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], float]:
 
 def _still(
     greys: Sequence[NDArray[Any]],
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+) -> tuple[BoolArray, BoolArray]:
     """(n, h, w) whether a patch is repeated at its place, and whether it shows anything."""
     size = (PATCH_PX, PATCH_PX)
     images = [grey.astype(np.float32) for grey in greys]
@@ -94,7 +95,7 @@ def _still(
     return repeated >= STILL_IN, variances > (1 + LEAST_CONTRAST) * noise
 
 
-def _opened(moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _opened(moving: BoolArray) -> BoolArray:
     """Without single pixels."""
     return (
         cv2.morphologyEx(
@@ -104,7 +105,7 @@ def _opened(moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
     )
 
 
-def windows(frames: Sequence[Frame], start: HandEyeStart) -> NDArray[np.int64] | None:
+def windows(frames: Sequence[Frame], start: HandEyeStart) -> IntArray | None:
     """(n, 3) left, top and side of a window around the thing; None if it fills the images."""
     poses = scene_from_parent(frames, "eye_to_hand") @ start.parent_from_camera
     points = _points(poses, start.matches)
@@ -128,7 +129,7 @@ def windows(frames: Sequence[Frame], start: HandEyeStart) -> NDArray[np.int64] |
     return np.c_[corner, np.full(len(corner), side)]
 
 
-def cropped(frame: Frame, window: NDArray[np.int64]) -> Frame:
+def cropped(frame: Frame, window: IntArray) -> Frame:
     """The part of a frame in a window."""
     left, top, side = window.tolist()
     camera = frame.camera
@@ -139,7 +140,7 @@ def cropped(frame: Frame, window: NDArray[np.int64]) -> Frame:
     return replace(frame, image=np.ascontiguousarray(image), camera=part)
 
 
-def _points(poses: SE3, pairs: Sequence[ImagePair]) -> NDArray[np.float64]:
+def _points(poses: SE3, pairs: Sequence[ImagePair]) -> Array:
     """(m, 3) matches triangulated in the frame of the gripper."""
     matrices = poses.matrix()
     points = [np.zeros((0, 3))]

@@ -6,9 +6,10 @@ from pathlib import Path
 from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.errors import InputError
 from evercal.storage.stages import is_store
+from evercal.typing import PathLike
 
 
-def calibration_at(path: str | os.PathLike[str]) -> Calibration:
+def calibration_at(path: PathLike) -> Calibration:
     """Read a calibration from its file, a map (`MAP`) or one of its scenes (`MAP:SCENE`)."""
     root, _, scene = os.fspath(path).rpartition(":")
     if is_store(Path(path)):

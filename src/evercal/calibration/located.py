@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.calibration import ImageUse
 from evercal.errors import InputError
@@ -19,12 +18,12 @@ from evercal.geometry import (
 )
 from evercal.localization.learned import localize_picture
 from evercal.recordings.images import Picture
+from evercal.typing import Array, BoolArray
 
 if TYPE_CHECKING:
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
 
-Array = NDArray[np.float64]
 Item = TypeVar("Item")
 _OUTLIER_SIGMAS = 5.0
 """Robust standard deviations from the mean beyond which a pose is an outlier."""
@@ -56,7 +55,7 @@ class Fused:
     pose: SE3
     scatter: Array
     """(6, 6) covariance of one pose about the others."""
-    used: NDArray[np.bool_]
+    used: BoolArray
     """(n,) inliers among the images."""
     uses: tuple[ImageUse, ...]
     """(n,) use of every image, or the reason for rejecting it."""
@@ -180,7 +179,7 @@ def deviations(poses: SE3, mean: SE3) -> Array:
     return np.concatenate([shift, rotation], axis=1)
 
 
-def _far(off: Array) -> NDArray[np.bool_]:
+def _far(off: Array) -> BoolArray:
     distance = np.linalg.norm(off.reshape(-1, 2, 3), axis=2)
     # For three Gaussian axes the median distance is 1.54 standard deviations.
     spread = np.median(distance, axis=0) / 1.54

@@ -19,7 +19,6 @@ frame: where the arm orbits one place, m hardly changes, and X is open in its di
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import (
@@ -28,8 +27,7 @@ from evercal.geometry import (
     pose_distance,
 )
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES
-
-Array = NDArray[np.floating]
+from evercal.typing import Array, BoolArray, IntArray
 
 
 def _covariance(metres: float, radians: float) -> Array:
@@ -61,7 +59,7 @@ _APART_M, _APART_DEG = 0.02, 4.0
 class NextViews:
     """Poses to go to, in order."""
 
-    index: NDArray[np.int64]
+    index: IntArray
     """(k,) index among the reachable poses."""
     poses: SE3
     """(k,) base_from_gripper."""
@@ -209,7 +207,7 @@ def _of_six(information: Array) -> Array:
     ]
 
 
-def _near(pose: SE3, others: SE3) -> NDArray[np.bool_]:
+def _near(pose: SE3, others: SE3) -> BoolArray:
     metres, radians = pose_distance(pose, others)
     return np.less(metres, _APART_M) & np.less(radians, np.deg2rad(_APART_DEG))
 

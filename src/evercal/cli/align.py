@@ -149,7 +149,7 @@ def read_rows(
 
     import numpy as np
 
-    from evercal.recordings.text_files import read_text
+    from evercal.storage.text_files import read_text
 
     count = columns.count(",") + 1
     lines = read_text(path, "table of points").splitlines()

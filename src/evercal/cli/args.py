@@ -152,7 +152,7 @@ def camera_for(file: Path | None, images: Sequence[Path]) -> "Camera | None":
 
 def stated_camera(file: Path | None, size: tuple[int, int]) -> "Camera | None":
     """The camera in the file of --camera, for images of (width, height)."""
-    from evercal.recordings.poses.camera_file import read_camera
+    from evercal.recordings.cameras.camera_file import read_camera
 
     return None if file is None else read_camera(file, size)
 

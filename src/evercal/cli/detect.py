@@ -77,7 +77,7 @@ class Detect(args.Verb):
             )
         require_writable(self.out, "--out")
         from evercal.recordings.image_files import image_files
-        from evercal.recordings.text_files import refuse_repeated
+        from evercal.storage.text_files import refuse_repeated
 
         board = self._board()
         files = image_files(self.images)
@@ -89,8 +89,8 @@ class Detect(args.Verb):
             raise InputError(str(error)) from None
         from evercal.calibration.boards.board_poses import board_poses
         from evercal.calibration.boards.corners import BoardView, calibrate_camera
+        from evercal.recordings.cameras.camera_file import read_camera_of_size
         from evercal.recordings.images import first_size
-        from evercal.recordings.poses.camera_file import read_camera_of_size
 
         width, height = first_size(files)
         camera = None

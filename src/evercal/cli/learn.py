@@ -346,7 +346,7 @@ def _warnings(adjusted: "Adjusted") -> Iterator[str]:
         ("warning: poses with large errors", adjusted.doubtful_poses),
     ):
         if names:
-            from evercal.recordings.text_files import few
+            from evercal.storage.text_files import few
 
             yield f"{what}: {few(names, most=8)}"
 

@@ -120,7 +120,7 @@ class Studio(Page):
         from evercal.live.camera import StreamCamera
         from evercal.live.robot import PoseFileRobot
         from evercal.recordings import read_robot_poses
-        from evercal.recordings.poses.camera_file import read_camera
+        from evercal.recordings.cameras.camera_file import read_camera
         from evercal.recordings.streams import is_live
         from evercal.service.studio.devices import Devices
 

@@ -12,10 +12,11 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from evercal.geometry import SE3
 from evercal.geometry.near import COARSE
+from evercal.typing import BoolArray
 
 Status = Literal["ok", "uncertain", "ambiguous", "unknown_scene", "failed"]
 
@@ -122,7 +123,7 @@ class ContinualScores:
 
 def correct(
     results: Iterable[FrameResult], thresholds: tuple[float, float] = COARSE
-) -> dict[str, NDArray[np.bool_]]:
+) -> dict[str, BoolArray]:
     """Which frames (frames,) of each scene are correct, by thresholds in metres and radians."""
     metres, radians = thresholds
 

@@ -18,8 +18,9 @@ from evercal.recordings import (
     posed_frames,
     stated_poses,
 )
+from evercal.typing import PathLike
 
-Recorded = str | os.PathLike[str] | Recording
+Recorded = PathLike | Recording
 """A recording, or its folder."""
 
 

@@ -22,10 +22,11 @@ from evercal.features.views import working_grey
 from evercal.features.vlad import Vlad, fit_centroids, unit
 from evercal.storage.atomic import write_bytes
 from evercal.storage.tensors import load_tensors, save_tensors
+from evercal.typing import Array, Float32Array, Image
 
 WEIGHTS = Path(__file__).parent / "weights"
 ENCODER_FILE = WEIGHTS / "encoder-2.onnx"
-Features = Callable[[NDArray[np.float32]], NDArray[np.floating]]
+Features = Callable[[Float32Array], Array]
 """A network: (h, w) grey values with mean 0 and deviation 1 -> (rows, columns, width) features.
 
 Cell (i, j) is centred on pixel (stride (j + 0.5) - 0.5, same for i)."""
@@ -57,29 +58,29 @@ class Encoder:
         self.stride = _PROBE[0] // len(features)
         self.width = features.shape[2]
         self.fingerprint = unit(features).mean((0, 1))[:8].round(4).tolist()
-        self._centroids: NDArray[np.float32] | None = None
+        self._centroids: Float32Array | None = None
         self._vlad: Vlad | None = None
 
-    def __call__(self, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def __call__(self, grey: Image) -> Float32Array:
         """(h, w) -> (h // stride, w // stride, width) unit vectors."""
         height, width = (side // self.stride * self.stride for side in grey.shape)
         return unit(self.function(_standardised(grey[:height, :width])))
 
-    def encode(self, image: np.ndarray, short_side: int) -> NDArray[np.float32]:
+    def encode(self, image: np.ndarray, short_side: int) -> Float32Array:
         """(rows, columns, width) features of an image (h, w) or (h, w, 3) at working size."""
         return self(working_grey(image, short_side))
 
     @property
-    def centroids(self) -> NDArray[np.float32] | None:
+    def centroids(self) -> Float32Array | None:
         """(k, width) VLAD centroids; None before they are fitted."""
         return self._centroids
 
     @centroids.setter
-    def centroids(self, value: NDArray[np.float32] | None) -> None:
+    def centroids(self, value: Float32Array | None) -> None:
         self._centroids = value
         self._vlad = None
 
-    def vlad(self, features: Sequence[NDArray[np.float32]] = ()) -> Vlad:
+    def vlad(self, features: Sequence[Float32Array] = ()) -> Vlad:
         """The VLAD of the encoder; missing centroids are fitted to features (cells, width)."""
         if self._centroids is None:
             if not features:
@@ -139,7 +140,7 @@ class _OnnxNetwork:
         self._idle: SimpleQueue[Any] = SimpleQueue()
         self._idle.put(self._read())
 
-    def __call__(self, grey: NDArray[np.float32]) -> NDArray[np.float32]:
+    def __call__(self, grey: Float32Array) -> Float32Array:
         try:
             network = self._idle.get_nowait()
         except Empty:
@@ -243,12 +244,12 @@ def _digest(arrays: Mapping[str, NDArray[np.generic]]) -> str:
     return digest.hexdigest()[:16]
 
 
-def _probe() -> NDArray[np.uint8]:
+def _probe() -> Image:
     noise = np.random.default_rng(0).integers(0, 256, _PROBE).astype(np.uint8)
     return np.asarray(cv2.GaussianBlur(noise, (0, 0), 3.0), np.uint8)
 
 
-def _standardised(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _standardised(grey: Image) -> Float32Array:
     """Mean 0 and deviation 1, which removes exposure and contrast."""
     mean, deviation = (float(value[0, 0]) for value in cv2.meanStdDev(grey))
     deviation *= (grey.size / max(grey.size - 1, 1)) ** 0.5

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry import Camera
-
-Array = NDArray[np.float64]
+from evercal.typing import Array, Float32Array, Image
 
 FEATURES, CONTRAST, RATIO = 1500, 0.01, 0.85
 """SIFT features of an image, their contrast, and the ratio of distances in Lowe's test."""
@@ -26,7 +25,7 @@ class SiftFeatures:
 
     pixels: Array
     """(n, 2)."""
-    descriptors: NDArray[np.float32]
+    descriptors: Float32Array
     """(n, 128) of unit length, RootSIFT (Arandjelovic and Zisserman, CVPR 2012)."""
 
 
@@ -42,7 +41,7 @@ class EpipolarPair:
     """(2, n, 3) rays of the inliers in both camera frames, at depth 1."""
 
 
-def sift_features(image: NDArray[np.uint8]) -> SiftFeatures:
+def sift_features(image: Image) -> SiftFeatures:
     """Detect and describe features of a grey image (h, w)."""
     import cv2
 
@@ -97,7 +96,7 @@ def epipolar_pair(
 
 
 def _distinct_matches(
-    a: NDArray[np.float32], b: NDArray[np.float32]
+    a: Float32Array, b: Float32Array
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     similar = a @ b.T
     best = similar.argmax(1)

@@ -106,9 +106,8 @@ def augmented_view(
             virtual.unproject(np.stack([u, v], -1).astype(float)) @ camera_from_view.T
         )
         source = np.nan_to_num(camera.project(rays), nan=-1.0).astype(np.float32)
-        warped = cv2.remap(
-            grey, source, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-        )  # type: ignore[call-overload]
+        border = cv2.BORDER_REFLECT
+        warped = cv2.remap(grey, source, None, cv2.INTER_LINEAR, borderMode=border)  # type: ignore[call-overload]
     else:
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         size = (width, height)

@@ -8,15 +8,14 @@ recording that is learned with it, and travel with the map.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+
+from evercal.typing import Array, Float32Array
 
 CENTROIDS = 16
 WIDTH = 1024
 _ROUNDS = 15
 _ROWS = 40_000
 """Features that centroids are fitted to, at most."""
-
-Array = NDArray[np.float32]
 
 
 class Vlad:
@@ -25,19 +24,19 @@ class Vlad:
     More numbers than `WIDTH` are projected to so many.
     """
 
-    def __init__(self, centroids: Array):
+    def __init__(self, centroids: Float32Array):
         self.centroids = centroids
         size = centroids.size
         self._projection = _random_projection(size) if size > WIDTH else None
 
-    def __call__(self, features: Array) -> Array:
+    def __call__(self, features: Float32Array) -> Float32Array:
         """(cells, channels) unit vectors of an image -> unit vector of at most `WIDTH` numbers."""
         sums = _sums(features, self.centroids, self.centroids)
         vector = unit(sums).ravel()
         return unit(vector if self._projection is None else vector @ self._projection)
 
 
-def fit_centroids(features: Sequence[Array]) -> Array:
+def fit_centroids(features: Sequence[Float32Array]) -> Float32Array:
     """(k, channels) centroids of unit features (cells, channels) of images, spherical k-means."""
     rows = np.concatenate(list(features)).astype(np.float32)
     rows = np.random.default_rng(0).permutation(rows)[:_ROWS]
@@ -51,7 +50,9 @@ def fit_centroids(features: Sequence[Array]) -> Array:
     return centroids
 
 
-def _sums(rows: Array, centroids: Array, origin: Array | None = None) -> Array:
+def _sums(
+    rows: Float32Array, centroids: Float32Array, origin: Float32Array | None = None
+) -> Float32Array:
     """(k, channels) sums of the rows nearest to each centroid, as differences from an origin."""
     nearest = (rows @ centroids.T).argmax(1)
     member = np.zeros((len(centroids), len(rows)), np.float32)
@@ -60,13 +61,13 @@ def _sums(rows: Array, centroids: Array, origin: Array | None = None) -> Array:
     return sums if origin is None else sums - member.sum(1, keepdims=True) * origin
 
 
-def unit(vectors: NDArray[np.floating]) -> Array:
+def unit(vectors: Array) -> Float32Array:
     """Vectors (..., n) of unit length."""
     length = np.sqrt(np.einsum("...c,...c->...", vectors, vectors))[..., None]
     return np.asarray(vectors / np.maximum(length, 1e-12), np.float32)
 
 
-def _random_projection(size: int) -> Array:
+def _random_projection(size: int) -> Float32Array:
     """(size, WIDTH) fixed random projection, which preserves angles: Box-Muller by blocks of 16."""
     # The numbers are part of every map that was ever made with a projection.
     count = size * WIDTH
@@ -81,7 +82,7 @@ def _random_projection(size: int) -> Array:
 
 
 def similar_pairs(
-    features: Sequence[Array], vlad: Vlad, partners: int
+    features: Sequence[Float32Array], vlad: Vlad, partners: int
 ) -> list[tuple[int, int]]:
     """Pairs of images, each with the most similar other ones, by features (cells, channels)."""
     descriptors = np.stack([vlad(rows) for rows in features])

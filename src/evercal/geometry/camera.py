@@ -16,9 +16,9 @@ from functools import cached_property
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from evercal.typing import Array
 
 Model = Literal["pinhole", "fisheye"]
 FISHEYE_DEG = 85.0

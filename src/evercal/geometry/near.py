@@ -3,15 +3,15 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry.se3 import SE3, pose_distance
+from evercal.typing import BoolArray
 
 COARSE = (0.05, math.radians(5.0))
 """5 cm and 5 deg, the threshold of the indoor benchmarks, in metres and radians."""
 
 
-def near_training(train_poses: SE3, test_poses: SE3) -> NDArray[np.bool_]:
+def near_training(train_poses: SE3, test_poses: SE3) -> BoolArray:
     """Which test frames have a training frame nearer than 5 cm and 5 deg.
 
     Poses (n,) and (m,) give (m,) bool. The bounds are those of accuracy, so that the share of such

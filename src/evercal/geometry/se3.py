@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from evercal.typing import Array
 
 _SMALL_RAD = 1e-3
 """Angle below which series replace quotients that cancel."""

@@ -8,11 +8,10 @@ the child.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from evercal.geometry.se3 import SE3
-
-Array = NDArray[np.float64]
+from evercal.typing import Array
 
 
 def cross_matrix(v: ArrayLike) -> Array:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry import SE3, pose_distance
 from evercal.localization.localizer import Localizer
@@ -12,6 +11,7 @@ from evercal.mapping.scene_map import MapContents
 from evercal.mapping.selection import spread_poses
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame
+from evercal.typing import IntArray
 
 MOST_SHARE = 0.3
 """Share of the frames that are keyframes at first."""
@@ -30,7 +30,7 @@ def fewest_keyframes(
     built: BuiltMap,
     frames: Sequence[Frame],
     on_progress: OnProgress = lambda *_: None,
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Select the fewest keyframes of a new scene.
 
     `contents` holds the scenes learned before, and `frames` are the posed training frames in

@@ -8,13 +8,9 @@ import time
 from collections.abc import Iterator
 from typing import Protocol, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
 from evercal.errors import InputError
 from evercal.recordings.streams import StreamFrame, is_live, stream
-
-Image = NDArray[np.uint8]
+from evercal.typing import Image
 
 
 class LiveCamera(Protocol):

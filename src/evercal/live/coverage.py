@@ -9,14 +9,12 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame
 from evercal.recordings.pictures import sharpness
-
-Array = NDArray[np.float64]
+from evercal.typing import Array, Image
 
 IMAGES = 25
 """Images of a complete recording."""
@@ -123,7 +121,7 @@ def coverage(
     return Coverage(rows, rotations, positions, rank, missing, ready, verdict)
 
 
-def clipped_share(image: NDArray[np.uint8]) -> float:
+def clipped_share(image: Image) -> float:
     """Share of pixels that are black (0 to 2) or white (253 to 255) in all channels."""
     return float(((image >= 253).all(-1) | (image <= 2).all(-1)).mean())
 

@@ -11,15 +11,13 @@ time. A folder that was begun earlier is continued.
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.formats import wrist
 from evercal.recordings.frame import Frame
 from evercal.recordings.images import write_jpeg
 from evercal.storage import write_bytes, write_json
+from evercal.typing import Image
 
 POSES = "base_from_gripper.csv"
 JPEG_QUALITY = 95
@@ -49,7 +47,7 @@ class WristRecorder:
         """The samples in recorded order."""
         return tuple(self._frames)
 
-    def add(self, image: NDArray[np.uint8], base_from_gripper: SE3) -> Frame:
+    def add(self, image: Image, base_from_gripper: SE3) -> Frame:
         """Write a sample and return it, or raise InputError for an image of another size."""
         if image.shape != (self._camera.height, self._camera.width, 3):
             raise InputError(

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera
 from evercal.localization.intrinsics import (
@@ -27,8 +26,8 @@ from evercal.mapping.patches import (
     to_level,
     whitening,
 )
+from evercal.typing import Array, IntArray
 
-Array = NDArray[np.floating]
 Pose = tuple[Array, Array]
 """Rotation (3, 3) and position (3,) of map_from_camera."""
 
@@ -177,7 +176,7 @@ class _Search:
             ]
         )
 
-    def patches(self, level: int, which: NDArray[np.int64]) -> Patches:
+    def patches(self, level: int, which: IntArray) -> Patches:
         """Templates of landmarks, indices in rising order."""
         ends = np.searchsorted(which, self.starts)
         spans = zip(self.keyframes, self.starts, ends, ends[1:], strict=False)

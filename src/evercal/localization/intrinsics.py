@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import Camera, UncertainPose
@@ -22,11 +21,11 @@ from evercal.localization.pose_refinement import (
     in_parent_axes,
     minimise,
 )
+from evercal.typing import Array
 
 if TYPE_CHECKING:
     from evercal.localization.learned import LearnedScene
 
-Array = NDArray[np.floating]
 
 CONTRADICTED = 15.1
 """Squared deviation of all five, above which no prior holds: the 99 % quantile (chi-squared)."""

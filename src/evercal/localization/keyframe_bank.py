@@ -8,7 +8,6 @@ from threading import Lock
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.features.encoder import Encoder
 from evercal.features.views import ideal_cell_pixels
@@ -18,6 +17,7 @@ from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.landmarks import project_surface
 from evercal.mapping.patches import Patches, cut_patches, image_pyramid, to_level
 from evercal.mapping.scene_map import MapContents
+from evercal.typing import Float32Array, IntArray
 
 ALIGNED_LEVELS = 2
 _SAMPLED = 6
@@ -28,7 +28,7 @@ _SAMPLED = 6
 class MatchedCells:
     """Patches of a keyframe that an image is matched to, in the map's frame."""
 
-    features: NDArray[np.float32]
+    features: Float32Array
     """(cells, channels)."""
     points_m: np.ndarray
     """(cells, 3) surface points of the patches."""
@@ -126,7 +126,7 @@ class KeyframeBank:
         self._most = most_loaded
         self._lock = Lock()
         self._loaded: OrderedDict[int, LoadedKeyframe] = OrderedDict()
-        self._sampled: dict[int, tuple[np.ndarray, NDArray[np.int64]]] = {}
+        self._sampled: dict[int, tuple[np.ndarray, IntArray]] = {}
         keyframes = [scene.keyframes for scene in contents.scenes]
         counts = [len(k) for k in keyframes]
         self.scene = np.repeat(np.arange(len(counts)), counts)
@@ -135,7 +135,7 @@ class KeyframeBank:
         self._descriptors = np.concatenate(descriptors).astype(np.float32)
         self._used = np.ones(len(self.scene), bool)
 
-    def only(self, keyframes: NDArray[np.int64]) -> Self:
+    def only(self, keyframes: IntArray) -> Self:
         """The same bank with these keyframes in use; they are loaded once for both."""
         part = copy(self)
         part._used = np.isin(np.arange(len(self.scene)), keyframes)
@@ -146,7 +146,7 @@ class KeyframeBank:
         """The encoder of the map."""
         return self._contents.encoder
 
-    def similarity(self, *descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    def similarity(self, *descriptors: Float32Array) -> Float32Array:
         """(images, keyframes) similarity to the descriptors (width,) of images.
 
         Keyframes that are not in use get -inf. With the ranking it takes 24 ms for 100,000
@@ -156,21 +156,19 @@ class KeyframeBank:
         similarity[:, ~self._used] = -np.inf
         return similarity
 
-    def ranked(self, similarity: NDArray[np.float32], most: int) -> NDArray[np.int64]:
+    def ranked(self, similarity: Float32Array, most: int) -> IntArray:
         """The `most` keyframes in use with the greatest similarity (keyframes,), best first."""
         first = min(most, len(similarity)) - 1
         best = np.flatnonzero(similarity >= -np.partition(-similarity, first)[first])
         order = best[np.argsort(-similarity[best], kind="stable")][:most]
         return order[self._used[order]]
 
-    def ranked_of(
-        self, scene: int, similarity: NDArray[np.float32]
-    ) -> NDArray[np.int64]:
+    def ranked_of(self, scene: int, similarity: Float32Array) -> IntArray:
         """The keyframes of a scene in use, best first."""
         own = np.flatnonzero((self.scene == scene) & self._used)
         return own[np.argsort(-similarity[own], kind="stable")]
 
-    def seen(self, scene: int, pose: SE3, camera: Camera) -> NDArray[np.int64]:
+    def seen(self, scene: int, pose: SE3, camera: Camera) -> IntArray:
         """Rank the keyframes of a scene by their landmarks that a pose map_from_camera shows."""
         if scene not in self._sampled:
             frames = self._contents.scenes[scene].keyframes
@@ -201,7 +199,7 @@ class KeyframeBank:
         ]
         return order[self._used[order]]
 
-    def pattern(self, keyframes: NDArray[np.int64]) -> np.ndarray:
+    def pattern(self, keyframes: IntArray) -> np.ndarray:
         """(k, 3) displacements by which a pose before the best keyframes may have slipped."""
         return np.concatenate(
             [self.load(int(k)).landmarks.pattern for k in keyframes[:1]]

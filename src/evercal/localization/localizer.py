@@ -3,7 +3,6 @@
 The way of an image: prepare, encode, retrieve keyframes, match, PnP, align landmarks, accept.
 """
 
-import os
 import time
 from collections.abc import Sequence
 from copy import copy
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.features.encoder import Features
@@ -45,6 +43,7 @@ from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
 from evercal.processes import one_product_thread
 from evercal.recordings.images import as_rgb
+from evercal.typing import Array, Float32Array, IntArray, PathLike
 
 _NONE = np.zeros((0, 0, 0), np.float32)
 
@@ -61,7 +60,7 @@ class Localizer:
     @classmethod
     def open(
         cls,
-        store: str | os.PathLike[str],
+        store: PathLike,
         options: LocalizeOptions | None = None,
         encoder: Features | None = None,
     ) -> Self:
@@ -76,7 +75,7 @@ class Localizer:
             )
         return cls(contents, options)
 
-    def only(self, scene: int, keyframes: NDArray[np.int64]) -> Self:
+    def only(self, scene: int, keyframes: IntArray) -> Self:
         """The same localizer with some keyframes of one scene."""
         part = copy(self)
         part._bank = self._bank.only(
@@ -130,7 +129,7 @@ class Localizer:
         self,
         image: np.ndarray,
         camera: Camera | None,
-        features: NDArray[np.float32] = _NONE,
+        features: Float32Array = _NONE,
     ) -> Query:
         """An image to be located, of the stated camera; alignment alone needs no features."""
         priors = tuple(prior_of(camera, image, scene) for scene in self.contents.scenes)
@@ -150,7 +149,7 @@ class Localizer:
             found, self.contents.scenes[scene], image.shape[:2], 0.0
         )
 
-    def slips(self, hypothesis: Hypothesis) -> NDArray[np.floating]:
+    def slips(self, hypothesis: Hypothesis) -> Array:
         """(k, 3) displacements, by which an aligned pose may have slipped, the shortest first."""
         found = hypothesis.candidate
         return (
@@ -261,7 +260,7 @@ class Localizer:
         candidate: Candidate,
         camera: Camera,
         start: SE3,
-        change: NDArray[np.floating],
+        change: Array,
         coarse: bool = True,
     ) -> Hypothesis | None:
         """A pose map_from_camera, refined by landmarks; see `align_pose`."""

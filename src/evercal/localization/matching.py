@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.features.views import cell_centres, ideal_cell_pixels, working_grey
 from evercal.geometry import Camera, resize_pixels
@@ -15,6 +14,7 @@ from evercal.localization.query import (
     Matches,
     Query,
 )
+from evercal.typing import Float32Array, IntArray
 
 
 class Matcher:
@@ -94,13 +94,13 @@ class Matcher:
             query, features=features, scale=scale, turns=0, similar={}, descriptor=[]
         )
 
-    def _similarity(self, *views: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _similarity(self, *views: Float32Array) -> Float32Array:
         """(views, keyframes) similarity of whole images by their features."""
         vlad = self._bank.encoder.vlad()
         return self._bank.similarity(*(vlad(_rows(features)) for features in views))
 
     def _mean_similarity(
-        self, features: NDArray[np.float32], similarity: NDArray[np.float32]
+        self, features: Float32Array, similarity: Float32Array
     ) -> float:
         """Mean similarity of every second row and column of features (rows, columns, channels).
 
@@ -140,7 +140,7 @@ class Matcher:
 
     def _most_similar(
         self, query: Query, stride: int, keyframe: int
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    ) -> tuple[IntArray, Float32Array]:
         """Index and similarity (n,) of the cell of a keyframe that is most similar to each patch.
 
         Patches are those of every `stride`-th row and column. Retrieval and matches share them.
@@ -154,7 +154,7 @@ class Matcher:
         return query.similar[key]
 
 
-def _grid(query: Query, stride: int) -> NDArray[np.int64]:
+def _grid(query: Query, stride: int) -> IntArray:
     """Indices (n,) of the patches of every `stride`-th row and column."""
     rows, columns = query.features.shape[:2]
     return np.arange(rows * columns).reshape(rows, columns)[::stride, ::stride].ravel()
@@ -167,7 +167,7 @@ def turned(image: np.ndarray, turns: int) -> np.ndarray:
 
 def strided_patches(
     query: Query, camera: Camera, encoder_stride: int, stride: int
-) -> tuple[NDArray[np.int64], np.ndarray]:
+) -> tuple[IntArray, np.ndarray]:
     """Indices (m,) and ideal pixels (m, 2) of patches of every n-th row and column with a ray."""
     patches = _grid(query, stride)
     pixels = cell_pixels(camera, encoder_stride, query.turns)[patches]
@@ -196,5 +196,5 @@ def cell_pixels(camera: Camera, stride: int, turns: int) -> np.ndarray:
     return camera.pinhole.project(camera.unproject(np.stack(back, -1)))
 
 
-def _rows(features: NDArray[np.float32]) -> NDArray[np.float32]:
+def _rows(features: Float32Array) -> Float32Array:
     return features.reshape(-1, features.shape[2])

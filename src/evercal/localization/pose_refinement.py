@@ -4,11 +4,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, UncertainPose
-
-Array = NDArray[np.floating]
+from evercal.typing import Array
 
 INTRINSICS = 5
 """Parameters of a change: logarithm of the focal lengths, principal point in pixels, k1, k2."""
@@ -271,7 +269,7 @@ def linearise(
     return np.stack([u + camera.cx - pixels[:, 0], v + camera.cy - pixels[:, 1]]), slope
 
 
-def in_parent_axes(rotation: Array, covariance: Array) -> NDArray[np.float64]:
+def in_parent_axes(rotation: Array, covariance: Array) -> Array:
     """Covariance (6, 6) with its translation part rotated from camera axes to the parent's."""
     slope = np.eye(6)
     slope[:3, :3] = rotation

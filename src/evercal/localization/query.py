@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.features.views import working_grey
 from evercal.geometry import SE3, Camera, UncertainPose
@@ -14,6 +13,7 @@ from evercal.localization.alignment import AlignmentOptions
 from evercal.localization.intrinsics import IntrinsicsPrior, RefinedPose
 from evercal.localization.pnp import PnpOptions
 from evercal.mapping.patches import image_pyramid
+from evercal.typing import Float32Array, IntArray
 
 
 class Attempt(NamedTuple):
@@ -82,17 +82,17 @@ class Query:
 
     image: np.ndarray
     """(h, w, 3) or (h, w) uint8."""
-    features: NDArray[np.float32]
+    features: Float32Array
     """(rows, columns, channels)."""
     short_side: int
     """Short side of `grey`, pixels, at most."""
     priors: Sequence[IntrinsicsPrior] = ()
     """Of the intrinsics in each scene."""
-    similar: dict[tuple[int, int], tuple[NDArray[np.int64], NDArray[np.float32]]] = (
-        field(default_factory=dict)
+    similar: dict[tuple[int, int], tuple[IntArray, Float32Array]] = field(
+        default_factory=dict
     )
     """Most similar cells of keyframes, see `Matcher`."""
-    descriptor: list[NDArray[np.float32]] = field(default_factory=list)
+    descriptor: list[Float32Array] = field(default_factory=list)
     """Similarity (keyframes,) of the whole image, once it is known."""
     scale: float = 1.0
     """Of the encoded image, relative to the encoder's working size."""
@@ -114,7 +114,7 @@ class Candidate(NamedTuple):
     """A scene to try."""
 
     scene: int
-    keyframes: NDArray[np.int64]
+    keyframes: IntArray
     """Its keyframes in the bank, most similar first."""
     stride: int = 1
     """Matches every n-th row and column of patches."""

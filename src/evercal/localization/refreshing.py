@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, average_poses
@@ -19,6 +18,7 @@ from evercal.mapping.selection import spread_poses
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame
 from evercal.recordings.images import Picture
+from evercal.typing import Array
 
 LEAST_IMAGES = 5
 """Located images that a refresh takes, at least."""
@@ -179,7 +179,7 @@ def _precise(estimate: PoseEstimate, scene: SceneMap) -> bool:
 
 def _verified(
     after: Localizer, check: Sequence[_NewImage], scene: str
-) -> tuple[SE3, NDArray[np.float64], int]:
+) -> tuple[SE3, Array, int]:
     """Locate images outside the refreshed map; return shift, its standard deviation, and count."""
     moves = []
     for frame, before, camera in check:

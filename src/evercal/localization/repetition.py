@@ -5,11 +5,9 @@ displacement, the pose displaced by it matches these landmarks as well, and othe
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry import SE3
-
-Array = NDArray[np.floating]
+from evercal.typing import Array
 
 MOST_LANDMARKS, MOST_STEPS = 400, 8
 """Landmarks that are compared, and steps that are returned, at most."""

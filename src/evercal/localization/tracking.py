@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.acceptance import accepted, answer
@@ -22,6 +21,7 @@ from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.localization.localizer import Localizer
 from evercal.localization.query import Candidate, Hypothesis
 from evercal.recordings.images import as_rgb
+from evercal.typing import Array, IntArray
 
 TrackState = Literal["tracking", "relocalized", "lost"]
 _Located = tuple[PoseEstimate, Hypothesis]
@@ -87,7 +87,7 @@ class Tracker:
     _scene: int = -1
     _poses: list[tuple[float, SE3]] = field(default_factory=list)
     """Times and poses map_from_camera of the last two frames."""
-    _change: NDArray[np.floating] | None = None
+    _change: Array | None = None
     _smoothed: tuple[float, SE3] | None = None
     _number: int = 0
     _alignment_s: float = 0.0
@@ -257,7 +257,7 @@ class Tracker:
         share = (stamp - last) / (last - before[0][0])
         return pose @ SE3.exp(share * (before[0][1].inverse() @ pose).log())
 
-    def _next_keyframes(self, pose: SE3) -> NDArray[np.int64]:
+    def _next_keyframes(self, pose: SE3) -> IntArray:
         keyframes = self.localizer.contents.scenes[self._scene].keyframes
         first = sum(
             len(s.keyframes) for s in self.localizer.contents.scenes[: self._scene]

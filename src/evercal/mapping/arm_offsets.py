@@ -5,15 +5,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.mapping.bundle_adjustment import JointSlopes
 from evercal.recordings.frame import Frame, Mount
+from evercal.typing import Array, BoolArray
 
 if TYPE_CHECKING:
-    from evercal.recordings.poses.arm import Arm
-
-Array = NDArray[np.float64]
+    from evercal.robot.arm import Arm
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +27,7 @@ class ArmOffsets:
     """(k, k)."""
     prior: Array
     """(k,) standard deviation of offsets of this arm before the images."""
-    determined: NDArray[np.bool_]
+    determined: BoolArray
     """(k,) whether the images tell the offset."""
 
     @classmethod

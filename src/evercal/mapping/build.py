@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
@@ -42,6 +41,7 @@ from evercal.mapping.tracks import (
 from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, Mount, stated_grippers, stated_poses
+from evercal.typing import Array, IntArray
 
 HAND_EYE_COVARIANCE_SCALE = 2.5
 """Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
@@ -142,21 +142,21 @@ class HandEyeCorrection:
 
     start_camera_from_camera: SE3
     """gripper_from_camera is the rough one times this."""
-    by_noise: NDArray[np.float64]
+    by_noise: Array
     """(6, 6) covariance by noise of images and gripper poses; camera frame, metres and radians."""
-    by_lens: NDArray[np.float64]
+    by_lens: Array
     """(6, 6) covariance by the uncertainty of the intrinsics."""
-    by_drift: NDArray[np.float64]
+    by_drift: Array
     """(6, 6) covariance by errors of gripper poses that vary slowly over the recording."""
-    residuals: dict[str, NDArray[np.float64]]
+    residuals: dict[str, Array]
     """(6,) deviation of each frame's gripper pose from the images, by name; gripper frame."""
-    moved: dict[str, NDArray[np.float64]]
+    moved: dict[str, Array]
     """(6,) the same as a motion of the camera, camera frame."""
     arm: ArmOffsets | None = None
     """Offsets of the joints of the arm, where its joint values are stated."""
 
     @property
-    def covariance(self) -> NDArray[np.float64]:
+    def covariance(self) -> Array:
         """(6, 6) of all causes."""
         return self.by_noise + self.by_lens + self.by_drift
 
@@ -233,7 +233,7 @@ class BuiltMap:
                 parts.append(LeftOut(tuple(some), others))
         return parts
 
-    def take(self, index: NDArray[np.int64]) -> "BuiltMap":
+    def take(self, index: IntArray) -> "BuiltMap":
         """The same map with a subset of its keyframes."""
         names = tuple(self.keyframe_names[i] for i in index.tolist())
         scene = replace(self.scene, keyframes=self.scene.keyframes.take(index))
@@ -320,7 +320,7 @@ def _prepare(
     return _Prepared(prepared, keyframes.tolist(), wrong, untracked, unit)
 
 
-def spread_frames(frames: Sequence[Frame], capacity: int) -> NDArray[np.int64]:
+def spread_frames(frames: Sequence[Frame], capacity: int) -> IntArray:
     """Indices of posed frames spread over their poses, see `spread_poses`."""
     return spread_poses(stated_poses(frames), capacity)
 

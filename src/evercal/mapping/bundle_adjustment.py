@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError
@@ -34,8 +33,7 @@ from evercal.mapping.bundle_equations import (
     Solution,
     StatedFrames,
 )
-
-Array = NDArray[np.floating]
+from evercal.typing import Array, BoolArray
 
 _GROUPS = ((0, 3), (3, 6), (6, 7), (-5, -4), (-4, -2), (-2, None))
 """Shared parameters that are relevant or not together: common translation, common rotation, time
@@ -151,7 +149,7 @@ class Adjustment:
     """(k, k) with systematic errors."""
     offsets_prior: Array
     """(k,) estimated standard deviation of the offsets of this arm."""
-    offsets_known: NDArray[np.bool_]
+    offsets_known: BoolArray
     """(k,) whether the images tell an offset better than the first prior."""
 
 
@@ -160,7 +158,7 @@ class JointSlopes(NamedTuple):
 
     slopes: Array
     """(n, 6, k) see `Arm.slopes`."""
-    rotates: NDArray[np.bool_]
+    rotates: BoolArray
     """(k,) whether a value is an angle."""
     at: Array
     """(k,) offsets that the stated poses contain."""

@@ -4,14 +4,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3, Camera, cross_matrix
-
-Array = NDArray[np.floating]
-Index = NDArray[np.int64]
+from evercal.typing import Array, BoolArray, IntArray
 
 COMMON = 6
 SHIFT = 1
@@ -29,15 +26,15 @@ MIN_DISTORTION = 1e-4
 class BundleTracks:
     """Landmarks and their observations."""
 
-    host: Index
+    host: IntArray
     """(p,) frame that a landmark's patch belongs to."""
     pixels: Array
     """(p, 2) pixel in the host frame."""
     inverse_depth: Array
     """(p,) per metre."""
-    landmark: Index
+    landmark: IntArray
     """(m,) landmark of each observation."""
-    frame: Index
+    frame: IntArray
     """(m,) frame of each observation."""
     observed: Array
     """(m, 2) pixels."""
@@ -47,7 +44,7 @@ class BundleTracks:
     """Factor on the usual depths of a room, see `plane_sweep.NEAR_M`."""
 
     @property
-    def host_frame(self) -> Index:
+    def host_frame(self) -> IntArray:
         """(m,) host of the landmark of each observation."""
         return self.host[self.landmark]
 
@@ -81,7 +78,7 @@ class Linearised:
     """(m, 2) by the inverse depth."""
     by_intrinsics: Array
     """(m, 2, 5)."""
-    valid: NDArray[np.bool_]
+    valid: BoolArray
     """(m,) False where the distortion of the camera has no pixel for the landmark."""
 
 
@@ -187,8 +184,8 @@ class StatedFrames:
         )
 
     def _by_camera(
-        self, parameters: Parameters, frames: Index
-    ) -> list[tuple[Camera, Index]]:
+        self, parameters: Parameters, frames: IntArray
+    ) -> list[tuple[Camera, IntArray]]:
         groups: dict[Camera, list[int]] = {}
         for i, camera in enumerate(self.cameras(parameters)):
             groups.setdefault(camera, []).append(i)
@@ -216,9 +213,9 @@ class Solution:
 class HostBlock(NamedTuple):
     """The landmarks of one host frame, and the parameters that their observations depend on."""
 
-    landmarks: Index
+    landmarks: IntArray
     """(a,)."""
-    columns: Index
+    columns: IntArray
     """(b,) parameters."""
     mixed: Array
     """(a, b) normal equations between inverse depths and parameters."""

@@ -19,6 +19,7 @@ from evercal.geometry.se3 import SE3
 from evercal.mapping.landmarks import Landmarks
 from evercal.recordings.frame import Frame
 from evercal.recordings.images import encode_jpeg
+from evercal.typing import IntArray
 
 JPEG_QUALITY = 95
 Part = TypeVar("Part")
@@ -56,7 +57,7 @@ class Keyframes:
     def __len__(self) -> int:
         return len(self.images)
 
-    def take(self, index: NDArray[np.int64]) -> "Keyframes":
+    def take(self, index: IntArray) -> "Keyframes":
         """The keyframes of an index."""
         rows = index.tolist()
         return Keyframes(
@@ -178,7 +179,7 @@ class _Parts(Sequence[Part]):
 
     def __init__(
         self,
-        counts: NDArray[np.int64],
+        counts: IntArray,
         stored: Sequence[Any],
         read: Callable[[slice], Part],
     ):

@@ -5,11 +5,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry.camera import Camera
-
-Array = NDArray[np.floating]
+from evercal.typing import Array, IntArray
 
 MIN_TEXTURE = 1e-4
 """Smallest minimum eigenvalue (cv2.cornerMinEigenVal, 5x5) of a landmark's pixel."""
@@ -60,7 +58,7 @@ class Landmarks:
 class ProjectedPatches(NamedTuple):
     """The m visible patches of n landmarks, as a camera should show them."""
 
-    landmark: NDArray[np.int64]
+    landmark: IntArray
     """(m,)."""
     pixels: Array
     """(m, 2)."""
@@ -103,7 +101,7 @@ def project_surface(
 
 def detect(
     grey: np.ndarray, grid: tuple[int, int], cell_px: float
-) -> tuple[Array, NDArray[np.int64]]:
+) -> tuple[Array, IntArray]:
     """Detect the most textured pixel of every textured cell.
 
     The image (h, w) is uint8, and a cell has `cell_px` pixels. Returns pixels (n, 2) and their

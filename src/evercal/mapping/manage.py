@@ -6,7 +6,6 @@ last complete state.
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,6 +27,7 @@ from evercal.storage.archive import (
 from evercal.storage.atomic import replace_folder, write_bytes, write_json
 from evercal.storage.manifest import MANIFEST, Manifest
 from evercal.storage.stages import REPORT, STAGES, StageStore, is_store, read_store
+from evercal.typing import PathLike
 
 OnClash = Literal["refuse", "rename", "skip", "replace"]
 """What `merge` does with a scene whose name is taken."""
@@ -85,7 +85,7 @@ def rename_scene(store: MapStore, name: str, new: str) -> None:
 
 def merge_maps(
     store: MapStore,
-    others: Sequence[str | os.PathLike[str]],
+    others: Sequence[PathLike],
     on_clash: OnClash = "refuse",
 ) -> Merged:
     """Add the scenes of other maps to a map, all in one step.

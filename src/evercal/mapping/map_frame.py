@@ -14,11 +14,9 @@ Slow corrections are predicted from neighbouring frames. Noise cannot be predict
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry import SE3, UncertainPose
-
-Array = NDArray[np.float64]
+from evercal.typing import Array
 
 RADII = ((0.1, 10.0), (0.2, 15.0), (0.4, 25.0))
 """Candidate correlation lengths of corrections, metres and degrees."""
@@ -34,7 +32,7 @@ class FrameCorrection:
 
     poses: SE3
     """(n,) base_from_camera as adjusted, without the common transform."""
-    correction: NDArray[np.floating]
+    correction: Array
     """(n, 6) in the camera frame, metres and radians."""
     radius: tuple[float, float]
     """Correlation length, metres and radians."""
@@ -156,9 +154,7 @@ class MapFrame:
         return pose @ SE3.exp(-self.correction.at(stated)) @ self.common.inverse()
 
 
-def fit_correction(
-    poses: SE3, correction: NDArray[np.floating]
-) -> FrameCorrection | None:
+def fit_correction(poses: SE3, correction: Array) -> FrameCorrection | None:
     """Fit the correlation length of corrections.
 
     Corrections (n, 6) are without the common transform and the time shift. Returns None if
@@ -183,7 +179,7 @@ def fit_correction(
 
 
 def shared_sigma(
-    poses: SE3, correction: NDArray[np.floating], fitted: FrameCorrection | None
+    poses: SE3, correction: Array, fitted: FrameCorrection | None
 ) -> tuple[float, float]:
     """Standard deviation per axis of stated poses whose errors neighbouring frames share.
 
@@ -206,9 +202,7 @@ def shared_sigma(
     return sigmas[0], sigmas[1]
 
 
-def _left_out(
-    poses: SE3, correction: NDArray[np.floating], radius: tuple[float, float]
-) -> Array:
+def _left_out(poses: SE3, correction: Array, radius: tuple[float, float]) -> Array:
     """(n, 6) corrections that the other frames predict."""
     weight = np.stack([_closeness(poses, poses[i], radius) for i in range(len(poses))])
     np.fill_diagonal(weight, 0)

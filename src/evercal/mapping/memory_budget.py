@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.mapping.selection import spread_poses
 from evercal.recordings.frame import Frame
+from evercal.typing import IntArray
 
 if TYPE_CHECKING:
     from evercal.mapping.keyframes import Keyframes
@@ -76,7 +76,7 @@ class MemoryBudget:
         one = store_keyframes(sample, short_side).bytes / len(sample)
         return min(len(frames), max(1, int(self.bytes / one)))
 
-    def fitting(self, keyframes: "Keyframes") -> NDArray[np.int64]:
+    def fitting(self, keyframes: "Keyframes") -> IntArray:
         """Indices of the keyframes that fit into the budget: spread by pose, at least one."""
         total = len(keyframes)
         if self.bytes is None or keyframes.bytes <= self.bytes:

@@ -10,11 +10,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry import resize_pixels
-
-Array = NDArray[np.floating]
+from evercal.typing import Array
 
 RADIUS = 5
 SIDE = 2 * RADIUS + 1

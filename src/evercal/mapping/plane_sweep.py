@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from evercal.features.views import ideal_cell_pixels
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
-
-Array = NDArray[np.floating]
+from evercal.typing import Array, BoolArray, Float32Array
 
 NEAR_M, USUAL_M, FAR_M = 0.25, 1.5, 12.0
 """Depths in a room; other recordings scale them (`pose_check.depth_scale`)."""
@@ -107,7 +106,7 @@ def inverse_depths(
     others: Sequence[PosedCells],
     guess_m: np.ndarray,
     scale: float = 1.0,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Inverse depth of every cell along the optical axis.
 
     The plane with the most similar features is refined by two Gauss-Newton steps along the ray,
@@ -167,7 +166,7 @@ class _SourceView:
         self.translation = other_from_view.translation_m
         self.similarity = (view.features @ other.features.T).reshape(-1, *other.grid)
 
-    def pixels(self, inverse: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def pixels(self, inverse: Array) -> tuple[Array, Array, BoolArray]:
         """Columns and rows (cells, ...) at inverse depths (cells, ...), and whether visible."""
         shape = (-1, *[1] * (inverse.ndim - 1))
         x, y, z = (

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from evercal.features.sift import SiftFeatures, epipolar_pair, sift_features
@@ -22,8 +21,7 @@ from evercal.features.vlad import Vlad, similar_pairs
 from evercal.geometry import Camera
 from evercal.mapping.plane_sweep import FAR_M, NEAR_M, USUAL_M
 from evercal.mapping.prepared_frames import PreparedFrames
-
-Array = NDArray[np.floating]
+from evercal.typing import Array, BoolArray, IntArray
 
 MIN_PARALLAX_PX, MAX_EPIPOLAR_PX = 16.0, 4.0
 """Matches are triangulated if parallax moves them by more than the first, and they lie nearer to
@@ -65,13 +63,13 @@ class MatchedPair:
 class PoseCheck:
     """Frames that are not used."""
 
-    wrong: NDArray[np.int64]
+    wrong: IntArray
     """Their stated pose contradicts the images."""
-    untracked: NDArray[np.int64]
+    untracked: IntArray
     """Their images neither confirm nor contradict the stated pose."""
 
     @property
-    def excluded(self) -> NDArray[np.int64]:
+    def excluded(self) -> IntArray:
         """All of them."""
         return np.union1d(self.wrong, self.untracked)
 
@@ -197,7 +195,7 @@ def _matched(recording: PreparedFrames, i: int, j: int) -> MatchedPair:
 
 
 @lru_cache(maxsize=4)
-def _apart(rows: int, columns: int) -> NDArray[np.bool_]:
+def _apart(rows: int, columns: int) -> BoolArray:
     """(cells, cells) whether two cells of a grid are no neighbours."""
     centres = cell_centres(rows, columns, 1)
     return cdist(centres, centres) > NEIGHBOURS

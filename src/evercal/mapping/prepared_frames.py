@@ -19,6 +19,7 @@ from evercal.mapping.plane_sweep import (
     select_source_views,
 )
 from evercal.recordings.frame import Frame, stated_poses
+from evercal.typing import Array, Float32Array, Image, IntArray
 
 PYRAMID_LEVELS = 3
 _PYRAMIDS = 128
@@ -43,7 +44,7 @@ class PreparedFrames:
         self.encoder = encoder
         self.size = size
         self._move(self.stated)
-        self.grey: list[NDArray[np.uint8]] = []
+        self.grey: list[Image] = []
         self.cameras: list[Camera] = []
         for frame in self.frames:
             image = frame.read_image()
@@ -56,7 +57,7 @@ class PreparedFrames:
         self._features: dict[int, NDArray[np.float16]] = {}
         self._cache_pyramids()
 
-    def without(self, excluded: NDArray[np.int64]) -> "PreparedFrames":
+    def without(self, excluded: IntArray) -> "PreparedFrames":
         """A copy without some frames; features of the others are not computed again."""
         index = np.setdiff1d(np.arange(len(self)), excluded)
         rest = copy(self)
@@ -99,7 +100,7 @@ class PreparedFrames:
         """Side of a cell of the feature grid, in pixels of the image that patches are cut from."""
         return self.encoder.stride * self.cameras[i].width / self.cell_camera(i).width
 
-    def features(self, i: int) -> NDArray[np.float32]:
+    def features(self, i: int) -> Float32Array:
         """(cells, channels) features of a frame, cached in half precision."""
         if i not in self._features:
             features = self.encoder.encode(self.grey[i], self.size.cells)
@@ -114,7 +115,7 @@ class PreparedFrames:
         stride = self.encoder.stride
         return PosedCells(self.features(i), camera, self.poses[i], stride)
 
-    def swept(self, i: int, source_views: int) -> tuple[NDArray[np.float32], list[int]]:
+    def swept(self, i: int, source_views: int) -> tuple[Float32Array, list[int]]:
         """Inverse depths (cells,) of a frame by a plane sweep, and the frames it was swept over.
 
         At most `source_views` frames are used, selected at the usual depth of the recording.
@@ -125,9 +126,7 @@ class PreparedFrames:
         others = [self.posed_cells(j) for j in near]
         return inverse_depths(view, others, guess, self.depth_scale), near
 
-    def source_views(
-        self, depth_m: NDArray[np.float64], view: PosedCells, count: int
-    ) -> list[int]:
+    def source_views(self, depth_m: Array, view: PosedCells, count: int) -> list[int]:
         """Frames that show the surfaces of a view, see `plane_sweep.select_source_views`."""
         cameras = [self.cell_camera(j) for j in range(len(self))]
         return select_source_views(depth_m, view, self.poses, cameras, count)

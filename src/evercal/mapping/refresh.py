@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, average_poses
@@ -34,8 +33,7 @@ from evercal.mapping.tracks import (
 from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame
-
-Mask = NDArray[np.bool_]
+from evercal.typing import Array, BoolArray
 
 
 @dataclass(frozen=True)
@@ -137,9 +135,9 @@ def refreshed(
 class _Survival:
     """The landmarks of a keyframe after new images were compared."""
 
-    checked: Mask
+    checked: BoolArray
     """(n,) landmarks that enough images should show."""
-    alive: Mask
+    alive: BoolArray
     """(n,) landmarks that were found, or could not be checked."""
 
     def share(self, least: int) -> float:
@@ -198,7 +196,7 @@ def _survival(
 
 
 def _selected(
-    poses: SE3, n: int, shares: NDArray[np.float64], options: RefreshOptions
+    poses: SE3, n: int, shares: Array, options: RefreshOptions
 ) -> tuple[list[int], list[int]]:
     """Return the old keyframes that stay and the new images that become keyframes."""
     kept = np.flatnonzero(shares >= options.least_surviving)
@@ -305,7 +303,7 @@ def _mean_motion(before: SE3, after: SE3) -> SE3:
 def _joined(
     prepared: PreparedFrames,
     old: Keyframes,
-    alive: Sequence[Mask],
+    alive: Sequence[BoolArray],
     kept: Sequence[int],
     opened: Sequence[KeyframeTracks],
 ) -> Keyframes:

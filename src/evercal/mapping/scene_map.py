@@ -5,13 +5,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
+from evercal.typing import IntArray
 
 if TYPE_CHECKING:
     from evercal.recordings.frame import Frame
@@ -116,5 +116,5 @@ class LeftOut(NamedTuple):
     """Frames that are located without the keyframes recorded near them."""
 
     frames: "tuple[Frame, ...]"
-    keyframes: NDArray[np.int64]
+    keyframes: IntArray
     """Indices of the other keyframes."""

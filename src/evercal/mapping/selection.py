@@ -22,9 +22,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry.se3 import SE3
+from evercal.typing import IntArray
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def _accept_until_full(space: PoseSpace, radius: float, capacity: int) -> np.nda
     return np.array(accepted, dtype=np.int64)
 
 
-def spread_poses(poses: SE3, capacity: int) -> NDArray[np.int64]:
+def spread_poses(poses: SE3, capacity: int) -> IntArray:
     """Select some of (n,) poses: by SARS with the largest radius that fills the capacity."""
     if len(poses) <= capacity:
         return np.arange(len(poses))

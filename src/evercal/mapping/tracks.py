@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.mapping.bundle_equations import BundleTracks
 from evercal.mapping.landmarks import Landmarks, detect, project_surface, slopes
@@ -18,9 +17,8 @@ from evercal.mapping.patches import (
 )
 from evercal.mapping.plane_sweep import FAR_M, NEAR_M, PROBED_CELLS
 from evercal.mapping.prepared_frames import PYRAMID_LEVELS, PreparedFrames
+from evercal.typing import Array, BoolArray, IntArray
 
-Array = NDArray[np.floating]
-Index = NDArray[np.int64]
 Steps = Sequence[tuple[int, int]]
 """Pyramid levels and alignment iterations, see `align_down`."""
 
@@ -76,16 +74,16 @@ class KeyframeTracks:
     """Templates of the landmarks in every pyramid level."""
     sources: tuple[int, ...]
     """Frames that see the same surfaces under parallax."""
-    confirmed: NDArray[np.bool_]
+    confirmed: BoolArray
     """(n,) landmarks that enough frames agree on."""
 
 
 class Observations(NamedTuple):
     """Landmarks of one keyframe in other frames."""
 
-    landmark: Index
+    landmark: IntArray
     """(m,)."""
-    frame: Index
+    frame: IntArray
     """(m,)."""
     pixels: Array
     """(m, 2)."""
@@ -123,7 +121,7 @@ def observe(
     recording: PreparedFrames,
     keyframe: KeyframeTracks,
     frame: int,
-    which: Index,
+    which: IntArray,
     steps: Steps,
     reach_px: float,
 ) -> Observations:
@@ -215,7 +213,7 @@ def bundle_tracks(
     )
 
 
-def _bundled(keyframe: KeyframeTracks, most: int) -> Index:
+def _bundled(keyframe: KeyframeTracks, most: int) -> IntArray:
     which = np.flatnonzero(keyframe.confirmed)
     if len(which) < most // 2:
         which = np.arange(len(keyframe.landmarks))

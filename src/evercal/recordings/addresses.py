@@ -9,7 +9,7 @@ from typing import Any, Self
 from uuid import uuid4
 
 from evercal.errors import InputError, optional_module
-from evercal.recordings.text_files import library_errors
+from evercal.storage.text_files import library_errors
 
 
 def is_address(text: object) -> bool:

@@ -7,17 +7,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from evercal.bounds import bounds
 from evercal.errors import InputError, is_plain
 from evercal.geometry import SE3, Camera
 from evercal.recordings.images import Picture, file_of, files_in, is_readable, pixels_of
-from evercal.recordings.text_files import few
+from evercal.storage.text_files import few
+from evercal.typing import Image
 
 if TYPE_CHECKING:
-    from evercal.recordings.poses.arm import Arm
+    from evercal.robot.arm import Arm
 
 Mount = Literal["eye_to_hand", "eye_in_hand"]
 MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
@@ -45,7 +43,7 @@ class Frame:
     """Joint values of the arm at the time of the image, if stated: radians, or metres of sliding
     joints."""
 
-    def read_image(self) -> NDArray[np.uint8]:
+    def read_image(self) -> Image:
         """Read the pixels, (H, W, 3) uint8 RGB; a size that is not the camera's is refused."""
         image = pixels_of(self.image)
         if image.shape[:2] != (self.camera.height, self.camera.width):

@@ -1,14 +1,14 @@
 """Image files that a user names: files, or folders of them."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.recordings.images import IMAGE_ENDINGS, files_in
+from evercal.typing import PathLike
 
 
-def image_files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
+def image_files(paths: Sequence[PathLike]) -> list[Path]:
     """Image files; a folder stands for its images, image-2 before image-10."""
     if not paths:
         raise InputError("no image given; name one or more image files or a folder")

@@ -1,6 +1,5 @@
 """Images on disk and in memory: (H, W, 3) uint8 in the order red, green, blue."""
 
-import os
 import re
 import zlib
 from abc import ABC, abstractmethod
@@ -10,12 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from evercal.bounds import bounds
 from evercal.errors import InputError
-from evercal.recordings.text_files import named_errors, natural_key
 from evercal.storage.atomic import write_bytes
+from evercal.storage.text_files import named_errors, natural_key
+from evercal.typing import Image, PathLike
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 """Endings of image files, in lower case."""
@@ -31,7 +31,7 @@ class StoredImage(ABC):
     """An image inside a larger file, such as a bag or a video, that is read on demand."""
 
     @abstractmethod
-    def read(self) -> NDArray[np.uint8]:
+    def read(self) -> Image:
         """Decode the image to (H, W, 3) uint8 RGB."""
 
     def file(self) -> tuple[str, bytes] | None:
@@ -45,16 +45,16 @@ class UnturnedImage(StoredImage):
 
     path: Path
 
-    def read(self) -> NDArray[np.uint8]:
+    def read(self) -> Image:
         """Decode the image to (H, W, 3) uint8 RGB."""
         return read_image(self.path, turned=False)
 
 
-Picture = Path | NDArray[np.uint8] | StoredImage
+Picture = Path | Image | StoredImage
 """A file, an array that `as_rgb` accepts, or an image inside a bag or video."""
 
 
-def pixels_of(image: Picture) -> NDArray[np.uint8]:
+def pixels_of(image: Picture) -> Image:
     """Read a picture: (H, W, 3) uint8 RGB."""
     if isinstance(image, Path):
         return read_image(image)
@@ -86,7 +86,7 @@ def as_stored(path: Path) -> Path | UnturnedImage:
     return path
 
 
-def _orientation(data: NDArray[np.uint8]) -> int:
+def _orientation(data: Image) -> int:
     """Position of the orientation in the bytes (n,) of a file that is not upright, else 0."""
     start = data[:12].tobytes()
     at = max(0, data.tobytes().rfind(b"EXIF")) if start[8:] == b"WEBP" else 0
@@ -96,7 +96,7 @@ def _orientation(data: NDArray[np.uint8]) -> int:
     return at + match.end() - 1 if match else 0
 
 
-def is_readable(image: Path | NDArray[np.uint8]) -> bool:
+def is_readable(image: Path | Image) -> bool:
     """Whether a file, or its bytes (n,), is an image that can be decoded.
 
     Of a PNG the checksums are compared, which takes a tenth of the time.
@@ -109,7 +109,7 @@ def is_readable(image: Path | NDArray[np.uint8]) -> bool:
     return False
 
 
-def _is_whole_png(data: NDArray[np.uint8]) -> bool:
+def _is_whole_png(data: Image) -> bool:
     at = 8
     kind = b""
     while data[:4].tobytes() == _PNG and kind != b"IEND" and at + 12 <= len(data):
@@ -129,7 +129,7 @@ def first_size(paths: Sequence[Path]) -> tuple[int, int]:
     return image_size(next(filter(is_readable, paths), paths[0]))
 
 
-def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
+def as_rgb(image: ArrayLike) -> Image:
     """Convert an image in memory to (H, W, 3) uint8 RGB.
 
     Args:
@@ -168,7 +168,7 @@ def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
     return np.ascontiguousarray(pixels[:, :, :3])
 
 
-def read_image(path: str | os.PathLike[str], turned: bool = True) -> NDArray[np.uint8]:
+def read_image(path: PathLike, turned: bool = True) -> Image:
     """Read a grey, RGB or RGBA image file of 8 or 16 bits, converted as by `as_rgb`.
 
     It is turned upright as its EXIF orientation states, unless `turned` is False; intrinsics are
@@ -186,9 +186,7 @@ def read_image(path: str | os.PathLike[str], turned: bool = True) -> NDArray[np.
     return image
 
 
-def decode_image(
-    data: NDArray[np.uint8], turned: bool = True
-) -> NDArray[np.uint8] | None:
+def decode_image(data: Image, turned: bool = True) -> Image | None:
     """Decode (n,) uint8 bytes of an image file as by `read_image`; None if they are no image."""
     import cv2
 
@@ -217,7 +215,7 @@ def image_file(data: bytes) -> tuple[str, bytes] | None:
     return None if ending is None else (ending, data)
 
 
-def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
+def write_image(path: PathLike, image: Image) -> None:
     """Write (H, W, 3) uint8 RGB in the format of the file's ending."""
     import cv2
 
@@ -240,16 +238,14 @@ def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
     path.write_bytes(data.tobytes())
 
 
-def write_jpeg(
-    path: str | os.PathLike[str], image: NDArray[np.uint8], quality: int
-) -> None:
+def write_jpeg(path: PathLike, image: Image, quality: int) -> None:
     """Write (H, W, 3) uint8 RGB, whole or not at all; missing folders are created."""
     data = encode_jpeg(image, quality)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, data)
 
 
-def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+def encode_jpeg(image: Image, quality: int) -> bytes:
     """Encode (H, W) grey or (H, W, 3) RGB uint8 as a JPEG file."""
     import cv2
 
@@ -257,7 +253,7 @@ def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
-def image_size(image: str | os.PathLike[str] | StoredImage) -> tuple[int, int]:
+def image_size(image: PathLike | StoredImage) -> tuple[int, int]:
     """Width and height in pixels of an image file, turned upright as by `read_image`."""
     height, width = pixels_of(
         image if isinstance(image, StoredImage) else Path(image)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -10,7 +9,8 @@ from types import ModuleType
 from evercal.errors import InputError
 from evercal.recordings.frame import Recording, with_images
 from evercal.recordings.read_options import ReadOptions, flag
-from evercal.recordings.text_files import named_errors
+from evercal.storage.text_files import named_errors
+from evercal.typing import PathLike
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def recognised(root: Path) -> str | None:
 
 
 def load_recording(
-    path: str | os.PathLike[str],
+    path: PathLike,
     format: str | None = None,
     name: str | None = None,
     options: ReadOptions | None = None,

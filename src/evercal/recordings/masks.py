@@ -8,7 +8,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.recordings.frame import Frame, Recording
@@ -19,6 +18,7 @@ from evercal.recordings.images import (
     pixels_of,
     read_image,
 )
+from evercal.typing import BoolArray, Image
 
 SOFT_PX = 9
 """Side of the square that softens the edge of what is left: a hard one would be texture."""
@@ -31,7 +31,7 @@ class MaskedImage(StoredImage):
     image: Picture
     mask: Path
 
-    def read(self) -> NDArray[np.uint8]:
+    def read(self) -> Image:
         """(H, W, 3), with its mean colour where the mask is black."""
         image = pixels_of(self.image)
         mask = read_image(self.mask)[..., 0] > 0
@@ -43,7 +43,7 @@ class MaskedImage(StoredImage):
         return without(image, mask)
 
 
-def without(image: NDArray[np.uint8], keep: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def without(image: Image, keep: BoolArray) -> Image:
     """The image (H, W, 3) with its mean colour, through a soft edge, outside `keep`.
 
     `keep` has the image's size, or is smaller.

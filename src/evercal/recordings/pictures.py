@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.recordings.frame import Frame
+from evercal.typing import Array, Image
 
 _LOOKED_AT, _SIDE_PX = 12, 240
 """Number of images that are looked at, spread over a recording, and their shorter side."""
@@ -69,7 +69,7 @@ def look_at(frames: Sequence[Frame]) -> Pictures:
     return Pictures((), usable=True)
 
 
-def is_blank(image: NDArray[np.uint8]) -> bool:
+def is_blank(image: Image) -> bool:
     """Whether an image (h, w, 3) is black, white or of one colour."""
     darkest, brightest = np.quantile(
         cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), [0.01, 0.99]
@@ -77,7 +77,7 @@ def is_blank(image: NDArray[np.uint8]) -> bool:
     return bool(brightest - darkest < _BLANK)
 
 
-def sharpness(image: NDArray[np.uint8]) -> float:
+def sharpness(image: Image) -> float:
     """Contrast of fine structure relative to coarser one, in the direction of motion blur.
 
     It is the smallest generalised eigenvalue of the structure tensors of two octaves, which hardly
@@ -96,12 +96,12 @@ def sharpness(image: NDArray[np.uint8]) -> float:
     return float(np.sqrt(max(eigh(above, below, eigvals_only=True)[0], 0.0)))
 
 
-def _structure(band: Any) -> NDArray[np.float64]:
+def _structure(band: Any) -> Array:
     slopes = [cv2.Sobel(band, cv2.CV_32F, *order).ravel() for order in ((1, 0), (0, 1))]
     return np.cov(slopes, bias=True)
 
 
-def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _small(image: Image) -> Image:
     scale = min(1.0, _SIDE_PX / min(image.shape[:2]))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.uint8)

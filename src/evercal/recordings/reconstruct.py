@@ -8,7 +8,6 @@ The unit of length is arbitrary until the map is aligned.
 """
 
 import itertools
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,12 +16,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError, optional_module
 from evercal.recordings.images import write_image
 from evercal.recordings.pictures import is_blank
 from evercal.recordings.streams import StreamFrame, stream
+from evercal.typing import Image, PathLike
 
 OnStep = Callable[[str, int, int], object]
 """Called with the name of the step, how much of it is done, and its total."""
@@ -52,8 +51,8 @@ class Reconstruction:
 
 
 def reconstruct(
-    source: str | os.PathLike[str],
-    out: str | os.PathLike[str],
+    source: PathLike,
+    out: PathLike,
     motion: float = 0.04,
     most_frames: int = 300,
     on_step: OnStep = lambda *_: None,
@@ -129,8 +128,8 @@ def _chosen(source: str, images: Path, motion: float, most: int) -> list[str]:
 
 def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFrame]:
     """Yield the sharpest frame of each step of a moving camera."""
-    last: NDArray[np.uint8] | None = None
-    best: tuple[float, StreamFrame, NDArray[np.uint8]] | None = None
+    last: Image | None = None
+    best: tuple[float, StreamFrame, Image] | None = None
     for frame in frames:
         if is_blank(frame.image):  # such as black ones before the picture comes
             continue
@@ -154,7 +153,7 @@ def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFram
         yield best[1]
 
 
-def _motion(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:
+def _motion(before: Image, now: Image) -> float:
     """Median motion of corners, parts of the width; infinite if most are lost."""
     corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 7)
     if corners is None:

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.recordings.image_files import image_files
 from evercal.recordings.images import read_image
 from evercal.recordings.poses.row_files import times_in_names
+from evercal.typing import Image
 
 _LIVE = re.compile(r"\d+|/dev/\S+|(rtsp|rtsps|http|https|udp|tcp)://\S+")
 """Sources whose frames have the time of their arrival."""
@@ -27,7 +27,7 @@ class StreamFrame(NamedTuple):
     """File name, or number."""
     stamp_s: float
     """Seconds: in the file's name, since the start of a video, or of arrival (Unix time)."""
-    image: NDArray[np.uint8]
+    image: Image
     """(H, W, 3) RGB."""
     arrived_s: float = 0.0
     """Time of arrival of a live frame by `time.monotonic`, which cannot be set back."""

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.boards.board_poses import read_board_poses
 from evercal.calibration.boards.corners import BoardView
@@ -24,12 +23,11 @@ from evercal.reports.overlay import (
     resized,
 )
 from evercal.reports.scene import Surroundings
+from evercal.typing import Array, Image
 
 if TYPE_CHECKING:
     from evercal.localization.learned import LearnedLocalizer
 
-Image = NDArray[np.uint8]
-Array = NDArray[np.float64]
 
 MAX_IMAGES = 4
 

@@ -5,12 +5,10 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.reports.overlay import overlay_lines
+from evercal.typing import Array, Image
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Text = tuple[str, float, float, int]
 """Words, and the pixel on their base line that they lie right of (0), around (1) or left of (2)."""
 

@@ -4,16 +4,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, resize_pixels
+from evercal.typing import Array, Image
 
 if TYPE_CHECKING:
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.learned import LearnedLocalizer
 
-Image = NDArray[np.uint8]
-Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 MAX_RESIDUAL_PX = 2.0
@@ -37,7 +35,7 @@ _VECTOR_COLOUR = (255, 140, 40)
 class LandmarkPicture(NamedTuple):
     """An image with its landmarks."""
 
-    image: NDArray[np.uint8]
+    image: Image
     """(h, w, 3) RGB."""
     landmarks: int
     """Number of landmarks."""
@@ -46,7 +44,7 @@ class LandmarkPicture(NamedTuple):
 
 
 def draw_landmarks(
-    image: NDArray[np.uint8],
+    image: Image,
     estimate: "PoseEstimate",
     localizer: "LearnedLocalizer",
     camera: Camera | None = None,

@@ -7,12 +7,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
 from evercal.recordings.images import encode_jpeg
 from evercal.recordings.poses.row_files import is_number
 from evercal.reports.charts import INKS
+from evercal.typing import Image
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -23,7 +21,7 @@ _TEMPLATES = Path(__file__).parent / "templates"
 class Picture(NamedTuple):
     """A photograph."""
 
-    image: NDArray[np.uint8]
+    image: Image
     """(h, w, 3) RGB."""
     caption: str = ""
     """Text below the picture, also its alternative text."""

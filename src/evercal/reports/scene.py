@@ -9,15 +9,13 @@ from dataclasses import dataclass, field
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.mapping.scene_map import SceneMap
 from evercal.reports.charts import Panel, Shape
 from evercal.reports.overlay import colour_map
+from evercal.typing import Array, Image
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 ColourBy = Literal["image", "height", "uncertainty"]
 Plane = tuple[int, int]
 
@@ -116,7 +114,7 @@ class Landmarks3D:
         """All landmarks, or `most` of them, drawn evenly from all keyframes."""
         keyframes = scene.keyframes
         scale = _scale(scene)
-        points = [np.zeros((0, 3))]
+        points: list[Array] = [np.zeros((0, 3))]
         grey = [np.zeros(0, np.uint8)]
         sigma = [np.zeros(0)]
         for i, marks in enumerate(keyframes.landmarks):
@@ -165,7 +163,7 @@ class KeyframeView:
     """Intrinsics at the size of `image`."""
     image: Image
     """(h, w, 3) RGB at working size."""
-    depths_m: NDArray[np.floating]
+    depths_m: Array
     """(n,) depths of its landmarks along the optical axis."""
 
 
@@ -196,7 +194,7 @@ class Surroundings:
 
     points_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
     """(n, 3) landmarks."""
-    grey: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    grey: Image = field(default_factory=lambda: np.zeros(0, np.uint8))
     """(n,) their pixels."""
     keyframes: tuple[Frustum, ...] = ()
     """Views of the map."""

@@ -8,18 +8,17 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.reports.answers import Answer, finite_pose
 from evercal.reports.charts import Panel, Shape, paint, write
 from evercal.reports.overlay import draw_landmarks
 from evercal.reports.scene import ABOVE, Frustum, Surroundings, view_panel
+from evercal.typing import Image
 
 if TYPE_CHECKING:
     from evercal.localization.learned import LearnedLocalizer
 
-Image = NDArray[np.uint8]
 
 ENDING = ".mp4"
 FRAMES_A_SECOND = 10

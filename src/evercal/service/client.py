@@ -15,6 +15,7 @@ from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.recordings.image_files import image_files
 from evercal.recordings.images import as_rgb
+from evercal.typing import PathLike
 
 if TYPE_CHECKING:
     from evercal.calibration.drift import Shift
@@ -59,7 +60,7 @@ class Client:
         return tuple(self._ask("GET", "/scenes")["scenes"])
 
     def localize(
-        self, image: np.ndarray | str | os.PathLike[str], camera: Camera | None = None
+        self, image: np.ndarray | PathLike, camera: Camera | None = None
     ) -> PoseEstimate:
         """Estimate the camera pose of one image, see `Map.localize`.
 
@@ -75,7 +76,7 @@ class Client:
         self,
         images: "ImageSource",
         *,
-        robot_poses: str | os.PathLike[str] | SE3 | None = None,
+        robot_poses: PathLike | SE3 | None = None,
         camera: Camera | None = None,
         mount: Mount | None = None,
     ) -> Calibration:
@@ -132,7 +133,7 @@ class Client:
         return content
 
 
-def _image_part(image: np.ndarray | str | os.PathLike[str], name: str) -> Part:
+def _image_part(image: np.ndarray | PathLike, name: str) -> Part:
     if isinstance(image, str | os.PathLike):
         path = Path(image)
         try:
@@ -159,7 +160,7 @@ def _json_part(name: str, record: Camera | Calibration | None) -> Parts:
     return [(name, (f"{name}.json", json.dumps(record.to_dict()).encode()))]
 
 
-def _poses_part(poses: str | os.PathLike[str] | SE3) -> Part:
+def _poses_part(poses: PathLike | SE3) -> Part:
     if isinstance(poses, str | os.PathLike):
         return _image_part(poses, "")
     rows = ((*pose.translation_m, *pose.rotation_wxyz) for pose in poses)

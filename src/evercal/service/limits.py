@@ -16,8 +16,8 @@ from evercal.bounds import RequestBounds, reading_a_request, request_bounds
 from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
+from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.images import decode_image
-from evercal.recordings.poses.camera_file import read_camera
 from evercal.recordings.poses.pairing import poses_of_images
 
 Image.preinit()

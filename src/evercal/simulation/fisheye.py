@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera
+from evercal.typing import Image
 
 _FACES = [(0.0, 0.0), (0.0, 90.0), (0.0, -90.0), (90.0, 0.0), (-90.0, 0.0)]
 """Turns of the faces about x and y, degrees."""
@@ -15,9 +15,9 @@ _FACES = [(0.0, 0.0), (0.0, 90.0), (0.0, -90.0), (90.0, 0.0), (-90.0, 0.0)]
 def fisheye_image(
     camera: Camera,
     base_from_camera: SE3,
-    render: Callable[[Camera, SE3], NDArray[np.uint8]],
+    render: Callable[[Camera, SE3], Image],
     finer: int = 2,
-) -> NDArray[np.uint8]:
+) -> Image:
     """An image (H, W, 3) of a fisheye; pixels without a ray are black.
 
     `render` gives the image of an ideal pinhole at a pose. Each pixel is the mean of finer x finer.

@@ -5,12 +5,10 @@ Craig's convention). The gripper frame is the flange.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
-
-Array = NDArray[np.float64]
+from evercal.typing import Array
 
 LINKS = np.array(
     [

@@ -7,7 +7,6 @@ that take time, and images. The truth is separate and serves tests.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
@@ -22,6 +21,7 @@ from evercal.simulation.cell_room import (
 )
 from evercal.simulation.panda_arm import base_from_flange
 from evercal.simulation.virtual_robot import Clock, VirtualRobot
+from evercal.typing import Image
 
 RESERVED = 9000
 """Seeds from here on are reserved for final evaluation."""
@@ -75,7 +75,7 @@ class VirtualCamera:
         self._mounted = mounted
         self._on_gripper = on_gripper
 
-    def read(self) -> tuple[float, NDArray[np.uint8]]:
+    def read(self) -> tuple[float, Image]:
         """Take an image: time in seconds, and (H, W, 3) RGB."""
         options = self._cell.options
         stamp = self._cell.clock.now()
@@ -92,7 +92,7 @@ class VirtualCamera:
         noisy = mean + 255 * options.image_noise * noise
         return stamp, np.clip(np.round(noisy), 0, 255).astype(np.uint8)
 
-    def _render(self, now_s: float) -> NDArray[np.uint8]:
+    def _render(self, now_s: float) -> Image:
         cell = self._cell
         base_from_gripper, joints = cell.robot.true_state(now_s)
         pose = base_from_gripper @ self._mounted if self._on_gripper else self._mounted
@@ -179,7 +179,7 @@ class VirtualCell:
         base_from_camera: SE3,
         joints_rad: np.ndarray,
         base_from_gripper: SE3 | None = None,
-    ) -> NDArray[np.uint8]:
+    ) -> Image:
         """An ideal image, (H, W, 3), of a camera at a pose while the arm has joint angles (7,).
 
         `base_from_gripper` is the pose of what the gripper holds. Default: that of the joints.

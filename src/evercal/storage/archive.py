@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import os
 import shutil
 import stat
 import zipfile
@@ -13,6 +12,7 @@ from pathlib import Path, PurePosixPath
 
 from evercal.errors import InputError
 from evercal.storage.atomic import replacing
+from evercal.typing import PathLike
 
 _DIRECTORY_BYTES = 512
 """Size of an entry in the central directory, bytes, on average and at most: Python keeps all
@@ -31,9 +31,7 @@ class ArchiveLimits:
     """Number of entries."""
 
 
-def write_archive(
-    file: str | os.PathLike[str], root: Path, names: Iterable[str]
-) -> None:
+def write_archive(file: PathLike, root: Path, names: Iterable[str]) -> None:
     """Write files of a folder into one zip archive, whole or not at all.
 
     Entries are stored, not compressed: JPEG images and half floats hardly shrink. The same files

@@ -13,8 +13,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from evercal.typing import PathLike
 
-def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
+
+def write_bytes(path: PathLike, data: bytes) -> None:
     """Create or replace a file.
 
     Raises:
@@ -25,7 +27,7 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+def replacing(path: PathLike) -> Iterator[BinaryIO]:
     """Open a file that takes the place of `path` when the block ends without an error.
 
     Raises:
@@ -46,7 +48,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     _sync_folder(path.parent)
 
 
-def write_json(path: str | os.PathLike[str], obj: object) -> None:
+def write_json(path: PathLike, obj: object) -> None:
     """Create or replace a UTF-8 JSON file; the same object gives the same bytes.
 
     Raises:
@@ -57,9 +59,7 @@ def write_json(path: str | os.PathLike[str], obj: object) -> None:
     write_bytes(path, (text + "\n").encode())
 
 
-def replace_folder(
-    temporary: str | os.PathLike[str], final: str | os.PathLike[str]
-) -> None:
+def replace_folder(temporary: PathLike, final: PathLike) -> None:
     """Rename a complete folder, replacing an existing one.
 
     No portable call swaps two folders. An existing `final` is first renamed to a fixed name. After
@@ -85,7 +85,7 @@ def replace_folder(
     _sync_folder(final.parent)
 
 
-def recover_folder(final: str | os.PathLike[str]) -> None:
+def recover_folder(final: PathLike) -> None:
     """Restore or remove a folder that an interrupted `replace_folder` has left."""
     final = Path(final)
     aside = _aside(final)

@@ -9,7 +9,6 @@ that a changed manifest is detected too.
 
 import hashlib
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -17,6 +16,7 @@ from typing import Any, Self
 
 from evercal.errors import InputError
 from evercal.storage.atomic import write_json
+from evercal.typing import PathLike
 
 MANIFEST = "manifest.json"
 _FORMAT = "evercal-manifest"
@@ -26,7 +26,7 @@ FileRecord = dict[str, object]
 """`sha256` and `bytes` of a file."""
 
 
-def sha256_file(path: str | os.PathLike[str]) -> str:
+def sha256_file(path: PathLike) -> str:
     """Checksum of a file's bytes, 64 hexadecimal digits."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -42,12 +42,12 @@ class Manifest:
     """Checksum and size of every file when it was written, by relative path."""
 
     @classmethod
-    def read(cls, root: str | os.PathLike[str]) -> Self:
+    def read(cls, root: PathLike) -> Self:
         """Read a manifest; files are not checked, see `problems`."""
         whole = _read(Path(root))
         return cls(whole["payload"], whole["files"])
 
-    def problems(self, root: str | os.PathLike[str]) -> list[str]:
+    def problems(self, root: PathLike) -> list[str]:
         """Compare every listed file with its size and checksum.
 
         Returns:
@@ -70,7 +70,7 @@ class Manifest:
 
 
 def write_manifest(
-    root: str | os.PathLike[str],
+    root: PathLike,
     payload: dict[str, object],
     files: Sequence[str],
     before: Manifest | None = None,
@@ -106,12 +106,12 @@ def write_manifest(
     )
 
 
-def read_manifest(root: str | os.PathLike[str]) -> dict[str, Any]:
+def read_manifest(root: PathLike) -> dict[str, Any]:
     """The payload; files are not checked, see `verify`."""
     return Manifest.read(root).payload
 
 
-def verify(root: str | os.PathLike[str]) -> list[str]:
+def verify(root: PathLike) -> list[str]:
     """Compare every listed file with its size and checksum; see `Manifest.problems`."""
     while True:
         manifest = Manifest.read(root)

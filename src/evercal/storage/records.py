@@ -1,12 +1,12 @@
 """JSON files that evercal wrote: they state their format and version."""
 
 import json
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 from evercal.errors import InputError
+from evercal.typing import PathLike
 
 Content = TypeVar("Content")
 
@@ -37,7 +37,7 @@ def of_format(
 
 
 def read_record(
-    path: str | os.PathLike[str], what: str, convert: Callable[[object], Content]
+    path: PathLike, what: str, convert: Callable[[object], Content]
 ) -> Content:
     """Read a JSON file and convert its values; `what` names it in messages."""
     try:

@@ -2,10 +2,11 @@
 
 import numpy as np
 from hypothesis import strategies as st
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from evercal.calibration.calibration import Calibration, ImageUse, Mount
 from evercal.geometry import SE3, Camera
+from evercal.typing import Array
 
 CAMERA = Camera(640, 480, 600.25, 601.5, 319.75, 240.5, (0.1, -0.2, 0.001, 0.002, 0.03))
 
@@ -58,7 +59,7 @@ def random_poses(count: int = 5, seed: int = 3) -> SE3:
 
 def quaternion_matrix(
     x: float, y: float, z: float, w: float, translation: ArrayLike
-) -> NDArray[np.float64]:
+) -> Array:
     """Return a 4x4 matrix by the textbook formula."""
     matrix = np.eye(4)
     matrix[:3, :3] = [

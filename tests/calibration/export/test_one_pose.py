@@ -18,19 +18,19 @@ import yaml
 import yourdfpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.calibration import Mount
 from evercal.calibration.export.formats import FORMATS
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.recordings.poses.camera_file import read_camera
+from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.poses.robot_poses import read_robot_poses
+from evercal.typing import Array
 
 from .random_poses import CAMERA, calibration_of, poses, quaternion_matrix
 
-Read = tuple[NDArray[np.floating], str, str]
+Read = tuple[Array, str, str]
 """Matrix parent_from_child, and the names of both frames; empty if the format has none."""
 NUMBER = r"-?\d+\.\d+"
 CHILD = "cam/optical-frame"
@@ -89,7 +89,7 @@ def ros1_launch(text: str) -> Read:
     return quaternion_matrix(*rotation, translation=(x, y, z)), parent, child
 
 
-def of_message(transform: dict[str, dict[str, float]]) -> NDArray[np.float64]:
+def of_message(transform: dict[str, dict[str, float]]) -> Array:
     """Read a geometry_msgs/Transform, which has fields of type float only."""
     position = [transform["translation"][axis] for axis in "xyz"]
     assert all(type(v) is float for v in (*position, *transform["rotation"].values()))
@@ -177,7 +177,7 @@ def opencv(text: str) -> Read:
     return np.linalg.inv(camera_from_parent), "", ""
 
 
-def plain(matrix: NDArray[np.floating], per_metre: float = 1.0) -> Read:
+def plain(matrix: Array, per_metre: float = 1.0) -> Read:
     return np.r_[matrix[:3] / [1, 1, 1, per_metre], matrix[3:]], "", ""
 
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from evercal.continual.networks.feature_cache import cache_features
 from evercal.features.encoder import Encoder
+from evercal.typing import Float32Array
 
 IMAGES = np.random.default_rng(0).integers(0, 256, (5, 16, 24)).astype(np.uint8)
 
@@ -20,7 +20,7 @@ class Counting:
         self.weight = weight
         self.captured = 0
 
-    def __call__(self, grey: NDArray[np.float32]) -> NDArray[np.float32]:
+    def __call__(self, grey: Float32Array) -> Float32Array:
         self.captured += 1
         rows, columns = (side // 8 for side in grey.shape)
         return self.weight * grey.reshape(rows, 8, columns, 8).sum(1) + self.weight**2

@@ -15,7 +15,7 @@ from evercal.recordings.image_files import image_files
 from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import times_in_names
-from evercal.recordings.text_files import natural_key
+from evercal.storage.text_files import natural_key
 
 from ..checks import assert_pose, refused
 

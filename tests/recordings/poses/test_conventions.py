@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from evercal.geometry import SE3, pose_distance
@@ -19,8 +18,7 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
     poses_from_numbers,
 )
-
-Array = NDArray[np.float64]
+from evercal.typing import Array
 
 
 def of_vector(x: float, y: float, z: float) -> Array:

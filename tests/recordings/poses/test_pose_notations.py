@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
@@ -17,10 +16,10 @@ from evercal.recordings.poses.conventions import (
     poses_from_numbers,
 )
 from evercal.recordings.poses.robot_poses import read_robot_poses
+from evercal.typing import Array
 
 from ..checks import refused
 
-Array = NDArray[np.float64]
 NAMES = tuple(f"{i}.png" for i in range(5))
 
 

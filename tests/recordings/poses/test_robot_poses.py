@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
@@ -19,6 +18,7 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
 )
 from evercal.recordings.poses.robot_poses import read_robot_poses
+from evercal.typing import Array
 
 from ..checks import refused
 
@@ -31,7 +31,7 @@ def arm(seed: int = 0) -> SE3:
     return SE3(rng.normal(size=(COUNT, 4)), rng.uniform(0.2, 0.8, (COUNT, 3)))
 
 
-def table(header: str, numbers: NDArray[np.float64], separator: str = ",") -> str:
+def table(header: str, numbers: Array, separator: str = ",") -> str:
     text = io.StringIO()
     writer = csv.writer(text, delimiter=separator)
     if header:

@@ -12,14 +12,12 @@ other fields. Covariances are those of `BoardPose`. Pixels `left_out` are corner
 neighbours.
 """
 
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.corners import (
@@ -32,8 +30,7 @@ from evercal.calibration.boards.corners import (
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
-
-Array = NDArray[np.floating]
+from evercal.typing import Array, PathLike
 
 FORMAT = "evercal-board-poses"
 VERSION = 1
@@ -103,12 +100,12 @@ class BoardPoses:
 
         return of_format(data, FORMAT, VERSION, read)
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: PathLike) -> None:
         """Write the file atomically."""
         write_json(path, self.to_dict())
 
 
-def read_board_poses(path: str | os.PathLike[str]) -> BoardPoses:
+def read_board_poses(path: PathLike) -> BoardPoses:
     """Read a file written by `evercal detect`."""
     return read_record(path, "file of camera poses", BoardPoses.from_dict)
 

@@ -12,7 +12,6 @@ from math import factorial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
@@ -20,8 +19,7 @@ from scipy.stats import norm
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, cross_matrix
 from evercal.geometry.camera import COEFFICIENTS, Model
-
-Array = NDArray[np.floating]
+from evercal.typing import Array, BoolArray
 
 _LEAST_PX = 0.02
 """Minimum standard deviation of a corner, due to errors of lens model and board."""
@@ -54,7 +52,7 @@ class BoardView:
         object.__setattr__(self, "points_m", points)
         object.__setattr__(self, "pixels", pixels)
 
-    def __getitem__(self, use: NDArray[np.bool_]) -> "BoardView":
+    def __getitem__(self, use: BoolArray) -> "BoardView":
         return BoardView(self.points_m[use], self.pixels[use])
 
 
@@ -264,7 +262,7 @@ def strays(
     poses: Sequence[BoardPose],
     camera: Camera,
     bend: Bend | None = None,
-) -> list[NDArray[np.bool_]]:
+) -> list[BoolArray]:
     """Return (k,) of every view: whether a corner leaves its neighbours by many sigma.
 
     Residuals of lens and board are smooth, so they are no reason. Each is left out before the next

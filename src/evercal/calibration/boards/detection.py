@@ -19,9 +19,7 @@ from evercal.calibration.boards.markers import (
 )
 from evercal.errors import InputError
 from evercal.geometry.camera import resize_pixels
-
-Array = NDArray[np.floating]
-Image = NDArray[np.uint8]
+from evercal.typing import Array, Image
 
 _LARGEST_CHANGE = 0.3
 """Maximum change of the step from corner to corner, parts of the mean step."""

@@ -6,8 +6,7 @@ from numpy.typing import NDArray
 
 from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.corners import BoardView
-
-Array = NDArray[np.floating]
+from evercal.typing import Array
 
 _NEIGHBOURS = 8
 _SMALLEST_WINDOW_PX = 2

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from evercal.calibration.boards.board import Board, dictionary_of
 from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.boards.edges import sharpened, squares_by_their_sides
+from evercal.typing import Array, BoolArray, IntArray
 
-Array = NDArray[np.floating]
-Ids = NDArray[np.int64]
 Plane = NDArray[np.complexfloating]
 """x + i y."""
 
@@ -48,13 +47,13 @@ class OtherBoard(str):
 class Markers(NamedTuple):
     """n markers in an image, and m steps from each to its neighbours in the image."""
 
-    ids: Ids
+    ids: IntArray
     """(n,)"""
     corners: Array
     """(n, 4, 2) pixels, clockwise from the upper left of OpenCV's print."""
-    start: Ids
+    start: IntArray
     """(m,) number of the marker at the start of a step."""
-    end: Ids
+    end: IntArray
     """(m,) number of the marker at its end."""
     steps: Plane
     """(m,) in axes and sides of the marker at the start."""
@@ -76,7 +75,7 @@ class Layout(NamedTuple):
     parity: int | None = None
     """Of column + row of squares that hold markers; None if each cell holds one."""
 
-    def cells(self, ids: Ids) -> Plane:
+    def cells(self, ids: IntArray) -> Plane:
         """Return column + i row of the cells of markers (n,)."""
         number = ids - self.first
         # Every second square; with even columns, rows alternate.
@@ -90,11 +89,11 @@ class Layout(NamedTuple):
         turned = sides * 1j**self.turn
         return turned.conj() if self.up else turned
 
-    def has(self, ids: Ids) -> NDArray[np.bool_]:
+    def has(self, ids: IntArray) -> BoolArray:
         """Return (n,) whether markers are on the board."""
         return (ids >= self.first) & (ids < self.first + self.markers)
 
-    def fit(self, markers: Markers) -> tuple[NDArray[np.bool_], float]:
+    def fit(self, markers: Markers) -> tuple[BoolArray, float]:
         """Return (m,) which steps fit the layout, and the side of a marker in cells."""
         wanted = self.cells(markers.end) - self.cells(markers.start)
         side = float(
@@ -144,7 +143,7 @@ def find_markers(grey: NDArray, board: Board) -> Markers:
     return Markers(ids, corners, *_steps(ids, corners))
 
 
-def _steps(ids: Ids, corners: Array) -> tuple[Ids, Ids, Plane]:
+def _steps(ids: IntArray, corners: Array) -> tuple[IntArray, IntArray, Plane]:
     n = len(ids)
     near = min(_NEAREST, max(len(ids) - 1, 0))
     ends = np.pad(corners, ((0, 0), (0, 0), (0, 1)), constant_values=1)

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from evercal.calibration.boards.board import Board, dictionary_of
 from evercal.errors import InputError
+from evercal.typing import Image
 
 if TYPE_CHECKING:
-    from PIL.Image import Image
+    from PIL.Image import Image as Page
 
 PAPERS_MM = {
     "a4": (210.0, 297.0),
@@ -31,7 +32,7 @@ _DPI = 300.0
 """Approximate resolution; the exact one makes a square a whole number of pixels."""
 
 
-def board_image(board: Board, unit_px: int) -> NDArray[np.uint8]:
+def board_image(board: Board, unit_px: int) -> Image:
     """Draw a board (h, w) without margin; `unit_px` lie along a square, or a cell of a tag."""
     import cv2
 
@@ -65,7 +66,7 @@ def _cells(board: Board) -> int:
     return dictionary_of(board).markerSize + 2 if board.kind == "apriltag" else 1
 
 
-def drawing(board: Board, paper: str = "a4") -> "tuple[Image, float]":
+def drawing(board: Board, paper: str = "a4") -> "tuple[Page, float]":
     """Draw a board on a sheet, with a ruler; also return the resolution in pixels per inch."""
     from PIL import Image, ImageDraw, ImageFont
 

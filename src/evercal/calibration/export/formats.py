@@ -1,6 +1,5 @@
 """The table of export formats, and `export_files`."""
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from evercal.calibration.export import writers as to
 from evercal.calibration.export.request import Export, ExportOptions, prepare_export
 from evercal.errors import InputError
 from evercal.storage import write_bytes
+from evercal.typing import PathLike
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
@@ -114,7 +114,7 @@ class Exported:
 def export_files(
     calibration: "Calibration",
     format: str,
-    path: str | os.PathLike[str] | None = None,
+    path: PathLike | None = None,
     **options: Unpack[ExportOptions],
 ) -> Exported:
     """Export a calibration to the format of another program.

@@ -11,7 +11,7 @@ from evercal.calibration.export.request import Export, pose_numbers
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.kinematics import RobotModel
-from evercal.recordings.text_files import library_errors, read_json
+from evercal.storage.text_files import library_errors, read_json
 
 _LEROBOT_TICKS = 4095 / 360
 """A degree of LeRobot is this many ticks: it divides by the resolution minus 1."""

@@ -5,7 +5,6 @@ have no second parent. By ROS REP 103, a link has x forward, y left, z up, and a
 x right, y down, z forward. The offset between their origins is in `/tf_static` or the data sheet.
 """
 
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,18 +12,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
-from evercal.recordings.text_files import read_text, yaml_documents
+from evercal.storage.text_files import read_text, yaml_documents
+from evercal.typing import Array, PathLike
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
 
-PoseSource: TypeAlias = RobotPoses | str | os.PathLike[str] | None
+PoseSource: TypeAlias = RobotPoses | PathLike | None
 
 # tf itself refuses only empty names and a leading slash; blanks, quotes and brackets would break
 # the shell commands, launch files and XML that hold the names.
@@ -40,7 +39,7 @@ class ExportOptions(TypedDict, total=False):
     """New name of the child frame."""
     via: str | None
     """Root frame of the camera driver, which becomes the child frame."""
-    via_transform: str | os.PathLike[str] | None
+    via_transform: PathLike | None
     """File with the transforms between the root frame and the optical frame."""
     via_offset: tuple[float, float, float] | None
     """Origin of the optical frame in the root frame: forward, left, up, metres."""
@@ -54,9 +53,9 @@ class ExportOptions(TypedDict, total=False):
     """camera_from_target of every image, or a file of them."""
     convention: str | None
     """Pose convention of the file of robot poses."""
-    urdf: str | os.PathLike[str] | None
+    urdf: PathLike | None
     """URDF of the arm, for `corrected_urdf`."""
-    lerobot_calibration: str | os.PathLike[str] | None
+    lerobot_calibration: PathLike | None
     """Calibration file of a LeRobot arm, for `lerobot`."""
     lerobot_motors: Literal["feetech", "dynamixel"] | None
     """Motors of that arm, which subtract the homing offset or add it."""
@@ -114,7 +113,7 @@ class Export:
         return pose_numbers(self.pose, convention).tolist()
 
 
-def pose_numbers(poses: SE3, convention: str = "xyzw") -> NDArray[np.float64]:
+def pose_numbers(poses: SE3, convention: str = "xyzw") -> Array:
     """Return (...) poses as numbers (..., k) of a convention, without negative zeros."""
     return numbers_from_poses(poses, pose_convention(convention)) + 0.0
 
@@ -193,9 +192,7 @@ def standard_link_from_optical(
     return SE3(np.array([0.5, -0.5, 0.5, -0.5]), np.array(offset_m))
 
 
-def read_link_from_optical(
-    path: str | os.PathLike[str], link: str, optical: str
-) -> SE3:
+def read_link_from_optical(path: PathLike, link: str, optical: str) -> SE3:
     """Read the pose of the optical frame in the driver's root frame from YAML or JSON.
 
     That is the output of `ros2 topic echo --once /tf_static`, a TransformStamped, or an object with

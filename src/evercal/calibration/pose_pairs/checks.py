@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.pose_pairs.fit import (
     KINDS,
@@ -21,8 +20,7 @@ from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs, listed
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation, Unknowns
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
-
-Array = NDArray[np.floating]
+from evercal.typing import IntArray
 
 _FAR_M = 20.0
 _MIN_ROTATION_DEG = 2.0
@@ -220,9 +218,7 @@ def repeatability(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
     return {"repeatability_mm": millimetres, "repeatability_deg": degrees}
 
 
-def _refined(
-    equation: PoseEquation, fit: HandEyeFit, rows: NDArray[np.int64]
-) -> Unknowns:
+def _refined(equation: PoseEquation, fit: HandEyeFit, rows: IntArray) -> Unknowns:
     use = np.zeros(len(equation), dtype=bool)
     use[rows] = True
     return refine(equation, fit.at, fit.weights, use)

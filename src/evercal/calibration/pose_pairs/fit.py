@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation, System, Unknowns
+from evercal.typing import Array, BoolArray
 
 _TAILS = 3.0
 """Degrees of freedom of the Student t distribution in `agreement`."""
@@ -31,8 +31,6 @@ _FLOOR = np.diag([1e-14] * 6)
 """Minimum variance of a pose, metres^2 and radians^2, so that exact poses have finite weight."""
 _LEVEL_ROUNDS = 100
 _COVERAGE = 0.95
-Array = NDArray[np.floating]
-Mask = NDArray[np.bool_]
 
 
 class NoiseLevels(NamedTuple):
@@ -51,7 +49,7 @@ class HandEyeFit:
     """(p, p) covariance of the unknowns, before multiplication by `factor`."""
     factor: float
     """Factor on the covariance for noise estimated from few poses, see `ellipsoid_factor`."""
-    inliers: Mask
+    inliers: BoolArray
     """(n,) poses used for the estimate."""
     residual: Array
     """(n, 6) residuals of all poses in the fixed frame, metres and radians."""
@@ -80,7 +78,7 @@ class Agreement:
     metres: float
     """Standard deviation of the board position per axis; `radians` of its rotation."""
     radians: float
-    inliers: Mask
+    inliers: BoolArray
     """(n,) poses without gross errors."""
 
 
@@ -141,7 +139,9 @@ def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
     return _result(equation, at, inliers, levels)
 
 
-def refine(equation: PoseEquation, at: Unknowns, weights: Array, use: Mask) -> Unknowns:
+def refine(
+    equation: PoseEquation, at: Unknowns, weights: Array, use: BoolArray
+) -> Unknowns:
     """Minimize least squares by Gauss-Newton steps; `weights` (n, 6, 6) are covariances."""
     selected = equation[use]
     information = np.linalg.inv(weights[use])
@@ -279,7 +279,7 @@ def _step(system: System, information: Array) -> tuple[Array, float]:
 
 
 def _result(
-    equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels
+    equation: PoseEquation, at: Unknowns, use: BoolArray, levels: NoiseLevels
 ) -> HandEyeFit:
     system = equation.system(at)
     used = equation[use].system(at)
@@ -321,7 +321,9 @@ def _result(
     )
 
 
-def _distances(system: System, noise: Array, covariance: Array, use: Mask) -> Array:
+def _distances(
+    system: System, noise: Array, covariance: Array, use: BoolArray
+) -> Array:
     # Used poses have moved the estimate towards themselves. Alone, one has no spread on some axis.
     sign = np.where(use, -1.0, 1.0)[:, None, None]
     explained = system.jacobian @ covariance @ system.jacobian.transpose(0, 2, 1)

@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.fit import MIN_POSES, Agreement, agreement
@@ -27,8 +26,7 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
     poses_from_numbers,
 )
-
-Array = NDArray[np.floating]
+from evercal.typing import Array
 
 _FAILS_M, _FAILS_RAD, _FEW = 0.01, np.deg2rad(1.0), 0.8
 """A reading fails with larger residuals, or with a smaller share of inliers."""

@@ -5,7 +5,6 @@ from pathlib import Path, PurePath
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.boards.board_poses import FORMAT, BoardPoses, read_board_poses
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PoseNumbers, PosePairs
@@ -21,7 +20,8 @@ from evercal.recordings.poses.row_files import (
     times_in_names,
     without_ending,
 )
-from evercal.recordings.text_files import natural_key, read_json
+from evercal.storage.text_files import natural_key, read_json
+from evercal.typing import Array, BoolArray, IntArray
 
 Inverted = Literal["robot", "camera", "both"]
 
@@ -46,11 +46,11 @@ class _Poses:
     """The n poses of a table, or of a file of `evercal detect`."""
 
     names: tuple[str, ...] | None
-    stamps_s: NDArray[np.float64] | None
+    stamps_s: Array | None
     """(n,) times from the file or from the names of images."""
     poses: SE3
     """(n,) poses; any for an image that shows no board."""
-    measured: NDArray[np.bool_]
+    measured: BoolArray
     """(n,) whether the image shows a board; true for a table."""
     numbers: PoseNumbers | None = None
     board: BoardPoses | None = None
@@ -58,7 +58,7 @@ class _Poses:
     def row_names(self) -> tuple[str, ...]:
         return self.names or tuple(f"row {i + 1}" for i in range(len(self.poses)))
 
-    def corners_of(self, rows: NDArray[np.int64]) -> BoardCorners | None:
+    def corners_of(self, rows: IntArray) -> BoardCorners | None:
         if self.board is None:
             return None
         images = self.board.images

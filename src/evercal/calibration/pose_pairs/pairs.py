@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -29,9 +28,7 @@ from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.conventions import PoseConvention
-
-Array = NDArray[np.floating]
-Mask = NDArray[np.bool_]
+from evercal.typing import Array, BoolArray, IntArray
 
 _SAME_ROBOT_M = 1e-4
 _SAME_ROBOT_RAD = np.deg2rad(0.01)
@@ -50,7 +47,7 @@ class PoseNumbers:
     camera_from: bool = False
     """Whether the camera's frame is the first of the pose."""
 
-    def __getitem__(self, rows: NDArray[np.int64]) -> Self:
+    def __getitem__(self, rows: IntArray) -> Self:
         return replace(self, numbers=self.numbers[rows])
 
 
@@ -89,16 +86,14 @@ class PosePairs:
     def __len__(self) -> int:
         return len(self.names)
 
-    def __getitem__(self, index: NDArray[np.int64] | Mask) -> Self:
+    def __getitem__(self, index: IntArray | BoolArray) -> Self:
         rows = np.arange(len(self))[index]
         given = {name: value for name, value in vars(self).items() if value is not None}
         each = given.keys() - {"names", "notes"}
         changed = {name: given[name][rows] for name in each}
         return replace(self, names=tuple(self.names[row] for row in rows), **changed)
 
-    def distinct(
-        self, scale_known: bool = True
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def distinct(self, scale_known: bool = True) -> tuple[IntArray, IntArray]:
         """Return indices of different pairs, sorted by value, and (n,) the first equal pair."""
         keys = [
             *self.base_from_gripper.translation_m.T,
@@ -113,7 +108,7 @@ class PosePairs:
         first[order] = order[self[order].repeats(scale_known)]
         return order[first[order] == order], first
 
-    def repeats(self, scale_known: bool = True) -> NDArray[np.int64]:
+    def repeats(self, scale_known: bool = True) -> IntArray:
         """Return (n,) the index of the first equal pair; the own index for a new pair."""
         # Equal robot poses with different camera poses are no repeats: the robot pose is stale.
         first = np.arange(len(self))
@@ -257,7 +252,7 @@ class Measured(NamedTuple):
             ),
         )
 
-    def extras(self, prior: LensPrior, accepted: Mask) -> Extras:
+    def extras(self, prior: LensPrior, accepted: BoolArray) -> Extras:
         """Return intrinsics and bend as unknowns; corners of `accepted` (n,) are in their prior."""
         poses = [pose for pose, use in zip(self.poses, accepted, strict=True) if use]
         change, information = lens_estimate(
@@ -280,7 +275,7 @@ def measured(
     return Measured(camera, bend, poses, pixel_sigma(poses))
 
 
-def middle_of(corners: BoardCorners | None) -> NDArray[np.float64]:
+def middle_of(corners: BoardCorners | None) -> Array:
     """(3,) middle of the board's corners, metres; the origin without corners."""
     if corners is None:
         return np.zeros(3)

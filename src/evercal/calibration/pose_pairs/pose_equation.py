@@ -12,12 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3, cross_matrix
-
-Array = NDArray[np.floating]
+from evercal.typing import Array, BoolArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +86,7 @@ class Extras:
             mean=np.append(self.mean, 0.0),
         )
 
-    def indices(self, group: str) -> NDArray[np.int64]:
+    def indices(self, group: str) -> IntArray:
         """Return the indices of a group."""
         return np.flatnonzero([name == group for name in self.groups])
 
@@ -140,7 +138,7 @@ class PoseEquation:
     """(n, 6) velocity of the parent in the frame `fixed`, for the last extra `clock`: the time to
     add to a camera stamp."""
 
-    def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Self:
+    def __getitem__(self, index: IntArray | BoolArray) -> Self:
         arrays = {
             k: v[index] for k, v in vars(self).items() if isinstance(v, np.ndarray)
         }

@@ -9,12 +9,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.stats import f
 
-from evercal.calibration.pose_pairs.fit import Array, HandEyeFit, Mask, normal_inverse
+from evercal.calibration.pose_pairs.fit import HandEyeFit, normal_inverse
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
+from evercal.typing import Array, BoolArray, IntArray
 
 _FEWEST = 2
 """Minimum number of poses before and after a slip; a single one is an outlier."""
@@ -40,9 +40,7 @@ class Slip(NamedTuple):
     """(p, p) to add to the covariance of the unknowns: they differ before and after the step."""
 
 
-def find_slip(
-    equation: PoseEquation, fit: HandEyeFit, rows: NDArray[np.int64]
-) -> Slip | None:
+def find_slip(equation: PoseEquation, fit: HandEyeFit, rows: IntArray) -> Slip | None:
     """Return the step that explains the residuals best, if noise would not be explained as well.
 
     Args:
@@ -80,7 +78,7 @@ def find_slip(
 
 
 def _steps(
-    equation: PoseEquation, fit: HandEyeFit, order: NDArray[np.int64], use: Mask
+    equation: PoseEquation, fit: HandEyeFit, order: IntArray, use: BoolArray
 ) -> Iterator[tuple[float, int, int, Array, Array]]:
     """Fit each step: squared residuals, row and kind, change of the unknowns and its covariance.
 

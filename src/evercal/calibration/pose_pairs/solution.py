@@ -5,7 +5,6 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.corners import LENS, moved_lens
@@ -26,8 +25,7 @@ from evercal.calibration.pose_pairs.pairs import (
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
 from evercal.calibration.verdict import verdict
 from evercal.geometry import SE3, Camera, pose_to_dict
-
-Array = NDArray[np.floating]
+from evercal.typing import Array, IntArray
 
 _CAUSES = {
     "translation": "position of robot and camera poses",
@@ -46,9 +44,9 @@ class PairSolution:
     """A fit and its pose pairs."""
 
     pairs: PosePairs
-    rows: NDArray[np.int64]
+    rows: IntArray
     """Pairs of the equation, sorted by value; `first` (n,) is the first pair equal to each."""
-    first: NDArray[np.int64]
+    first: IntArray
     equation: PoseEquation
     fit: HandEyeFit
     mount: Mount

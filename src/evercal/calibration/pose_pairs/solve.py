@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.boards.corners import board_pose, lens_vector, moved_lens
 from evercal.calibration.calibration import Calibration, Mount
@@ -17,7 +16,6 @@ from evercal.calibration.pose_pairs.checks import (
 )
 from evercal.calibration.pose_pairs.fit import (
     HandEyeFit,
-    Mask,
     agreement,
     least_sigma,
     robust_fit,
@@ -35,8 +33,7 @@ from evercal.calibration.pose_pairs.slips import find_slip
 from evercal.calibration.pose_pairs.solution import PairSolution
 from evercal.errors import InputError
 from evercal.geometry import SE3, cross_matrix, pose_distance
-
-Array = NDArray[np.floating]
+from evercal.typing import BoolArray, IntArray
 
 _REACH_M, _OTHER_MOUNT = 0.4, 4.0
 """Distance from the gripper of what it carries, and its ratio to what the base carries, above which
@@ -151,7 +148,7 @@ class _Problem:
     def fitted(
         self,
         pairs: PosePairs,
-        rows: NDArray[np.int64],
+        rows: IntArray,
         start: Unknowns,
         lens: Measured | None,
     ) -> tuple[PoseEquation, HandEyeFit, Measured | None]:
@@ -190,7 +187,7 @@ class _Problem:
         )
 
     def equation(
-        self, pairs: PosePairs, lens: Measured | None, accepted: Mask
+        self, pairs: PosePairs, lens: Measured | None, accepted: BoolArray
     ) -> PoseEquation:
         """Return the equation with all extras, about the middle of the board.
 
@@ -271,8 +268,8 @@ def _mount_warnings(at: Unknowns, mount: Mount) -> list[str]:
 def _other_board_poses(
     corners: BoardCorners,
     lens: Measured,
-    rows: NDArray[np.int64],
-    outliers: NDArray[np.bool_],
+    rows: IntArray,
+    outliers: BoolArray,
     predicted: SE3,
 ) -> tuple[BoardCorners, SE3]:
     """Fit the board pose of each outlier again, starting from the predicted pose.

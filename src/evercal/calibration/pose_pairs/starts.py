@@ -10,11 +10,9 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation, Unknowns
-
-Array = NDArray[np.floating]
+from evercal.typing import Array, IntArray
 
 _SAMPLES = 150
 """Number of samples; even with 50 % outliers about 20 samples contain inliers only."""
@@ -61,7 +59,7 @@ def consensus_start(equation: PoseEquation, scale_known: bool = True) -> Start:
     return Start(at, float(scales[best]))
 
 
-def _triples(n: int) -> NDArray[np.int64]:
+def _triples(n: int) -> IntArray:
     if n * (n - 1) * (n - 2) // 6 <= _SAMPLES:
         return np.array(list(combinations(range(n), 3)))
     rng = np.random.default_rng(0)
@@ -70,8 +68,8 @@ def _triples(n: int) -> NDArray[np.int64]:
 
 def _solve_motions(
     equation: PoseEquation,
-    first: NDArray[np.int64],
-    second: NDArray[np.int64],
+    first: IntArray,
+    second: IntArray,
     scale_known: bool,
 ) -> tuple[Array, Array, Array]:
     """Solve A X = X B for h sets of m motions between the poses `first` and `second`, (h, m).

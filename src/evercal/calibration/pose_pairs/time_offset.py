@@ -8,7 +8,6 @@ refined together with the transforms.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, Mount
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
@@ -16,8 +15,7 @@ from evercal.calibration.pose_pairs.solve import solve_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.pose_track import PoseTrack
-
-Array = NDArray[np.floating]
+from evercal.typing import Array, BoolArray
 
 _STEP_S = 0.01
 _MAX_SIGMA_S, _HALF_S = 0.05, 0.005
@@ -36,7 +34,7 @@ class CameraTrack:
     corners: BoardCorners | None = None
     """Corners of the images, in the same order."""
 
-    def __getitem__(self, index: NDArray[np.bool_]) -> "CameraTrack":
+    def __getitem__(self, index: BoolArray) -> "CameraTrack":
         rows = np.flatnonzero(index)
         corners = self.corners
         if corners is not None:

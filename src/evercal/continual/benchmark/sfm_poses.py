@@ -21,7 +21,7 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Recording
-from evercal.recordings.text_files import read_text
+from evercal.storage.text_files import read_text
 
 
 def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from evercal.continual.networks.buffer import FeatureBuffer
@@ -20,6 +19,7 @@ from evercal.geometry import SE3
 from evercal.mapping.pose_check import depth_scale, matched_pairs
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
 from evercal.recordings.frame import Frame, stated_poses
+from evercal.typing import Array
 
 SOURCE_VIEWS = 8
 """Frames that a depth is swept over, at most."""
@@ -31,7 +31,7 @@ TOLERANCE = 0.04
 
 def frame_depths(
     frames: Sequence[Frame], encoder: Encoder, short_side: int
-) -> list[NDArray[np.float64]]:
+) -> list[Array]:
     """Estimate the depth of every cell of every frame by plane sweeps.
 
     The depth of a cell counts if at least two other frames have the same surface there, as in
@@ -52,8 +52,8 @@ def frame_depths(
 
 
 def _agreed(
-    prepared: PreparedFrames, i: int, swept: list[NDArray[np.float64]], near: list[int]
-) -> NDArray[np.float64]:
+    prepared: PreparedFrames, i: int, swept: list[Array], near: list[int]
+) -> Array:
     """Depths of a frame as a grid; NaN where too few of the other frames agree."""
     view = prepared.posed_cells(i)
     points = view.base_from_camera.apply(view.rays() * swept[i][:, None])
@@ -67,9 +67,7 @@ def _agreed(
     return np.where(votes >= AGREEING, swept[i], np.nan).reshape(view.grid)
 
 
-def _at_pixels(
-    depths: NDArray[np.float64], pixels: NDArray[np.float64], stride: int
-) -> NDArray[np.float64]:
+def _at_pixels(depths: Array, pixels: Array, stride: int) -> Array:
     """Depths (n,) of the cells nearest to pixels (n, 2); NaN outside the grid."""
     cell = (
         np.nan_to_num((pixels - (stride - 1) / 2) / stride, nan=-9.0)
@@ -85,7 +83,7 @@ def _at_pixels(
 
 def shared_depths(
     cache: Path | None, frames: Sequence[Frame], encoder: Encoder, short_side: int
-) -> list[NDArray[np.float64]]:
+) -> list[Array]:
     """Estimate the depths of frames, see `frame_depths`, or read those of an earlier run.
 
     `cache` is the folder of the depths of all runs; without one they are always estimated.
@@ -111,7 +109,7 @@ def shared_depths(
 def surface_points(
     buffer: FeatureBuffer,
     frames: Sequence[Frame],
-    depths: Sequence[NDArray[np.float64]],
+    depths: Sequence[Array],
     stride: int,
 ) -> Tensor:
     """Compute the points (rows, 3) of a buffer in the atlas from the depths of its frames.

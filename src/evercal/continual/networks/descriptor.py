@@ -3,15 +3,14 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from evercal.continual.networks.device import device_of_network
 from evercal.errors import InputError
 from evercal.features.encoder import WEIGHTS
+from evercal.typing import Float32Array
 
 DESCRIPTOR_FILE = WEIGHTS / "descriptor.safetensors"
 DESCRIBED_ENCODER = WEIGHTS / "encoder-1.onnx"
@@ -122,9 +121,7 @@ def descriptor_for(encoder_file: Path, inputs: int) -> Descriptor:
 
 
 @torch.inference_mode()
-def described(
-    features: NDArray[np.float32], descriptor: Descriptor
-) -> tuple[Tensor, Tensor]:
+def described(features: Float32Array, descriptor: Descriptor) -> tuple[Tensor, Tensor]:
     """Convert the features (rows, columns, channels) of an image, and describe it.
 
     Returns features (rows * columns, channels) and descriptor (width,), on the descriptor's device.

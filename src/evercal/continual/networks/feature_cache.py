@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.features.encoder import Encoder
+from evercal.typing import Array, Float32Array
 
 
 def cache_features(encoder: Encoder, folder: Path) -> None:
@@ -23,7 +24,7 @@ def cache_features(encoder: Encoder, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     compute = encoder.function
 
-    def cached(grey: NDArray[np.float32]) -> NDArray[np.floating]:
+    def cached(grey: Float32Array) -> Array:
         digest = hashlib.blake2b(grey.tobytes(), digest_size=16).hexdigest()
         path = folder / f"{'x'.join(map(str, grey.shape))}-{digest}.npy"
         if (features := read_cached(path)) is None:

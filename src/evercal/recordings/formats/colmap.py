@@ -15,12 +15,12 @@ from evercal.errors import InputError, optional_module
 from evercal.geometry import SE3, Camera
 from evercal.geometry.camera import COEFFICIENTS
 from evercal.processes import status_of
+from evercal.recordings.cameras.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.formats.nerfstudio import frame_note
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import as_stored, files_in
-from evercal.recordings.poses.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import (
+from evercal.storage.text_files import (
     library_errors,
     named_errors,
     natural_key,

@@ -5,7 +5,6 @@ ignored.
 """
 
 import contextlib
-import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -18,7 +17,9 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, write_image
-from evercal.recordings.text_files import (
+from evercal.storage import write_json
+from evercal.storage.records import of_format
+from evercal.storage.text_files import (
     is_real,
     named_errors,
     naming,
@@ -26,8 +27,7 @@ from evercal.recordings.text_files import (
     read_json,
     refuse_repeated,
 )
-from evercal.storage import write_json
-from evercal.storage.records import of_format
+from evercal.typing import PathLike
 
 FILE = "scene.json"
 _FORMAT = "evercal-scene"
@@ -82,7 +82,7 @@ def _frames(
 
 
 def write(
-    root: str | os.PathLike[str],
+    root: PathLike,
     recording: Recording,
     *,
     link: bool = False,
@@ -113,9 +113,7 @@ class SceneWriter:
     and errors are those of `write`.
     """
 
-    def __init__(
-        self, root: str | os.PathLike[str], name: str, link: bool = False
-    ) -> None:
+    def __init__(self, root: PathLike, name: str, link: bool = False) -> None:
         self.untracked = 0
         self.notes: tuple[str, ...] = ()
         self.metric = True

@@ -24,13 +24,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError, optional_module
+from evercal.recordings.cameras.camera_file import read_camera_of_size
 from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, decode_image, files_in, image_file
-from evercal.recordings.poses.camera_file import read_camera_of_size
 from evercal.recordings.poses.conventions import (
     asking_for,
     checked_poses,
@@ -40,15 +39,15 @@ from evercal.recordings.poses.kinematics import RobotModel, in_radians
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import (
+from evercal.storage.text_files import (
     library_errors,
     named_errors,
     path_inside,
     read_json,
     refuse_repeated,
 )
+from evercal.typing import Array, Image
 
-Array = NDArray[np.float64]
 USES = (
     "camera",
     "image_topic",
@@ -263,7 +262,7 @@ class _Embedded(StoredImage):
     path: Path
     row: int
 
-    def read(self) -> NDArray[np.uint8]:
+    def read(self) -> Image:
         """(H, W, 3) uint8 RGB."""
         image = decode_image(np.frombuffer(self._content(), np.uint8))
         if image is None:

@@ -15,7 +15,6 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
@@ -29,13 +28,14 @@ from evercal.recordings.images import (
 )
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import (
+from evercal.storage.text_files import (
     is_real,
     named_errors,
     naming,
     read_json,
     refuse_repeated,
 )
+from evercal.typing import Array
 
 FILE = "transforms.json"
 # The first one there is read. ScanNet++ keeps undistorted images beside those of the fisheye lens.
@@ -277,7 +277,7 @@ def _test_names(root: Path, data: Mapping[str, object], frames: list[str]) -> se
     return test
 
 
-def _matrix(value: object, name: str) -> NDArray[np.float64]:
+def _matrix(value: object, name: str) -> Array:
     matrix = number_array(value, repr(name))
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise ValueError(f"{name!r} is 4x4 or 3x4 numbers, got {str(value)[:60]}")

@@ -17,6 +17,11 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
+from evercal.recordings.cameras.camera_file import (
+    camera_from_fields,
+    check_size,
+    read_camera_of_size,
+)
 from evercal.recordings.formats.bags.file import (
     CAMERA_INFO,
     COMPRESSED,
@@ -33,14 +38,10 @@ from evercal.recordings.images import (
     image_file,
     is_readable,
 )
-from evercal.recordings.poses.camera_file import (
-    camera_from_fields,
-    check_size,
-    read_camera_of_size,
-)
 from evercal.recordings.poses.pose_track import MAX_GAP_S
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import named_errors
+from evercal.storage.text_files import named_errors
+from evercal.typing import Image
 
 # Encoding: bytes of a channel, channels, and OpenCV's COLOR_... constant if `as_rgb` needs it. ROS
 # names a Bayer pattern by its first two pixels and OpenCV by its second row.
@@ -108,7 +109,7 @@ class BagImage(StoredImage):
     stamp_ns: int
     frame_id: str
 
-    def read(self) -> NDArray[np.uint8]:
+    def read(self) -> Image:
         """Decode the message, see `StoredImage.read`."""
         is_compressed = self.bag.kinds[self.topic] == COMPRESSED
         message = self.bag.message(self.topic, self.logged_ns, self.repeat)
@@ -238,7 +239,7 @@ def unsupported(encoding: str) -> str | None:
     return f"encoding {encoding!r} is not supported; use one of {', '.join(_ENCODINGS)}"
 
 
-def image_of(message: Any) -> NDArray[np.uint8]:
+def image_of(message: Any) -> Image:
     """Decode a sensor_msgs/Image to (H, W, 3) uint8 RGB, 16-bit values converted as by `as_rgb`."""
     reason = unsupported(message.encoding)
     if reason is not None:
@@ -261,7 +262,7 @@ def image_of(message: Any) -> NDArray[np.uint8]:
     return _rgb(pixels, message.encoding)
 
 
-def _rgb(pixels: NDArray[Any], encoding: str) -> NDArray[np.uint8]:
+def _rgb(pixels: NDArray[Any], encoding: str) -> Image:
     import cv2
 
     conversion = _ENCODINGS[encoding][2]
@@ -270,7 +271,7 @@ def _rgb(pixels: NDArray[Any], encoding: str) -> NDArray[np.uint8]:
     return as_rgb(pixels)
 
 
-def compressed_image_of(message: Any) -> NDArray[np.uint8]:
+def compressed_image_of(message: Any) -> Image:
     """Decode a sensor_msgs/CompressedImage with a PNG or JPEG to (H, W, 3) uint8 RGB."""
     encoding = _pixels_in(message.format)
     if (reason := unsupported(encoding)) is not None:

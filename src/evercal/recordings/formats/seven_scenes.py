@@ -10,14 +10,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import files_in, first_size
 from evercal.recordings.poses.row_files import is_number
-from evercal.recordings.text_files import named_errors, read_text, refuse_repeated
+from evercal.storage.text_files import named_errors, read_text, refuse_repeated
+from evercal.typing import Array
 
 _SPLITS = ("TrainSplit.txt", "TestSplit.txt")
 _FOCAL_AT_640 = 525.0
@@ -128,7 +128,7 @@ def tracked_frames(
     return tuple(frames)
 
 
-def read_numbers(file: Path, count: int, what: str) -> NDArray[np.float64]:
+def read_numbers(file: Path, count: int, what: str) -> Array:
     """Read the `count` numbers of a matrix from a small text file."""
     # float() on the words: np.loadtxt takes longer per file than reading the file.
     # Windows prints -1.#INF, 1.#QNAN and -nan(ind).

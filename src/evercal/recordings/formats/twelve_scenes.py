@@ -13,7 +13,7 @@ from evercal.geometry import Camera
 from evercal.recordings.formats.seven_scenes import colour_images, tracked_frames
 from evercal.recordings.frame import Recording
 from evercal.recordings.images import first_size
-from evercal.recordings.text_files import library_errors, read_text
+from evercal.storage.text_files import library_errors, read_text
 
 
 def detect(root: Path) -> bool:

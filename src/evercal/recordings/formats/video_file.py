@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError, optional_module
 from evercal.recordings.images import StoredImage
+from evercal.typing import Image
 
 _MOST_OPEN = 4
 # Within this time ahead, decoding frame by frame is cheaper than seeking.
@@ -26,7 +26,7 @@ class VideoFrame(StoredImage):
     seconds: float
     """Time since the video's first frame."""
 
-    def read(self) -> NDArray[np.uint8]:
+    def read(self) -> Image:
         """Decode the frame to (H, W, 3) uint8 RGB."""
         return self.videos.frame(self.path, self.seconds)
 
@@ -39,7 +39,7 @@ class _Open:
         self.frames: Any = None
         self.last: Any = None
 
-    def at(self, seconds: float, half: float) -> NDArray[np.uint8] | None:
+    def at(self, seconds: float, half: float) -> Image | None:
         """Frame within `half` seconds of a time, or None if there is none."""
         if self.last is None or not -half < seconds - self.last.time < _READ_AHEAD_S:
             start = max(0, round(seconds / self.stream.time_base))
@@ -68,7 +68,7 @@ class Videos:
         self._open: OrderedDict[Path, _Open] = OrderedDict()
         self._lock = threading.Lock()
 
-    def frame(self, path: Path, seconds: float) -> NDArray[np.uint8]:
+    def frame(self, path: Path, seconds: float) -> Image:
         """Decode the frame at a time in seconds since the first frame to (H, W, 3) uint8 RGB."""
         with self._lock:
             try:

@@ -1,1 +1,1 @@
-"""Robot poses: tables, conventions, joint angles, pairing with images; camera files."""
+"""Robot poses: tables, conventions, joint angles, pairing with images."""

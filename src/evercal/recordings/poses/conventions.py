@@ -16,12 +16,11 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry.se3 import SE3
-
-Array = NDArray[np.float64]
+from evercal.typing import Array, BoolArray
 
 _FAR_M = 10.0  # largest distance of a gripper from its base, metres
 _NEAR_M = (
@@ -338,7 +337,7 @@ def _matrices(numbers: Array, layout: str) -> Array:
     return np.swapaxes(numbers.reshape(*numbers.shape[:-1], 4, height), -1, -2)
 
 
-def _rigid(matrices: Array) -> NDArray[np.bool_]:
+def _rigid(matrices: Array) -> BoolArray:
     block = matrices[..., :3, :3]
     last = matrices[..., 3:, :]
     drift = np.abs(np.swapaxes(block, -1, -2) @ block - np.eye(3)).max(

@@ -4,30 +4,28 @@ A CSV table has a column for each joint of the URDF; JSON has `joint_names` and 
 are radians, or degrees if a name ends in `_deg`, and metres for prismatic joints.
 """
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError, optional_module
 from evercal.geometry import SE3
-from evercal.recordings.poses.arm import Arm, Motion
 from evercal.recordings.poses.pose_track import times_around
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import Rows, read_rows, row_labels
-from evercal.recordings.text_files import (
+from evercal.robot.arm import Arm, Motion
+from evercal.storage.text_files import (
     library_errors,
     named_errors,
     read_json,
     read_text,
     refuse_repeated,
 )
+from evercal.typing import Array, BoolArray, PathLike
 
-Array = NDArray[np.float64]
 _MOVING = ("revolute", "continuous", "prismatic")
 # Two full rotations: no joint of an arm exceeds them, and 12.6 in degrees is a small angle.
 _LARGEST_RAD = 4 * np.pi
@@ -41,7 +39,7 @@ _JSON = (
 class RobotModel:
     """Links and joints of a URDF; its meshes are not read."""
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: PathLike) -> None:
         self.path = Path(path)
         need = f"{path}: reading a URDF needs yourdfpy"
         yourdfpy = optional_module("yourdfpy", need, "urdf")
@@ -99,7 +97,7 @@ class RobotModel:
         values: Array,
         base: str | None,
         gripper: str | None,
-        source: str | os.PathLike[str] = "joints",
+        source: PathLike = "joints",
     ) -> tuple[RobotPoses, list[str]]:
         """Compute (n,) poses of the gripper, with notes about their source and joint limits.
 
@@ -306,7 +304,7 @@ def in_radians(
 
 def interpolate(
     times_s: Array, positions: Array, stamps_s: Array
-) -> tuple[Array, NDArray[np.bool_]]:
+) -> tuple[Array, BoolArray]:
     """Interpolate (n,) positions of a joint at (m,) seconds, and whether each is valid.
 
     Jumps by full rotations are removed. Validity is that of `PoseTrack.at`.

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
@@ -13,12 +12,13 @@ from evercal.recordings.poses.kinematics import interpolate
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import is_number, same_numbers, times_in_names
-from evercal.recordings.text_files import (
+from evercal.storage.text_files import (
     few,
     named_errors,
     natural_key,
     refuse_repeated,
 )
+from evercal.typing import Array
 
 Pairing = tuple[list[SE3 | None], list[str]]
 """The pose of each image, if it has one, and notes."""
@@ -72,7 +72,7 @@ def pair_joints(
     rows: RobotPoses,
     stamps_s: Mapping[str, float] | None,
     file: Path,
-) -> list[NDArray[np.float64] | None]:
+) -> list[Array | None]:
     """Joint values (k,) of every image, paired as its pose; None without any."""
     values = rows.joints
     times = rows.stamps_s
@@ -149,7 +149,7 @@ def unpaired(images: Sequence[str], rows: Sequence[str], file: str) -> list[str]
     return notes
 
 
-def _by_time(times: NDArray[np.float64], track: PoseTrack, file: Path) -> Pairing:
+def _by_time(times: Array, track: PoseTrack, file: Path) -> Pairing:
     poses, valid = track.at(times)
     if not valid.any():
         first = track.stamps_s[0]
@@ -170,7 +170,7 @@ def _by_time(times: NDArray[np.float64], track: PoseTrack, file: Path) -> Pairin
 
 def _image_times(
     images: Sequence[Path], stamps_s: Mapping[str, float] | None
-) -> NDArray[np.float64] | None:
+) -> Array | None:
     if stamps_s is None:
         return times_in_names([image.name for image in images])
     times = [stamps_s.get(i.name, stamps_s.get(i.stem)) for i in images]

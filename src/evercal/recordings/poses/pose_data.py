@@ -10,7 +10,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.bounds import require_at_most
 from evercal.recordings.images import IMAGE_ENDINGS
@@ -32,8 +31,8 @@ from evercal.recordings.poses.row_files import (
     row_labels,
     text_cells,
 )
+from evercal.typing import Array
 
-Array = NDArray[np.float64]
 Columns = Mapping[str, Any]
 """Values by key: of one pose, or lists of the values of all poses."""
 

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3
 from evercal.recordings.frame import Frame
-
-Array = NDArray[np.float64]
+from evercal.typing import Array, Float32Array
 
 PAIRS = 16  # number of image pairs that are compared
 LEAST_PAIRS = 6  # matched pairs below which there is no verdict
@@ -147,7 +146,7 @@ def measured_rotation(first: Frame, second: Frame) -> Array | None:
     return Rotation.from_matrix(second_from_first).inv().as_rotvec()
 
 
-def _features(frame: Frame) -> tuple[Array, NDArray[np.float32]]:
+def _features(frame: Frame) -> tuple[Array, Float32Array]:
     """(n, 2) points of the plane z = 1, and their SIFT descriptors."""
     image = cv2.cvtColor(frame.read_image(), cv2.COLOR_RGB2GRAY)
     camera = frame.camera

@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.bounds import require_at_most
 from evercal.recordings.poses.conventions import (
@@ -34,8 +33,7 @@ from evercal.recordings.poses.row_files import (
     row_labels,
     table_cells,
 )
-
-Array = NDArray[np.float64]
+from evercal.typing import Array
 
 
 class PoseTable(NamedTuple):

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from evercal.geometry import SE3, pose_distance
-
-Array = NDArray[np.float64]
+from evercal.typing import Array, BoolArray
 
 MAX_GAP_S = 0.2  # longest time between two poses over which a moving frame is interpolated, seconds
 STILL_M, STILL_DEG = 0.001, 0.1
@@ -36,7 +35,7 @@ class PoseTrack:
         object.__setattr__(self, "stamps_s", stamps[order])
         object.__setattr__(self, "poses", self.poses[order])
 
-    def at(self, stamps_s: Array) -> tuple[SE3, NDArray[np.bool_]]:
+    def at(self, stamps_s: Array) -> tuple[SE3, BoolArray]:
         """Interpolate positions linearly and rotations along great circles at (m,) seconds.
 
         Returns:
@@ -60,9 +59,7 @@ class PoseTrack:
         return SE3(quaternion, np.stack(position, axis=-1)), valid & (close | still)
 
 
-def times_around(
-    times_s: Array, stamps_s: Array
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def times_around(times_s: Array, stamps_s: Array) -> tuple[NDArray[np.intp], BoolArray]:
     """Index of the time after each stamp, and whether no long gap is around it."""
     after = np.searchsorted(times_s, stamps_s).clip(1, len(times_s) - 1)
     short = times_s[after] - times_s[after - 1] <= MAX_GAP_S

@@ -11,11 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry import SE3
 from evercal.recordings.images import files_in
-from evercal.recordings.poses.arm import Arm
 from evercal.recordings.poses.conventions import (
     PoseConvention,
     asking_for,
@@ -25,12 +23,14 @@ from evercal.recordings.poses.conventions import (
 from evercal.recordings.poses.pose_data import pose_data
 from evercal.recordings.poses.pose_table import PoseTable, read_pose_table
 from evercal.recordings.poses.row_files import Names, arrays_as_lists
-from evercal.recordings.text_files import (
+from evercal.robot.arm import Arm
+from evercal.storage.text_files import (
     documents,
     named_errors,
     read_text,
     refuse_repeated,
 )
+from evercal.typing import Array, PathLike
 
 POSE_ENDINGS = (
     ".csv",
@@ -61,17 +61,17 @@ class RobotPoses:
 
     names: Names
     """(n,) unique names of images or rows, if the file has any."""
-    stamps_s: NDArray[np.float64] | None
+    stamps_s: Array | None
     """(n,) seconds, if the file has any."""
     poses: SE3
     """(n,) base_from_gripper, or the transforms that the file holds instead."""
-    numbers: NDArray[np.float64] | None = None
+    numbers: Array | None = None
     """(n, k) numbers of the file, to be read by `poses_from_numbers`."""
     convention: PoseConvention | None = None
     """Convention of the numbers; numbers and convention are None for JSON's quaternion_wxyz."""
     arm: Arm | None = None
     """Arm whose joint values are stated instead of poses."""
-    joints: NDArray[np.float64] | None = None
+    joints: Array | None = None
     """(n, k) values of its joints, radians, or metres of sliding joints."""
 
     def __len__(self) -> int:
@@ -84,7 +84,7 @@ class RobotPoses:
 
 
 def read_robot_poses(
-    path: str | os.PathLike[str],
+    path: PathLike,
     convention: str | None = None,
     *,
     what: str = "file of robot poses",
@@ -117,9 +117,7 @@ def read_robot_poses(
         return RobotPoses(table.names, table.stamps_s, poses, *stated)
 
 
-def read_last_robot_pose(
-    path: str | os.PathLike[str], convention: str | None = None
-) -> SE3:
+def read_last_robot_pose(path: PathLike, convention: str | None = None) -> SE3:
     """Read the last complete row of a table or of JSON lines that another program appends to.
 
     A row is complete once its line break is written. Long files are read at both ends only.

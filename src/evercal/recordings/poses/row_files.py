@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from evercal.bounds import bounds, require_at_most
 from evercal.recordings.images import IMAGE_ENDINGS
-from evercal.recordings.text_files import library_errors, named_errors, read_text
+from evercal.storage.text_files import library_errors, named_errors, read_text
+from evercal.typing import Array
 
-Array = NDArray[np.float64]
 Cells = NDArray[np.object_]
 """(n, k) str, each of its own length."""
 Names = tuple[str, ...] | None

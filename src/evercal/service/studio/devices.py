@@ -5,15 +5,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg
 from evercal.live.camera import LiveCamera
 from evercal.live.robot import Robot
+from evercal.typing import Array, Image
 
-Image = NDArray[np.uint8]
 Which = Literal["wrist", "fixed"]
 
 STILL_MM, STILL_DEG = 0.2, 0.05
@@ -41,7 +38,7 @@ class Devices:
     """Lets a virtual gripper hold something or let go; a real one is loaded by hand."""
     rough: SE3 | None = None
     """A rough gripper_from_camera."""
-    arm: Callable[[], NDArray[np.floating]] | None = None
+    arm: Callable[[], Array] | None = None
     """Points (k, 3) along the arm in the base frame, for the drawing."""
     settle_s: float = 0.8
     """Time from a motion on request to a sample, seconds: images arrive late from networks and USB,

@@ -18,9 +18,9 @@ from evercal.live.coverage import IMAGES, SAME_DEG, SAME_MM, Coverage, Sample, c
 from evercal.live.recorder import JPEG_QUALITY, POSES, WristRecorder
 from evercal.live.robot import MovingRobot
 from evercal.map import Map
+from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES, stated_grippers
 from evercal.recordings.images import write_jpeg
-from evercal.recordings.poses.camera_file import read_camera
 from evercal.service.studio.devices import Connection, Devices, Which
 from evercal.storage import sha256_file, write_json
 

@@ -17,7 +17,7 @@ from evercal.geometry import SE3
 from evercal.live.camera import StreamCamera
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker
-from evercal.recordings.poses.camera_file import read_camera
+from evercal.recordings.cameras.camera_file import read_camera
 from evercal.reports.answers import unit_known
 from evercal.reports.overlay import resized
 from evercal.reports.scene import THUMBNAIL_PX, ColourBy, Frustum, KeyframeView

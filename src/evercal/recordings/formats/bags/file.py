@@ -9,7 +9,7 @@ from typing import Any
 
 from evercal.errors import InputError, optional_module
 from evercal.recordings.images import files_in
-from evercal.recordings.text_files import few, library_errors
+from evercal.storage.text_files import few, library_errors
 
 _FILES = (".bag", ".mcap", ".db3")
 IMAGE = "sensor_msgs/msg/Image"

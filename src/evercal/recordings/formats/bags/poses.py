@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
@@ -15,8 +14,8 @@ from evercal.recordings.poses.kinematics import RobotModel, interpolate
 from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
+from evercal.typing import Array, BoolArray, IntArray
 
-Array = NDArray[np.float64]
 _BASES = (
     "base_link",
     "base",
@@ -96,9 +95,7 @@ class _TfTree:
     def connected(self, a: str, b: str) -> bool:
         return self._chain(a)[-1] == self._chain(b)[-1]
 
-    def a_from_b(
-        self, a: str, b: str, stamps_s: Array
-    ) -> tuple[SE3, NDArray[np.bool_]]:
+    def a_from_b(self, a: str, b: str, stamps_s: Array) -> tuple[SE3, BoolArray]:
         """Interpolate (n,) poses of frame b in frame a, and whether each is valid."""
         up = self._chain(a)
         down = self._chain(b)
@@ -154,7 +151,7 @@ class _TfTree:
                 f" them"
             )
 
-    def _at(self, child: str, stamps_s: Array) -> tuple[SE3, NDArray[np.bool_]]:
+    def _at(self, child: str, stamps_s: Array) -> tuple[SE3, BoolArray]:
         edge = self._edge(child)
         _, _, stamps, quaternions, translations = zip(*edge.transforms, strict=True)
         poses = SE3(np.array(quaternions), np.array(translations))
@@ -186,14 +183,14 @@ class ImagePoses:
 
     stated: RobotPoses
     """(n,) base_from_gripper, or base_from_camera."""
-    valid: NDArray[np.bool_]
+    valid: BoolArray
     """(n,) whether each pose was recorded close enough to the image."""
     of_camera: bool
     notes: list[str]
 
 
 def poses_at_images(
-    bag: BagFile, stamps_ns: NDArray[np.int64], camera_frame: str, options: ReadOptions
+    bag: BagFile, stamps_ns: IntArray, camera_frame: str, options: ReadOptions
 ) -> ImagePoses:
     """Interpolate the pose of the gripper at n images in `camera_frame`, at `stamps_ns` (n,)."""
     zero = int(stamps_ns[0])

@@ -6,7 +6,6 @@ A camera may stand inside other entries, such as `cam0` of a Kalibr chain. In al
 (0, 0) is the centre of the top-left pixel, and images are upright.
 """
 
-import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -19,9 +18,10 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.geometry.camera import COEFFICIENTS
-from evercal.recordings.poses.radial_models import RADIAL_MODELS, nearest_fisheye
+from evercal.recordings.cameras.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import arrays_as_lists, is_number
-from evercal.recordings.text_files import documents, named_errors, naming, read_text
+from evercal.storage.text_files import documents, named_errors, naming, read_text
+from evercal.typing import PathLike
 
 # Kinds of models by name, and names of fields, in lower case without spaces, dashes, underscores.
 _MODELS = {
@@ -83,9 +83,7 @@ _EXPECTED = (
 )
 
 
-def read_camera(
-    path: str | os.PathLike[str], size: tuple[int, int] | None = None
-) -> Camera:
+def read_camera(path: PathLike, size: tuple[int, int] | None = None) -> Camera:
     """Read the intrinsics of one camera.
 
     `size` is (width, height) of the images in pixels, for files without one.

@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import ArrayLike
 
 from evercal.geometry import SE3, pose_distance
-from evercal.recordings.poses.arm import Arm
 from evercal.recordings.poses.kinematics import RobotModel
+from evercal.robot.arm import Arm
 
-from ..checks import refused
+from ..recordings.checks import refused
 
 pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
 

@@ -10,12 +10,11 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.geometry import Camera
 from evercal.geometry.camera import FISHEYE_DEG
+from evercal.typing import Array
 
-Array = NDArray[np.float64]
 MOST_PX = 0.5
 """Largest error of the nearest fisheye."""
 

@@ -4,12 +4,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3
-
-Array = NDArray[np.float64]
+from evercal.typing import Array, BoolArray
 
 
 class Motion(NamedTuple):
@@ -37,12 +35,12 @@ class Arm:
     last: Array
     """(4, 4) from the frame after the last joint to the gripper."""
 
-    def rotates(self) -> NDArray[np.bool_]:
+    def rotates(self) -> BoolArray:
         """(k,) whether a value is an angle."""
         angles = {motion.value for motion in self.chain if motion.rotates}
         return np.array([i in angles for i in range(len(self.joints))])
 
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> BoolArray:
         """(k,) whether the offset of a value can be told from images.
 
         That of the first joint turns base and scene together, that of the last one gripper and

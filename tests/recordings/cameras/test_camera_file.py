@@ -14,8 +14,8 @@ from evercal.calibration.boards.detection import Board
 from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.recordings.poses.camera_file import read_camera
-from evercal.recordings.poses.radial_models import RADIAL_MODELS
+from evercal.recordings.cameras.camera_file import read_camera
+from evercal.recordings.cameras.radial_models import RADIAL_MODELS
 
 from ..checks import refused
 

@@ -1,0 +1,1 @@
+"""Camera files: intrinsics and distortion, in the formats of other programs."""

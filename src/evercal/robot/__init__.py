@@ -1,0 +1,1 @@
+"""The arm: its URDF, forward kinematics and joint offsets; no images."""

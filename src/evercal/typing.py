@@ -1,0 +1,20 @@
+"""Types of arrays by element, and of paths."""
+
+import os
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array: TypeAlias = NDArray[np.floating]
+"""Floating point numbers: float64 unless a docstring states otherwise."""
+Float32Array: TypeAlias = NDArray[np.float32]
+"""Values of features and patches."""
+IntArray: TypeAlias = NDArray[np.int64]
+"""Indices and counts."""
+BoolArray: TypeAlias = NDArray[np.bool_]
+"""Masks."""
+Image: TypeAlias = NDArray[np.uint8]
+"""(H, W, 3) RGB or (H, W) grey."""
+PathLike: TypeAlias = str | os.PathLike[str]
+"""A file or folder of the caller."""
