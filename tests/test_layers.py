@@ -42,8 +42,10 @@ FOR_ALL = ("bounds", "cluster", "errors", "processes", "progress", "typing")
 FACES = ("__init__", "__main__")
 """Modules of the root that may import everything."""
 PRODUCT = ORDER[: ORDER.index("simulation")]
-MOST_LOCALIZING, MOST_LEARNING = 43, 64
-"""Modules of evercal that a program loads, at most."""
+MOST_LOCALIZING = 47
+"""Modules of evercal that a program loads for localizing, at most."""
+MOST_LEARNING = 70
+"""The same for learning."""
 
 
 def imported(
