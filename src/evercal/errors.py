@@ -1,11 +1,14 @@
 """The one exception that a user is meant to read."""
 
 import importlib
+import re
 import unicodedata
 from typing import Any
 
 _LONGEST = 2_000
 """Characters of a message, which may repeat what came from outside."""
+_FIELD = re.compile(r"`([a-z]\w*)`")
+"""An argument in a message: `robot_poses`."""
 
 
 class InputError(Exception):
@@ -14,13 +17,23 @@ class InputError(Exception):
     The message is one line that names the thing, shows what came and says what to do next. The
     command line prints it and exits with status 2; anything else that is raised is a bug. Line
     breaks become spaces, and other control characters are escaped: names from damaged files can
-    hold any character.
+    hold any character. Arguments stand in backquotes, by their names in Python.
     """
 
     def __init__(self, message: str = ""):
         text = str(message)
         text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
         super().__init__(printable(" ".join(text.splitlines())))
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the arguments that the message is about."""
+        return tuple(_FIELD.findall(str(self)))
+
+
+def with_options(text: str) -> str:
+    """A text for a terminal: `robot_poses` becomes --robot-poses."""
+    return _FIELD.sub(lambda match: "--" + match[1].replace("_", "-"), text)
 
 
 def is_plain(character: str) -> bool:

@@ -8,12 +8,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
-from evercal.errors import InputError, printable
+from evercal.errors import InputError, printable, with_options
 
 
 def say(text: str, file: TextIO | None = None) -> None:
-    """Print text, to stdout by default, with control characters escaped."""
-    print(printable(text), file=file, flush=True)
+    """Print text, to stdout by default, with options and escaped control characters."""
+    print(printable(with_options(text)), file=file, flush=True)
 
 
 def say_notes(notes: Iterable[str]) -> None:
@@ -23,8 +23,8 @@ def say_notes(notes: Iterable[str]) -> None:
 
 
 def print_json(record: object) -> None:
-    """Print one JSON object on one line of stdout."""
-    print(json.dumps(record, allow_nan=False), flush=True)
+    """Print one JSON object on one line of stdout; its sentences name options."""
+    print(with_options(json.dumps(record, allow_nan=False)), flush=True)
 
 
 def print_next(*words: object) -> None:
