@@ -24,7 +24,7 @@ from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3, Camera
 from evercal.map import Map
 from evercal.recordings.frame import Frame, Recording
-from evercal.robot.arm import Arm, Motion
+from evercal.robot.arm import Arm, MovingJoint
 from evercal.simulation import panda_arm
 from evercal.simulation.box_room import look_at
 from evercal.simulation.cell_room import WORK_AREA_M, cell_room
@@ -117,7 +117,8 @@ def robot(name: str) -> Robot:
                 )
             )
         motions = tuple(
-            Motion(b, np.array([0, 0, 1.0]), True, i) for i, b in enumerate(before[:7])
+            MovingJoint(b, np.array([0, 0, 1.0]), True, i)
+            for i, b in enumerate(before[:7])
         )
         spread = np.array([0.9, 0.4, 0.5, 0.4, 0.6, 0.5, 0.9])
         return Robot(
@@ -147,7 +148,7 @@ def robot(name: str) -> Robot:
         middle = (0, -0.1, 0.2, 1.1, 0)
         spread = (0.8, 0.4, 0.5, 0.5, 0.9)
     motions = tuple(
-        Motion(SE3.from_translation(at).matrix(), axis, True, i)
+        MovingJoint(SE3.from_translation(at).matrix(), axis, True, i)
         for i, (at, axis) in enumerate(steps)
     )
     arm = Arm(_names(len(steps)), motions, SE3.from_translation(0.06 * x).matrix())

@@ -9,7 +9,7 @@ from tyro.conf import Positional
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
-from evercal.recordings.poses.kinematics import RobotModel
+from evercal.robot.robot_model import RobotModel
 from evercal.typing import Array
 
 SETS = 20

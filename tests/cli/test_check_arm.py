@@ -9,7 +9,7 @@ import pytest
 
 from evercal.geometry import SE3, Camera
 from evercal.recordings import write_image
-from evercal.recordings.poses.kinematics import RobotModel
+from evercal.robot.robot_model import RobotModel
 from evercal.simulation.cell_room import WORK_AREA_M, cell_room
 
 pytestmark = pytest.mark.slow(

@@ -12,14 +12,14 @@ from evercal.mapping.arm_offsets import ArmOffsets
 from evercal.mapping.build import MapOptions
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment
 from evercal.recordings.frame import Frame, Mount
-from evercal.robot.arm import Arm, Motion
+from evercal.robot.arm import Arm, MovingJoint
 from tests.mapping.test_bundle_adjustment import CAMERA, FRAMES, world
 
 X, Y, Z = np.eye(3)
 ARM = Arm(
     ("pan", "lift", "elbow", "wrist", "roll"),
     tuple(
-        Motion(SE3.from_translation(at).matrix(), axis, True, i)
+        MovingJoint(SE3.from_translation(at).matrix(), axis, True, i)
         for i, (at, axis) in enumerate(
             ((0.1 * Z, Z), (0.05 * Z, Y), (0.4 * Z, Y), (0.4 * X, Y), (0.1 * X, X))
         )

@@ -9,7 +9,7 @@ import pytest
 from evercal.recordings.formats import colmap, lerobot
 from evercal.recordings.formats.bags.file import BagFile
 from evercal.recordings.formats.video_file import Videos
-from evercal.recordings.poses.kinematics import RobotModel
+from evercal.robot.robot_model import RobotModel
 
 from .checks import refused
 

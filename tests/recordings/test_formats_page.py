@@ -21,7 +21,7 @@ from evercal.recordings import (
 from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.formats import lerobot, wrist
 from evercal.recordings.formats.lerobot import _pose_feature
-from evercal.recordings.poses.kinematics import read_joints
+from evercal.recordings.poses.joint_tables import read_joints
 
 from .checks import assert_pose
 

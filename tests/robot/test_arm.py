@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import ArrayLike
 
 from evercal.geometry import SE3, pose_distance
-from evercal.recordings.poses.kinematics import RobotModel
 from evercal.robot.arm import Arm
+from evercal.robot.robot_model import RobotModel
 
 from ..recordings.checks import refused
 

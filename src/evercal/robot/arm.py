@@ -10,7 +10,7 @@ from evercal.geometry import SE3
 from evercal.typing import Array, BoolArray
 
 
-class Motion(NamedTuple):
+class MovingJoint(NamedTuple):
     """One moving joint of a chain."""
 
     before: Array
@@ -31,7 +31,7 @@ class Arm:
 
     joints: tuple[str, ...]
     """Names of the k joint values, from the base outwards."""
-    chain: tuple[Motion, ...]
+    chain: tuple[MovingJoint, ...]
     last: Array
     """(4, 4) from the frame after the last joint to the gripper."""
 

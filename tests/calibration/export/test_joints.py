@@ -12,7 +12,7 @@ import pytest
 from evercal.calibration.calibration import Calibration, JointOffset
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
-from evercal.recordings.poses.kinematics import RobotModel
+from evercal.robot.robot_model import RobotModel
 
 from .random_poses import calibration_of
 

@@ -11,11 +11,8 @@ from hypothesis import strategies as st
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings import ReadOptions, load_recording, write_image
-from evercal.recordings.poses.kinematics import (
-    RobotModel,
-    interpolate,
-    read_joint_poses,
-)
+from evercal.recordings.poses.joint_tables import interpolate, read_joint_poses
+from evercal.robot.robot_model import RobotModel
 
 from ..checks import assert_pose, refused
 
@@ -67,7 +64,7 @@ def test_planar_arm_agrees_with_its_closed_form(
     # In another order than the chain's, with a joint that the arm has not.
     values = np.array([[9.0, reach, shoulder, elbow]])
     names = ["finger", "reach", "shoulder", "elbow"]
-    poses = model.poses(names, values, "base", "tip")[0].poses
+    poses = model.poses(names, values, "base", "tip").poses
     metres, radians = pose_distance(poses[0], planar(shoulder, elbow, reach))
     assert max(metres, radians) < 1e-7  # trimesh takes 1e-8 for nothing
 
@@ -77,9 +74,9 @@ def test_any_two_links_can_be_chosen(model: RobotModel) -> None:
     assert model.arm("base", "tip").joints == ("shoulder", "elbow", "reach")
     assert model.arm("upper", "lower").joints == ("elbow",)
     assert model.arm("tip", "lower").joints == ("reach",)
-    pose_in_degrees = model.poses(["elbow"], np.array([[0.7]]), "lower", "upper")[
+    pose_in_degrees = model.poses(["elbow"], np.array([[0.7]]), "lower", "upper").poses[
         0
-    ].poses[0]
+    ]
     expected = SE3.exp([0.5, 0, 0, 0, 0, 0]) @ SE3.exp([0, 0, 0, 0, 0, 0.7])
     assert max(pose_distance(pose_in_degrees, expected.inverse())) < 1e-9
 
@@ -111,7 +108,7 @@ def test_panda_agrees_with_its_published_parameters() -> None:
     )
     model = RobotModel(Path(file.locate()))
     refused(
-        r"has 3 ends; name the link with --gripper-frame",
+        r"has 3 ends; name the link with `gripper_frame`",
         model.chosen_links,
         None,
         None,
@@ -119,11 +116,11 @@ def test_panda_agrees_with_its_published_parameters() -> None:
     joints = model.arm("panda_link0", "panda_link8").joints
     assert joints == tuple(f"panda_joint{i}" for i in range(1, 8))
     q = np.random.default_rng(1).uniform(-1.5, 0.0, (20, 7))
-    poses = model.poses(joints, q, "panda_link0", "panda_link8")[0].poses
+    poses = model.poses(joints, q, "panda_link0", "panda_link8").poses
     for row, pose in zip(q, poses, strict=True):
         assert max(pose_distance(pose, panda_flange(row))) < 1e-6
     # The other way round, and from the hand, which is fixed to the flange.
-    back = model.poses(joints, q, "panda_link8", "panda_link0")[0].poses
+    back = model.poses(joints, q, "panda_link8", "panda_link0").poses
     assert max(pose_distance(back, poses.inverse())[0]) < 1e-9
 
 

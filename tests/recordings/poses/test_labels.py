@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from evercal.errors import InputError
-from evercal.recordings.poses.kinematics import read_joints
+from evercal.recordings.poses.joint_tables import read_joints
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
-from evercal.recordings.poses.row_files import Rows, read_rows
+from evercal.recordings.poses.row_files import LabelledRows, read_rows
 
 from ..checks import refused
 
@@ -34,7 +34,9 @@ STAMPS = (
 POSE = {"translation_m": [0.5, 0.0, 0.2], "quaternion_wxyz": [1, 0, 0, 0]}
 
 
-def read_all(root: Path, label: str, cells: list[object]) -> list[RobotPoses | Rows]:
+def read_all(
+    root: Path, label: str, cells: list[object]
+) -> list[RobotPoses | LabelledRows]:
     """Two rows with one label each, in every kind of file."""
     (root / "p.csv").write_text(
         f"x,y,z,qw,qx,qy,qz,{label}\n"
@@ -48,7 +50,9 @@ def read_all(root: Path, label: str, cells: list[object]) -> list[RobotPoses | R
     return [*poses, read_rows(root / "r.csv", "numbers")]
 
 
-def as_lists(root: Path, label: str, cells: list[object]) -> list[RobotPoses | Rows]:
+def as_lists(
+    root: Path, label: str, cells: list[object]
+) -> list[RobotPoses | LabelledRows]:
     """The same in lists beside the poses or joint angles."""
     (root / "p.json").write_text(
         json.dumps({"poses": [POSE] * len(cells), label: cells})

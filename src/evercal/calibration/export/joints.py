@@ -10,7 +10,7 @@ from evercal.calibration.calibration import JointOffset
 from evercal.calibration.export.request import Export, pose_numbers
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.recordings.poses.kinematics import RobotModel
+from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import library_errors, read_json
 
 _LEROBOT_TICKS = 4095 / 360

@@ -35,10 +35,11 @@ from evercal.recordings.poses.conventions import (
     checked_poses,
     pose_convention,
 )
-from evercal.recordings.poses.kinematics import RobotModel, in_radians
+from evercal.recordings.poses.joint_tables import in_radians, poses_of_arm
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
+from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import (
     library_errors,
     named_errors,
@@ -371,7 +372,10 @@ def _joint_poses(
         refuse_repeated(names, "rename the numbers")
     model = RobotModel(options.urdf)
     values = in_radians(model, names, stated, [unit] * count)
-    return model.poses(names, values, options.base_frame, options.gripper_frame, source)
+    moved = model.poses(
+        names, values, options.base_frame, options.gripper_frame, source
+    )
+    return poses_of_arm(moved), moved.notes
 
 
 def _pose_columns(names: list[str], arm: str | None) -> tuple[str, list[int]]:

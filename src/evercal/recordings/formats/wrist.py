@@ -20,7 +20,7 @@ from evercal.recordings.cameras import camera_file
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, files_in, first_size
 from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
-from evercal.recordings.poses.kinematics import RobotModel, read_joint_poses
+from evercal.recordings.poses.joint_tables import read_joint_poses
 from evercal.recordings.poses.pairing import pair_images, pair_joints
 from evercal.recordings.poses.robot_poses import (
     POSE_ENDINGS,
@@ -29,6 +29,7 @@ from evercal.recordings.poses.robot_poses import (
 )
 from evercal.recordings.poses.row_files import number_array, read_rows, same_numbers
 from evercal.recordings.read_options import ReadOptions, flag
+from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import named_errors, read_json, refuse_repeated
 
 USES = ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention")

@@ -8,7 +8,7 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.recordings.poses.kinematics import interpolate
+from evercal.recordings.poses.joint_tables import interpolate
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import is_number, same_numbers, times_in_names

@@ -43,7 +43,7 @@ _LATEST_S = 4e9  # 2001 and 2096 in seconds since 1970
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$")
 
 
-class Rows(NamedTuple):
+class LabelledRows(NamedTuple):
     """A table of numbers with one row for each image or time."""
 
     names: Names
@@ -55,7 +55,7 @@ class Rows(NamedTuple):
     """(n, columns) numbers of the other columns."""
 
 
-def read_rows(path: Path, contents: str) -> Rows:
+def read_rows(path: Path, contents: str) -> LabelledRows:
     """Read a table whose first line names the columns; `contents` describes it in messages."""
     text = read_text(path, f"file with {contents}")
     with named_errors(path, contents):
@@ -66,7 +66,9 @@ def read_rows(path: Path, contents: str) -> Rows:
         rows = cells[1:]
         names, stamps, others = row_labels(header, rows.T.tolist(), len(rows))
         columns = tuple(header[i] for i in others)
-        return Rows(names, stamps, columns, cell_numbers(rows[:, others], columns))
+        return LabelledRows(
+            names, stamps, columns, cell_numbers(rows[:, others], columns)
+        )
 
 
 def table_cells(lines: Sequence[str]) -> Cells:

@@ -11,7 +11,6 @@ from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.mapping.scene_map import SceneMap
-from evercal.recordings.poses.kinematics import RobotModel
 from evercal.reports.overlay import resized
 from evercal.reports.scene import (
     THUMBNAIL_PX,
@@ -23,6 +22,7 @@ from evercal.reports.scene import (
     keyframe_views,
     readable_scale,
 )
+from evercal.robot.robot_model import RobotModel
 from evercal.service.viewer.html import GREY, MAGENTA, Colour
 
 OnKeyframe = Callable[[KeyframeView, viser.ClientHandle], Any]
@@ -208,10 +208,8 @@ def add_arm(
         values = np.array([slider.value for slider in sliders])
         shown.update_cfg(values)
         if link is not None:
-            place(
-                gripper,
-                model.poses(tuple(limits), values[None], None, link)[0].poses[0],
-            )
+            moved = model.poses(tuple(limits), values[None], None, link)
+            place(gripper, moved.poses[0])
 
     with server.gui.add_folder("Arm", expand_by_default=False):
         for name, (low, high) in limits.items():

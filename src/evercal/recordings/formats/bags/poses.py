@@ -10,10 +10,11 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.formats.bags.file import JOINT_STATE, TF, BagFile
-from evercal.recordings.poses.kinematics import RobotModel, interpolate
+from evercal.recordings.poses.joint_tables import interpolate, poses_of_arm
 from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
+from evercal.robot.robot_model import RobotModel
 from evercal.typing import Array, BoolArray, IntArray
 
 _BASES = (
@@ -307,10 +308,10 @@ def _from_joints(
             np.array(times), np.array(positions), stamps
         )
         valid &= here
-    moved, notes = model.poses([*tracks], values, base, gripper, bag.path)
+    moved = model.poses([*tracks], values, base, gripper, bag.path)
     if not valid.any():
         _refuse_times(bag, stamps, times, "the joint states")
-    return ImagePoses(moved, valid, False, notes)
+    return ImagePoses(poses_of_arm(moved), valid, False, moved.notes)
 
 
 def _joint_tracks(

@@ -1,39 +1,32 @@
-"""Gripper poses from joint angles and a URDF, which yourdfpy reads (extra `urdf`).
-
-A CSV table has a column for each joint of the URDF; JSON has `joint_names` and `positions`. Values
-are radians, or degrees if a name ends in `_deg`, and metres for prismatic joints.
-"""
+"""`RobotModel`: an arm from its URDF, which yourdfpy reads (extra `urdf`)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from evercal.errors import InputError, optional_module
 from evercal.geometry import SE3
-from evercal.recordings.poses.pose_track import times_around
-from evercal.recordings.poses.robot_poses import RobotPoses
-from evercal.recordings.poses.row_files import Rows, read_rows, row_labels
-from evercal.robot.arm import Arm, Motion
-from evercal.storage.text_files import (
-    library_errors,
-    named_errors,
-    read_json,
-    read_text,
-    refuse_repeated,
-)
-from evercal.typing import Array, BoolArray, PathLike
+from evercal.robot.arm import Arm, MovingJoint
+from evercal.storage.text_files import library_errors, read_text, refuse_repeated
+from evercal.typing import Array, PathLike
 
 _MOVING = ("revolute", "continuous", "prismatic")
-# Two full rotations: no joint of an arm exceeds them, and 12.6 in degrees is a small angle.
 _LARGEST_RAD = 4 * np.pi
-_UNITS = ("deg", "rad", "m")
-_STILL_RAD = 0.001
-_JSON = (
-    "an object with 'joint_names', 'positions' and optionally 'images' or 'stamps_s'"
-)
+"""Two rotations: no joint of an arm exceeds them, and 12.6 in degrees is a small angle."""
+
+
+class ArmPoses(NamedTuple):
+    """Poses of an arm at n times."""
+
+    poses: SE3
+    """(n,) base_from_gripper."""
+    arm: Arm
+    joints: Array
+    """(n, k) values of the joints of the arm, radians, or metres of sliding joints."""
+    notes: list[str]
+    """Links that were chosen, and joints beyond their limits."""
 
 
 class RobotModel:
@@ -86,7 +79,7 @@ class RobotModel:
         ends = [link for link in self.links if link not in parents]
         if gripper is None and len(ends) != 1:
             raise InputError(
-                f"{self.path}: has {len(ends)} ends; name the link with --gripper-frame, one of"
+                f"{self.path}: has {len(ends)} ends; name the link with `gripper_frame`, one of"
                 f" {', '.join(self.links)}"
             )
         return base or self.base_link, gripper or ends[0]
@@ -98,8 +91,8 @@ class RobotModel:
         base: str | None,
         gripper: str | None,
         source: PathLike = "joints",
-    ) -> tuple[RobotPoses, list[str]]:
-        """Compute (n,) poses of the gripper, with notes about their source and joint limits.
+    ) -> ArmPoses:
+        """Compute (n,) poses of the gripper.
 
         Values (n, k) of the k named joints are radians, or metres for prismatic joints. `source`
         names their origin in messages.
@@ -120,11 +113,11 @@ class RobotModel:
                 raise InputError(
                     f"{source}: joint {name} is at {column[np.abs(column).argmax()]:.1f}, too far"
                     f" for radians; if these are degrees, write the column as {name}_deg or give"
-                    f" --pose-convention deg"
+                    f" `pose_convention` deg"
                 )
         note = f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
-        moved = RobotPoses(None, None, arm.poses(values), arm=arm, joints=values)
-        return moved, [note, *self._beyond_limits(needed, values)]
+        notes = [note, *self._beyond_limits(needed, values)]
+        return ArmPoses(arm.poses(values), arm, values, notes)
 
     def arm(self, base: str, gripper: str) -> Arm:
         """The chain between two links; its joint values are those that others do not mimic."""
@@ -137,7 +130,7 @@ class RobotModel:
         steps = [(joint, True) for joint in up if joint not in down]
         steps += [(joint, False) for joint in reversed(down) if joint not in up]
         names: list[str] = []
-        chain: list[Motion] = []
+        chain: list[MovingJoint] = []
         before = np.eye(4)
         for joint, backwards in steps:
             if joint.type not in (*_MOVING, "fixed"):
@@ -152,7 +145,9 @@ class RobotModel:
                 axis = -self._axis(joint) if backwards else self._axis(joint)
                 rotates = joint.type != "prismatic"
                 value = names.index(name)
-                chain.append(Motion(before, axis, rotates, value, factor, constant))
+                chain.append(
+                    MovingJoint(before, axis, rotates, value, factor, constant)
+                )
                 before = np.eye(4)
             before = before @ np.linalg.inv(origin) if backwards else before
         return Arm(tuple(names), tuple(chain), before)
@@ -254,84 +249,3 @@ class RobotModel:
                     f"{self.path}: the joints above link {link} form a circle"
                 )
         return joints
-
-
-def read_joint_poses(
-    path: Path,
-    model: RobotModel,
-    base: str | None = None,
-    gripper: str | None = None,
-    unit: str | None = None,
-) -> tuple[RobotPoses, list[str]]:
-    """Read joint angles and compute gripper poses, with notes.
-
-    `unit` is "rad" or "deg" of angles whose column states no unit; radians if omitted.
-    """
-    rows = read_joints(path)
-    base, gripper = model.chosen_links(base, gripper)
-    if not model.arm(base, gripper).joints:
-        raise InputError(
-            f"{model.path}: no joint moves {gripper} against {base}; name other links"
-        )
-    names = []
-    units = []
-    for column in rows.columns:
-        plain, _, ending = column.rpartition("_")
-        stated = (
-            ending in _UNITS and not model.has_joint(column) and model.has_joint(plain)
-        )
-        names.append(plain if stated else column)
-        units.append(ending if stated else unit)
-    with named_errors(path, "joint angles"):
-        refuse_repeated(filter(model.has_joint, names), "keep one column of each joint")
-    values = in_radians(model, names, rows.values, units)
-    moved, notes = model.poses(names, values, base, gripper, path)
-    return replace(moved, names=rows.names, stamps_s=rows.stamps_s), notes
-
-
-def in_radians(
-    model: RobotModel, names: Sequence[str], values: Array, units: Sequence[str | None]
-) -> Array:
-    """Convert angles in degrees to radians and leave other values (n, k) as they are."""
-    other = next((unit for unit in units if unit not in (None, *_UNITS)), None)
-    if other is not None:
-        raise InputError(f"--pose-convention {other}: joint angles are rad or deg")
-    degrees = [
-        u == "deg" and model.rotates(name) for u, name in zip(units, names, strict=True)
-    ]
-    return np.where(degrees, np.deg2rad(values), values)
-
-
-def interpolate(
-    times_s: Array, positions: Array, stamps_s: Array
-) -> tuple[Array, BoolArray]:
-    """Interpolate (n,) positions of a joint at (m,) seconds, and whether each is valid.
-
-    Jumps by full rotations are removed. Validity is that of `PoseTrack.at`.
-    """
-    times, first = np.unique(times_s, return_index=True)
-    values = np.unwrap(positions[first])
-    valid = (stamps_s >= times[0]) & (stamps_s <= times[-1])
-    if len(times) > 1:
-        after, close = times_around(times, stamps_s)
-        valid &= close | (np.abs(values[after] - values[after - 1]) < _STILL_RAD)
-    return np.interp(stamps_s, times, values), valid
-
-
-def read_joints(path: Path) -> Rows:
-    """Read a table of joint values."""
-    if path.suffix.lower() == ".csv":
-        return read_rows(path, "joint angles")
-    data = read_json(path, "file of joint angles", f"give {_JSON}")
-    with library_errors(f"{path}: give {_JSON}"):
-        columns = tuple(str(name) for name in data["joint_names"])
-        values = np.array(data["positions"], dtype=np.float64)
-        lists = {key: value for key, value in data.items() if isinstance(value, list)}
-        names, times, _ = row_labels(
-            [*lists], [*lists.values()], len(values), plural=True
-        )
-        if values.shape != (len(values), len(columns)) or not np.isfinite(values).all():
-            raise ValueError(
-                "'positions' are rows of finite numbers, one for each joint"
-            )
-        return Rows(names, times, columns, values)
