@@ -15,7 +15,7 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from benchmarks.rows import Row, save, show
-from evercal.calibration.next_views import (
+from evercal.calibration.from_map.next_views import (
     CAMERA_NOISE,
     GRIPPER_NOISE,
     next_views,

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration as Calibration
     from evercal.calibration.calibration import read_calibration as read_calibration
     from evercal.calibration.drift import Shift as Shift
-    from evercal.calibration.next_views import next_views as next_views
+    from evercal.calibration.from_map.next_views import next_views as next_views
     from evercal.calibration.pose_pairs.pairs import PosePairs as PosePairs
     from evercal.calibration.pose_pairs.solve import solve as solve
     from evercal.errors import InputError as InputError
@@ -51,7 +51,7 @@ _PUBLIC = {
     "Shift": "evercal.calibration.drift",
     "UncertainPose": "evercal.geometry",
     "load_recording": "evercal.recordings",
-    "next_views": "evercal.calibration.next_views",
+    "next_views": "evercal.calibration.from_map.next_views",
     "read_calibration": "evercal.calibration.calibration",
     "read_image": "evercal.recordings",
     "solve": "evercal.calibration.pose_pairs.solve",

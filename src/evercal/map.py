@@ -21,10 +21,10 @@ from evercal.typing import PathLike
 if TYPE_CHECKING:
     import numpy as np
 
-    from evercal.calibration.align import MapAlignment
     from evercal.calibration.calibration import Calibration
     from evercal.calibration.drift import Shift
     from evercal.calibration.from_images import ImageSource
+    from evercal.calibration.from_map.align import MapAlignment
     from evercal.evaluation import Scores
     from evercal.features.encoder import Features
     from evercal.geometry import SE3, Camera
@@ -510,8 +510,8 @@ class Map:
             InputError: No such scene, too few images or points, or another process writes into the
                 map. The map is unchanged.
         """
-        from evercal.calibration.align import align_by_gripper, align_by_points
         from evercal.calibration.from_images import Images
+        from evercal.calibration.from_map.align import align_by_gripper, align_by_points
 
         with self._store.writing():
             own = self.localizer.contents.scene(scene)

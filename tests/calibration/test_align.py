@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.align import (
+from evercal.calibration.drift import check
+from evercal.calibration.from_images import Images, calibrate
+from evercal.calibration.from_map.align import (
     MapAlignment,
     Picks,
     align_by_gripper,
     align_by_points,
     fit_picks,
 )
-from evercal.calibration.drift import check
-from evercal.calibration.from_images import Images, calibrate
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
 from evercal.localization.localizer import Localizer

@@ -6,7 +6,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from evercal.calibration.hand_eye_start import (
+from evercal.calibration.from_map.hand_eye_start import (
     LEAST_ROTATION_DEG,
     ImagePair,
     solve_pairs,

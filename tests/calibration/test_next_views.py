@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.next_views import (
+from evercal.calibration.from_map.next_views import (
     CAMERA_NOISE,
     GRIPPER_NOISE,
     _chosen,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evercal.calibration.calibration import Calibration, ImageUse
-from evercal.calibration.held_again import LEAST_IMAGES, held_again
+from evercal.calibration.held_thing.held_again import LEAST_IMAGES, held_again
 from evercal.calibration.located import (
     Fused,
     ImagePose,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Self, get_args
 import numpy as np
 
 from evercal.calibration.calibration import Calibration, ErrorTerm, Mount, largest_term
-from evercal.calibration.held_again import held_again
+from evercal.calibration.held_thing.held_again import held_again
 from evercal.calibration.located import (
     Fused,
     ImagePose,

@@ -20,14 +20,15 @@ from evercal.calibration.calibration import (
     ImageUse,
     JointOffset,
 )
-from evercal.calibration.hand_eye_start import (
+from evercal.calibration.from_map.hand_eye_start import (
     HandEyeStart,
     hand_eye_start,
     scene_from_parent,
 )
-from evercal.calibration.held_thing import cropped, moving_parts, windows
+from evercal.calibration.from_map.next_views import open_position
+from evercal.calibration.held_thing.moving_parts import moving_parts
+from evercal.calibration.held_thing.windows import cropped, windows
 from evercal.calibration.located import deviations, length_mm_deg
-from evercal.calibration.next_views import open_position
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder

@@ -12,7 +12,7 @@ from evercal.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from evercal.calibration.align import MapAlignment
+    from evercal.calibration.from_map.align import MapAlignment
     from evercal.map import Map
 
 

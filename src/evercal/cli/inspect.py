@@ -11,7 +11,7 @@ from evercal.cli import args
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.calibration.next_views import NextViews
+    from evercal.calibration.from_map.next_views import NextViews
     from evercal.geometry import SE3
     from evercal.live.coverage import Coverage
     from evercal.recordings import Recording
@@ -46,7 +46,7 @@ class Inspect(args.Verb):
         record = asdict(found)
         lines = [*_lines(found)]
         if found.poses == "gripper":
-            from evercal.calibration.next_views import open_position
+            from evercal.calibration.from_map.next_views import open_position
             from evercal.recordings.frame import stated_grippers
 
             rough = args.transform_of(self.gripper_from_camera)
@@ -85,7 +85,7 @@ class Inspect(args.Verb):
             lines += _next_lines(views)
 
     def _next_views(self, file: Path, poses: "SE3", rough: "SE3 | None") -> "NextViews":
-        from evercal.calibration.next_views import next_views
+        from evercal.calibration.from_map.next_views import next_views
         from evercal.recordings import read_robot_poses
 
         convention = self.reading.pose_convention

@@ -9,7 +9,7 @@ import numpy as np
 import viser
 
 from evercal.calibration.export.formats import FORMATS
-from evercal.calibration.next_views import NextViews
+from evercal.calibration.from_map.next_views import NextViews
 from evercal.errors import InputError
 from evercal.live.coverage import POSITION_MM, ROTATION_DEG
 from evercal.service.studio.devices import Which

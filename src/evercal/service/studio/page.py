@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 import viser
 
-from evercal.calibration.next_views import NextViews
+from evercal.calibration.from_map.next_views import NextViews
 from evercal.geometry import SE3
 from evercal.reports.overlay import resized
 from evercal.reports.scene import THUMBNAIL_PX, Frustum

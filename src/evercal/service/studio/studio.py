@@ -11,7 +11,7 @@ import numpy as np
 
 from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.calibration.export.formats import FORMATS, export_files
-from evercal.calibration.next_views import NextViews, looked_at, next_views
+from evercal.calibration.from_map.next_views import NextViews, looked_at, next_views
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.live.coverage import IMAGES, SAME_DEG, SAME_MM, Coverage, Sample, coverage

@@ -1,0 +1,77 @@
+"""Windows of images around what the gripper holds, which enlarge a thing of a few pixels."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from evercal.calibration.from_map.hand_eye_start import (
+    HandEyeStart,
+    ImagePair,
+    scene_from_parent,
+)
+from evercal.calibration.held_thing.moving_parts import PATCH_PX
+from evercal.geometry import SE3
+from evercal.recordings.frame import Frame
+from evercal.typing import Array, IntArray
+
+MARGIN = 1.2
+"""Side of the window around a thing, as a factor."""
+MOST_WINDOW = 0.75
+"""Windows larger than this share of the image are not worth it."""
+
+
+def windows(frames: Sequence[Frame], start: HandEyeStart) -> IntArray | None:
+    """(n, 3) left, top and side of a window around the thing; None if it fills the images."""
+    poses = scene_from_parent(frames, "eye_to_hand") @ start.parent_from_camera
+    points = _points(poses, start.matches)
+    if not len(points):
+        return None
+    inner = np.abs(points - np.median(points, 0))
+    points = points[(inner < 4 * np.median(inner, 0) + 1e-6).all(1)]
+    low = []
+    high = []
+    for frame, pose in zip(frames, poses, strict=True):
+        pixels = frame.camera.project(pose.inverse().apply(points))
+        low.append(np.nanquantile(pixels, 0.01, axis=0))
+        high.append(np.nanquantile(pixels, 0.99, axis=0))
+    size = np.array([frames[0].camera.width, frames[0].camera.height])
+    low = np.clip(low, 0, size - 1)
+    high = np.clip(high, 0, size - 1)
+    side = int(MARGIN * np.max(high - low)) + 2 * PATCH_PX
+    if not np.isfinite(low + high).all() or side > MOST_WINDOW * size.min():
+        return None
+    corner = np.clip(np.rint((low + high - side) / 2), 0, size - side).astype(np.int64)
+    return np.c_[corner, np.full(len(corner), side)]
+
+
+def cropped(frame: Frame, window: IntArray) -> Frame:
+    """The part of a frame in a window."""
+    left, top, side = window.tolist()
+    camera = frame.camera
+    image = frame.read_image()[top : top + side, left : left + side]
+    part = replace(
+        camera, width=side, height=side, cx=camera.cx - left, cy=camera.cy - top
+    )
+    return replace(frame, image=np.ascontiguousarray(image), camera=part)
+
+
+def _points(poses: SE3, pairs: Sequence[ImagePair]) -> Array:
+    """(m, 3) matches triangulated in the frame of the gripper."""
+    matrices = poses.matrix()
+    points = [np.zeros((0, 3))]
+    for pair in pairs:
+        first = matrices[pair.first]
+        second = matrices[pair.second]
+        a = pair.rays[0] @ first[:3, :3].T
+        b = pair.rays[1] @ second[:3, :3].T
+        between = second[:3, 3] - first[:3, 3]
+        # Nearest points of two rays: a s - b t = between.
+        aa = (a * a).sum(1)
+        ab = (a * b).sum(1)
+        bb = (b * b).sum(1)
+        along = (bb * (a @ between) - ab * (b @ between)) / np.maximum(
+            aa * bb - ab**2, 1e-9
+        )
+        points.append(first[:3, 3] + a * along[:, None])
+    return np.concatenate(points)
