@@ -33,11 +33,11 @@ def example() -> Calibration:
         "good for bin picking",
         {"command": "solve"},
         "2026-01-01T00:00:00+00:00",
-        (
+        joints=(
             JointOffset("lift", 0.01, 0.002),
             JointOffset("rail", 0.0, 0.1, False, "move it"),
         ),
-        np.array([[4e-6, 1e-6], [1e-6, 1e-2]]),
+        joint_covariance=np.array([[4e-6, 1e-6], [1e-6, 1e-2]]),
     )
 
 

@@ -20,6 +20,9 @@ from typing import Any, NamedTuple, Self, get_args
 
 import numpy as np
 
+from evercal.calibration.framed_pose import FramedPose
+from evercal.calibration.framed_pose import ImageUse as ImageUse
+from evercal.calibration.framed_pose import JointOffset as JointOffset
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_distance
 from evercal.recordings.frame import Mount
@@ -30,19 +33,6 @@ from evercal.typing import Array, PathLike
 
 FORMAT = "evercal-calibration"
 VERSION = 1
-
-
-@dataclass(frozen=True)
-class ImageUse:
-    """Use of one image or pose pair."""
-
-    name: str
-    used: bool
-    reason: str = ""
-    """Reason for leaving it out; empty if it was used."""
-    residual_mm: float | None = None
-    """Distance of its translation from the prediction; `residual_deg` of its rotation."""
-    residual_deg: float | None = None
 
 
 @dataclass(frozen=True)
@@ -60,26 +50,6 @@ class ErrorTerm:
         return cls(name, *axis_deviation(np.diag(variance)))
 
 
-@dataclass(frozen=True)
-class JointOffset:
-    """Offset of a joint of the arm, which is to be added to the values that the robot reports."""
-
-    name: str
-    """Name of the joint in the URDF."""
-    offset: float
-    """Radians, or metres of a sliding joint."""
-    sigma: float
-    """Standard deviation; that before any image where the offset is not determined."""
-    is_angle: bool = True
-    open: str = ""
-    """Why it is not determined, and what would; empty if it is."""
-
-    @property
-    def unit(self) -> tuple[str, float]:
-        """Unit for people, deg or mm, and how many of it make a radian or a metre."""
-        return ("deg", 180 / np.pi) if self.is_angle else ("mm", 1000.0)
-
-
 def position_shares(terms: Sequence[ErrorTerm]) -> list[float]:
     """Share of each term in the variance of the position, 0 to 1."""
     variances = [term.translation_mm**2 for term in terms]
@@ -94,22 +64,9 @@ def largest_term(terms: Sequence[ErrorTerm]) -> tuple[str, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
-    """Pose of a camera: `parent_from_child`."""
+class Calibration(FramedPose):
+    """Pose of a camera with its sources of error, checks and verdict."""
 
-    mount: Mount
-    """`eye_to_hand`: the camera stands still. `eye_in_hand`: the gripper carries it."""
-    parent_from_child: SE3
-    covariance: Array
-    """(6, 6) of (translation in the parent frame, metres; rotation about child axes, radians)."""
-    parent_frame: str = "base"
-    """`base` for eye_to_hand, `gripper` for eye_in_hand, or the robot's names of them."""
-    child_frame: str = "camera"
-    """The camera's optical frame: x right, y down, z forward."""
-    camera: Camera | None = None
-    """Intrinsics of the images."""
-    images: tuple[ImageUse, ...] = ()
-    """All images in the given order."""
     error_terms: tuple[ErrorTerm, ...] = ()
     """Parts of the covariance by cause; from images, those of `CovarianceTerm` and the scatter."""
     checks: Mapping[str, Any] = field(default_factory=dict)
@@ -120,11 +77,6 @@ class Calibration:
     """Command, store, scene and options, JSON values."""
     created: str = ""
     """ISO 8601 time with zone."""
-    joints: tuple[JointOffset, ...] = ()
-    """Offsets of the k joints of the arm, if its joint values were stated. The transform is that of
-    an arm that moves with them."""
-    joint_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    """(k, k) of the offsets."""
 
     def __post_init__(self) -> None:
         covariance = np.array(self.covariance, dtype=np.float64)
@@ -154,18 +106,6 @@ class Calibration:
         object.__setattr__(self, "joint_covariance", of_joints.reshape(k, k))
 
     @property
-    def meaning(self) -> str:
-        """The direction in words."""
-        child = self.child_frame
-        parent = self.parent_frame
-        return f"pose of {child} in {parent}: takes points from {child} to {parent}"
-
-    @property
-    def uncertain_pose(self) -> UncertainPose:
-        """`parent_from_child` with its covariance."""
-        return UncertainPose(self.parent_from_child, self.covariance)
-
-    @property
     def sigma_mm(self) -> float:
         """One standard deviation of the translation, root mean square of the axes."""
         return axis_deviation(self.covariance)[0]
@@ -181,13 +121,7 @@ class Calibration:
             "format": FORMAT,
             "version": VERSION,
             "mount": self.mount,
-            "parent_frame": self.parent_frame,
-            "child_frame": self.child_frame,
-            "meaning": self.meaning,
-            "translation_m": self.parent_from_child.translation_m.tolist(),
-            "quaternion_wxyz": self.parent_from_child.rotation_wxyz.tolist(),
-            "matrix": self.parent_from_child.matrix().tolist(),
-            "covariance": self.covariance.tolist(),
+            **self.transform_to_dict(),
             "sigma_mm": self.sigma_mm,
             "sigma_deg": self.sigma_deg,
             "camera": None if self.camera is None else self.camera.to_dict(),

@@ -83,13 +83,13 @@ class Export(args.Verb):
             raise InputError("no calibration given; name its JSON file after 'export'")
         options = {key: getattr(self, key) for key in ExportOptions.__annotations__}
         calibration = calibration_at(self.calibration)
-        self._show(export_files(calibration, self.format, self.out, **options))
+        exported = export_files(calibration, self.format, self.out, **options)
+        self._show(exported, calibration.verdict)
         return 0
 
-    def _show(self, exported: "Exported") -> None:
+    def _show(self, exported: "Exported", verdict: str) -> None:
         calibration = exported.calibration
         child = calibration.child_frame
-        verdict = calibration.verdict
         if exported.format.frame == "tf" and self.via is None and "optical" in child:
             say(
                 f"note: most camera drivers publish {child} themselves; if yours does, give its"

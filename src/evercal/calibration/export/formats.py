@@ -3,17 +3,15 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias, Unpack
+from typing import Literal, TypeAlias, Unpack
 
 from evercal.calibration.export import joints as arm
 from evercal.calibration.export import writers as to
 from evercal.calibration.export.request import Export, ExportOptions, prepare_export
+from evercal.calibration.framed_pose import FramedPose
 from evercal.errors import InputError
 from evercal.storage import write_bytes
 from evercal.typing import PathLike
-
-if TYPE_CHECKING:
-    from evercal.calibration.calibration import Calibration
 
 Content: TypeAlias = str | bytes | dict[str, str]
 """Text, bytes, or the texts of a folder by file name."""
@@ -104,7 +102,7 @@ class Exported:
     """A calibration with the exported frames in another format."""
 
     format: Format
-    calibration: "Calibration"
+    calibration: FramedPose
     text: str
     """Exported text; empty for a binary file or a folder."""
     files: tuple[Path, ...]
@@ -112,7 +110,7 @@ class Exported:
 
 
 def export_files(
-    calibration: "Calibration",
+    calibration: FramedPose,
     format: str,
     path: PathLike | None = None,
     **options: Unpack[ExportOptions],

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from xml.parsers import expat
 
-from evercal.calibration.calibration import JointOffset
 from evercal.calibration.export.request import Export, pose_numbers
+from evercal.calibration.framed_pose import JointOffset
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.robot.robot_model import RobotModel

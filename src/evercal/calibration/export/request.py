@@ -9,19 +9,17 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, Unpack
+from typing import Any, Literal, TypeAlias, TypedDict, Unpack
 
 import numpy as np
 
+from evercal.calibration.framed_pose import FramedPose
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.storage.text_files import read_text, yaml_documents
 from evercal.typing import Array, PathLike
-
-if TYPE_CHECKING:
-    from evercal.calibration.calibration import Calibration
 
 PoseSource: TypeAlias = RobotPoses | PathLike | None
 
@@ -65,7 +63,7 @@ class ExportOptions(TypedDict, total=False):
 class Export:
     """A calibration with what a format writer may need, see `ExportOptions`."""
 
-    calibration: "Calibration"
+    calibration: FramedPose
     """Calibration with the exported frames."""
     name: str
     """Name of the calibration in easy_handeye."""
@@ -119,7 +117,7 @@ def pose_numbers(poses: SE3, convention: str = "xyzw") -> Array:
 
 
 def prepare_export(
-    calibration: "Calibration", name: str = "evercal", **options: Unpack[ExportOptions]
+    calibration: FramedPose, name: str = "evercal", **options: Unpack[ExportOptions]
 ) -> Export:
     """Rename the frames, move the pose to the driver's root frame, and read the files."""
     parent = options.get("parent") or calibration.parent_frame

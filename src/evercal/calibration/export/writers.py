@@ -236,17 +236,10 @@ def npy(export: Export) -> bytes:
 
 def as_json(export: Export) -> str:
     """Write matrix, quaternion, covariance and frame names; `read_robot_poses` reads them."""
-    names = (
-        "parent_frame",
-        "child_frame",
-        "meaning",
-        "translation_m",
-        "quaternion_wxyz",
-        "matrix",
+    return (
+        json.dumps(export.calibration.transform_to_dict(), indent=1, allow_nan=False)
+        + "\n"
     )
-    whole = export.calibration.to_dict()
-    record = {name: whole[name] for name in (*names, "covariance")}
-    return json.dumps(record, indent=1, allow_nan=False) + "\n"
 
 
 def zivid(export: Export) -> str:

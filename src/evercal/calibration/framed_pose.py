@@ -1,0 +1,93 @@
+"""`FramedPose`: the pose of a camera between two named frames, as other programs take it."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.recordings.frame import Mount
+from evercal.typing import Array
+
+
+@dataclass(frozen=True)
+class ImageUse:
+    """Use of one image or pose pair."""
+
+    name: str
+    used: bool
+    reason: str = ""
+    """Reason for leaving it out; empty if it was used."""
+    residual_mm: float | None = None
+    """Distance of its translation from the prediction; `residual_deg` of its rotation."""
+    residual_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class JointOffset:
+    """Offset of a joint of the arm, which is to be added to the values that the robot reports."""
+
+    name: str
+    """Name of the joint in the URDF."""
+    offset: float
+    """Radians, or metres of a sliding joint."""
+    sigma: float
+    """Standard deviation; that before any image where the offset is not determined."""
+    is_angle: bool = True
+    open: str = ""
+    """Why it is not determined, and what would; empty if it is."""
+
+    @property
+    def unit(self) -> tuple[str, float]:
+        """Unit for people, deg or mm, and how many of it make a radian or a metre."""
+        return ("deg", 180 / np.pi) if self.is_angle else ("mm", 1000.0)
+
+
+@dataclass(frozen=True, eq=False)
+class FramedPose:
+    """Pose of a camera: `parent_from_child`."""
+
+    mount: Mount
+    """`eye_to_hand`: the camera stands still. `eye_in_hand`: the gripper carries it."""
+    parent_from_child: SE3
+    covariance: Array
+    """(6, 6) of (translation in the parent frame, metres; rotation about child axes, radians)."""
+    parent_frame: str = "base"
+    """`base` for eye_to_hand, `gripper` for eye_in_hand, or the robot's names of them."""
+    child_frame: str = "camera"
+    """The camera's optical frame: x right, y down, z forward."""
+    camera: Camera | None = None
+    """Intrinsics of the images."""
+    images: tuple[ImageUse, ...] = ()
+    """All images in the given order."""
+    joints: tuple[JointOffset, ...] = field(default=(), kw_only=True)
+    """Offsets of the k joints of the arm, if its joint values were stated. The transform is that of
+    an arm that moves with them."""
+    joint_covariance: Array = field(
+        default_factory=lambda: np.zeros((0, 0)), kw_only=True
+    )
+    """(k, k) of the offsets."""
+
+    @property
+    def meaning(self) -> str:
+        """The direction in words."""
+        child = self.child_frame
+        parent = self.parent_frame
+        return f"pose of {child} in {parent}: takes points from {child} to {parent}"
+
+    @property
+    def uncertain_pose(self) -> UncertainPose:
+        """`parent_from_child` with its covariance."""
+        return UncertainPose(self.parent_from_child, self.covariance)
+
+    def transform_to_dict(self) -> dict[str, Any]:
+        """Return JSON values of the transform."""
+        return {
+            "parent_frame": self.parent_frame,
+            "child_frame": self.child_frame,
+            "meaning": self.meaning,
+            "translation_m": self.parent_from_child.translation_m.tolist(),
+            "quaternion_wxyz": self.parent_from_child.rotation_wxyz.tolist(),
+            "matrix": self.parent_from_child.matrix().tolist(),
+            "covariance": self.covariance.tolist(),
+        }
