@@ -515,7 +515,7 @@ class Map:
 
         with self._store.writing():
             own = self.localizer.contents.scene(scene)
-            scale_known = own.metric and not unknown_scale
+            scale_known = own.unit is None and not unknown_scale
             if points is not None:
                 found = align_by_points(
                     self.localizer, scene, points, picks, scale_known

@@ -32,7 +32,7 @@ def answers(arc: Recording, factor: float) -> tuple[np.ndarray, list[str]]:
     recording = replace(arc, train=scaled(arc.train, factor), metric=False)
     empty = MapContents(load_encoder(), 120)
     scene, _ = learn_scene(recording, empty, memory="50%")
-    assert not scene.unit_known
+    assert not scene.metric
     localizer = Localizer(empty.with_scene(scene))
     rows = []
     test = scaled(arc.test[4:8], factor)

@@ -75,7 +75,7 @@ def scenes(rooms: tuple[Recording, ...]) -> list[SceneMap]:
                 keyframes=keyframes,
                 frame=frame if i == 0 else MapFrame(),
                 train_frames=30 + i,
-                metric=i > 0,
+                unit=None if i else 1.0,
             )
         )
     return made
@@ -112,7 +112,7 @@ def content() -> Contents:
             listed.append(
                 (scene.name, scene.camera, scene.adjusted_camera, scene.train_frames)
             )
-            listed.append((scene.metric, scene.unit_known))
+            listed.append((scene.unit, scene.metric))
             listed.append(_rounded(frame_to_dict(scene.frame)))
             tensors = scene.keyframes.to_tensors()
             if scene.frame.correction is not None:

@@ -267,8 +267,8 @@ def test_scenes_that_state_no_unit_are_in_metres(
 ) -> None:
     store = make(tmp_path / "map", scenes[:1])
     folder = store.folder(store.stages[0])
-    assert not read_scene(folder).metric
+    assert read_scene(folder).unit == 1.0
     content = json.loads((folder / "scene.json").read_text())
     del content["metric"]
     (folder / "scene.json").write_text(json.dumps(content))
-    assert read_scene(folder).metric
+    assert read_scene(folder).unit is None

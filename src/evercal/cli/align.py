@@ -66,7 +66,7 @@ class Align(args.Verb):
         from evercal.mapping.store import MapStore
 
         cell = Map(MapStore.open(self.store))
-        unit = cell.localizer.contents.scene(self.scene).unit
+        unit = cell.localizer.contents.scene(self.scene).unit or 1.0
         self._show(self._by_points(cell) if by_points else self._by_gripper(cell), unit)
         return 0
 

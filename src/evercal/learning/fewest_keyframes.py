@@ -50,7 +50,7 @@ def fewest_keyframes(
         others[i] for i, pose in zip(spread, located, strict=True) if pose is not None
     ]
     reference = [pose for pose in located if pose is not None]
-    unit = built.scene.frame.unit
+    unit = built.scene.frame.scale
     sizes = sorted({max(1, int(share * built.scene.train_frames)) for share in SHARES})
     for step, size in enumerate(size for size in sizes if size < len(poses)):
         on_progress("selecting keyframes", step + 1, len(sizes))

@@ -73,7 +73,7 @@ def _located(
     localizer: Localizer, frames: Sequence[Frame], scene: SceneMap
 ) -> list[_Answer]:
     answers = []
-    size = np.repeat([scene.frame.unit, 1.0], 3)
+    size = np.repeat([scene.frame.scale, 1.0], 3)
     index = localizer.scenes.index(scene.name)
     for frame in frames:
         if (stated := frame.base_from_camera) is None:

@@ -163,15 +163,15 @@ def answer(
         return replace(
             rejected,
             status="ambiguous",
-            reason=_rival_reason(mm, deg, scene.unit_known),
+            reason=_rival_reason(mm, deg, scene.metric),
             scene=scene.name,
             alternatives=(estimate.pose, other),
         )
-    metres = estimate.sigma_mm / 1000 / scene.frame.unit * scene.metres_per_unit
+    metres = scene.at_room_scale(estimate.sigma_mm / 1000)
     if metres > USELESS_M:
         off = (
             f"{1000 * metres:.0f} mm"
-            if scene.unit_known
+            if scene.metric
             else f"{estimate.sigma_mm / 1000:.3g}"
         )
         wide = f"its position is uncertain by {off} per axis"

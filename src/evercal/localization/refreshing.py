@@ -131,11 +131,9 @@ def refresh_scene(
         keyframes_added=result.added,
         memory_bytes=updated.keyframes.bytes,
         verified=verified,
-        shift_mm=1000 * float(np.linalg.norm(tangent[:3]))
-        if scene.unit_known
-        else None,
+        shift_mm=scene.in_metres(1000 * float(np.linalg.norm(tangent[:3]))),
         shift_deg=float(np.rad2deg(np.linalg.norm(tangent[3:]))),
-        shift_sigma_mm=1000 * float(sigma[0]) if scene.unit_known else None,
+        shift_sigma_mm=scene.in_metres(1000 * float(sigma[0])),
         shift_sigma_deg=float(np.rad2deg(sigma[1])),
     )
     return updated, report
@@ -173,7 +171,7 @@ def _precise(estimate: PoseEstimate, scene: SceneMap) -> bool:
         term.covariance for term in estimate.terms if term.name in ("view", "lens")
     )
     sigma = np.sqrt(np.diag(np.asarray(own)).reshape(2, 3).mean(1))
-    metres = sigma[0] / scene.frame.unit * scene.metres_per_unit
+    metres = scene.at_room_scale(sigma[0])
     return bool(sigma[1] < PRECISE_RAD and metres < PRECISE_M)
 
 

@@ -239,12 +239,12 @@ class Tracker:
         if len(self._poses) > 1:
             unsure = min(unsure, MOST_ACCELERATION_M_S2 / 2 * elapsed**2)
         off, _ = pose_distance(found.pose.pose, predicted)
-        scale = self._metres_per_unit
-        return float(np.linalg.norm(steps[0]) - off) * scale < unsure
+        return self._at_room_scale(float(np.linalg.norm(steps[0]) - off)) < unsure
 
-    @property
-    def _metres_per_unit(self) -> float:
-        return self.localizer.contents.scenes[self._scene].metres_per_unit
+    def _at_room_scale(self, length: float) -> float:
+        """A length of the map, see `SceneMap.at_room_scale`."""
+        scene = self.localizer.contents.scenes[self._scene]
+        return scene.at_room_scale(scene.frame.scale * length)
 
     def _predicted(self, stamp: float) -> SE3 | None:
         if not self._poses:
@@ -271,7 +271,7 @@ class Tracker:
         if found.pose is None or not accepted(found, times):
             return False
         metres, radians = pose_distance(found.pose.pose, predicted)
-        near = float(metres) * self._metres_per_unit < self.options.reach_m
+        near = self._at_room_scale(float(metres)) < self.options.reach_m
         return near and float(radians) < np.deg2rad(self.options.reach_deg)
 
     def _remember(self, found: Hypothesis, stamp: float, settled: bool = False) -> None:

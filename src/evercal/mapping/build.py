@@ -455,7 +455,7 @@ def _finish(
     own = (
         None
         if options.metric
-        else Similarity(SE3.identity(), prepared.unit, known=False)
+        else Similarity(SE3.identity(), prepared.unit, metric=False)
     )
     if adjustment is not None:
         block = np.einsum("nii->ni", adjustment.covariance[numbers])
@@ -498,8 +498,7 @@ def _finish(
             adjusted_camera=camera,
             keyframes=_keyframes(frames, tracks),
             frame=replace(frame, similarity=own),
-            metric=options.metric,
-            unit=prepared.unit,
+            unit=None if options.metric else prepared.unit,
             train_frames=len(frames),
         ),
         _adjusted(prepared, adjustment, camera),

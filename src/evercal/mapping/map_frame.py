@@ -51,7 +51,7 @@ class Similarity:
     """Applied after scaling."""
     scale: float = 1.0
     """Units of length of the base frame per unit of the map."""
-    known: bool = True
+    metric: bool = True
     """Whether the base frame is in metres. Otherwise this leads to the recording's own unit."""
 
     def pose(self, map_from_camera: SE3) -> SE3:
@@ -109,7 +109,7 @@ class MapFrame:
         return UncertainPose(SE3.identity(), self.base_covariance) @ estimate
 
     @property
-    def unit(self) -> float:
+    def scale(self) -> float:
         """Units of length of an answer per unit of the map."""
         return 1.0 if self.similarity is None else self.similarity.scale
 

@@ -33,23 +33,30 @@ class SceneMap:
     """Relation of the landmarks' frame to the base frame."""
     train_frames: int
     """Frames that the map was built from."""
-    metric: bool = True
-    """Whether the recording was in metres; False where its unit of length is unknown."""
     parent_frame: str = "base"
     """Frame of the answers: base, or gripper for the map of a thing that the gripper holds."""
-    unit: float = 1.0
-    """Units of length of the recording per unit of the map; 1 where the recording is in metres."""
+    unit: float | None = None
+    """Units of length of the recording per unit of the map; None where the recording is in metres.
+    A map of unknown unit is normalised to the depths of a room."""
 
     @property
-    def unit_known(self) -> bool:
+    def metric(self) -> bool:
         """Whether answers are in metres: of the recording, or by alignment with the base frame."""
         similarity = self.frame.similarity
-        return self.metric or (similarity is not None and similarity.known)
+        aligned = similarity is not None and similarity.metric
+        return self.unit is None or aligned
 
-    @property
-    def metres_per_unit(self) -> float:
-        """Metres per unit of the map; 1 where it is unknown: depths are then those of rooms."""
-        return self.frame.unit if self.unit_known else 1.0
+    def in_metres(self, length: float) -> float | None:
+        """Metres of a length of an answer; None where the unit of length is unknown."""
+        return length if self.metric else None
+
+    def at_room_scale(self, length: float) -> float:
+        """A length of an answer, to be compared with a bound in metres.
+
+        Where the unit is unknown, depths of the scene are taken to be those of a room.
+        """
+        metres = self.in_metres(length)
+        return length / self.frame.scale if metres is None else metres
 
     @property
     def landmarks(self) -> int:
@@ -99,7 +106,7 @@ class MapContents:
     def metric_scene(self, name: str) -> SceneMap:
         """The map of a scene whose answers are in metres."""
         scene = self.scene(name)
-        if not scene.unit_known:
+        if not scene.metric:
             raise InputError(
                 f"scene {name}: the unit of length of its recording is unknown, so there are no"
                 " millimetres; run 'evercal align' first, with --robot-poses or with --points and"

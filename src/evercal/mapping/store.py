@@ -46,17 +46,6 @@ REFRESHES = "refreshes.json"
 _STATE, PREVIOUS = (SCENE, KEYFRAMES, CORRECTION), "previous-"
 """Files that a refresh replaces, and the prefix of their state before."""
 
-_FIELDS = (
-    "name",
-    "camera",
-    "adjusted_camera",
-    "train_frames",
-    "metric",
-    "parent_frame",
-    "unit",
-)
-"""Fields of `SceneMap` in scene.json, beside `frame`."""
-
 
 class MapStore(StageStore[MapContents]):
     """A map on disk and in memory.
@@ -236,11 +225,17 @@ def require_map(root: Path, manifest: Manifest) -> dict[str, Any]:
 
 def write_scene(folder: Path, scene: SceneMap) -> None:
     """Write everything of a scene but its keyframes into its folder."""
-    values = {name: getattr(scene, name) for name in _FIELDS}
     content = {
-        k: v.to_dict() if isinstance(v, Camera) else v for k, v in values.items()
+        "name": scene.name,
+        "camera": scene.camera.to_dict(),
+        "adjusted_camera": scene.adjusted_camera.to_dict(),
+        "train_frames": scene.train_frames,
+        "metric": scene.unit is None,
+        "parent_frame": scene.parent_frame,
+        "unit": scene.unit or 1.0,
+        "frame": frame_to_dict(scene.frame),
     }
-    write_json(folder / SCENE, {**content, "frame": frame_to_dict(scene.frame)})
+    write_json(folder / SCENE, content)
     (folder / CORRECTION).unlink(missing_ok=True)  # of the scene that is replaced
     if scene.frame.correction is not None:
         save_tensors(folder / CORRECTION, correction_tensors(scene.frame.correction))
@@ -274,23 +269,23 @@ def read_scene(folder: Path) -> SceneMap:
 
 
 def _read_scene(folder: Path) -> SceneMap:
-    content = {
-        "metric": True,
-        "unit": 1.0,
-        "parent_frame": "base",
-        **json.loads((folder / SCENE).read_text()),
-    }
+    content = json.loads((folder / SCENE).read_text())
     correction = None
     if (folder / CORRECTION).exists():
         correction = correction_of(load_tensors(folder / CORRECTION))
-    values: dict[str, Any] = {name: content[name] for name in _FIELDS}
-    for name in ("camera", "adjusted_camera"):
-        values[name] = Camera.from_dict(values[name])
-    checked_name(values["name"])
+    unit = None
+    # Maps written by earlier versions lack some keys.
+    if not content.get("metric", True):
+        unit = content.get("unit", 1.0)
     return SceneMap(
+        name=checked_name(content["name"]),
+        camera=Camera.from_dict(content["camera"]),
+        adjusted_camera=Camera.from_dict(content["adjusted_camera"]),
         keyframes=Keyframes.from_tensors(open_tensors(folder / KEYFRAMES)),
         frame=frame_of(content["frame"], correction),
-        **values,
+        train_frames=content["train_frames"],
+        parent_frame=content.get("parent_frame", "base"),
+        unit=unit,
     )
 
 
@@ -304,7 +299,7 @@ def frame_to_dict(frame: MapFrame) -> dict[str, object]:
         "frame_sigma": list(frame.frame_sigma),
         "base_from_map": pose_to_dict(similarity.base_from_map if similarity else None),
         "scale": 1.0 if similarity is None else similarity.scale,
-        "unit_known": similarity is None or similarity.known,
+        "unit_known": similarity is None or similarity.metric,
         "base_covariance": None if covariance is None else covariance.tolist(),
     }
 

@@ -27,7 +27,7 @@ class Answer:
 def unit_known(localizer: "LearnedLocalizer", name: str | None) -> bool:
     """Whether answers in a scene are in metres; those of networks are taken to be."""
     scenes = [scene for scene in localizer.contents.scenes if scene.name == name]
-    return all(getattr(scene, "unit_known", True) for scene in scenes)
+    return all(getattr(scene, "metric", True) for scene in scenes)
 
 
 def answer_row(answer: Answer) -> dict[str, object]:

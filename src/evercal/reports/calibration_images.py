@@ -158,7 +158,7 @@ def annotate_images(
     scene = _scene_of(calibration, localizer)
     digest = calibration.source.get("map")
     other = digest is not None and (scene is None or scene.digest != digest)
-    still = scene is not None and scene.unit_known and scene.parent_frame == "base"
+    still = scene is not None and scene.metric and scene.parent_frame == "base"
     around = Surroundings.of(
         scene if still and calibration.mount == "eye_to_hand" else None
     )
