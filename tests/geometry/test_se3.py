@@ -52,6 +52,21 @@ def test_group_axioms(case: tuple[int, str]) -> None:
 
 @given(cases)
 @settings(max_examples=60)
+def test_scipy_rotations_and_back(case: tuple[int, str]) -> None:
+    seed, angle = case
+    poses = random_poses(np.random.default_rng(seed), (2, 3), angle)
+    np.testing.assert_allclose(
+        poses.rotation.as_matrix(), poses.rotation_matrix(), atol=1e-12
+    )
+    back = SE3.of(poses.rotation, poses.translation_m)
+    assert_close(back, poses)
+    assert (back.rotation_wxyz[..., 0] >= 0).all()
+    kept = SE3.of(poses.rotation, poses.translation_m, canonical=False)
+    np.testing.assert_allclose(kept.rotation_wxyz, poses.rotation_wxyz, atol=1e-15)
+
+
+@given(cases)
+@settings(max_examples=60)
 def test_agrees_with_matrices(case: tuple[int, str]) -> None:
     seed, angle = case
     rng = np.random.default_rng(seed)

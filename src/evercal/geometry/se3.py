@@ -7,12 +7,15 @@ Metres, radians, quaternions in the order w, x, y, z, tangents in the order (tra
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from evercal.typing import Array
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 _SMALL_RAD = 1e-3
 """Angle below which series replace quotients that cancel."""
@@ -66,6 +69,17 @@ class SE3:
         """Create poses without rotation from (..., 3) translations, metres."""
         pose = cls.identity(np.shape(translation_m)[:-1])
         return cls(pose.rotation_wxyz, np.asarray(translation_m, dtype=np.float64))
+
+    @classmethod
+    def of(
+        cls, rotation: "Rotation", translation_m: ArrayLike, canonical: bool = True
+    ) -> Self:
+        """Create poses (...) from SciPy's rotations and (..., 3) translations, metres.
+
+        Quaternions get w >= 0 if they are `canonical`; otherwise they keep their sign.
+        """
+        quaternion = rotation.as_quat(canonical=canonical, scalar_first=True)
+        return cls(quaternion, np.asarray(translation_m, dtype=np.float64))
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike, tolerance: float = 1e-3) -> Self:
@@ -160,6 +174,13 @@ class SE3:
     def __iter__(self) -> Iterator[Self]:
         """Over the first batch axis."""
         return (self[i] for i in range(len(self)))
+
+    @property
+    def rotation(self) -> "Rotation":
+        """The rotations (...) as SciPy's."""
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_quat(self.rotation_wxyz, scalar_first=True)
 
     def rotation_matrix(self) -> Array:
         """(..., 3, 3)."""
@@ -259,6 +280,30 @@ def pose_distance_mm_deg(a: SE3, b: SE3) -> tuple[float, float]:
     """`pose_distance` of two single transforms, in millimetres and degrees."""
     metres, radians = pose_distance(a, b)
     return 1000 * float(metres), float(np.rad2deg(radians))
+
+
+def deviations(poses: SE3, mean: SE3) -> Array:
+    """(n, 6) deviations of poses: translations in the parent frame, rotations about child axes."""
+    shift = poses.translation_m - mean.translation_m
+    rotation = (mean.inverse() @ poses).log()[:, 3:]
+    return np.concatenate([shift, rotation], axis=1)
+
+
+def length_mm_deg(deviation: Array) -> tuple[float, float]:
+    """Length of one deviation (6,) in millimetres and degrees."""
+    metres = np.linalg.norm(deviation[:3])
+    radians = np.linalg.norm(deviation[3:])
+    return 1000 * float(metres), float(np.rad2deg(radians))
+
+
+def cross_matrix(v: ArrayLike) -> Array:
+    """(..., 3, 3) matrices of the cross product with vectors (..., 3)."""
+    v = np.asarray(v, dtype=np.float64)
+    matrix = np.zeros((*v.shape, 3))
+    matrix[..., 0, 1] = -v[..., 2]
+    matrix[..., 0, 2] = v[..., 1]
+    matrix[..., 1, 2] = -v[..., 0]
+    return matrix - np.swapaxes(matrix, -1, -2)
 
 
 def average_poses(poses: SE3) -> SE3:

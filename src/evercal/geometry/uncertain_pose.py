@@ -10,18 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evercal.geometry.se3 import SE3
+from evercal.geometry.se3 import SE3, cross_matrix
 from evercal.typing import Array
-
-
-def cross_matrix(v: ArrayLike) -> Array:
-    """(..., 3, 3) matrices of the cross product with vectors (..., 3)."""
-    v = np.asarray(v, dtype=np.float64)
-    matrix = np.zeros((*v.shape, 3))
-    matrix[..., 0, 1] = -v[..., 2]
-    matrix[..., 0, 2] = v[..., 1]
-    matrix[..., 1, 2] = -v[..., 0]
-    return matrix - np.swapaxes(matrix, -1, -2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +110,13 @@ def axis_deviation(covariance: ArrayLike) -> tuple[float, float]:
     metres = np.sqrt(variance[:3].mean())
     radians = np.sqrt(variance[3:].mean())
     return 1000 * float(metres), float(np.rad2deg(radians))
+
+
+def in_parent_axes(rotation: Array, covariance: Array) -> Array:
+    """Covariance (6, 6) with its translation part rotated from child axes to the parent's."""
+    slope = np.eye(6)
+    slope[:3, :3] = rotation
+    return np.asarray(slope @ covariance @ slope.T, np.float64)
 
 
 def frame_covariance(base_from_camera: SE3, covariance: ArrayLike) -> Array:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame
@@ -157,7 +156,7 @@ def _rotations_deg(poses: SE3) -> tuple[Array, Array]:
     """Standard deviations about the mover's own axes, and about principal axes, degrees, (3,)."""
     if len(poses) < 2:
         return np.zeros(3), np.zeros(3)
-    rotations = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
+    rotations = poses.rotation
     away = np.rad2deg((rotations.mean().inv() * rotations).as_rotvec())
     away = away - away.mean(0)
     principal = np.linalg.svd(away, compute_uv=False) / np.sqrt(len(away))

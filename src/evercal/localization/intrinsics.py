@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evercal.errors import InputError
-from evercal.geometry import Camera, UncertainPose
+from evercal.geometry import Camera, UncertainPose, in_parent_axes
 from evercal.localization.pose_refinement import (
     INTRINSICS,
     Minimum,
     Observed,
     cells_of,
-    in_parent_axes,
     minimise,
 )
 from evercal.typing import Array

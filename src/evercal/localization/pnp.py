@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evercal.geometry import SE3, Camera, UncertainPose
-from evercal.localization.pose_refinement import in_parent_axes, linearise
+from evercal.geometry import SE3, Camera, UncertainPose, in_parent_axes
+from evercal.localization.pose_refinement import linearise
 
 MIN_INLIERS = 6
 

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.geometry import SE3, Camera, UncertainPose, in_parent_axes
+from evercal.geometry.normal_equations import normal_inverse
 from evercal.typing import Array
 
 INTRINSICS = 5
@@ -86,7 +87,7 @@ class Minimum:
         gradient = self.gradient.copy()
         data.flat[6 * len(data) + 6 :: len(data) + 1] += prior
         gradient[6:] += prior * self.change[:count]
-        inverse = inverse_of(data)
+        inverse = normal_inverse(data, _OPEN)
         return -inverse @ gradient, inverse
 
     def covariance(self, prior: Array, cells: Array) -> Array:
@@ -107,7 +108,7 @@ class Minimum:
         diagonal = slice(6 * count + 6, None, count + 1)
         hessian.flat[diagonal] += prior
         scores.flat[diagonal] += prior * (self.variance + self.bent)
-        inverse = inverse_of(hessian)
+        inverse = normal_inverse(hessian, _OPEN)
         return inverse @ scores @ inverse
 
     def after(self, step: Array) -> "Minimum":
@@ -203,15 +204,6 @@ def cells_of(pixels: Array, camera: Camera) -> Array:
     return (cell[:, None] == np.unique(cell)).astype(np.float64)
 
 
-def inverse_of(information: Array) -> Array:
-    """Inverse of a positive semi-definite matrix whose units differ by orders of magnitude."""
-    scale = 1 / np.sqrt(information.diagonal() + 1e-300)
-    scales = scale * scale[:, None]
-    scaled = information * scales
-    scaled.flat[:: len(scale) + 1] += _OPEN
-    return np.linalg.inv(scaled) * scales
-
-
 def linearise(
     pixels: Array,
     points_m: Array,
@@ -267,10 +259,3 @@ def linearise(
             slope[9] = slope[6] * r2
             slope[10] = slope[9] * r2
     return np.stack([u + camera.cx - pixels[:, 0], v + camera.cy - pixels[:, 1]]), slope
-
-
-def in_parent_axes(rotation: Array, covariance: Array) -> Array:
-    """Covariance (6, 6) with its translation part rotated from camera axes to the parent's."""
-    slope = np.eye(6)
-    slope[:3, :3] = rotation
-    return np.asarray(slope @ covariance @ slope.T, np.float64)

@@ -531,7 +531,7 @@ class BundleAdjustment:
         """
         n = self.n
         stated = self.frames.stated
-        rotations = Rotation.from_quat(stated.rotation_wxyz, scalar_first=True)
+        rotations = stated.rotation
         turns = (rotations.mean().inv() * rotations).as_rotvec()
         # Of a fixed camera the frame of the map is the gripper: the arm's position is inverse.
         arm = self.gripper_from_camera.inverse().translation_m

@@ -147,11 +147,8 @@ def board_pose(
     by_lens = np.c_[by_camera, (by_z * by_bend[:, None]).reshape(-1, len(BEND))]
     lens_slope = -covariance @ (jacobian.T @ by_lens)
     unexplained = by_lens + jacobian @ lens_slope
-    quaternion = rotation.as_quat(canonical=True, scalar_first=True)
     return BoardPose(
-        camera_from_board=SE3(
-            quaternion, np.asarray(translation, dtype=np.float64).ravel()
-        ),
+        camera_from_board=SE3.of(rotation, np.ravel(translation)),
         unit_covariance=(covariance + covariance.T) / 2,
         residual_px=error.reshape(-1, 2),
         lens_slope=lens_slope,
@@ -166,11 +163,7 @@ def _refined(
     """Rotation vector and translation (3, 1) of the board that fit its corners best."""
     import cv2
 
-    rotvec = (
-        Rotation.from_quat(start.rotation_wxyz, scalar_first=True)
-        .as_rotvec()
-        .reshape(3, 1)
-    )
+    rotvec = start.rotation.as_rotvec().reshape(3, 1)
     translation = start.translation_m.reshape(3, 1).copy()
     if camera.model == "pinhole":
         lens = camera.matrix(), lens_vector(camera)[4:]
@@ -238,12 +231,8 @@ def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
                 and np.isfinite(translation).all()
                 and translation[2] > 0
             ):
-                quaternion = Rotation.from_rotvec(np.ravel(rotvec)).as_quat(
-                    scalar_first=True
-                )
-                poses.append(
-                    SE3(quaternion, np.asarray(translation, dtype=np.float64).ravel())
-                )
+                rotation = Rotation.from_rotvec(np.ravel(rotvec))
+                poses.append(SE3.of(rotation, np.ravel(translation), canonical=False))
     return poses
 
 

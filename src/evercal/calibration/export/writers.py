@@ -13,7 +13,6 @@ from collections.abc import Callable
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from evercal.calibration.export.request import Export, pose_numbers
 from evercal.errors import InputError
@@ -205,7 +204,7 @@ def opencv(export: Export) -> str:
     import cv2
 
     camera_from_parent = export.pose.inverse()
-    rotation = Rotation.from_quat(camera_from_parent.rotation_wxyz, scalar_first=True)
+    rotation = camera_from_parent.rotation
     mode = (
         cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
     )

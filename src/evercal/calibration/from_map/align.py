@@ -245,15 +245,14 @@ def fit_picks(
     )
     start = _umeyama(in_map, in_base, scale_known)
     centre = in_base.mean(0)
-    before = Rotation.from_quat(start.base_from_map.rotation_wxyz, scalar_first=True)
+    before = start.base_from_map.rotation
     shift = start.base_from_map.translation_m - centre
 
     def moved(small: Array) -> Similarity:
         growth = 1.0 if scale_known else float(np.exp(small[6]))
         rotation = Rotation.from_rotvec(small[3:6])
-        both = (rotation * before).as_quat(canonical=True, scalar_first=True)
         translation = rotation.apply(shift) * growth + centre + small[:3]
-        return Similarity(SE3(both, translation), start.scale * growth)
+        return Similarity(SE3.of(rotation * before, translation), start.scale * growth)
 
     def residuals(small: Array) -> Array:
         return np.concatenate([_distances(image, moved(small)) for image in images])
@@ -316,6 +315,4 @@ def _umeyama(source: Array, target: Array, scale_known: bool) -> Similarity:
     rotation = Rotation.align_vectors(b, a)[0]
     scale = 1.0 if scale_known else float((b * rotation.apply(a)).sum() / (a**2).sum())
     shift = target.mean(0) - scale * rotation.apply(source.mean(0))
-    return Similarity(
-        SE3(rotation.as_quat(canonical=True, scalar_first=True), shift), scale
-    )
+    return Similarity(SE3.of(rotation, shift), scale)

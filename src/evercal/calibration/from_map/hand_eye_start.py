@@ -350,7 +350,7 @@ class _EpipolarFit:
     def transform(self, x: Array) -> SE3:
         """parent_from_camera of parameters (6,)."""
         turned = Rotation.from_rotvec(x[:3]) * self.rotation
-        return SE3(turned.as_quat(canonical=True, scalar_first=True), x[3:6])
+        return SE3.of(turned, x[3:6])
 
 
 def image_pairs(
@@ -400,9 +400,7 @@ def image_pairs(
 
 def _turned_least(frames: Sequence[Frame]) -> list[tuple[int, int]]:
     """Pairs of frames, each with those between which the gripper turned least."""
-    rotation = Rotation.from_quat(
-        stated_grippers(frames).rotation_wxyz, scalar_first=True
-    )
+    rotation = stated_grippers(frames).rotation
     pairs = set()
     for i, first in enumerate(rotation):
         nearest = np.argsort((first.inv() * rotation).magnitude(), kind="stable")[1:]

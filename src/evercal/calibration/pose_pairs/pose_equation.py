@@ -41,8 +41,7 @@ class Unknowns:
 
     def _pose(self, which: int) -> SE3:
         rotation = Rotation.from_matrix(self.rotations[which])
-        quaternion = rotation.as_quat(canonical=True, scalar_first=True)
-        return SE3(quaternion, np.asarray(self.translations[which], dtype=np.float64))
+        return SE3.of(rotation, self.translations[which])
 
     def moved(self, step: Array) -> "Unknowns":
         """Return the unknowns after a (12 + q,) step of (translation, rotation) of X, Z, extras."""

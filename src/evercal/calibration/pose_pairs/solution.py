@@ -86,12 +86,9 @@ class PairSolution:
         """(len(rows),) board poses by the robot's poses and the calibration."""
         equation = self.equation
         carried = self.fit.at.parent_from_camera
-        rotation = Rotation.from_matrix(equation.robot_rotation).as_quat(
-            scalar_first=True
-        )
-        fixed_from_parent = SE3(
-            rotation, np.asarray(equation.robot_translation, np.float64)
-        )
+        rotation = Rotation.from_matrix(equation.robot_rotation)
+        translation = equation.robot_translation
+        fixed_from_parent = SE3.of(rotation, translation, canonical=False)
         return (fixed_from_parent @ carried).inverse() @ self.fixed_from_board
 
     def calibration(self, time_offset_s: float | None = None) -> Calibration:

@@ -196,8 +196,9 @@ def poses_from_numbers(
     if convention.is_matrix:
         poses = _from_matrices(numbers, convention)
     else:
-        quaternion = _rotations(numbers[..., 3:], convention).as_quat(scalar_first=True)
-        poses = SE3(quaternion, numbers[..., :3] * convention.metres_per_unit)
+        translation = numbers[..., :3] * convention.metres_per_unit
+        rotation = _rotations(numbers[..., 3:], convention)
+        poses = SE3.of(rotation, translation, canonical=False)
     poses = poses.inverse() if convention.has("inverse") else poses
     if not convention.has("opengl"):
         return poses
@@ -228,7 +229,7 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
         matrix[..., :3, 3] = translation
         matrix = matrix if layout == "rows" else np.swapaxes(matrix, -1, -2)
         return matrix.reshape(*poses.shape, 16)
-    rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
+    rotation = poses.rotation
     if layout == "vector":
         numbers = rotation.as_rotvec(degrees=degrees)
     elif convention.has_angles:

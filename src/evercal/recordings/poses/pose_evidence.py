@@ -92,7 +92,7 @@ def _readings(
 ) -> tuple[Array, dict[str, Array]]:
     """(n, 3) rotation vectors first_from_second of pairs as stated, and in other readings."""
     first, second = pairs.T
-    rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
+    rotation = poses.rotation
     swapped = Rotation.from_quat(poses.rotation_wxyz)
     stated = (rotation[first].inv() * rotation[second]).as_rotvec()
     inverse = (rotation[first] * rotation[second].inv()).as_rotvec()
@@ -173,7 +173,7 @@ def _pairs(poses: SE3) -> list[tuple[int, int]]:
     Large rotations separate the readings best, but with nonsensical angles only near frames are
     certain to match. Every second pair is therefore the nearest one.
     """
-    rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
+    rotation = poses.rotation
     pairs = []
     firsts = np.unique(np.linspace(0, len(poses) - 2, PAIRS).round().astype(int))
     for i, first in enumerate(firsts):

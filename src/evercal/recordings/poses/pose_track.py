@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Slerp
 
 from evercal.geometry import SE3, pose_distance
 from evercal.typing import Array, BoolArray
@@ -50,13 +50,13 @@ class PoseTrack:
         after, close = times_around(self.stamps_s, inside)
         metres, radians = pose_distance(self.poses[after - 1], self.poses[after])
         still = (metres < STILL_M) & (np.rad2deg(radians) < STILL_DEG)
-        rotations = Rotation.from_quat(self.poses.rotation_wxyz, scalar_first=True)
         position = [
             np.interp(inside, self.stamps_s, axis)
             for axis in self.poses.translation_m.T
         ]
-        quaternion = Slerp(self.stamps_s, rotations)(inside).as_quat(scalar_first=True)
-        return SE3(quaternion, np.stack(position, axis=-1)), valid & (close | still)
+        rotation = Slerp(self.stamps_s, self.poses.rotation)(inside)
+        poses = SE3.of(rotation, np.stack(position, axis=-1), canonical=False)
+        return poses, valid & (close | still)
 
 
 def times_around(times_s: Array, stamps_s: Array) -> tuple[NDArray[np.intp], BoolArray]:
