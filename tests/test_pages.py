@@ -5,6 +5,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from evercal.errors import with_options
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "evercal"
 LONGEST = 40
@@ -144,7 +146,7 @@ def is_quote(message: str, text: str) -> bool:
 def test_messages_of_troubleshooting_are_in_the_source() -> None:
     quoted = re.findall(r"^\| `(.*?)` \| .*? \| .*? \|$", TROUBLESHOOTING, re.M)
     assert len(quoted) == len(set(quoted)) > 40
-    source = {text for tree in TREES.values() for text in texts(tree)}
+    source = {with_options(text) for tree in TREES.values() for text in texts(tree)}
     for message in quoted:
         assert len(re.sub(r"\W", "", message)) >= 8, (
             f"{message}: too short to identify a message"

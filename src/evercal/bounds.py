@@ -119,6 +119,6 @@ def require_at_most(count: int, name: str, what: str) -> None:
     """Raise ValueError if there is more of `what` than the bound of this name allows."""
     if count > (most := getattr(bounds(), name)):
         raise ValueError(
-            f"{count:,} {what}, at most {most:,} are read; if it is right, add --limits"
+            f"{count:,} {what}, at most {most:,} are read; if it is right, add `limits`"
             f" {name}={count}"
         )

@@ -41,9 +41,9 @@ def connected(address: str) -> Iterator[Any]:
         except (ConnectionError, TimeoutError, ValueError, RuntimeError) as error:
             reason = str(error).strip().partition("\n")[0]
             raise InputError(
-                f"--ray {address}: {reason[:300]}; start a cluster, or give HOST:PORT of one"
+                f"`ray` {address}: {reason[:300]}; start a cluster, or give HOST:PORT of one"
             ) from None
-    # Ray prints messages of its machines to stdout, whatever `log_to_driver` is; --json is there.
+    # Ray prints messages of its machines to stdout, whatever `log_to_driver` is; JSON is there.
     ray._private.worker._worker_logs_enabled = False
     try:
         yield ray
@@ -61,6 +61,6 @@ def _require_listener(address: str) -> None:
             ).close()
         except (OSError, ValueError) as error:
             raise InputError(
-                f"--ray {address}: nothing answers ({error}); give auto, or HOST:PORT or"
+                f"`ray` {address}: nothing answers ({error}); give auto, or HOST:PORT or"
                 " ray://HOST:PORT of a cluster"
             ) from None

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TextIO
 
-from evercal.errors import printable
+from evercal.errors import printable, with_options
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -84,10 +84,10 @@ class Bars:
         return bar
 
     def write(self, text: str) -> None:
-        """Print lines above the bar."""
+        """Print lines above the bar; their sentences name options."""
         from tqdm import tqdm
 
-        tqdm.write(printable(text), file=self._stream)
+        tqdm.write(printable(with_options(text)), file=self._stream)
 
     def _close(self) -> None:
         if self._bar is not None:

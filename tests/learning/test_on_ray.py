@@ -156,5 +156,5 @@ def test_another_way_of_reading_gets_another_result(folders: list[Path]) -> None
 
 
 def test_what_does_not_answer_is_named(folders: list[Path], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"--ray 127.0.0.1:1: nothing answers"):
+    with pytest.raises(InputError, match=r"`ray` 127.0.0.1:1: nothing answers"):
         small_map(tmp_path / "map").learn_many(folders[:1], ray="127.0.0.1:1")

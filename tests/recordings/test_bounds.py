@@ -173,7 +173,7 @@ def test_the_bounds_are_raised_by_the_variable(
     path.write_text(
         HEADER.replace("image", "image," + ",".join(["more"] * 1_500)) + ROW
     )
-    with pytest.raises(InputError, match=r"--limits columns=1508"):
+    with pytest.raises(InputError, match=r"`limits` columns=1508"):
         read_robot_poses(path)
     monkeypatch.setenv(VARIABLE, "columns=2000, pixels=1e6")
     assert (bounds().columns, bounds().pixels) == (2000, 10**6)

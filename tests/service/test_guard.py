@@ -133,17 +133,17 @@ def test_what_is_no_http_is_refused(hall_service: Any, data: bytes) -> None:
     [
         (
             {"host": "0.0.0.0"},
-            "--host 0.0.0.0: other machines could use the map; give --token-",
+            "`host` 0.0.0.0: other machines could use the map; give `token_",
         ),
-        ({"host": "::"}, "--host ::: other machines"),
+        ({"host": "::"}, "`host` ::: other machines"),
         ({"host": "example.invalid"}, "other machines"),
         ({"token": "short"}, "token: give at least 16"),
         ({"token": "x" * 20 + " "}, "token: give at least 16"),
         (
             {"host": "example.invalid", "token": TOKEN},
-            "--host example.invalid --port 0: ",
+            "`host` example.invalid `port` 0: ",
         ),
-        ({"port": 70_000}, "--port 70000: "),
+        ({"port": 70_000}, "`port` 70000: "),
     ],
 )
 def test_addresses_that_are_refused(
@@ -156,7 +156,7 @@ def test_addresses_that_are_refused(
 def test_a_token_opens_all_addresses_and_a_port_is_used_once(tmp_path: Path) -> None:
     with bound_socket(ServeOptions(tmp_path, "0.0.0.0", 0, TOKEN)) as first:
         port = first.getsockname()[1]
-        with pytest.raises(InputError, match=f"--port {port}: Address already in use"):
+        with pytest.raises(InputError, match=f"`port` {port}: Address already in use"):
             bound_socket(ServeOptions(tmp_path, "0.0.0.0", port, TOKEN))
 
 

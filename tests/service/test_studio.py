@@ -204,7 +204,7 @@ def test_devices_that_give_nothing_are_named(cell: VirtualCell, tmp_path: Path) 
     assert not connection.complete
     calls: list[tuple[Callable[[], str], str]] = [
         (lambda: studio.move_to(SE3.identity()), "move it by hand"),
-        (studio.take_fixed, "--fixed SOURCE"),
+        (studio.take_fixed, "`fixed` SOURCE"),
         (studio.check_fixed, "the fixed camera is not calibrated yet"),
         (lambda: studio.calibrate_fixed(silent), "take one first"),
         (lambda: studio.export("wrist", "urdf"), "not calibrated yet"),

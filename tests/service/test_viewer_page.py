@@ -86,9 +86,9 @@ def test_backdrop_shows_each_pixel_where_the_camera_sees_it() -> None:
 def test_an_address_that_cannot_be_used_is_refused() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(InputError, match=f"--port {port}: Address already in use"):
+        with pytest.raises(InputError, match=f"`port` {port}: Address already in use"):
             start_server("127.0.0.1", port, "page")
-    with pytest.raises(InputError, match="--port 99999: give 0 to 65535"):
+    with pytest.raises(InputError, match="`port` 99999: give 0 to 65535"):
         start_server("127.0.0.1", 99999, "page")
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
+from evercal.errors import with_options
 from evercal.recordings.images import encode_jpeg
 from evercal.recordings.poses.row_files import is_number
 from evercal.reports.charts import INKS
@@ -90,16 +91,18 @@ def render(template: str, **values: object) -> str:
 
 @functools.cache
 def environment() -> "Environment":
-    """The templates; undefined names raise."""
+    """The templates; undefined names raise. Filter `options`: see `with_options`."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    return Environment(
+    templates = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    templates.filters["options"] = lambda value: with_options(str(value))
+    return templates
 
 
 def _cell(name: str, value: object) -> str:

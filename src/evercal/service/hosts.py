@@ -38,15 +38,15 @@ def foreign(host: str, origin: str | None, local: bool) -> str | None:
 
 
 def listening_socket(host: str, port: int) -> socket.socket:
-    """A socket that listens; one line about --host or --port if it cannot. Port 0 is any free."""
+    """A socket that listens; InputError names `host` or `port` otherwise. Port 0 is any free."""
     if not 0 <= port <= 65_535:  # the resolver takes the remainder
-        raise InputError(f"--port {port}: give 0 to 65535")
+        raise InputError(f"`port` {port}: give 0 to 65535")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family)
     except OSError as error:
         reason = error.strerror or error
-        raise InputError(f"--host {host} --port {port}: {reason}") from None
+        raise InputError(f"`host` {host} `port` {port}: {reason}") from None
 
 
 def url_of(host: str, port: int) -> str:

@@ -65,13 +65,13 @@ def serve_on_ray(
     """
     if options.token is None:
         raise InputError(
-            "--ray: other machines could use the map; give --token-file, or set EVERCAL_TOKEN"
+            "`ray`: other machines could use the map; give `token_file`, or set EVERCAL_TOKEN"
         )
     require_token(options.token)
     if not 1 <= options.port <= 65_535:
-        raise InputError(f"--port {options.port}: give 1 to 65535")
+        raise InputError(f"`port` {options.port}: give 1 to 65535")
     if replicas < 1:
-        raise InputError(f"--replicas {replicas}: give a number >= 1")
+        raise InputError(f"`replicas` {replicas}: give a number >= 1")
     options = replace(options, map=options.map.absolute())
     scenes = Map.open(options.map).scenes
     stop = threading.Event()
@@ -84,7 +84,7 @@ def serve_on_ray(
             logging_config={"log_level": "ERROR"},
         )
         if NAME in serve.status().applications:
-            raise InputError(f"--ray {address}: serves a map already; stop that first")
+            raise InputError(f"`ray` {address}: serves a map already; stop that first")
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: stop.set())
         try:
@@ -104,6 +104,6 @@ def serve_on_ray(
             on_ready(url, scenes)
             stop.wait()
         except RuntimeError as error:
-            raise InputError(f"--ray {address}: {error}") from None
+            raise InputError(f"`ray` {address}: {error}") from None
         finally:
             serve.delete(NAME)

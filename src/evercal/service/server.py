@@ -135,7 +135,7 @@ def bound_socket(options: ServeOptions) -> socket.socket:
     token = options.token
     if token is None and not hosts.is_local(options.host):
         raise InputError(
-            f"--host {options.host}: other machines could use the map; give --token-file, or set"
+            f"`host` {options.host}: other machines could use the map; give `token_file`, or set"
             " EVERCAL_TOKEN"
         )
     if token is not None:

@@ -90,7 +90,7 @@ class Connection:
         if camera is None:
             option = "camera" if which == "wrist" else "fixed"
             raise InputError(
-                f"no {which} camera was given; restart with --{option} SOURCE"
+                f"no {which} camera was given; restart with `{option}` SOURCE"
             )
         with self._lock:
             self.images[which] = camera.read()[1]

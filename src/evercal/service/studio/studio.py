@@ -12,7 +12,7 @@ import numpy as np
 from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.calibration.export.formats import FORMATS, export_files
 from evercal.calibration.from_map.next_views import NextViews, looked_at, next_views
-from evercal.errors import InputError
+from evercal.errors import InputError, with_options
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.live.coverage import IMAGES, SAME_DEG, SAME_MM, Coverage, Sample, coverage
 from evercal.live.recorder import JPEG_QUALITY, POSES, WristRecorder
@@ -348,7 +348,7 @@ def _free_name(name: str, taken: tuple[str, ...]) -> str:
     )
 
 
-_NO_FIXED = "No fixed camera was given; restart with --fixed SOURCE, or go on."
+_NO_FIXED = "No fixed camera was given; restart with `fixed` SOURCE, or go on."
 
 
 def _connect(studio: Studio) -> State:
@@ -388,7 +388,9 @@ def _fixed(studio: Studio) -> State:
     images = len(studio.fixed_images)
     found = studio.calibrations.get("fixed")
     if found is not None:
-        return "done", found.verdict.replace("--camera", "--fixed-intrinsics")
+        return "done", with_options(found.verdict).replace(
+            "--camera", "--fixed-intrinsics"
+        )
     if not studio.cell.scenes:
         return (
             "waits",

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from html import escape
 
 from evercal.calibration.calibration import Calibration
+from evercal.errors import with_options
 from evercal.reports.scene import Ellipsoid
 
 GREEN = (22, 163, 74)
@@ -26,18 +27,18 @@ _TEXT = "padding:2px 12px 6px;font-size:0.85em;line-height:1.4;overflow-wrap:any
 
 
 def chip_html(state: str, text: str = "") -> str:
-    """A state on its colour, and a sentence below it."""
+    """A state on its colour, and a sentence below it, which names options."""
     colour = _COLOURS.get(state, GREEN)
     style = f"background:rgb{colour};color:white;border-radius:4px;padding:1px 8px;font-weight:600"
     chip = f'<span style="{style}">{escape(state)}</span>'
-    return f'<div style="{_TEXT}">{chip}<div>{escape(text)}</div></div>'
+    return f'<div style="{_TEXT}">{chip}<div>{escape(with_options(text))}</div></div>'
 
 
 def rows_html(rows: Sequence[tuple[str, str]]) -> str:
     """Names and values, one pair a line."""
     cells = "".join(
         f'<tr><td style="width:40%;vertical-align:top">{escape(name)}</td>'
-        f"<td>{escape(value)}</td></tr>"
+        f"<td>{escape(with_options(value))}</td></tr>"
         for name, value in rows
     )
     return (
