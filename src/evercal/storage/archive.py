@@ -18,7 +18,13 @@ _DIRECTORY_BYTES = 512
 """Size of an entry in the central directory, bytes, on average and at most: Python keeps all
 entries in memory before any of them can be checked."""
 _CHUNK = 1 << 20
+"""Bytes that are copied at a time."""
 _SAME_TIME = (1980, 1, 1, 0, 0, 0)
+"""Date of all entries: the earliest that a zip archive can state."""
+_BROKEN = (
+    zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError,
+)  # fmt: skip
+"""Errors of the library while it reads a damaged archive."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +55,10 @@ def write_archive(file: PathLike, root: Path, names: Iterable[str]) -> None:
         for name in names:
             entry = zipfile.ZipInfo(name, _SAME_TIME)
             entry.external_attr = (stat.S_IFREG | 0o644) << 16
+            path = root / name
             # Above 2 GiB the header is longer.
-            entry.file_size = (root / name).stat().st_size
-            with open(root / name, "rb") as source, archive.open(entry, "w") as target:
+            entry.file_size = path.stat().st_size
+            with open(path, "rb") as source, archive.open(entry, "w") as target:
                 shutil.copyfileobj(source, target, _CHUNK)
 
 
@@ -85,24 +92,14 @@ def extract_archive(
 
 @contextlib.contextmanager
 def _opened(file: Path, limits: ArchiveLimits) -> Iterator[zipfile.ZipFile]:
-    broken: object
     try:
         with zipfile.ZipFile(_bounded(file, limits)) as archive:
             yield archive
-            return
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        EOFError,
-        ValueError,
-        NotImplementedError,
-    ) as error:
-        broken = error
-    except OSError as error:
-        if error.errno != errno.EINVAL:  # a broken offset
+    except (*_BROKEN, OSError) as error:
+        # A broken offset is an invalid argument of a system call.
+        if isinstance(error, OSError) and error.errno != errno.EINVAL:
             raise
-        broken = error
-    raise InputError(f"{file}: not a readable zip archive ({broken})")
+        raise InputError(f"{file}: not a readable zip archive ({error})") from None
 
 
 def _bounded(file: Path, limits: ArchiveLimits) -> Path:
@@ -111,7 +108,8 @@ def _bounded(file: Path, limits: ArchiveLimits) -> Path:
         end = zipfile._EndRecData(opened)  # pyright: ignore[reportAttributeAccessIssue]
     if not end:
         raise InputError(f"{file}: not a zip archive")
-    if max(end[4], end[5] // _DIRECTORY_BYTES) > limits.files:
+    entries, directory_bytes = end[4:6]
+    if max(entries, directory_bytes // _DIRECTORY_BYTES) > limits.files:
         raise InputError(f"{file}: more than {limits.files:,} entries; split it")
     return file
 
@@ -164,15 +162,10 @@ def _checked(
 
 def _stays_inside(name: str) -> bool:
     parts = name.removesuffix("/").split("/")
-    plain = all(
-        part not in ("", ".", "..") and len(part.encode()) <= 255 for part in parts
-    )
-    return (
-        plain
-        and not set(name) & {"\\", "\0"}
-        and parts[0][1:2] != ":"
-        and len(name) <= 1024
-    )
+    if any(part in ("", ".", "..") or len(part.encode()) > 255 for part in parts):
+        return False
+    has_drive = parts[0][1:2] == ":"
+    return not has_drive and set(name).isdisjoint("\\\0") and len(name) <= 1024
 
 
 def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) -> None:

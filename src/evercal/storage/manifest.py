@@ -21,8 +21,9 @@ from evercal.typing import PathLike
 MANIFEST = "manifest.json"
 _FORMAT = "evercal-manifest"
 _SCHEMA = 1
+"""Version of the format of the manifest itself."""
 
-FileRecord = dict[str, object]
+FileRecord = dict[str, Any]
 """`sha256` and `bytes` of a file."""
 
 

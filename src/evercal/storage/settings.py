@@ -19,12 +19,12 @@ def lock_settings(path: Path, settings: Mapping[str, object]) -> None:
     before = read_settings(path)
     now = json.loads(json.dumps(settings))
     for key in sorted({*before, *now}):
-        a = before.get(key)
-        b = now.get(key)
-        if a != b:
+        old = before.get(key)
+        new = now.get(key)
+        if old != new:
             raise InputError(
-                f"{path.parent}: was begun with other settings: {key} {a!r}, now it is {b!r}; "
-                f"give another --out or the same settings"
+                f"{path.parent}: was begun with other settings: {key} {old!r}, now it is {new!r};"
+                f" give another `out` or the same settings"
             )
 
 

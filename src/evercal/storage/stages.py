@@ -14,6 +14,7 @@ last. After a crash the next change removes those that the manifest does not lis
 """
 
 import json
+import os
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,10 +29,17 @@ from evercal.storage.atomic import replace_folder, write_json
 from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
 
 SCHEMA = 6
+"""Version of the files of a store."""
 STAGES = "stages"
+"""Folder of the stages."""
 REPORT = "report.json"
+"""File of a stage."""
 _STAGE = re.compile(r"(\d{4,})-[\w.~-]*")
+"""Name of a stage: its number, and what the user calls it."""
 _JOURNAL = ".writing"
+"""File with the stages that a change adds and drops."""
+_NEW = Manifest({"stages": []}, {})
+"""Manifest of a store that is not written yet."""
 _NETWORKS = ("encoder-", "vlad-", "descriptor-")
 """Beginnings of the names of network files."""
 _MADE = "made"
@@ -53,8 +61,8 @@ def require_free(root: Path) -> None:
     if not root.exists():
         return
     if not root.is_dir() or not all(
-        path.name == STAGES or path.name.startswith((*_NETWORKS, "."))
-        for path in root.iterdir()
+        name == STAGES or name.startswith((*_NETWORKS, "."))
+        for name in os.listdir(root)
     ):
         raise InputError(
             f"store {root}: exists and is not an evercal store; give another path"
@@ -151,11 +159,11 @@ class StageStore(Generic[Contents]):
         return self.root / STAGES / stage
 
     @contextmanager
-    def writing(self) -> Iterator[Manifest | None]:
+    def writing(self) -> Iterator[Manifest]:
         """Keep other writers out while this store is changed.
 
         Yields:
-            The manifest that will be replaced; None for a new store.
+            The manifest that will be replaced; one without stages for a new store.
         """
         # The lock file is never removed: a process that waits for it would lock a deleted file.
         try:
@@ -171,12 +179,12 @@ class StageStore(Generic[Contents]):
             ) from error
         try:
             _require_no_links(self.root)
-            before = Manifest.read(self.root) if is_store(self.root) else None
-            if self.stages != (before.payload["stages"] if before else []):
+            before = _manifest(self.root)
+            if self.stages != before.payload["stages"]:
                 raise InputError(
                     f"store {self.root}: another process has changed it; run it again"
                 )
-            if before is None:
+            if before is _NEW:
                 _require_no_scenes(self.root)
             yield before
         finally:
@@ -210,17 +218,19 @@ class StageStore(Generic[Contents]):
         """
         with self._changing() as before:
             made = _made(before)
-            new = {}
             # A folder that the manifest does not list keeps its name.
-            names = map(_STAGE.fullmatch, _names(self.root / STAGES))
-            first = 1 + max([made, *(int(name[1]) for name in names if name)])
-            for number, (name, write) in enumerate(added, first):
+            number = made
+            for match in map(_STAGE.fullmatch, _names(self.root / STAGES)):
+                if match is not None:
+                    number = max(number, int(match[1]))
+            new = {}
+            for name, write in added:
+                number += 1
+                made = number
                 legal = re.sub(r"[^\w.-]", "_", name)[:60]
                 new[f"{number:04d}-{legal}"] = write
-            made = first + len(new) - 1 if new else made
-            self._publish(
-                [*kept, *new], new, {**payload, _MADE: made}, before, superseded
-            )
+            settings = {**payload, _MADE: made}
+            self._publish([*kept, *new], new, settings, before, superseded)
 
     def replace(self, index: int, write: Write, payload: Mapping[str, object]) -> None:
         """Replace a stage: whole, or not at all.
@@ -230,13 +240,12 @@ class StageStore(Generic[Contents]):
         old = self.stages[index]
 
         def write_copy(folder: Path) -> None:
-            for file in before.files if before else ():
+            for file in before.files:
                 if file.startswith(f"{STAGES}/{old}/"):
                     shutil.copyfile(self.root / file, folder / Path(file).name)
             write(folder)
 
         with self._changing() as before:
-            assert before is not None, "a store with stages has a manifest"
             _check(self.root, before)  # copies get checksums of their own
             stem, _, version = old.partition("~")
             number = int(version or 1) + 1
@@ -244,7 +253,8 @@ class StageStore(Generic[Contents]):
             while f"{stem}~{number}" in taken:
                 number += 1
             stage = f"{stem}~{number}"
-            stages = [*self.stages[:index], stage, *self.stages[index + 1 :]]
+            stages = [*self.stages]
+            stages[index] = stage
             settings = {**payload, _MADE: _made(before)}
             self._publish(
                 stages, {stage: write_copy}, settings, before, lambda _: False
@@ -258,30 +268,28 @@ class StageStore(Generic[Contents]):
 
     def size_bytes(self) -> dict[str, int]:
         """Size on disk of every file in the manifest, by relative path."""
-        manifest = Manifest.read(self.root)
-        return {
-            file: int(str(record["bytes"])) for file, record in manifest.files.items()
-        }
+        files = Manifest.read(self.root).files
+        return {name: int(record["bytes"]) for name, record in files.items()}
 
     @contextmanager
-    def _changing(self) -> Iterator[Manifest | None]:
+    def _changing(self) -> Iterator[Manifest]:
         """As `writing`; a change that is refused leaves no file, on disk or in memory."""
         networks = self.networks
         with self.writing() as before:
             _tidy(self.root)
-            exists = self.root.exists()
-            there = _names(self.root)
+            folders = [self.root / STAGES, self.root]
+            missing = [folder for folder in folders if not folder.exists()]
+            names = _names(self.root)
             try:
                 yield before
             except BaseException:
                 self.networks = networks
                 _tidy(self.root)
                 if not is_store(self.root):
-                    for name in _names(self.root) - there:
+                    for name in _names(self.root) - names:
                         if name.startswith(_NETWORKS):
                             (self.root / name).unlink(missing_ok=True)
-                new = [] if STAGES in there else [self.root / STAGES]
-                for folder in new if exists else [*new, self.root]:
+                for folder in missing:
                     with suppress(OSError):  # it is not there, or holds something else
                         folder.rmdir()
                 raise
@@ -292,7 +300,7 @@ class StageStore(Generic[Contents]):
         stages: list[str],
         new: Mapping[str, Write],
         payload: Mapping[str, object],
-        before: Manifest | None,
+        before: Manifest,
         superseded: Callable[[str], bool],
     ) -> None:
         self.root.mkdir(parents=True, exist_ok=True)
@@ -303,11 +311,10 @@ class StageStore(Generic[Contents]):
             write(self.folder(f".{stage}"))
         files = [*self.networks]
         for stage in new:
-            replace_folder(self.folder(f".{stage}"), self.folder(stage))
-            files += [
-                f"{STAGES}/{stage}/{path.name}" for path in self.folder(stage).iterdir()
-            ]
-        for file in before.files if before else ():
+            folder = self.folder(stage)
+            replace_folder(self.folder(f".{stage}"), folder)
+            files += [f"{STAGES}/{stage}/{name}" for name in os.listdir(folder)]
+        for file in before.files:
             stage, _, name = file.removeprefix(f"{STAGES}/").partition("/")
             if stage in stages and stage not in new and not superseded(name):
                 files.append(file)
@@ -323,18 +330,17 @@ class StageStore(Generic[Contents]):
 
 def _tidy(root: Path) -> None:
     """Remove what a change has dropped, or has left because it was refused or killed."""
-    manifest = Manifest.read(root) if is_store(root) else None
-    stages, files = (
-        (manifest.payload["stages"], manifest.files) if manifest else ([], {})
-    )
+    manifest = _manifest(root)
+    stages = manifest.payload["stages"]
     left = {*_journal(root, "new"), *_journal(root, "dropped")}.difference(stages)
     for name in _names(root / STAGES):
         folder = root / STAGES / name
-        if name in left or (name.startswith(".") and _STAGE.fullmatch(name[1:])):
+        is_unfinished = name.startswith(".") and _STAGE.fullmatch(name[1:])
+        if name in left or is_unfinished:
             shutil.rmtree(folder, ignore_errors=True)
         elif name in stages:
             for file in _names(folder):
-                if f"{STAGES}/{name}/{file}" not in files:
+                if f"{STAGES}/{name}/{file}" not in manifest.files:
                     with suppress(OSError):
                         (folder / file).unlink()
     with suppress(OSError):
@@ -342,6 +348,12 @@ def _tidy(root: Path) -> None:
             unfinished.unlink()
         if not left & _names(root / STAGES):
             (root / _JOURNAL).unlink()
+
+
+def _manifest(root: Path) -> Manifest:
+    if is_store(root):
+        return Manifest.read(root)
+    return _NEW
 
 
 def _journal(root: Path, key: str) -> list[str]:
@@ -355,14 +367,12 @@ def _journal(root: Path, key: str) -> list[str]:
 
 def _names(folder: Path) -> set[str]:
     try:
-        return {path.name for path in folder.iterdir()}
+        return {*os.listdir(folder)}
     except OSError:
         return set()
 
 
-def _made(manifest: Manifest | None) -> int:
-    if manifest is None:
-        return 0
+def _made(manifest: Manifest) -> int:
     return int(manifest.payload.get(_MADE, len(manifest.payload["stages"])))
 
 

@@ -1,6 +1,7 @@
 """Named arrays in safetensors files."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,10 @@ def save_tensors(
 
 def load_tensors(path: Path) -> dict[str, NDArray[np.generic]]:
     """Read the named arrays of a file."""
-    from safetensors import SafetensorError
     from safetensors.numpy import load
 
-    try:
+    with _reading(path):
         return load(path.read_bytes())
-    except (OSError, SafetensorError) as error:
-        raise InputError(
-            f"{path}: not readable ({error}); run 'evercal info --check'"
-        ) from None
 
 
 class StoredRows:
@@ -44,26 +40,37 @@ class StoredRows:
     """
 
     def __init__(self, file: Any, name: str):
-        part = file.get_slice(name)
-        shape = part.get_shape()
+        self._rows = file.get_slice(name)
+        shape = self._rows.get_shape()
         self._count = shape[0]
-        self._rows = file.get_tensor(name) if 0 in shape else part
+        if 0 in shape:
+            self._rows = file.get_tensor(name)
 
     def __len__(self) -> int:
         return self._count
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
         start, stop, _ = rows.indices(self._count)
-        return self._rows[start:stop] if start < stop else self._rows[:0]
+        if start >= stop:
+            return self._rows[:0]
+        return self._rows[start:stop]
 
 
 def open_tensors(path: Path) -> dict[str, StoredRows]:
     """The named arrays of a file, one or more dimensions each, which stays mapped into memory."""
-    from safetensors import SafetensorError, safe_open
+    from safetensors import safe_open
 
-    try:
+    with _reading(path):
         file = safe_open(path, "np")
         return {name: StoredRows(file, name) for name in file.keys()}  # noqa: SIM118
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    from safetensors import SafetensorError
+
+    try:
+        yield
     except (OSError, SafetensorError) as error:
         raise InputError(
             f"{path}: not readable ({error}); run 'evercal info --check'"

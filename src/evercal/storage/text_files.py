@@ -82,16 +82,23 @@ def decoded(data: bytes) -> str:
 
     Every second byte of UTF-16 is mostly zero, so it needs no byte order mark.
     """
-    half = len(data) // 4
-    encoding = "utf-16-be" if data[::2].count(0) > half else "utf-8-sig"
-    encoding = "utf-16-le" if data[1::2].count(0) > half else encoding
-    encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else encoding
-    for each in (encoding, "latin-1"):
+    for encoding in (_unicode_of(data), "latin-1"):
         with suppress(UnicodeDecodeError):
-            text = data.decode(each)
-            if each == "utf-8-sig" or not _CONTROL.search(text):
+            text = data.decode(encoding)
+            if encoding == "utf-8-sig" or not _CONTROL.search(text):
                 return text.replace("\r\n", "\n").replace("\r", "\n")
     raise UnicodeDecodeError("utf-8", data, 0, 1, "no text")
+
+
+def _unicode_of(data: bytes) -> str:
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16"
+    many = len(data) // 4
+    if data[1::2].count(0) > many:
+        return "utf-16-le"
+    if data[::2].count(0) > many:
+        return "utf-16-be"
+    return "utf-8-sig"
 
 
 def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str, Any]:
@@ -134,13 +141,8 @@ def yaml_documents(text: str) -> list[Any]:
             depth -= isinstance(event, yaml.CollectionEndEvent)
             nodes += isinstance(event, yaml.NodeEvent)
             word = getattr(event, "value", "")
-            tag = getattr(event, "tag", None)
-            if (
-                isinstance(event, yaml.AliasEvent)
-                or word == "<<"
-                or tag
-                or depth > _DEPTH
-            ):
+            is_reference = isinstance(event, yaml.AliasEvent) or word == "<<"
+            if is_reference or getattr(event, "tag", None) or depth > _DEPTH:
                 raise ValueError(
                     "it holds references (*name), tags (!name) or nests too deeply"
                 )
@@ -153,12 +155,14 @@ def yaml_documents(text: str) -> list[Any]:
 
 def few(names: Sequence[str], near: Iterable[str] = (), most: int = 3) -> str:
     """The first names, and the one of `near` that is most like the first."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    like = {name.lower(): f" (nearest: {name})" for name in sorted(near)}
-    best = [
-        like[m] for n in names[:1] for m in get_close_matches(n.lower(), like, 1, 0.7)
-    ]
-    return "".join([", ".join(names[:most]), more, *best])
+    text = ", ".join(names[:most])
+    if len(names) > most:
+        text += f" and {len(names) - most} more"
+    similar = {name.lower(): name for name in sorted(near)}
+    if names:
+        for match in get_close_matches(names[0].lower(), similar, 1, 0.7):
+            text += f" (nearest: {similar[match]})"
+    return text
 
 
 def refuse_repeated(names: Iterable[str], remedy: str) -> None:
@@ -172,13 +176,14 @@ def refuse_repeated(names: Iterable[str], remedy: str) -> None:
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Sorting key that puts `image-2` before `image-10`."""
-    parts = re.findall(r"[0-9]+|[^0-9]+", name)
-    return tuple(
-        (0, len(p.lstrip("0")), f"{p.lstrip('0')} {p}")
-        if p[0] in "0123456789"
-        else (1, 0, p)
-        for p in parts
-    )
+    return tuple(map(_part_key, re.findall(r"[0-9]+|[^0-9]+", name)))
+
+
+def _part_key(text: str) -> tuple[int, int, str]:
+    if text[0] not in "0123456789":
+        return (1, 0, text)
+    digits = text.lstrip("0")
+    return (0, len(digits), f"{digits} {text}")
 
 
 def path_inside(path: object, what: str) -> str:
@@ -187,11 +192,12 @@ def path_inside(path: object, what: str) -> str:
     Symbolic links are followed: download caches keep files elsewhere. `what` names the entry.
     """
     # Windows paths split at both kinds of slashes and have an anchor for drives as well.
-    if not isinstance(path, str) or not path or PureWindowsPath(path).anchor:
+    relative = PureWindowsPath(str(path))
+    if not isinstance(path, str) or not path or relative.anchor:
         raise ValueError(f"{what} is a path relative to the folder, got {path!r}")
-    if ".." in PureWindowsPath(path).parts:
+    if ".." in relative.parts:
         raise ValueError(f"{what} stays inside the folder, got {path!r}")
-    return PureWindowsPath(path).as_posix()
+    return relative.as_posix()
 
 
 def is_real(value: object) -> bool:
