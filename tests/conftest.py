@@ -331,6 +331,15 @@ def full_disk(
 
 
 @pytest.fixture
+def quick_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files are written but not synced, for tests without a power cut: a sync takes long.
+
+    What is synced must still be open.
+    """
+    monkeypatch.setattr(os, "fsync", os.fstat)
+
+
+@pytest.fixture
 def snapshot() -> Callable[[Path], dict[str, bytes | None]]:
     """Every file and folder below a folder with its content."""
 
