@@ -1,8 +1,10 @@
 """The one exception that a user is meant to read."""
 
 import importlib
+import math
 import re
 import unicodedata
+from collections.abc import Iterable
 from typing import Any
 
 _LONGEST = 2_000
@@ -47,6 +49,20 @@ def printable(text: str) -> str:
         c if is_plain(c) or c == "\n" else c.encode("unicode_escape").decode()
         for c in text
     )
+
+
+def require_numbers(
+    options: object, names: Iterable[str], least: float, most: float = math.inf
+) -> None:
+    """Refuse an options record with a field that is not a finite number from `least` to `most`."""
+    allowed = f"{least:g} or more"
+    if most < math.inf:
+        allowed = f"{least:g} to {most:g}"
+    for name in names:
+        value = getattr(options, name)
+        if not (math.isfinite(value) and least <= value <= most):
+            kind = type(options).__name__
+            raise InputError(f"{kind}.{name} is {value}; it is a number, {allowed}")
 
 
 def missing_extra(need: str, extra: str) -> InputError:
