@@ -44,6 +44,7 @@ VERBS = {
         "a stream with holes, beside the location of single frames",
     ),
     "refresh": ("changing_room", "a map in a rendered room that changes in ten rounds"),
+    "same-answers": ("same_answers", "answers of this tree, beside a commit's"),
     "speed": ("speed", "time of learning, localization and SARS"),
     "serve": ("serve", "latency of the HTTP service"),
     "retrieval": (
