@@ -18,11 +18,13 @@ class MovingJoint(NamedTuple):
     axis: Array
     """(3,) unit vector; backwards where the chain goes from child to parent."""
     rotates: bool
+    """Whether it turns about its axis, else slides along it."""
     value: int
-    """Number of the joint value that moves it; several joints share one where others mimic it."""
+    """Index of the joint value that moves it; joints that mimic one share its value."""
     factor: float = 1.0
-    """It moves by factor * value + constant, radians or metres."""
+    """Multiplier of the value; the joint moves by factor * value + constant."""
     constant: float = 0.0
+    """Offset of the motion, radians, or metres of sliding joints."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,23 +34,28 @@ class Arm:
     joints: tuple[str, ...]
     """Names of the k joint values, from the base outwards."""
     chain: tuple[MovingJoint, ...]
+    """Joints that move, from the base to the gripper."""
     last: Array
     """(4, 4) from the frame after the last joint to the gripper."""
 
     def rotates(self) -> BoolArray:
         """(k,) whether a value is an angle."""
-        angles = {motion.value for motion in self.chain if motion.rotates}
-        return np.array([i in angles for i in range(len(self.joints))])
+        rotates = np.zeros(len(self.joints), dtype=bool)
+        for joint in self.chain:
+            rotates[joint.value] |= joint.rotates
+        return rotates
 
     def free(self) -> BoolArray:
-        """(k,) whether the offset of a value can be told from images.
+        """(k,) whether images determine the offset of a value.
 
         That of the first joint turns base and scene together, that of the last one gripper and
         camera.
         """
-        moved = [motion.value for motion in self.chain]
-        ends = {value for value in (*moved[:1], *moved[-1:]) if moved.count(value) == 1}
-        return np.array([i not in ends for i in range(len(self.joints))])
+        values = [joint.value for joint in self.chain]
+        free = np.ones(len(self.joints), dtype=bool)
+        for end in (*values[:1], *values[-1:]):
+            free[end] = values.count(end) > 1
+        return free
 
     def poses(self, values: Array) -> SE3:
         """(n,) base_from_gripper of joint values (n, k), radians, or metres of sliding joints."""
@@ -57,30 +64,33 @@ class Arm:
     def slopes(self, values: Array) -> Array:
         """(n, 6, k) motion of the gripper by each value: translation, rotation; gripper's axes."""
         frames = self._frames(values)
-        from_gripper = np.linalg.inv(frames[-1])
+        gripper_from_base = np.linalg.inv(frames[-1])
         slopes = np.zeros((len(values), 6, len(self.joints)))
-        for motion, frame in zip(self.chain, frames, strict=False):
-            moved = from_gripper @ frame
-            axis = motion.factor * (moved[:, :3, :3] @ motion.axis)
-            if motion.rotates:
-                slopes[:, 3:, motion.value] += axis
-                # The origin of the gripper turns about the joint, which lies at -moved.
-                slopes[:, :3, motion.value] -= np.cross(axis, moved[:, :3, 3])
+        for joint, base_from_joint in zip(self.chain, frames, strict=False):
+            gripper_from_joint = gripper_from_base @ base_from_joint
+            axis = joint.factor * (gripper_from_joint[:, :3, :3] @ joint.axis)
+            slope = slopes[:, :, joint.value]
+            if joint.rotates:
+                slope[:, 3:] += axis
+                # The gripper's origin, as seen from the joint, is at minus this position.
+                slope[:, :3] -= np.cross(axis, gripper_from_joint[:, :3, 3])
             else:
-                slopes[:, :3, motion.value] += axis
+                slope[:, :3] += axis
         return slopes
 
     def _frames(self, values: Array) -> list[Array]:
         """(n, 4, 4) frames after each joint, and that of the gripper."""
-        frame = np.tile(np.eye(4), (len(values), 1, 1))
+        identity = np.tile(np.eye(4), (len(values), 1, 1))
+        frame = identity
         frames = []
-        for motion in self.chain:
-            moved = np.tile(np.eye(4), (len(values), 1, 1))
-            steps = (motion.factor * values[:, motion.value] + motion.constant)[:, None]
-            if motion.rotates:
-                moved[:, :3, :3] = Rotation.from_rotvec(steps * motion.axis).as_matrix()
+        for joint in self.chain:
+            steps = joint.factor * values[:, joint.value] + joint.constant
+            motion = steps[:, None] * joint.axis
+            moved = identity.copy()
+            if joint.rotates:
+                moved[:, :3, :3] = Rotation.from_rotvec(motion).as_matrix()
             else:
-                moved[:, :3, 3] = steps * motion.axis
-            frame = frame @ motion.before @ moved
+                moved[:, :3, 3] = motion
+            frame = frame @ joint.before @ moved
             frames.append(frame)
         return [*frames, frame @ self.last]

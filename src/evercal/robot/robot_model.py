@@ -43,39 +43,48 @@ class RobotModel:
             raise InputError(
                 f"{path}: is a macro file; make a URDF of it with 'xacro' first"
             )
-        # Its scene graph fails where a part of no interest is wrong.
-        plain = ("load_meshes", "load_collision_meshes", "build_scene_graph")
         with library_errors(f"{path}: no usable URDF"):
             if "</robot" not in read_text(self.path, "URDF"):
-                # Else the parts before a cut would be read as the whole.
+                # Else the elements before a cut would be read as the whole.
                 raise ValueError("it does not end with </robot>, so a part is missing")
-            self._urdf = yourdfpy.URDF.load(
-                str(self.path), **dict.fromkeys(plain, False)
+            urdf = yourdfpy.URDF.load(
+                str(path),
+                load_meshes=False,
+                load_collision_meshes=False,
+                build_scene_graph=False,  # it fails where a part of no interest is wrong
             )
-            self.links = tuple(link.name for link in self._urdf.robot.links)
-            joints = self._urdf.robot.joints
-            self._joint_above = {joint.child: joint for joint in joints}
-            for names in (self.links, [joint.name for joint in joints]):
-                refuse_repeated(names, "give each link and each joint its own name")
-            refuse_repeated(
-                (joint.child for joint in joints), "a link is below one joint at most"
-            )
-            roots = [link for link in self.links if link not in self._joint_above]
-            self.base_link = [*roots, *self.links][0]
+            self._joints = urdf.robot.joints
+            self._joint_named = urdf.joint_map
+            self.links = tuple(link.name for link in urdf.robot.links)
+            self._index_links()
+            tree = etree.parse(str(path), etree.XMLParser(recover=True))
+            _check_origins(tree)
             # Of the readers pinocchio alone heeds quat_xyzw, and yourdfpy does not keep it.
-            tree = etree.parse(str(self.path), etree.XMLParser(recover=True))
-            for text in tree.xpath("/robot/joint/*/@xyz | /robot/joint/*/@rpy"):
-                if np.isfinite(list(map(float, text.split()))).sum() != 3:
-                    raise ValueError(f"'{text}' are not three finite numbers")
             self._turned = set(tree.xpath("/robot/joint[origin/@quat_xyzw]/@name"))
+
+    def _index_links(self) -> None:
+        unique = "give each link and each joint its own name"
+        refuse_repeated(self.links, unique)
+        refuse_repeated((joint.name for joint in self._joints), unique)
+        refuse_repeated(
+            (joint.child for joint in self._joints), "a link is below one joint at most"
+        )
+        self._joint_above = {joint.child: joint for joint in self._joints}
+        roots = [link for link in self.links if link not in self._joint_above]
+        self.base_link = [*roots, *self.links][0]
 
     def has_joint(self, name: str) -> bool:
         """Whether the URDF has a joint of this name."""
-        return name in self._urdf.joint_map
+        return name in self._joint_named
+
+    def rotates(self, name: str) -> bool:
+        """Whether a joint exists and its values are angles."""
+        joint = self._joint_named.get(name)
+        return joint is not None and joint.type in ("revolute", "continuous")
 
     def chosen_links(self, base: str | None, gripper: str | None) -> tuple[str, str]:
         """Base and gripper link; if omitted, the root and the only end of the arm."""
-        parents = {joint.parent for joint in self._joint_above.values()}
+        parents = {joint.parent for joint in self._joints}
         ends = [link for link in self.links if link not in parents]
         if gripper is None and len(ends) != 1:
             raise InputError(
@@ -99,31 +108,27 @@ class RobotModel:
         """
         base, gripper = self.chosen_links(base, gripper)
         arm = self.arm(base, gripper)
-        needed = arm.joints
-        missing = [name for name in needed if name not in names]
+        missing = [name for name in arm.joints if name not in names]
         if missing:
             raise InputError(
                 f"{source}: no values for joint {', '.join(missing)}, which {gripper} depends on;"
                 f" given are {', '.join(names) or 'none'}"
             )
-        values = values[:, [list(names).index(name) for name in needed]]
-        for name, column in zip(needed, values.T, strict=True):
-            revolute = self._urdf.joint_map[name].type == "revolute"
-            if revolute and column.size and np.abs(column).max() > _LARGEST_RAD:
-                raise InputError(
-                    f"{source}: joint {name} is at {column[np.abs(column).argmax()]:.1f}, too far"
-                    f" for radians; if these are degrees, write the column as {name}_deg or give"
-                    f" `pose_convention` deg"
-                )
-        note = f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
-        notes = [note, *self._beyond_limits(needed, values)]
+        values = values[:, [list(names).index(name) for name in arm.joints]]
+        notes = [
+            f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
+        ]
+        for name, column in zip(arm.joints, values.T, strict=True):
+            self._refuse_degrees(name, column, source)
+        for name, column in zip(arm.joints, values.T, strict=True):
+            notes += self._beyond_limits(name, column)
         return ArmPoses(arm.poses(values), arm, values, notes)
 
     def arm(self, base: str, gripper: str) -> Arm:
         """The chain between two links; its joint values are those that others do not mimic."""
-        up = self._ancestors(base)
-        down = self._ancestors(gripper)
-        if (up[-1].parent if up else base) != (down[-1].parent if down else gripper):
+        up, root = self._joints_above(base)
+        down, gripper_root = self._joints_above(gripper)
+        if root != gripper_root:
             raise InputError(
                 f"{self.path}: no joints connect {base} and {gripper}; name others"
             )
@@ -134,22 +139,24 @@ class RobotModel:
         before = np.eye(4)
         for joint, backwards in steps:
             if joint.type not in (*_MOVING, "fixed"):
-                raise InputError(
-                    f"{self.path}: joint {joint.name} is {joint.type}; not supported"
-                )
+                raise self._error(joint, f"is {joint.type}; not supported")
             origin = self._origin(joint)
-            before = before if backwards else before @ origin
+            if not backwards:
+                before = before @ origin
             if joint.type in _MOVING:
                 name, factor, constant = self._driver(joint)
-                names += [] if name in names else [name]
-                axis = -self._axis(joint) if backwards else self._axis(joint)
+                if name not in names:
+                    names.append(name)
+                axis = self._axis(joint)
+                if backwards:
+                    axis = -axis
                 rotates = joint.type != "prismatic"
                 value = names.index(name)
-                chain.append(
-                    MovingJoint(before, axis, rotates, value, factor, constant)
-                )
+                moving = MovingJoint(before, axis, rotates, value, factor, constant)
+                chain.append(moving)
                 before = np.eye(4)
-            before = before @ np.linalg.inv(origin) if backwards else before
+            if backwards:
+                before = before @ np.linalg.inv(origin)
         return Arm(tuple(names), tuple(chain), before)
 
     def origins_with(self, offsets: Mapping[str, float]) -> dict[str, tuple[SE3, bool]]:
@@ -159,83 +166,89 @@ class RobotModel:
         are among them. A program that gets the values without offsets then computes the poses of
         those with them.
         """
-        moved = {}
-        for joint in self._urdf.robot.joints:
+        origins = {}
+        for joint in self._joints:
             name, factor, _ = self._driver(joint)
-            if joint.type in _MOVING and name in offsets:
-                step = factor * offsets[name]
-                rotates = joint.type != "prismatic"
-                motion = np.kron((0, step) if rotates else (step, 0), self._axis(joint))
-                moved[joint.name] = (
-                    SE3.from_matrix(self._origin(joint)) @ SE3.exp(motion),
-                    rotates,
-                )
-        return moved
+            if joint.type not in _MOVING or name not in offsets:
+                continue
+            step = factor * offsets[name]
+            rotates = joint.type != "prismatic"
+            weights = (0, step) if rotates else (step, 0)
+            motion = SE3.exp(np.kron(weights, self._axis(joint)))
+            origin = SE3.from_matrix(self._origin(joint))
+            origins[joint.name] = (origin @ motion, rotates)
+        return origins
 
     def _origin(self, joint: Any) -> Array:
+        """(4, 4) parent_from_joint at the value zero."""
         if joint.name in self._turned:
-            what = "turned by quat_xyzw, which most programs ignore; write rpy"
-            raise InputError(f"{self.path}: joint {joint.name} is {what}")
-        return np.eye(4) if joint.origin is None else joint.origin
+            problem = "is turned by quat_xyzw, which most programs ignore; write rpy"
+            raise self._error(joint, problem)
+        if joint.origin is None:
+            return np.eye(4)
+        return joint.origin
 
     def _axis(self, joint: Any) -> Array:
         """(3,) unit vector."""
         length = np.linalg.norm(joint.axis)
         if not 0 < length < np.inf:
-            raise InputError(
-                f"{self.path}: joint {joint.name} has the axis {joint.axis}"
-            )
+            raise self._error(joint, f"has the axis {joint.axis}")
         return joint.axis / length
 
     def _driver(self, joint: Any) -> tuple[str, float, float]:
         """Name of the value that moves a joint, and factor and constant of its motion."""
         factor = 1.0
         constant = 0.0
-        passed = [joint.name]
+        followers = [joint.name]
         while joint.mimic is not None:
             constant += factor * joint.mimic.offset
             factor *= joint.mimic.multiplier
-            other = self._urdf.joint_map.get(joint.mimic.joint)
-            if other is None or other.name in passed or other.type not in _MOVING:
-                why = (
-                    "mimics it"
-                    if joint.mimic.joint in passed
-                    else "is no moving joint of it"
+            name = joint.mimic.joint
+            driver = self._joint_named.get(name)
+            problem = ""
+            if name in followers:
+                problem = "mimics it"
+            elif driver is None or driver.type not in _MOVING:
+                problem = "is no moving joint of it"
+            if problem:
+                raise self._error(
+                    joint, f"mimics {name}, which {problem}; correct the URDF"
                 )
-                raise InputError(
-                    f"{self.path}: joint {joint.name} mimics {joint.mimic.joint}, which {why};"
-                    " correct the URDF"
-                )
-            joint = other
-            passed.append(joint.name)
+            joint = driver
+            followers.append(name)
         return joint.name, factor, constant
 
-    def rotates(self, name: str) -> bool:
-        """Whether a joint exists and its values are angles."""
-        joint = self._urdf.joint_map.get(name)
-        return joint is not None and joint.type in ("revolute", "continuous")
-
-    def _beyond_limits(self, names: Sequence[str], values: Array) -> list[str]:
-        """One sentence for each joint that exceeds its limits by 0.1, or two rotations."""
-        notes = []
-        for name, column in zip(names, values.T, strict=True):
-            joint = self._urdf.joint_map[name]
-            covered = f"joint {name} goes from {column.min():.2f} to {column.max():.2f}"
-            if joint.type == "continuous" and np.ptp(column) > _LARGEST_RAD:
-                notes.append(f"{covered}, more than two rotations; are these degrees?")
-            lower, upper = (
-                getattr(joint.limit, end, None) for end in ("lower", "upper")
+    def _refuse_degrees(self, name: str, column: Array, source: PathLike) -> None:
+        if self._joint_named[name].type != "revolute" or not column.size:
+            return
+        largest = column[np.abs(column).argmax()]
+        if abs(largest) > _LARGEST_RAD:
+            raise InputError(
+                f"{source}: joint {name} is at {largest:.1f}, too far for radians; if these are"
+                f" degrees, write the column as {name}_deg or give `pose_convention` deg"
             )
-            if joint.type == "continuous" or lower is None or upper is None:
-                continue
-            if column.min() < lower - 0.1 or column.max() > upper + 0.1:
-                notes.append(
-                    f"{covered}, the URDF allows {lower:.2f} to {upper:.2f}; are the joints in the"
-                    f" right order and in radians?"
-                )
-        return notes
 
-    def _ancestors(self, link: str) -> list[Any]:
+    def _beyond_limits(self, name: str, column: Array) -> list[str]:
+        """A sentence if values of a joint exceed its limits by 0.1, or two rotations."""
+        joint = self._joint_named[name]
+        covered = f"joint {name} goes from {column.min():.2f} to {column.max():.2f}"
+        if joint.type == "continuous":
+            if np.ptp(column) > _LARGEST_RAD:
+                return [f"{covered}, more than two rotations; are these degrees?"]
+            return []
+        lower = getattr(joint.limit, "lower", None)
+        upper = getattr(joint.limit, "upper", None)
+        if lower is None or upper is None:
+            return []
+        if column.min() >= lower - 0.1 and column.max() <= upper + 0.1:
+            return []
+        return [
+            f"{covered}, the URDF allows {lower:.2f} to {upper:.2f}; are the joints in the"
+            f" right order and in radians?"
+        ]
+
+    def _joints_above(self, link: str) -> tuple[list[Any], str]:
+        """Joints from a link up to its root, and the root."""
         if link not in self.links:
             raise InputError(
                 f"{self.path}: has no link {link!r}; it has {', '.join(self.links)}"
@@ -248,4 +261,15 @@ class RobotModel:
                 raise InputError(
                     f"{self.path}: the joints above link {link} form a circle"
                 )
-        return joints
+        return joints, link
+
+    def _error(self, joint: Any, problem: str) -> InputError:
+        return InputError(f"{self.path}: joint {joint.name} {problem}")
+
+
+def _check_origins(tree: Any) -> None:
+    """Refuse positions and angles in the XML of a URDF that are not three finite numbers."""
+    for text in tree.xpath("/robot/joint/*/@xyz | /robot/joint/*/@rpy"):
+        numbers = [float(word) for word in text.split()]
+        if np.isfinite(numbers).sum() != 3:
+            raise ValueError(f"'{text}' are not three finite numbers")
