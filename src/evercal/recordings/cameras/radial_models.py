@@ -15,34 +15,41 @@ from evercal.geometry import Camera
 from evercal.geometry.camera import FISHEYE_DEG
 from evercal.typing import Array
 
-MOST_PX = 0.5
-"""Largest error of the nearest fisheye."""
+MAX_ERROR_PX = 0.5
+"""Largest difference between a model and the fisheye that replaces it, pixels."""
 
 
 class RadialModel(NamedTuple):
     """A model without other distortion."""
 
     parameters: tuple[str, ...]
+    """Names of the parameters of `radius`, in order."""
     radius: Callable[..., Array]
-    """Image radius in focal lengths, of angles and parameters."""
+    """Image radius in focal lengths, of (n,) angles to the axis and parameters."""
 
 
-def _fov(t: Array, w: float) -> Array:
-    return np.arctan(2 * np.tan(t) * np.tan(w / 2)) / w if w else np.tan(t)
+def _fov(angle: Array, omega: float) -> Array:
+    if not omega:
+        return np.tan(angle)
+    return np.arctan(2 * np.tan(angle) * np.tan(omega / 2)) / omega
 
 
-def _omni(t: Array, xi: float) -> Array:
-    return np.sin(t) / (np.cos(t) + xi)
+def _omni(angle: Array, xi: float) -> Array:
+    return np.sin(angle) / (np.cos(angle) + xi)
 
 
-def _eucm(t: Array, alpha: float, beta: float) -> Array:
-    away = np.sqrt(beta * np.sin(t) ** 2 + np.cos(t) ** 2)
-    return np.sin(t) / (alpha * away + (1 - alpha) * np.cos(t))
+def _eucm(angle: Array, alpha: float, beta: float) -> Array:
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
+    distance = np.sqrt(beta * sine**2 + cosine**2)
+    return sine / (alpha * distance + (1 - alpha) * cosine)
 
 
-def _ds(t: Array, xi: float, alpha: float) -> Array:
-    second = np.sqrt(np.sin(t) ** 2 + (xi + np.cos(t)) ** 2)
-    return np.sin(t) / (alpha * second + (1 - alpha) * (xi + np.cos(t)))
+def _ds(angle: Array, xi: float, alpha: float) -> Array:
+    sine = np.sin(angle)
+    shifted = xi + np.cos(angle)
+    distance = np.sqrt(sine**2 + shifted**2)
+    return sine / (alpha * distance + (1 - alpha) * shifted)
 
 
 RADIAL_MODELS = {
@@ -51,6 +58,7 @@ RADIAL_MODELS = {
     "eucm": RadialModel(("alpha", "beta"), _eucm),
     "ds": RadialModel(("xi", "alpha"), _ds),
 }
+"""Models by their names at Kalibr and COLMAP."""
 
 
 def nearest_fisheye(
@@ -59,24 +67,30 @@ def nearest_fisheye(
     size: tuple[int, int],
     focal: tuple[float, float],
     centre: tuple[float, float],
-) -> tuple[Camera, float]:
-    """The fisheye that is nearest to a model of `RADIAL_MODELS`, and its largest error in pixels.
+) -> Camera:
+    """The fisheye that is nearest to a model of `RADIAL_MODELS`, by least squares.
 
     Focal lengths and principal point are in pixels; the angles are those of the image.
 
     Raises:
-        ValueError: No fisheye is near.
+        ValueError: No fisheye is within `MAX_ERROR_PX`.
     """
     radius = RADIAL_MODELS[name].radius
-    corner = np.hypot(*(np.maximum(centre, np.array(size) - 1 - centre) / focal))
+    corner = np.maximum(centre, np.array(size) - 1 - centre) / focal
+    largest = np.hypot(*corner) * 1.01
     angles = np.deg2rad(np.linspace(0.05, FISHEYE_DEG, 400))
     radii = radius(angles, *parameters)
     rising = np.cumprod(np.diff(radii, append=np.inf) > 0).astype(bool)
-    use = rising & np.isfinite(radii) & (radii <= corner * 1.01)
-    powers = angles[use, None] ** np.arange(1, 10, 2)
-    terms = np.linalg.lstsq(powers, radii[use], rcond=None)[0]
-    off = float(np.abs(powers @ terms - radii[use]).max() * max(focal))
-    if not off < MOST_PX:
-        raise ValueError(f"no fisheye is nearer than {off:.1f} px to this {name} model")
-    fx, fy = (terms[0] * f for f in focal)
-    return Camera(*size, fx, fy, *centre, tuple(terms[1:] / terms[0]), "fisheye"), off
+    in_image = rising & np.isfinite(radii) & (radii <= largest)
+    angles = angles[in_image]
+    radii = radii[in_image]
+    powers = angles[:, None] ** np.arange(1, 10, 2)
+    terms = np.linalg.lstsq(powers, radii, rcond=None)[0]
+    error = np.abs(powers @ terms - radii).max() * max(focal)
+    if not error < MAX_ERROR_PX:
+        raise ValueError(
+            f"no fisheye is nearer than {error:.1f} px to this {name} model"
+        )
+    fx, fy = terms[0] * np.array(focal)
+    distortion = tuple(terms[1:] / terms[0])
+    return Camera(*size, fx, fy, *centre, distortion, "fisheye")

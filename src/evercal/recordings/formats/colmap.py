@@ -168,7 +168,7 @@ def _camera(folder: Path, camera: Any) -> Camera:
     with named_errors(folder, "COLMAP model"):
         if kind in RADIAL_MODELS:
             own = [named[key] for key in RADIAL_MODELS[kind].parameters]
-            return nearest_fisheye(kind, own, size, focal, centre)[0]
+            return nearest_fisheye(kind, own, size, focal, centre)
         model = "fisheye" if kind.endswith("fisheye") else "pinhole"
         count = 8 if "k6" in named else 4 if "k1" in named else 0
         distortion = tuple(named.get(key, 0.0) for key in COEFFICIENTS[model][:count])

@@ -1,0 +1,343 @@
+"""A camera from named numbers, as programs write them; docs/formats.md lists the names.
+
+Names are compared in lower case without underscores. Of ROS, the matrix K and D of the raw image
+are used. Pixel (0, 0) is the centre of the top-left pixel, and images are upright.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from evercal.geometry import Camera
+from evercal.geometry.camera import COEFFICIENTS
+from evercal.recordings.cameras.radial_models import RADIAL_MODELS, nearest_fisheye
+from evercal.recordings.poses.row_files import is_number
+from evercal.storage.text_files import few
+from evercal.typing import Array
+
+Fields = Mapping[str, Any]
+"""Values by name."""
+
+
+def _by_alias(table: str) -> dict[str, str]:
+    """Names by alias, of lines `name: alias alias`."""
+    names: dict[str, str] = {}
+    for line in table.strip().splitlines():
+        name, _, aliases = line.partition(":")
+        names |= dict.fromkeys(aliases.split(), name)
+    return names
+
+
+_NAMES = _by_alias("""
+camera_matrix: cameramatrix intrinsicmatrix cameraintrinsics intrinsics intrinsic k mtx
+camera_matrix: projectionparameters
+distortion_coefficients: distortioncoefficients distortioncoeffs distcoeffs distcoeff distortion
+distortion_coefficients: distortionparameters distortionparams dist coefficients coeffs d kc
+image_width: imagewidth width w
+image_height: imageheight height h
+image_size: imagesize imgsize resolution size
+fx: fx
+fy: fy
+cx: cx ppx
+cy: cy ppy
+""")
+"""Names of fields by their aliases."""
+_MODELS = {"": "brown"} | _by_alias("""
+brown: plumbbob rationalpolynomial brownconrady radtan radialtangential opencv fullopencv pinhole
+brown: perspective rectified
+none: none null
+fisheye: equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8
+fov: fov atan
+omni: omni
+eucm: eucm
+ds: ds doublesphere
+""")
+"""Kinds of distortion by names of models, without spaces, dashes and underscores."""
+_MODEL_NAMES = (
+    "distortionmodel",
+    "model",
+    "cameramodel",
+    "modeltype",
+    "projectionmodel",
+)
+"""Names of fields that hold the name of a model."""
+_PINHOLE = COEFFICIENTS["pinhole"]
+DISTORTION = ("distortion_coefficients", *_PINHOLE)
+"""Names of fields that hold distortion."""
+_UNIQUE = {*_NAMES.values(), *_PINHOLE}
+"""Fields that may be stated once."""
+_LENGTHS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
+"""Numbers of coefficients that a model may have."""
+_CAMERA_INFO = {"rectificationmatrix", "projectionmatrix", "header", "roi"}
+"""Names of fields of ROS."""
+_RECTIFIED = {"p", "r"}
+"""Names of the matrices of ROS for rectified images."""
+_MODIFIERS = {"binningx", "binningy", "fisheyemodel"}
+_KNOWN = {*_NAMES.values(), *DISTORTION, *_MODEL_NAMES, *_CAMERA_INFO, *_MODIFIERS}
+_HARMLESS = re.compile(
+    r"error|rms|repro|resid|std|dev|sigma|covar|uncert|fps|rate|freq|square|board|marker|pattern"
+    r"|chess|tag|count|num|frames|images|views|points|flags|date|time|stamp|version|serial|index"
+    r"|id$|baseline|depth|range|temp|apert|expos|gain|fov|angle|focal|aspect|mm$|rotation|trans"
+    r"|^[rt]vec|quat|extrin|pose|position|orient|imu|noise|rgb|track|^bf$|^new|imagescale|overlaps"
+    r"|^d[wh]$|^cameratype$|perframe"
+)
+"""Names of numbers that do not change where a point lies in the image."""
+EXPECTED = (
+    "give a 3x3 matrix as text, JSON, YAML or NPZ with camera_matrix and dist_coeffs, a ROS"
+    " camera_info or OpenCV's storage"
+)
+"""What a camera file may hold, for messages."""
+
+
+def field_name(key: object) -> str:
+    """The name that a key is an alias of, or else the key in lower case."""
+    plain = _plain(key)
+    return _NAMES.get(plain, plain)
+
+
+def named_fields(data: Fields) -> dict[str, Any]:
+    """Values by `field_name`; ValueError if two keys are the same field."""
+    keys: dict[str, str] = {}
+    for key in data:
+        name = field_name(key)
+        if name in keys and name in _UNIQUE:
+            raise ValueError(f"{keys[name]} and {key} are the same; keep one of them")
+        keys[name] = key
+    return {name: data[key] for name, key in keys.items()}
+
+
+def camera_of(data: Fields, size: tuple[int, int] | None) -> Camera:
+    """One camera from its fields.
+
+    `size` is (width, height) in pixels of images, for fields without a size. ValueError: they are
+    no camera, or the images are cut out or distorted otherwise.
+    """
+    fields = named_fields(data)
+    roi = data.get("roi")
+    if isinstance(roi, dict) and (roi.get("x_offset") or roi.get("y_offset")):
+        raise ValueError(
+            f"the image is a cut-out (roi {roi}); give the whole image's camera_info"
+        )
+    models: dict[str, object] = {}
+    for name in _MODEL_NAMES:
+        if name in fields:
+            models[_model_kind(fields[name])] = fields[name]
+    for kind in models:
+        if kind in RADIAL_MODELS:
+            return _of_radial_model(kind, fields, _size(fields, data, size))
+    is_ros = not (_CAMERA_INFO | _RECTIFIED).isdisjoint(map(_plain, data))
+    model = "pinhole"
+    if "fisheye" in models or fields.get("fisheyemodel"):
+        model = "fisheye"
+    distortion = _distortion(fields, model)
+    if distortion is None:
+        optional = not is_ros and model == "pinhole" and "distortionmodel" not in fields
+        if not optional and "none" not in models:
+            raise ValueError(
+                f"'distortion_coefficients' is missing, there is {_keys(data)}; write four zeros"
+                f" if images have no lens distortion"
+            )
+        distortion = ()
+    _refuse_other_models(models, distortion)
+    matrix = _matrix(fields, data)
+    if is_ros:
+        width, height = _size(fields, data, None)
+    else:
+        width, height = _size(fields, data, size)
+    _refuse_unknown(data)
+    camera = Camera.from_matrix(matrix, width, height)
+    camera = replace(camera, distortion=distortion, model=model)
+    if size != (camera.width, camera.height):
+        camera = _binned(camera, fields)
+    _refuse_misfit(camera)
+    return camera
+
+
+def _model_kind(model: object) -> str:
+    """A value of `_MODELS`; `zero` for models that are read without distortion only, else empty."""
+    plain = re.sub(r"[\s_-]", "", str(model).rpartition(".")[2].lower())
+    kind = _MODELS.get(plain, "")
+    if not kind and "conrady" in plain:
+        # RealSense prints distortion.inverse_brown_conrady, mostly with zeros.
+        return "zero"
+    return kind
+
+
+def _of_radial_model(kind: str, fields: Fields, size: tuple[Any, Any]) -> Camera:
+    """As Kalibr states it: parameters before the focal lengths, or the one of `fov` after them."""
+    numbers = numbers_of(fields.get("camera_matrix"), "intrinsics")
+    name = "distortion_coefficients"
+    distortion = numbers_of(fields.get(name, []), name)
+    if kind == "fov":
+        numbers = [*distortion, *numbers]
+        distortion = []
+    names = (*RADIAL_MODELS[kind].parameters, "fx", "fy", "cx", "cy")
+    if len(numbers) != len(names) or any(distortion):
+        raise ValueError(
+            f"a camera of model {kind} has {', '.join(names)} and no other distortion, got"
+            f" {numbers} and {distortion}; rectify the images or calibrate an equidistant model"
+        )
+    *parameters, fx, fy, cx, cy = numbers
+    pixels = (int(size[0]), int(size[1]))
+    return nearest_fisheye(kind, parameters, pixels, (fx, fy), (cx, cy))
+
+
+def _distortion(fields: Fields, model: str) -> tuple[float, ...] | None:
+    """Coefficients in OpenCV's order; None if there is no field of them."""
+    names = COEFFICIENTS[model]
+    others = [name for name in _PINHOLE if fields.get(name) and name not in names]
+    if others:
+        raise ValueError(
+            f"a fisheye has {', '.join(names)}, got {', '.join(others)}; leave others out"
+        )
+    key = "distortion_coefficients"
+    stated = [name for name in names if name in fields]
+    if key in fields:
+        if str(fields[key]).lower() in ("none", "null"):
+            return ()
+        numbers = numbers_of(fields[key], key)
+    elif stated:
+        numbers = numbers_of([fields.get(name, 0.0) for name in names], stated[0])
+        if not any(numbers[5:]):
+            numbers = numbers[:5]
+    else:
+        return None
+    # Longer models add terms that are mostly zero and can then be dropped.
+    while len(numbers) not in _LENGTHS[model] and numbers[-1] == 0:
+        numbers.pop()
+    return tuple(numbers)
+
+
+def _refuse_other_models(
+    models: Mapping[str, object], distortion: tuple[float, ...]
+) -> None:
+    """Refuse models other than OpenCV's, which `none` and `zero` are without coefficients."""
+    for kind in models.keys() - {"brown", "fisheye"}:
+        if not kind or any(distortion):
+            raise ValueError(
+                f"distortion_model {models[kind]!r} is not supported with the coefficients"
+                f" {[*distortion]}; rectify the images or calibrate with plumb_bob"
+            )
+
+
+def _matrix(fields: Fields, data: Fields) -> Array:
+    """(3, 3) intrinsic matrix."""
+    names = ("fx", "fy", "cx", "cy")
+    if "camera_matrix" in fields:
+        numbers = numbers_of(fields["camera_matrix"], "camera_matrix")
+        # As Kalibr writes it; other orders differ in the first two.
+        if len(numbers) == 4 and 0.8 * numbers[1] < numbers[0] < 1.25 * numbers[1]:
+            return _matrix_of(*numbers)
+        if len(numbers) == 16 and numbers[3::4] == numbers[12:] == [0, 0, 0, 1]:
+            numbers = np.reshape(numbers, (4, 4))[:3, :3].ravel().tolist()
+        matrix = np.reshape(numbers_of(numbers, "camera_matrix", 9), (3, 3))
+        if matrix[2, :2].any() and not matrix[:2, 2].any():
+            return matrix.T  # Open3D writes it column after column.
+        return matrix
+    missing = [name for name in names if name not in fields]
+    if missing:
+        problem = "'camera_matrix' is missing"
+        if len(missing) < len(names):
+            problem = f"camera {missing[0]!r} is missing"
+        raise ValueError(f"{problem}, there is {_keys(data) or 'nothing'}; {EXPECTED}")
+    return _matrix_of(
+        *numbers_of([fields[name] for name in names], "fx, fy, cx, cy", 4)
+    )
+
+
+def _matrix_of(fx: float, fy: float, cx: float, cy: float) -> Array:
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def _size(
+    fields: Fields, data: Fields, size: tuple[int, int] | None
+) -> tuple[Any, Any]:
+    """Width and height in pixels, or `size` if no field states either."""
+    missing = [name for name in ("image_width", "image_height") if name not in fields]
+    stated = fields.get("image_size")
+    if not missing:
+        stated = [fields["image_width"], fields["image_height"]]
+    elif isinstance(stated, Mapping):
+        return _size(named_fields(stated), stated, None)
+    elif not isinstance(stated, list | tuple):  # a number called `size` is not one
+        stated = size
+        if len(missing) == 1:
+            stated = None
+    if stated is None:
+        raise ValueError(
+            f"{missing[0]!r} is missing (no image size), there is {_keys(data)}"
+        )
+    width, height = numbers_of([*stated], "image size (width, height)", 2)
+    return width, height
+
+
+def _refuse_unknown(data: Fields) -> None:
+    """Refuse numbers that may change where a point lies in the image."""
+    for key, value in data.items():
+        if field_name(key) in _KNOWN or _HARMLESS.search(_plain(key)):
+            continue
+        if isinstance(value, Mapping):
+            value = value.get("data")
+        cells = np.ravel(np.array(value, dtype=object)).tolist()
+        numeric = all(map(is_number, cells))
+        if numeric and any(map(float, cells)) and not _is_matrix(key, value, cells):
+            raise ValueError(
+                f"{key!r} is not known and may change the image; name distortion k1, k2, p1, p2,"
+                f" k3, or distortion_coefficients in this order, and leave other numbers out"
+            )
+
+
+def _is_matrix(key: object, value: object, cells: list[Any]) -> bool:
+    """Whether numbers are a 3x3 or 4x4 matrix, or P of ROS, or another one in rows."""
+    if len(cells) in (9, 16):
+        return True
+    if len(cells) == 12 and _plain(key) == "p":
+        return True
+    if not isinstance(value, list) or len(value) < 3:
+        return False
+    return all(np.size(row) > 2 for row in value)
+
+
+def _binned(camera: Camera, fields: Fields) -> Camera:
+    """The camera of combined pixels: ROS states intrinsics and size of the sensor before that."""
+    across = max(1, int(fields.get("binningx") or 1))
+    down = max(1, int(fields.get("binningy") or 1))
+    return camera.resized(camera.width // across, camera.height // down)
+
+
+def _refuse_misfit(camera: Camera) -> None:
+    """Refuse short focal lengths, and principal points outside of the image."""
+    inside = 0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height
+    if inside and min(camera.fx, camera.fy) >= camera.width / 10:
+        return
+    raise ValueError(
+        f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} do not fit"
+        f" {camera.width}x{camera.height} images; give them in pixels and of this image size"
+    )
+
+
+def _keys(data: Fields) -> str:
+    return few([str(key) for key in data], most=10)
+
+
+def _plain(key: object) -> str:
+    return str(key).lower().replace("_", "")
+
+
+def numbers_of(value: Any, name: str, count: int | None = None) -> list[float]:
+    """Numbers of nested lists, or of an array of OpenCV or ROS; ValueError for others."""
+    if isinstance(value, dict):
+        value = value.get("data")
+    try:
+        if not isinstance(value, list) or any(isinstance(v, bool) for v in value):
+            raise TypeError
+        # YAML 1.1 reads 1e-05, as written by ROS, as a word.
+        numbers = np.array(value, dtype=np.float64).ravel().tolist()
+    except (TypeError, ValueError):
+        raise ValueError(f"'{name}' is a list of numbers, got {value!r}") from None
+    if count is not None and len(numbers) != count:
+        raise ValueError(f"{name} has {count} numbers, got {len(numbers)}; {EXPECTED}")
+    return numbers
