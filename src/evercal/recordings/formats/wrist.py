@@ -16,7 +16,7 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.recordings.cameras import camera_file
+from evercal.recordings.cameras import camera_fields, camera_file
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, files_in, first_size
 from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
@@ -129,7 +129,7 @@ def _frames(root: Path, layout: Layout, options: ReadOptions) -> Recording:
     joints = pair_joints(images, rows, stamps, source)
     if file.name == "sensor.yaml":
         with named_errors(file, "camera file"):
-            numbers = camera_file.numbers_of(
+            numbers = camera_fields.numbers_of(
                 camera_file.fields_of(file).get("T_BS"), "T_BS", 16
             )
             body_from_camera = SE3.from_matrix(np.reshape(numbers, (4, 4)))
