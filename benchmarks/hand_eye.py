@@ -11,18 +11,18 @@ from tqdm import tqdm
 from tyro.conf import arg
 
 from benchmarks.rows import save
-from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3
+from evercal.robot.mount import MountName
 
 
 @dataclass(frozen=True)
 class Setting:
     """Options of a simulation."""
 
-    mount: Mount = "eye_in_hand"
+    mount: MountName = "eye_in_hand"
     """Mount of the camera."""
     poses: int = 25
     """Number of pairs."""

@@ -27,12 +27,12 @@ from evercal.calibration.boards.corners import (
     lens_vector,
     moved_camera,
 )
-from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.solve import solve, solve_pairs
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3, Camera, pose_distance
+from evercal.robot.mount import MountName
 
 Array = NDArray[Any]
 LENS = (-0.26, 0.11, 0.0004, -0.0003, -0.03)
@@ -43,7 +43,7 @@ LENS = (-0.26, 0.11, 0.0004, -0.0003, -0.03)
 class BoardSetting:
     """Options of a simulated recording."""
 
-    mount: Mount = "eye_in_hand"
+    mount: MountName = "eye_in_hand"
     """Mount of the camera."""
     views: int = 20
     """Number of images."""
@@ -256,7 +256,7 @@ def corner_pairs(recording: BoardRecording) -> tuple[PosePairs, BoardCorners]:
     return pairs, BoardCorners(camera, recording.views, size_m=size)
 
 
-def opencv_solvers(pairs: PosePairs, mount: Mount) -> dict[str, SE3]:
+def opencv_solvers(pairs: PosePairs, mount: MountName) -> dict[str, SE3]:
     """Return parent_from_camera by each solver of OpenCV; empty where OpenCV has none (5.0)."""
     import cv2
 

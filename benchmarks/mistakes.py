@@ -23,7 +23,6 @@ from benchmarks.hand_eye_boards import (
 )
 from benchmarks.rows import Row, once, save
 from evercal.calibration.boards.corners import BoardView
-from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PoseNumbers, PosePairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.errors import InputError
@@ -34,10 +33,14 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
     poses_from_numbers,
 )
+from evercal.robot.mount import MountName
 
 Mistake = Callable[[PosePairs], PosePairs]
 _FLIP = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
-OTHER: dict[Mount, Mount] = {"eye_in_hand": "eye_to_hand", "eye_to_hand": "eye_in_hand"}
+OTHER: dict[MountName, MountName] = {
+    "eye_in_hand": "eye_to_hand",
+    "eye_to_hand": "eye_in_hand",
+}
 FIRST_SEED = 700
 """Seeds below were used while the messages were written."""
 
@@ -125,7 +128,7 @@ class Case(NamedTuple):
     """What `solve` is given."""
 
     pairs: PosePairs
-    mount: Mount
+    mount: MountName
     right: tuple[SE3, ...]
     """Right answers: the pose of the camera, before and after it slipped; () for equal lists."""
     pattern: str
@@ -141,7 +144,7 @@ def drawn(
     tilt = 35 * rng.choice((0.25, 0.5, 1.0, 1.6))
     square = float(rng.choice(squares_m))
     views = poses or int(rng.integers(12, 30))
-    mount: Mount = ("eye_in_hand", "eye_to_hand")[seed // 2 % 2]
+    mount: MountName = ("eye_in_hand", "eye_to_hand")[seed // 2 % 2]
     return record(
         BoardSetting(mount=mount, views=views, tilt_deg=tilt, square_m=square), seed
     )

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 from evercal.errors import InputError
 from evercal.mapping.store import MapStore
-from evercal.recordings.frame import Mount, Recording
+from evercal.recordings.frame import Recording
+from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount, MountName
 from evercal.typing import PathLike
 
 if TYPE_CHECKING:
@@ -167,7 +168,7 @@ class Map:
                 another process is writing into the map.
         """
         report = self._learn(
-            recording, name, None, None, None, on_progress, "eye_to_hand"
+            recording, name, None, None, None, on_progress, EYE_TO_HAND
         )
         return self.calibration(report.scene)
 
@@ -179,7 +180,7 @@ class Map:
         gripper_from_camera: SE3 | None,
         options: MapOptions | None,
         on_progress: OnProgress | None,
-        mount: Mount = "eye_in_hand",
+        mount: Mount | None = None,
     ) -> LearnReport:
         from evercal.learning.scene import learn_scene
         from evercal.progress import shown
@@ -193,7 +194,13 @@ class Map:
         with self._store.writing(), shown(on_progress) as step:
             contents = self._store.contents
             scene, report = learn_scene(
-                loaded, contents, memory, gripper_from_camera, options, step, mount
+                loaded,
+                contents,
+                memory,
+                gripper_from_camera,
+                options,
+                step,
+                mount or EYE_IN_HAND,
             )
             self._store.commit(scene, asdict(report))
         self._localizer = None
@@ -445,7 +452,7 @@ class Map:
         *,
         robot_poses: PathLike | SE3 | None = None,
         camera: Camera | None = None,
-        mount: Mount | None = None,
+        mount: MountName | None = None,
         on_image: Callable[[], object] = lambda: None,
     ) -> Calibration:
         """Calibrate a camera from its images; no marker is needed.

@@ -10,13 +10,7 @@ import numpy as np
 import pytest
 
 from evercal.calibration.audit import audit
-from evercal.calibration.calibration import (
-    Calibration,
-    ErrorTerm,
-    Mount,
-    largest_term,
-    rig_of,
-)
+from evercal.calibration.calibration import Calibration, ErrorTerm, largest_term, rig_of
 from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
 from evercal.calibration.from_images import _from_many_spots as from_many_spots
@@ -31,6 +25,7 @@ from evercal.mapping.scene_map import MapContents
 from evercal.recordings import write_image
 from evercal.recordings.formats import generic
 from evercal.recordings.frame import Frame, Recording
+from evercal.robot.mount import MountName
 
 CAUSES = ["view", "lens", "map", "stated poses", "base frame"]
 Draw = Callable[[Frame, int, int], list[tuple[str, np.ndarray]]]
@@ -134,7 +129,7 @@ def test_terms_of_a_camera_on_the_gripper_contain_the_arm(
     ],
 )
 def test_advice_where_the_lens_is_the_largest_term(
-    mount: Mount, intrinsics: str, advice: str
+    mount: MountName, intrinsics: str, advice: str
 ) -> None:
     def words(lens_mm: float) -> str:
         terms = (ErrorTerm("view", 1.0, 0.1), ErrorTerm("lens", lens_mm, 0.1))

@@ -9,12 +9,12 @@ import pytest
 from evercal.calibration.from_map.hand_eye_start import (
     LEAST_ROTATION_DEG,
     ImagePair,
-    solve_pairs,
+    start_from_matches,
 )
 from evercal.calibration.pose_pairs.checks import require_rotations
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
-from evercal.recordings.frame import Mount
+from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
 
 TRUTH = SE3.exp([0.05, -0.08, 0.12, 0.4, -1.2, 2.0])
 
@@ -45,16 +45,16 @@ def image_pairs(
     return pairs
 
 
-@pytest.mark.parametrize("mount", ["eye_in_hand", "eye_to_hand"])
+@pytest.mark.parametrize("mount", [EYE_IN_HAND, EYE_TO_HAND])
 def test_exact_pairs_give_the_exact_transform(mount: Mount) -> None:
     poses = grippers(12, 0)
     truth = TRUTH
-    if mount == "eye_to_hand":  # a fixed camera, 1.3 m from the base
+    if not mount.moves:  # a fixed camera, 1.3 m from the base
         truth = SE3.exp([1.0, -0.3, 0.8, 0.4, -1.2, 2.0])
         poses = (
             SE3.from_translation(truth.apply(np.array([0.0, 0.0, 0.6]))) @ poses
         ).inverse()
-    start = solve_pairs(poses, image_pairs(poses, truth), mount)
+    start = start_from_matches(poses, image_pairs(poses, truth), mount)
     metres, radians = pose_distance(start.parent_from_camera, truth)
     assert metres < 1e-4
     assert radians < 1e-4
@@ -64,7 +64,9 @@ def test_exact_pairs_give_the_exact_transform(mount: Mount) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_wrong_pairs_are_rejected(seed: int) -> None:
     poses = grippers(30, seed)
-    start = solve_pairs(poses, image_pairs(poses, TRUTH, 0.5, wrong=20), "eye_in_hand")
+    start = start_from_matches(
+        poses, image_pairs(poses, TRUTH, 0.5, wrong=20), EYE_IN_HAND
+    )
     metres, radians = pose_distance(start.parent_from_camera, TRUTH)
     assert metres < 0.003
     assert np.rad2deg(radians) < 0.1
@@ -78,7 +80,7 @@ def test_a_camera_that_orbits_one_place_does_not_end_there(seed: int) -> None:
     turns = SE3.exp(np.pad(rng.normal(0, 0.25, (25, 3)), ((0, 0), (3, 0))))
     poses = turns @ SE3.from_translation((0.0, 0.0, -0.6)) @ TRUTH.inverse()
     noisy = poses @ SE3.exp(rng.normal(0, np.repeat([3e-4, 3e-4], 3), (25, 6)))
-    start = solve_pairs(noisy, image_pairs(poses, TRUTH, 0.5), "eye_in_hand")
+    start = start_from_matches(noisy, image_pairs(poses, TRUTH, 0.5), EYE_IN_HAND)
     assert pose_distance(start.parent_from_camera, TRUTH)[0] < 0.3
 
 
@@ -96,7 +98,7 @@ def test_a_thing_of_a_few_pixels_suffices(seed: int) -> None:
         rays = np.stack([points / points[:, 2:] for points in seen])
         rays[..., :2] += rng.normal(0, 0.3 / 600, rays[..., :2].shape)
         pairs.append(ImagePair(i, j, rays))
-    start = solve_pairs(poses, pairs, "eye_to_hand")
+    start = start_from_matches(poses, pairs, EYE_TO_HAND)
     metres, radians = pose_distance(start.parent_from_camera, truth)
     assert metres < 0.05
     assert np.rad2deg(radians) < 2
@@ -106,9 +108,9 @@ def test_a_thing_of_a_few_pixels_suffices(seed: int) -> None:
 def test_inverted_poses_and_too_few_pairs_are_refused() -> None:
     poses = grippers(20, 0)
     with pytest.raises(InputError, match=r"agree in only .*not the inverse"):
-        solve_pairs(poses.inverse(), image_pairs(poses, TRUTH), "eye_in_hand")
+        start_from_matches(poses.inverse(), image_pairs(poses, TRUTH), EYE_IN_HAND)
     with pytest.raises(InputError, match="only 3 pairs"):
-        solve_pairs(poses[:3], image_pairs(poses[:3], TRUTH), "eye_in_hand")
+        start_from_matches(poses[:3], image_pairs(poses[:3], TRUTH), EYE_IN_HAND)
 
 
 @pytest.mark.parametrize(

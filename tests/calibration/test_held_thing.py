@@ -10,6 +10,7 @@ from evercal.calibration.held_thing.moving_parts import moving_parts
 from evercal.calibration.held_thing.windows import cropped, windows
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame
+from evercal.robot.mount import EYE_TO_HAND
 
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
 
@@ -82,7 +83,7 @@ def test_a_window_follows_the_thing_and_keeps_its_rays() -> None:
     pairs = tuple(
         ImagePair(i, i + 1, np.stack([rays[i], rays[i + 1]])) for i in range(5)
     )
-    around = windows(frames, HandEyeStart(base_from_camera, "eye_to_hand", 5, 5, pairs))
+    around = windows(frames, HandEyeStart(base_from_camera, EYE_TO_HAND, 5, 5, pairs))
     assert around is not None
     assert around[0, 2] < 90
     for frame, window, rows in zip(frames, around, seen, strict=True):

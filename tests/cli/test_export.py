@@ -13,7 +13,6 @@ from evercal.calibration.calibration import (
     Calibration,
     ImageUse,
     JointOffset,
-    Mount,
     read_calibration,
 )
 from evercal.calibration.export.formats import FORMATS
@@ -23,13 +22,14 @@ from evercal.calibration.export.request import (
 )
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.robot_poses import read_robot_poses
+from evercal.robot.mount import MountName
 
 POSE = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
 
 
 @pytest.fixture
 def make(tmp_path: Path) -> Any:
-    def write(mount: Mount = "eye_to_hand", child: str = "camera") -> Path:
+    def write(mount: MountName = "eye_to_hand", child: str = "camera") -> Path:
         parent = "base" if mount == "eye_to_hand" else "gripper"
         camera = Camera(640, 480, 600, 601, 320, 240)
         images = (ImageUse("1.png", True),)

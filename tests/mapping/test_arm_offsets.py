@@ -11,8 +11,9 @@ from evercal.geometry import SE3
 from evercal.mapping.arm_offsets import ArmOffsets
 from evercal.mapping.build import MapOptions
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment
-from evercal.recordings.frame import Frame, Mount
+from evercal.recordings.frame import Frame
 from evercal.robot.arm import Arm, MovingJoint
+from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
 from tests.mapping.test_bundle_adjustment import CAMERA, FRAMES, world
 
 X, Y, Z = np.eye(3)
@@ -47,7 +48,7 @@ def adjusted(
     offsets = np.deg2rad(offsets_deg)
     true = ARM.poses(joints)
     stated = ARM.poses(joints - offsets)
-    wrist = mount == "eye_in_hand"
+    wrist = mount.moves
     # A fixed camera looks at the arm from 2 m away.
     turned = SE3.exp(np.array([0, 0, 0, 0, 0, np.pi]))
     camera = (
@@ -83,7 +84,7 @@ def adjusted(
     ).solve(made.tracks)
 
 
-@pytest.mark.parametrize("mount", ["eye_in_hand", "eye_to_hand"])
+@pytest.mark.parametrize("mount", [EYE_IN_HAND, EYE_TO_HAND])
 def test_offsets_are_estimated_from_images(mount: Mount) -> None:
     result = adjusted((0, 0.8, -1.1, 0.6, 0), mount)
     offsets = np.rad2deg(result.offsets)
@@ -94,14 +95,14 @@ def test_offsets_are_estimated_from_images(mount: Mount) -> None:
 
 
 def test_a_perfect_arm_has_small_offsets() -> None:
-    result = adjusted((0, 0, 0, 0, 0), "eye_in_hand")
+    result = adjusted((0, 0, 0, 0, 0), EYE_IN_HAND)
     assert np.abs(np.rad2deg(result.offsets)).max() < 0.02
     assert np.rad2deg(result.offsets_prior).max() < 0.1
 
 
 def test_an_offset_that_no_image_shows_is_as_uncertain_as_that_of_others() -> None:
     """Behind the last joint that moves, an offset is one of the mount, and so is its own."""
-    result = adjusted((0, 1.0, -1.5, 0, 0), "eye_in_hand", moving=3)
+    result = adjusted((0, 1.0, -1.5, 0, 0), EYE_IN_HAND, moving=3)
     assert result.offsets_known.tolist() == [False, True, False, False, False]
     sigma = np.sqrt(np.diag(result.offsets_covariance))
     assert sigma[3] > 0.5 * result.offsets_prior[3]
@@ -111,7 +112,7 @@ def test_an_offset_that_no_image_shows_is_as_uncertain_as_that_of_others() -> No
 def test_frames_keep_the_transform_of_gripper_and_camera() -> None:
     joints = np.array([0.1, 0.2, -0.3, 0.4, 0.5])
     gripper = ARM.poses(joints[None])[0]
-    offsets = ArmOffsets.start(ARM, "eye_in_hand", np.full(5, 0.02))
+    offsets = ArmOffsets.start(ARM, EYE_IN_HAND, np.full(5, 0.02))
     frame = Frame("a", np.zeros((1, 1, 3), np.uint8), CAMERA, gripper @ MOUNT, gripper)
     (same,) = offsets.moved([frame])
     assert same is frame
@@ -129,7 +130,7 @@ def test_a_fixed_camera_keeps_its_place_in_the_base() -> None:
     joints = np.array([0.1, 0.2, -0.3, 0.4, 0.5])
     gripper = ARM.poses(joints[None])[0]
     camera = SE3.from_translation((1.0, 0.2, 0.5))
-    offsets = ArmOffsets.start(ARM, "eye_to_hand", np.full(5, 0.02))
+    offsets = ArmOffsets.start(ARM, EYE_TO_HAND, np.full(5, 0.02))
     pose = gripper.inverse() @ camera
     image = np.zeros((1, 1, 3), np.uint8)
     (moved,) = offsets.moved(

@@ -25,7 +25,7 @@ from evercal.calibration.framed_pose import ImageUse as ImageUse
 from evercal.calibration.framed_pose import JointOffset as JointOffset
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_distance
-from evercal.recordings.frame import Mount
+from evercal.robot.mount import MountName
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
 from evercal.storage.text_files import read_text
@@ -142,9 +142,9 @@ class Calibration(FramedPose):
 
     @classmethod
     def _from_mapping(cls, data: Mapping[str, Any]) -> Self:
-        if data.get("mount") not in get_args(Mount):
+        if data.get("mount") not in get_args(MountName):
             raise ValueError(
-                f"'mount' is one of {get_args(Mount)}, got {data.get('mount')!r}"
+                f"'mount' is one of {get_args(MountName)}, got {data.get('mount')!r}"
             )
         for name in ("checks", "source"):
             if not isinstance(data.get(name, {}), Mapping):

@@ -135,7 +135,7 @@ def shift_between(
 
 
 def _require_fixed(reference: Calibration) -> None:
-    if reference.mount != "eye_to_hand":
+    if reference.on_gripper:
         raise InputError(
             "the reference is a camera on the gripper, whose pose in the base changes with every"
             " move; give the calibration of a camera that stands still, or one with joint offsets"

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from evercal.geometry import SE3, Camera, UncertainPose
-from evercal.recordings.frame import Mount
+from evercal.robot.mount import MountName, mount_named
 from evercal.typing import Array
 
 
@@ -47,7 +47,7 @@ class JointOffset:
 class FramedPose:
     """Pose of a camera: `parent_from_child`."""
 
-    mount: Mount
+    mount: MountName
     """`eye_to_hand`: the camera stands still. `eye_in_hand`: the gripper carries it."""
     parent_from_child: SE3
     covariance: Array
@@ -67,6 +67,11 @@ class FramedPose:
         default_factory=lambda: np.zeros((0, 0)), kw_only=True
     )
     """(k, k) of the offsets."""
+
+    @property
+    def on_gripper(self) -> bool:
+        """Whether the gripper carries the camera; otherwise it stands still in the base."""
+        return mount_named(self.mount).moves
 
     @property
     def meaning(self) -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self, get_args
 
 import numpy as np
 
-from evercal.calibration.calibration import Calibration, ErrorTerm, Mount, largest_term
+from evercal.calibration.calibration import Calibration, ErrorTerm, largest_term
 from evercal.calibration.held_thing.held_again import held_again
 from evercal.calibration.located import (
     Fused,
@@ -36,6 +36,7 @@ from evercal.localization.intrinsics import STATED, cameras_in_scenes
 from evercal.recordings.image_files import image_files
 from evercal.recordings.images import Picture, as_rgb, pixels_of
 from evercal.recordings.poses.pairing import poses_of_images
+from evercal.robot.mount import MountName
 from evercal.typing import Array, IntArray, PathLike
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ class Images:
 def calibrate(
     localizer: "Localizer",
     given: Images,
-    mount: Mount | None = None,
+    mount: MountName | None = None,
     on_image: Callable[[], object] = lambda: None,
 ) -> Calibration:
     """Estimate the pose of a camera from images of a mapped scene, see `Map.calibrate`.
@@ -340,7 +341,7 @@ def _advice(
         advice.append(
             "It rests on one image: give five or more to measure their scatter."
         )
-    elif calibration.mount == "eye_to_hand" and used >= 5:
+    elif not calibration.on_gripper and used >= 5:
         near = largest_term(calibration.error_terms)[0] in ("view", "map")
         advice.append(
             "More images from this spot will not help: the remaining error is common to all of"
@@ -353,7 +354,7 @@ def _lens_advice(calibration: Calibration) -> list[str]:
     name, share = largest_term(calibration.error_terms)
     if name != "lens":
         return []
-    moves = calibration.mount == "eye_in_hand"
+    moves = calibration.on_gripper
     if calibration.source["intrinsics"] == "given":
         known = (
             f"--camera counts as known to {100 * STATED.focal:g} % of the focal length"

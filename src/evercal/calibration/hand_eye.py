@@ -39,11 +39,11 @@ from evercal.progress import OnProgress
 from evercal.recordings.frame import (
     MIN_GRIPPER_FRAMES,
     Frame,
-    Mount,
     Recording,
     stated_grippers,
 )
 from evercal.recordings.held_out import require_frames
+from evercal.robot.mount import Mount, MountName
 from evercal.typing import Array
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class HandEyeReport:
     start_mm: float
     """Change of the first estimate by bundle adjustment."""
     start_deg: float
-    mount: Mount = "eye_in_hand"
+    mount: MountName = "eye_in_hand"
     """eye_in_hand estimates `gripper_from_camera`, eye_to_hand `base_from_camera`."""
     map: str = ""
     """Digest of the scene, see `SceneMap.digest`."""
@@ -168,14 +168,14 @@ def posed_by_gripper(
         frame for frame in recording.train if frame.base_from_gripper is not None
     )
     require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
-    if mount == "eye_to_hand":
+    if not mount.moves:
         frames, _ = moving_parts(frames)
     arm = recording.arm if has_joints(frames) else None
     try:
         start = hand_eye_start(frames, mount, encoder, on_progress, arm)
     except InputError as error:
         hint = ""
-        if mount == "eye_in_hand" and (still := moving_parts(frames)[1]) > STILL_SHARE:
+        if mount.moves and (still := moving_parts(frames)[1]) > STILL_SHARE:
             hint = (
                 f"; {100 * still:.0f} % of what the images show stands still: 'evercal eye-to-hand'"
                 " calibrates a fixed camera by a thing in the gripper"
@@ -184,7 +184,7 @@ def posed_by_gripper(
     if start.arm is not None:
         frames = tuple(start.arm.moved(frames))
     poses = scene_from_parent(frames, mount) @ start.parent_from_camera
-    if mount == "eye_to_hand" and (around := windows(frames, start)) is not None:
+    if not mount.moves and (around := windows(frames, start)) is not None:
         frames = tuple(cropped(*both) for both in zip(frames, around, strict=True))
     train = tuple(
         replace(frame, base_from_camera=pose)
@@ -214,7 +214,7 @@ def hand_eye_report(
     )
     estimate = start.parent_from_camera @ start_from_camera
     start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.parent_from_camera)
-    fixed = start.mount == "eye_to_hand"
+    fixed = not start.mount.moves
     left = None if fixed else open_position(stated_grippers(frames), estimate.pose)
     widest_mm = 1000 * float(
         np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1])
@@ -232,7 +232,7 @@ def hand_eye_report(
         start_deg=start_deg,
         given_mm=from_given[0],
         given_deg=from_given[1],
-        mount=start.mount,
+        mount=start.mount.name,
         map=built.scene.digest,
         warnings=_warnings(built.adjusted),
         advice=left.sentence(widest_mm) if left else "",
@@ -286,7 +286,7 @@ def _refuse_slip(
 
     A thing that slips in the gripper steps in the gripper's residuals, a camera in its own.
     """
-    if mount == "eye_in_hand":
+    if mount.moves:
         return
     names = [frame.name for frame in frames if frame.name in correction.residuals]
     steps = [

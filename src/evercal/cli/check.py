@@ -56,7 +56,7 @@ class Check(args.Verb):
         from evercal.recordings.image_files import image_files
 
         reference = read_calibration(self.reference)
-        on_arm = reference.mount == "eye_in_hand" and reference.joints
+        on_arm = reference.on_gripper and reference.joints
         if on_arm or self.urdf is not None or self.gripper_frame is not None:
             return self._check_arm(reference)
         files = image_files(self.images)
@@ -94,9 +94,7 @@ class Check(args.Verb):
         )
         with TemporaryDirectory() as folder:
             new = Map.open(Path(folder) / "map")
-            (new.learn if reference.mount == "eye_in_hand" else new.eye_to_hand)(
-                recording
-            )
+            (new.learn if reference.on_gripper else new.eye_to_hand)(recording)
             now = new.calibration()
         confidence, changed, joints = arm_change(reference, now)
         shift = shift_of(

@@ -20,12 +20,12 @@ from evercal.recordings.frame import (
     MIN_GRIPPER_FRAMES,
     MIN_TRAIN_FRAMES,
     Frame,
-    Mount,
     Recording,
     lacks_camera_poses,
 )
 from evercal.recordings.held_out import HeldOutSplit, require_frames, split_held_out
 from evercal.recordings.pictures import look_at
+from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
 
 if TYPE_CHECKING:
     from evercal.calibration.hand_eye import HandEyeReport
@@ -82,7 +82,7 @@ def learn_scene(
     gripper_from_camera: SE3 | None = None,
     options: MapOptions | None = None,
     on_progress: OnProgress = lambda *_: None,
-    mount: Mount = "eye_in_hand",
+    mount: Mount = EYE_IN_HAND,
 ) -> tuple[SceneMap, LearnReport]:
     """Build the map of one scene and fit the scatter of its stated poses; nothing is written.
 
@@ -118,14 +118,14 @@ def learn_scene(
     require_frames(recording, least)
     split = split_held_out(recording.train)
     # A calibration, in which no image is to be located.
-    if options.mount == "eye_to_hand":
+    if options.mount == EYE_TO_HAND:
         split = HeldOutSplit(recording.train, ())
     options = _sized(options, budget, contents.short_side)
     options = replace(options, metric=recording.metric)
     built = build_map(
         recording.name, split.train, contents.encoder, options, on_progress
     )
-    if options.mount == "eye_to_hand":
+    if options.mount == EYE_TO_HAND:
         built = replace(built, scene=of_whole_images(built.scene, whole[0].camera))
     if budget.auto:
         from evercal.learning.fewest_keyframes import fewest_keyframes
@@ -159,9 +159,9 @@ def learn_scene(
 
         # The frames of a fixed camera are windows by now.
         used = [frame for frame in whole if frame.base_from_gripper is not None]
-        used = used if mount == "eye_to_hand" else split.train
+        used = used if mount == EYE_TO_HAND else split.train
         hand_eye = hand_eye_report(start, built, used, gripper_from_camera)
-        if mount == "eye_to_hand":
+        if mount == EYE_TO_HAND:
             others = [
                 frame for frame in whole if frame.name not in built.keyframe_names
             ]

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from evercal.mapping.bundle_adjustment import JointSlopes
-from evercal.recordings.frame import Frame, Mount
+from evercal.recordings.frame import Frame
+from evercal.robot.mount import Mount
 from evercal.typing import Array, BoolArray
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class ArmOffsets:
                 after = self.arm.poses(
                     (np.array(frame.joints_rad) + self.values)[None]
                 )[0]
-                fixed = self.mount == "eye_to_hand"
+                fixed = not self.mount.moves
                 change = (
                     after.inverse() @ gripper if fixed else after @ gripper.inverse()
                 )
@@ -63,7 +64,7 @@ class ArmOffsets:
         joints = np.array([frame.joints_rad for frame in frames])
         slopes = self.arm.slopes(joints + self.values) * self.arm.free()
         # In the frame of the gripper, a fixed camera moves the other way.
-        sign = -1 if self.mount == "eye_to_hand" else 1
+        sign = 1 if self.mount.moves else -1
         return JointSlopes(sign * slopes, self.arm.rotates(), self.values)
 
 

@@ -40,7 +40,8 @@ from evercal.mapping.tracks import (
 )
 from evercal.processes import cores
 from evercal.progress import OnProgress
-from evercal.recordings.frame import Frame, Mount, stated_grippers, stated_poses
+from evercal.recordings.frame import Frame, stated_grippers, stated_poses
+from evercal.robot.mount import Mount
 from evercal.typing import Array, IntArray
 
 HAND_EYE_COVARIANCE_SCALE = 2.5
@@ -88,13 +89,13 @@ class MapOptions:
             self.bundle,
             common_stated=False,
             # Before one place, the adjusted mount depends on its start by more than the noise.
-            least_systematic=1.0 if mount == "eye_in_hand" else 0.1,
+            least_systematic=1.0 if mount.moves else 0.1,
             common_sigma_m=0.2,
             common_sigma_deg=10.0,
             least_sigma_m=2e-4,
             least_sigma_deg=0.015,
         )
-        if mount == "eye_to_hand":
+        if not mount.moves:
             bundle = replace(
                 bundle,
                 correlation=2.7,
@@ -416,7 +417,7 @@ def _gripper_from_camera(prepared: PreparedFrames, mount: Mount | None) -> SE3 |
     """(n,) stated poses of the cameras in the gripper; None where camera poses were stated."""
     if mount is None:
         return None
-    if mount == "eye_to_hand":
+    if not mount.moves:
         return prepared.stated
     return stated_grippers(prepared.frames).inverse() @ prepared.stated
 
@@ -476,7 +477,7 @@ def _finish(
         if not options.bundle.common_stated:
             # The common transform is part of the answer and not an error to undo.
             by_noise = np.asarray(adjustment.common_covariance, np.float64)
-            if options.mount == "eye_in_hand":
+            if options.mount is not None and options.mount.moves:
                 by_noise = HAND_EYE_COVARIANCE_SCALE * by_noise
             by_lens = np.asarray(adjustment.common_by_lens, np.float64)
             by_drift = np.asarray(adjustment.common_systematic, np.float64)

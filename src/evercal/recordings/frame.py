@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from evercal.bounds import bounds
 from evercal.errors import InputError, is_plain
@@ -17,7 +17,6 @@ from evercal.typing import Image
 if TYPE_CHECKING:
     from evercal.robot.arm import Arm
 
-Mount = Literal["eye_to_hand", "eye_in_hand"]
 MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
 MIN_GRIPPER_FRAMES = (
     8  # the same for a camera on the gripper: a few views around one place

@@ -159,9 +159,7 @@ def annotate_images(
     digest = calibration.source.get("map")
     other = digest is not None and (scene is None or scene.digest != digest)
     still = scene is not None and scene.metric and scene.parent_frame == "base"
-    around = Surroundings.of(
-        scene if still and calibration.mount == "eye_to_hand" else None
-    )
+    around = Surroundings.of(scene if still and not calibration.on_gripper else None)
     return AnnotatedImages(annotated, tuple(missing), other, around)
 
 
@@ -192,7 +190,7 @@ def _with_evidence(
     if scene is not None and estimate.scene not in (None, scene):
         return LandmarkPicture(large, 0, f"shows {estimate.scene}, not {scene}")
     # A camera or a thing on the gripper moves, so images are compared with their own poses.
-    still = calibration.mount == "eye_to_hand" and estimate.parent_frame == "base"
+    still = not calibration.on_gripper and estimate.parent_frame == "base"
     pose = calibration.parent_from_child if still else None
     return draw_landmarks(image, estimate, evidence, camera, pose)
 

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from evercal.calibration.calibration import Calibration, ImageUse, Mount
+from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.errors import InputError, missing_extra
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.recordings.image_files import image_files
 from evercal.recordings.images import as_rgb
+from evercal.robot.mount import MountName
 from evercal.typing import PathLike
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ class Client:
         *,
         robot_poses: PathLike | SE3 | None = None,
         camera: Camera | None = None,
-        mount: Mount | None = None,
+        mount: MountName | None = None,
     ) -> Calibration:
         """Calibrate a camera from its images, see `Map.calibrate`."""
         parts = [*_image_parts(images), *_json_part("camera", camera)]

@@ -4,15 +4,16 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
-from evercal.calibration.calibration import Calibration, ImageUse, Mount
+from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.geometry import SE3, Camera
+from evercal.robot.mount import MountName
 from evercal.typing import Array
 
 CAMERA = Camera(640, 480, 600.25, 601.5, 319.75, 240.5, (0.1, -0.2, 0.001, 0.002, 0.03))
 
 
 def calibration_of(
-    pose: SE3, mount: Mount = "eye_to_hand", camera: Camera | None = CAMERA
+    pose: SE3, mount: MountName = "eye_to_hand", camera: Camera | None = CAMERA
 ) -> Calibration:
     """Return a calibration with typical frame names and three images, one of them unused."""
     parent = "base_link" if mount == "eye_to_hand" else "tool0"

@@ -20,12 +20,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.calibration import Mount
 from evercal.calibration.export.formats import FORMATS
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.poses.robot_poses import read_robot_poses
+from evercal.robot.mount import MountName
 from evercal.typing import Array
 
 from .random_poses import CAMERA, calibration_of, poses, quaternion_matrix
@@ -36,7 +36,7 @@ NUMBER = r"-?\d+\.\d+"
 CHILD = "cam/optical-frame"
 
 
-def parent_of(mount: Mount) -> str:
+def parent_of(mount: MountName) -> str:
     return "base_link" if mount == "eye_to_hand" else "tool0"
 
 
@@ -262,7 +262,7 @@ def test_every_format_of_one_pose_has_a_reader() -> None:
 @given(poses(), st.sampled_from(["eye_to_hand", "eye_in_hand"]))
 @settings(max_examples=8)
 def test_the_pose_and_its_frames_are_read_back(
-    name: str, pose: SE3, mount: Mount
+    name: str, pose: SE3, mount: MountName
 ) -> None:
     matrix, parent, child = READERS[name](calibration_of(pose, mount).export(name))
     assert (parent, child) in (("", ""), (parent_of(mount), CHILD))

@@ -11,17 +11,17 @@ from scipy.spatial.transform import Rotation
 from benchmarks.hand_eye import Setting, error, pose, recording, rotations, shaken
 from benchmarks.hand_eye_boards import BoardSetting, pose_pairs, record
 from benchmarks.mistakes import MISTAKES, OTHER, Mistake
-from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.robot.mount import MountName
 
-MOUNTS: tuple[Mount, ...] = ("eye_in_hand", "eye_to_hand")
+MOUNTS: tuple[MountName, ...] = ("eye_in_hand", "eye_to_hand")
 EXACT = Setting(noise_mm=0, noise_deg=0)
 
 
-def pairs_of(robot: SE3, mount: Mount, noise: float) -> PosePairs:
+def pairs_of(robot: SE3, mount: MountName, noise: float) -> PosePairs:
     """Simulate the camera poses of given robot poses."""
     truth = recording(replace(EXACT, mount=mount, path="table"), 0)
     fixed_from_parent = robot if mount == "eye_in_hand" else robot.inverse()
@@ -63,7 +63,7 @@ def degenerate_motions() -> dict[str, tuple[SE3, str]]:
 @pytest.mark.parametrize("name", degenerate_motions())
 @pytest.mark.parametrize("scale_known", [True, False])
 def test_degenerate_motions_are_refused(
-    mount: Mount, noise: float, name: str, scale_known: bool
+    mount: MountName, noise: float, name: str, scale_known: bool
 ) -> None:
     robot, message = degenerate_motions()[name]
     pairs = pairs_of(robot, mount, noise)
@@ -198,7 +198,7 @@ UNUSUAL: dict[str, tuple[Mistake, str]] = {
 def test_mistakes_are_diagnosed(name: str) -> None:
     mistake, expected = UNUSUAL[name]
     in_hand = len(name) % 2 == 0
-    mount: Mount = "eye_in_hand" if in_hand else "eye_to_hand"
+    mount: MountName = "eye_in_hand" if in_hand else "eye_to_hand"
     path = "table" if in_hand else "random"
     with pytest.raises(InputError) as caught:
         solve(mistake(recording(Setting(mount, path=path), 7).pairs), mount)
@@ -218,7 +218,7 @@ def test_usual_mistakes_are_named(name: str) -> None:
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
-def test_a_wrong_size_of_the_squares_is_named_and_estimated(mount: Mount) -> None:
+def test_a_wrong_size_of_the_squares_is_named_and_estimated(mount: MountName) -> None:
     truth = recording(Setting(mount, path="table"), 7)
     pairs = camera_by(scaled(1.05))(truth.pairs)
     calibration = solve(pairs, mount)

@@ -24,16 +24,17 @@ from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.board_poses import board_poses
 from evercal.calibration.boards.corners import BoardView, board_pose, calibrate_camera
 from evercal.calibration.boards.detection import find_board
-from evercal.calibration.calibration import Calibration, Mount
+from evercal.calibration.calibration import Calibration
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import BoardCorners, solve
 from evercal.evaluation import share_inside
 from evercal.geometry import SE3, Camera, average_poses, pose_distance
 from evercal.recordings import read_image
+from evercal.robot.mount import MountName
 
 from ..boards.printed import grid
 
-MOUNTS: tuple[Mount, ...] = ("eye_in_hand", "eye_to_hand")
+MOUNTS: tuple[MountName, ...] = ("eye_in_hand", "eye_to_hand")
 EXACT = Setting(noise_mm=0, noise_deg=0)
 
 
@@ -45,7 +46,7 @@ EXACT = Setting(noise_mm=0, noise_deg=0)
     st.sampled_from([None, 0.01, 3.0]),
 )
 def test_exact_poses_give_the_exact_calibration(
-    mount: Mount, seed: int, path: str, scale: float | None
+    mount: MountName, seed: int, path: str, scale: float | None
 ) -> None:
     truth = recording(replace(EXACT, mount=mount, path=path, scale=scale), seed)
     calibration = solve(truth.pairs, mount, scale is None)
@@ -138,7 +139,7 @@ def test_checks_and_error_terms_match_the_noise() -> None:
     ("what", "row"), [("camera", 4), ("board", 12), ("camera", 23)]
 )
 def test_a_slip_is_named_and_widens_the_covariance(what: str, row: int) -> None:
-    mount: Mount = "eye_in_hand" if row == 4 else "eye_to_hand"
+    mount: MountName = "eye_in_hand" if row == 4 else "eye_to_hand"
     truth = recording(Setting(mount, path="table", noise_mm=0.3, noise_deg=0.03), 8)
     step = SE3.exp([0.002, 0.003, -0.004, 0.004, 0.0, 0.006])
     pairs = truth.pairs
@@ -180,7 +181,7 @@ class Photographed(NamedTuple):
         )
 
 
-def photographed(mount: Mount, seed: int, robot_deg: float = 0.0) -> Photographed:
+def photographed(mount: MountName, seed: int, robot_deg: float = 0.0) -> Photographed:
     """Simulate exact camera poses, and robot poses with rotation noise."""
     rng = np.random.default_rng(seed)
     camera = Camera(1280, 960, 1000, 1000, 640, 480, (-0.1, 0.05, 0.001, 0.0))
@@ -205,7 +206,7 @@ def photographed(mount: Mount, seed: int, robot_deg: float = 0.0) -> Photographe
     [("eye_in_hand", 0.3, 0.0), ("eye_to_hand", 0.1, 0.1)],
 )
 def test_corners_improve_the_calibration(
-    mount: Mount, noise_px: float, robot_deg: float
+    mount: MountName, noise_px: float, robot_deg: float
 ) -> None:
     distances = []
     with_corners = []
@@ -379,7 +380,7 @@ def test_real_recordings(
     boards = SE3.stack(
         [i.camera_from_board for i in poses.images if i.camera_from_board]
     )
-    mount: Mount = "eye_in_hand" if name.endswith("in_hand") else "eye_to_hand"
+    mount: MountName = "eye_in_hand" if name.endswith("in_hand") else "eye_to_hand"
     corners = BoardCorners(camera, views, stated=stated)
     solved = solve(PosePairs(tuple(images), robot, boards), mount, corners=corners)
     fixed_from_parent = robot if mount == "eye_in_hand" else robot.inverse()

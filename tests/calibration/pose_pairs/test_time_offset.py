@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.hand_eye import Setting, error, pose, shaken
-from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.time_offset import (
     CameraTrack,
     interpolated_pairs,
@@ -16,6 +15,7 @@ from evercal.calibration.pose_pairs.time_offset import (
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import PoseTrack
+from evercal.robot.mount import MountName
 
 X = SE3.exp([0.05, -0.03, 0.1, 0.2, 1.0, -0.4])
 Z = SE3.exp([0.4, 0.2, 0.0, 1.5, 0.3, 0.2])
@@ -36,7 +36,9 @@ def robot_at(times: np.ndarray, speed: float = 1.0) -> SE3:
     return pose(rotation, sway[:, :3] + np.array([0.5, 0.0, 0.5]))
 
 
-def streams(mount: Mount, offset: float, noise: float) -> tuple[PoseTrack, CameraTrack]:
+def streams(
+    mount: MountName, offset: float, noise: float
+) -> tuple[PoseTrack, CameraTrack]:
     rng = np.random.default_rng(0)
     stamps = np.arange(0, 25, 0.01)
     times = np.sort(rng.uniform(1.5, 23, 50))
@@ -51,7 +53,7 @@ def streams(mount: Mount, offset: float, noise: float) -> tuple[PoseTrack, Camer
 @pytest.mark.parametrize(
     ("mount", "offset"), [("eye_in_hand", 0.237), ("eye_to_hand", -0.6)]
 )
-def test_offset_and_transform_are_estimated(mount: Mount, offset: float) -> None:
+def test_offset_and_transform_are_estimated(mount: MountName, offset: float) -> None:
     calibration = solve_with_offset(*streams(mount, offset, 1.0), mount)
     sigma = calibration.checks["time_offset_sigma_s"]
     assert sigma < 0.002

@@ -85,7 +85,7 @@ class Export:
     @property
     def in_hand(self) -> bool:
         """Whether the gripper carries the camera."""
-        return self.calibration.mount == "eye_in_hand"
+        return self.calibration.on_gripper
 
     @property
     def pose(self) -> SE3:

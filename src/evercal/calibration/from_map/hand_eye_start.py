@@ -31,8 +31,9 @@ from evercal.mapping.bundle_adjustment import BundleOptions
 from evercal.mapping.selection import spread_poses
 from evercal.processes import cores
 from evercal.progress import OnProgress
-from evercal.recordings.frame import Frame, Mount, stated_grippers
+from evercal.recordings.frame import Frame, stated_grippers
 from evercal.robot.arm import Arm
+from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
 from evercal.typing import Array, BoolArray, Float32Array, Image
 
 FRAMES, PARTNERS = 120, 6
@@ -42,7 +43,7 @@ ANGLE_DEG, AGREE_DEG = 3.0, 0.5
 median of a pair that agrees."""
 LEAST_ROTATION_DEG, LEAST_PAIRS = 5.7, 6
 """Root mean square angle between frames about each of two axes, and pairs that must agree."""
-SPREAD_M: dict[Mount, float] = {"eye_in_hand": 0.2, "eye_to_hand": 2.0}
+SPREAD_M = {EYE_IN_HAND: 0.2, EYE_TO_HAND: 2.0}
 """Standard deviation of the position of the camera before any image."""
 JOINT_SPREAD = np.deg2rad(BundleOptions().joint_sigma_deg)
 """Standard deviation of the offset of a joint, radians or metres."""
@@ -102,13 +103,12 @@ class Joints(NamedTuple):
     def matrices(self, offsets: Array, mount: Mount) -> Array:
         """(n, 4, 4) as `scene_from_parent`, with offsets (k,)."""
         poses = self.arm.poses(self.values + offsets * self.arm.free())
-        return (poses if mount == "eye_in_hand" else poses.inverse()).matrix()
+        return mount.scene_from_parent(poses).matrix()
 
 
 def scene_from_parent(frames: Sequence[Frame], mount: Mount) -> SE3:
     """(n,) poses that move the camera: base_from_gripper, or gripper_from_base of eye_to_hand."""
-    poses = stated_grippers(frames)
-    return poses if mount == "eye_in_hand" else poses.inverse()
+    return mount.scene_from_parent(stated_grippers(frames))
 
 
 def hand_eye_start(
@@ -131,7 +131,7 @@ def hand_eye_start(
     pairs = image_pairs(frames, mount, encoder, on_progress)
     joints = arm and Joints(arm, np.array([frame.joints_rad for frame in frames]))
     try:
-        start = solve_pairs(poses, pairs, mount, joints)
+        start = start_from_matches(poses, pairs, mount, joints)
     except InputError:
         _refuse_other_mount(poses.inverse(), pairs, mount, None)
         raise
@@ -147,14 +147,14 @@ def _refuse_other_mount(
     rivals = []
     for other in SPREAD_M:
         with suppress(InputError):
-            rivals.append(solve_pairs(poses, pairs, other))
+            rivals.append(start_from_matches(poses, pairs, other))
     rival = min(rivals, key=lambda rival: rival.distance_deg, default=None)
     if rival is None or (
         start is not None and rival.distance_deg > start.distance_deg / 2
     ):
         return
     another = "the camera moves with the gripper ('evercal learn MAP RECORDING --calibration FILE')"
-    if mount == "eye_in_hand":
+    if mount.moves:
         another = "the camera stands still and shows what the gripper holds ('evercal eye-to-hand')"
     raise InputError(
         f"the inverse poses agree with the images in {rival.pairs} of {rival.of_pairs} pairs of"
@@ -163,7 +163,7 @@ def _refuse_other_mount(
     )
 
 
-def solve_pairs(
+def start_from_matches(
     poses: SE3, pairs: Sequence[ImagePair], mount: Mount, joints: Joints | None = None
 ) -> HandEyeStart:
     """Solve for the transform from pairs between n frames with `scene_from_parent` (n,)."""
@@ -281,7 +281,7 @@ class _EpipolarFit:
 
     def starts(self, mount: Mount) -> list[Array]:
         """First parameters (6,): rotation vector after `rotation`, position."""
-        if mount == "eye_in_hand":
+        if mount.moves:
             beside = (
                 np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * BESIDE_M
             )
@@ -363,7 +363,7 @@ def image_pairs(
     images: list[Image] = []
     cameras: list[Camera] = []
     features: list[Float32Array] = []
-    fixed = mount == "eye_to_hand"
+    fixed = not mount.moves
     for frame in frames:
         image = frame.read_image()
         short_side = min(960 if fixed else 480, *image.shape[:2])

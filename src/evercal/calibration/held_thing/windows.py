@@ -13,6 +13,7 @@ from evercal.calibration.from_map.hand_eye_start import (
 from evercal.calibration.held_thing.moving_parts import PATCH_PX
 from evercal.geometry import SE3
 from evercal.recordings.frame import Frame
+from evercal.robot.mount import EYE_TO_HAND
 from evercal.typing import Array, IntArray
 
 MARGIN = 1.2
@@ -23,7 +24,7 @@ MOST_WINDOW = 0.75
 
 def windows(frames: Sequence[Frame], start: HandEyeStart) -> IntArray | None:
     """(n, 3) left, top and side of a window around the thing; None if it fills the images."""
-    poses = scene_from_parent(frames, "eye_to_hand") @ start.parent_from_camera
+    poses = scene_from_parent(frames, EYE_TO_HAND) @ start.parent_from_camera
     points = _points(poses, start.matches)
     if not len(points):
         return None

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.fit import MIN_POSES, Agreement, agreement
 from evercal.calibration.pose_pairs.pairs import PoseNumbers, PosePairs
 from evercal.calibration.pose_pairs.pose_equation import Extras
@@ -26,6 +25,7 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
     poses_from_numbers,
 )
+from evercal.robot.mount import MountName, mount_named
 from evercal.typing import Array
 
 _FAILS_M, _FAILS_RAD, _FEW = 0.01, np.deg2rad(1.0), 0.8
@@ -59,11 +59,11 @@ class _Reading(NamedTuple):
 
     message: str
     pairs: PosePairs
-    mount: Mount
+    mount: MountName
 
 
 def quick_fit(
-    pairs: PosePairs, mount: Mount, scale_known: bool
+    pairs: PosePairs, mount: MountName, scale_known: bool
 ) -> tuple[Agreement, float]:
     """Return a robust estimate of X and Z alone, and the scale."""
     blank = Extras.nothing(len(pairs))
@@ -73,7 +73,11 @@ def quick_fit(
 
 
 def require_agreement(
-    pairs: PosePairs, mount: Mount, scale_known: bool, fit: Agreement, own_camera: bool
+    pairs: PosePairs,
+    mount: MountName,
+    scale_known: bool,
+    fit: Agreement,
+    own_camera: bool,
 ) -> None:
     """Check that pose pairs agree, or name the mistake.
 
@@ -131,7 +135,7 @@ def _require_plausible(given: _Reading, fit: Agreement, scale_known: bool) -> No
     beside = coherent > _COHERENT and mean[2] < _OBLIQUE * coherent
     x = fit.at.parent_from_camera
     z = fit.at.fixed_from_board
-    carried = x if given.mount == "eye_in_hand" else z
+    carried = x if mount_named(given.mount).moves else z
     if not (behind or beside or np.linalg.norm(carried.translation_m) > _LONG_M):
         return
     others = [
@@ -163,7 +167,8 @@ def _better(other: Agreement, fit: Agreement) -> bool:
 def _plausibility(reading: _Reading, fit: Agreement) -> float:
     x = fit.at.parent_from_camera
     z = fit.at.fixed_from_board
-    usual = (_NEAR_M, _FAR_M) if reading.mount == "eye_in_hand" else (_FAR_M, _NEAR_M)
+    on_arm = mount_named(reading.mount).moves
+    usual = (_NEAR_M, _FAR_M) if on_arm else (_FAR_M, _NEAR_M)
     lengths = np.array(
         [np.linalg.norm(x.translation_m), np.linalg.norm(z.translation_m)]
     )
@@ -225,9 +230,9 @@ _OTHER_CAMERA: dict[str, _Change] = {
 
 
 def _readings(
-    pairs: PosePairs, mount: Mount, changes: Mapping[str, _Change]
+    pairs: PosePairs, mount: MountName, changes: Mapping[str, _Change]
 ) -> list[_Reading]:
-    other: Mount = "eye_to_hand" if mount == "eye_in_hand" else "eye_in_hand"
+    other = mount_named(mount).other.name
     readings = []
     for message, change in changes.items():
         robot, camera = change(pairs.base_from_gripper, pairs.camera_from_board)
@@ -237,7 +242,7 @@ def _readings(
     return readings
 
 
-def _shifted(pairs: PosePairs, mount: Mount) -> list[_Reading]:
+def _shifted(pairs: PosePairs, mount: MountName) -> list[_Reading]:
     """Return the pairs without one extra row of either file, where successive angles fit best."""
     if len(pairs) <= MIN_POSES:
         return []
@@ -265,7 +270,9 @@ def _shifted(pairs: PosePairs, mount: Mount) -> list[_Reading]:
     return readings
 
 
-def _other_conventions(pairs: PosePairs, mount: Mount, every: bool) -> list[_Reading]:
+def _other_conventions(
+    pairs: PosePairs, mount: MountName, every: bool
+) -> list[_Reading]:
     """Return the pairs in other conventions of one file: `every`, or those that agree better."""
     robot = pairs.base_from_gripper
     camera = pairs.camera_from_board
@@ -327,7 +334,7 @@ def _mismatch_rad(robot: SE3, camera: SE3) -> float:
     return float(np.quantile(np.abs(_angles(robot) - _angles(camera)), 0.25))
 
 
-def _require_unit(pairs: PosePairs, mount: Mount, fit: Agreement) -> None:
+def _require_unit(pairs: PosePairs, mount: MountName, fit: Agreement) -> None:
     """Refuse camera lengths in another unit than the robot's."""
     free, scale = quick_fit(pairs, mount, False)
     if free.metres * _BETTER > fit.metres or free.radians > 1.5 * fit.radians + 1e-4:

@@ -24,10 +24,10 @@ from evercal.calibration.boards.corners import (
     pixel_sigma,
     strays,
 )
-from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.conventions import PoseConvention
+from evercal.robot.mount import MountName, mount_named
 from evercal.typing import Array, BoolArray, IntArray
 
 _SAME_ROBOT_M = 1e-4
@@ -139,11 +139,12 @@ class PosePairs:
         moved = SE3(camera.rotation_wxyz, scale * camera.translation_m)
         return replace(self, camera_from_board=moved)
 
-    def equation(self, mount: Mount, extras: Extras) -> PoseEquation:
+    def equation(self, mount: MountName, extras: Extras) -> PoseEquation:
         """Return the equation; the board is fixed in the base for a camera on the arm."""
-        on_arm = mount == "eye_in_hand"
+        mounted = mount_named(mount)
+        on_arm = mounted.moves
         robot = self.base_from_gripper
-        fixed_from_parent = robot if on_arm else robot.inverse()
+        fixed_from_parent = mounted.scene_from_parent(robot)
         covariance = self.camera_covariance
         velocity = self.velocity
         if velocity is not None and not on_arm:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.corners import LENS, moved_lens
-from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, Mount
+from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
 from evercal.calibration.located import length_mm_deg
 from evercal.calibration.pose_pairs.checks import (
     held_out_error,
@@ -25,6 +25,7 @@ from evercal.calibration.pose_pairs.pairs import (
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
 from evercal.calibration.verdict import verdict
 from evercal.geometry import SE3, Camera, pose_to_dict
+from evercal.robot.mount import MountName, mount_named
 from evercal.typing import Array, IntArray
 
 _CAUSES = {
@@ -49,7 +50,7 @@ class PairSolution:
     first: IntArray
     equation: PoseEquation
     fit: HandEyeFit
-    mount: Mount
+    mount: MountName
     scale: float
     """Metres per unit of the camera's lengths."""
     warnings: tuple[str, ...]
@@ -59,7 +60,7 @@ class PairSolution:
     @property
     def parent(self) -> str:
         """Frame that carries the camera."""
-        return "gripper" if self.mount == "eye_in_hand" else "base"
+        return mount_named(self.mount).parent
 
     @property
     def camera(self) -> Camera | None:
@@ -113,7 +114,7 @@ class PairSolution:
         used = fit.residual[fit.inliers].reshape(-1, 2, 3)
         rms = np.sqrt((used**2).sum(2).mean(0))
         distance = np.linalg.norm(self.equation.camera_translation[fit.inliers], axis=1)
-        fixed = "base" if self.mount == "eye_in_hand" else "gripper"
+        fixed = mount_named(self.mount).scene
         checks: dict[str, Any] = {
             "poses_given": len(self.pairs),
             "poses_used": int(fit.inliers.sum()),

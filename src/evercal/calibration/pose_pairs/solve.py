@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evercal.calibration.boards.corners import board_pose, lens_vector, moved_lens
-from evercal.calibration.calibration import Calibration, Mount
+from evercal.calibration.calibration import Calibration
 from evercal.calibration.pose_pairs.checks import (
     SIZE_SIGMA,
     require_observable,
@@ -33,6 +33,7 @@ from evercal.calibration.pose_pairs.slips import find_slip
 from evercal.calibration.pose_pairs.solution import PairSolution
 from evercal.errors import InputError
 from evercal.geometry import SE3, cross_matrix, pose_distance
+from evercal.robot.mount import MountName, mount_named
 from evercal.typing import BoolArray, IntArray
 
 _REACH_M, _OTHER_MOUNT = 0.4, 4.0
@@ -48,7 +49,7 @@ _LENS_WARNING = 3.0
 
 def solve(
     pairs: PosePairs,
-    mount: Mount,
+    mount: MountName,
     scale_known: bool = True,
     corners: BoardCorners | None = None,
 ) -> Calibration:
@@ -79,12 +80,13 @@ def solve(
 
 def solve_pairs(
     pairs: PosePairs,
-    mount: Mount,
+    mount: MountName,
     scale_known: bool = True,
     corners: BoardCorners | None = None,
     of_board: bool = True,
 ) -> PairSolution:
     """Like `solve`, but return the fit. Poses in a map, not `of_board`, may have any direction."""
+    mount_named(mount)
     if of_board:
         require_two_lists(pairs)
     require_observable(pairs, scale_known)
@@ -100,7 +102,7 @@ def solve_pairs(
         pairs = lens.applied_to(pairs)
         start, scale = quick_fit(pairs[rows], mount, scale_known)
         robot = pairs[rows].base_from_gripper
-        fixed_from_parent = robot if mount == "eye_in_hand" else robot.inverse()
+        fixed_from_parent = mount_named(mount).scene_from_parent(robot)
         at = start.at
         predicted = (
             fixed_from_parent @ at.parent_from_camera
@@ -138,7 +140,7 @@ def solve_pairs(
 class _Problem:
     """What is known of the pairs besides their poses."""
 
-    mount: Mount
+    mount: MountName
     scale: float
     """Metres per unit of the camera's lengths, roughly if it is unknown."""
     scale_known: bool
@@ -243,19 +245,16 @@ def _lens_warnings(
     ]
 
 
-def _mount_warnings(at: Unknowns, mount: Mount) -> list[str]:
+def _mount_warnings(at: Unknowns, mount: MountName) -> list[str]:
     """The other mount with inverted robot poses obeys the same equation."""
     both = np.stack(
         [at.parent_from_camera.translation_m, at.fixed_from_board.translation_m]
     )
     camera, board = np.linalg.norm(both, axis=1).tolist()
-    carried = camera
-    on = ("gripper", "base")
-    other = "eye_to_hand"
-    if mount == "eye_to_hand":
-        carried = board
-        on = ("base", "gripper")
-        other = "eye_in_hand"
+    mounted = mount_named(mount)
+    carried = camera if mounted.moves else board
+    on = (mounted.parent, mounted.scene)
+    other = mounted.other.name
     if carried < max(_REACH_M, _OTHER_MOUNT * min(camera, board)):
         return []
     return [

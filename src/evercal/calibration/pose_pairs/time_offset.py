@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evercal.calibration.calibration import Calibration, Mount
+from evercal.calibration.calibration import Calibration
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.solve import solve_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.pose_track import PoseTrack
+from evercal.robot.mount import MountName
 from evercal.typing import Array, BoolArray
 
 _STEP_S = 0.01
@@ -48,7 +49,7 @@ class CameraTrack:
 def solve_with_offset(
     robot: PoseTrack,
     camera: CameraTrack,
-    mount: Mount,
+    mount: MountName,
     scale_known: bool = True,
     largest_s: float = 1.0,
 ) -> Calibration:

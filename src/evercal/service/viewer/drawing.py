@@ -162,7 +162,7 @@ def add_calibrations(
     for name, found in calibrations.items():
         ellipsoid = Ellipsoid.of(found.uncertain_pose)
         base = drawn.node(found.source.get("scene")) if drawn else "/base"
-        parent = GRIPPER if found.mount == "eye_in_hand" else base
+        parent = GRIPPER if found.on_gripper else base
         node = f"{parent}/{name.replace('/', '_')}"
         frustum = Frustum.of(found.parent_from_child, found.camera or default)
         add_frustum(server, node, frustum, size_m, MAGENTA)

@@ -53,7 +53,7 @@ def calibration_rows(calibration: Calibration) -> list[tuple[str, str]]:
     x, y, z = 1000 * calibration.parent_from_child.translation_m
     principal = Ellipsoid.of(calibration.uncertain_pose).sigmas_mm
     return [
-        ("mount", "on the gripper" if calibration.mount == "eye_in_hand" else "fixed"),
+        ("mount", "on the gripper" if calibration.on_gripper else "fixed"),
         (f"in {calibration.parent_frame}", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"),
         (
             "1 sigma per axis",

@@ -54,9 +54,7 @@ class Page:
             self._begin_behind(scenes[0].name)
             self._add_controls(given)
             if urdf is not None:
-                hands = [
-                    c.parent_frame for c in given.values() if c.mount == "eye_in_hand"
-                ]
+                hands = [c.parent_frame for c in given.values() if c.on_gripper]
                 drawing.add_arm(server, urdf, gripper, hands)
         except BaseException:
             self.close()
