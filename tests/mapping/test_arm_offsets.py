@@ -14,7 +14,8 @@ from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment
 from evercal.recordings.frame import Frame
 from evercal.robot.arm import Arm, MovingJoint
 from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
-from tests.mapping.test_bundle_adjustment import CAMERA, FRAMES, world
+
+from .projected_tracks import CAMERA, FRAMES, world
 
 X, Y, Z = np.eye(3)
 ARM = Arm(

@@ -2,145 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.optimize
-from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError
-from evercal.geometry.camera import Camera
-from evercal.geometry.se3 import SE3, pose_distance
-from evercal.mapping.bundle_adjustment import (
-    Adjustment,
-    BundleAdjustment,
-    BundleOptions,
-    noise_of,
-)
-from evercal.mapping.bundle_equations import (
-    COMMON,
-    INTRINSICS,
-    SHARED,
-    SHIFT,
-    BundleTracks,
-    Linearised,
-    NormalEquations,
-    Parameters,
-    StatedFrames,
-)
-from evercal.simulation.box_room import look_at
+from evercal.geometry import SE3, pose_distance
+from evercal.mapping.bundle_adjustment import BundleAdjustment, noise_of
+from evercal.mapping.bundle_equations import COMMON, SHARED, Parameters
+from evercal.mapping.bundle_options import BundleOptions
 from evercal.typing import Array
 
-CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-FRAMES = 30
-
-
-def path(times: Array) -> SE3:
-    """A smooth walk in front of a wall, rotating about all axes."""
-    poses = []
-    for t in times / FRAMES * 2 * np.pi:
-        eye = np.array(
-            [0.6 * np.sin(t), 0.4 * np.cos(2 * t + 1), 1.4 + 0.3 * np.sin(3 * t)]
-        )
-        ahead = np.array([0.3 * np.cos(2 * t), 2.5, 0.3 * np.sin(t)])
-        poses.append(look_at(eye, eye + ahead, 0.5 * np.sin(t + 2)))
-    return SE3.stack(poses)
-
-
-@dataclass
-class World:
-    """Tracks, and the poses, camera and depths that they were made with."""
-
-    truth: SE3
-    tracks: BundleTracks
-    camera: Camera
-    inverse_depth: Array
-
-
-def world(
-    camera: Camera = CAMERA,
-    noise_px: float = 0.2,
-    seed: int = 0,
-    truth: SE3 | None = None,
-    every: int = 3,
-    landmarks: int = 25,
-) -> World:
-    """Landmarks of every third frame at random depths, observed by all frames that see them."""
-    rng = np.random.default_rng(seed)
-    poses = truth or path(np.arange(float(FRAMES)))
-    host = np.repeat(np.arange(0, len(poses), every), landmarks)
-    pixels = rng.uniform([40, 40], [600, 440], (len(host), 2))
-    inverse = 1 / rng.uniform(1.5, 4.0, len(host))
-    rays = camera.unproject(pixels)
-    landmark = []
-    frame = []
-    observed = []
-    points = np.stack(
-        [
-            poses[int(k)].apply(r / d)
-            for k, r, d in zip(host, rays, inverse, strict=True)
-        ]
-    )
-    for j in range(len(poses)):
-        local = poses[j].inverse().apply(points)
-        ahead = local[:, 2] > 0.3
-        pixel = camera.project(np.where(ahead[:, None], local, [0, 0, 1]))
-        inside = ahead & (host != j) & (pixel > 5).all(1) & (pixel < [634, 474]).all(1)
-        which = np.flatnonzero(inside)
-        landmark.append(which)
-        frame.append(np.full(len(which), j))
-        observed.append(pixel[which] + rng.normal(0, noise_px, (len(which), 2)))
-    landmarks_ = np.concatenate(landmark)
-    tracks = BundleTracks(
-        host=host,
-        pixels=pixels,
-        inverse_depth=inverse * (1 + rng.normal(0, 0.01, len(inverse))),
-        landmark=landmarks_,
-        frame=np.concatenate(frame),
-        observed=np.concatenate(observed),
-        whitening=np.tile(np.eye(2) / 0.3, (len(landmarks_), 1, 1)),
-    )
-    return World(poses, tracks, camera, inverse)
-
-
-def problem(
-    stated: SE3,
-    camera: Camera = CAMERA,
-    velocity: Array | None = None,
-    options: BundleOptions | None = None,
-) -> BundleAdjustment:
-    if velocity is None:
-        velocity = np.zeros((len(stated), 6))
-    cameras = [camera] * len(stated)
-    return BundleAdjustment(stated, cameras, velocity, options or BundleOptions())
-
-
-def adjusted(
-    made: World,
-    stated: SE3,
-    camera: Camera | None = None,
-    velocity: Array | None = None,
-    options: BundleOptions | None = None,
-) -> Adjustment:
-    return problem(stated, camera or made.camera, velocity, options).solve(made.tracks)
-
-
-def jittered(poses: SE3, sigma_m: float, sigma_rad: float, seed: int = 1) -> SE3:
-    noise = np.random.default_rng(seed).normal(size=(len(poses), 6))
-    return poses @ SE3.exp(noise * ([sigma_m] * 3 + [sigma_rad] * 3))
-
-
-def errors(poses: SE3, truth: SE3) -> tuple[Array, Array]:
-    """Metres and radians of each pose."""
-    both = [pose_distance(poses[i], truth[i]) for i in range(len(truth))]
-    return np.array([m for m, _ in both]), np.array([r for _, r in both])
-
-
-def without_gauge(poses: SE3, truth: SE3) -> SE3:
-    """Poses after the common motion that fits them to the true ones."""
-    mean = (truth @ poses.inverse()).log().mean(0)
-    return SE3.exp(mean) @ poses
+from .projected_tracks import (
+    CAMERA,
+    FRAMES,
+    adjusted,
+    errors,
+    jittered,
+    path,
+    problem,
+    velocities,
+    without_gauge,
+    world,
+)
 
 
 def test_exact_poses_do_not_change() -> None:
@@ -211,7 +97,7 @@ def test_systematic_errors_of_an_arm_widen_the_covariance(systematic: bool) -> N
     options = BundleOptions(
         common_stated=False, common_sigma_m=0.2, common_sigma_deg=10.0
     )
-    rotations = Rotation.from_quat(made.truth.rotation_wxyz, scalar_first=True)
+    rotations = made.truth.rotation
     turns = (rotations.mean().inv() * rotations).as_rotvec()
     linear = np.concatenate([turns, made.truth.translation_m], 1)
     linear = (linear - linear.mean(0)) / linear.std(0) / np.sqrt(6)
@@ -305,14 +191,6 @@ def test_missing_distortion_is_estimated() -> None:
     )
 
 
-def velocities(stated: SE3) -> Array:
-    """(n, 6) motion per frame by central differences."""
-    steps = (stated[:-1].inverse() @ stated[1:]).log()
-    velocity = np.zeros((len(stated), 6))
-    velocity[1:-1] = (steps[:-1] + steps[1:]) / 2
-    return velocity
-
-
 @pytest.mark.parametrize("late", [0.4, -0.3, 0.0])
 def test_time_shift_is_estimated(late: float) -> None:
     times = np.arange(float(FRAMES))
@@ -354,93 +232,6 @@ def test_few_outlier_tracks_change_little() -> None:
     result = adjusted(made, made.truth)
     metres, _ = errors(result.poses, made.truth)
     assert metres.max() < 2e-3
-
-
-DISTORTIONS = [
-    (),
-    (-0.1, 0.05, 0.0, 0.0),
-    (-0.1, 0.05, 0.004, -0.003),
-    (0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
-    (0.1, -0.05, 0.001, -0.002, 0.01, 0.15, 0.01, 0.002),
-]
-
-
-def dense(lin: Linearised, tracks: BundleTracks) -> Array:
-    """(2 m, 6 n + 12) derivatives by corrections and shared parameters."""
-    jacobian = np.zeros((len(tracks.frame), 2, 6 * FRAMES + SHARED))
-    for i, (host, frame) in enumerate(
-        zip(tracks.host_frame, tracks.frame, strict=True)
-    ):
-        jacobian[i, :, 6 * host : 6 * host + 6] = lin.by_host[i]
-        jacobian[i, :, 6 * frame : 6 * frame + 6] = lin.by_frame[i]
-    jacobian[..., -INTRINSICS:] = lin.by_intrinsics
-    return jacobian.reshape(-1, jacobian.shape[2])
-
-
-def test_normal_equations_are_those_of_the_dense_derivatives() -> None:
-    made = world(CAMERA)
-    frames = StatedFrames(made.truth, [CAMERA] * FRAMES)
-    tracks = made.tracks
-    rng = np.random.default_rng(1)
-    size = 6 * FRAMES + SHARED
-    own = rng.normal(0, 1e-3, (FRAMES, 6))
-    shared = np.zeros(SHARED)
-    lin = frames.linearise(tracks, Parameters(own, shared, tracks.inverse_depth))
-    weight = rng.uniform(0.5, 2, len(tracks.frame))
-    solution = NormalEquations.of(
-        tracks, lin, weight, np.eye(size), np.zeros(size)
-    ).solve(0.1)
-    assert solution is not None
-    depth = np.zeros((2 * len(tracks.frame), len(tracks.host)))
-    depth[np.arange(len(depth)), np.repeat(tracks.landmark, 2)] = lin.by_depth.ravel()
-    root = np.sqrt(np.repeat(weight, 2))[:, None]
-    whole = np.hstack([dense(lin, tracks), depth]) * root
-    slope = lin.residual.ravel() * root[:, 0]
-    system = whole.T @ whole + np.diag(
-        np.r_[np.ones(size), np.full(depth.shape[1], 1e-6)]
-    )
-    system += 0.1 * np.diag(np.diag(system))
-    step = -np.linalg.solve(system, whole.T @ slope)
-    np.testing.assert_allclose(solution.change, step[:size], rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(solution.depths, step[size:], rtol=1e-6, atol=1e-12)
-
-
-@pytest.mark.parametrize("distortion", DISTORTIONS)
-def test_derivatives_are_finite_differences(distortion: tuple[float, ...]) -> None:
-    camera = replace(CAMERA, distortion=distortion)
-    made = world(camera)
-    frames = StatedFrames(made.truth, [camera] * FRAMES)
-    tracks = made.tracks
-
-    def parameters(change: Array, depth: Array) -> Parameters:
-        own = change[: 6 * FRAMES].reshape(-1, 6)
-        shared = change[6 * FRAMES :]
-        return Parameters(own, shared, depth)
-
-    def residual(change: Array, depth: Array = tracks.inverse_depth) -> Array:
-        return frames.linearise(tracks, parameters(change, depth)).residual.ravel()
-
-    zero = np.zeros(6 * FRAMES + SHARED)
-    lin = frames.linearise(tracks, parameters(zero, tracks.inverse_depth))
-    jacobian = dense(lin, tracks)
-    rng = np.random.default_rng(0)
-    poses = rng.choice(6 * FRAMES, 30, replace=False)
-    intrinsics = 6 * FRAMES + COMMON + SHIFT + np.arange(INTRINSICS)
-    for column in (*poses.tolist(), *intrinsics.tolist()):
-        step = zero.copy()
-        # Changes of the distortion below 1e-4 are ignored.
-        step[column] = 1e-3 if column >= 6 * FRAMES + SHARED - 2 else 1e-5
-        slope = (residual(step) - residual(-step)) / (2 * step[column])
-        np.testing.assert_allclose(
-            jacobian[:, column], slope, atol=1e-3 * np.abs(slope).max()
-        )
-    # Common transform and time shift act through the priors alone.
-    assert not jacobian[:, 6 * FRAMES : 6 * FRAMES + COMMON + SHIFT].any()
-    rho = tracks.inverse_depth
-    slope = (residual(zero, rho + 1e-6) - residual(zero, rho - 1e-6)) / 2e-6
-    np.testing.assert_allclose(
-        lin.by_depth.ravel(), slope, atol=1e-4 * np.abs(slope).max()
-    )
 
 
 def test_steps_reach_the_minimum_of_a_slow_solver() -> None:
@@ -485,7 +276,7 @@ def test_steps_reach_the_minimum_of_a_slow_solver() -> None:
     slow = scipy.optimize.least_squares(
         residuals, np.zeros(len(scale)), xtol=1e-14, ftol=1e-14
     )
-    cost = bundle.cost(estimate.linearised, estimate.parameters, variances, noise)
+    cost = bundle.cost(estimate, variances, noise)
     assert 2 * slow.cost == pytest.approx(cost, rel=2e-6)
     expected = parameters(slow.x)
     difference = np.concatenate(
@@ -517,9 +308,9 @@ def test_no_step_raises_the_cost_far_from_the_minimum() -> None:
     estimate = bundle.start(tracks)
     for _ in range(10):
         noise = noise_of(estimate.linearised)
-        before = bundle.cost(estimate.linearised, estimate.parameters, variances, noise)
+        before = bundle.cost(estimate, variances, noise)
         estimate = bundle.step(tracks, estimate, variances)
-        after = bundle.cost(estimate.linearised, estimate.parameters, variances, noise)
+        after = bundle.cost(estimate, variances, noise)
         assert after <= before * (1 + 1e-8)
 
 

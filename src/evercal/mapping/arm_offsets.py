@@ -2,24 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 
-from evercal.mapping.bundle_adjustment import JointSlopes
 from evercal.recordings.frame import Frame
+from evercal.robot.arm import Arm, JointSlopes
 from evercal.robot.mount import Mount
 from evercal.typing import Array, BoolArray
-
-if TYPE_CHECKING:
-    from evercal.robot.arm import Arm
 
 
 @dataclass(frozen=True, eq=False)
 class ArmOffsets:
     """Estimated offsets of the k joints of an arm."""
 
-    arm: "Arm"
+    arm: Arm
     mount: Mount
     """Of the camera; the map of a fixed one is in the frame of the gripper."""
     values: Array
@@ -32,7 +29,7 @@ class ArmOffsets:
     """(k,) whether the images tell the offset."""
 
     @classmethod
-    def start(cls, arm: "Arm", mount: Mount, values: Array) -> Self:
+    def start(cls, arm: Arm, mount: Mount, values: Array) -> Self:
         """Offsets of unknown uncertainty."""
         unknown = np.full(len(values), np.inf)
         return cls(arm, mount, values, np.diag(unknown), unknown, np.isfinite(unknown))

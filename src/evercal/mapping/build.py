@@ -16,11 +16,8 @@ from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera
 from evercal.geometry.uncertain_pose import frame_covariance
 from evercal.mapping.arm_offsets import ArmOffsets
-from evercal.mapping.bundle_adjustment import (
-    Adjustment,
-    BundleAdjustment,
-    BundleOptions,
-)
+from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment
+from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.map_frame import MapFrame, Similarity, fit_correction, shared_sigma
 from evercal.mapping.memory_budget import MemoryBudget

@@ -13,7 +13,8 @@ import numpy as np
 
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, average_poses
-from evercal.mapping.bundle_adjustment import BundleAdjustment, BundleOptions
+from evercal.mapping.bundle_adjustment import BundleAdjustment
+from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.landmarks import project_surface
 from evercal.mapping.patches import cut_patches, to_level

@@ -27,7 +27,7 @@ from evercal.features.views import working_image
 from evercal.features.vlad import similar_pairs
 from evercal.geometry import SE3, Camera, cross_matrix
 from evercal.mapping.arm_offsets import ArmOffsets
-from evercal.mapping.bundle_adjustment import BundleOptions
+from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.selection import spread_poses
 from evercal.processes import cores
 from evercal.progress import OnProgress

@@ -1,0 +1,73 @@
+"""`BundleOptions`: priors and weights of a bundle adjustment."""
+
+from dataclasses import dataclass
+
+from evercal.errors import require_numbers
+
+_MAY_BE_ZERO = ("relevance", "least_share", "least_systematic")
+"""Lower bounds that have no effect at 0."""
+_LEAST = 1e-12
+"""Smallest value of the other numbers, which are divisors."""
+
+
+@dataclass(frozen=True)
+class BundleOptions:
+    """Priors and weights of a bundle adjustment."""
+
+    iterations: int = 10
+    """Maximum number of Levenberg-Marquardt steps."""
+    start_sigma_m: float = 0.01
+    """Standard deviation of stated positions per axis, metres, before it is estimated."""
+    start_sigma_deg: float = 0.4
+    """The same for stated rotations, degrees."""
+    least_sigma_m: float = 5e-5
+    """Lower bound of the estimated standard deviation of positions per axis, metres."""
+    least_sigma_deg: float = 3e-4
+    """The same for rotations, degrees."""
+    most_sigma_m: float = 0.1
+    """Upper bound of the estimated standard deviation of positions per axis, metres."""
+    most_sigma_rad: float = 0.1
+    """The same for rotations, radians."""
+    common_sigma_m: float = 0.02
+    """Prior standard deviation of the common translation per axis, metres."""
+    common_sigma_deg: float = 2.0
+    """The same for the common rotation, degrees."""
+    common_stated: bool = True
+    """The common transform stays zero unless the images contradict. False for a rough
+    `gripper_from_camera`: the common transform is estimated with its full uncertainty."""
+    joint_sigma_deg: float = 3.0
+    """Prior standard deviation of the offset of a joint, degrees, before it is estimated."""
+    joint_sigma_m: float = 0.01
+    """The same for sliding joints, metres."""
+    shift_sigma_frames: float = 2.0
+    """Prior standard deviation of the time shift, in frames of the recording."""
+    focal_sigma: float = 0.02
+    """Prior standard deviation of the focal length, as a share of it."""
+    centre_sigma_px: float = 5.0
+    """Prior standard deviation of the principal point, pixels."""
+    distortion_sigma: float = 0.2
+    """Prior standard deviation of k1 and k2 where the recording states no distortion."""
+    relevance: float = 4.0
+    """A group of parameters is adjusted when its squares are this many times their variance."""
+    least_share: float = 1e-6
+    """Variance that a group keeps where the images require no change, as a share of its prior."""
+    least_systematic: float = 0.1
+    """Lower bound of the variance of systematic errors of an arm, in variances of the noise."""
+    tail: float = 5.0
+    """Degrees of freedom of the Student distribution of pose errors, which has heavy tails."""
+    correlation: float = 2.0
+    """Factor on the standard deviation of observations: alignment errors of neighbouring views are
+    correlated."""
+    intrinsics: bool = True
+    """Adjust the intrinsics."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers outside their range.
+
+        Raises:
+            InputError: Fewer than one iteration, a negative number or zero.
+        """
+        flags = {"common_stated", "intrinsics"}
+        require_numbers(self, ("iterations",), 1)
+        require_numbers(self, _MAY_BE_ZERO, 0)
+        require_numbers(self, vars(self).keys() - flags - {*_MAY_BE_ZERO}, _LEAST)

@@ -1,0 +1,122 @@
+"""`StatedErrors`: how the poses of a recording deviate from the stated ones.
+
+A correction of a pose is what the parameters common to all frames explain, and an error of its own.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from evercal.geometry import SE3
+from evercal.mapping.bundle_equations import (
+    COMMON,
+    INTRINSICS,
+    SHARED,
+    SHIFT,
+    Parameters,
+)
+from evercal.robot.arm import JointSlopes
+from evercal.typing import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Variances:
+    """Priors of a bundle adjustment."""
+
+    sigma: Array
+    """(6,) standard deviation of stated poses, metres and radians."""
+    weight: Array
+    """(n,) weights of the stated poses."""
+    shared: Array
+    """(12 + k,) variances of the shared parameters."""
+
+    def close_to(self, other: "Variances", tolerance: float) -> bool:
+        """Whether two priors differ by less than this share."""
+        return all(
+            np.allclose(values, vars(other)[name], rtol=tolerance, atol=0)
+            for name, values in vars(self).items()
+        )
+
+
+class StatedErrors:
+    """Corrections of the stated poses of n frames, and their prior.
+
+    The velocity (n, 6) is the motion from frame to frame, camera frame, metres and radians; 0 if
+    unknown. With `gripper_from_camera` (n,), the errors of stated poses are those of an arm: they
+    arise at the gripper, and its rotation moves the camera on a lever. With `joints`, offsets of
+    its joints are estimated.
+    """
+
+    def __init__(
+        self,
+        velocity: Array,
+        gripper_from_camera: SE3 | None = None,
+        joints: JointSlopes | None = None,
+    ):
+        self.n = len(velocity)
+        self.gripper_from_camera = gripper_from_camera or SE3.identity((self.n,))
+        self.lever = self.gripper_from_camera.adjoint()
+        self.joints = joints or JointSlopes(
+            np.zeros((self.n, 6, 0)), np.zeros(0, dtype=bool), np.zeros(0)
+        )
+        by_joints = np.linalg.solve(self.lever, self.joints.slopes)
+        by_common = np.tile(np.eye(6), (self.n, 1, 1))
+        self.motion = np.concatenate([by_common, velocity[..., None], by_joints], 2)
+        """(n, 6, 7 + k) motion of each camera by common transform, time shift and joints."""
+        self.size = SHARED + by_joints.shape[2]
+        """Number of shared parameters."""
+        last = self.size - INTRINSICS
+        self.moving = slice(0, last)
+        """Shared parameters that move cameras."""
+        self.offsets = slice(COMMON + SHIFT, last)
+        """Shared parameters that are offsets of joints."""
+
+    def of_cameras(self, parameters: Parameters) -> Array:
+        """(n, 6) of each correction from what the shared parameters explain."""
+        moved = parameters.shared[self.moving].copy()
+        moved[self.offsets] -= self.joints.at
+        return parameters.correction - self.motion @ moved
+
+    def at_origin(self, parameters: Parameters) -> Array:
+        """(n, 6) the same where the errors arise: at the gripper, or at the camera."""
+        return np.einsum("nij,nj->ni", self.lever, self.of_cameras(parameters))
+
+    def of_rows(self, rows: Array) -> Array:
+        """(r, n, 6) errors at their origin by rows (r, 6 n + 12 + k) of all parameters.
+
+        Of the factor of the parameters' covariance, that of the errors.
+        """
+        corrections = rows[:, : 6 * self.n].reshape(-1, self.n, 6)
+        shared = rows[:, 6 * self.n :][:, self.moving]
+        explained = np.einsum("nij,kj->kni", self.motion, shared)
+        return np.einsum("nij,knj->kni", self.lever, corrections - explained)
+
+    def prior(
+        self, parameters: Parameters, variances: Variances
+    ) -> tuple[Array, Array]:
+        """Normal matrix of the priors (6 n + 12 + k, 6 n + 12 + k), and their slope."""
+        poses = 6 * self.n
+        system = np.zeros((poses + self.size,) * 2)
+        slope = np.zeros(poses + self.size)
+        precision = self._precision(variances)
+        pull = np.einsum("nij,nj->ni", precision, self.of_cameras(parameters))
+        drift = precision @ self.motion
+        moving = slice(poses, poses + self.motion.shape[2])
+        for i in range(self.n):
+            rows = slice(6 * i, 6 * i + 6)
+            system[rows, rows] = precision[i]
+            system[rows, moving] = -drift[i]
+            system[moving, rows] = -drift[i].T
+        system[moving, moving] = np.einsum("nij,nik->jk", self.motion, drift)
+        slope[:poses] = pull.ravel()
+        slope[moving] = -np.einsum("nij,ni->j", self.motion, pull)
+        shared = np.arange(poses, len(slope))
+        system[shared, shared] += 1 / variances.shared
+        slope[shared] += parameters.shared / variances.shared
+        return system, slope
+
+    def _precision(self, variances: Variances) -> Array:
+        """(n, 6, 6) information on each error of a camera."""
+        weighted = self.lever * variances.weight[:, None, None]
+        scaled = weighted / variances.sigma[:, None] ** 2
+        return self.lever.transpose(0, 2, 1) @ scaled

@@ -1,0 +1,141 @@
+"""Variances of the priors of a bundle adjustment, estimated from its own result.
+
+Each function estimates one of them. Variance components: Foerstner and Wrobel, Photogrammetric
+Computer Vision, 2016, section 4.2.4. Relevance of single parameters: MacKay, Bayesian
+interpolation, 1992.
+
+An estimate d with the prior variance s^2 and the posterior variance v is a share K = 1 - v / s^2 of
+what the images say: y = d / K has the variance s^2 + v / K.
+"""
+
+import numpy as np
+
+from evercal.mapping.bundle_options import BundleOptions
+from evercal.typing import Array
+
+_COMMON_GROUPS = (slice(0, 3), slice(3, 6))
+"""Common translation and rotation: shared parameters that are relevant or not together."""
+_OTHER_GROUPS = (slice(6, 7), slice(-5, -4), slice(-4, -2), slice(-2, None))
+"""The same: time shift, focal length, principal point, distortion."""
+RESOLVED_SHARE = 0.03
+"""Below this mean share K, errors of stated poses are smaller than what the images resolve."""
+UNRESOLVED_SHRINKAGE = 1.5
+"""Divisor of the standard deviation of errors that the images do not resolve, in one iteration."""
+MOST_SHRINKAGE = 3
+"""Largest divisor of the standard deviation of stated poses in one iteration."""
+MOST_GROWTH = 2
+"""Largest factor on the standard deviation of stated poses in one iteration."""
+LEAST_SHARE = 1e-3
+"""Lower bound of the share K of a shared parameter, which is a divisor."""
+VARIANCE_SHRINKAGE = 16
+"""Largest divisor of the variance of shared parameters in one iteration."""
+USUAL_OFFSET = 0.05 / 3
+"""Prior of the offsets: one pseudo-joint with this offset, in sigmas of the first prior."""
+
+
+def pose_sigma(
+    errors: Array, posterior: Array, weight: Array, sigma: Array, options: BundleOptions
+) -> Array:
+    """Standard deviations (6,) of stated poses: the mean of d^2 - v K over that of K^2.
+
+    Positions and rotations have one each. `sigma` (6,) are those of the iteration before.
+
+    Args:
+        errors: (n, 6) errors d of the stated poses, metres and radians.
+        posterior: (n, 6) their posterior variances v.
+        weight: (n,) see `student_weights`.
+        sigma: (6,) their prior standard deviations s.
+        options: Bounds.
+    """
+    weight = weight[:, None]
+    share = 1 - np.minimum(posterior * weight / sigma**2, 1)
+    estimated = sigma.copy()
+    for axes in (slice(0, 3), slice(3, 6)):
+        before = sigma[axes]
+        k = share[:, axes]
+        if k.mean() < RESOLVED_SHARE:
+            estimated[axes] = before / UNRESOLVED_SHRINKAGE
+            continue
+        excess = (weight * (errors[:, axes] ** 2 - posterior[:, axes] * k)).sum()
+        independent = np.sqrt(max(excess, 0.0) / (k**2).sum())
+        estimated[axes] = independent.clip(
+            before / MOST_SHRINKAGE, before * MOST_GROWTH
+        )
+    least = [options.least_sigma_m, np.deg2rad(options.least_sigma_deg)]
+    most = [options.most_sigma_m, options.most_sigma_rad]
+    return estimated.clip(np.repeat(least, 3), np.repeat(most, 3))
+
+
+def student_weights(errors: Array, sigma: Array, tail: float) -> Array:
+    """Weights (n,) of stated poses whose errors (n, 6) have a Student distribution.
+
+    (tail + 6) / (tail + |d / s|^2) for six axes and `tail` degrees of freedom.
+    """
+    return (tail + 6) / (tail + ((errors / sigma) ** 2).sum(1))
+
+
+def shared_variances(
+    values: Array,
+    rows: Array,
+    prior: Array,
+    widest: Array,
+    joints: slice,
+    options: BundleOptions,
+) -> Array:
+    """Prior variances (12 + k,) of the shared parameters.
+
+    Args:
+        values: (12 + k,) estimates d.
+        rows: (r, 12 + k) factor of their posterior covariance, rows.T @ rows.
+        prior: (12 + k,) their prior variances s^2.
+        widest: (12 + k,) their first prior variances.
+        joints: Parameters that are offsets of joints.
+        options: Bounds.
+    """
+    posterior = np.einsum("ij,ij->j", rows, rows)
+    variances = prior.copy()
+    groups = _OTHER_GROUPS
+    if options.common_stated:
+        groups = _COMMON_GROUPS + groups
+    for group in groups:
+        variances[group] = group_variance(
+            values[group], posterior[group], prior[group], widest[group], options
+        )
+    if joints.stop > joints.start:
+        variances[joints] = joint_variance(
+            values[joints], posterior[joints], prior[joints], widest[joints]
+        )
+    return variances
+
+
+def group_variance(
+    values: Array, posterior: Array, prior: Array, widest: Array, options: BundleOptions
+) -> Array:
+    """Prior variances (g,) of parameters that are relevant or not together.
+
+    The mean of y^2 - v / K, if the images require the group: y^2 exceeds its variance v / K by the
+    factor `options.relevance`. Otherwise it shrinks to a share of the first prior, `widest`.
+    """
+    share = np.maximum(1 - np.minimum(posterior / prior, 1), LEAST_SHARE)
+    squares = (values / share) ** 2
+    noise = posterior / share
+    variance = 0.0
+    if (squares / noise).mean() > options.relevance:
+        variance = (squares - noise).mean()
+    variance = np.clip(variance, prior / VARIANCE_SHRINKAGE, widest)
+    return np.maximum(variance, options.least_share * widest)
+
+
+def joint_variance(
+    values: Array, posterior: Array, prior: Array, widest: Array
+) -> Array:
+    """Prior variances (k,) of the offsets of an arm's joints: one share of `widest` for all.
+
+    The sum of d^2 over the sum of K, both with the pseudo-joint of `USUAL_OFFSET`. So an offset
+    that no image constrains is as large as the others.
+    """
+    constrained = (1 - posterior / prior).clip(0).sum()
+    squares = float((values**2 / widest).sum()) + USUAL_OFFSET**2
+    share = min(squares / (constrained + 1), 1.0)
+    before = float((prior / widest)[0])
+    return max(share, before / VARIANCE_SHRINKAGE) * widest
