@@ -5,6 +5,7 @@ networks import torch.
 """
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -211,6 +212,9 @@ def test_import_is_fast_and_provides_every_public_name() -> None:
     assert float(seconds) < 1.0
     for name in dir(evercal):
         assert getattr(evercal, name) is not None
+    # What `help(evercal)` lists.
+    listed = re.findall(r"^    (\w+)  ", evercal.__doc__ or "", re.M)
+    assert sorted([*listed, "__version__"]) == dir(evercal)
     with pytest.raises(AttributeError, match="'evercal' has no attribute 'Localiser'"):
         _ = evercal.Localiser  # pyright: ignore[reportAttributeAccessIssue]
 

@@ -1,5 +1,6 @@
 """The wheel contains everything the package reads."""
 
+import os
 import re
 import subprocess
 import sys
@@ -25,25 +26,29 @@ DATA = (
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
-    """Names in the wheel of `python -m build`."""
+def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the wheel and the sdist that `python -m build` makes."""
     out = tmp_path_factory.mktemp("dist")
-    command = [
-        sys.executable,
-        "-m",
-        "build",
-        "--wheel",
-        "--no-isolation",
-        "--outdir",
-        str(out),
-    ]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    (path,) = out.glob("evercal-*.whl")
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out))
+    return out
+
+
+@pytest.fixture(scope="module")
+def wheel(distributions: Path) -> set[str]:
+    """Names in the wheel."""
+    (path,) = distributions.glob("evercal-*.whl")
     with zipfile.ZipFile(path) as archive:
         return set(archive.namelist())
+
+
+def run(*command: str, cwd: Path = ROOT) -> str:
+    """What a command prints that knows nothing of this checkout."""
+    environment = {**os.environ, "PYTHONPATH": ""}
+    done = subprocess.run(
+        command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 @pytest.mark.parametrize("pattern", DATA)
@@ -109,3 +114,21 @@ def test_the_licence_of_every_package_is_listed() -> None:
     ):
         everything = brought("evercal", frozenset(extras), {})
         assert everything.keys() - {"evercal"} <= listed
+
+
+@pytest.mark.slow("pyproject.toml", "README.md", "src/evercal/cli/demo.py")
+def test_the_wheel_runs_in_an_empty_environment(
+    distributions: Path, tmp_path: Path
+) -> None:
+    """The wheel alone runs the demo, and both files can be published."""
+    files = sorted(map(str, distributions.glob("evercal-*")))
+    run(sys.executable, "-m", "venv", str(tmp_path / "empty"))
+    python = str(tmp_path / "empty" / "bin" / "python")
+    pins = str(ROOT / "constraints.txt")
+    run(python, "-m", "pip", "install", "-c", pins, files[0], "twine", cwd=tmp_path)
+    assert run(python, "-m", "twine", "check", "--strict", *files).count("PASSED") == 2
+    where = run(python, "-c", "import evercal; print(evercal.__file__)", cwd=tmp_path)
+    assert Path(where.strip()).is_relative_to(tmp_path)
+    evercal = str(tmp_path / "empty" / "bin" / "evercal")
+    run(evercal, "demo", cwd=tmp_path)
+    assert (tmp_path / "evercal-demo" / "report.html").is_file()
