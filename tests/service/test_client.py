@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +12,11 @@ import pytest
 import evercal
 from evercal import Calibration, Client, InputError, Map
 from evercal.geometry import SE3, pose_distance
+from evercal.mapping.store import MapStore
 from evercal.recordings import read_image, write_image
 
 if TYPE_CHECKING:
+    from evercal.mapping.scene_map import MapContents
     from evercal.recordings import Recording
 
 
@@ -72,6 +75,31 @@ def test_calibrations_and_checks(
     assert fixed.mount == "eye_to_hand"
     with pytest.raises(InputError, match="robot_poses: 1 poses for 3 images"):
         client.calibrate(tmp_path, robot_poses=arm[:1])
+
+
+def test_a_camera_before_a_held_thing_is_checked(
+    serve: Any, hall_map: MapContents, hall: Recording, image: Path, tmp_path: Path
+) -> None:
+    store = tmp_path / "held.evercal"
+    held = replace(hall_map.scenes[0], parent_frame="gripper")
+    MapStore.create(store).commit(held, {"scene": "hall"})
+    opened = Map.open(store)
+    arm = SE3.stack([SE3.exp([0.1, 0.2, 0.3, 0.0, 0.1, 0.2])])
+    camera = hall.test[7].camera
+    with serve(store) as service:
+        client = Client(service.url)
+        reference = client.calibrate(image, robot_poses=arm, camera=camera)
+        shift = client.check(image, reference, robot_poses=arm)
+        moved = client.check(image, reference, robot_poses=arm @ arm, camera=camera)
+        with pytest.raises(InputError, match=r"scene hall is a thing.*robot.poses"):
+            client.check(image, reference)
+        with pytest.raises(InputError, match="robot_poses: 2 poses for 1 images"):
+            client.check(image, reference, robot_poses=SE3.stack([*arm, *arm]))
+    expected = opened.check(image, reference, robot_poses=arm)
+    assert not shift.moved
+    assert shift.translation_mm == pytest.approx(expected.translation_mm)
+    assert moved.moved
+    assert moved.translation_mm > 100
 
 
 def test_refusals_are_the_lines_of_the_service(client: Client, tmp_path: Path) -> None:

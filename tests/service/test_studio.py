@@ -27,7 +27,8 @@ from evercal.recordings import load_recording, write_image
 from evercal.service.studio.controls import Tasks
 from evercal.service.studio.devices import Devices
 from evercal.service.studio.page import StudioPage
-from evercal.service.studio.studio import STEPS, Studio
+from evercal.service.studio.steps import STEPS
+from evercal.service.studio.studio import Studio
 from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
 
 

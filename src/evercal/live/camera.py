@@ -17,18 +17,21 @@ class LiveCamera(Protocol):
     """A camera that states when each image was taken."""
 
     def read(self) -> tuple[float, Image]:
-        """Take an image: time in seconds, and (H, W, 3) RGB."""
+        """Return an image, (H, W, 3) RGB, and the time when it was taken, seconds."""
         ...
 
 
 class StreamCamera:
     """The frames of a camera, a network stream, a video or a folder, one for each `read`.
 
-    A live image arrived after the call that asks for it; it was taken earlier by the delay of the
-    source. A thread empties the buffer of a live source. A video or a folder gives its next frame.
+    Of a live source, `read` returns the first image that arrives after the call, never a buffered
+    one. It blocks until then. Of a video or a folder it returns the next frame.
 
-    `rate` is that of a folder whose file names hold no times, per second. A live source that gives
-    no image for `timeout_s` has ended; None waits as long as it is open.
+    Args:
+        source: Number or device of a camera, address of a stream, video file or folder.
+        rate: Frames per second of a folder whose file names hold no times.
+        timeout_s: Seconds without an image after which a live source has ended; None waits as long
+            as it is open.
     """
 
     def __init__(self, source: str, rate: float = 15.0, timeout_s: float | None = 5.0):
@@ -39,14 +42,17 @@ class StreamCamera:
         self._error: Exception | None = None
         self._changed = threading.Condition()
         self._ended = False
-        self._thread = (
-            threading.Thread(target=self._run, daemon=True) if is_live(source) else None
-        )
-        if self._thread is not None:
+        self._thread: threading.Thread | None = None
+        if is_live(source):  # the thread empties the buffer of the source
+            self._thread = threading.Thread(target=self._run, daemon=True)
             self._thread.start()
 
     def read(self) -> tuple[float, Image]:
-        """Take the next image; an error of a live source is raised here."""
+        """Return the next image with its time, seconds.
+
+        Raises:
+            InputError: The source has ended, or reading a live one failed.
+        """
         for frame in self:
             return frame.stamp_s, frame.image
         raise InputError(
@@ -77,7 +83,7 @@ class StreamCamera:
         self.close()
 
     def _next(self) -> StreamFrame | None:
-        """The next frame, of a live source the first to arrive from now on; None at the end."""
+        """The next frame, of a live source the first that arrives from now on; None at the end."""
         if self._thread is None:
             return next(self._frames, None)
         asked_s = time.monotonic()
@@ -110,5 +116,6 @@ class StreamCamera:
                 self._changed.notify_all()
 
     def _close_frames(self) -> None:
-        if (close := getattr(self._frames, "close", None)) is not None:
+        close = getattr(self._frames, "close", None)
+        if close is not None:
             close()

@@ -1,4 +1,4 @@
-"""What a wrist recording covers so far, and which samples are bad.
+"""Which motions a wrist recording covers so far, and which samples are bad.
 
 Hand-eye calibration needs rotations about two axes (Tsai and Lenz, IEEE T-RA 1989); images are
 blurred, over- or underexposed, or show what another one shows.
@@ -17,19 +17,23 @@ from evercal.typing import Array, Image
 
 IMAGES = 25
 """Images of a complete recording."""
-ROTATION_DEG, POSITION_MM = 8.0, 25.0
-"""Standard deviations about or along an axis that counts as covered."""
+ROTATION_DEG = 8.0
+"""Standard deviation of the rotations about an axis, from which it counts as covered, degrees."""
+POSITION_MM = 25.0
+"""Standard deviation of the positions along an axis, from which it counts as covered."""
 SHARPNESS = 0.8
-"""Sharpness, relative to the median, below which an image is blurred."""
+"""Sharpness, relative to the median of the recording, below which an image is blurred."""
 CLIPPED = 0.15
 """Share of black or white pixels above which an image is badly exposed."""
-SAME_MM, SAME_DEG = 8.0, 2.0
-"""Two samples closer than both are duplicates."""
+SAME_MM = 8.0
+"""Distance in millimetres below which two samples may be duplicates."""
+SAME_DEG = 2.0
+"""Rotation in degrees below which two samples may be duplicates."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """What coverage needs of one frame; measure it once."""
+    """Pose and image quality of one frame, measured once."""
 
     name: str
     base_from_gripper: SE3
@@ -44,7 +48,10 @@ class Sample:
         assert frame.base_from_gripper is not None, "coverage is of gripper poses"
         image = frame.read_image()
         return cls(
-            frame.name, frame.base_from_gripper, sharpness(image), clipped_share(image)
+            name=frame.name,
+            base_from_gripper=frame.base_from_gripper,
+            sharpness=sharpness(image),
+            clipped=clipped_share(image),
         )
 
 
@@ -73,11 +80,11 @@ class AxisCoverage:
 
 @dataclass(frozen=True)
 class Coverage:
-    """What a recording covers."""
+    """Motions that a recording covers, its bad samples, and what to record next."""
 
     samples: tuple[SampleReport, ...]
     rotations: tuple[AxisCoverage, ...]
-    """About x, y and z of the camera, or of the gripper if the camera's place is unknown."""
+    """About x, y and z of the camera, or of the gripper if gripper_from_camera is unknown."""
     positions: tuple[AxisCoverage, ...]
     """Of the camera or the gripper, along x, y and z of the base."""
     rotation_rank: int
@@ -97,21 +104,26 @@ def coverage(
 
     With a rough `gripper_from_camera`, axes are those of the camera.
     """
-    rows = _sample_reports(samples)
-    good = [s for s, row in zip(samples, rows, strict=True) if not row.problems]
-    poses = SE3.stack([sample.base_from_gripper for sample in good])
+    poses = SE3.stack([sample.base_from_gripper for sample in samples])
+    rows = _sample_reports(samples, poses)
+    good = [i for i, row in enumerate(rows) if not row.problems]
+    poses = poses[good]
     mover = "gripper"
     if gripper_from_camera is not None:
         poses = poses @ gripper_from_camera
         mover = "camera"
-    turned, principal = _rotations_deg(poses)
-    moved = 1000 * poses.translation_m.std(0) if good else np.zeros(3)
-    rotations = _axes(f"about the {mover}'s", turned, ROTATION_DEG)
-    positions = _axes("along the base's", moved, POSITION_MM)
-    rank = int((principal >= ROTATION_DEG).sum())
+    rotation_spreads, principal_spreads = _rotation_spreads_deg(poses)
+    position_spreads = np.zeros(3)
+    if good:
+        position_spreads = 1000 * poses.translation_m.std(0)
+    rotations = _axes(f"about the {mover}'s", rotation_spreads, ROTATION_DEG)
+    positions = _axes("along the base's", position_spreads, POSITION_MM)
+    rank = int((principal_spreads >= ROTATION_DEG).sum())
     ready = len(good) >= MIN_GRIPPER_FRAMES and rank >= 2
     missing = _missing(len(good), rank, rotations, positions)
-    state = "can be learned" if ready else "cannot be learned yet"
+    state = "cannot be learned yet"
+    if ready:
+        state = "can be learned"
     verdict = f"{len(good)} of {len(rows)} images are good; the recording {state}."
     if missing:
         verdict += f" Missing: {'; '.join(missing[:3])}."
@@ -122,17 +134,20 @@ def coverage(
 
 def clipped_share(image: Image) -> float:
     """Share of pixels that are black (0 to 2) or white (253 to 255) in all channels."""
-    return float(((image >= 253).all(-1) | (image <= 2).all(-1)).mean())
+    white = (image >= 253).all(-1)
+    black = (image <= 2).all(-1)
+    return float((white | black).mean())
 
 
-def _sample_reports(samples: Sequence[Sample]) -> tuple[SampleReport, ...]:
-    middle = (
-        float(np.median([sample.sharpness for sample in samples])) if samples else 1.0
-    )
-    poses = SE3.stack([sample.base_from_gripper for sample in samples])
+def _sample_reports(samples: Sequence[Sample], poses: SE3) -> tuple[SampleReport, ...]:
+    median = 0.0
+    if samples:
+        median = float(np.median([sample.sharpness for sample in samples]))
     rows = []
     for i, sample in enumerate(samples):
-        relative = sample.sharpness / middle if middle > 0 else 0.0
+        relative = 0.0
+        if median > 0:
+            relative = sample.sharpness / median
         problems = []
         if relative < SHARPNESS:
             problems.append(f"blurred (sharpness {100 * relative:.0f} % of the median)")
@@ -142,9 +157,10 @@ def _sample_reports(samples: Sequence[Sample]) -> tuple[SampleReport, ...]:
             )
         if i:
             metres, radians = pose_distance(poses[i], poses[:i])
-            away = np.stack([1000 * metres / SAME_MM, np.rad2deg(radians) / SAME_DEG])
-            nearest = int(np.argmin(np.hypot(*away)))
-            if (away[:, nearest] < 1).all():
+            positions = 1000 * metres / SAME_MM
+            rotations = np.rad2deg(radians) / SAME_DEG
+            nearest = int(np.argmin(np.hypot(positions, rotations)))
+            if positions[nearest] < 1 and rotations[nearest] < 1:
                 problems.append(f"same pose as {samples[nearest].name}")
         rows.append(
             SampleReport(sample.name, relative, sample.clipped, tuple(problems))
@@ -152,22 +168,23 @@ def _sample_reports(samples: Sequence[Sample]) -> tuple[SampleReport, ...]:
     return tuple(rows)
 
 
-def _rotations_deg(poses: SE3) -> tuple[Array, Array]:
-    """Standard deviations about the mover's own axes, and about principal axes, degrees, (3,)."""
+def _rotation_spreads_deg(poses: SE3) -> tuple[Array, Array]:
+    """Standard deviations about the mover's axes, and about principal axes, degrees, (3,)."""
     if len(poses) < 2:
         return np.zeros(3), np.zeros(3)
     rotations = poses.rotation
-    away = np.rad2deg((rotations.mean().inv() * rotations).as_rotvec())
-    away = away - away.mean(0)
-    principal = np.linalg.svd(away, compute_uv=False) / np.sqrt(len(away))
-    return away.std(0), np.pad(principal, (0, 3 - len(principal)))
+    from_mean = rotations.mean().inv() * rotations
+    angles = np.rad2deg(from_mean.as_rotvec())
+    angles = angles - angles.mean(0)
+    principal = np.linalg.svd(angles, compute_uv=False) / np.sqrt(len(angles))
+    return angles.std(0), np.pad(principal, (0, 3 - len(principal)))
 
 
 def _axes(words: str, spreads: Array, least: float) -> tuple[AxisCoverage, ...]:
-    named = zip("xyz", spreads.tolist(), strict=True)
-    return tuple(
-        AxisCoverage(f"{words} {axis} axis", s, s >= least) for axis, s in named
-    )
+    axes = []
+    for letter, spread in zip("xyz", spreads.tolist(), strict=True):
+        axes.append(AxisCoverage(f"{words} {letter} axis", spread, spread >= least))
+    return tuple(axes)
 
 
 def _missing(
@@ -196,6 +213,5 @@ def _missing(
 
 
 def _uncovered(axes: Sequence[AxisCoverage]) -> list[AxisCoverage]:
-    return sorted(
-        (axis for axis in axes if not axis.covered), key=lambda axis: axis.spread
-    )
+    uncovered = [axis for axis in axes if not axis.covered]
+    return sorted(uncovered, key=lambda axis: axis.spread)

@@ -8,19 +8,22 @@ The table is replaced as a whole after every change, so that the folder is a val
 time. A folder that was begun earlier is continued.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.formats import wrist
-from evercal.recordings.frame import Frame
+from evercal.recordings.frame import Frame, stated_grippers
 from evercal.recordings.images import write_jpeg
 from evercal.storage import write_bytes, write_json
 from evercal.typing import Image
 
 POSES = "base_from_gripper.csv"
+"""File name of the gripper poses."""
 JPEG_QUALITY = 95
+"""Quality of the images, as of libjpeg."""
 _COLUMNS = "x,y,z,qw,qx,qy,qz"
 
 
@@ -57,8 +60,7 @@ class WristRecorder:
         if not self._frames:
             (self._root / "images").mkdir(parents=True, exist_ok=True)
             write_json(self._root / "camera.json", asdict(self._camera))
-        numbers = [int(Path(frame.name).stem) for frame in self._frames]
-        name = f"{max(numbers, default=-1) + 1:04d}.jpg"
+        name = next_name(frame.name for frame in self._frames)
         path = self._root / "images" / name
         write_jpeg(path, image, JPEG_QUALITY)
         frame = Frame(name, path, self._camera, None, base_from_gripper)
@@ -78,23 +80,27 @@ class WristRecorder:
     def _write_poses(self) -> None:
         path = self._root / POSES
         if self._frames:
-            poses = SE3.stack(
-                [p for f in self._frames if (p := f.base_from_gripper) is not None]
-            )
-            names = tuple(frame.name for frame in self._frames)
+            poses = stated_grippers(self._frames)
+            names = [frame.name for frame in self._frames]
             write_bytes(path, pose_rows(poses, names).encode())
         else:
             path.unlink(missing_ok=True)
 
 
-def pose_rows(poses: SE3, names: tuple[str, ...] | None = None) -> str:
+def next_name(names: Iterable[str]) -> str:
+    """File name of the image after those with these names, which are numbers."""
+    number = 0
+    for name in names:
+        number = max(number, int(Path(name).stem) + 1)
+    return f"{number:04d}.jpg"
+
+
+def pose_rows(poses: SE3, names: Sequence[str] = ()) -> str:
     """A table of (n,) poses, with a column of (n,) image names if given."""
-    first = ("image", *names) if names is not None else ("",) * (len(poses) + 1)
     rows = [_COLUMNS]
     for pose in poses:
         numbers = (*pose.translation_m, *pose.rotation_wxyz)
-        rows.append(",".join(f"{number:.8f}" for number in numbers))
-    named = [
-        f"{name},{row}" if name else row for name, row in zip(first, rows, strict=True)
-    ]
-    return "\n".join(named) + "\n"
+        rows.append(",".join(map("{:.8f}".format, numbers)))
+    if names:
+        rows = list(map("{},{}".format, ("image", *names), rows))
+    return "\n".join(rows) + "\n"

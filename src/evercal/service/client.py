@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,6 @@ from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.errors import InputError, missing_extra
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
-from evercal.recordings.image_files import image_files
 from evercal.recordings.images import as_rgb
 from evercal.robot.mount import MountName
 from evercal.typing import PathLike
@@ -46,7 +45,9 @@ class Client:
             import urllib3
         except ImportError:
             raise missing_extra("a client needs urllib3", "serve") from None
-        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        headers = {}
+        if token is not None:
+            headers["Authorization"] = f"Bearer {token}"
         self._url = url.rstrip("/")
         retries = urllib3.Retry(
             connect=2, read=0, redirect=0, status=0, other=0, backoff_factor=0.1
@@ -82,9 +83,7 @@ class Client:
         mount: MountName | None = None,
     ) -> Calibration:
         """Calibrate a camera from its images, see `Map.calibrate`."""
-        parts = [*_image_parts(images), *_json_part("camera", camera)]
-        if robot_poses is not None:
-            parts.append(("robot_poses", _poses_part(robot_poses)))
+        parts = _image_parts(images, robot_poses, camera)
         if mount is not None:
             parts.append(("mount", mount))
         return Calibration.from_dict(self._ask("POST", "/calibrations", parts))
@@ -94,6 +93,7 @@ class Client:
         images: "ImageSource",
         calibration: Calibration,
         *,
+        robot_poses: PathLike | SE3 | None = None,
         camera: Camera | None = None,
     ) -> "Shift":
         """Test whether a fixed camera has moved, see `Map.check`.
@@ -102,10 +102,9 @@ class Client:
         """
         from evercal.calibration.drift import Shift
 
-        parts = [*_image_parts(images), *_json_part("camera", camera)]
-        record = self._ask(
-            "POST", "/check", [*parts, *_json_part("calibration", calibration)]
-        )
+        parts = _image_parts(images, robot_poses, camera)
+        parts += _json_part("calibration", calibration)
+        record = self._ask("POST", "/check", parts)
         record.pop("images")
         left_out = tuple(ImageUse(**use) for use in record.pop("left_out"))
         pose = SE3.from_matrix(record.pop("reference_from_now"))
@@ -118,20 +117,18 @@ class Client:
         try:
             answer = self._pool.request(method, self._url + path, fields=parts)
         except urllib3.exceptions.HTTPError as error:
-            reason = " ".join(str(getattr(error, "reason", None) or error).split())[
-                :200
-            ]
-            raise InputError(f"{self._url}: no answer ({reason})") from None
+            reason = " ".join(str(getattr(error, "reason", None) or error).split())
+            raise InputError(f"{self._url}: no answer ({reason[:200]})") from None
         try:
             content = json.loads(answer.data)
         except ValueError:
             content = None
-        if answer.status >= 400 or content is None:
-            error = content.get("error") if isinstance(content, dict) else None
-            raise InputError(
-                error or f"{self._url}: status {answer.status}; is it evercal serve?"
-            )
-        return content
+        if answer.status < 400 and content is not None:
+            return content
+        message = f"{self._url}: status {answer.status}; is it evercal serve?"
+        if isinstance(content, dict):
+            message = content.get("error") or message
+        raise InputError(message)
 
 
 def _image_part(image: np.ndarray | PathLike, name: str) -> Part:
@@ -145,14 +142,20 @@ def _image_part(image: np.ndarray | PathLike, name: str) -> Part:
     return name, data.tobytes()
 
 
-def _image_parts(source: "ImageSource") -> Parts:
-    single = isinstance(source, str | os.PathLike) or (
-        isinstance(source, np.ndarray) and source.ndim < 4
-    )
-    items: list[Any] = [source] if single else [*source]  # pyright: ignore[reportGeneralTypeIssues]
-    if not items or isinstance(items[0], str | os.PathLike):
-        items = [*image_files(items)]
-    return [("images", _image_part(item, f"image {i}")) for i, item in enumerate(items)]
+def _image_parts(
+    source: "ImageSource", robot_poses: PathLike | SE3 | None, camera: Camera | None
+) -> Parts:
+    """Images of one camera, with intrinsics and gripper poses if they are given."""
+    from evercal.calibration.from_images import Images
+
+    parts: Parts = []
+    pictures: Sequence[tuple[str, Any]] = Images.of(source).images
+    for name, picture in pictures:
+        parts.append(("images", _image_part(picture, name)))
+    parts += _json_part("camera", camera)
+    if robot_poses is not None:
+        parts.append(("robot_poses", _poses_part(robot_poses)))
+    return parts
 
 
 def _json_part(name: str, record: Camera | Calibration | None) -> Parts:
@@ -164,37 +167,30 @@ def _json_part(name: str, record: Camera | Calibration | None) -> Parts:
 def _poses_part(poses: PathLike | SE3) -> Part:
     if isinstance(poses, str | os.PathLike):
         return _image_part(poses, "")
-    rows = ((*pose.translation_m, *pose.rotation_wxyz) for pose in poses)
-    lines = [
-        "x,y,z,qw,qx,qy,qz",
-        *(",".join(repr(float(v)) for v in row) for row in rows),
-    ]
+    lines = ["x,y,z,qw,qx,qy,qz"]
+    for pose in poses:
+        numbers = [*pose.translation_m.tolist(), *pose.rotation_wxyz.tolist()]
+        lines.append(",".join(map(repr, numbers)))
     return "poses.csv", "\n".join(lines).encode()
 
 
 def _estimate(row: Mapping[str, Any]) -> PoseEstimate:
+    pose = row["base_from_camera"]
     covariance = row["covariance"]
-    same = (
-        "status",
-        "reason",
-        "scene",
-        "inliers",
-        "inlier_ratio",
-        "support",
-        "parent_frame",
-    )
     return PoseEstimate(
-        **{key: row[key] for key in same},
-        base_from_camera=_pose(row["base_from_camera"]),
-        covariance=None if covariance is None else np.array(covariance),
+        status=row["status"],
+        reason=row["reason"],
+        scene=row["scene"],
+        inliers=row["inliers"],
+        inlier_ratio=row["inlier_ratio"],
+        support=row["support"],
+        parent_frame=row["parent_frame"],
+        base_from_camera=pose and _pose(pose),
+        covariance=covariance and np.array(covariance),
         milliseconds=row["ms"],
-        alternatives=tuple(p for p in map(_pose, row["alternatives"]) if p is not None),
+        alternatives=tuple(map(_pose, row["alternatives"])),
     )
 
 
-def _pose(values: Mapping[str, Any] | None) -> SE3 | None:
-    return (
-        None
-        if values is None
-        else SE3(values["quaternion_wxyz"], values["translation_m"])
-    )
+def _pose(values: Mapping[str, Any]) -> SE3:
+    return SE3(values["quaternion_wxyz"], values["translation_m"])

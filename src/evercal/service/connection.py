@@ -14,75 +14,93 @@ def protocols(
 ) -> tuple[type[H11Protocol], type[WebSocketsSansIOProtocol]]:
     """The protocols of a service with limits: of requests, and of streams."""
 
-    class Patient:
-        """Closes a connection whose answers are not read in time."""
+    class BoundedConnection(_Connection):
+        bounds = limits
 
-        loop: asyncio.AbstractEventLoop
-        transport: Any
-        unread: asyncio.TimerHandle | None = None
+    class BoundedStream(_Stream):
+        bounds = limits
 
-        def pause_writing(self) -> None:
-            super().pause_writing()  # pyright: ignore[reportAttributeAccessIssue]
-            self.unread = self.loop.call_later(limits.wait_s, self.transport.abort)
+    return BoundedConnection, BoundedStream
 
-        def resume_writing(self) -> None:
-            super().resume_writing()  # pyright: ignore[reportAttributeAccessIssue]
-            if self.unread is not None:
-                self.unread.cancel()
 
-    class Stream(Patient, WebSocketsSansIOProtocol):
-        """A stream that is closed if its handshake takes too long."""
+class _Patient:
+    """Closes a connection whose answers are not read in time."""
 
-        def connection_made(self, transport: Any) -> None:
-            super().connection_made(transport)
-            self.loop.call_later(limits.wait_s, self._late)
+    bounds: RequestBounds
+    loop: asyncio.AbstractEventLoop
+    transport: Any
+    unread: asyncio.TimerHandle | None = None
 
-        def _late(self) -> None:
-            if not self.handshake_complete:
-                self.transport.abort()
+    def pause_writing(self) -> None:
+        super().pause_writing()  # pyright: ignore[reportAttributeAccessIssue]
+        self.unread = self.loop.call_later(self.bounds.wait_s, self.transport.abort)
 
-    class Connection(Patient, H11Protocol):
-        """A connection that is closed if a header takes too long."""
+    def resume_writing(self) -> None:
+        super().resume_writing()  # pyright: ignore[reportAttributeAccessIssue]
+        if self.unread is not None:
+            self.unread.cancel()
 
-        latest: asyncio.TimerHandle | None = None
 
-        @property
-        def waits(self) -> bool:
-            """Whether no request is under way."""
-            return self.cycle is None or self.cycle.response_complete
+class _Stream(_Patient, WebSocketsSansIOProtocol):
+    """A stream that is closed if its handshake takes too long."""
 
-        def connection_made(self, transport: Any) -> None:
-            super().connection_made(transport)
-            self._wait()
-            if len(self.connections) > limits.connections:
-                others = [
-                    c for c in self.connections if isinstance(c, Connection) and c.waits
-                ]
-                oldest = min(others, key=lambda c: c.latest.when() if c.latest else 0.0)
-                oldest.transport.abort()  # at worst this one
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        self.loop.call_later(self.bounds.wait_s, self._late)
 
-        def connection_lost(self, exc: Exception | None) -> None:
-            self._stop_waiting()
-            super().connection_lost(exc)
+    def _late(self) -> None:
+        if not self.handshake_complete:
+            self.transport.abort()
 
-        def on_response_complete(self) -> None:
-            super().on_response_complete()
-            self._wait()
 
-        def handle_websocket_upgrade(self, event: Any) -> None:
-            self._stop_waiting()
-            super().handle_websocket_upgrade(event)
+class _Connection(_Patient, H11Protocol):
+    """A connection that is closed if a header takes too long."""
 
-        def _wait(self) -> None:
-            self._stop_waiting()
-            self.latest = self.loop.call_later(limits.wait_s, self._late)
+    latest: asyncio.TimerHandle | None = None
+    """Closes the connection unless a request is under way by then."""
 
-        def _stop_waiting(self) -> None:
-            if self.latest is not None:
-                self.latest.cancel()
+    @property
+    def waits(self) -> bool:
+        """Whether no request is under way."""
+        return self.cycle is None or self.cycle.response_complete
 
-        def _late(self) -> None:
-            if self.waits:
-                self.transport.abort()
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        self._wait()
+        if len(self.connections) <= self.bounds.connections:
+            return
+        waiting = []
+        for connection in self.connections:
+            if isinstance(connection, _Connection) and connection.waits:
+                waiting.append(connection)
+        oldest = min(waiting, key=_Connection._deadline)
+        oldest.transport.abort()  # at worst this one
 
-    return Connection, Stream
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._stop_waiting()
+        super().connection_lost(exc)
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        self._wait()
+
+    def handle_websocket_upgrade(self, event: Any) -> None:
+        self._stop_waiting()
+        super().handle_websocket_upgrade(event)
+
+    def _deadline(self) -> float:
+        if self.latest is None:
+            return 0.0
+        return self.latest.when()
+
+    def _wait(self) -> None:
+        self._stop_waiting()
+        self.latest = self.loop.call_later(self.bounds.wait_s, self._late)
+
+    def _stop_waiting(self) -> None:
+        if self.latest is not None:
+            self.latest.cancel()
+
+    def _late(self) -> None:
+        if self.waits:
+            self.transport.abort()

@@ -17,17 +17,22 @@ from evercal.service.hosts import foreign
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
-App = Callable[[MutableMapping[str, Any], Receive, Send], Awaitable[None]]
+App = Callable[[Message, Receive, Send], Awaitable[None]]
 OPEN = ("/", "/health", "/docs", "/openapi.json")
-PAGES = "/pages/"
 """Paths without a token: they reveal nothing of the map."""
+PAGES = "/pages/"
+"""Beginning of the paths of files of the page, which need no token either."""
 SECURE = {
     "Content-Security-Policy": "default-src 'self'; script-src 'self' 'unsafe-inline';"
     " style-src 'self' 'unsafe-inline'; img-src 'self' data:; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
 }
 """Headers of every answer: its pages load nothing from elsewhere, and no page shows them."""
+_HEADERS = tuple(
+    (key.lower().encode(), value.encode()) for key, value in SECURE.items()
+)
 _METHODS = ("GET", "POST", "DELETE", "HEAD", "OPTIONS", "PUT", "PATCH")
+"""Methods that are counted by name; Prometheus would store any other word that came."""
 
 
 class Metrics:
@@ -53,6 +58,40 @@ class Metrics:
         )
 
 
+class _Body:
+    """The body of a request, which is refused with status 408 if it takes too long."""
+
+    def __init__(self, receive: Receive, seconds: float):
+        self._receive = receive
+        self._latest = time.perf_counter() + seconds
+        self._ended = False
+
+    async def part(self) -> Message:
+        """The next message; after the last part the end of the connection."""
+        seconds = None
+        if not self._ended:
+            seconds = max(self._latest - time.perf_counter(), 0.0)
+        try:
+            message = await asyncio.wait_for(self._receive(), seconds)
+        except TimeoutError:
+            self._ended = True
+            raise HTTPException(
+                408, "the body did not arrive in time; send it again"
+            ) from None
+        self._ended = not message.get("more_body", False)
+        return message
+
+    async def discard(self) -> None:
+        """Read the rest for at most a second.
+
+        A connection that is closed with unread bytes is reset: the answer would be lost.
+        """
+        with suppress(TimeoutError, HTTPException):
+            async with asyncio.timeout(1.0):
+                while not self._ended:
+                    await self.part()
+
+
 class Guard:
     """Refuses requests before their body is read; an ASGI middleware.
 
@@ -70,66 +109,51 @@ class Guard:
         self._bodies: dict[object, int] = {}
         self._streams = 0
 
-    async def __call__(
-        self, scope: MutableMapping[str, Any], receive: Receive, send: Send
-    ) -> None:
+    async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
         """Answer a request."""
         if scope["type"] == "lifespan":
             return await self._app(scope, receive, send)
         headers = dict(scope["headers"])
-        refusal = self._refusal(scope["path"], headers)
-        if scope["type"] == "websocket":
-            return await self._stream(refusal, scope, receive, send)
-        began = time.perf_counter()
-        status = 500
-        ended = False
         # The server has checked that it is one.
         length = int(headers.get(b"content-length", b"0"))
-        latest = began + self._limits.wait_s + length / self._limits.bytes_per_s
-
-        async def part() -> Message:
-            nonlocal ended
-            seconds = None if ended else max(latest - time.perf_counter(), 0.0)
-            try:
-                message = await asyncio.wait_for(receive(), seconds)
-            except TimeoutError:
-                ended = True
-                raise HTTPException(
-                    408, "the body did not arrive in time; send it again"
-                ) from None
-            ended = not message.get("more_body", False)
-            return message
+        refusal = self._refusal(scope["path"], headers, length)
+        if scope["type"] == "websocket":
+            return await self._stream(refusal, scope, receive, send)
+        app = self._app
+        if refusal is not None:
+            app = _refused(*refusal)
+        began = time.perf_counter()
+        status = 500
+        seconds = self._limits.wait_s + length / self._limits.bytes_per_s
+        body = _Body(receive, seconds)
 
         async def counted(message: Message) -> None:
             nonlocal status
-            status = message.get("status", status)
-            if "status" in message and status >= 400 and b"expect" not in headers:
-                # A connection that is closed with unread bytes is reset: the answer would be lost.
-                with suppress(TimeoutError, HTTPException):
-                    async with asyncio.timeout(1.0):
-                        while not ended:
-                            await part()
             if "status" in message:
-                given = [(k.lower().encode(), v.encode()) for k, v in SECURE.items()]
-                message = {**message, "headers": [*message.get("headers", ()), *given]}
+                status = message["status"]
+                if status >= 400 and b"expect" not in headers:
+                    await body.discard()
+                headers_sent = [*message.get("headers", ()), *_HEADERS]
+                message = {**message, "headers": headers_sent}
             await send(message)
 
         if refusal is None and length:
-            self._bodies[part] = length
+            self._bodies[body] = length
         try:
-            answer = self._app if refusal is None else _refused(*refusal)
-            await answer(scope, part, counted)
+            await app(scope, body.part, counted)
         finally:
-            self._bodies.pop(part, None)
+            self._bodies.pop(body, None)
             route = getattr(scope.get("route"), "path", "other")
-            method = scope["method"] if scope["method"] in _METHODS else "other"
+            method = scope["method"]
+            if method not in _METHODS:
+                method = "other"
             self._metrics.requests.labels(method, route, status).inc()
             self._metrics.seconds.labels(route).observe(time.perf_counter() - began)
 
     async def _stream(
         self,
         refusal: tuple[int, str] | None,
-        scope: MutableMapping[str, Any],
+        scope: Message,
         receive: Receive,
         send: Send,
     ) -> None:
@@ -146,7 +170,7 @@ class Guard:
             self._streams -= 1
 
     def _refusal(
-        self, path: str, headers: dict[bytes, bytes]
+        self, path: str, headers: dict[bytes, bytes], length: int
     ) -> tuple[int, str] | None:
         """Status and reason for refusing a request."""
         if self._token is not None and path not in OPEN and not path.startswith(PAGES):
@@ -156,9 +180,10 @@ class Guard:
                 return 401, "send 'Authorization: Bearer TOKEN'"
         elif self._token is None:
             # Pages that a browser on this machine shows must not reach the map.
-            host, origin = (headers.get(name) for name in (b"host", b"origin"))
+            host = headers.get(b"host", b"").decode("latin-1")
+            origin = headers.get(b"origin")
             stated = None if origin is None else origin.decode("latin-1")
-            if reason := foreign((host or b"").decode("latin-1"), stated, local=True):
+            if reason := foreign(host, stated, local=True):
                 return 403, f"{reason}; a token is needed"
         kind = headers.get(b"content-type", b"").lower()
         # Some take very long, or break names.
@@ -166,17 +191,12 @@ class Guard:
             return 415, "send forms in UTF-8"
         if b"transfer-encoding" in headers:
             return 411, "bodies of unknown length are refused; send content-length"
-        # The server has checked that it is one.
-        length = int(headers.get(b"content-length", b"0"))
         if length > self._limits.body_bytes:
-            return (
-                413,
-                f"body of {str(length)[:20]} bytes; at most {self._limits.body_bytes}",
-            )
-        waits = len(self._bodies) >= self._limits.requests
-        if length and (
-            waits or sum(self._bodies.values()) + length > self._limits.held_bytes
-        ):
+            most = self._limits.body_bytes
+            return 413, f"body of {str(length)[:20]} bytes; at most {most}"
+        held_bytes = sum(self._bodies.values()) + length
+        crowded = len(self._bodies) >= self._limits.requests
+        if length and (crowded or held_bytes > self._limits.held_bytes):
             return 429, "too many requests wait; try again"
         return None
 

@@ -41,7 +41,9 @@ def listening_socket(host: str, port: int) -> socket.socket:
     """A socket that listens; InputError names `host` or `port` otherwise. Port 0 is any free."""
     if not 0 <= port <= 65_535:  # the resolver takes the remainder
         raise InputError(f"`port` {port}: give 0 to 65535")
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    family = socket.AF_INET
+    if ":" in host:
+        family = socket.AF_INET6
     try:
         return socket.create_server((host, port), family=family)
     except OSError as error:
@@ -52,4 +54,6 @@ def listening_socket(host: str, port: int) -> socket.socket:
 def url_of(host: str, port: int) -> str:
     """Address that a program on this machine opens."""
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
+    if ":" in host:
+        host = f"[{host}]"
+    return f"http://{host}:{port}"

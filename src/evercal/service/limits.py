@@ -59,10 +59,12 @@ class Sent(Sequence[tuple[str, np.ndarray]]):
 
     def check_pixels(self) -> None:
         """Refuse more pixels than a request may hold, by the headers of the images."""
-        sizes = [_header_size(data, name) for name, data in self._files]
-        if (total := sum(w * h for w, h in sizes)) > (
-            most := self._limits.request_pixels
-        ):
+        total = 0
+        for name, data in self._files:
+            width, height = _header_size(data, name)
+            total += width * height
+        most = self._limits.request_pixels
+        if total > most:
             raise TooLargeError(f"images: {total:,} pixels in all; at most {most:,}")
 
     @property
@@ -72,11 +74,9 @@ class Sent(Sequence[tuple[str, np.ndarray]]):
 
     def camera(self, intrinsics: bytes | None) -> Camera | None:
         """The camera in a file of intrinsics, by the size of the first image."""
-        return (
-            None
-            if intrinsics is None
-            else camera_of(intrinsics, self[0][1].shape[1::-1])
-        )
+        if intrinsics is None:
+            return None
+        return camera_of(intrinsics, self[0][1].shape[1::-1])
 
     def __len__(self) -> int:
         return len(self._files)
@@ -101,22 +101,24 @@ def _header_size(data: bytes, name: str) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=8)  # a robot sends the same intrinsics with every image
-def camera_of(data: bytes, size: tuple[int, int]) -> Camera:
-    """Intrinsics in a file that `--camera` would read, for images of a size (width, height)."""
+def camera_of(data: bytes | None, size: tuple[int, int]) -> Camera | None:
+    """Intrinsics in a file of any format, for images of a size (width, height)."""
+    if data is None:
+        return None
     return _from_text(data, "camera", ".json", lambda path: read_camera(path, size))
 
 
 def poses_of(data: bytes, ending: str, images: list[str]) -> SE3:
     """(n,) base_from_gripper of n named images, by a pose table whose file had an ending."""
-    files = [Path(name) for name in images]
-    ending = (
-        ending.lower()
-        if ending.lower() in (".csv", ".txt", ".json", ".tum")
-        else ".csv"
-    )
-    return _from_text(
-        data, "robot_poses", ending, lambda path: poses_of_images(path, files)[0]
-    )
+    files = list(map(Path, images))
+    ending = ending.lower()
+    if ending not in (".txt", ".json", ".tum"):
+        ending = ".csv"
+
+    def read(path: Path) -> SE3:
+        return poses_of_images(path, files)[0]
+
+    return _from_text(data, "robot_poses", ending, read)
 
 
 def calibration_of(data: bytes) -> Calibration:
@@ -131,7 +133,8 @@ def _from_text(
 
     One line for whatever a reader raises, with the name of the request's part.
     """
-    if len(data) > (most := request_bounds().text_bytes):
+    most = request_bounds().text_bytes
+    if len(data) > most:
         raise TooLargeError(f"{name}: {len(data)} bytes; at most {most}")
     if data[:2] == b"PK" or b"\0" in data:
         raise InputError(f"{name}: not a text file; send JSON, YAML or a table as text")

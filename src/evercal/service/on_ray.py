@@ -89,13 +89,7 @@ def serve_on_ray(
             signal.signal(number, lambda *_: stop.set())
         try:
             serve.run(deployment(options, replicas), name=NAME)
-            head = next(
-                node["NodeManagerAddress"]
-                for node in ray.nodes()
-                if "node:__internal_head__" in node["Resources"]
-            )
-            host = head if options.host in ("0.0.0.0", "::") else options.host
-            url = url_of(host, options.port)
+            url = url_of(_listening_host(ray, options.host), options.port)
             # It fails where a Serve that ran before listens elsewhere.
             if Client(url, options.token).scenes != scenes:
                 raise InputError(
@@ -107,3 +101,12 @@ def serve_on_ray(
             raise InputError(f"`ray` {address}: {error}") from None
         finally:
             serve.delete(NAME)
+
+
+def _listening_host(ray: Any, host: str) -> str:
+    """Address of the cluster's head where it listens on all of its addresses."""
+    if host in ("0.0.0.0", "::"):
+        for node in ray.nodes():
+            if "node:__internal_head__" in node["Resources"]:
+                return node["NodeManagerAddress"]
+    return host

@@ -2,13 +2,12 @@
 
 import json
 import time
-from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-import numpy as np
 from fastapi import (
     APIRouter,
     Depends,
@@ -21,13 +20,14 @@ from fastapi import (
 )
 from fastapi.responses import PlainTextResponse, RedirectResponse
 from prometheus_client import generate_latest
+from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketDisconnect
 
 from evercal.bounds import RequestBounds
 from evercal.calibration import drift
+from evercal.calibration.calibration import Mount
 from evercal.calibration.from_images import Images, calibrate
 from evercal.errors import InputError
-from evercal.geometry import Camera
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker
 from evercal.reports.answers import Answer, answer_row, check_record, unit_known
@@ -48,6 +48,11 @@ CameraFile = Annotated[
     UploadFile | None,
     File(description="Intrinsics: JSON, YAML or a 3x3 matrix as text."),
 ]
+PosesFile = Annotated[
+    UploadFile | None,
+    File(description="base_from_gripper of every image: a table as text, or JSON."),
+]
+Shots = Annotated[list[UploadFile], File(description="Image files, all of one camera.")]
 _NAME = 100
 """Characters of a file name that are kept."""
 
@@ -62,24 +67,27 @@ class Service:
     metrics: Metrics
 
 
-def service_of(request: Request | WebSocket) -> Service:
+async def service_of(connection: HTTPConnection) -> Service:
     """The service that a request came to."""
-    return request.app.state.service
+    return connection.app.state.service
 
 
-def form(one: str, many: str = "") -> Any:
-    """Refuse other fields of a form, and all but `many` of them more than once."""
-    known = [*one.split(), *many.split()]
+Asked = Annotated[Service, Depends(service_of)]
+
+
+def form(*known: str) -> Any:
+    """Refuse other fields of a form, and all but `images` more than once."""
 
     async def check(request: Request) -> None:
-        given = Counter(key for key, _ in (await request.form()).multi_items())
-        for name, count in given.items():
+        parts = await request.form()
+        for name in parts:
             if name not in known:
                 fields = ", ".join(known)
                 raise InputError(
                     f"{name[:_NAME]!r} is no field of this form; it has {fields}"
                 )
-            if count > 1 and name not in many.split():
+            count = len(parts.getlist(name))
+            if count > 1 and name != "images":
                 raise InputError(f"{name}: given {count} times; give it once")
 
     return Depends(check)
@@ -92,23 +100,22 @@ async def index() -> Response:
 
 
 @router.get("/health")
-async def health(request: Request) -> dict[str, Any]:
+async def health(service: Asked) -> dict[str, Any]:
     """Whether the service answers."""
-    return {"status": "ok", "scenes": len(service_of(request).live.current.scenes)}
+    return {"status": "ok", "scenes": len(service.live.current.scenes)}
 
 
 @router.get("/scenes")
-async def scenes(request: Request) -> dict[str, Any]:
+async def scenes(service: Asked) -> dict[str, Any]:
     """Names of the scenes, in order of learning."""
-    return {"scenes": list(service_of(request).live.current.scenes)}
+    return {"scenes": list(service.live.current.scenes)}
 
 
-@router.post("/localize", dependencies=[form("image camera")])
+@router.post("/localize", dependencies=[form("image", "camera")])
 async def localize(
-    request: Request, image: UploadFile, camera: CameraFile = None
+    service: Asked, image: UploadFile, camera: CameraFile = None
 ) -> dict[str, Any]:
     """Estimate the camera pose of one image: the row of `evercal localize --json`."""
-    service = service_of(request)
     name = _name(image, "image")
     data = await image.read()
     intrinsics = await _content(camera)
@@ -117,7 +124,9 @@ async def localize(
         localizer = service.live.current.localizer
         began = time.perf_counter()
         pixels = decoded(data, name, service.limits)
-        estimate = localizer.localize(pixels, _camera(intrinsics, pixels))
+        estimate = localizer.localize(
+            pixels, camera_of(intrinsics, pixels.shape[1::-1])
+        )
         milliseconds = 1000 * (time.perf_counter() - began)
         known = unit_known(localizer, estimate.scene)
         return answer_row(Answer(Path(name), estimate, milliseconds, known))
@@ -127,66 +136,79 @@ async def localize(
     return row
 
 
-Shots = Annotated[list[UploadFile], File(description="Image files, all of one camera.")]
+async def _images(
+    service: Service,
+    files: list[UploadFile],
+    camera: UploadFile | None,
+    robot_poses: UploadFile | None,
+) -> Callable[[], Images]:
+    """A function that decodes the images of a request, with their camera and robot poses."""
+    contents = []
+    for i, file in enumerate(files):
+        contents.append((_name(file, f"image {i}"), await file.read()))
+    sent = Sent(contents, service.limits)
+    intrinsics = await _content(camera)
+    table = await _content(robot_poses)
+
+    def decode() -> Images:
+        sent.check_pixels()
+        poses = None
+        if robot_poses is not None and table is not None:
+            ending = Path(robot_poses.filename or "").suffix
+            poses = poses_of(table, ending, sent.names)
+        return Images(sent, sent.camera(intrinsics), poses)
+
+    return decode
 
 
-async def _sent(request: Request, images: list[UploadFile]) -> Sent:
-    files = [
-        (_name(image, f"image {i}"), await image.read())
-        for i, image in enumerate(images)
-    ]
-    return Sent(files, service_of(request).limits)
-
-
-@router.post("/calibrations", dependencies=[form("camera robot_poses mount", "images")])
+@router.post(
+    "/calibrations",
+    dependencies=[form("camera", "robot_poses", "mount", "images")],
+)
 async def calibrations(
-    request: Request,
+    service: Asked,
     images: Shots,
     camera: CameraFile = None,
-    robot_poses: Annotated[
-        UploadFile | None,
-        File(description="base_from_gripper of every image: a table as text, or JSON."),
-    ] = None,
-    mount: Annotated[Literal["eye_to_hand", "eye_in_hand"] | None, Form()] = None,
+    robot_poses: PosesFile = None,
+    mount: Annotated[Mount | None, Form()] = None,
 ) -> dict[str, Any]:
     """Calibrate a camera from its images: the calibration file."""
-    service = service_of(request)
-    sent = await _sent(request, images)
-    table = await _content(robot_poses)
-    intrinsics = await _content(camera)
-    ending = "" if robot_poses is None else Path(robot_poses.filename or "").suffix
+    decode = await _images(service, images, camera, robot_poses)
 
     def work() -> dict[str, Any]:
-        sent.check_pixels()
-        poses = None if table is None else poses_of(table, ending, sent.names)
-        given = Images(sent, sent.camera(intrinsics), poses)
-        return calibrate(service.live.current.localizer, given, mount).to_dict()
+        return calibrate(service.live.current.localizer, decode(), mount).to_dict()
 
     return await service.desk.run(work)
 
 
-@router.post("/check", dependencies=[form("camera calibration", "images")])
+@router.post(
+    "/check",
+    dependencies=[form("camera", "robot_poses", "calibration", "images")],
+)
 async def check(
-    request: Request,
+    service: Asked,
     images: Shots,
     calibration: Annotated[
         UploadFile, File(description="The calibration file of the camera.")
     ],
     camera: CameraFile = None,
+    robot_poses: PosesFile = None,
 ) -> dict[str, Any]:
     """Test whether a fixed camera has moved: the object of `evercal check --json`."""
-    service = service_of(request)
-    sent = await _sent(request, images)
-    reference = await calibration.read()
-    intrinsics = await _content(camera)
+    decode = await _images(service, images, camera, robot_poses)
+    content = await calibration.read()
 
     def work() -> dict[str, Any]:
-        stated = calibration_of(reference)
-        sent.check_pixels()
-        given = sent.camera(intrinsics)
-        return check_record(
-            drift.check(service.live.current.localizer, sent, stated, given)
+        reference = calibration_of(content)
+        given = decode()
+        shift = drift.check(
+            service.live.current.localizer,
+            given.images,
+            reference,
+            given.camera,
+            base_from_gripper=given.base_from_gripper,
         )
+        return check_record(shift)
 
     return await service.desk.run(work)
 
@@ -196,17 +218,14 @@ def _name(file: UploadFile, default: str) -> str:
 
 
 async def _content(file: UploadFile | None) -> bytes | None:
-    return None if file is None else await file.read()
-
-
-def _camera(intrinsics: bytes | None, image: np.ndarray) -> Camera | None:
-    return None if intrinsics is None else camera_of(intrinsics, image.shape[1::-1])
+    if file is None:
+        return None
+    return await file.read()
 
 
 @router.get("/metrics", response_class=PlainTextResponse)
-async def metrics(request: Request) -> Response:
+async def metrics(service: Asked) -> Response:
     """Counters for Prometheus."""
-    service = service_of(request)
     service.metrics.scenes.set(len(service.live.current.scenes))
     service.metrics.waiting.set(service.desk.waiting)
     text = generate_latest(service.metrics.registry)
@@ -214,14 +233,13 @@ async def metrics(request: Request) -> Response:
 
 
 @router.websocket("/track")
-async def track(socket: WebSocket) -> None:
+async def track(socket: WebSocket, service: Asked) -> None:
     """Frames in, rows out: each binary message is an image file, each answer a JSON row.
 
     Rows have the state of the tracking (`tracking`, `relocalized`, `lost`). A text message holds
     the intrinsics of the frames that follow, as `camera` of `/localize`. A frame that cannot be
     used is answered with `{"error": ...}`.
     """
-    service = service_of(socket)
     intrinsics = None
     number = 0
     tracker: Tracker | None = None
@@ -232,11 +250,8 @@ async def track(socket: WebSocket) -> None:
         localizer = service.live.current.localizer
         image = decoded(data, name, service.limits)
         # The map or the camera changed.
-        if tracker is None or tracked != (
-            localizer,
-            intrinsics,
-        ):
-            tracker = Tracker(localizer, _camera(intrinsics, image))
+        if tracker is None or tracked != (localizer, intrinsics):
+            tracker = Tracker(localizer, camera_of(intrinsics, image.shape[1::-1]))
             tracked = (localizer, intrinsics)
         frame = tracker.track(image, time.monotonic())
         return track_row(frame, name, unit_known(localizer, frame.estimate.scene))

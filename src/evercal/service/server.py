@@ -32,6 +32,7 @@ POLL_S = 0.5
 DRAIN_S = 30
 """Time that requests get to finish when the service is stopped."""
 LEAST_TOKEN = 16
+"""Characters of a token, at least."""
 HEADER_BYTES = 32 * 1024
 """Path and headers of a request."""
 
@@ -78,7 +79,9 @@ def make_app(
         title="evercal", version="1", docs_url=None, redoc_url=None, lifespan=lifespan
     )
     # Only for the page, which then can send the token; the guard compares it.
-    bearer = [Security(HTTPBearer(auto_error=False))] if options.token else None
+    bearer = []
+    if options.token:
+        bearer.append(Security(HTTPBearer(auto_error=False)))
     app.include_router(routes.router, dependencies=bearer)
     app.mount(PAGES, StaticFiles(packages=[("fastapi_swagger", "resources")]))
     app.get("/docs", include_in_schema=False)(_page)

@@ -13,10 +13,12 @@ from evercal.calibration.from_map.next_views import NextViews
 from evercal.errors import InputError
 from evercal.live.coverage import POSITION_MM, ROTATION_DEG
 from evercal.service.studio.devices import Which
-from evercal.service.studio.studio import FIXED_IMAGES, STEPS, Studio
+from evercal.service.studio.steps import STEPS
+from evercal.service.studio.studio import FIXED_IMAGES, Studio
 from evercal.service.viewer.html import calibration_rows, chip_html, rows_html
 
 _CAMERAS: dict[str, Which] = {"camera on the gripper": "wrist", "fixed camera": "fixed"}
+"""Cameras by their labels."""
 
 
 class Tasks:
@@ -50,7 +52,9 @@ class Tasks:
     def step(self, what: str, done: float, total: float) -> None:
         """Report progress from inside a task."""
         self.message = what
-        self.progress = min(done / total, 1.0) if total else 0.0
+        self.progress = 0.0
+        if total:
+            self.progress = min(done / total, 1.0)
         self._changed()
 
     def _run(self, task: Callable[[], str]) -> None:
@@ -80,10 +84,9 @@ class Controls:
         """Calls that bring single controls up to date."""
         gui = self._gui
         gui.main_panel.dock_right()
-        given = studio.connection.devices.cameras
-        self._camera = gui.add_dropdown(
-            "Camera", [n for n, w in _CAMERAS.items() if w in given]
-        )
+        cameras = studio.connection.devices.cameras
+        labels = [label for label, which in _CAMERAS.items() if which in cameras]
+        self._camera = gui.add_dropdown("Camera", labels)
         self._picture = gui.add_image(np.zeros((3, 4, 3), np.uint8))
         self._keep(gui.add_html(""), content=self._message)
         bar = gui.add_progress_bar(0.0, animated=True)
@@ -121,10 +124,9 @@ class Controls:
         connection = self._studio.connection
         if self.which in connection.images:
             self._picture.image = connection.images[self.which]
-        rows = [
-            (f"{name}: no data", problem)
-            for name, problem in connection.problems.items()
-        ]
+        rows = []
+        for name, problem in connection.problems.items():
+            rows.append((f"{name}: no data", problem))
         if connection.base_from_gripper is not None:
             x, y, z = 1000 * connection.base_from_gripper.translation_m
             rows.append(("gripper", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"))
@@ -137,7 +139,8 @@ class Controls:
         studio = self._studio
         gui = self._gui
         tasks = self._tasks
-        take, move = ("T", "M") if which == "wrist" else (None, None)
+        keys = {"wrist": ("T", "M"), "fixed": (None, None)}
+        take, move = keys[which]
         self._button("Take sample", lambda: studio.take_sample(which), take)
         if studio.can_move:
             self._button("Move there", lambda: studio.move_on(which), move)
@@ -150,12 +153,12 @@ class Controls:
         sample: Any = gui.add_dropdown("Sample", ("-",))
 
         def names() -> tuple[str, ...]:
-            return tuple(
-                frame.name for frame in reversed(studio.recorders[which].frames)
-            )
+            frames = reversed(studio.recorders[which].frames)
+            return tuple(frame.name for frame in frames)
 
         def show_names() -> None:
-            if (shown := names() or ("-",)) != sample.options:
+            shown = names() or ("-",)
+            if shown != sample.options:
                 sample.options = shown
                 sample.value = shown[0]  # the one taken last
 
@@ -224,8 +227,14 @@ class Controls:
 
     def _message(self) -> str:
         tasks = self._tasks
-        kind = "failed" if tasks.failed else "working" if tasks.busy else "done"
-        return chip_html(kind, tasks.message) if tasks.message else ""
+        if not tasks.message:
+            return ""
+        state = "done"
+        if tasks.failed:
+            state = "failed"
+        elif tasks.busy:
+            state = "working"
+        return chip_html(state, tasks.message)
 
     def _coverage(self, which: Which) -> str:
         covered = self._studio.coverage(which)
@@ -233,7 +242,9 @@ class Controls:
         axes = [(axis, "°", ROTATION_DEG) for axis in covered.rotations]
         axes += [(axis, " mm", POSITION_MM) for axis in covered.positions]
         for axis, unit, wanted in axes:
-            enough = "✓" if axis.covered else f"of {wanted:.0f}{unit}"
+            enough = f"of {wanted:.0f}{unit}"
+            if axis.covered:
+                enough = "✓"
             rows.append((axis.name, f"{axis.spread:.0f}{unit} {enough}"))
         if which == "wrist" and self._view is not None:
             x, y, z = 1000 * self._view.poses[0].translation_m
@@ -242,19 +253,14 @@ class Controls:
                 ("next view (amber)", f"gripper at {x:+.0f} {y:+.0f} {z:+.0f} mm")
             )
             rows.append(("expected 1 sigma", f"{now:.3f} mm → {then:.3f} mm"))
-        bad = [
-            (row.name, "; ".join(row.problems))
-            for row in covered.samples
-            if row.problems
-        ]
-        return rows_html(rows + bad)
+        for row in covered.samples:
+            if row.problems:
+                rows.append((row.name, "; ".join(row.problems)))
+        return rows_html(rows)
 
     def _numbers(self, which: Which) -> str:
-        if (found := self._studio.calibrations.get(which)) is None:
+        calibration = self._studio.calibrations.get(which)
+        if calibration is None:
             return ""
-        return rows_html(
-            [
-                *calibration_rows(found),
-                ("file", str(self._studio.calibration_file(which))),
-            ]
-        )
+        file = str(self._studio.calibration_file(which))
+        return rows_html([*calibration_rows(calibration), ("file", file)])

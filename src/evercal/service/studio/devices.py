@@ -13,8 +13,10 @@ from evercal.typing import Array, Image
 
 Which = Literal["wrist", "fixed"]
 
-STILL_MM, STILL_DEG = 0.2, 0.05
-"""The arm stands still while its stated pose changes by less."""
+STILL_MM = 0.2
+"""Change of the gripper's position, in millimetres, below which the arm stands still."""
+STILL_DEG = 0.05
+"""Change of the gripper's rotation, in degrees, below which the arm stands still."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +51,12 @@ class Devices:
     @property
     def cameras(self) -> dict[Which, LiveCamera]:
         """The cameras that were given, that on the gripper first."""
-        given: dict[Which, LiveCamera | None]
-        given = {"wrist": self.wrist_camera, "fixed": self.fixed_camera}
-        return {which: camera for which, camera in given.items() if camera is not None}
+        cameras: dict[Which, LiveCamera] = {}
+        if self.wrist_camera is not None:
+            cameras["wrist"] = self.wrist_camera
+        if self.fixed_camera is not None:
+            cameras["fixed"] = self.fixed_camera
+        return cameras
 
 
 class Connection:
@@ -75,22 +80,24 @@ class Connection:
 
     def look(self, which: Which | None = "wrist") -> None:
         """Read the pose and an image of one camera, or none; failures are kept in `problems`."""
-        for name in ("robot", which):
-            try:
-                if name == "robot":
-                    self._pose()
-                elif which is not None:
-                    self.image(which)
-            except (InputError, OSError) as error:
-                self.problems[str(name)] = str(error)
+        try:
+            self._pose()
+        except (InputError, OSError) as error:
+            self.problems["robot"] = str(error)
+        if which is None:
+            return
+        try:
+            self.image(which)
+        except (InputError, OSError) as error:
+            self.problems[which] = str(error)
 
     def image(self, which: Which) -> Image:
         """Read an image."""
         camera = self.devices.cameras.get(which)
         if camera is None:
-            option = "camera" if which == "wrist" else "fixed"
+            option = {"wrist": "`camera`", "fixed": "`fixed`"}[which]
             raise InputError(
-                f"no {which} camera was given; restart with `{option}` SOURCE"
+                f"no {which} camera was given; restart with {option} SOURCE"
             )
         with self._lock:
             self.images[which] = camera.read()[1]

@@ -8,6 +8,7 @@ from contextlib import suppress
 import numpy as np
 import viser
 
+from evercal.calibration.calibration import Calibration
 from evercal.calibration.from_map.next_views import NextViews
 from evercal.geometry import SE3
 from evercal.reports.overlay import resized
@@ -24,8 +25,10 @@ from evercal.service.viewer.drawing import (
 from evercal.service.viewer.html import AMBER, BLUE, GREEN, RED
 from evercal.service.viewer.page import start_server
 
-_LIVE_S, _REFRESH_S = 0.25, 0.5
-"""Between live images, and between reports of progress."""
+_LIVE_S = 0.25
+"""Interval of live images, seconds."""
+_REFRESH_S = 0.5
+"""Interval of reports of progress, seconds."""
 _DRAWN_S = 10.0
 """Time in which a browser that shows the page draws it."""
 _SIZE_M = 0.045
@@ -89,9 +92,10 @@ class StudioPage:
             try:
                 which = self.controls.which
                 wanted = connection.devices.live and not self.tasks.busy
-                connection.look(
-                    which if wanted or which not in connection.images else None
-                )
+                if wanted or which not in connection.images:
+                    connection.look(which)
+                else:
+                    connection.look(None)
                 with self._lock, self.server.atomic():
                     self.controls.show_live()
                     self._drawing.show_live()
@@ -149,23 +153,26 @@ class _Drawing:
             gripper = frame.base_from_gripper
             assert gripper is not None, "a wrist recording"
             if name not in self._samples:
-                node = f"/samples/{name}"
-                frustum = Frustum.of(gripper, frame.camera)
-                image = frame.read_image()
-                drawn = add_frustum(self._server, node, frustum, _SIZE_M, GREEN, image)
-                self._samples[name] = drawn
-            place(self._samples[name], gripper @ self._mount())
-            self._samples[name].color = RED if name in bad else GREEN
+                self._samples[name] = add_frustum(
+                    self._server,
+                    f"/samples/{name}",
+                    Frustum.of(gripper, frame.camera),
+                    _SIZE_M,
+                    GREEN,
+                    frame.read_image(),
+                )
+            drawn = self._samples[name]
+            drawn.color = GREEN
+            if name in bad:
+                drawn.color = RED
+            place(drawn, gripper @ self._mount())
         place(self._next, next_view and next_view.poses[0] @ self._mount())
 
     def show_results(self) -> None:
         """Draw the map and the calibrations, if they have changed."""
         studio = self._studio
-        found = {
-            str(which): calibration
-            for which, calibration in studio.calibrations.items()
-        }
-        drawn = (studio.cell.scenes, *found.values())
+        calibrations: dict[str, Calibration] = {**studio.calibrations}
+        drawn = (studio.cell.scenes, *calibrations.values())
         if drawn == self._drawn:
             return
         shown = None
@@ -174,10 +181,10 @@ class _Drawing:
             scenes = studio.cell.localizer.contents.scenes
             shown = DrawnMap(self._server, scenes)
             shown.show(studio.scene or scenes[0].name)
-        for name in found:  # by a held thing it has no scene, by the map it has
+        for name in calibrations:  # by a held thing it has no scene, by the map it has
             self._server.scene.remove_by_name(f"/base/{name}")
         camera = studio.connection.devices.intrinsics
-        add_calibrations(self._server, found, shown, camera, 1.3 * _SIZE_M)
+        add_calibrations(self._server, calibrations, shown, camera, 1.3 * _SIZE_M)
 
     def _mount(self) -> SE3:
         return self._studio.mount or SE3.identity()

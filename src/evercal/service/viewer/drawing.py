@@ -39,6 +39,8 @@ def add_frustum(
     image: np.ndarray | None = None,
 ) -> viser.CameraFrustumHandle:
     """Add a camera with its image to the scene."""
+    if image is not None:
+        image = resized(image, THUMBNAIL_PX)
     return server.scene.add_camera_frustum(
         name,
         frustum.fov_rad,
@@ -47,7 +49,7 @@ def add_frustum(
         thickness=2.0,
         thickness_units="screen",
         color=colour,
-        image=None if image is None else resized(image, THUMBNAIL_PX),
+        image=image,
         wxyz=frustum.base_from_camera.rotation_wxyz,
         position=frustum.base_from_camera.translation_m,
     )
@@ -67,12 +69,15 @@ def add_base(server: viser.ViserServer, side_m: float) -> viser.FrameHandle:
         "/base", axes_length=0.05 * side_m, axes_radius=0.0015 * side_m
     )
     server.scene.add_label("/base/label", "robot base")
-    lines = {
-        "cell_size": 0.1,
-        "cell_color": (60, 66, 76),
-        "section_color": (80, 87, 99),
-    }
-    server.scene.add_grid("/floor", side_m, side_m, shadow_opacity=0.0, **lines)
+    server.scene.add_grid(
+        "/floor",
+        side_m,
+        side_m,
+        cell_size=0.1,
+        cell_color=(60, 66, 76),
+        section_color=(80, 87, 99),
+        shadow_opacity=0.0,
+    )
     return server.scene.add_frame(GRIPPER, show_axes=False, visible=False)
 
 
@@ -89,8 +94,8 @@ class DrawnMap:
         self.keyframes = {scene.name: keyframe_views(scene) for scene in scenes}
         # Twice the median distance of landmarks from their median.
         points = self.landmarks[scenes[0].name].points_m
-        away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-        self.extent_m = max(2 * float(np.median(away)), 0.05)
+        distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+        self.extent_m = max(2 * float(np.median(distances)), 0.05)
         self.frustum_m = 0.03 * self.extent_m
         self._nodes: dict[str, viser.FrameHandle] = {}
         self._clouds: dict[str, viser.PointCloudHandle] = {}
@@ -103,7 +108,10 @@ class DrawnMap:
 
     def node(self, scene: object) -> str:
         """Node of a scene; that of the base for what belongs to none."""
-        return self._nodes[str(scene)].name if str(scene) in self._nodes else "/base"
+        node = self._nodes.get(str(scene))
+        if node is None:
+            return "/base"
+        return node.name
 
     def show(self, scene: str) -> None:
         """Show one scene; visitors show others in the scene tree of viser's settings."""
@@ -156,17 +164,21 @@ def add_calibrations(
 
     Where no map is drawn, they are in the base.
     """
-    scale = readable_scale(
-        [Ellipsoid.of(c.uncertain_pose) for c in calibrations.values()]
-    )
-    for name, found in calibrations.items():
-        ellipsoid = Ellipsoid.of(found.uncertain_pose)
-        base = drawn.node(found.source.get("scene")) if drawn else "/base"
-        parent = GRIPPER if found.on_gripper else base
+    ellipsoids = [Ellipsoid.of(c.uncertain_pose) for c in calibrations.values()]
+    scale = readable_scale(ellipsoids)
+    for ellipsoid, (name, calibration) in zip(
+        ellipsoids, calibrations.items(), strict=True
+    ):
+        parent = "/base"
+        if calibration.on_gripper:
+            parent = GRIPPER
+        elif drawn:
+            parent = drawn.node(calibration.source.get("scene"))
         node = f"{parent}/{name.replace('/', '_')}"
-        frustum = Frustum.of(found.parent_from_child, found.camera or default)
+        camera = calibration.camera or default
+        frustum = Frustum.of(calibration.parent_from_child, camera)
         add_frustum(server, node, frustum, size_m, MAGENTA)
-        x, y, z = (max(float(scale * axis), 1e-6) for axis in ellipsoid.axes_m)
+        x, y, z = np.maximum(scale * np.asarray(ellipsoid.axes_m), 1e-6).tolist()
         server.scene.add_icosphere(
             f"{node} ellipsoid",
             scale=(x, y, z),
@@ -175,7 +187,8 @@ def add_calibrations(
             wxyz=ellipsoid.rotation_wxyz,
             position=ellipsoid.centre_m,
         )
-        words = f"{name}: {found.sigma_mm:.2g} mm (1 sigma), ellipsoid x {scale:g}"
+        sigma = f"{calibration.sigma_mm:.2g} mm (1 sigma)"
+        words = f"{name}: {sigma}, ellipsoid x {scale:g}"
         server.scene.add_label(f"{node}/label", words)
 
 
@@ -187,7 +200,7 @@ def add_arm(
 ) -> list[viser.GuiSliderHandle[float]]:
     """Add an arm at the robot base, and a slider for each joint, which are returned.
 
-    `gripper` is a node that moves with the first of `links` that the arm has.
+    The node `gripper` moves with the first of `links` that the arm has.
     """
     model = RobotModel(path)  # reports what is wrong in the file
     from viser.extras import ViserUrdf
@@ -213,10 +226,13 @@ def add_arm(
 
     with server.gui.add_folder("Arm", expand_by_default=False):
         for name, (low, high) in limits.items():
-            least = -np.pi if low is None else low
-            most = np.pi if high is None else high
-            start = min(max(0.0, least), most)
-            sliders.append(server.gui.add_slider(name, least, most, 0.01, start))
-            sliders[-1].on_update(lambda _: move())
+            if low is None:
+                low = -np.pi
+            if high is None:
+                high = np.pi
+            start = min(max(0.0, low), high)
+            slider = server.gui.add_slider(name, low, high, 0.01, start)
+            slider.on_update(lambda _: move())
+            sliders.append(slider)
     move()
     return sliders

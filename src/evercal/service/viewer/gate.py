@@ -20,10 +20,12 @@ from evercal.service.hosts import foreign
 
 def refusal(request: Request, key: str, local: bool) -> str | None:
     """Why a page's request, or the handshake of its connection, is refused; None if it is not."""
-    given = f"{request.path}/".split("/")[1].partition("?")[0]
-    if not hmac.compare_digest(given.encode("utf-8", "surrogateescape"), key.encode()):
+    stated = f"{request.path}/".split("/")[1].partition("?")[0]
+    stated = stated.encode("utf-8", "surrogateescape")
+    if not hmac.compare_digest(stated, key.encode()):
         return "open the address that evercal printed, with its key"
-    hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+    hosts = request.headers.get_all("Host")
+    origins = request.headers.get_all("Origin")
     if len(hosts) != 1 or len(origins) > 1:
         return "one Host and at most one Origin are needed"
     return foreign(hosts[0], next(iter(origins), None), local)
@@ -35,7 +37,7 @@ def gated(key: str, local: bool) -> Iterator[None]:
 
     Args:
         key: First part of the path of every request.
-        local: Whether only names of this machine are right.
+        local: Whether `Host` must name this machine.
     """
     opened = []
     serve = websockets.asyncio.server.serve

@@ -36,28 +36,23 @@ def chip_html(state: str, text: str = "") -> str:
 
 def rows_html(rows: Sequence[tuple[str, str]]) -> str:
     """Names and values, one pair a line."""
-    cells = "".join(
-        f'<tr><td style="width:40%;vertical-align:top">{escape(name)}</td>'
-        f"<td>{escape(with_options(value))}</td></tr>"
-        for name, value in rows
-    )
-    return (
-        f'<div style="{_TEXT}"><table style="width:100%">{cells}</table></div>'
-        if rows
-        else ""
-    )
+    if not rows:
+        return ""
+    html = f'<div style="{_TEXT}"><table style="width:100%">'
+    for name, value in rows:
+        html += f'<tr><td style="width:40%;vertical-align:top">{escape(name)}</td>'
+        html += f"<td>{escape(with_options(value))}</td></tr>"
+    return html + "</table></div>"
 
 
 def calibration_rows(calibration: Calibration) -> list[tuple[str, str]]:
     """Names and values of a calibration."""
     x, y, z = 1000 * calibration.parent_from_child.translation_m
+    spread = f"{calibration.sigma_mm:.2g} mm, {calibration.sigma_deg:.2g}°"
     principal = Ellipsoid.of(calibration.uncertain_pose).sigmas_mm
     return [
         ("mount", "on the gripper" if calibration.on_gripper else "fixed"),
         (f"in {calibration.parent_frame}", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"),
-        (
-            "1 sigma per axis",
-            f"{calibration.sigma_mm:.2g} mm, {calibration.sigma_deg:.2g}°",
-        ),
+        ("1 sigma per axis", spread),
         ("principal axes", f"{principal} mm"),
     ]

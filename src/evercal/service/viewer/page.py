@@ -54,8 +54,8 @@ class Page:
             self._begin_behind(scenes[0].name)
             self._add_controls(given)
             if urdf is not None:
-                hands = [c.parent_frame for c in given.values() if c.on_gripper]
-                drawing.add_arm(server, urdf, gripper, hands)
+                links = [c.parent_frame for c in given.values() if c.on_gripper]
+                drawing.add_arm(server, urdf, gripper, links)
         except BaseException:
             self.close()
             raise
@@ -69,11 +69,14 @@ class Page:
         """Show a camera, a video or a folder as it is tracked; by default with the map's camera."""
         camera = StreamCamera(source)
         height, width = camera.read()[1].shape[:2]
-        given = None if intrinsics is None else read_camera(intrinsics, (width, height))
-        tracker = Tracker(self._localizer, given)
-        threading.Thread(
+        stated = None
+        if intrinsics is not None:
+            stated = read_camera(intrinsics, (width, height))
+        tracker = Tracker(self._localizer, stated)
+        thread = threading.Thread(
             target=self._track, args=(camera, tracker), daemon=True
-        ).start()
+        )
+        thread.start()
 
     def look_through(self, view: KeyframeView, client: viser.ClientHandle) -> None:
         """Show a visitor what a keyframe shows: its image stands behind its landmarks."""
@@ -105,15 +108,13 @@ class Page:
         self.map.show_keyframes(True)
 
     def _begin_behind(self, scene: str) -> None:
-        poses = SE3.stack(
-            [view.frustum.base_from_camera for view in self.map.keyframes[scene]]
-        )
+        keyframes = self.map.keyframes[scene]
+        poses = SE3.stack([view.frustum.base_from_camera for view in keyframes])
         ahead = poses.rotation_matrix()[:, :, 2].mean(0) * (1, 1, 0)
         camera = self.server.initial_camera
         middle = poses.translation_m.mean(0)
-        camera.position = middle + self.map.extent_m * (
-            np.array([0, 0, 0.4]) - 0.6 * ahead
-        )
+        offset = np.array([0, 0, 0.4]) - 0.6 * ahead
+        camera.position = middle + self.map.extent_m * offset
         camera.look_at = middle
 
     def _add_controls(self, given: dict[str, Calibration]) -> None:
@@ -162,10 +163,12 @@ class Page:
                 text.content += chip_html("ended", str(error))
                 break
             estimate = tracked.estimate
-            pose = estimate.uncertain_pose if estimate.status == "ok" else None
-            drawing.place(node, pose and pose.pose)
             rows = [("time", f"{estimate.milliseconds:.0f} ms")]
-            if pose is not None:
+            pose = estimate.uncertain_pose
+            if pose is None or estimate.status != "ok":
+                drawing.place(node, None)
+            else:
+                drawing.place(node, pose.pose)
                 if estimate.scene != shown:  # else the visitor's choice stays
                     shown = str(estimate.scene)
                     self.map.show(shown)
@@ -182,15 +185,16 @@ class Page:
 
 def backdrop(view: KeyframeView) -> tuple[np.ndarray, float, float]:
     """Centre, width and height of a keyframe's image as a plane behind nearly all landmarks."""
-    depth = (
-        1.05 * float(np.percentile(view.depths_m, 98)) if len(view.depths_m) else 1.0
-    )
+    depth = 1.0
+    if len(view.depths_m):
+        depth = 1.05 * float(np.percentile(view.depths_m, 98))
     camera = view.camera
-    middle = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-    ahead = np.append((middle - (camera.cx, camera.cy)) / (camera.fx, camera.fy), 1.0)
+    x = ((camera.width - 1) / 2 - camera.cx) / camera.fx
+    y = ((camera.height - 1) / 2 - camera.cy) / camera.fy
+    centre = depth * np.array([x, y, 1.0])
     width = depth * camera.width / camera.fx
     height = depth * camera.height / camera.fy
-    return view.frustum.base_from_camera.apply(depth * ahead), width, height
+    return view.frustum.base_from_camera.apply(centre), width, height
 
 
 class _Server(viser.ViserServer):
@@ -217,10 +221,7 @@ def start_server(host: str, port: int, label: str) -> _Server:
     listening_socket(host, port).close()  # viser alone would take the next free port
     key = secrets.token_urlsafe(16)
     # Viser prints.
-    with (
-        gated(key, is_local(host)),
-        contextlib.redirect_stdout(io.StringIO()),
-    ):
+    with gated(key, is_local(host)), contextlib.redirect_stdout(io.StringIO()):
         server = _Server(host, port, label=label, verbose=False)
     server.key = key
     server.gui.configure_theme(
