@@ -9,21 +9,23 @@ import dataclasses
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from evercal.geometry import SE3
 from evercal.geometry.near import COARSE
+from evercal.localization.estimate import Status
 from evercal.typing import BoolArray
 
-Status = Literal["ok", "uncertain", "ambiguous", "unknown_scene", "failed"]
-
-MIDDLE = (0.02, math.radians(2.0))
-FINE = (0.01, math.radians(1.0))
-FINEST = (0.005, math.radians(0.5))
-"""Thresholds in metres and radians, as `COARSE`."""
+Thresholds = tuple[float, float]
+"""Errors of position in metres and of rotation in radians, below which a pose is correct."""
+MIDDLE: Thresholds = (0.02, math.radians(2.0))
+"""2 cm and 2 deg, for one room."""
+FINE: Thresholds = (0.01, math.radians(1.0))
+"""1 cm and 1 deg."""
+FINEST: Thresholds = (0.005, math.radians(0.5))
+"""5 mm and 0.5 deg, for a robot cell."""
 
 CHI2_6 = 12.5916
 """95 % quantile of chi square with six degrees of freedom."""
@@ -95,8 +97,9 @@ class Scores:
 
     def to_dict(self) -> dict[str, object]:
         """Convert to plain values for JSON; infinity and NaN become None."""
-        scenes = {name: _plain(row) for name, row in self.scenes.items()}
-        return {**dataclasses.asdict(self), "scenes": scenes}
+        values = dataclasses.asdict(self)
+        values["scenes"] = {name: _plain(row) for name, row in self.scenes.items()}
+        return values
 
 
 @dataclass(frozen=True)
@@ -122,16 +125,11 @@ class ContinualScores:
 
 
 def correct(
-    results: Iterable[FrameResult], thresholds: tuple[float, float] = COARSE
+    results: Iterable[FrameResult], thresholds: Thresholds = COARSE
 ) -> dict[str, BoolArray]:
     """Which frames (frames,) of each scene are correct, by thresholds in metres and radians."""
-    metres, radians = thresholds
-
-    def right(row: FrameResult) -> bool:
-        return row.translation_error_m < metres and row.rotation_error_rad < radians
-
     return {
-        name: np.array([*map(right, rows)]) for name, rows in _by_scene(results).items()
+        name: _correct(rows, thresholds) for name, rows in _by_scene(results).items()
     }
 
 
@@ -139,12 +137,14 @@ def scores(results: Sequence[FrameResult]) -> Scores:
     """Compute scores of scenes from the results of all frames, at least one."""
     if not results:
         raise ValueError("scores needs at least one result, got none")
-    scenes = {scene: _scene_scores(rows) for scene, rows in _by_scene(results).items()}
+    scenes = {}
+    for name, rows in _by_scene(results).items():
+        scenes[name] = _scene_scores(rows)
     return Scores(
-        scenes,
-        float(np.mean([row.accuracy_5cm_5deg for row in scenes.values()])),
-        float(np.mean([row.accuracy_1cm_1deg for row in scenes.values()])),
-        float(np.mean([result.milliseconds for result in results])),
+        scenes=scenes,
+        mean_accuracy_5cm_5deg=_mean(scenes.values(), "accuracy_5cm_5deg"),
+        mean_accuracy_1cm_1deg=_mean(scenes.values(), "accuracy_1cm_1deg"),
+        ms_per_image=_mean(results, "milliseconds"),
     )
 
 
@@ -155,7 +155,9 @@ def share_inside(squared: ArrayLike) -> float:
     """
     values = np.asarray(squared, dtype=np.float64)
     values = values[~np.isnan(values)]
-    return _percent(values < CHI2_6) if len(values) else math.nan
+    if not len(values):
+        return math.nan
+    return _percent(values < CHI2_6)
 
 
 def recall_area(translation_m: ArrayLike, within_m: float = 0.2) -> float:
@@ -174,7 +176,7 @@ def continual_scores(accuracies: ArrayLike) -> ContinualScores:
     stage j. Entries above the diagonal are ignored.
     """
     matrix = np.asarray(accuracies, dtype=np.float64)
-    count = len(matrix) if matrix.ndim == 2 else 0
+    count = len(np.atleast_1d(matrix))
     if count == 0 or matrix.shape != (count, count):
         raise ValueError(
             f"accuracies must be square (stages, scenes), got {matrix.shape}"
@@ -190,9 +192,9 @@ def continual_scores(accuracies: ArrayLike) -> ContinualScores:
     newest = float(last[-1])
     if count == 1:
         return ContinualScores(final, math.nan, math.nan, math.nan, newest, along)
-    old = range(count - 1)
-    best = np.array([matrix[j:, j].max() for j in old])
-    best_before = np.array([matrix[j:-1, j].max() for j in old])
+    since_learned = np.where(np.tri(count, dtype=bool), matrix, -np.inf)[:, :-1]
+    best = since_learned.max(0)
+    best_before = since_learned[:-1].max(0)
     return ContinualScores(
         final_accuracy=final,
         total_forgetting=float((best - last[:-1]).mean()),
@@ -211,36 +213,49 @@ def _by_scene(results: Iterable[FrameResult]) -> dict[str, list[FrameResult]]:
 
 
 def _scene_scores(rows: list[FrameResult]) -> SceneScores:
-    # The upper median: a mean of the two middle errors may include infinity.
-    middle = len(rows) // 2
-    within = [
-        _percent(*correct(rows, t).values()) for t in (COARSE, MIDDLE, FINE, FINEST)
-    ]
+    status = _column(rows, "status")
     return SceneScores(
         frames=len(rows),
-        accuracy_5cm_5deg=within[0],
-        accuracy_2cm_2deg=within[1],
-        accuracy_1cm_1deg=within[2],
-        accuracy_5mm_05deg=within[3],
-        median_translation_cm=100.0
-        * sorted(row.translation_error_m for row in rows)[middle],
-        median_rotation_deg=math.degrees(
-            sorted(row.rotation_error_rad for row in rows)[middle]
-        ),
-        wrong_scene=_percent([row.wrong_scene for row in rows]),
-        unknown=_percent(
-            [row.status in ("uncertain", "unknown_scene", "ambiguous") for row in rows]
-        ),
-        near_training_frame=_percent([row.near_training_frame for row in rows]),
-        inside_95=share_inside([row.squared_mahalanobis for row in rows]),
+        accuracy_5cm_5deg=_percent(_correct(rows, COARSE)),
+        accuracy_2cm_2deg=_percent(_correct(rows, MIDDLE)),
+        accuracy_1cm_1deg=_percent(_correct(rows, FINE)),
+        accuracy_5mm_05deg=_percent(_correct(rows, FINEST)),
+        median_translation_cm=100.0 * _upper_median(rows, "translation_error_m"),
+        median_rotation_deg=math.degrees(_upper_median(rows, "rotation_error_rad")),
+        wrong_scene=_percent(_column(rows, "wrong_scene")),
+        unknown=_percent(np.isin(status, ("uncertain", "unknown_scene", "ambiguous"))),
+        near_training_frame=_percent(_column(rows, "near_training_frame")),
+        inside_95=share_inside(_column(rows, "squared_mahalanobis")),
     )
 
 
-def _percent(flags: ArrayLike) -> float:
-    flags = np.asarray(flags)
+def _correct(rows: Iterable[FrameResult], thresholds: Thresholds) -> BoolArray:
+    metres, radians = thresholds
+    near = _column(rows, "translation_error_m") < metres
+    return near & (_column(rows, "rotation_error_rad") < radians)
+
+
+def _upper_median(rows: Iterable[FrameResult], name: str) -> float:
+    """The upper median: a mean of the two middle errors may include infinity."""
+    values = np.sort(_column(rows, name))
+    return float(values[len(values) // 2])
+
+
+def _mean(rows: Iterable[SceneScores | FrameResult], name: str) -> float:
+    return float(np.mean(_column(rows, name)))
+
+
+def _column(rows: Iterable[SceneScores | FrameResult], name: str) -> np.ndarray:
+    return np.array([getattr(row, name) for row in rows])
+
+
+def _percent(flags: BoolArray) -> float:
     return 100.0 * int(flags.sum()) / len(flags)
 
 
 def _plain(record: SceneScores | ContinualScores) -> dict[str, object]:
-    values = dataclasses.asdict(record).items()
-    return {key: value if math.isfinite(value) else None for key, value in values}
+    values = dataclasses.asdict(record)
+    for key, value in values.items():
+        if not math.isfinite(value):
+            values[key] = None
+    return values

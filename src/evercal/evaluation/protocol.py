@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from evercal.recordings import (
     posed_frames,
     stated_poses,
 )
+from evercal.storage.text_files import few
 from evercal.typing import PathLike
 
 Recorded = PathLike | Recording
@@ -42,38 +44,45 @@ def evaluate(
         seed: Seed of the random order; results are in recorded order.
         on_frame: Called after each image with the numbers of images done and in total.
     """
-    named = _named(scenes)
-    tests = {
-        name: _test_frames(localizer, name, scene) for name, scene in named.items()
-    }
+    recordings = _named(scenes)
+    tests: list[_Test] = []
+    for name in recordings:
+        tests += _scene_tests(localizer, name, recordings)
     if not tests:
-        raise InputError(
-            f"no scene to evaluate; give one or more of {_listed(localizer.scenes)}"
-        )
-    near = [
-        flag for name, frames in tests.items() for flag in _near(named[name], frames)
-    ]
-    jobs = [(name, frame) for name, frames in tests.items() for frame in frames]
+        names = few(localizer.scenes) or "none"
+        raise InputError(f"no scene to evaluate; give one or more of {names}")
     results: dict[int, FrameResult] = {}
-    for done, index in enumerate(
-        np.random.default_rng(seed).permutation(len(jobs)), start=1
-    ):
-        name, frame = jobs[index]
-        accepted = _same_base(name, named)
-        results[int(index)] = _result(localizer, name, frame, near[index], accepted)
+    order = np.random.default_rng(seed).permutation(len(tests))
+    for done, index in enumerate(order.tolist(), start=1):
+        results[index] = _result(localizer, tests[index])
         if on_frame is not None:
-            on_frame(done, len(jobs))
-    return [results[index] for index in range(len(jobs))]
+            on_frame(done, len(tests))
+    return [results[index] for index in range(len(tests))]
+
+
+@dataclass(frozen=True)
+class _Test:
+    """A frame to localize."""
+
+    scene: str
+    frame: Frame
+    near_training: bool
+    """Whether a training frame of the scene is within 5 cm and 5 deg."""
+    accepted: set[str]
+    """Scenes with the base frame of the frame's scene."""
 
 
 def _named(
     scenes: Recorded | Sequence[Recorded] | Mapping[str, Recorded],
 ) -> dict[str, Recording]:
-    if isinstance(scenes, Mapping):
-        return {name: _loaded(scene) for name, scene in scenes.items()}
-    given = [scenes] if isinstance(scenes, str | os.PathLike | Recording) else scenes
     named: dict[str, Recording] = {}
-    for scene in map(_loaded, given):
+    if isinstance(scenes, Mapping):
+        for name, scene in scenes.items():
+            named[name] = _loaded(scene)
+        return named
+    if isinstance(scenes, str | os.PathLike | Recording):
+        scenes = [scenes]
+    for scene in map(_loaded, scenes):
         if scene.name in named:
             raise InputError(
                 f"scene {scene.name!r}: given twice; give a mapping of the names under which they"
@@ -84,36 +93,37 @@ def _named(
 
 
 def _loaded(scene: Recorded) -> Recording:
-    return scene if isinstance(scene, Recording) else load_recording(scene)
+    if isinstance(scene, Recording):
+        return scene
+    return load_recording(scene)
 
 
-def _test_frames(
-    localizer: SceneLocalizer, name: str, scene: Recording
-) -> tuple[Frame, ...]:
+def _scene_tests(
+    localizer: SceneLocalizer, name: str, recordings: Mapping[str, Recording]
+) -> list[_Test]:
     if name not in localizer.scenes:
+        names = few(localizer.scenes) or "none"
         raise InputError(
-            f"scene {name!r} is not in the store; its scenes are {_listed(localizer.scenes)};"
+            f"scene {name!r} is not in the store; its scenes are {names};"
             " give NAME=SCENE with the name under which it was learned"
         )
+    scene = recordings[name]
     frames = posed_frames(scene.test)
     if not frames:
         raise InputError(
             f"scene {name!r} has {len(scene.test)} test frames, none with a pose; give a scene with"
             " posed test frames"
         )
-    return frames
+    accepted = {name}
+    for other, recording in recordings.items():
+        if scene.base is not None and recording.base == scene.base:
+            accepted.add(other)
+    near = near_training(stated_poses(scene.train), stated_poses(frames)).tolist()
+    return [_Test(name, *row, accepted) for row in zip(frames, near, strict=True)]
 
 
-def _same_base(name: str, scenes: Mapping[str, Recording]) -> set[str]:
-    base = scenes[name].base
-    return {name} | {
-        n for n, scene in scenes.items() if base is not None and scene.base == base
-    }
-
-
-def _result(
-    localizer: SceneLocalizer, name: str, frame: Frame, near: bool, accepted: set[str]
-) -> FrameResult:
+def _result(localizer: SceneLocalizer, test: _Test) -> FrameResult:
+    frame = test.frame
     start = time.perf_counter()
     estimate = localizer.localize(frame.read_image(), frame.camera)
     milliseconds = 1e3 * (time.perf_counter() - start)
@@ -121,7 +131,7 @@ def _result(
     squared = np.nan
     truth = frame.base_from_camera
     pose = estimate.base_from_camera
-    if estimate.status == "ok" and estimate.scene in accepted:
+    if estimate.status == "ok" and estimate.scene in test.accepted:
         assert truth is not None
         assert pose is not None, "an estimate whose status is ok has a pose"
         metres, radians = pose_distance(truth, pose)
@@ -129,24 +139,16 @@ def _result(
         if uncertain is not None:
             squared = uncertain.squared_mahalanobis(truth)
     return FrameResult(
-        scene=name,
+        scene=test.scene,
         frame=frame.name,
         translation_error_m=float(metres),
         rotation_error_rad=float(radians),
         status=estimate.status,
         found_scene=estimate.scene,
-        near_training_frame=near,
+        near_training_frame=test.near_training,
         milliseconds=milliseconds,
         inliers=int(estimate.inliers),
         inlier_ratio=float(estimate.inlier_ratio),
         squared_mahalanobis=squared,
         estimated=pose,
     )
-
-
-def _near(scene: Recording, frames: Sequence[Frame]) -> list[bool]:
-    return near_training(stated_poses(scene.train), stated_poses(frames)).tolist()
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names) or "none"

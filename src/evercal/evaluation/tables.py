@@ -6,7 +6,6 @@ import numpy as np
 
 from evercal.evaluation.metrics import Scores
 
-# Title, field of SceneScores, factor and number of decimals.
 _COLUMNS = (
     ("5cm 5deg %", "accuracy_5cm_5deg", 1, 1),
     ("2cm 2deg %", "accuracy_2cm_2deg", 1, 1),
@@ -19,27 +18,25 @@ _COLUMNS = (
     ("in 95 % ellipsoid", "inside_95", 1, 1),
     ("near training %", "near_training_frame", 1, 1),
 )
+"""Title, field of `SceneScores`, factor and number of decimals."""
 
 
 def score_rows(scores: Scores) -> list[dict[str, str]]:
     """Cells by title: a row a scene and, for several scenes, their unweighted mean."""
-    values = [
-        [f * getattr(row, name) for _, name, f, _ in _COLUMNS]
-        for row in scores.scenes.values()
-    ]
-    heads = [(name, str(row.frames)) for name, row in scores.scenes.items()]
+    values = []
+    rows = []
+    for name, scene in scores.scenes.items():
+        values.append([f * getattr(scene, field) for _, field, f, _ in _COLUMNS])
+        rows.append(_row(name, str(scene.frames), values[-1]))
     if len(values) > 1:
-        values.append(np.mean(values, axis=0).tolist())
-        heads.append(("mean", ""))
-    return [
-        {"scene": scene, "frames": frames}
-        | {
-            title: _cell(value, digits)
-            for value, (title, _, _, digits) in zip(row, _COLUMNS, strict=True)
-        }
-        for (scene, frames), row in zip(heads, values, strict=True)
-    ]
+        rows.append(_row("mean", "", np.mean(values, axis=0).tolist()))
+    return rows
 
 
-def _cell(value: float, digits: int) -> str:
-    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+def _row(scene: str, frames: str, values: list[float]) -> dict[str, str]:
+    cells = {"scene": scene, "frames": frames}
+    for value, (title, _, _, digits) in zip(values, _COLUMNS, strict=True):
+        cells[title] = "-"
+        if not math.isnan(value):
+            cells[title] = f"{value:.{digits}f}"
+    return cells

@@ -7,6 +7,8 @@ import numpy as np
 
 from evercal.geometry import SE3, Camera, UncertainPose
 
+Status = Literal["ok", "uncertain", "ambiguous", "unknown_scene", "failed"]
+"""Outcome of locating an image."""
 Cause = Literal["view", "lens", "map", "stated poses", "base frame"]
 
 
@@ -26,7 +28,7 @@ class CovarianceTerm:
 class PoseEstimate:
     """The answer for one image; failure is a value, not an exception."""
 
-    status: Literal["ok", "uncertain", "ambiguous", "unknown_scene", "failed"]
+    status: Status
     """`uncertain`: the scene is known, the pose is too uncertain to be useful. `ambiguous`: two
     poses explain the image, see `alternatives`. `unknown_scene`: no pose has enough support.
     `failed`: no pose, or a network's pose outside the cell of its scene."""
