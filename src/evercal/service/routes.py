@@ -25,13 +25,13 @@ from starlette.websockets import WebSocketDisconnect
 
 from evercal.bounds import RequestBounds
 from evercal.calibration import drift
-from evercal.calibration.calibration import Mount
 from evercal.calibration.from_images import Images, calibrate
 from evercal.errors import InputError
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker
 from evercal.reports.answers import Answer, answer_row, check_record, unit_known
 from evercal.reports.track_files import track_row
+from evercal.robot.mount import MountName
 from evercal.service.desk import Desk
 from evercal.service.guard import Metrics
 from evercal.service.limits import (
@@ -170,7 +170,7 @@ async def calibrations(
     images: Shots,
     camera: CameraFile = None,
     robot_poses: PosesFile = None,
-    mount: Annotated[Mount | None, Form()] = None,
+    mount: Annotated[MountName | None, Form()] = None,
 ) -> dict[str, Any]:
     """Calibrate a camera from its images: the calibration file."""
     decode = await _images(service, images, camera, robot_poses)
