@@ -13,17 +13,26 @@ from dataclasses import asdict
 from pathlib import Path
 
 from evercal.errors import InputError
-from evercal.geometry import pose_to_dict
+from evercal.geometry import SE3, pose_to_dict
 from evercal.live.recorder import JPEG_QUALITY, WristRecorder, pose_rows
 from evercal.mapping.selection import spread_poses
 from evercal.recordings.images import write_jpeg
-from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
+from evercal.simulation.virtual_cell import (
+    CellOptions,
+    VirtualCamera,
+    VirtualCell,
+    nominal_mount,
+)
 from evercal.storage import write_bytes, write_json
 
 WRIST_IMAGES = 25
+"""Images of the camera on the gripper, by default."""
 TRIPOD_IMAGES = 8
+"""Images of the fixed camera while the arm moves."""
 HELD_IMAGES = 25
+"""Images of the fixed camera while the gripper turns a box."""
 REACHABLE = 200
+"""Gripper poses in reachable.csv, from which those of the recordings are chosen."""
 
 
 def record_cell(
@@ -44,35 +53,42 @@ def record_cell(
     out.mkdir(parents=True, exist_ok=True)
     reachable = cell.reachable_poses(REACHABLE)
     views = cell.reachable_poses(max(20 * wrist_images, REACHABLE), seed=1)
-    recorder = WristRecorder(out / "wrist", cell.intrinsics)
-    for i in spread_poses(views, wrist_images):
-        cell.robot.move_to(views[i])
-        recorder.add(cell.wrist_camera.read()[1], cell.robot.base_from_gripper())
-        yield
+    camera = cell.wrist_camera
+    yield from _record(cell, camera, views, wrist_images, out / "wrist")
     for i in range(TRIPOD_IMAGES):
         cell.robot.move_to(reachable[i])
-        write_jpeg(
-            out / f"tripod/{i:04d}.jpg", cell.tripod_camera.read()[1], JPEG_QUALITY
-        )
+        _, image = cell.tripod_camera.read()
+        write_jpeg(out / f"tripod/{i:04d}.jpg", image, JPEG_QUALITY)
         yield
     cell.hold(True)
-    recorder = WristRecorder(out / "held", cell.intrinsics)
     views = cell.holding_poses(REACHABLE)
-    for i in spread_poses(views, HELD_IMAGES):
-        cell.robot.move_to(views[i])
-        recorder.add(cell.tripod_camera.read()[1], cell.robot.base_from_gripper())
-        yield
+    camera = cell.tripod_camera
+    yield from _record(cell, camera, views, HELD_IMAGES, out / "held")
     write_bytes(out / "reachable.csv", pose_rows(reachable).encode())
-    rough = "\n".join(
-        " ".join(f"{x:.9g}" for x in row) for row in nominal_mount().matrix()
-    )
-    write_bytes(out / "rough.txt", (rough + "\n").encode())
-    write_json(
-        out / "truth.json",
-        {
-            "gripper_from_camera": pose_to_dict(cell.truth.gripper_from_camera),
-            "base_from_tripod": pose_to_dict(cell.truth.base_from_tripod),
-            "seed": seed,
-            "options": asdict(cell.options),
-        },
-    )
+    rows = []
+    for row in nominal_mount().matrix():
+        rows.append(" ".join(f"{x:.9g}" for x in row) + "\n")
+    write_bytes(out / "rough.txt", "".join(rows).encode())
+    truth = {
+        "gripper_from_camera": pose_to_dict(cell.truth.gripper_from_camera),
+        "base_from_tripod": pose_to_dict(cell.truth.base_from_tripod),
+        "seed": seed,
+        "options": asdict(cell.options),
+    }
+    write_json(out / "truth.json", truth)
+
+
+def _record(
+    cell: VirtualCell,
+    camera: VirtualCamera,
+    views: SE3,
+    images: int,
+    out: Path,
+) -> Iterator[None]:
+    """Record images of a camera at gripper poses that are spread over `views` (n,)."""
+    recorder = WristRecorder(out, cell.intrinsics)
+    for i in spread_poses(views, images):
+        cell.robot.move_to(views[i])
+        _, image = camera.read()
+        recorder.add(image, cell.robot.base_from_gripper())
+        yield

@@ -8,92 +8,115 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
+from numpy.random import default_rng
 
 from evercal.geometry import SE3
-from evercal.simulation.box_room import BoxRoom, Surface, box_faces
+from evercal.simulation.box_room import BoxRoom
 from evercal.simulation.panda_arm import joint_frames
+from evercal.simulation.surfaces import Pyramid, Surface, box_faces, unit_vector
+from evercal.typing import Array
 
 TABLE_M = 0.75
 """Height of the table over the floor."""
 WORK_AREA_M = np.array([0.52, 0.0, 0.04])
 """Centre of the work area that cameras look at, base frame."""
 
-THING_LOW_M, THING_SIZE_M = np.array([-0.08, -0.06, 0.1]), np.array([0.16, 0.12, 0.24])
-"""Lowest corner and sides of what the gripper holds, flange frame: the fingers are 10 cm long."""
+THING_LOW_M = np.array([-0.08, -0.06, 0.1])
+"""Lowest corner of the box that the gripper holds, flange frame: the fingers are 10 cm long."""
+THING_SIZE_M = np.array([0.16, 0.12, 0.24])
+"""Sides of the box that the gripper holds, along the axes of the flange, metres."""
 
-_TABLE_LOW = np.array([-0.35, -0.65])
-_TABLE_HIGH = np.array([1.05, 0.65])
+_TABLE_LOW_M = np.array([-0.35, -0.65, -0.04])
+"""Lowest corner of the table's top, base frame."""
+_TABLE_SIZE_M = np.array([1.4, 1.3, 0.04])
+"""Sides of the table's top, metres."""
 _FREE_M = 0.28
-"""Distance from the foot of the arm within which no box stands."""
+"""Distance from the foot of the arm within which no box stands, metres."""
 _LINK_M = 0.1
+"""Width of the boxes that stand for the arm's links, metres."""
 _TEXTURE_PX = 512
+"""Side of the textures of the room, pixels."""
 _TABLE_TEXTURE_PX = 1024
+"""Side of the textures of the table, pixels."""
 _BOX_TEXTURE_PX = 128
+"""Side of the textures of the boxes on the table, pixels."""
 
 
 @lru_cache(maxsize=4)
 def cell_room(seed: int, boxes: int = 12) -> BoxRoom:
     """The room without the arm, in the base frame."""
-    rng = np.random.default_rng([seed, 31])
+    rng = default_rng([seed, 31])
     room = BoxRoom(seed, furniture=6, texture_px=_TEXTURE_PX)
     down = np.array([0.0, 0.0, TABLE_M])
-    room.surfaces = [
-        replace(surface, corner_m=surface.corner_m - down) for surface in room.surfaces
-    ]
+    for i, surface in enumerate(room.surfaces):
+        room.surfaces[i] = replace(surface, corner_m=surface.corner_m - down)
     room.texture_px = _TABLE_TEXTURE_PX
-    size = np.array([*(_TABLE_HIGH - _TABLE_LOW), 0.04])
-    room.add_box(np.array([*_TABLE_LOW, -0.04]), size, rng)
+    room.add_box(_TABLE_LOW_M, _TABLE_SIZE_M, rng)
     room.texture_px = _BOX_TEXTURE_PX
     for _ in range(boxes):
-        size = np.array([*rng.uniform(0.04, 0.14, 2), rng.uniform(0.02, 0.16)])
+        width, depth = rng.uniform(0.04, 0.14, 2)
+        height = rng.uniform(0.02, 0.16)
+        size = np.array([width, depth, height])
         centre = WORK_AREA_M[:2] + rng.uniform(-1, 1, 2) * (0.32, 0.42)
-        away = np.linalg.norm(centre)
-        centre *= max(1.0, _FREE_M / away)
-        room.add_box(np.array([*(centre - size[:2] / 2), 0.0]), size, rng)
+        centre *= max(1.0, _FREE_M / np.linalg.norm(centre))
+        low = np.append(centre - size[:2] / 2, 0.0)
+        room.add_box(low, size, rng)
     return room
 
 
-def arm_surfaces(joints_rad: np.ndarray) -> list[Surface]:
+def arm_surfaces(joints_rad: Array) -> list[Surface]:
     """Boxes along the links of the arm for joint angles (7,)."""
     frames = joint_frames(joints_rad)
-    points = np.concatenate([np.zeros((1, 3)), frames[[0, 2, 3, 4, 6, 7], :3, 3]])
-    surfaces = []
+    origins = frames[[0, 2, 3, 4, 6, 7], :3, 3]
+    points = np.concatenate([np.zeros((1, 3)), origins])
+    surfaces: list[Surface] = []
     for start, end in pairwise(points):
         along = end - start
         length = np.linalg.norm(along)
         if length < 1e-6:
             continue
         up = along / length
-        side = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
-        side /= np.linalg.norm(side)
-        edges = np.stack([_LINK_M * side, _LINK_M * np.cross(up, side), along])
-        low = start - (edges[0] + edges[1]) / 2
-        surfaces += [Surface(*face, _link_texture()) for face in box_faces(low, edges)]
+        axis = np.array([0.0, 1.0, 0.0])
+        if abs(up[1]) >= 0.9:
+            axis = np.array([1.0, 0.0, 0.0])
+        side = unit_vector(np.cross(up, axis))
+        width = _LINK_M * side
+        depth = _LINK_M * np.cross(up, side)
+        low = start - (width + depth) / 2
+        for face in box_faces(low, np.stack([width, depth, along])):
+            surfaces.append(Surface(*face, _link_texture()))
     return surfaces
 
 
 def thing_surfaces(seed: int, base_from_gripper: SE3) -> list[Surface]:
     """The textured box that the gripper holds."""
     rotation = base_from_gripper.rotation_matrix()
-    return [
-        Surface(base_from_gripper.apply(corner), rotation @ u, rotation @ v, pyramid)
-        for corner, u, v, pyramid in _thing(seed)
-    ]
+    surfaces: list[Surface] = []
+    for thing in _thing(seed):
+        in_base = Surface(
+            corner_m=base_from_gripper.apply(thing.corner_m),
+            edge_u_m=rotation @ thing.edge_u_m,
+            edge_v_m=rotation @ thing.edge_v_m,
+            pyramid=thing.pyramid,
+        )
+        surfaces.append(in_base)
+    return surfaces
 
 
 @lru_cache(maxsize=4)
-def _thing(
-    seed: int,
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, ...]]]:
-    rng = np.random.default_rng([seed, 36])
+def _thing(seed: int) -> list[Surface]:
+    """The held box in the flange frame."""
+    rng = default_rng([seed, 36])
+    room = cell_room(seed)
     edges = np.diag(THING_SIZE_M)
-    bottom = THING_LOW_M + edges[1], edges[0], -edges[1]
-    faces = [*box_faces(THING_LOW_M, edges), bottom]
-    return [(*face, cell_room(seed).texture(rng, calm=False)) for face in faces]
+    bottom = (THING_LOW_M + edges[1], edges[0], -edges[1])
+    faces = box_faces(THING_LOW_M, edges)
+    faces.append(bottom)
+    return [Surface(*face, room.texture(rng, calm=False)) for face in faces]
 
 
 @lru_cache(maxsize=1)
-def _link_texture() -> tuple[np.ndarray, ...]:
+def _link_texture() -> Pyramid:
     picture = np.full((16, 16, 3), 205, np.uint8)
     picture[[0, -1]] = picture[:, [0, -1]] = 150
     return (picture,)

@@ -5,6 +5,7 @@ Craig's convention). The gripper frame is the flange.
 """
 
 import numpy as np
+from numpy.random import default_rng
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
@@ -23,25 +24,48 @@ LINKS = np.array(
     ]
 )
 """(8, 3) a, d and alpha of each joint and of the flange, metres and radians."""
-LOW_RAD = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
-HIGH_RAD = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
+_LIMITS_RAD = np.array(
+    [
+        (-2.8973, 2.8973),
+        (-1.7628, 1.7628),
+        (-2.8973, 2.8973),
+        (-3.0718, -0.0698),
+        (-2.8973, 2.8973),
+        (-0.0175, 3.7525),
+        (-2.8973, 2.8973),
+    ]
+)
+LOW_RAD = _LIMITS_RAD[:, 0]
+"""(7,) lower limits of the joint angles, radians."""
+HIGH_RAD = _LIMITS_RAD[:, 1]
+"""(7,) upper limits of the joint angles, radians."""
 HOME_RAD = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
-"""Franka's ready position."""
+"""(7,) joint angles of Franka's ready position, radians."""
 
 _REACHED_M = 1e-6
+"""Distance from the target position below which it is reached, metres."""
 _REACHED_RAD = 1e-6
+"""Angle from the target rotation below which it is reached, radians."""
+_CONVERGED = 1e-8
+"""Largest error, metres or radians, at which the iteration ends."""
 _STEPS = 60
+"""Maximum number of steps from one start."""
 _STARTS = 12
+"""Number of starts: the current joint angles, the ready position, and random ones."""
+_DAMPING = 1e-6
+"""Damping of the least-squares step, added to the diagonal."""
+_LONGEST_STEP_RAD = 0.5
+"""Maximum change of a joint angle in a step, radians."""
 
 
 def joint_frames(joints_rad: Array) -> Array:
     """(8, 4, 4) frames of the seven joints and of the flange in the base, for joint angles (7,)."""
     frames = np.zeros((8, 4, 4))
     current = np.eye(4)
+    angles = np.append(joints_rad, 0.0)
     for i, (a, d, alpha) in enumerate(LINKS):
-        angle = joints_rad[i] if i < 7 else 0.0
-        c = np.cos(angle)
-        s = np.sin(angle)
+        c = np.cos(angles[i])
+        s = np.sin(angles[i])
         ca = np.cos(alpha)
         sa = np.sin(alpha)
         step = np.array(
@@ -67,9 +91,9 @@ def joints_for(base_from_gripper: SE3, start_rad: Array, seed: int = 0) -> Array
 
     Damped least squares (Nakamura and Hanafusa 1986) with random restarts.
     """
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     starts = [np.asarray(start_rad, float), HOME_RAD]
-    starts += list(rng.uniform(LOW_RAD, HIGH_RAD, (_STARTS - 2, 7)))
+    starts.extend(rng.uniform(LOW_RAD, HIGH_RAD, (_STARTS - 2, 7)))
     nearest = np.inf
     for start in starts:
         joints, metres, radians = _descend(base_from_gripper, start)
@@ -90,15 +114,20 @@ def _descend(target: SE3, start: Array) -> tuple[Array, float, float]:
     for _ in range(_STEPS):
         frames = joint_frames(joints)
         flange = SE3.from_matrix(frames[-1])
+        shift = target.translation_m - flange.translation_m
         turn = (target @ flange.inverse()).log()[3:]
-        error = np.concatenate([target.translation_m - flange.translation_m, turn])
-        if np.abs(error).max() < 1e-8:
+        error = np.concatenate([shift, turn])
+        if np.abs(error).max() < _CONVERGED:
             break
         axes = frames[:7, :3, 2]
-        levers = frames[-1, :3, 3] - frames[:7, :3, 3]
-        jacobian = np.concatenate([np.cross(axes, levers), axes], 1).T
-        damped = jacobian @ jacobian.T + 1e-6 * np.eye(6)
+        origins = frames[:7, :3, 3]
+        levers = frames[-1, :3, 3] - origins
+        jacobian = np.hstack([np.cross(axes, levers), axes]).T
+        damped = jacobian @ jacobian.T + _DAMPING * np.eye(6)
         step = jacobian.T @ np.linalg.solve(damped, error)
-        step *= min(1.0, 0.5 / max(np.abs(step).max(), 1e-12))
+        longest = max(np.abs(step).max(), 1e-12)
+        step *= min(1.0, _LONGEST_STEP_RAD / longest)
         joints = np.clip(joints + step, LOW_RAD, HIGH_RAD)
-    return joints, float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
+    metres = float(np.linalg.norm(error[:3]))
+    radians = float(np.linalg.norm(error[3:]))
+    return joints, metres, radians

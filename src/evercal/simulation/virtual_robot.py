@@ -5,28 +5,34 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.random import default_rng
 
 from evercal.geometry import SE3
 from evercal.simulation.panda_arm import HOME_RAD, base_from_flange, joints_for
+from evercal.typing import Array
 
 SPEED_RAD_S = 1.0
-"""Speed of the fastest joint."""
+"""Speed of the fastest joint, radians per second."""
 _SETTLE_S = 0.1
+"""Time after a motion until the arm stands still, seconds."""
 
 
 class Clock:
     """Unix time, or a simulated one that passes only by `sleep`, at once."""
 
     def __init__(self, real: bool):
-        self._now_s = None if real else 0.0
+        self._real = real
+        self._now_s = 0.0
 
     def now(self) -> float:
         """Seconds since 1970, or since the start."""
-        return time.time() if self._now_s is None else self._now_s
+        if self._real:
+            return time.time()
+        return self._now_s
 
     def sleep(self, seconds: float) -> None:
         """Wait, or advance the simulated time."""
-        if self._now_s is None:
+        if self._real:
             time.sleep(seconds)
         else:
             self._now_s += seconds
@@ -36,24 +42,27 @@ class Clock:
 class Motion:
     """A motion of the joints from one pose to the next."""
 
-    start_rad: np.ndarray
-    end_rad: np.ndarray
+    start_rad: Array
+    """(7,) joint angles before the motion."""
+    end_rad: Array
+    """(7,) joint angles after the motion."""
     start_s: float
+    """Time at which the motion starts, seconds."""
     end_s: float
+    """Time at which the motion ends, seconds."""
     start_error: SE3
     """gripper_stated_from_gripper before the motion."""
     end_error: SE3
-    """The same after it."""
+    """gripper_stated_from_gripper after the motion."""
 
-    def at(self, now_s: float) -> tuple[np.ndarray, SE3]:
+    def at(self, now_s: float) -> tuple[Array, SE3]:
         """Joint angles (7,) and error at a time; the motion is smooth at both ends."""
-        t = np.clip(
-            (now_s - self.start_s) / max(self.end_s - self.start_s, 1e-9), 0.0, 1.0
-        )
+        seconds = max(self.end_s - self.start_s, 1e-9)
+        t = np.clip((now_s - self.start_s) / seconds, 0.0, 1.0)
         share = float(t * t * (3 - 2 * t))
-        start = self.start_error
         joints = self.start_rad + share * (self.end_rad - self.start_rad)
-        return joints, start @ SE3.exp(share * (start.inverse() @ self.end_error).log())
+        change = (self.start_error.inverse() @ self.end_error).log()
+        return joints, self.start_error @ SE3.exp(share * change)
 
 
 class VirtualRobot:
@@ -63,7 +72,7 @@ class VirtualRobot:
         # Standard deviations of the true pose about the stated one, per axis.
         self._clock = clock
         self._sigma = np.repeat([noise_m, noise_rad], 3)
-        self._rng = np.random.default_rng([seed, 32])
+        self._rng = default_rng([seed, 32])
         self._lock = threading.Lock()
         error = self._draw()
         now = clock.now()
@@ -71,11 +80,11 @@ class VirtualRobot:
 
     def base_from_gripper(self) -> SE3:
         """The stated pose of the flange."""
-        return base_from_flange(self._motion.at(self._clock.now())[0])
+        return base_from_flange(self._stated_joints())
 
     def joints_rad(self) -> tuple[float, ...]:
         """The seven stated joint angles, radians."""
-        return tuple(self._motion.at(self._clock.now())[0].tolist())
+        return tuple(self._stated_joints().tolist())
 
     def move_to(self, base_from_gripper: SE3) -> None:
         """Move and return when the arm stands still; a second caller waits for the first."""
@@ -84,14 +93,24 @@ class VirtualRobot:
             start, _ = self._motion.at(now)
             end = joints_for(base_from_gripper, start)
             seconds = float(np.abs(end - start).max()) / SPEED_RAD_S
-            errors = self._motion.end_error, self._draw()
-            self._motion = Motion(start, end, now, now + seconds, *errors)
+            self._motion = Motion(
+                start_rad=start,
+                end_rad=end,
+                start_s=now,
+                end_s=now + seconds,
+                start_error=self._motion.end_error,
+                end_error=self._draw(),
+            )
             self._clock.sleep(seconds + _SETTLE_S)
 
-    def true_state(self, now_s: float) -> tuple[SE3, np.ndarray]:
+    def true_state(self, now_s: float) -> tuple[SE3, Array]:
         """True base_from_gripper and joint angles (7,) at a time; for cameras and tests only."""
         joints, error = self._motion.at(now_s)
         return base_from_flange(joints) @ error, joints
+
+    def _stated_joints(self) -> Array:
+        joints, _ = self._motion.at(self._clock.now())
+        return joints
 
     def _draw(self) -> SE3:
         return SE3.exp(self._sigma * self._rng.standard_normal(6))
