@@ -42,7 +42,8 @@ class BoxRoom:
         self.texture_px = texture_px
         self.surfaces: list[Surface] = []
         x, y, _ = self.size_m
-        self.add_box(np.array([-x / 2, -y / 2, 0]), self.size_m, rng, inward=True)
+        low = np.array([-x / 2, -y / 2, 0])
+        self.add_box(low, self.size_m, rng, inward=True)
         if furniture is None:
             furniture = int(rng.integers(5, 14))
         for _ in range(furniture):
@@ -77,7 +78,8 @@ class BoxRoom:
     ) -> None:
         """Add a textured box from its lowest corner (3,) and its sides (3,), see `box_faces`."""
         for corner, u, v in box_faces(low, np.diag(size), inward):
-            pyramid = self.texture(rng, calm=inward or rng.random() < 0.3)
+            calm = inward or rng.random() < 0.3
+            pyramid = self.texture(rng, calm)
             self.surfaces.append(Surface(corner, u, v, pyramid))
 
     def _add_furniture(self, rng: Generator) -> None:
@@ -85,7 +87,8 @@ class BoxRoom:
         size = rng.uniform(0.2, (1.2, 1.2, 1.4))
         wall = rng.integers(4)
         free = self.size_m - size
-        centre = rng.uniform(-0.5, 0.5, 2) * free[:2]
+        centre = rng.uniform(-0.5, 0.5, 2)
+        centre *= free[:2]
         axis = wall // 2
         sign = 1 - 2 * (wall % 2)
         at_wall = sign * free[axis] / 2
@@ -130,11 +133,18 @@ class BoxRoom:
         camera_from_base = base_from_camera.inverse()
         rotation = camera_from_base.rotation_matrix()
         for surface in (*self.surfaces, *moving):
-            corner = camera_from_base.apply(surface.corner_m)
+            corner_m = camera_from_base.apply(surface.corner_m)
             edge_u = rotation @ surface.edge_u_m
             edge_v = rotation @ surface.edge_v_m
             edges = np.stack([edge_u, edge_v], -1)
-            draw(image, nearness, surface.pyramid, corner, edges, camera)
+            draw(
+                image,
+                nearness,
+                surface.pyramid,
+                corner_m,
+                edges,
+                camera,
+            )
         return image
 
     def intersect(

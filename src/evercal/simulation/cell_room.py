@@ -54,11 +54,11 @@ def cell_room(seed: int, boxes: int = 12) -> BoxRoom:
     room.add_box(_TABLE_LOW_M, _TABLE_SIZE_M, rng)
     room.texture_px = _BOX_TEXTURE_PX
     for _ in range(boxes):
-        width, depth = rng.uniform(0.04, 0.14, 2)
-        height = rng.uniform(0.02, 0.16)
-        size = np.array([width, depth, height])
-        centre = WORK_AREA_M[:2] + rng.uniform(-1, 1, 2) * (0.32, 0.42)
-        centre *= max(1.0, _FREE_M / np.linalg.norm(centre))
+        size = rng.uniform((0.04, 0.04, 0.02), (0.14, 0.14, 0.16))
+        aside = rng.uniform(-1, 1, 2) * (0.32, 0.42)
+        centre = WORK_AREA_M[:2] + aside
+        away = np.linalg.norm(centre)
+        centre *= max(1.0, _FREE_M / away)
         low = np.append(centre - size[:2] / 2, 0.0)
         room.add_box(low, size, rng)
     return room
@@ -118,5 +118,6 @@ def _thing(seed: int) -> list[Surface]:
 @lru_cache(maxsize=1)
 def _link_texture() -> Pyramid:
     picture = np.full((16, 16, 3), 205, np.uint8)
-    picture[[0, -1]] = picture[:, [0, -1]] = 150
+    picture[[0, -1]] = 150
+    picture[:, [0, -1]] = 150
     return (picture,)

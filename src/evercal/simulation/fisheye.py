@@ -28,7 +28,10 @@ def fisheye_image(
 
     `render` gives the image of an ideal pinhole at a pose. Each pixel is the mean of finer x finer.
     """
-    large = camera.resized(finer * camera.width, finer * camera.height)
+    large = camera.resized(
+        width=finer * camera.width,
+        height=finer * camera.height,
+    )
     v, u = np.mgrid[: large.height, : large.width]
     rays = large.unproject(np.stack([u, v], -1))
     lengths = np.linalg.norm(rays, axis=-1)
@@ -63,4 +66,11 @@ def _face_camera(side: int) -> Camera:
     """A pinhole for a face of the cube, with a border beside 90 degrees for the interpolation."""
     focal = side / 2.04
     centre = (side - 1) / 2
-    return Camera(side, side, focal, focal, centre, centre)
+    return Camera(
+        width=side,
+        height=side,
+        fx=focal,
+        fy=focal,
+        cx=centre,
+        cy=centre,
+    )

@@ -24,22 +24,23 @@ LINKS = np.array(
     ]
 )
 """(8, 3) a, d and alpha of each joint and of the flange, metres and radians."""
-_LIMITS_RAD = np.array(
+_JOINTS_RAD = np.array(
     [
-        (-2.8973, 2.8973),
-        (-1.7628, 1.7628),
-        (-2.8973, 2.8973),
-        (-3.0718, -0.0698),
-        (-2.8973, 2.8973),
-        (-0.0175, 3.7525),
-        (-2.8973, 2.8973),
+        (-2.8973, 2.8973, 0.0),
+        (-1.7628, 1.7628, -0.785),
+        (-2.8973, 2.8973, 0.0),
+        (-3.0718, -0.0698, -2.356),
+        (-2.8973, 2.8973, 0.0),
+        (-0.0175, 3.7525, 1.571),
+        (-2.8973, 2.8973, 0.785),
     ]
 )
-LOW_RAD = _LIMITS_RAD[:, 0]
+"""(7, 3) lower limit, upper limit and ready position of each joint, radians."""
+LOW_RAD = _JOINTS_RAD[:, 0]
 """(7,) lower limits of the joint angles, radians."""
-HIGH_RAD = _LIMITS_RAD[:, 1]
+HIGH_RAD = _JOINTS_RAD[:, 1]
 """(7,) upper limits of the joint angles, radians."""
-HOME_RAD = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+HOME_RAD = _JOINTS_RAD[:, 2]
 """(7,) joint angles of Franka's ready position, radians."""
 
 _REACHED_M = 1e-6
@@ -83,17 +84,23 @@ def joint_frames(joints_rad: Array) -> Array:
 
 def base_from_flange(joints_rad: Array) -> SE3:
     """Pose of the flange for joint angles (7,)."""
-    return SE3.from_matrix(joint_frames(np.asarray(joints_rad, float))[-1])
+    frames = joint_frames(joints_rad)
+    return SE3.from_matrix(frames[-1])
 
 
-def joints_for(base_from_gripper: SE3, start_rad: Array, seed: int = 0) -> Array:
+def joints_for(
+    base_from_gripper: SE3,
+    start_rad: Array,
+    seed: int = 0,
+) -> Array:
     """Joint angles (7,) that bring the flange to a pose, near `start_rad` if possible.
 
     Damped least squares (Nakamura and Hanafusa 1986) with random restarts.
     """
     rng = default_rng(seed)
     starts = [np.asarray(start_rad, float), HOME_RAD]
-    starts.extend(rng.uniform(LOW_RAD, HIGH_RAD, (_STARTS - 2, 7)))
+    for _ in range(len(starts), _STARTS):
+        starts.append(rng.uniform(LOW_RAD, HIGH_RAD))
     nearest = np.inf
     for start in starts:
         joints, metres, radians = _descend(base_from_gripper, start)
@@ -123,7 +130,8 @@ def _descend(target: SE3, start: Array) -> tuple[Array, float, float]:
         origins = frames[:7, :3, 3]
         levers = frames[-1, :3, 3] - origins
         jacobian = np.hstack([np.cross(axes, levers), axes]).T
-        damped = jacobian @ jacobian.T + _DAMPING * np.eye(6)
+        damped = jacobian @ jacobian.T
+        damped += _DAMPING * np.eye(6)
         step = jacobian.T @ np.linalg.solve(damped, error)
         longest = max(np.abs(step).max(), 1e-12)
         step *= min(1.0, _LONGEST_STEP_RAD / longest)

@@ -11,7 +11,14 @@ from evercal.typing import Array, BoolArray, Image
 
 NEAR_M = 0.05
 """Depth of the near plane of rendered images, metres."""
-_CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+_CORNERS = np.array(
+    [
+        (0, 0),
+        (1, 0),
+        (1, 1),
+        (0, 1),
+    ]
+)
 """(4, 2) corners of a rectangle, in units of its edges."""
 
 Pyramid = tuple[Image, ...]
@@ -46,10 +53,12 @@ class Surface:
         distance = (self.corner_m - origin) @ self.normal
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = distance / slope
-            local = origin + depth[:, None] * rays - self.corner_m
+            points = origin + depth[:, None] * rays
+            local = points - self.corner_m
             u = local @ self.edge_u_m / (self.edge_u_m @ self.edge_u_m)
             v = local @ self.edge_v_m / (self.edge_v_m @ self.edge_v_m)
-            hit = _in_unit_square(u, v) & (slope < 0) & (depth > 1e-6)
+            ahead = (slope < 0) & (depth > 1e-6)
+            hit = ahead & _in_unit_square(u, v)
         return np.where(hit, depth, np.inf)
 
 
@@ -86,11 +95,13 @@ def _window(corners: Array, camera: Camera) -> tuple[slice, slice] | None:
         return slice(0, camera.height), slice(0, camera.width)
     pixels = camera.project(corners)
     size = (camera.width, camera.height)
-    low = np.maximum(np.floor(pixels.min(0)), 0).astype(int)
-    high = np.minimum(np.ceil(pixels.max(0)) + 1, size).astype(int)
-    if (low >= high).any():
+    low = np.floor(pixels.min(0))
+    high = np.ceil(pixels.max(0)) + 1
+    start = np.maximum(low, 0).astype(int)
+    stop = np.minimum(high, size).astype(int)
+    if (start >= stop).any():
         return None
-    columns, rows = map(slice, low, high)
+    columns, rows = map(slice, start, stop)
     return rows, columns
 
 
@@ -103,8 +114,8 @@ def draw(
     camera: Camera,
 ) -> None:
     """Warp a rectangle in camera coordinates into `image` where it is nearest, by `nearness`."""
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    if normal @ corner >= 0:  # back side
+    edge_u, edge_v = edges.T
+    if np.cross(edge_u, edge_v) @ corner >= 0:  # back side
         return
     window = _window(corner + _CORNERS @ edges.T, camera)
     if window is None:
@@ -115,7 +126,9 @@ def draw(
     v, u = np.mgrid[window].astype(np.float32)
 
     def product(row: Array) -> Array:
-        return (row[0] * u + row[1] * v + row[2]).astype(np.float32)
+        along_u, along_v, offset = row
+        values = along_u * u + along_v * v + offset
+        return values.astype(np.float32)
 
     a, b, w = map(product, texture_from_image)
     front = nearness[window]
@@ -153,4 +166,6 @@ def unit_vector(vector: Array) -> Array:
 
 
 def _in_unit_square(u: Array, v: Array) -> BoolArray:
-    return (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+    inside_u = (u >= 0) & (u <= 1)
+    inside_v = (v >= 0) & (v <= 1)
+    return inside_u & inside_v

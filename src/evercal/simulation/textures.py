@@ -92,7 +92,8 @@ def _pixels(height: int, width: int) -> Float32Array:
 
 
 def _square_wave(periods: Array) -> Array:
-    return np.sign(np.sin(2 * np.pi * periods))
+    sine = np.sin(2 * np.pi * periods)
+    return np.sign(sine)
 
 
 _FILLS = (
@@ -106,10 +107,12 @@ _FILLS = (
 
 def _ellipse(mask: Image, rng: Generator) -> None:
     height, width = mask.shape
+    radius_u = max(1, width // 2 - 1)
+    radius_v = max(1, height // 2 - 1)
     cv2.ellipse(
         mask,
         center=(width // 2, height // 2),
-        axes=(max(1, width // 2 - 1), max(1, height // 2 - 1)),
+        axes=(radius_u, radius_v),
         angle=0.0,
         startAngle=0.0,
         endAngle=360.0,
@@ -126,11 +129,11 @@ def _rectangle(mask: Image, rng: Generator) -> None:
 def _polygon(mask: Image, rng: Generator) -> None:
     height, width = mask.shape
     corners = rng.integers(3, 8)
-    angle = np.sort(rng.uniform(0, 2 * np.pi, corners))
-    x = np.cos(angle) * width / 2
-    y = np.sin(angle) * height / 2
-    centre = (width // 2, height // 2)
-    _fill_polygon(mask, np.stack([x, y], -1) + centre)
+    angles = rng.uniform(0, 2 * np.pi, corners)
+    angles.sort()
+    x = width // 2 + np.cos(angles) * width / 2
+    y = height // 2 + np.sin(angles) * height / 2
+    _fill_polygon(mask, np.stack([x, y], -1))
 
 
 def _turned_box(mask: Image, rng: Generator) -> None:
@@ -189,7 +192,8 @@ def dead_leaves(
     smallest = 10.0
     largest = 0.6 * min(height, width)
     u = rng.random(leaves)
-    sizes = 1.0 / (u / smallest + (1 - u) / largest)
+    inverse_sizes = u / smallest + (1 - u) / largest
+    sizes = 1.0 / inverse_sizes
     saturation = rng.uniform(0.0, 0.35)
     for size in np.sort(sizes)[::-1]:
         _add_leaf(picture, size, saturation, rng)
@@ -206,14 +210,15 @@ def _add_leaf(
     stretched = size * rng.uniform(0.6, 1.6, 2)
     sides = np.clip(stretched, 4, bounds - 1).astype(int)
     low = rng.integers(-sides // 2, bounds - sides // 2)
-    mask = np.zeros(sides, np.uint8)
+    mask: Image = np.zeros(sides, np.uint8)
     draw = _SHAPES[rng.integers(len(_SHAPES))]
     draw(mask, rng)
     fill = _FILLS[rng.integers(len(_FILLS))]
     height, width = mask.shape
     texture = fill(height, width, rng)
     grey = rng.uniform(0.02, 0.98)
-    colour = grey + saturation * rng.uniform(-1, 1, 3)
+    tint = rng.uniform(-1, 1, 3)
+    colour = grey + saturation * tint
     start = np.maximum(low, 0)
     stop = np.minimum(low + sides, bounds)
     in_picture = tuple(map(slice, start, stop))

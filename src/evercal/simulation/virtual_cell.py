@@ -41,10 +41,18 @@ HELD_TURN_DEG = 40.0
 HIDDEN_DEG = 60.0
 """The arm hides a held box from a camera within this angle of the flange's back, degrees."""
 
-_CENTRE_RAD = np.array([0.0, -0.6, 0.0, -2.2, 0.0, 1.75, 0.785])
-"""(7,) joint angles in the middle of random poses, radians."""
-_SPREAD_RAD = np.array([0.8, 0.6, 0.5, 0.5, 0.7, 0.55, 1.2])
-"""(7,) maximum deviation of joint angles from the middle, radians."""
+_ARM_POSES_RAD = np.array(
+    [
+        (0.0, 0.8),
+        (-0.6, 0.6),
+        (0.0, 0.5),
+        (-2.2, 0.5),
+        (0.0, 0.7),
+        (1.75, 0.55),
+        (0.785, 1.2),
+    ]
+)
+"""(7, 2) mean of random angles of each joint and their maximum deviation, radians."""
 _BLUR_RAD = 0.002
 """Joint step between two copies of a blurred image, radians: they shift by about a pixel."""
 _MOST_BLUR_STEPS = 16
@@ -86,7 +94,12 @@ class CellTruth:
 class VirtualCamera:
     """A camera of the cell: on the gripper by gripper_from_camera, or fixed in the base."""
 
-    def __init__(self, cell: "VirtualCell", mounted: SE3, on_gripper: bool):
+    def __init__(
+        self,
+        cell: "VirtualCell",
+        mounted: SE3,
+        on_gripper: bool,
+    ):
         self._cell = cell
         self._mounted = mounted
         self._on_gripper = on_gripper
@@ -140,8 +153,16 @@ class VirtualCell:
         noise_rad = float(np.deg2rad(options.arm_noise_deg))
         self.robot = VirtualRobot(self.clock, noise_m, noise_rad, seed)
         self.truth = CellTruth(_mount(rng), _tripod(rng))
-        self.wrist_camera = VirtualCamera(self, self.truth.gripper_from_camera, True)
-        self.tripod_camera = VirtualCamera(self, self.truth.base_from_tripod, False)
+        self.wrist_camera = VirtualCamera(
+            self,
+            mounted=self.truth.gripper_from_camera,
+            on_gripper=True,
+        )
+        self.tripod_camera = VirtualCamera(
+            self,
+            mounted=self.truth.base_from_tripod,
+            on_gripper=False,
+        )
         self._holds = False
         self.seed = seed
         self.noise = default_rng([seed, 34])
@@ -153,9 +174,11 @@ class VirtualCell:
             base_from_camera = gripper @ nominal_mount()
             work_area = base_from_camera.inverse().apply(WORK_AREA_M)
             distance = float(np.linalg.norm(work_area))
-            ahead = work_area[2] > np.cos(np.deg2rad(OFF_AXIS_DEG)) * distance
+            least_depth = np.cos(np.deg2rad(OFF_AXIS_DEG)) * distance
+            ahead = work_area[2] > least_depth
             near = NEAREST_M < distance < FARTHEST_M
-            return ahead and near and gripper.translation_m[2] > LOWEST_M
+            high = gripper.translation_m[2] > LOWEST_M
+            return ahead and near and high
 
         return _random_poses(count, [self.seed, 35, seed], usable)
 
@@ -167,7 +190,7 @@ class VirtualCell:
         """Random gripper poses (count,) at which the fixed camera sees all of the held thing."""
         base_from_camera = self.truth.base_from_tripod
         camera_from_base = base_from_camera.inverse()
-        middle_from_base = base_from_flange(_CENTRE_RAD).inverse()
+        middle_from_base = base_from_flange(_ARM_POSES_RAD[:, 0]).inverse()
         unit_cube = np.indices((2, 2, 2)).reshape(3, 8).T
         corners = THING_LOW_M + THING_SIZE_M * unit_cube
         image = (self.intrinsics.width, self.intrinsics.height)
@@ -184,7 +207,8 @@ class VirtualCell:
             turn = (middle_from_base @ gripper).log()[3:]
             upright = np.abs(turn).max() < np.deg2rad(HELD_TURN_DEG)
             above = points[:, 2].min() > 0
-            return bool(visible and to_camera[2] > behind and upright and above)
+            unhidden = to_camera[2] > behind
+            return bool(visible and unhidden and upright and above)
 
         return _random_poses(count, [self.seed, 37, seed], usable)
 
@@ -209,18 +233,22 @@ class VirtualCell:
 
 def nominal_mount() -> SE3:
     """gripper_from_camera as in the drawing of the cell: beside the flange, along the fingers."""
-    turned = SE3.exp(np.array([0, 0, 0, 0, 0, np.pi / 4]))
-    return SE3.from_translation((0.05, -0.05, 0.03)) @ turned
+    turn = SE3.exp([0, 0, 0, 0, 0, np.pi / 4])
+    shift = SE3.from_translation((0.05, -0.05, 0.03))
+    return shift @ turn
 
 
 def _random_poses(
-    count: int, seed: Sequence[int], usable: Callable[[SE3], bool]
+    count: int,
+    seed: Sequence[int],
+    usable: Callable[[SE3], bool],
 ) -> SE3:
     """Usable gripper poses (count,) for random joint angles."""
     rng = default_rng(seed)
+    mean, spread = _ARM_POSES_RAD.T
     poses: list[SE3] = []
     while len(poses) < count:
-        joints = _CENTRE_RAD + _SPREAD_RAD * rng.uniform(-1, 1, 7)
+        joints = mean + spread * rng.uniform(-1, 1, 7)
         gripper = base_from_flange(joints)
         if usable(gripper):
             poses.append(gripper)

@@ -58,9 +58,11 @@ class Motion:
     def at(self, now_s: float) -> tuple[Array, SE3]:
         """Joint angles (7,) and error at a time; the motion is smooth at both ends."""
         seconds = max(self.end_s - self.start_s, 1e-9)
-        t = np.clip((now_s - self.start_s) / seconds, 0.0, 1.0)
+        passed = now_s - self.start_s
+        t = np.clip(passed / seconds, 0.0, 1.0)
         share = float(t * t * (3 - 2 * t))
-        joints = self.start_rad + share * (self.end_rad - self.start_rad)
+        turn = self.end_rad - self.start_rad
+        joints = self.start_rad + share * turn
         change = (self.start_error.inverse() @ self.end_error).log()
         return joints, self.start_error @ SE3.exp(share * change)
 
@@ -68,7 +70,13 @@ class Motion:
 class VirtualRobot:
     """An arm that moves in joint space and stops with a small error that it does not state."""
 
-    def __init__(self, clock: Clock, noise_m: float, noise_rad: float, seed: int):
+    def __init__(
+        self,
+        clock: Clock,
+        noise_m: float,
+        noise_rad: float,
+        seed: int,
+    ):
         # Standard deviations of the true pose about the stated one, per axis.
         self._clock = clock
         self._sigma = np.repeat([noise_m, noise_rad], 3)
@@ -76,7 +84,14 @@ class VirtualRobot:
         self._lock = threading.Lock()
         error = self._draw()
         now = clock.now()
-        self._motion = Motion(HOME_RAD, HOME_RAD, now, now, error, error)
+        self._motion = Motion(
+            start_rad=HOME_RAD,
+            end_rad=HOME_RAD,
+            start_s=now,
+            end_s=now,
+            start_error=error,
+            end_error=error,
+        )
 
     def base_from_gripper(self) -> SE3:
         """The stated pose of the flange."""
@@ -92,7 +107,8 @@ class VirtualRobot:
             now = self._clock.now()
             start, _ = self._motion.at(now)
             end = joints_for(base_from_gripper, start)
-            seconds = float(np.abs(end - start).max()) / SPEED_RAD_S
+            largest_rad = np.abs(end - start).max()
+            seconds = float(largest_rad) / SPEED_RAD_S
             self._motion = Motion(
                 start_rad=start,
                 end_rad=end,
