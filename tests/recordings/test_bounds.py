@@ -207,7 +207,7 @@ def test_an_image_that_opencv_refuses_is_one_line(
     write_image(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
     monkeypatch.setattr(cv2, "imdecode", refuse)
     with pytest.raises(
-        InputError, match=r"at most 100,000,000 pixels.* --limits pixels=NUMBER"
+        InputError, match=r"at most 100,000,000 pixels.* `limits` pixels=NUMBER"
     ):
         read_image(tmp_path / "a.png")
 

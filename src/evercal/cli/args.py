@@ -126,7 +126,8 @@ class Reading:
         from evercal.recordings import ReadOptions, load_recording
 
         given = {field.name: getattr(self, field.name) for field in fields(ReadOptions)}
-        return load_recording(path, self.format, name, ReadOptions(**given))
+        options = ReadOptions(**given)
+        return load_recording(path, self.format, name, options)  # pyright: ignore[reportArgumentType]
 
     def words(self) -> list[str]:
         """The options that were given, as words of a command."""

@@ -46,9 +46,9 @@ def local_copy(address: str) -> Iterator[Path]:
                     raise InputError(
                         f"{address}: its file {inside!r} leads out of it; rename it"
                     )
-                to = target / inside if inside else target
-                to.parent.mkdir(parents=True, exist_ok=True)
-                store.get_file(file, str(to))
+                copy = target / inside  # target itself where the address is a file
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                store.get_file(file, str(copy))
         yield target
 
 

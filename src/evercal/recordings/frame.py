@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,10 +18,10 @@ from evercal.typing import Image
 if TYPE_CHECKING:
     from evercal.robot.arm import Arm
 
-MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
-MIN_GRIPPER_FRAMES = (
-    8  # the same for a camera on the gripper: a few views around one place
-)
+MIN_TRAIN_FRAMES = 16
+"""Minimum number of training frames with a camera pose for learning a scene."""
+MIN_GRIPPER_FRAMES = 8
+"""The same with gripper poses: a few views around one place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,18 +110,22 @@ def checked_name(name: str) -> str:
 
 def with_images(recording: Recording, folder: Path) -> Recording:
     """Leave out frames without a readable image file in `folder`; more than half are refused."""
-    both = recording.train + recording.test
-    files = {frame.name: file for frame in both if (file := file_of(frame.image))}
-    lost = {
-        n: os.path.relpath(f, folder) for n, f in files.items() if not is_readable(f)
-    }
+    files = {}
+    lost = {}
+    for frame in (*recording.train, *recording.test):
+        file = file_of(frame.image)
+        if file is not None:
+            files[frame.name] = file
+            if not is_readable(file):
+                lost[frame.name] = file
     if not lost:
         return recording
-    is_there = files[next(iter(lost))].is_file()
-    unused = set() if is_there else {*files_in(folder, glob="**/*")} - {*files.values()}
-    note = lost_images(
-        [*lost.values()], len(files), [os.path.relpath(f, folder) for f in unused]
-    )
+    unused: set[Path] = set()
+    if not next(iter(lost.values())).is_file():
+        unused = {*files_in(folder, glob="**/*")}.difference(files.values())
+    relative = partial(os.path.relpath, start=folder)
+    names = [*map(relative, lost.values())]
+    note = lost_images(names, len(files), map(relative, unused))
     train = tuple(frame for frame in recording.train if frame.name not in lost)
     test = tuple(frame for frame in recording.test if frame.name not in lost)
     return replace(recording, train=train, test=test, notes=(*recording.notes, note))
@@ -145,7 +150,6 @@ def posed_recording(recording: Recording) -> Recording:
 
 def lacks_camera_poses(recording: Recording) -> bool:
     """Whether a recording states gripper poses but no camera poses."""
-    stated = any(frame.base_from_camera is not None for frame in recording.train)
-    return not stated and any(
-        frame.base_from_gripper is not None for frame in recording.train
-    )
+    if posed_frames(recording.train):
+        return False
+    return any(frame.base_from_gripper is not None for frame in recording.train)

@@ -11,7 +11,9 @@ if TYPE_CHECKING:
     from evercal.recordings.addresses import RecordingAt
 
 EVERY = 100
+"""Training frames of which one block is held out."""
 BLOCK = 4
+"""Consecutive frames of a block that is held out."""
 Named = TypeVar("Named", bound="Recording | RecordingAt")
 
 
@@ -21,8 +23,8 @@ class HeldOutSplit:
 
     train: tuple[Frame, ...]
     held_out: tuple[Frame, ...]
-    """Frames that acceptance is fitted to: blocks of 4 in every 100, at least one block; none of a
-    recording with fewer than `MIN_TRAIN_FRAMES` frames."""
+    """Frames that the scatter of the stated poses is fitted to: 4 consecutive ones in every 100,
+    and at least 4. A recording with fewer than `MIN_TRAIN_FRAMES` frames has none."""
 
 
 def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
@@ -31,18 +33,24 @@ def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
         return HeldOutSplit(tuple(frames), ())
     every = min(EVERY, len(frames))
     middle = every // 2
-    parts: tuple[list[Frame], list[Frame]] = ([], [])
+    train = []
+    held_out = []
     for i, frame in enumerate(frames):
-        parts[middle <= i % every < middle + BLOCK].append(frame)
-    return HeldOutSplit(*map(tuple, parts))
+        if middle <= i % every < middle + BLOCK:
+            held_out.append(frame)
+        else:
+            train.append(frame)
+    return HeldOutSplit(tuple(train), tuple(held_out))
 
 
 def named_recording(recording: Named, name: str | None, taken: Iterable[str]) -> Named:
     """A recording under the name that its scene will have; its own name by default."""
-    name = checked_name(recording.name if name is None else name)
+    if name is None:
+        name = recording.name
+    checked_name(name)
     if name in taken:
         raise InputError(
-            f"scene {name!r}: a scene of this name exists; give another with --name"
+            f"scene {name!r}: a scene of this name exists; give another with `name`"
         )
     return replace(recording, name=name)
 

@@ -15,11 +15,12 @@ def image_files(paths: Sequence[PathLike]) -> list[Path]:
     files: list[Path] = []
     for path in map(Path, paths):
         if path.is_dir():
-            if not (inside := files_in(path)):
+            images = files_in(path)
+            if not images:
                 raise InputError(
                     f"{path}: no images in this folder ({', '.join(IMAGE_ENDINGS)})"
                 )
-            files += inside
+            files += images
         elif path.is_file():
             files.append(path)
         else:

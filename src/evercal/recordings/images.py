@@ -19,12 +19,18 @@ from evercal.typing import Image, PathLike
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 """Endings of image files, in lower case."""
-_JPEG, _SCAN, _MOST_SCANS = b"\xff\xd8", b"\xff\xda", 100
-"""Beginning of a JPEG file, and of a scan in it: progressive files have about ten."""
+_JPEG = b"\xff\xd8"
+"""Beginning of a JPEG file."""
+_SCAN = b"\xff\xda"
+"""Beginning of a scan in a JPEG file."""
+_MOST_SCANS = 100
+"""Maximum number of scans; progressive files have about ten."""
 _TURNED = re.compile(rb"(\x01\x12\0\x03\0{3}\x01\0|\x12\x01\x03\0\x01\0{3})[\x02-\x08]")
 """EXIF orientation other than upright."""
 _TIFF = {b"II*\0": "<u4", b"MM\0*": ">u4"}
+"""Byte order of a TIFF file by its beginning."""
 _PNG = b"\x89PNG"
+"""Beginning of a PNG file."""
 
 
 class StoredImage(ABC):
@@ -58,13 +64,18 @@ def pixels_of(image: Picture) -> Image:
     """Read a picture: (H, W, 3) uint8 RGB."""
     if isinstance(image, Path):
         return read_image(image)
-    return image.read() if isinstance(image, StoredImage) else as_rgb(image)
+    if isinstance(image, StoredImage):
+        return image.read()
+    return as_rgb(image)
 
 
 def file_of(image: Picture) -> Path | None:
     """The file of which a picture is the only content, if there is one."""
-    file = image.path if isinstance(image, UnturnedImage) else image
-    return file if isinstance(file, Path) else None
+    if isinstance(image, UnturnedImage):
+        return image.path
+    if isinstance(image, Path):
+        return image
+    return None
 
 
 def files_in(
@@ -74,26 +85,35 @@ def files_in(
 
     Hidden files, such as ._a.jpg that macOS puts beside a.jpg, are no content.
     """
-    files = (file for file in folder.glob(glob) if file.name[0] != ".")
-    own = (file for file in files if file.name.lower().endswith(end))
-    return sorted(own, key=lambda file: natural_key(file.as_posix()))
+    files = []
+    for file in folder.glob(glob):
+        name = file.name.lower()
+        if name.endswith(end) and not name.startswith("."):
+            files.append(file)
+    return sorted(files, key=lambda file: natural_key(file.as_posix()))
 
 
 def as_stored(path: Path) -> Path | UnturnedImage:
     """An image file whose EXIF orientation is not applied; the file itself if it states none."""
     with suppress(OSError, ValueError):  # ValueError: the file is empty
-        return UnturnedImage(path) if _orientation(np.memmap(path, mode="r")) else path
+        if _orientation(np.memmap(path, mode="r")):
+            return UnturnedImage(path)
     return path
 
 
 def _orientation(data: Image) -> int:
     """Position of the orientation in the bytes (n,) of a file that is not upright, else 0."""
-    start = data[:12].tobytes()
-    at = max(0, data.tobytes().rfind(b"EXIF")) if start[8:] == b"WEBP" else 0
-    if start[:4] in _TIFF:
-        at = int(np.frombuffer(start, _TIFF[start[:4]], 1, 4)[0])
-    match = _TURNED.search(data[at : at + 4096].tobytes())
-    return at + match.end() - 1 if match else 0
+    header = data[:12].tobytes()
+    kind = header[:4]
+    start = 0
+    if header[8:] == b"WEBP":
+        start = max(0, data.tobytes().rfind(b"EXIF"))
+    if kind in _TIFF:
+        start = int(np.frombuffer(header, _TIFF[kind], 1, 4)[0])
+    match = _TURNED.search(data[start : start + 4096].tobytes())
+    if match is None:
+        return 0
+    return start + match.end() - 1
 
 
 def is_readable(image: Path | Image) -> bool:
@@ -102,25 +122,27 @@ def is_readable(image: Path | Image) -> bool:
     Of a PNG the checksums are compared, which takes a tenth of the time.
     """
     with suppress(OSError, ValueError):  # ValueError: the file is empty
-        data = np.asarray(
-            np.memmap(image, mode="r") if isinstance(image, Path) else image
-        )
+        if isinstance(image, Path):
+            image = np.memmap(image, mode="r")
+        data = np.asarray(image)
         return _is_whole_png(data) or decode_image(data) is not None
     return False
 
 
 def _is_whole_png(data: Image) -> bool:
-    at = 8
+    if data[:4].tobytes() != _PNG:
+        return False
+    start = 8
     kind = b""
-    while data[:4].tobytes() == _PNG and kind != b"IEND" and at + 12 <= len(data):
-        end = at + 8 + int.from_bytes(data[at : at + 4].tobytes(), "big")
-        kind = data[at + 4 : at + 8].tobytes()
-        if (
-            zlib.crc32(data[at + 4 : end].data).to_bytes(4, "big")
-            != data[end : end + 4].tobytes()
-        ):
+    while kind != b"IEND" and start + 12 <= len(data):
+        length = int.from_bytes(data[start : start + 4].tobytes(), "big")
+        end = start + 8 + length
+        chunk = data[start + 4 : end]
+        kind = chunk[:4].tobytes()
+        checksum = zlib.crc32(chunk.data)
+        if checksum != int.from_bytes(data[end : end + 4].tobytes(), "big"):
             return False
-        at = end + 4
+        start = end + 4
     return kind == b"IEND"
 
 
@@ -141,13 +163,10 @@ def as_rgb(image: ArrayLike) -> Image:
         pixels = np.asarray(image)
     except (TypeError, ValueError):
         raise InputError("image: not an array; give (H, W, 3) uint8 RGB") from None
-    if (
-        isinstance(image, (list, tuple))
-        and np.issubdtype(pixels.dtype, np.integer)
-        and pixels.size
-    ):
-        in_range = pixels.min() >= 0 and pixels.max() <= 255
-        pixels = pixels.astype(np.uint8) if in_range else pixels
+    is_list = isinstance(image, (list, tuple)) and pixels.size > 0
+    if is_list and np.issubdtype(pixels.dtype, np.integer):
+        is_byte = pixels.min() >= 0 and pixels.max() <= 255
+        pixels = pixels.astype(np.uint8 if is_byte else pixels.dtype)
     channels = pixels.shape[2:] or (1,)
     valid = pixels.ndim in (2, 3) and channels[0] in (1, 3, 4) and pixels.size
     if not valid or pixels.dtype not in (np.uint8, np.uint16):
@@ -156,16 +175,12 @@ def as_rgb(image: ArrayLike) -> Image:
             f" (H, W, 3) RGB or (H, W, 4) RGBA as uint8 or uint16"
         )
     if pixels.dtype == np.uint16:
-        wide = pixels
-        pixels = np.empty(pixels.shape, np.uint8)
-        # In parts, because the sums take four bytes each.
-        for row in range(0, len(wide), 64):
-            pixels[row : row + 64] = (
-                wide[row : row + 64].astype(np.uint32) + 128
-            ) // 257
+        import cv2
+
+        pixels = cv2.convertScaleAbs(pixels, alpha=1 / 257).reshape(pixels.shape)
     if channels == (1,):
         pixels = np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, axis=2)
-    return np.ascontiguousarray(pixels[:, :, :3])
+    return np.ascontiguousarray(pixels[:, :, :3], np.uint8)
 
 
 def read_image(path: PathLike, turned: bool = True) -> Image:
@@ -181,7 +196,7 @@ def read_image(path: PathLike, turned: bool = True) -> Image:
     if image is None:
         raise InputError(
             f"{path}: not a readable image ({data.size} bytes) of at most {bounds().pixels:,}"
-            " pixels; use PNG or JPEG, or add --limits pixels=NUMBER"
+            " pixels; use PNG or JPEG, or add `limits` pixels=NUMBER"
         )
     return image
 
@@ -193,26 +208,30 @@ def decode_image(data: Image, turned: bool = True) -> Image | None:
     # IMREAD_UNCHANGED would ignore the orientation; ANYDEPTH keeps 16 bits for as_rgb to round.
     # IMREAD_COLOR_RGB leaves the pixels of a TIFF of 16 bits as they were in memory.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-    flags |= 0 if turned else cv2.IMREAD_IGNORE_ORIENTATION
     if data[:2].tobytes() == _JPEG and data.tobytes().count(_SCAN) > _MOST_SCANS:
         return None  # each scan takes as long as a whole image
-    if not turned and data[:4].tobytes() in _TIFF and (at := _orientation(data)):
-        data = data.copy()  # OpenCV turns these whatever the flags
-        data[at] = 1
-    try:
-        image = cv2.imdecode(data, flags) if data.size else None
-    except cv2.error:
-        return None
+    if not turned:
+        flags |= cv2.IMREAD_IGNORE_ORIENTATION
+        position = _orientation(data)
+        if position and data[:4].tobytes() in _TIFF:
+            data = data.copy()  # OpenCV turns these whatever the flags
+            data[position] = 1
+    image = None
+    with suppress(cv2.error):  # also for no bytes
+        image = cv2.imdecode(data, flags)
     if image is None or image.dtype not in (np.uint8, np.uint16):
         return None
-    return as_rgb(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return as_rgb(image)
 
 
 def image_file(data: bytes) -> tuple[str, bytes] | None:
     """Ending and bytes of a PNG or JPEG file, or None for other bytes."""
-    starts = {_PNG: ".png", b"\xff\xd8\xff": ".jpg"}
-    ending = next((e for start, e in starts.items() if data.startswith(start)), None)
-    return None if ending is None else (ending, data)
+    for start, ending in ((_PNG, ".png"), (b"\xff\xd8\xff", ".jpg")):
+        if data.startswith(start):
+            return ending, data
+    return None
 
 
 def write_image(path: PathLike, image: Image) -> None:
@@ -224,17 +243,15 @@ def write_image(path: PathLike, image: Image) -> None:
         raise ValueError(
             f"an image is (H, W, 3) uint8, got {image.shape} {image.dtype}"
         )
+    bgr = np.ascontiguousarray(image[:, :, ::-1])
     try:
-        encoded, data = cv2.imencode(
-            path.suffix, np.ascontiguousarray(image[:, :, ::-1])
-        )
-    except cv2.error:
-        encoded = False
-        data = np.empty(0, np.uint8)
-    if not encoded:
+        encoded, data = cv2.imencode(path.suffix, bgr)
+        if not encoded:
+            raise ValueError
+    except (cv2.error, ValueError):
         raise InputError(
             f"{path}: '{path.suffix}' is no image format; use .png or .jpg"
-        )
+        ) from None
     path.write_bytes(data.tobytes())
 
 
@@ -249,13 +266,15 @@ def encode_jpeg(image: Image, quality: int) -> bytes:
     """Encode (H, W) grey or (H, W, 3) RGB uint8 as a JPEG file."""
     import cv2
 
-    bgr = np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    if image.ndim == 3:
+        image = np.ascontiguousarray(image[..., ::-1])
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    return cv2.imencode(".jpg", image, parameters)[1].tobytes()
 
 
 def image_size(image: PathLike | StoredImage) -> tuple[int, int]:
     """Width and height in pixels of an image file, turned upright as by `read_image`."""
-    height, width = pixels_of(
-        image if isinstance(image, StoredImage) else Path(image)
-    ).shape[:2]
+    if not isinstance(image, StoredImage):
+        image = Path(image)
+    height, width, _ = pixels_of(image).shape
     return width, height

@@ -22,12 +22,23 @@ from evercal.recordings.pictures import look_at
 from evercal.recordings.poses.pose_evidence import rotation_warnings
 
 SAME_M = 0.001
+"""Distance below which two poses are the same, metres."""
 SAME_DEG = 0.1
+"""Angle below which two poses are the same, degrees."""
 LARGEST_EXTENT_M = 100.0
+"""Largest plausible side of the box around the positions, metres."""
 LARGEST_STEP_M = 0.5
+"""Largest plausible median distance between consecutive frames, metres."""
 SMALLEST_EXTENT_M = 0.05
+"""Smallest plausible side of the box around the positions, metres."""
 LARGEST_REACH_M = 5.0
+"""Largest plausible distance of a gripper from the base of its robot, metres."""
 MOST_CAMERAS_LISTED = 4
+"""Sets of intrinsics that are listed one by one; of more, those of one image size share a line."""
+
+
+Owner = Literal["camera", "gripper", "none"]
+"""Owner of the poses of a recording."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +46,7 @@ class Inspection:
     """Summary of a recording."""
 
     name: str
-    poses: Literal["camera", "gripper", "none"]
+    poses: Owner
     """Owner of the stated poses; the camera if both are stated."""
     train: int
     """Training frames with a pose."""
@@ -49,65 +60,62 @@ class Inspection:
     """Whether lengths are in metres; else their unit is unknown."""
     extent_m: tuple[float, float, float]
     """Sides of the box around the training positions, metres."""
-    step_median_m: float | None
+    step_median_m: float | None = None
     """Median distance between consecutive training frames, metres; None for fewer than two."""
-    step_median_deg: float | None
+    step_median_deg: float | None = None
     """Median rotation between consecutive training frames, degrees; None for fewer than two."""
-    step_largest_m: float | None
+    step_largest_m: float | None = None
     """Largest distance between consecutive training frames, metres; None for fewer than two."""
-    near_training: float | None
+    near_training: float | None = None
     """Per cent of test frames with a training frame within 5 cm and 5 deg; None without frames, or
     where the unit is unknown."""
-    notes: tuple[str, ...]
-    warnings: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    """Choices and omissions of the reader."""
+    warnings: tuple[str, ...] = ()
+    """What is implausible."""
 
 
 def inspect_recording(recording: Recording) -> Inspection:
     """Check poses, cameras and some images of a recording."""
-    both = (*recording.train, *recording.test)
-    grippers = any(frame.base_from_gripper for frame in both)
-    owner = "camera" if posed_frames(both) else "gripper" if grippers else "none"
+    frames = (*recording.train, *recording.test)
+    owner = _pose_owner(frames)
     pose_of = attrgetter(
         "base_from_gripper" if owner == "gripper" else "base_from_camera"
     )
-    train, test = (
-        tuple(filter(pose_of, part)) for part in (recording.train, recording.test)
-    )
-    cameras = Counter(frame.camera for frame in both)
-    for size in {(camera.width, camera.height) for camera in cameras}:
-        next(f for f in both if (f.camera.width, f.camera.height) == size).read_image()
-    poses, tested = (SE3.stack([*map(pose_of, part)]) for part in (train, test))
-    extent = np.ptp(poses.translation_m, axis=0) if len(train) else np.zeros(3)
-    untracked = recording.untracked + len(both) - len(train) - len(test)
+    train = tuple(filter(pose_of, recording.train))
+    test = tuple(filter(pose_of, recording.test))
+    poses = SE3.stack([*map(pose_of, train)])
+    test_poses = SE3.stack([*map(pose_of, test)])
+    _require_image_sizes(frames)
+    extent = np.ptp(poses.translation_m, axis=0) if train else np.zeros(3)
+    largest = float(extent.max())
+    untracked = recording.untracked + len(frames) - len(train) - len(test)
     shown = look_at(recording.train)
-    warnings = [
-        *_frame_warnings(len(train), len(test), untracked, owner),
-        *shown.warnings,
-    ]
-    warnings += [warning for camera in cameras for warning in _camera_warnings(camera)]
-    step_m = step_deg = largest_m = near = None
+    cameras = Counter(frame.camera for frame in frames)
+    warnings = [*_frame_warnings(len(train), len(test), untracked, owner)]
+    warnings += shown.warnings
+    for camera in cameras:
+        warnings += _camera_warnings(camera)
+    steps: dict[str, float] = {}
     if len(train) > 1:
-        metres, radians = pose_distance(poses[:-1], poses[1:])
-        step_m = float(np.median(metres))
-        step_deg = float(np.rad2deg(np.median(radians)))
-        largest_m = float(metres.max())
-        of_camera = owner == "camera"
+        steps = _steps(poses)
         if recording.metric:
-            warnings += _motion_warnings(poses, float(extent.max()), step_m, of_camera)
-        if np.rad2deg(pose_distance(poses[0], poses)[1].max()) < SAME_DEG:
+            step = steps["step_median_m"]
+            warnings += _motion_warnings(poses, largest, step, owner)
+        if _largest_turn_deg(poses) < SAME_DEG:
             warnings.append(
                 "all training frames look the same way; are the rotations missing?"
             )
         if shown.usable:
-            warnings += rotation_warnings(train, poses, of_camera)
+            warnings += rotation_warnings(train, poses, owner == "camera")
+    near = None
     if train and test:
-        same_m = SAME_M if recording.metric else SAME_M * float(extent.max())
-        warnings += _copy_warnings(train, test, poses, tested, same_m)
-        near = (
-            100 * float(near_training(poses, tested).mean())
-            if recording.metric
-            else None
-        )
+        same_m = SAME_M
+        if recording.metric:
+            near = 100 * float(near_training(poses, test_poses).mean())
+        else:
+            same_m *= largest
+        warnings += _copy_warnings(train, test, poses, test_poses, same_m)
     x, y, z = extent.tolist()
     return Inspection(
         name=recording.name,
@@ -118,35 +126,76 @@ def inspect_recording(recording: Recording) -> Inspection:
         cameras=tuple(_camera_lines(cameras)),
         metric=recording.metric,
         extent_m=(x, y, z),
-        step_median_m=step_m,
-        step_median_deg=step_deg,
-        step_largest_m=largest_m,
         near_training=near,
         notes=recording.notes,
         warnings=tuple(warnings),
+        **steps,
     )
+
+
+def _pose_owner(frames: Sequence[Frame]) -> Owner:
+    if posed_frames(frames):
+        return "camera"
+    if any(frame.base_from_gripper for frame in frames):
+        return "gripper"
+    return "none"
+
+
+def _require_image_sizes(frames: Sequence[Frame]) -> None:
+    """Refuse images of another size than their camera's; one image of each size is read."""
+    sizes = set()
+    for frame in frames:
+        size = (frame.camera.width, frame.camera.height)
+        if size not in sizes:
+            frame.read_image()
+        sizes.add(size)
+
+
+def _steps(poses: SE3) -> dict[str, float]:
+    """Motion from each training frame to the next, as fields of `Inspection`."""
+    metres, radians = pose_distance(poses[:-1], poses[1:])
+    return {
+        "step_median_m": float(np.median(metres)),
+        "step_median_deg": float(np.rad2deg(np.median(radians))),
+        "step_largest_m": float(metres.max()),
+    }
+
+
+def _largest_turn_deg(poses: SE3) -> float:
+    """Largest rotation from the first pose to another one."""
+    return float(np.rad2deg(pose_distance(poses[0], poses)[1].max()))
 
 
 def _camera_lines(cameras: Counter[Camera]) -> Iterator[str]:
     if len(cameras) <= MOST_CAMERAS_LISTED:
-        for c, count in cameras.items():
-            kind = "fisheye" if c.model == "fisheye" else "distortion"
-            distortion = f"{kind} {' '.join(f'{k:g}' for k in c.distortion)}"
-            yield (
-                f"{c.width}x{c.height}, fx {c.fx:.1f} fy {c.fy:.1f} cx {c.cx:.1f} cy {c.cy:.1f},"
-                f" {distortion if c.distortion else 'no distortion'}; {count} frames"
-            )
+        for camera, count in cameras.items():
+            yield f"{_camera_line(camera)}; {count} frames"
         return
-    for size in dict.fromkeys((camera.width, camera.height) for camera in cameras):
-        group = {c: n for c, n in cameras.items() if (c.width, c.height) == size}
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    for size in dict.fromkeys(sizes):
+        group = [camera for camera in cameras if (camera.width, camera.height) == size]
         focal = [camera.fx for camera in group]
+        count = sum(cameras[camera] for camera in group)
         yield (
             f"{size[0]}x{size[1]}, {len(group)} sets of intrinsics, fx {min(focal):.1f} to"
-            f" {max(focal):.1f}; {sum(group.values())} frames"
+            f" {max(focal):.1f}; {count} frames"
         )
 
 
-def _frame_warnings(train: int, test: int, untracked: int, owner: str) -> Iterator[str]:
+def _camera_line(camera: Camera) -> str:
+    distortion = "no distortion"
+    if camera.distortion:
+        kind = "fisheye" if camera.model == "fisheye" else "distortion"
+        distortion = f"{kind} {' '.join(f'{k:g}' for k in camera.distortion)}"
+    return (
+        f"{camera.width}x{camera.height}, fx {camera.fx:.1f} fy {camera.fy:.1f}"
+        f" cx {camera.cx:.1f} cy {camera.cy:.1f}, {distortion}"
+    )
+
+
+def _frame_warnings(
+    train: int, test: int, untracked: int, owner: Owner
+) -> Iterator[str]:
     least = MIN_GRIPPER_FRAMES if owner == "gripper" else MIN_TRAIN_FRAMES
     if train < least:
         yield f"{train} training frames with a pose; learning takes {least} or more"
@@ -159,10 +208,11 @@ def _frame_warnings(train: int, test: int, untracked: int, owner: str) -> Iterat
 
 def _camera_warnings(camera: Camera) -> Iterator[str]:
     name = f"camera {camera.width}x{camera.height}"
-    middle = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height
+    right = (camera.cx + 0.5) / camera.width
+    below = (camera.cy + 0.5) / camera.height
     view = np.rad2deg(2 * np.arctan(camera.width / (2 * camera.fx)))
     size = "are the intrinsics those of this image size?"
-    if max(abs(share - 0.5) for share in middle) > 0.2:
+    if max(abs(right - 0.5), abs(below - 0.5)) > 0.2:
         point = f"({camera.cx:.0f}, {camera.cy:.0f})"
         yield f"{name}: principal point {point} is far from the middle; {size}"
     if not 20 < view < 150:
@@ -172,9 +222,10 @@ def _camera_warnings(camera: Camera) -> Iterator[str]:
 
 
 def _motion_warnings(
-    poses: SE3, extent: float, step: float, of_camera: bool
+    poses: SE3, extent: float, step: float, owner: Owner
 ) -> Iterator[str]:
-    rotation_deg = np.rad2deg(pose_distance(poses[0], poses)[1].max())
+    of_camera = owner == "camera"
+    rotation_deg = _largest_turn_deg(poses)
     reach = float(np.median(np.linalg.norm(poses.translation_m, axis=1)))
     if reach > LARGEST_REACH_M and not of_camera:
         yield (
@@ -201,20 +252,22 @@ def _copy_warnings(
     train: Sequence[Frame],
     test: Sequence[Frame],
     poses: SE3,
-    tested: SE3,
+    test_poses: SE3,
     same_m: float,
 ) -> Iterator[str]:
     from scipy.spatial import KDTree
 
     files = {file_of(f.image) for f in train} - {None}
-    close = KDTree(poses.translation_m).query_ball_point(tested.translation_m, same_m)
+    close = KDTree(poses.translation_m).query_ball_point(
+        test_poses.translation_m, same_m
+    )
     copies = 0
     for i, frame in enumerate(test):
-        copied = file_of(frame.image) in files
-        if not copied and close[i]:
-            radians = pose_distance(tested[i], poses[close[i]])[1]
-            copied = bool(np.rad2deg(radians.min()) < SAME_DEG)
-        copies += copied
+        if file_of(frame.image) in files:
+            copies += 1
+        elif close[i]:
+            radians = pose_distance(test_poses[i], poses[close[i]])[1]
+            copies += bool(np.rad2deg(radians.min()) < SAME_DEG)
     if copies >= max(1, len(test) / 10):
         yield (
             f"{copies} of {len(test)} test frames have the pose or the file of a training frame;"

@@ -1,20 +1,32 @@
 """`load_recording`: recognise the format of a recording and read it."""
 
-import dataclasses
 import importlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
+from typing import Literal, TypeAlias
 
 from evercal.errors import InputError
 from evercal.recordings.frame import Recording, with_images
-from evercal.recordings.read_options import ReadOptions, flag
+from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import named_errors
 from evercal.typing import PathLike
 
+FormatName: TypeAlias = Literal[
+    "generic",
+    "7scenes",
+    "12scenes",
+    "nerfstudio",
+    "colmap",
+    "wrist",
+    "lerobot",
+    "rosbag",
+]
+"""Name of a format of recordings."""
+
 
 @dataclass(frozen=True)
-class Format:
+class RecordingFormat:
     """Recognition and reader of one format; its module is loaded on first use."""
 
     module: str
@@ -33,33 +45,34 @@ class Format:
         return getattr(self.reader, "USES", ())
 
 
-FORMATS = {
-    "generic": Format("generic", "scene.json"),
-    "7scenes": Format(
+FORMATS: dict[FormatName, RecordingFormat] = {
+    "generic": RecordingFormat("generic", "scene.json"),
+    "7scenes": RecordingFormat(
         "seven_scenes", "TrainSplit.txt, TestSplit.txt and seq-XX folders"
     ),
-    "12scenes": Format("twelve_scenes", "info.txt and data"),
-    "nerfstudio": Format("nerfstudio", "transforms.json"),
-    "colmap": Format("colmap", "sparse/0 with cameras and images"),
-    "wrist": Format(
+    "12scenes": RecordingFormat("twelve_scenes", "info.txt and data"),
+    "nerfstudio": RecordingFormat("nerfstudio", "transforms.json"),
+    "colmap": RecordingFormat("colmap", "sparse/0 with cameras and images"),
+    "wrist": RecordingFormat(
         "wrist", "images beside base_from_gripper.csv, joints.csv, base_from_camera.csv"
     ),
-    "lerobot": Format("lerobot", "meta/info.json"),
-    "rosbag": Format("ros_bag", "a .bag or .mcap file or bag folder"),
+    "lerobot": RecordingFormat("lerobot", "meta/info.json"),
+    "rosbag": RecordingFormat("ros_bag", "a .bag or .mcap file or bag folder"),
 }
 """All formats by name, in the order in which they are tried."""
 
 
-def recognised(root: Path) -> str | None:
+def recognised(root: Path) -> FormatName | None:
     """The format that the files of a folder or a bag are of; None if they are of none."""
-    return next(
-        (key for key, entry in FORMATS.items() if entry.reader.detect(root)), None
-    )
+    for name, entry in FORMATS.items():
+        if entry.reader.detect(root):
+            return name
+    return None
 
 
 def load_recording(
     path: PathLike,
-    format: str | None = None,
+    format: FormatName | None = None,
     name: str | None = None,
     options: ReadOptions | None = None,
 ) -> Recording:
@@ -77,43 +90,45 @@ def load_recording(
     """
     root = Path(path)
     options = options or ReadOptions()
-    if format is not None and format not in FORMATS:
-        raise InputError(
-            f"format {format!r} is not known; use one of {', '.join(FORMATS)}"
-        )
-    if not root.exists():
-        raise InputError(f"{root}: no such folder; give the folder of a recorded scene")
-    if format is None:
-        format = recognised(root)
-    if format is None:
-        what = (
-            "no known scene format"
-            if root.is_dir()
-            else "a file, not a folder, and no bag"
-        )
-        known = ", ".join(f"{entry.contents} ({key})" for key, entry in FORMATS.items())
-        raise InputError(f"{root}: {what}; expected {known}")
-    if options.every < 1:
-        raise InputError(f"--every {options.every}: give a number >= 1")
-    read = FORMATS[format].reader.load
+    format = _format_of(root, format)
     uses = FORMATS[format].uses
-    for given in options.given():
-        if given not in ("every", *uses):
-            users = [key for key, entry in FORMATS.items() if given in entry.uses]
+    for option in options.given():
+        if option not in ("every", *uses):
+            users = [key for key, entry in FORMATS.items() if option in entry.uses]
             raise InputError(
-                f"{flag(given)}: not used by recordings of format {format}, only by"
+                f"`{option}`: not used by recordings of format {format}, only by"
                 f" {', '.join(users)}; leave it out"
             )
-    recording = read(root, options) if uses else read(root)
+    load = FORMATS[format].reader.load
+    recording = load(root, options) if uses else load(root)
     if options.every > 1:
-        train, test = (
-            part[:: options.every] for part in (recording.train, recording.test)
-        )
-        recording = dataclasses.replace(recording, train=train, test=test)
+        train = recording.train[:: options.every]
+        test = recording.test[:: options.every]
+        recording = replace(recording, train=train, test=test)
     with named_errors(root, "recording"):
-        recording = with_images(recording, root if root.is_dir() else root.parent)
+        folder = root if root.is_dir() else root.parent
+        recording = with_images(recording, folder)
     if (root / "masks").is_dir():
         from evercal.recordings.masks import with_masks
 
         recording = with_masks(recording, root)
-    return recording if name is None else dataclasses.replace(recording, name=name)
+    if name is not None:
+        recording = replace(recording, name=name)
+    return recording
+
+
+def _format_of(root: Path, stated: FormatName | None) -> FormatName:
+    if stated is not None and stated not in FORMATS:
+        raise InputError(
+            f"format {stated!r} is not known; use one of {', '.join(FORMATS)}"
+        )
+    if not root.exists():
+        raise InputError(f"{root}: no such folder; give the folder of a recorded scene")
+    format = stated or recognised(root)
+    if format is None:
+        what = "a file, not a folder, and no bag"
+        if root.is_dir():
+            what = "no known scene format"
+        known = ", ".join(f"{entry.contents} ({key})" for key, entry in FORMATS.items())
+        raise InputError(f"{root}: {what}; expected {known}")
+    return format

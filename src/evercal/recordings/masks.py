@@ -21,7 +21,7 @@ from evercal.recordings.images import (
 from evercal.typing import BoolArray, Image
 
 SOFT_PX = 9
-"""Side of the square that softens the edge of what is left: a hard one would be texture."""
+"""Width of the soft edge of a mask, pixels: a hard edge would be texture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +70,10 @@ def with_masks(recording: Recording, root: Path) -> Recording:
 
 
 def _masked(frame: Frame, folder: Path) -> Frame:
-    if (file := file_of(frame.image)) is None:
-        return frame
-    places = [folder / f"{file.stem}.png", folder / f"{file.name}.png"]
-    mask = next((place for place in places if place.is_file()), None)
-    return (
-        frame if mask is None else replace(frame, image=MaskedImage(frame.image, mask))
-    )
+    file = file_of(frame.image)
+    if file is not None:
+        for name in (file.stem, file.name):
+            mask = folder / f"{name}.png"
+            if mask.is_file():
+                return replace(frame, image=MaskedImage(frame.image, mask))
+    return frame

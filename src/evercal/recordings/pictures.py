@@ -9,8 +9,10 @@ import numpy as np
 from evercal.recordings.frame import Frame
 from evercal.typing import Array, Image
 
-_LOOKED_AT, _SIDE_PX = 12, 240
-"""Number of images that are looked at, spread over a recording, and their shorter side."""
+_LOOKED_AT = 12
+"""Number of images that are looked at, spread over a recording."""
+_SIDE_PX = 240
+"""Shorter side to which they are reduced, pixels."""
 _BLANK = 20.0
 """Grey values between the 1 % darkest and brightest pixels below which an image is blank. Of a room
 at 1/8, 1/16, 1/32 of its brightness (27, 14, 7), maps located all, half and none of the images."""
@@ -38,26 +40,15 @@ def look_at(frames: Sequence[Frame]) -> Pictures:
         return Pictures((), usable=True)
     chosen = np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).round().astype(int))
     images = [_small(frames[i].read_image()) for i in chosen]
-    if blank := [image for image in images if is_blank(image)]:
-        level = float(np.median([np.median(image) for image in blank]))
-        what = (
-            "almost black"
-            if level < 48
-            else "almost white"
-            if level > 207
-            else "of one colour"
-        )
-        hint = "; if 12-bit values are stored in 16 bits, multiply them by 16" * (
-            level < 48
-        )
-        words = (
-            f"{len(blank)} of {len(images)} images that were looked at are {what}{hint}"
-        )
+    blank = [image for image in images if is_blank(image)]
+    if blank:
+        look = _look_of_blank(blank)
+        words = f"{len(blank)} of {len(images)} images that were looked at are {look}"
         return Pictures((words,), 2 * len(blank) <= len(images))
     tiny = [
         cv2.resize(image, (40, 30), interpolation=cv2.INTER_AREA) for image in images
     ]
-    change = np.abs(np.diff(np.stack(tiny).astype(np.float64), axis=0)).mean((1, 2, 3))
+    change = np.abs(np.diff(np.array(tiny, np.float64), axis=0)).mean((1, 2, 3))
     if len(images) > 1 and np.median(change) < _SAME:
         return Pictures(
             ("all images are the same; is each pose that of its image?",), False
@@ -69,11 +60,21 @@ def look_at(frames: Sequence[Frame]) -> Pictures:
     return Pictures((), usable=True)
 
 
+def _look_of_blank(images: Sequence[Image]) -> str:
+    level = float(np.median([np.median(image) for image in images]))
+    if level < 48:
+        return (
+            "almost black; if 12-bit values are stored in 16 bits, multiply them by 16"
+        )
+    if level > 207:
+        return "almost white"
+    return "of one colour"
+
+
 def is_blank(image: Image) -> bool:
     """Whether an image (h, w, 3) is black, white or of one colour."""
-    darkest, brightest = np.quantile(
-        cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), [0.01, 0.99]
-    )
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    darkest, brightest = np.quantile(grey, [0.01, 0.99])
     return bool(brightest - darkest < _BLANK)
 
 
@@ -86,9 +87,9 @@ def sharpness(image: Image) -> float:
     from scipy.linalg import eigh
 
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    fine, middle, coarse = (
-        cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1.0, 2.0, 4.0)
-    )
+    fine = cv2.GaussianBlur(grey, (0, 0), 1.0)
+    middle = cv2.GaussianBlur(grey, (0, 0), 2.0)
+    coarse = cv2.GaussianBlur(grey, (0, 0), 4.0)
     above = _structure(fine - middle)
     below = _structure(middle - coarse)
     if np.linalg.eigvalsh(below)[0] < _FLAT:
@@ -97,8 +98,9 @@ def sharpness(image: Image) -> float:
 
 
 def _structure(band: Any) -> Array:
-    slopes = [cv2.Sobel(band, cv2.CV_32F, *order).ravel() for order in ((1, 0), (0, 1))]
-    return np.cov(slopes, bias=True)
+    across = cv2.Sobel(band, cv2.CV_32F, 1, 0).ravel()
+    down = cv2.Sobel(band, cv2.CV_32F, 0, 1).ravel()
+    return np.cov([across, down], bias=True)
 
 
 def _small(image: Image) -> Image:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+from evercal.errors import InputError
+
 
 @dataclass(frozen=True)
 class ReadOptions:
@@ -30,11 +32,11 @@ class ReadOptions:
     every: int = 1
     """Take every N-th image; 1 for all."""
 
+    def __post_init__(self) -> None:
+        """Refuse a step that takes no image."""
+        if self.every < 1:
+            raise InputError(f"`every` {self.every}: give a number >= 1")
+
     def given(self) -> tuple[str, ...]:
         """Names of the fields that differ from their defaults."""
         return tuple(f.name for f in fields(self) if getattr(self, f.name) != f.default)
-
-
-def flag(name: str) -> str:
-    """Command line option of a field: `image_topic` is `--image-topic`."""
-    return "--" + name.replace("_", "-")

@@ -26,12 +26,15 @@ from evercal.typing import Image, PathLike
 OnStep = Callable[[str, int, int], object]
 """Called with the name of the step, how much of it is done, and its total."""
 
-_SMALL_PX = 320  # width of the copy in which motion and sharpness are measured
+_SMALL_PX = 320
+"""Width of the copy in which motion and sharpness are measured, pixels."""
 _LEAST_FRAMES = 12
+"""Minimum number of frames of a reconstruction."""
 _EXHAUSTIVE = 60
 """Up to this many frames are matched exhaustively. Longer sequences are matched sequentially, plus
 exhaustively on a subset of this size for loop closure."""
-_CAMERA_MODEL = "OPENCV"  # shared by all frames
+_CAMERA_MODEL = "OPENCV"
+"""Model of the camera that all frames share."""
 
 
 @dataclass(frozen=True)
@@ -102,12 +105,16 @@ def reconstruct(
 
 
 def _chosen(source: str, images: Path, motion: float, most: int) -> list[str]:
-    folder = Path(source).is_dir()
+    is_folder = Path(source).is_dir()
+    frames = stream(source)
+    if not is_folder:
+        frames = _moving(frames, motion)
     names = []
-    for frame in stream(source) if folder else _moving(stream(source), motion):
-        name = (
-            Path(frame.name).stem + ".jpg" if folder else f"{int(frame.name):06d}.jpg"
-        )
+    for frame in frames:
+        if is_folder:
+            name = f"{Path(frame.name).stem}.jpg"
+        else:
+            name = f"{int(frame.name):06d}.jpg"
         if name in names:
             raise InputError(
                 f"{source}: has two images called {Path(name).stem}; rename one"
@@ -139,7 +146,7 @@ def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFram
             grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
         )
         small = np.asarray(resized, np.uint8)
-        moved = np.inf if last is None else _motion(last, small)
+        moved = _motion(last, small)
         if best is not None and moved > 1.5 * motion:
             yield best[1]
             last = best[2]
@@ -153,18 +160,19 @@ def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFram
         yield best[1]
 
 
-def _motion(before: Image, now: Image) -> float:
+def _motion(before: Image | None, now: Image) -> float:
     """Median motion of corners, parts of the width; infinite if most are lost."""
+    if before is None:
+        return np.inf
     corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 7)
     if corners is None:
         return np.inf
     moved, status, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None)  # pyright: ignore
-    found = status.ravel() == 1
-    if found.mean() < 0.3:
+    tracked = status.ravel() == 1
+    if tracked.mean() < 0.3:
         return np.inf
-    return (
-        float(np.median(np.linalg.norm((moved - corners)[found], axis=-1))) / _SMALL_PX
-    )
+    lengths = np.linalg.norm((moved - corners)[tracked], axis=-1)
+    return float(np.median(lengths)) / _SMALL_PX
 
 
 def _match(pycolmap: Any, root: Path, names: list[str]) -> None:
@@ -186,7 +194,7 @@ def _mapped(pycolmap: Any, root: Path, count: int, on_step: OnStep) -> list[Any]
     done = itertools.count(1)
     working.mkdir()
     on_step("mapping", 0, count)
-    found = pycolmap.incremental_mapping(
+    parts = pycolmap.incremental_mapping(
         root / "database.db",
         root / "images",
         working,
@@ -194,9 +202,9 @@ def _mapped(pycolmap: Any, root: Path, count: int, on_step: OnStep) -> list[Any]
     )
     on_step("mapping", count, count)
     shutil.rmtree(working)
-    models = sorted(found.values(), key=lambda m: -m.num_reg_images())
-    for number, item in enumerate(models):
+    models = sorted(parts.values(), key=lambda model: -model.num_reg_images())
+    for number, model in enumerate(models):
         folder = root / "sparse" / str(number)
         folder.mkdir(parents=True)
-        item.write(folder)
+        model.write(folder)
     return models

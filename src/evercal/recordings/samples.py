@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evercal.errors import InputError
-from evercal.recordings import Recording, load_recording
+from evercal.recordings.frame import Recording
+from evercal.recordings.load import load_recording
 
 FOLDER = Path(__file__).parent / "sample_rooms"
 """One folder for each room, rendered by `python -m rooms sim-mini`."""
@@ -32,15 +33,12 @@ class SampleRoom:
 
 def sample_rooms() -> tuple[SampleRoom, ...]:
     """Load the sample rooms in the order of `ROOMS`."""
-    return tuple(
-        SampleRoom(
-            load_recording(FOLDER / name),
-            load_recording(FOLDER / name / "calibration" / "fixed"),
-            load_recording(FOLDER / name / "calibration" / "bumped"),
-            load_recording(FOLDER / name / "changed"),
-        )
-        for name in ROOMS
-    )
+    rooms = []
+    for name in ROOMS:
+        parts = ("", "calibration/fixed", "calibration/bumped", "changed")
+        recordings = (load_recording(FOLDER / name / part) for part in parts)
+        rooms.append(SampleRoom(*recordings))
+    return tuple(rooms)
 
 
 def copy_samples(target: Path) -> None:
@@ -49,7 +47,8 @@ def copy_samples(target: Path) -> None:
         raise InputError(
             f"{target}: is a file; name a new folder for the sample recordings"
         )
-    sources = {name: FOLDER / name for name in ROOMS} | {"cell": CELL}
+    sources = {name: FOLDER / name for name in ROOMS}
+    sources["cell"] = CELL
     try:
         if target.is_dir() and any(target.iterdir()):
             raise InputError(

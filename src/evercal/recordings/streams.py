@@ -4,7 +4,7 @@ import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -60,39 +60,47 @@ def stream(source: str, rate: float = 15.0) -> Iterator[StreamFrame]:
 def _images(folder: Path, rate: float) -> Iterator[StreamFrame]:
     files = image_files([folder])
     stamps = times_in_names([path.name for path in files])
-    for i, path in enumerate(files):
-        stamp = i / rate if stamps is None else float(stamps[i])
+    if stamps is None:
+        stamps = np.arange(len(files)) / rate
+    for path, stamp in zip(files, stamps.tolist(), strict=True):
         yield StreamFrame(path.name, stamp, read_image(path))
 
 
 def _captured(source: str) -> Iterator[StreamFrame]:
     import cv2
 
-    live = is_live(source)
-    capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
+    if source.isdigit():
+        capture = cv2.VideoCapture(int(source))
+    else:
+        capture = cv2.VideoCapture(source)
     if not capture.isOpened():
         raise InputError(
             f"{source}: cannot be opened as a video; check path, address and codec"
         )
+    return _frames_of(capture, is_live(source))
 
-    def frames() -> Iterator[StreamFrame]:
-        number = 0
-        unreadable = 0
-        try:
-            while unreadable < (_MOST_UNREADABLE if live else 1):
-                good, bgr = capture.read()
-                if not good:
-                    unreadable += 1
-                    continue
-                arrived = time.monotonic()
-                stamp = (
-                    time.time() if live else capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-                )
-                image = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-                yield StreamFrame(str(number), stamp, image, arrived)
-                number = number + 1
-                unreadable = 0
-        finally:
-            capture.release()
 
-    return frames()
+def _frames_of(capture: Any, live: bool) -> Iterator[StreamFrame]:
+    import cv2
+
+    number = 0
+    unreadable = 0
+    try:
+        while live or not unreadable:
+            good, bgr = capture.read()
+            if not good:
+                unreadable += 1
+                if unreadable == _MOST_UNREADABLE:
+                    return
+                continue
+            unreadable = 0
+            arrived = time.monotonic()
+            if live:
+                stamp = time.time()
+            else:
+                stamp = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            image = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+            yield StreamFrame(str(number), stamp, image, arrived)
+            number += 1
+    finally:
+        capture.release()

@@ -28,7 +28,7 @@ from evercal.recordings.poses.robot_poses import (
     read_robot_poses,
 )
 from evercal.recordings.poses.row_files import number_array, read_rows, same_numbers
-from evercal.recordings.read_options import ReadOptions, flag
+from evercal.recordings.read_options import ReadOptions
 from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import named_errors, read_json, refuse_repeated
 
@@ -178,7 +178,7 @@ def _rows(
     ]
     if unused:
         raise InputError(
-            f"{flag(unused[0])}: {file} holds poses already; leave the option out, or give"
+            f"`{unused[0]}`: {file} holds poses already; leave the option out, or give"
             f" joint angles in joints.csv instead"
         )
     convention = options.pose_convention or convention
