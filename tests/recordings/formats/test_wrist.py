@@ -226,7 +226,7 @@ def test_missing_and_ambiguous_files_are_refused(tmp_path: Path) -> None:
     refused(r"holds base_from_gripper\.csv and joints\.csv", load_recording, tmp_path)
     (tmp_path / "joints.csv").unlink()
     write_image(tmp_path / "1.png", np.zeros((24, 32, 3), np.uint8))
-    with pytest.raises(InputError, match="`gripper_frame`: .* holds poses already"):
+    with pytest.raises(InputError, match=r"`gripper_frame`: .* holds poses already"):
         load_recording(tmp_path, options=ReadOptions(gripper_frame="tool0"))
     (tmp_path / "base_from_gripper.csv").unlink()
     refused("no gripper poses; expected base_from_gripper", wrist.load, tmp_path)
