@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evercal.choices import Status
 from evercal.geometry import SE3
 from evercal.geometry.near import COARSE
-from evercal.localization.estimate import Status
 from evercal.typing import BoolArray
 
 Thresholds = tuple[float, float]

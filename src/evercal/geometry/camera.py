@@ -13,14 +13,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evercal.choices import CameraModel
 from evercal.typing import Array
 
-Model = Literal["pinhole", "fisheye"]
 FISHEYE_DEG = 85.0
 """Largest angle to the optical axis of a ray of a fisheye."""
 COEFFICIENTS: dict[str, tuple[str, ...]] = {
@@ -61,7 +61,7 @@ class Camera:
     distortion: tuple[float, ...] = ()
     """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty without distortion. Zeros become empty.
     Of a fisheye k1 k2 k3 k4, also zeros."""
-    model: Model = "pinhole"
+    model: CameraModel = "pinhole"
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):

@@ -5,10 +5,9 @@ from typing import Literal
 
 import numpy as np
 
+from evercal.choices import Status
 from evercal.geometry import SE3, Camera, UncertainPose
 
-Status = Literal["ok", "uncertain", "ambiguous", "unknown_scene", "failed"]
-"""Outcome of locating an image."""
 Cause = Literal["view", "lens", "map", "stated poses", "base frame"]
 
 

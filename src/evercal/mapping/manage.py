@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
+from evercal.choices import OnClash
 from evercal.errors import InputError
 from evercal.features.encoder import read_network
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -28,9 +29,6 @@ from evercal.storage.atomic import replace_folder, write_bytes, write_json
 from evercal.storage.manifest import MANIFEST, Manifest
 from evercal.storage.stages import REPORT, STAGES, StageStore, is_store, read_store
 from evercal.typing import PathLike
-
-OnClash = Literal["refuse", "rename", "skip", "replace"]
-"""What `merge` does with a scene whose name is taken."""
 
 
 @dataclass(frozen=True)

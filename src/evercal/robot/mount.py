@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from evercal.choices import MountName
 from evercal.errors import InputError
 from evercal.geometry import SE3
 
-MountName = Literal["eye_to_hand", "eye_in_hand"]
-"""Word of a mount in files, options and arguments."""
 Frame = Literal["base", "gripper"]
 
 

@@ -12,11 +12,10 @@
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, Self, get_args
+from typing import Any, Self, get_args
 
+from evercal.choices import BoardKind
 from evercal.errors import InputError
-
-BoardKind = Literal["chessboard", "charuco", "apriltag", "aprilgrid", "arucogrid"]
 
 _LEAST_COUNT = {
     "chessboard": 3,

@@ -16,9 +16,10 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
+from evercal.choices import CameraModel
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, cross_matrix
-from evercal.geometry.camera import COEFFICIENTS, Model
+from evercal.geometry.camera import COEFFICIENTS
 from evercal.typing import Array, BoolArray
 
 _LEAST_PX = 0.02
@@ -400,7 +401,7 @@ def moved_camera(camera: Camera, change: Array) -> Camera:
 
 
 def calibrate_camera(
-    views: Sequence[BoardView], width: int, height: int, model: Model = "pinhole"
+    views: Sequence[BoardView], width: int, height: int, model: CameraModel = "pinhole"
 ) -> Intrinsics:
     """Estimate focal lengths, principal point and distortion, with weak priors.
 
@@ -471,7 +472,9 @@ def _misfits(views: Sequence[BoardView], camera: Camera) -> Array:
     return rms
 
 
-def _rough(views: Sequence[BoardView], width: int, height: int, model: Model) -> Camera:
+def _rough(
+    views: Sequence[BoardView], width: int, height: int, model: CameraModel
+) -> Camera:
     """Return a camera without distortion whose only unknown is the focal length."""
     import cv2
 

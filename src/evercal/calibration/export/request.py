@@ -9,11 +9,12 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, TypedDict, Unpack
+from typing import Any, TypeAlias, TypedDict, Unpack
 
 import numpy as np
 
 from evercal.calibration.framed_pose import FramedPose
+from evercal.choices import Motors
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
@@ -55,7 +56,7 @@ class ExportOptions(TypedDict, total=False):
     """URDF of the arm, for `corrected_urdf`."""
     lerobot_calibration: PathLike | None
     """Calibration file of a LeRobot arm, for `lerobot`."""
-    lerobot_motors: Literal["feetech", "dynamixel"] | None
+    lerobot_motors: Motors | None
     """Motors of that arm, which subtract the homing offset or add it."""
 
 

@@ -1,0 +1,18 @@
+"""Words that arguments and answers take, as types that editors and the command line know."""
+
+from typing import Literal
+
+MountName = Literal["eye_to_hand", "eye_in_hand"]
+"""Mount of a camera: fixed beside the arm, or on the gripper."""
+Status = Literal["ok", "uncertain", "ambiguous", "unknown_scene", "failed"]
+"""Outcome of locating an image."""
+CameraModel = Literal["pinhole", "fisheye"]
+"""Projection of a camera; fisheye is OpenCV's."""
+BoardKind = Literal["chessboard", "charuco", "apriltag", "aprilgrid", "arucogrid"]
+"""Printed board: aprilgrid is Kalibr's, arucogrid OpenCV's GridBoard."""
+OnClash = Literal["refuse", "rename", "skip", "replace"]
+"""What a merge of maps does with a scene whose name is taken."""
+Motors = Literal["feetech", "dynamixel"]
+"""Motors of an arm of LeRobot."""
+Preset = Literal["fast", "demo", "bench", "converged", "paper"]
+"""Amount of training of a network."""
