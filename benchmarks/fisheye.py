@@ -20,8 +20,9 @@ from benchmarks.calibration import as_wrist_recording, learned_mount
 from benchmarks.hand_eye import pose
 from benchmarks.rows import Row, once, save
 from evercal.calibration.boards.board_poses import board_poses
-from evercal.calibration.boards.corners import BoardView, calibrate_camera
+from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.boards.detection import find_board
+from evercal.calibration.boards.intrinsics import calibrate_camera
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.errors import InputError

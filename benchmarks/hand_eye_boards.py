@@ -20,13 +20,8 @@ from tyro.conf import arg
 
 from benchmarks.hand_eye import error, pose, rotations
 from benchmarks.rows import Row, once, save
-from evercal.calibration.boards.corners import (
-    BoardView,
-    board_pose,
-    calibrate_camera,
-    lens_vector,
-    moved_camera,
-)
+from evercal.calibration.boards.corners import BoardView, board_pose, lens_vector
+from evercal.calibration.boards.intrinsics import calibrate_camera, moved_camera
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.solve import solve, solve_pairs
 from evercal.errors import InputError

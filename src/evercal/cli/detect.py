@@ -88,7 +88,8 @@ class Detect(args.Verb):
         except ValueError as error:
             raise InputError(str(error)) from None
         from evercal.calibration.boards.board_poses import board_poses
-        from evercal.calibration.boards.corners import BoardView, calibrate_camera
+        from evercal.calibration.boards.corners import BoardView
+        from evercal.calibration.boards.intrinsics import calibrate_camera
         from evercal.recordings.cameras.camera_file import read_camera_of_size
         from evercal.recordings.images import first_size
 

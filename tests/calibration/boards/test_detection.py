@@ -17,13 +17,9 @@ from evercal.calibration.boards.board_poses import (
     board_poses,
     read_board_poses,
 )
-from evercal.calibration.boards.corners import (
-    BoardView,
-    board_pose,
-    calibrate_camera,
-    pixel_sigma,
-)
+from evercal.calibration.boards.corners import BoardView, board_pose, pixel_sigma
 from evercal.calibration.boards.detection import find_board, find_boards
+from evercal.calibration.boards.intrinsics import calibrate_camera
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 

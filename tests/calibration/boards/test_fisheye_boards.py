@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from evercal.calibration.boards.corners import BoardView, board_pose, calibrate_camera
+from evercal.calibration.boards.corners import BoardView, board_pose
+from evercal.calibration.boards.intrinsics import calibrate_camera
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg

@@ -22,8 +22,9 @@ from benchmarks.hand_eye_boards import (
 )
 from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.board_poses import board_poses
-from evercal.calibration.boards.corners import BoardView, board_pose, calibrate_camera
+from evercal.calibration.boards.corners import BoardView, board_pose
 from evercal.calibration.boards.detection import find_board
+from evercal.calibration.boards.intrinsics import calibrate_camera
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import BoardCorners, solve

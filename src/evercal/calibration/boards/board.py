@@ -24,9 +24,13 @@ _LEAST_COUNT = {
     "aprilgrid": 1,
     "arucogrid": 1,
 }
+"""Minimum number of rows and of columns."""
 _MOST_COUNT = 200
-_LEAST_M, _MOST_M = 0.0005, 2.0
-"""Smallest and largest side of a square or marker: beyond, the unit is wrong."""
+"""Maximum number of rows and of columns."""
+_LEAST_M = 0.0005
+"""Minimum side of a square or marker, metres: below, the unit is wrong."""
+_MOST_M = 2.0
+"""Maximum side of a square or marker, metres: above, the unit is wrong."""
 
 
 @dataclass(frozen=True)
@@ -58,26 +62,26 @@ class Board:
         if not _LEAST_M <= self.size_m <= _MOST_M:
             raise InputError(
                 f"the side of a square or tag is {1000 * self.size_m:g} mm; allowed are"
-                f" {1000 * _LEAST_M:g} to {1000 * _MOST_M:g} mm; give millimetres: --square-mm 25"
+                f" {1000 * _LEAST_M:g} to {1000 * _MOST_M:g} mm; give millimetres: `square_mm` 25"
             )
         counts = (self.columns, self.rows)
         least = _LEAST_COUNT[self.kind]
         if min(counts) < least or max(counts) > _MOST_COUNT:
             raise InputError(
                 f"a {self.kind} has a size of {least}x{least} to {_MOST_COUNT}x{_MOST_COUNT}, got"
-                f" {self.columns}x{self.rows}; give for example --size 9x6: inner corners of a"
+                f" {self.columns}x{self.rows}; give for example `size` 9x6: inner corners of a"
                 f" chessboard, squares of a ChArUco board, markers of a grid"
             )
         if self.is_grid and not 0 < self.gap_m < 10 * self.size_m:
             raise InputError(
                 f"the gap between markers of {1000 * self.size_m:g} mm is {1000 * self.gap_m:g} mm;"
-                f" give --gap-mm: the side of a marker times Kalibr's tagSpacing, or OpenCV's"
+                f" give `gap_mm`: the side of a marker times Kalibr's tagSpacing, or OpenCV's"
                 f" markerSeparation"
             )
         if self.kind == "charuco" and not 0 < self.marker_m < self.size_m:
             raise InputError(
                 f"markers of a ChArUco board are smaller than its squares, got"
-                f" {1000 * self.marker_m:g} mm in {1000 * self.size_m:g} mm; give --marker-mm"
+                f" {1000 * self.marker_m:g} mm in {1000 * self.size_m:g} mm; give `marker_mm`"
             )
         if self.kind != "chessboard":
             dictionary_of(self)
@@ -90,8 +94,9 @@ class Board:
     @property
     def marker_share(self) -> float:
         """Side of a marker, parts of the distance from one square or marker to the next."""
-        marker = self.size_m if self.is_grid else self.marker_m
-        return marker / (self.size_m + self.gap_m)
+        if self.is_grid:
+            return self.size_m / (self.size_m + self.gap_m)
+        return self.marker_m / (self.size_m + self.gap_m)
 
     @property
     def half_turn(self) -> bool:

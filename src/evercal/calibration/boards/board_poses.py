@@ -23,6 +23,7 @@ from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.corners import (
     BoardPose,
     BoardView,
+    Detection,
     board_pose,
     pixel_sigma,
     strays,
@@ -69,9 +70,7 @@ class BoardPoses:
     @property
     def detected(self) -> tuple[BoardImage, ...]:
         """Images that show the board."""
-        return tuple(
-            image for image in self.images if image.camera_from_board is not None
-        )
+        return tuple(image for image in self.images if image.camera_from_board)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON values described at the top of this file."""
@@ -113,52 +112,67 @@ def read_board_poses(path: PathLike) -> BoardPoses:
 def board_poses(
     board: Board,
     camera: Camera,
-    views: Mapping[str, BoardView | str],
+    views: Mapping[str, Detection],
     camera_from: str = "file",
 ) -> BoardPoses:
     """Fit the pose of the board in every image; a view may be the reason for a missing board."""
-    seen = {name: view for name, view in views.items() if isinstance(view, BoardView)}
+    detected: dict[str, BoardView] = {}
     fits: dict[str, BoardPose] = {}
-    for name, view in seen.items():
+    for name, view in views.items():
         with suppress(ValueError):
-            fits[name] = board_pose(view, camera)
-    seen = {name: seen[name] for name in fits}
-    stray = dict(
-        zip(seen, strays([*seen.values()], [*fits.values()], camera), strict=True)
-    )
-    left_out = {name: seen[name].pixels[mask].tolist() for name, mask in stray.items()}
-    for name in (name for name, mask in stray.items() if mask.any()):
-        seen[name] = seen[name][~stray[name]]
-        fits[name] = board_pose(seen[name], camera, fits[name].camera_from_board)
-    sigma = pixel_sigma([*fits.values()]) if fits else 0.0
+            if isinstance(view, BoardView):
+                fits[name] = board_pose(view, camera)
+                detected[name] = view
+    left_out = {}
+    stray = strays(list(detected.values()), list(fits.values()), camera)
+    for name, mask in zip(fits, stray, strict=True):
+        view = detected[name]
+        left_out[name] = tuple((x, y) for x, y in view.pixels[mask].tolist())
+        if mask.any():
+            detected[name] = view[~mask]
+            start = fits[name].camera_from_board
+            fits[name] = board_pose(detected[name], camera, start)
+    sigma = 0.0
+    if fits:
+        sigma = pixel_sigma(list(fits.values()))
     images: list[BoardImage] = []
     for name, view in views.items():
-        if fit := fits.get(name):
-            pose = fit.camera_from_board
-            covariance = sigma**2 * fit.unit_covariance
-            corners = tuple((x, y) for x, y in left_out[name])
+        if name in fits:
+            fit = fits[name]
             image = BoardImage(
-                name, seen[name], pose, covariance, fit.rms_px, left_out=corners
+                name,
+                detected[name],
+                fit.camera_from_board,
+                sigma**2 * fit.unit_covariance,
+                fit.rms_px,
+                left_out=left_out[name],
             )
+        elif isinstance(view, str):
+            image = BoardImage(name, reason=view)
         else:
             reason = "the detected corners fit no pose of the board"
-            image = BoardImage(name, reason=view if isinstance(view, str) else reason)
+            image = BoardImage(name, reason=reason)
         images.append(image)
     return BoardPoses(board, camera, tuple(images), sigma, camera_from)
 
 
 def _image_to_dict(image: BoardImage) -> dict[str, Any]:
-    view = image.view
-    return {
+    record: dict[str, Any] = {
         "name": image.name,
         "reason": image.reason,
         "rms_px": image.rms_px,
         "camera_from_board": pose_to_dict(image.camera_from_board),
-        "covariance": None if image.covariance is None else image.covariance.tolist(),
-        "points_m": None if view is None else view.points_m.tolist(),
-        "pixels": None if view is None else view.pixels.tolist(),
+        "covariance": None,
+        "points_m": None,
+        "pixels": None,
         "left_out": image.left_out,
     }
+    if image.covariance is not None:
+        record["covariance"] = image.covariance.tolist()
+    if image.view is not None:
+        record["points_m"] = image.view.points_m.tolist()
+        record["pixels"] = image.view.pixels.tolist()
+    return record
 
 
 def _image_from_dict(data: Mapping[str, Any]) -> BoardImage:

@@ -4,14 +4,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.boards.board import Board, dictionary_of
 from evercal.errors import InputError
-from evercal.typing import Image
+from evercal.typing import Array, Image
 
 if TYPE_CHECKING:
-    from PIL.Image import Image as Page
+    from PIL.Image import Image as PillowImage
 
 PAPERS_MM = {
     "a4": (210.0, 297.0),
@@ -25,11 +24,19 @@ PAPERS_MM = {
 }
 """Width and height of upright paper, smaller sheets first."""
 FILE_KINDS = (".pdf", ".png")
+"""Endings of the files that `write_board` writes."""
 _MARGIN_MM = 8.0
+"""White margin around the board and its footer."""
 _FOOTER_MM = 13.0
+"""Height of the ruler and the line of text below the board."""
 _RULER_MM = 100
+"""Length of the ruler."""
+_TICK_MM = 10
+"""Distance of its ticks."""
 _DPI = 300.0
 """Approximate resolution; the exact one makes a square a whole number of pixels."""
+_MM_PER_INCH = 25.4
+"""Millimetres in an inch."""
 
 
 def board_image(board: Board, unit_px: int) -> Image:
@@ -37,61 +44,82 @@ def board_image(board: Board, unit_px: int) -> Image:
     import cv2
 
     if board.kind == "chessboard":
-        i, j = np.indices((board.rows + 1, board.columns + 1))
+        row, column = np.indices((board.rows + 1, board.columns + 1))
         # The square between the first four inner corners is bright.
-        bright = np.where((i + j) % 2 == 0, 255, 0).astype(np.uint8)
+        bright = np.where((row + column) % 2 == 0, 255, 0).astype(np.uint8)
         return bright.repeat(unit_px, 0).repeat(unit_px, 1)
     if board.is_grid:
         raise InputError(
             f"an {board.kind} is not printed; take the print of Kalibr or OpenCV, or print"
-            f" --board charuco"
+            f" `board` charuco"
         )
     dictionary = dictionary_of(board)
-    size = (board.columns, board.rows)
-    last = size[0] * size[1] // 2 - 1 if board.kind == "charuco" else board.tag or 0
-    if not 0 <= last < len(dictionary.bytesList):
-        raise InputError(
-            f"{board.dictionary} has no marker {last}; its numbers are 0 to"
-            f" {len(dictionary.bytesList) - 1}"
-        )
     if board.kind == "charuco":
+        _require_marker(board, board.columns * board.rows // 2 - 1)
+        size = (board.columns, board.rows)
         page = cv2.aruco.CharucoBoard(size, board.size_m, board.marker_m, dictionary)
-        drawn = page.generateImage((size[0] * unit_px, size[1] * unit_px))
+        drawn = page.generateImage((board.columns * unit_px, board.rows * unit_px))
     else:
-        drawn = cv2.aruco.generateImageMarker(dictionary, last, _cells(board) * unit_px)
+        number = board.tag or 0
+        _require_marker(board, number)
+        side_px = _cells(board) * unit_px
+        drawn = cv2.aruco.generateImageMarker(dictionary, number, side_px)
     return np.asarray(drawn, dtype=np.uint8)
 
 
+def _require_marker(board: Board, number: int) -> None:
+    count = len(dictionary_of(board).bytesList)
+    if not 0 <= number < count:
+        raise InputError(
+            f"{board.dictionary} has no marker {number}; its numbers are 0 to {count - 1}"
+        )
+
+
 def _cells(board: Board) -> int:
-    return dictionary_of(board).markerSize + 2 if board.kind == "apriltag" else 1
+    """Number of units along a square or tag."""
+    if board.kind == "apriltag":
+        return dictionary_of(board).markerSize + 2
+    return 1
 
 
-def drawing(board: Board, paper: str = "a4") -> "tuple[Page, float]":
+def drawing(board: Board, paper: str = "a4") -> "tuple[PillowImage, float]":
     """Draw a board on a sheet, with a ruler; also return the resolution in pixels per inch."""
-    from PIL import Image, ImageDraw, ImageFont
+    from PIL import Image
 
     unit_mm = 1000 * board.size_m / _cells(board)
-    unit_px = max(1, round(unit_mm * _DPI / 25.4))
-    per_mm = unit_px / unit_mm
+    unit_px = max(1, round(unit_mm * _DPI / _MM_PER_INCH))
+    px_per_mm = unit_px / unit_mm
     picture = board_image(board, unit_px)
-    width, height = _sheet(board, paper, np.array(picture.shape[::-1]) / per_mm)
-    page = Image.new("1", (round(width * per_mm), round(height * per_mm)), 1)
-    left = (page.width - picture.shape[1]) // 2
-    top = (page.height - round(_FOOTER_MM * per_mm) - picture.shape[0]) // 2
-    page.paste(Image.fromarray(picture), (left, top))
-    draw = ImageDraw.Draw(page)
-    bottom = height - _MARGIN_MM
-    bars = [(0, bottom, _RULER_MM, 0.3)]
-    bars += [(tick, bottom - 2, 0.2, 2) for tick in range(0, _RULER_MM + 1, 10)]
-    for x, y, wide, high in bars:
-        corners = (
-            np.array([x + _MARGIN_MM, y, x + _MARGIN_MM + wide, y + high]) * per_mm
-        )
+    size_mm = np.array(picture.shape[::-1]) / px_per_mm
+    width, height = _sheet(board, paper, size_mm)
+    sheet = Image.new("1", (round(width * px_per_mm), round(height * px_per_mm)), 1)
+    left = (sheet.width - picture.shape[1]) // 2
+    top = (sheet.height - round(_FOOTER_MM * px_per_mm) - picture.shape[0]) // 2
+    sheet.paste(Image.fromarray(picture), (left, top))
+    _draw_footer(sheet, f"{_RULER_MM} mm: {label(board)}", height, px_per_mm)
+    return sheet, _MM_PER_INCH * px_per_mm
+
+
+def _draw_footer(
+    sheet: "PillowImage", text: str, height_mm: float, px_per_mm: float
+) -> None:
+    """Draw a ruler with ticks, and a line of text below it."""
+    from PIL import ImageDraw, ImageFont
+
+    draw = ImageDraw.Draw(sheet)
+    bottom = height_mm - _MARGIN_MM
+
+    def draw_bar(x: float, y: float, width: float, height: float) -> None:
+        corners_mm = [x + _MARGIN_MM, y, x + _MARGIN_MM + width, y + height]
+        corners = np.array(corners_mm) * px_per_mm
         draw.rectangle(corners.round().tolist(), fill=0)
-    text_at = (_MARGIN_MM * per_mm, (bottom + 1) * per_mm)
-    font = ImageFont.load_default(size=2.5 * per_mm)
-    draw.text(text_at, f"{_RULER_MM} mm: {label(board)}", font=font, fill=0)
-    return page, 25.4 * per_mm
+
+    draw_bar(0, bottom, _RULER_MM, 0.3)
+    for tick in range(0, _RULER_MM + 1, _TICK_MM):
+        draw_bar(tick, bottom - 2, 0.2, 2)
+    origin = (_MARGIN_MM * px_per_mm, (bottom + 1) * px_per_mm)
+    font = ImageFont.load_default(size=2.5 * px_per_mm)
+    draw.text(origin, text, font=font, fill=0)
 
 
 def label(board: Board) -> str:
@@ -111,29 +139,36 @@ def label(board: Board) -> str:
     return f"{words}. Print at 100 %."
 
 
-def _sheet(board: Board, paper: str, size_mm: NDArray) -> tuple[float, float]:
+def _sheet(board: Board, paper: str, size_mm: Array) -> tuple[float, float]:
     """Return width and height of the sheet, turned if the board fits only or better so."""
     if paper not in PAPERS_MM:
         raise InputError(
             f"paper {paper!r} is not known; use one of {', '.join(PAPERS_MM)}"
         )
-    takes = size_mm + np.array([2 * _MARGIN_MM, 2 * _MARGIN_MM + _FOOTER_MM])
+    needed = size_mm + np.array([2 * _MARGIN_MM, 2 * _MARGIN_MM + _FOOTER_MM])
 
-    def turned(name: str) -> tuple[float, float] | None:
+    def fitting(name: str) -> tuple[float, float] | None:
         short, long = PAPERS_MM[name]
         sheets = [(short, long), (long, short)]
-        sheets = sheets[:: 1 if size_mm[0] <= size_mm[1] else -1]
-        return next((s for s in sheets if (takes <= np.array(s) + 1e-6).all()), None)
+        if size_mm[0] > size_mm[1]:
+            sheets.reverse()
+        for sheet in sheets:
+            if (needed <= np.array(sheet) + 1e-6).all():
+                return sheet
+        return None
 
-    sheet = turned(paper)
-    if sheet is None:
-        larger = next((name for name in PAPERS_MM if turned(name)), None)
-        remedy = f"give --paper {larger}" if larger else "make the squares smaller"
-        raise InputError(
-            f"the {board.kind} takes {takes[0]:.0f}x{takes[1]:.0f} mm with margins, {paper} is"
-            f" {PAPERS_MM[paper][0]:.0f}x{PAPERS_MM[paper][1]:.0f} mm; {remedy}"
-        )
-    return sheet
+    sheet = fitting(paper)
+    if sheet is not None:
+        return sheet
+    remedy = "make the squares smaller"
+    for larger in reversed(PAPERS_MM):
+        if fitting(larger):
+            remedy = f"give `paper` {larger}"
+    width, height = PAPERS_MM[paper]
+    raise InputError(
+        f"the {board.kind} takes {needed[0]:.0f}x{needed[1]:.0f} mm with margins, {paper} is"
+        f" {width:.0f}x{height:.0f} mm; {remedy}"
+    )
 
 
 def write_board(path: Path, board: Board, paper: str = "a4") -> None:
@@ -142,5 +177,5 @@ def write_board(path: Path, board: Board, paper: str = "a4") -> None:
         raise InputError(
             f"{path}: give a file name that ends with {' or '.join(FILE_KINDS)}"
         )
-    page, dpi = drawing(board, paper)
-    page.save(path, dpi=(dpi, dpi))
+    sheet, dpi = drawing(board, paper)
+    sheet.save(path, dpi=(dpi, dpi))

@@ -14,16 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.corners import (
     BEND,
-    LENS,
     Bend,
     BoardPose,
     BoardView,
-    LensPrior,
     board_pose,
-    lens_estimate,
     pixel_sigma,
     strays,
 )
+from evercal.calibration.boards.intrinsics import LENS, LensPrior, lens_estimate
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.conventions import PoseConvention

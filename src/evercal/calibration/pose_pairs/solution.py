@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.boards.corners import LENS, moved_lens
+from evercal.calibration.boards.intrinsics import LENS, moved_lens
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
 from evercal.calibration.located import length_mm_deg
 from evercal.calibration.pose_pairs.checks import (

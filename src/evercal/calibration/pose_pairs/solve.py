@@ -4,7 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evercal.calibration.boards.corners import board_pose, lens_vector, moved_lens
+from evercal.calibration.boards.corners import board_pose, lens_vector
+from evercal.calibration.boards.intrinsics import moved_lens
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.pose_pairs.checks import (
     SIZE_SIGMA,
