@@ -66,7 +66,7 @@ def test_images_without_the_board_give_a_reason() -> None:
     tag = photographed(TAG, view_of(TAG, 1))
     chessboard = photographed(CHESSBOARD, view_of(CHESSBOARD, 0))
     part = (
-        "inner corners, not 12x9 inner corners; show the whole board, or correct --size"
+        "inner corners, not 12x9 inner corners; show the whole board, or correct `size`"
     )
     for image, board, message in (
         (grey, CHESSBOARD, "no chessboard with 9x6 inner corners"),
@@ -92,12 +92,12 @@ def test_images_without_the_board_give_a_reason() -> None:
         ),
         (
             lambda: Board("chessboard", 25.0, 9, 6),
-            "is 25000 mm; .*give millimetres: --square-mm",
+            "is 25000 mm; .*give millimetres: `square_mm`",
         ),
         (lambda: Board("chessboard", 0.025, 900, 6), "got 900x6"),
         (
             lambda: Board("aprilgrid", 0.03, 6, 6),
-            "is 0 mm; give --gap-mm: .* Kalibr's tagSpacing",
+            "is 0 mm; give `gap_mm`: .* Kalibr's tagSpacing",
         ),
         (
             lambda: Board("charuco", 0.03, 5, 7, 0.04, "4X4_50"),
@@ -360,7 +360,7 @@ def test_the_first_marker_of_a_grid_may_have_any_number(board: Board) -> None:
         (
             CHARUCO,
             {"columns": 4, "rows": 4},
-            "they fit 6x5 squares, not 4x4; correct --size",
+            "they fit 6x5 squares, not 4x4; correct `size`",
         ),
         (
             CHARUCO,
@@ -370,17 +370,17 @@ def test_the_first_marker_of_a_grid_may_have_any_number(board: Board) -> None:
         (
             APRILGRID,
             {"columns": 3, "rows": 4},
-            "they fit 4x3 markers from --tag 0, not 3x4",
+            "they fit 4x3 markers from `tag` 0, not 3x4",
         ),
         (
             ARUCOGRID,
             {"columns": 4, "rows": 2},
-            "they fit 4x3 markers from --tag 0, not 4x2",
+            "they fit 4x3 markers from `tag` 0, not 4x2",
         ),
         (
             ARUCOGRID,
             {"tag": 5},
-            "they fit 4x3 .* from --tag 0, not 4x3; correct --size or --tag",
+            "they fit 4x3 .* from `tag` 0, not 4x3; correct `size` or `tag`",
         ),
         (
             APRILGRID,

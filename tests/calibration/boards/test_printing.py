@@ -63,7 +63,7 @@ def test_pdf_files_have_the_size_of_the_paper(tmp_path: Path) -> None:
             Board("chessboard", 0.025, 28, 17),
             "a4",
             "b.pdf",
-            "741x479 mm .*; give --paper a1",
+            "741x479 mm .*; give `paper` a1",
         ),
         (Board("chessboard", 0.2, 28, 17), "a4", "b.pdf", "make the squares smaller"),
         (
