@@ -75,10 +75,12 @@ def _require_board(views: Mapping[str, Detection], count: int) -> None:
     if len(others) < _FEW_IMAGES and tried not in (_MANY_IMAGES, count):
         return
     name = [*others, *views][0]
-    images = f"{tried} images"
+    spread = ""
     if tried < count:
-        images += f", spread over {count}"
-    raise InputError(f"no board in any of {images} ({name}: {views[name]})")
+        spread = f", spread over {count}"
+    raise InputError(
+        f"no board in any of {tried} images{spread} ({name}: {views[name]})"
+    )
 
 
 def _look(image: Image, board: Board) -> Detection | Markers:
