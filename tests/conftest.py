@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     import torch
 
     from evercal.continual.learning.stage import StageOptions
-    from evercal.mapping.build import BuiltMap
+    from evercal.mapping.built_map import BuiltMap
     from evercal.mapping.scene_map import MapContents
     from evercal.recordings.frame import Recording
     from evercal.simulation.box_room import BoxRoom

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3, UncertainPose, axis_deviation
-from evercal.geometry.uncertain_pose import frame_covariance
 
 FIRST = SE3.exp([0.4, -0.3, 1.2, 0.5, -0.8, 0.3])
 SECOND = SE3.exp([-0.2, 0.6, 0.7, -1.1, 0.4, 0.9])
@@ -67,18 +66,6 @@ def test_exact_transforms_on_either_side() -> None:
     right = a @ FIRST
     assert_same(left.covariance, sample_covariance(FIRST @ sampled(a, 7), left.pose))
     assert_same(right.covariance, sample_covariance(sampled(a, 8) @ FIRST, right.pose))
-
-
-def test_common_motion_of_the_cameras_moves_the_base_frame() -> None:
-    motion = covariance(9)
-    frame = frame_covariance(SE3.stack([FIRST]), motion)
-    draws = np.random.default_rng(10).multivariate_normal(
-        np.zeros(6), motion, size=40_000
-    )
-    # exp(x) in the base frame moves FIRST as the drawn motion moves it in the camera frame.
-    moved = FIRST @ SE3.exp(draws) @ FIRST.inverse()
-    errors = moved.log()
-    assert_same(frame, errors.T @ errors / len(errors))
 
 
 def test_adjoint_moves_a_tangent_to_the_other_side() -> None:

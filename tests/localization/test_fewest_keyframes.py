@@ -8,7 +8,7 @@ import pytest
 from evercal.geometry import pose_distance
 from evercal.learning.fewest_keyframes import fewest_keyframes
 from evercal.localization.localizer import Localizer
-from evercal.mapping.build import BuiltMap
+from evercal.mapping.built_map import BuiltMap
 from evercal.mapping.scene_map import MapContents
 from evercal.recordings.frame import Recording
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 if TYPE_CHECKING:
-    from evercal.mapping.build import BuiltMap
+    from evercal.mapping.built_map import BuiltMap
     from evercal.mapping.scene_map import MapContents, SceneMap
     from evercal.mapping.store import MapStore
     from evercal.recordings.frame import Recording

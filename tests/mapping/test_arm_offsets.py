@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3
-from evercal.mapping.arm_offsets import ArmOffsets
+from evercal.mapping.arm_offsets import joint_slopes, with_offsets
 from evercal.mapping.build import MapOptions
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment
 from evercal.recordings.frame import Frame
 from evercal.robot.arm import Arm, MovingJoint
+from evercal.robot.arm_offsets import ArmOffsets
 from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
 
 from .projected_tracks import CAMERA, FRAMES, world
@@ -81,7 +82,7 @@ def adjusted(
         np.zeros((FRAMES, 6)),
         options,
         SE3.stack([camera] * FRAMES) if wrist else restated,
-        begun.slopes(frames),
+        joint_slopes(frames, begun),
     ).solve(made.tracks)
 
 
@@ -115,9 +116,9 @@ def test_frames_keep_the_transform_of_gripper_and_camera() -> None:
     gripper = ARM.poses(joints[None])[0]
     offsets = ArmOffsets.start(ARM, EYE_IN_HAND, np.full(5, 0.02))
     frame = Frame("a", np.zeros((1, 1, 3), np.uint8), CAMERA, gripper @ MOUNT, gripper)
-    (same,) = offsets.moved([frame])
+    (same,) = with_offsets([frame], offsets)
     assert same is frame
-    (moved,) = offsets.moved([replace(frame, joints_rad=tuple(joints))])
+    (moved,) = with_offsets([replace(frame, joints_rad=tuple(joints))], offsets)
     assert moved.base_from_gripper is not None
     assert moved.base_from_camera is not None
     change = moved.base_from_gripper.inverse() @ moved.base_from_camera
@@ -134,8 +135,9 @@ def test_a_fixed_camera_keeps_its_place_in_the_base() -> None:
     offsets = ArmOffsets.start(ARM, EYE_TO_HAND, np.full(5, 0.02))
     pose = gripper.inverse() @ camera
     image = np.zeros((1, 1, 3), np.uint8)
-    (moved,) = offsets.moved(
-        [Frame("a", image, CAMERA, pose, gripper, joints_rad=tuple(joints.tolist()))]
+    (moved,) = with_offsets(
+        [Frame("a", image, CAMERA, pose, gripper, joints_rad=tuple(joints.tolist()))],
+        offsets,
     )
     assert moved.base_from_gripper is not None
     assert moved.base_from_camera is not None

@@ -11,6 +11,7 @@ from evercal.mapping.map_frame import (
     MapFrame,
     Similarity,
     fit_correction,
+    frame_covariance,
     shared_sigma,
 )
 
@@ -141,3 +142,14 @@ def test_error_of_the_stated_frame_is_added() -> None:
     exact = UncertainPose.exact(POSE)
     wide = MapFrame(pose_sigma=(0.003, 0.0), frame_sigma=(0.004, 0.02)).to_base(exact)
     np.testing.assert_allclose(np.diag(wide.covariance), [0.005**2] * 3 + [0.02**2] * 3)
+
+
+def test_common_motion_of_the_cameras_moves_the_base_frame() -> None:
+    rng = np.random.default_rng(10)
+    root = rng.normal(0, 0.01, (6, 6))
+    frame = frame_covariance(SE3.stack([POSE]), root @ root.T)
+    draws = rng.normal(size=(40_000, 6)) @ root.T
+    # exp(x) in the base frame moves the pose as a drawn motion moves it in the camera frame.
+    errors = (POSE @ SE3.exp(draws) @ POSE.inverse()).log()
+    sampled = errors.T @ errors / len(errors)
+    np.testing.assert_allclose(frame, sampled, atol=0.02 * np.trace(sampled))

@@ -6,6 +6,7 @@ from scipy.ndimage import map_coordinates
 
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
+from evercal.mapping.covisibility import select_source_views
 from evercal.mapping.plane_sweep import (
     FAR_M,
     NEAR_M,
@@ -17,7 +18,6 @@ from evercal.mapping.plane_sweep import (
     inverse_depths,
     parabola,
     peak,
-    select_source_views,
 )
 
 STRIDE = 8

@@ -33,8 +33,8 @@ from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
-from evercal.mapping.arm_offsets import ArmOffsets, has_joints
-from evercal.mapping.build import Adjusted, BuiltMap, HandEyeCorrection
+from evercal.mapping.arm_offsets import has_joints, with_offsets
+from evercal.mapping.built_map import Adjusted, BuiltMap, HandEyeCorrection
 from evercal.progress import OnProgress
 from evercal.recordings.frame import (
     MIN_GRIPPER_FRAMES,
@@ -43,6 +43,7 @@ from evercal.recordings.frame import (
     stated_grippers,
 )
 from evercal.recordings.held_out import require_frames
+from evercal.robot.arm_offsets import ArmOffsets
 from evercal.robot.mount import Mount, MountName
 from evercal.typing import Array
 
@@ -182,7 +183,7 @@ def posed_by_gripper(
             )
         raise InputError(f"{recording.name}: {error}{hint}") from None
     if start.arm is not None:
-        frames = tuple(start.arm.moved(frames))
+        frames = tuple(with_offsets(frames, start.arm))
     poses = scene_from_parent(frames, mount) @ start.parent_from_camera
     if not mount.moves and (around := windows(frames, start)) is not None:
         frames = tuple(cropped(*both) for both in zip(frames, around, strict=True))

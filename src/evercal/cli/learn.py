@@ -19,7 +19,7 @@ from evercal.progress import Bars
 
 if TYPE_CHECKING:
     from evercal.learning.scene import LearnReport
-    from evercal.mapping.build import Adjusted
+    from evercal.mapping.built_map import Adjusted
     from evercal.recordings import Recording
 
 FEW_LANDMARKS = 50

@@ -117,13 +117,3 @@ def in_parent_axes(rotation: Array, covariance: Array) -> Array:
     slope = np.eye(6)
     slope[:3, :3] = rotation
     return np.asarray(slope @ covariance @ slope.T, np.float64)
-
-
-def frame_covariance(base_from_camera: SE3, covariance: ArrayLike) -> Array:
-    """Covariance of the base frame from a motion that is common to all cameras of a map.
-
-    Landmarks move with the cameras that observe them, so an error of `gripper_from_camera`, (6, 6)
-    in the camera frame, moves the frame of the map by the mean over its cameras.
-    """
-    mean = base_from_camera.adjoint().mean(0)
-    return mean @ np.asarray(covariance) @ mean.T

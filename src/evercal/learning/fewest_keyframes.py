@@ -6,7 +6,7 @@ import numpy as np
 
 from evercal.geometry import SE3, pose_distance
 from evercal.localization.localizer import Localizer
-from evercal.mapping.build import BuiltMap
+from evercal.mapping.built_map import BuiltMap
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.selection import spread_poses
 from evercal.progress import OnProgress

@@ -10,7 +10,9 @@ from evercal.geometry import SE3, Camera
 from evercal.learning.stated_scatter import with_scatter
 from evercal.localization.acceptance import differ
 from evercal.localization.localizer import Localizer
-from evercal.mapping.build import Adjusted, MapOptions, build_map
+from evercal.mapping.arm_offsets import with_offsets
+from evercal.mapping.build import MapOptions, build_map
+from evercal.mapping.built_map import Adjusted
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.processes import one_product_thread
@@ -168,7 +170,7 @@ def learn_scene(
             localizer = Localizer(contents.empty().with_scene(scene))
             shown = others or whole
             if built.hand_eye is not None and built.hand_eye.arm is not None:
-                shown = built.hand_eye.arm.moved(shown)
+                shown = with_offsets(shown, built.hand_eye.arm)
             hand_eye = with_image_scatter(hand_eye, localizer, shown)
         report = replace(report, hand_eye=hand_eye)
     return scene, report

@@ -32,13 +32,13 @@ from evercal.mapping.bundle_equations import (
 )
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.stated_errors import StatedErrors, Variances
-from evercal.mapping.systematic_errors import systematic_covariance
 from evercal.mapping.variance_components import (
     pose_sigma,
     shared_variances,
     student_weights,
+    systematic_covariance,
 )
-from evercal.robot.arm import JointSlopes
+from evercal.robot.arm_offsets import JointSlopes
 from evercal.typing import Array, BoolArray
 
 FIXED = 1e-9

@@ -71,6 +71,20 @@ class Keyframes:
             descriptors=None if self.descriptors is None else self.descriptors[index],
         )
 
+    def joined(self, other: "Keyframes") -> "Keyframes":
+        """These keyframes and those of another map of the same encoder."""
+        assert self.descriptors is not None, "a map has descriptors"
+        assert other.descriptors is not None, "a map has descriptors"
+        poses = [*self.base_from_camera, *other.base_from_camera]
+        return Keyframes(
+            images=(*self.images, *other.images),
+            cameras=self.cameras + other.cameras,
+            base_from_camera=SE3.stack(poses),
+            inverse_depth=(*self.inverse_depth, *other.inverse_depth),
+            landmarks=(*self.landmarks, *other.landmarks),
+            descriptors=np.concatenate([self.descriptors, other.descriptors]),
+        )
+
     def grey(self, i: int) -> np.ndarray:
         """(h, w) uint8 image of a keyframe, decoded."""
         import cv2

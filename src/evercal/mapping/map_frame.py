@@ -154,6 +154,16 @@ class MapFrame:
         return pose @ SE3.exp(-self.correction.at(stated)) @ self.common.inverse()
 
 
+def frame_covariance(base_from_camera: SE3, covariance: Array) -> Array:
+    """Covariance of the base frame from a motion that is common to all cameras of a map.
+
+    Landmarks move with the cameras that observe them, so an error of `gripper_from_camera`, (6, 6)
+    in the camera frame, moves the frame of the map by the mean over its cameras.
+    """
+    mean = base_from_camera.adjoint().mean(0)
+    return mean @ covariance @ mean.T
+
+
 def fit_correction(poses: SE3, correction: Array) -> FrameCorrection | None:
     """Fit the correlation length of corrections.
 

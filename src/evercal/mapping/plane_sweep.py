@@ -16,20 +16,18 @@ from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.typing import Array, BoolArray, Float32Array
 
-NEAR_M, USUAL_M, FAR_M = 0.25, 1.5, 12.0
-"""Depths in a room; other recordings scale them (`pose_check.depth_scale`)."""
+NEAR_M = 0.25
+"""Smallest depth in a room, metres; other recordings scale it (`pose_check.depth_scale`)."""
+USUAL_M = 1.5
+"""Usual depth in a room, metres, scaled alike."""
+FAR_M = 12.0
+"""Largest depth in a room, metres, scaled alike."""
 PLANES = 96
 """Inverse depths that are tried."""
 SEEN_BY = 4
 """A depth is scored by the mean similarity of this many best views; others may be occluded."""
 SMOOTHING = 0.7
 """Share of a cell's neighbours in its similarity."""
-PARALLAX_RAD = np.deg2rad([4.0, 20.0, 35.0])
-"""Parallax of a good view: at least the first, at most the second, useless from the third on."""
-MIN_USEFULNESS = 0.1
-"""Smallest mean usefulness of a source view."""
-PROBED_CELLS = 64
-"""Cells of a view that are projected into other views."""
 MIN_PEAK_SIMILARITY = 0.4
 _MOST_ROWS = 30_000  # cv2.remap takes images of up to 32,767 rows
 OUTLIER_PX = 4.0
@@ -64,43 +62,6 @@ class PosedCells:
         )
 
 
-def select_source_views(
-    depth_m: np.ndarray,
-    view: PosedCells,
-    poses: SE3,
-    cameras: Sequence[Camera],
-    count: int,
-) -> list[int]:
-    """Select the views that show the surfaces of a view under good parallax.
-
-    Rough depths (h * w,) are those of the cells of the view; poses (n,) are base_from_camera.
-    """
-    some = np.linspace(0, len(depth_m) - 1, PROBED_CELLS).astype(int)
-    points = view.base_from_camera.apply(view.rays()[some] * depth_m[some, None])
-    own = points - view.base_from_camera.translation_m
-    own /= np.linalg.norm(own, axis=-1, keepdims=True)
-    few, enough, many = PARALLAX_RAD
-    other = points - poses.translation_m[:, None]
-    within = other @ poses.rotation_matrix()
-    front = within[..., 2:] > 0
-    within = np.where(front, within, [0, 0, 1])
-    visible = front[..., 0]
-    for camera in set(cameras):
-        rows = [i for i, own_camera in enumerate(cameras) if own_camera == camera]
-        pixels = camera.project(within[rows])
-        visible[rows] &= ((pixels > 0) & (pixels < [camera.width, camera.height])).all(
-            -1
-        )
-    other /= np.linalg.norm(other, axis=-1, keepdims=True) + 1e-9
-    parallax = np.arccos(np.clip((own * other).sum(-1), -1, 1))
-    useful = np.clip(parallax / few, 0, 1) * np.clip(
-        (many - parallax) / (many - enough), 0, 1
-    )
-    usefulness = np.where(visible, useful, 0).mean(-1)
-    best = np.argsort(-usefulness, kind="stable")[:count]
-    return [int(i) for i in best if usefulness[i] > MIN_USEFULNESS]
-
-
 def inverse_depths(
     view: PosedCells,
     others: Sequence[PosedCells],
@@ -114,7 +75,7 @@ def inverse_depths(
 
     Args:
         view: the view.
-        others: see `select_source_views`; without other views the guess is returned.
+        others: see `covisibility.select_source_views`; without other views the guess is returned.
         guess_m: (h * w,) rough depths, metres.
         scale: factor on the depths that are searched, see `NEAR_M`.
 

@@ -11,13 +11,9 @@ from numpy.typing import NDArray
 from evercal.features.encoder import Encoder
 from evercal.features.views import working_image
 from evercal.geometry import SE3, Camera
+from evercal.mapping.covisibility import select_source_views
 from evercal.mapping.patches import image_pyramid
-from evercal.mapping.plane_sweep import (
-    USUAL_M,
-    PosedCells,
-    inverse_depths,
-    select_source_views,
-)
+from evercal.mapping.plane_sweep import USUAL_M, PosedCells, inverse_depths
 from evercal.recordings.frame import Frame, stated_poses
 from evercal.typing import Array, Float32Array, Image, IntArray
 
@@ -92,6 +88,10 @@ class PreparedFrames:
         """(n,) base_from_camera as the recording states them."""
         return stated_poses(self.frames)
 
+    def names(self, index: IntArray) -> tuple[str, ...]:
+        """Names of the frames of an index."""
+        return tuple(self.frames[i].name for i in index)
+
     def cell_camera(self, i: int) -> Camera:
         """The camera of a frame at the encoder's working size."""
         return self.cameras[i].short_side_resized(self.size.cells)
@@ -127,7 +127,7 @@ class PreparedFrames:
         return inverse_depths(view, others, guess, self.depth_scale), near
 
     def source_views(self, depth_m: Array, view: PosedCells, count: int) -> list[int]:
-        """Frames that show the surfaces of a view, see `plane_sweep.select_source_views`."""
+        """Frames that show the surfaces of a view, see `select_source_views`."""
         cameras = [self.cell_camera(j) for j in range(len(self))]
         return select_source_views(depth_m, view, self.poses, cameras, count)
 

@@ -5,36 +5,36 @@ Keyframes that lost most landmarks leave, and new ones take their place, so the 
 same. Keyframes that remain keep their poses: they tie the map to what did not move.
 """
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from evercal.errors import require_numbers
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, average_poses
 from evercal.mapping.bundle_adjustment import BundleAdjustment
 from evercal.mapping.bundle_options import BundleOptions
-from evercal.mapping.keyframes import Keyframes, jpeg
+from evercal.mapping.bundle_tracks import bundle_tracks
+from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.landmarks import project_surface
-from evercal.mapping.patches import cut_patches, to_level
 from evercal.mapping.pose_check import scale_of_depths
-from evercal.mapping.prepared_frames import PYRAMID_LEVELS, PreparedFrames, WorkingSize
+from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
 from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import PoseSpace, select_farthest
 from evercal.mapping.tracks import (
     REACH_PX,
     WIDE_STEPS,
     KeyframeTracks,
-    bundle_tracks,
     observe,
-    open_keyframe,
+    opened_keyframes,
     refine_depths,
+    template_patches,
+    tracked_keyframes,
 )
-from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame
-from evercal.typing import Array, BoolArray
+from evercal.typing import Array, BoolArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,16 @@ class RefreshOptions:
         default_factory=lambda: BundleOptions(intrinsics=False)
     )
     """Adjustment of the new images' poses."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers outside their range.
+
+        Raises:
+            InputError: A count below 1, a negative number or a share above 1.
+        """
+        require_numbers(self, ("most_frames", "looks", "least_checked"), 1)
+        require_numbers(self, ("similar_deg", "richer", "novel"), 0)
+        require_numbers(self, ("least_surviving", "most_novel"), 0, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,36 +108,41 @@ def refreshed(
     """
     options = options or RefreshOptions()
     old = scene.keyframes
-    n = len(old)
-    frames = [*old.frames(), *located]
-    prepared = PreparedFrames(frames, encoder, size)
-    prepared.depth_scale = scale_of_depths(
-        1 / np.concatenate([k.inverse_depth for k in old.landmarks])
-    )
-    tracks = [_reopened(prepared, old, i) for i in range(n)]
-    new = range(n, len(frames))
-    states = []
-    for i, keyframe in enumerate(tracks):
-        states.append(_survival(prepared, keyframe, new, options))
-        on_progress("comparing", i + 1, n)
-    shares = np.array([state.share(options.least_checked) for state in states])
-    kept, added = _selected(prepared.stated, n, shares, options)
-    rivals = _nearest(prepared.stated, kept, [i for i in new if i not in added])
-    numbers = sorted({*added, *rivals.values()})
-    opened = {k.frame: k for k in _opened(prepared, numbers, on_progress)}
+    count = len(old)
+    # Frames are numbered alike everywhere: the old keyframes first, then the new images.
+    prepared = PreparedFrames([*old.frames(), *located], encoder, size)
+    inverse_depth = np.concatenate([marks.inverse_depth for marks in old.landmarks])
+    prepared.depth_scale = scale_of_depths(1 / inverse_depth)
+    tracks = [_reopened(prepared, old, i) for i in range(count)]
+    images = range(count, len(prepared))
+    survivals = []
+    for keyframe in tracks:
+        survivals.append(_survival(prepared, keyframe, images, options))
+        on_progress("comparing", len(survivals), count)
+    shares = np.array([survival.share(options) for survival in survivals])
+    kept, added = _selected(prepared.stated, shares, options)
+    rivals = _nearest(prepared.stated, kept, [i for i in images if i not in added])
+    opened = {}
+    candidates = sorted({*added, *rivals.values()})
+    for keyframe in opened_keyframes(prepared, candidates, on_progress):
+        if keyframe.confirmed.any():
+            opened[keyframe.frame] = keyframe
     for i, rival in rivals.items():
-        alive = int(states[i].alive.sum())
-        if rival in opened and opened[rival].confirmed.sum() > options.richer * alive:
+        least = options.richer * int(survivals[i].alive.sum())
+        if rival in opened and opened[rival].confirmed.sum() > least:
             kept.remove(i)
             added.append(rival)
     chosen = [opened[i] for i in sorted(set(added)) if i in opened]
-    _adjust(prepared, tracks, chosen, n, options)
-    keyframes = _joined(prepared, old, [states[i].alive for i in kept], kept, chosen)
+    if chosen:
+        _adjust(prepared, tracks, chosen, options)
+    remaining = _without_gone(old, kept, survivals)
+    if chosen:
+        remaining = remaining.joined(tracked_keyframes(prepared, chosen))
     return Refreshed(
-        scene=replace(scene, keyframes=keyframes),
-        checked=sum(int(state.checked.sum()) for state in states),
-        gone=sum(int((~state.alive).sum()) for state in states),
-        left=n - len(kept),
+        scene=replace(scene, keyframes=remaining),
+        checked=sum(int(survival.checked.sum()) for survival in survivals),
+        gone=sum(int((~survival.alive).sum()) for survival in survivals),
+        left=count - len(kept),
         added=len(chosen),
     )
 
@@ -141,23 +156,20 @@ class _Survival:
     alive: BoolArray
     """(n,) landmarks that were found, or could not be checked."""
 
-    def share(self, least: int) -> float:
-        """Share of the checked landmarks that are alive; 1 for fewer than `least`."""
-        count = int(self.checked.sum())
-        return 1.0 if count < least else float(self.alive[self.checked].mean())
+    def share(self, options: RefreshOptions) -> float:
+        """Share of the checked landmarks that are alive; 1 for fewer than `least_checked`."""
+        if int(self.checked.sum()) < options.least_checked:
+            return 1.0
+        return float(self.alive[self.checked].mean())
 
 
 def _reopened(prepared: PreparedFrames, old: Keyframes, i: int) -> KeyframeTracks:
     landmarks = old.landmarks[i]
-    pyramid = prepared.pyramid(i)
     return KeyframeTracks(
         frame=i,
         landmarks=landmarks,
         cell_inverse_depth=old.inverse_depth[i].astype(np.float64),
-        patches=tuple(
-            cut_patches(pyramid[level], to_level(landmarks.pixels, level))
-            for level in range(PYRAMID_LEVELS)
-        ),
+        patches=template_patches(prepared, i, landmarks.pixels),
         sources=(),
         confirmed=np.ones(len(landmarks), bool),
     )
@@ -166,167 +178,125 @@ def _reopened(prepared: PreparedFrames, old: Keyframes, i: int) -> KeyframeTrack
 def _survival(
     prepared: PreparedFrames,
     keyframe: KeyframeTracks,
-    new: range,
+    images: range,
     options: RefreshOptions,
 ) -> _Survival:
-    """Look for the landmarks of a keyframe in new images."""
-    n = len(keyframe.landmarks)
-    every = np.arange(len(keyframe.landmarks))
-    expected = np.zeros(n, int)
-    found = np.zeros(n, int)
+    """Search for the landmarks of a keyframe in new images."""
+    expected = np.zeros(len(keyframe.landmarks), int)
+    observed = np.zeros(len(keyframe.landmarks), int)
     surface = keyframe.landmarks.surface(prepared.cameras[keyframe.frame])
-    points = surface[0]
     least = np.cos(np.deg2rad(options.similar_deg))
-    for j in new:
+    for j in images:
         rotation, translation = prepared.relative(j, keyframe.frame)
-        seen = project_surface(
-            surface, rotation, translation, prepared.cameras[j]
-        ).landmark
+        camera = prepared.cameras[j]
+        visible = project_surface(surface, rotation, translation, camera).landmark
+        points = surface[0, visible]
         # The camera of image j in the frame of the keyframe's camera.
         centre = -rotation.T @ translation
-        rays = points[seen] - centre
-        lengths = np.linalg.norm(rays, axis=1) * np.linalg.norm(points[seen], axis=1)
-        similar = seen[(rays * points[seen]).sum(1) > least * lengths]
-        if not len(similar):
-            continue
-        expected[similar] += 1
-        observed = observe(prepared, keyframe, j, every[similar], WIDE_STEPS, REACH_PX)
-        found[observed.landmark] += 1
-    checked = (expected >= options.looks) | (found > 0)
-    return _Survival(checked, ~checked | (found > 0))
+        rays = points - centre
+        lengths = np.linalg.norm(rays, axis=1) * np.linalg.norm(points, axis=1)
+        similar = visible[(rays * points).sum(1) > least * lengths]
+        if len(similar):
+            expected[similar] += 1
+            found = observe(prepared, keyframe, j, similar, WIDE_STEPS, REACH_PX)
+            observed[found.landmark] += 1
+    checked = (expected >= options.looks) | (observed > 0)
+    return _Survival(checked, ~checked | (observed > 0))
 
 
 def _selected(
-    poses: SE3, n: int, shares: Array, options: RefreshOptions
+    poses: SE3, shares: Array, options: RefreshOptions
 ) -> tuple[list[int], list[int]]:
-    """Return the old keyframes that stay and the new images that become keyframes."""
+    """Return the old keyframes that stay and the new images that become keyframes.
+
+    Poses are those of all frames; shares are those of the old keyframes.
+    """
+    count = len(shares)
     kept = np.flatnonzero(shares >= options.least_surviving)
-    new = np.arange(n, len(poses))
-    space = PoseSpace.of(poses.translation_m, poses.rotation_wxyz)
+    images = np.arange(count, len(poses))
     if len(kept) > 1:
-        between = np.stack([space.distances(int(i), kept) for i in kept])
-        step = float(np.median(np.where(between > 0, between, np.inf).min(1)))
-        gap = (
-            np.stack([space.distances(int(i), kept).min() for i in new])
-            if len(new)
-            else new
-        )
-        most = int(options.most_novel * n)
-        room = min(int((gap > options.novel * step).sum()), most) - (n - len(kept))
-        if room > 0:
-            rows = select_farthest(
-                poses.translation_m[kept], poses.rotation_wxyz[kept], len(kept) - room
+        space = PoseSpace.of(poses.translation_m, poses.rotation_wxyz)
+        gaps = _distances(space, images, kept).min(1)
+        unexplored = int((gaps > options.novel * _spacing(space, kept)).sum())
+        most = int(options.most_novel * count)
+        surplus = min(unexplored, most) - (count - len(kept))
+        if surplus > 0:
+            spread = select_farthest(
+                poses.translation_m[kept],
+                poses.rotation_wxyz[kept],
+                len(kept) - surplus,
             )
-            kept = kept[rows]
-    count = min(n, len(kept) + len(new))
-    pool = np.concatenate([kept, new])
+            kept = kept[spread]
+    pool = np.concatenate([kept, images])
     chosen = select_farthest(
         poses.translation_m[pool],
         poses.rotation_wxyz[pool],
-        count,
+        min(count, len(pool)),
         start=range(len(kept)),
     )
-    return kept.tolist(), [int(pool[i]) for i in chosen if i >= len(kept)]
+    return kept.tolist(), pool[chosen[chosen >= len(kept)]].tolist()
 
 
-def _nearest(poses: SE3, kept: Sequence[int], new: Sequence[int]) -> dict[int, int]:
+def _nearest(poses: SE3, kept: list[int], images: list[int]) -> dict[int, int]:
     """Return for each kept keyframe the new image next to it, each image at most once.
 
     Images farther away than the usual step between keyframes replace none.
     """
+    nearest: dict[int, int] = {}
+    if len(kept) < 2 or not images:
+        return nearest
     space = PoseSpace.of(poses.translation_m, poses.rotation_wxyz)
-    if len(kept) < 2 or not new:
-        return {}
-    rows = np.array(kept)
-    columns = np.array(new)
-    between = np.stack([space.distances(int(i), rows) for i in kept])
-    step = np.median(np.where(between > 0, between, np.inf).min(1))
-    gaps = np.stack([space.distances(int(i), columns) for i in kept])
-    found: dict[int, int] = {}
-    for flat in np.argsort(gaps, axis=None):
-        a, b = divmod(int(flat), len(new))
-        if gaps[a, b] > step:
+    step = _spacing(space, np.array(kept))
+    gaps = _distances(space, kept, np.array(images))
+    for pair in np.argsort(gaps, axis=None):
+        row, column = divmod(int(pair), len(images))
+        if gaps[row, column] > step:
             break
-        if kept[a] not in found and new[b] not in found.values():
-            found[kept[a]] = new[b]
-    return found
+        if kept[row] not in nearest and images[column] not in nearest.values():
+            nearest[kept[row]] = images[column]
+    return nearest
 
 
-def _opened(
-    prepared: PreparedFrames, numbers: Sequence[int], on_progress: OnProgress
-) -> list[KeyframeTracks]:
-    def open_one(frame: int) -> KeyframeTracks:
-        keyframe = open_keyframe(prepared, frame)
-        refine_depths(prepared, keyframe)
-        return keyframe
+def _distances(space: PoseSpace, rows: Iterable[int], columns: IntArray) -> Array:
+    """(r, c) distances between frames."""
+    distances = [space.distances(int(i), columns) for i in rows]
+    return np.reshape(distances, (-1, len(columns)))
 
-    opened = []
-    with ThreadPoolExecutor(cores()) as pool:
-        for keyframe in pool.map(open_one, numbers):
-            opened.append(keyframe)
-            on_progress("mapping", len(opened), len(numbers))
-    return [keyframe for keyframe in opened if keyframe.confirmed.any()]
+
+def _spacing(space: PoseSpace, keyframes: IntArray) -> float:
+    """Median distance of keyframes from the next one."""
+    between = _distances(space, keyframes, keyframes)
+    return float(np.median(np.where(between > 0, between, np.inf).min(1)))
 
 
 def _adjust(
     prepared: PreparedFrames,
     tracks: list[KeyframeTracks],
     opened: list[KeyframeTracks],
-    n: int,
     options: RefreshOptions,
 ) -> None:
-    """Adjust the poses of the new images together, without moving the n old keyframes."""
-    keyframes = [*(k for k in tracks if len(k.landmarks)), *opened]
-    if not opened:
-        return
-    observed = bundle_tracks(prepared, keyframes)
+    """Adjust the poses of the new images together, without moving the old keyframes."""
+    count = len(tracks)
+    old = [keyframe for keyframe in tracks if len(keyframe.landmarks)]
+    observed = bundle_tracks(prepared, [*old, *opened])
+    stated = prepared.stated
     problem = BundleAdjustment(
-        prepared.stated,
-        list(prepared.cameras),
-        np.zeros((len(prepared), 6)),
-        options.bundle,
+        stated, list(prepared.cameras), np.zeros((len(stated), 6)), options.bundle
     )
     poses = problem.solve(observed).poses
     # The old keyframes define the frame: undo their mean motion.
-    shift = _mean_motion(prepared.stated[:n], poses[:n])
-    poses = shift @ poses
-    fixed = SE3.stack([*prepared.stated[:n], *poses[n:]])
-    prepared.adjust(fixed, None)
+    poses = average_poses(stated[:count] @ poses[:count].inverse()) @ poses
+    prepared.adjust(SE3.stack([*stated[:count], *poses[count:]]), None)
     for keyframe in opened:
         refine_depths(prepared, keyframe, again=True)
 
 
-def _mean_motion(before: SE3, after: SE3) -> SE3:
-    """Return the rigid motion that moves poses (n,) back, robustly."""
-    return average_poses(before @ after.inverse())
-
-
-def _joined(
-    prepared: PreparedFrames,
-    old: Keyframes,
-    alive: Sequence[BoolArray],
-    kept: Sequence[int],
-    opened: Sequence[KeyframeTracks],
+def _without_gone(
+    old: Keyframes, kept: list[int], survivals: list[_Survival]
 ) -> Keyframes:
-    """Return kept keyframes without what is gone, and the new ones."""
-    vlad = prepared.encoder.vlad()
-    numbers = [keyframe.frame for keyframe in opened]
-    stay = old.take(np.array(kept, np.int64))
-    assert stay.descriptors is not None, "a map has descriptors"
-    rows = [vlad(prepared.features(i)).astype(np.float16) for i in numbers]
-    poses = [*stay.base_from_camera, *(prepared.poses[i] for i in numbers)]
-    return Keyframes(
-        images=(*stay.images, *(jpeg(prepared.grey[i]) for i in numbers)),
-        cameras=(*stay.cameras, *(prepared.cameras[i] for i in numbers)),
-        base_from_camera=SE3.stack(poses),
-        inverse_depth=(
-            *stay.inverse_depth,
-            *(k.cell_inverse_depth.astype(np.float16) for k in opened),
-        ),
-        landmarks=(
-            *(marks.take(np.flatnonzero(mask))
-              for marks, mask in zip(stay.landmarks, alive, strict=True)),
-            *(k.landmarks.take(np.flatnonzero(k.confirmed)) for k in opened),
-        ),
-        descriptors=np.concatenate([stay.descriptors, *(row[None] for row in rows)]),
-    )  # fmt: skip
+    """The kept keyframes without the landmarks that are gone."""
+    remaining = old.take(np.array(kept, np.int64))
+    landmarks = []
+    for i, marks in zip(kept, remaining.landmarks, strict=True):
+        landmarks.append(marks.take(np.flatnonzero(survivals[i].alive)))
+    return replace(remaining, landmarks=tuple(landmarks))

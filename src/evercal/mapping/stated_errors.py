@@ -15,7 +15,7 @@ from evercal.mapping.bundle_equations import (
     SHIFT,
     Parameters,
 )
-from evercal.robot.arm import JointSlopes
+from evercal.robot.arm_offsets import JointSlopes
 from evercal.typing import Array
 
 

@@ -1,12 +1,13 @@
 """Tracks: observations of landmarks in other frames, by patch alignment."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from evercal.mapping.bundle_equations import BundleTracks
+from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.landmarks import Landmarks, detect, project_surface, slopes
 from evercal.mapping.patches import (
     Patches,
@@ -15,8 +16,10 @@ from evercal.mapping.patches import (
     to_level,
     whitening,
 )
-from evercal.mapping.plane_sweep import FAR_M, NEAR_M, PROBED_CELLS
-from evercal.mapping.prepared_frames import PYRAMID_LEVELS, PreparedFrames
+from evercal.mapping.plane_sweep import FAR_M, NEAR_M
+from evercal.mapping.prepared_frames import PreparedFrames
+from evercal.processes import cores
+from evercal.progress import OnProgress
 from evercal.typing import Array, BoolArray, IntArray
 
 Steps = Sequence[tuple[int, int]]
@@ -40,16 +43,6 @@ MIN_CORRELATION = 0.8
 """Smallest normalised cross-correlation of an observation."""
 REACH_PX = 12.0
 """Largest distance of an observation from its prediction, pixels."""
-WIDE_REACH_PX = 25.0
-"""The same while poses are adjusted."""
-FRAMES_PER_KEYFRAME = 3
-"""Keyframes that each frame is tied to in bundle adjustment."""
-LANDMARKS_PER_KEYFRAME = 200
-"""Landmarks of a keyframe in bundle adjustment, at most."""
-BUNDLE_LANDMARKS = 6000
-"""Landmarks of all keyframes in bundle adjustment, at most."""
-MIN_SHARED_VIEW = 0.15
-"""Share of a keyframe's view that a frame tied to it must show."""
 FLOOR_PX = 0.1
 """Alignment error of a perfect patch where the noise is 1, pixels: 0.08 px where it is 0.8."""
 NOISE = 0.8
@@ -103,17 +96,66 @@ def open_keyframe(recording: PreparedFrames, frame: int) -> KeyframeTracks:
     pixels = pixels[has_ray]
     cells = cells[has_ray]
     slant = slopes(inverse, view.grid, cell_px)
-    pyramid = recording.pyramid(frame)
     return KeyframeTracks(
         frame=frame,
         landmarks=Landmarks(pixels, inverse[cells], slant[cells], np.ones(len(cells))),
         cell_inverse_depth=inverse,
-        patches=tuple(
-            cut_patches(pyramid[level], to_level(pixels, level))
-            for level in range(PYRAMID_LEVELS)
-        ),
+        patches=template_patches(recording, frame, pixels),
         sources=tuple(near),
         confirmed=np.zeros(len(cells), bool),
+    )
+
+
+def opened_keyframes(
+    recording: PreparedFrames, frames: Sequence[int], on_progress: OnProgress
+) -> list[KeyframeTracks]:
+    """Open keyframes in parallel and refine their depths."""
+
+    def open_one(frame: int) -> KeyframeTracks:
+        keyframe = open_keyframe(recording, frame)
+        refine_depths(recording, keyframe)
+        return keyframe
+
+    opened = []
+    with ThreadPoolExecutor(cores()) as pool:
+        for keyframe in pool.map(open_one, frames):
+            opened.append(keyframe)
+            on_progress("mapping", len(opened), len(frames))
+    return opened
+
+
+def template_patches(
+    recording: PreparedFrames, frame: int, pixels: Array
+) -> tuple[Patches, ...]:
+    """Templates around (n, 2) pixels of a frame, in every pyramid level."""
+    return tuple(
+        cut_patches(image, to_level(pixels, level))
+        for level, image in enumerate(recording.pyramid(frame))
+    )
+
+
+def tracked_keyframes(
+    recording: PreparedFrames, tracks: Sequence[KeyframeTracks]
+) -> Keyframes:
+    """What is stored of keyframes: their confirmed landmarks."""
+    numbers = np.array([keyframe.frame for keyframe in tracks])
+    vlad = recording.encoder.vlad()
+    images = []
+    landmarks = []
+    depths = []
+    descriptors = []
+    for keyframe in tracks:
+        images.append(jpeg(recording.grey[keyframe.frame]))
+        landmarks.append(keyframe.landmarks.take(np.flatnonzero(keyframe.confirmed)))
+        depths.append(keyframe.cell_inverse_depth.astype(np.float16))
+        descriptors.append(vlad(recording.features(keyframe.frame)))
+    return Keyframes(
+        images=tuple(images),
+        cameras=tuple(recording.cameras[i] for i in numbers),
+        base_from_camera=recording.poses[numbers],
+        inverse_depth=tuple(depths),
+        landmarks=tuple(landmarks),
+        descriptors=np.stack(descriptors).astype(np.float16),
     )
 
 
@@ -165,7 +207,7 @@ def refine_depths(
             observe(recording, keyframe, j, which, steps, REACH_PX)
             for j in keyframe.sources
         ]
-        observations = _joined(parts)
+        observations = joined(parts)
         # Landmarks with too few observations at a coarse level are not tried at a finer one.
         count = np.bincount(observations.landmark, minlength=len(keyframe.landmarks))
         which = np.flatnonzero(count >= MIN_VIEWS - 1)
@@ -175,94 +217,8 @@ def refine_depths(
     _confirm(recording, keyframe, observations)
 
 
-def bundle_tracks(
-    recording: PreparedFrames, keyframes: list[KeyframeTracks]
-) -> BundleTracks:
-    """Observe a spread subset of the landmarks in all frames that show enough of their keyframe."""
-    most = max(30, min(LANDMARKS_PER_KEYFRAME, BUNDLE_LANDMARKS // len(keyframes)))
-    tied = _tied_frames(recording, keyframes)
-    parts: list[Observations] = []
-    host = []
-    pixels = []
-    inverse = []
-    start = 0
-    for keyframe, frames in zip(keyframes, tied, strict=True):
-        which = _bundled(keyframe, most)
-        if not len(which):
-            continue
-        number = np.full(len(keyframe.landmarks), -1)
-        number[which] = start + np.arange(len(which))
-        for j in frames:
-            observed = observe(recording, keyframe, j, which, WIDE_STEPS, WIDE_REACH_PX)
-            parts.append(observed._replace(landmark=number[observed.landmark]))
-        host.append(np.full(len(which), keyframe.frame))
-        pixels.append(keyframe.landmarks.pixels[which])
-        inverse.append(keyframe.landmarks.inverse_depth[which])
-        start += len(which)
-    observed = _joined(parts)
-    often = np.bincount(observed.landmark, minlength=start)[observed.landmark] >= 2
-    return BundleTracks(
-        host=np.concatenate(host),
-        pixels=np.concatenate(pixels),
-        inverse_depth=np.concatenate(inverse),
-        landmark=observed.landmark[often],
-        frame=observed.frame[often],
-        observed=observed.pixels[often],
-        whitening=observed.whitening[often],
-        depth_scale=recording.depth_scale,
-    )
-
-
-def _bundled(keyframe: KeyframeTracks, most: int) -> IntArray:
-    which = np.flatnonzero(keyframe.confirmed)
-    if len(which) < most // 2:
-        which = np.arange(len(keyframe.landmarks))
-    if len(which) > most:
-        which = which[np.linspace(0, len(which) - 1, most).astype(int)]
-    return which
-
-
-def _tied_frames(
-    recording: PreparedFrames, keyframes: list[KeyframeTracks]
-) -> list[list[int]]:
-    shared = np.stack([_shared_view(recording, keyframe) for keyframe in keyframes])
-    best = np.argsort(-shared, axis=0, kind="stable")[:FRAMES_PER_KEYFRAME]
-    tied = np.zeros(shared.shape, bool)
-    np.put_along_axis(tied, best, True, axis=0)
-    tied &= shared > MIN_SHARED_VIEW
-    return [
-        sorted({*np.flatnonzero(row).tolist(), *keyframe.sources} - {keyframe.frame})
-        for row, keyframe in zip(tied, keyframes, strict=True)
-    ]
-
-
-def _shared_view(recording: PreparedFrames, keyframe: KeyframeTracks) -> np.ndarray:
-    """(n,) share of a keyframe's view that each frame shows from a similar direction."""
-    cells = recording.posed_cells(keyframe.frame)
-    poses = recording.poses
-    some = np.linspace(0, len(keyframe.cell_inverse_depth) - 1, PROBED_CELLS).astype(
-        int
-    )
-    local = cells.rays()[some] / keyframe.cell_inverse_depth[some, None]
-    points = cells.base_from_camera.apply(local)
-    direction = points[None] - poses.translation_m[:, None]
-    unit = direction / (np.linalg.norm(direction, axis=-1, keepdims=True) + 1e-9)
-    within = np.einsum("nji,npj->npi", poses.rotation_matrix(), direction)
-    shared = np.zeros(len(recording))
-    for i in range(len(recording)):
-        camera = recording.cameras[i]
-        front = within[i, :, 2] > 0
-        pixel = camera.project(np.where(front[:, None], within[i], [0, 0, 1]))
-        inside = (
-            front & (pixel > 0).all(1) & (pixel < [camera.width, camera.height]).all(1)
-        )
-        similar = ((unit[i] * unit[keyframe.frame]).sum(1) - 0.7).clip(0, 1) / 0.3
-        shared[i] = np.where(inside, similar, 0).mean()
-    shared[keyframe.frame] = 0
-    return shared
-
-
-def _joined(parts: Sequence[Observations]) -> Observations:
+def joined(parts: Sequence[Observations]) -> Observations:
+    """Several sets of observations as one."""
     return Observations(*map(np.concatenate, zip(*parts, strict=True)))
 
 

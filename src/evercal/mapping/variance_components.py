@@ -10,7 +10,10 @@ what the images say: y = d / K has the variance s^2 + v / K.
 
 import numpy as np
 
+from evercal.geometry import SE3
+from evercal.mapping.bundle_equations import Parameters
 from evercal.mapping.bundle_options import BundleOptions
+from evercal.mapping.stated_errors import StatedErrors, Variances
 from evercal.typing import Array
 
 _COMMON_GROUPS = (slice(0, 3), slice(3, 6))
@@ -31,6 +34,16 @@ VARIANCE_SHRINKAGE = 16
 """Largest divisor of the variance of shared parameters in one iteration."""
 USUAL_OFFSET = 0.05 / 3
 """Prior of the offsets: one pseudo-joint with this offset, in sigmas of the first prior."""
+SYSTEMATIC_WEIGHT = 1.0
+"""Weight of the prior of the variance of systematic errors, in directions that the images observe
+fully."""
+SYSTEMATIC_VARIANCE = 1.0
+"""Mean of that prior, in variances of the noise."""
+HIDDEN = 4.0
+"""Factor on the variance of systematic errors in directions that the images hide: a real arm that
+orbits one place moves its mount by 19 mm along the axis (research/trust.md)."""
+LEAST_SINGULAR = 1e-6
+"""Directions with a smaller singular value, as a share of the largest, do not vary."""
 
 
 def pose_sigma(
@@ -139,3 +152,58 @@ def joint_variance(
     share = min(squares / (constrained + 1), 1.0)
     before = float((prior / widest)[0])
     return max(share, before / VARIANCE_SHRINKAGE) * widest
+
+
+def systematic_covariance(
+    stated: SE3,
+    errors: StatedErrors,
+    parameters: Parameters,
+    root: Array,
+    variances: Variances,
+    least: float,
+) -> Array:
+    """Covariance of common transform, time shift and joints by systematic errors of poses.
+
+    The errors of an arm's joints vary slowly with the pose. They are modelled by errors that are
+    linear in the rotation and position of a frame. Their variance t^2 is estimated from the
+    residuals, as that of independent errors is: an error in a unit direction that the images
+    observe to a share K leaves a residual with the variance K^2 t^2 + K s^2. It is at least `least`
+    times s^2.
+
+    Args:
+        stated: (n,) stated poses.
+        errors: Their errors.
+        parameters: Result of the adjustment.
+        root: Factor of the parameters' covariance, root.T @ root.
+        variances: Priors of the adjustment.
+        least: Lower bound of the variance, in variances of the noise.
+    """
+    basis = _linear_motions(stated, errors.gripper_from_camera)
+    weight = np.sqrt(variances.weight)[:, None]
+    posterior = np.einsum("nr,kni->kri", basis, weight * errors.of_rows(root))
+    residual = basis.T @ (weight * errors.at_origin(parameters)) / variances.sigma
+    share = (1 - ((posterior / variances.sigma) ** 2).sum(0)).clip(0)
+    ratio = np.zeros(6)
+    for axes in (slice(0, 3), slice(3, 6)):
+        k = share[:, axes]
+        excess = (
+            residual[:, axes] ** 2 - k
+        ).sum() + SYSTEMATIC_WEIGHT * SYSTEMATIC_VARIANCE
+        ratio[axes] = max(excess / ((k**2).sum() + SYSTEMATIC_WEIGHT), least)
+    # Response of the shared parameters to an error of each stated pose: (7 + k, n, 6).
+    covariance = root[:, 6 * errors.n :][:, errors.moving].T @ root
+    response = weight * errors.of_rows(covariance) / variances.sigma
+    scaled = np.einsum("kni,nr->kri", response, basis) * np.sqrt(HIDDEN * ratio)
+    rows = scaled.reshape(len(scaled), -1)
+    return rows @ rows.T
+
+
+def _linear_motions(stated: SE3, gripper_from_camera: SE3) -> Array:
+    """(n, r) orthonormal functions of the frame, linear in its rotation and position."""
+    rotations = stated.rotation
+    turns = (rotations.mean().inv() * rotations).as_rotvec()
+    # Of a fixed camera the frame of the map is the gripper: the arm's position is inverse.
+    arm = gripper_from_camera.inverse().translation_m
+    linear = np.concatenate([turns, stated.translation_m, arm], axis=1)
+    basis, size, _ = np.linalg.svd(linear - linear.mean(0), full_matrices=False)
+    return basis[:, size > LEAST_SINGULAR * size[0]]

@@ -27,17 +27,6 @@ class MovingJoint(NamedTuple):
     """Offset of the motion, radians, or metres of sliding joints."""
 
 
-class JointSlopes(NamedTuple):
-    """How the k joints of an arm move the gripper, in n frames."""
-
-    slopes: Array
-    """(n, 6, k) see `Arm.slopes`."""
-    rotates: BoolArray
-    """(k,) whether a value is an angle."""
-    at: Array
-    """(k,) offsets that the stated poses contain."""
-
-
 @dataclass(frozen=True, eq=False)
 class Arm:
     """Kinematics of an arm."""

@@ -26,13 +26,13 @@ from evercal.features.sift import epipolar_pair, sift_features
 from evercal.features.views import working_image
 from evercal.features.vlad import similar_pairs
 from evercal.geometry import SE3, Camera, cross_matrix
-from evercal.mapping.arm_offsets import ArmOffsets
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.selection import spread_poses
 from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, stated_grippers
 from evercal.robot.arm import Arm
+from evercal.robot.arm_offsets import ArmOffsets
 from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
 from evercal.typing import Array, BoolArray, Float32Array, Image
 

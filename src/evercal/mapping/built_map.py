@@ -1,0 +1,174 @@
+"""`BuiltMap`: a scene's map, what was adjusted to build it, and what is needed to judge it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from evercal.geometry import SE3, Camera
+from evercal.mapping.arm_offsets import with_offsets
+from evercal.mapping.bundle_adjustment import Adjustment
+from evercal.mapping.scene_map import LeftOut, SceneMap
+from evercal.recordings.frame import Frame
+from evercal.robot.arm_offsets import ArmOffsets
+from evercal.typing import Array, IntArray
+
+GAP = 10
+"""Cross-validation: frames without keyframes before and after a part that is left out. Frames
+between similar keyframes are located more exactly than new images are."""
+MOST_PARTS = 12
+"""Maximum number of parts that are left out in turn."""
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """What bundle adjustment changed about a recording, as JSON values."""
+
+    common_translation_mm: tuple[float, ...] | None = (0.0, 0.0, 0.0)
+    """(3,) correction common to all stated poses, in the camera frame; None where their unit of
+    length is unknown, as `pose_sigma_mm`."""
+    common_rotation_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
+    """(3,) its rotation vector."""
+    focal_percent: float = 0.0
+    """Change of the focal length."""
+    residual_px: float | None = None
+    """Median reprojection error after the adjustment; None without adjustment."""
+    pose_sigma_mm: float | None = 0.0
+    """Estimated error of the stated positions, standard deviation per axis."""
+    pose_sigma_deg: float = 0.0
+    """The same for the stated rotations, degrees."""
+    time_shift_frames: float = 0.0
+    """Delay of the images after their stated poses."""
+    wrong_poses: tuple[str, ...] = ()
+    """Frames whose stated pose contradicts the images; they are excluded."""
+    untracked: tuple[str, ...] = ()
+    """Frames that could not be tracked in other images, or not enough; they are excluded."""
+    doubtful_poses: tuple[str, ...] = ()
+    """Frames whose stated pose has an unusually large error; they were given less weight."""
+    corner_px: float = 0.0
+    """Largest change of a corner of the first frame's image by the intrinsics, pixels."""
+    intrinsics: tuple[dict[str, object], ...] = ()
+    """Its intrinsics as stated and as adjusted; none without adjustment."""
+
+    @classmethod
+    def of(cls, adjustment: Adjustment, stated: Camera, camera: Camera) -> Self:
+        """Changes by bundle adjustment, without names of frames.
+
+        `stated` and `camera` are the intrinsics before and after.
+        """
+        tangent = adjustment.common.log()
+        size = (stated.width, stated.height)
+        corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - 0.5
+        moved = np.linalg.norm(
+            camera.project(stated.unproject(corners)) - corners, axis=-1
+        )
+        return cls(
+            common_translation_mm=tuple((1000 * tangent[:3]).tolist()),
+            common_rotation_deg=tuple(np.rad2deg(tangent[3:]).tolist()),
+            focal_percent=100 * (camera.fx / stated.fx - 1),
+            residual_px=adjustment.residual_px,
+            pose_sigma_mm=1000 * adjustment.sigma_m,
+            pose_sigma_deg=float(np.rad2deg(adjustment.sigma_rad)),
+            time_shift_frames=adjustment.shift_frames,
+            corner_px=float(np.fmax.reduce(moved, initial=0.0)),
+            intrinsics=(stated.to_dict(), camera.to_dict()),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class HandEyeCorrection:
+    """Adjustment of a rough `gripper_from_camera`."""
+
+    start_camera_from_camera: SE3
+    """gripper_from_camera is the rough one times this."""
+    by_noise: Array
+    """(6, 6) covariance by noise of images and gripper poses; camera frame, metres and radians."""
+    by_lens: Array
+    """(6, 6) covariance by the uncertainty of the intrinsics."""
+    by_drift: Array
+    """(6, 6) covariance by errors of gripper poses that vary slowly over the recording."""
+    residuals: dict[str, Array]
+    """(6,) deviation of each frame's gripper pose from the images, by name; gripper frame."""
+    moved: dict[str, Array]
+    """(6,) the same as a motion of the camera, camera frame."""
+    arm: ArmOffsets | None = None
+    """Offsets of the joints of the arm, where its joint values are stated."""
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) of all causes."""
+        return self.by_noise + self.by_lens + self.by_drift
+
+
+@dataclass(frozen=True, eq=False)
+class BuiltMap:
+    """A scene's map and how it came about."""
+
+    scene: SceneMap
+    """What is stored."""
+    adjusted: Adjusted
+    """Changes by bundle adjustment, for reports."""
+    keyframe_names: tuple[str, ...]
+    """Names of the frames that are keyframes."""
+    hand_eye: HandEyeCorrection | None = None
+    """Adjustment of `gripper_from_camera`; None where camera poses were stated."""
+
+    @property
+    def independent_noise(self) -> tuple[float, float]:
+        """Standard deviation of stated poses per axis that neighbouring frames do not share."""
+        metres = (self.adjusted.pose_sigma_mm or 0) / 1000
+        radians = np.deg2rad(self.adjusted.pose_sigma_deg)
+        shared = self.scene.frame.frame_sigma
+        independent = np.where(shared, 0.0, [metres, radians])
+        return float(independent[0]), float(independent[1])
+
+    def corrected(self, frames: Sequence[Frame]) -> list[Frame]:
+        """Other frames of the recording, with the adjusted `gripper_from_camera`."""
+        if self.hand_eye is None:
+            return list(frames)
+        if self.hand_eye.arm is not None:
+            frames = with_offsets(frames, self.hand_eye.arm)
+        change = self.hand_eye.start_camera_from_camera
+        corrected = []
+        for frame in frames:
+            if frame.base_from_camera is not None:
+                pose = frame.base_from_camera @ change
+                corrected.append(replace(frame, base_from_camera=pose))
+        return corrected
+
+    def cleared(self, names: Sequence[str]) -> "BuiltMap":
+        """The same map, in which the poses of some frames no longer count as wrong."""
+        before = self.adjusted
+        wrong = tuple(name for name in before.wrong_poses if name not in names)
+        untracked = (*before.untracked, *names)
+        adjusted = replace(before, wrong_poses=wrong, untracked=untracked)
+        return replace(self, adjusted=adjusted)
+
+    def left_out(self, frames: Sequence[Frame]) -> list[LeftOut]:
+        """Parts of the recording, each with the keyframes that were recorded before and after it.
+
+        The frames are all that the map was built from, in recorded order. A recording that is too
+        short for it, or that states gripper poses, gives none.
+        """
+        if len(frames) < 3 * GAP or self.hand_eye is not None:
+            return []
+        order = {frame.name: i for i, frame in enumerate(frames)}
+        recorded = np.array([order[name] for name in self.keyframe_names])
+        excluded = {*self.adjusted.wrong_poses, *self.adjusted.untracked}
+        count = min(MOST_PARTS, len(frames) // (2 * GAP))
+        parts = []
+        middles = np.linspace(GAP, len(frames) - GAP - 1, count).astype(int)
+        for middle in middles.tolist():
+            others = np.flatnonzero(np.abs(recorded - middle) > GAP)
+            near = frames[middle - 3 : middle + 4 : 2]
+            usable = tuple(frame for frame in near if frame.name not in excluded)
+            if len(others) and usable:
+                parts.append(LeftOut(usable, others))
+        return parts
+
+    def take(self, index: IntArray) -> "BuiltMap":
+        """The same map with a subset of its keyframes."""
+        names = tuple(self.keyframe_names[i] for i in index.tolist())
+        scene = replace(self.scene, keyframes=self.scene.keyframes.take(index))
+        return replace(self, scene=scene, keyframe_names=names)
