@@ -132,7 +132,7 @@ def test_unusable_images_are_reported(tmp_path: Path) -> None:
     text = " ".join(result.missing)
     assert "wide.png is 160x90, which does not fit the camera, 160x120" in text
     assert "broken.png: not a readable image" in text
-    assert "No landmarks: pass --store" in text
+    assert "No landmarks: pass `store`" in text
 
 
 def test_axes_of_an_older_calibration_are_added(tmp_path: Path) -> None:

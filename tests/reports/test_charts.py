@@ -12,7 +12,7 @@ import pytest
 from evercal.geometry import SE3, Camera
 from evercal.reports.charts import INKS, Panel, Shape, paint, rgb, write
 from evercal.reports.page import environment
-from evercal.reports.scene import ABOVE, Frustum, Surroundings, view_panel
+from evercal.reports.scene import Axes, Frustum, Surroundings, view_panel
 
 from .html_reader import HtmlReader
 
@@ -168,9 +168,7 @@ def test_a_view_has_one_scale_and_shows_what_lies_inside() -> None:
     around = Surroundings(points, np.array([0, 255, 90], np.uint8))
     view = Frustum.of(SE3.identity(), Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
     seen = np.array([[0.0, 0.0, 0.0], [2.0, 0.5, 1.0]])
-    shown = view_panel(
-        (300, 200), ABOVE, around, seen, view, names=("base", "unit unknown")
-    )
+    shown = view_panel((300, 200), Axes(unit="unit unknown"), around, seen, view)
     x, y = np.ptp(shown.limits, axis=0)
     assert x / y == pytest.approx(1.5)
     assert (shown.limits[0] < seen[:, :2].min(0)).all()

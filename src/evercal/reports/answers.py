@@ -42,20 +42,27 @@ def answer_row(answer: Answer) -> dict[str, object]:
     uncertain = finite_pose(estimate)
     if pose is not None and estimate.base_from_camera is not None:
         pose["matrix"] = estimate.base_from_camera.matrix().tolist()
-    terms = [{**vars(term), "share": share} for term, share in budget_of(estimate)]
-    if not answer.unit_known:
-        terms = [{**term, "translation_mm": None} for term in terms]
-    unit = "metres" if answer.unit_known else "unknown"
+    terms = []
+    for term, share in budget_of(estimate):
+        terms.append({**vars(term), "share": share})
+        if not answer.unit_known:
+            terms[-1]["translation_mm"] = None
+    unit = None
+    if pose is not None or estimate.alternatives:
+        unit = "metres" if answer.unit_known else "unknown"
+    covariance = None
+    if uncertain is not None:
+        covariance = uncertain.covariance.tolist()
     return {
         "path": str(answer.path),
         "status": estimate.status,
         "reason": estimate.reason,
         "scene": estimate.scene,
-        "unit": unit if pose is not None or estimate.alternatives else None,
+        "unit": unit,
         "parent_frame": estimate.parent_frame,
         "base_from_camera": pose,
         "alternatives": [pose_to_dict(other) for other in estimate.alternatives],
-        "covariance": None if uncertain is None else uncertain.covariance.tolist(),
+        "covariance": covariance,
         "error_terms": terms,
         "inliers": int(estimate.inliers),
         "inlier_ratio": float(estimate.inlier_ratio),
@@ -67,10 +74,9 @@ def answer_row(answer: Answer) -> dict[str, object]:
 def finite_pose(estimate: "PoseEstimate") -> "UncertainPose | None":
     """The pose with its covariance; None without a usable one."""
     uncertain = estimate.uncertain_pose
-    finite = uncertain is not None and all(
-        map(math.isfinite, uncertain.covariance.flat)
-    )
-    return uncertain if finite else None
+    if uncertain is None or all(map(math.isfinite, uncertain.covariance.flat)):
+        return uncertain
+    return None
 
 
 def budget_of(estimate: "PoseEstimate") -> "list[tuple[ErrorTerm, float]]":

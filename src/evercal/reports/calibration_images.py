@@ -89,7 +89,7 @@ def select_images(
     if not calibration.images:
         return (
             [],
-            "No pictures: the calibration names no images; pass some with --images.",
+            "No pictures: the calibration names no images; pass some with `images`.",
         )
     used: list[ImageFile] = []
     rejected: list[ImageFile] = []
@@ -102,7 +102,7 @@ def select_images(
     if not used and not rejected:
         return [], (
             f"No pictures: none of the {len(calibration.images)} images of the calibration exists"
-            f" (first: {calibration.images[0].name}); pass images with --images."
+            f" (first: {calibration.images[0].name}); pass images with `images`."
         )
     if not used:
         return _spread(rejected), ""
@@ -152,7 +152,7 @@ def annotate_images(
         annotated[str(file.path)] = LandmarkPicture(picture, drawn.landmarks, summary)
         on_image()
     if annotated and localizer is None and not boards:
-        missing.append("No landmarks: pass --store to draw them.")
+        missing.append("No landmarks: pass `store` to draw them.")
     if localizer is None:
         return AnnotatedImages(annotated, tuple(missing))
     scene = _scene_of(calibration, localizer)

@@ -20,6 +20,7 @@ from evercal.reports.page import Picture, Table, Tile, render
 from evercal.reports.scene import (
     ABOVE,
     CHI2_95,
+    Axes,
     Ellipsoid,
     Frustum,
     Surroundings,
@@ -64,7 +65,7 @@ def difference(new: Calibration, old: Calibration) -> Difference:
     """Compare two calibrations of one camera."""
     if new.mount != old.mount:
         raise InputError(
-            f"--against: it is {old.mount} and the calibration is {new.mount}; give one of the"
+            f"`against`: it is {old.mount} and the calibration is {new.mount}; give one of the"
             " same mount"
         )
     offset = deviations(SE3.stack([new.parent_from_child]), old.parent_from_child)[0]
@@ -345,7 +346,7 @@ def camera_views(calibration: Calibration, around: Surroundings) -> Chart:
     ends = np.stack([np.zeros(3), pose.pose.translation_m])
     extent = float(np.ptp(around.bounds(ends), axis=0).max())
     times = readable_scale([Ellipsoid.of(pose)], 0.07 * extent)
-    variances, axes = np.linalg.eigh(pose.covariance[:3, :3])
+    variances, directions = np.linalg.eigh(pose.covariance[:3, :3])
     half = times * np.sqrt(CHI2_95 * np.diag(pose.covariance)[:3].clip(0))
     seen = np.concatenate([ends, [ends[1] - half, ends[1] + half]])
     width, depth, _ = np.ptp(around.bounds(seen), axis=0)
@@ -354,12 +355,11 @@ def camera_views(calibration: Calibration, around: Surroundings) -> Chart:
     view = None if camera is None else Frustum.of(pose.pose, camera)
     for plane in (ABOVE, (int(depth > width), 2)):  # from the wider side
         shape = Shape("area", ellipse(pose, times, plane), "orange", opacity=0.3)
-        panels.append(
-            view_panel(_VIEW_PX, plane, around, seen, view, [shape], (parent, "m"))
-        )
+        axes = Axes(plane, parent)
+        panels.append(view_panel(_VIEW_PX, axes, around, seen, view, [shape]))
     c, b, a = 1000 * np.sqrt(CHI2_95 * variances.clip(0))
     forward = pose.pose.rotation_matrix()[:, 2]
-    angle = np.rad2deg(np.arccos(np.clip(abs(axes[:, 2] @ forward), 0.0, 1.0)))
+    angle = np.rad2deg(np.arccos(np.clip(abs(directions[:, 2] @ forward), 0.0, 1.0)))
     caption = (
         f"In {parent}, from above and from the side. The 95 % ellipsoid of the position has half"
         f" axes of {a:.2f}, {b:.2f} and {c:.2f} mm and is drawn {times} times as large. The longest"

@@ -22,7 +22,20 @@ INKS = {
 }
 """Colours on light and on dark paper. Blue and orange, of Okabe and Ito, differ for all eyes."""
 _GAP = (np.nan, np.nan)
-_FINER = 4  # steps in a pixel of a frame
+"""Interrupts a line."""
+_FINER = 4
+"""Steps in a pixel of a frame."""
+
+
+class Tick(NamedTuple):
+    """A number at an axis."""
+
+    value: float
+    """In the unit of the axis."""
+    pixels: float
+    """Distance from the lower end of the axis."""
+    words: str
+    """The number as it is written."""
 
 
 class Shape(NamedTuple):
@@ -60,16 +73,25 @@ class Panel:
         """The points of a shape as a path of SVG."""
         places = self.pixels(shape.points).round(1).tolist()
         words = " ".join(f"{x:g},{y:g}" for x, y in places)
+        path = ""
         if shape.kind == "dots":
-            return "".join(f"M{word}h0" for word in words.split())
-        return "".join(f"M{part}" for part in words.split("nan,nan") if part.strip())
+            for word in words.split():
+                path += f"M{word}h0"
+            return path
+        for piece in words.split("nan,nan"):
+            if piece.strip():
+                path += f"M{piece}"
+        return path
 
     @property
     def drawn(self) -> list[Shape]:
         """The grid, the shapes, and the axes."""
         (x0, y0), (x1, y1) = self.limits
-        lines = [[(x, y0), (x, y1), _GAP] for x, _, _ in self._ticks(0)]
-        lines += [[(x0, y), (x1, y), _GAP] for y, _, _ in self._ticks(1)]
+        lines = []
+        for tick in self._ticks(0):
+            lines += [(tick.value, y0), (tick.value, y1), _GAP]
+        for tick in self._ticks(1):
+            lines += [(x0, tick.value), (x1, tick.value), _GAP]
         grid = Shape("line", np.array(lines).reshape(-1, 2), "grid")
         axes = Shape("line", np.array([(x0, y1), (x0, y0), (x1, y0)]), "text", 2.0)
         return [grid, *self.shapes, axes]
@@ -77,32 +99,40 @@ class Panel:
     @property
     def texts(self) -> list[Text]:
         """The numbers at the axes, and what these show."""
-        (width, height), (x, y) = self.size, self.labels
-        below = [(words, at, height + 18, 1) for _, at, words in self._ticks(0)]
-        beside = [(words, -8, height - at + 4, 2) for _, at, words in self._ticks(1)]
-        return [
-            (y, -52, -12, 0),
-            (x, width / 2, height + 40, 1),
-            *beside,
-            *(below if x else []),
-        ]
+        width, height = self.size
+        x, y = self.labels
+        texts: list[Text] = [(y, -52, -12, 0), (x, width / 2, height + 40, 1)]
+        for tick in self._ticks(1):
+            texts.append((tick.words, -8, height - tick.pixels + 4, 2))
+        if x:
+            for tick in self._ticks(0):
+                texts.append((tick.words, tick.pixels, height + 18, 1))
+        return texts
 
-    def _ticks(self, axis: int) -> list[tuple[float, float, str]]:
-        """Round numbers along an axis, their distance from its lower end in pixels, and words."""
-        (low, high), size = self.limits[:, axis].tolist(), self.size[axis]
-        coarse = (high - low) / min(max(size // 50, 5), 8)
-        power = 10.0 ** np.floor(np.log10(coarse))
-        step = power * next(
-            factor for factor in (1, 2, 5, 10) if factor * power >= coarse
-        )
+    def _ticks(self, axis: int) -> list[Tick]:
+        """Round numbers along an axis."""
+        low, high = self.limits[:, axis].tolist()
+        size = self.size[axis]
+        step = _round_step((high - low) / min(max(size // 50, 5), 8))
         digits = max(0, -int(np.floor(np.log10(step) + 1e-9)))
         numbers = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
-        at = ((numbers - low) / (high - low) * size).round(1)
-        # Adding zero makes a positive zero of a negative one. A minus sign is as wide as a digit.
-        words = [
-            f"{n + 0.0:.{digits}f}".replace("-", "\N{MINUS SIGN}") for n in numbers
-        ]
-        return list(zip(numbers.tolist(), at.tolist(), words, strict=True))
+        pixels = ((numbers - low) / (high - low) * size).round(1)
+        ticks = []
+        for number, pixel in zip(numbers.tolist(), pixels.tolist(), strict=True):
+            # Adding zero makes a positive zero of a negative one.
+            words = f"{number + 0.0:.{digits}f}"
+            # A minus sign is as wide as a digit.
+            ticks.append(Tick(number, pixel, words.replace("-", "\N{MINUS SIGN}")))
+        return ticks
+
+
+def _round_step(coarse: float) -> float:
+    """The smallest of 1, 2, 5, 10 ... that is not below a step."""
+    power = 10.0 ** np.floor(np.log10(coarse))
+    for factor in (1, 2, 5):
+        if factor * power >= coarse:
+            return power * factor
+    return power * 10
 
 
 Chart = tuple[list[Panel], str]
@@ -122,8 +152,8 @@ def write(image: Image, text: Text, size: int = 13, ink: str = "text") -> None:
     words, x, y, align = text
     font = cv2.FontFace("sans")
     width = cv2.getTextSize((0, 0), words, (0, 0), font, size, 400)[2]
-    at = round(x - align * width / 2), round(y)
-    cv2.putText(image, words, at, rgb(ink), font, size, 400)
+    origin = (round(x - align * width / 2), round(y))
+    cv2.putText(image, words, origin, rgb(ink), font, size, 400)
 
 
 def paint(image: Image, panel: Panel, left: int, top: int) -> None:

@@ -66,17 +66,17 @@ class DemoResult:
         """Explanation of each main result, most important first."""
         position = _median(1000 * row.translation_error_m for row in self.test)
         degrees = math.degrees(median(row.rotation_error_rad for row in self.test))
+        fixed = _median(camera.error_mm for camera in self.cameras)
         shift = _median(camera.shift_mm for camera in self.cameras)
         true_shift = _median(camera.true_shift_mm for camera in self.cameras)
         detected = sum(camera.bump_detected for camera in self.cameras)
+        bumps = f"{detected} of {len(self.cameras)} bumps"
+        refused = f"{self.unknown_refused} of {self.unknown_images}"
         return {
             position: f"median position error of one image, {degrees:.3f} deg in rotation",
-            _median(
-                camera.error_mm for camera in self.cameras
-            ): "median position error of a fixed camera after calibration",
-            f"{detected} of {len(self.cameras)} bumps": f"detected: {shift} measured, {true_shift}"
-            " true (medians)",
-            f"{self.unknown_refused} of {self.unknown_images}": "images of unknown rooms refused",
+            fixed: "median position error of a fixed camera after calibration",
+            bumps: f"detected: {shift} measured, {true_shift} true (medians)",
+            refused: "images of unknown rooms refused",
         }
 
     def to_dict(self) -> dict[str, object]:
@@ -115,4 +115,6 @@ def demo_page(result: DemoResult, pictures: Sequence[Picture]) -> str:
 
 def _median(values: Iterable[float | None]) -> str:
     numbers = [value for value in values if value is not None]
-    return f"{median(numbers):.2f} mm" if numbers else "none"
+    if not numbers:
+        return "none"
+    return f"{median(numbers):.2f} mm"

@@ -19,17 +19,27 @@ MAX_RESIDUAL_PX = 2.0
 PICTURE_PX = 640
 """Width of pictures in reports and videos."""
 AXES_M = 0.1
+"""Length of drawn axes, metres."""
 _AXES_STEPS = 32
+"""Straight pieces of a drawn axis, which distortion bends."""
 _AXES = ((214, 39, 40), (44, 160, 44), (31, 95, 220))
 """x red, y green, z blue."""
 _PALE_AXES = ((237, 158, 158), (160, 212, 160), (154, 183, 239))
+"""The same of an older calibration."""
 _NAN_COLOUR = (160, 160, 160)
-_FRACTION_BITS = 4  # of a pixel, for OpenCV's drawing functions
-_FONT = 0  # cv2.FONT_HERSHEY_SIMPLEX; OpenCV is imported inside functions only
+"""Colour of a value that is not finite."""
+_FRACTION_BITS = 4
+"""Bits of a fraction of a pixel, for OpenCV's drawing functions."""
+_FRACTIONS = 1 << _FRACTION_BITS
+"""Fractions in a pixel."""
+_FONT = 0
+"""cv2.FONT_HERSHEY_SIMPLEX; OpenCV is imported inside functions only."""
 _MARGIN = 6
+"""Around the legend, pixels."""
 _VECTOR_PX = 25.0
 """Length of long residual vectors as drawn, pixels."""
 _VECTOR_COLOUR = (255, 140, 40)
+"""Orange, RGB."""
 
 
 class LandmarkPicture(NamedTuple):
@@ -60,31 +70,24 @@ def draw_landmarks(
     pose = base_from_camera or estimate.base_from_camera
     pixels = estimate.pixels
     points = estimate.points_m
-    if (
-        pose is None
-        or pixels is None
-        or points is None
-        or estimate.base_from_camera is None
-    ):
-        return LandmarkPicture(
-            large, 0, estimate.reason or estimate.status.replace("_", " ")
-        )
+    located = estimate.base_from_camera is not None
+    if not located or pose is None or pixels is None or points is None:
+        reason = estimate.reason or estimate.status.replace("_", " ")
+        return LandmarkPicture(large, 0, reason)
     scene = next(s for s in localizer.contents.scenes if s.name == estimate.scene)
     whole = camera or estimate.camera or scene.adjusted_camera
     working = whole.short_side_resized(localizer.contents.short_side)
     in_camera = scene.frame.camera_among_points(pose).inverse().apply(points)
     errors = working.project(in_camera) - pixels
     enlarged = large.shape[0] / working.height
-    own = image.shape[0] / working.height
-    residuals = own * np.linalg.norm(errors, axis=1)
-    drawn, times = draw_residuals(
-        large,
-        resize_pixels(pixels, enlarged),
-        enlarged * errors,
-        residuals,
-        own * MAX_RESIDUAL_PX,
-    )
-    median = float(np.nanmedian(residuals)) if np.isfinite(residuals).any() else np.nan
+    image_scale = image.shape[0] / working.height
+    residuals = image_scale * np.linalg.norm(errors, axis=1)
+    centres = resize_pixels(pixels, enlarged)
+    largest = image_scale * MAX_RESIDUAL_PX
+    drawn, times = draw_residuals(large, centres, enlarged * errors, residuals, largest)
+    median = np.nan
+    if np.isfinite(residuals).any():
+        median = float(np.nanmedian(residuals))
     count = len(residuals)
     words = f"{count} landmarks, median residual {median:.2f} px, lines {times} times as long"
     return LandmarkPicture(drawn, count, words)
@@ -103,13 +106,12 @@ def draw_residuals(
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     drawn = np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
     limits = (0.0, largest)
-    radius = max(2.0, image.shape[1] / 180)
+    radius = round(max(2.0, image.shape[1] / 180) * _FRACTIONS)
     visible = (np.abs(pixels) < 1e5).all(axis=1)
-    centres = np.round(pixels[visible] * (1 << _FRACTION_BITS)).astype(int).tolist()
+    centres = np.round(pixels[visible] * _FRACTIONS).astype(int).tolist()
     colours = colour_map(residuals, limits)[visible].tolist()
     for centre, colour in zip(centres, colours, strict=True):
-        size = round(radius * (1 << _FRACTION_BITS))
-        cv2.circle(drawn, centre, size, colour, -1, cv2.LINE_AA, _FRACTION_BITS)
+        cv2.circle(drawn, centre, radius, colour, -1, cv2.LINE_AA, _FRACTION_BITS)
     times = exaggeration(vectors)
     lines = np.stack([pixels, pixels + times * vectors], 1)
     drawn = overlay_lines(drawn, lines, [_VECTOR_COLOUR] * len(lines), 1)
@@ -127,10 +129,10 @@ def overlay_lines(
     for line, colour in zip(lines, colours, strict=True):
         # OpenCV uses 32-bit integers.
         valid = np.asarray((np.abs(line) < 1e6).all(axis=1))
-        fixed = np.round(
-            np.where(valid[:, None], line, 0) * (1 << _FRACTION_BITS)
-        ).astype(np.int32)
-        pieces = [fixed[i : i + 2] for i in np.flatnonzero(valid[:-1] & valid[1:])]
+        finite = np.where(valid[:, None], line, 0)
+        fixed = np.round(finite * _FRACTIONS).astype(np.int32)
+        starts = np.flatnonzero(valid[:-1] & valid[1:])
+        pieces = [fixed[start : start + 2] for start in starts]
         cv2.polylines(drawn, pieces, False, colour, width, cv2.LINE_AA, _FRACTION_BITS)
     return drawn
 
@@ -138,13 +140,13 @@ def overlay_lines(
 def exaggeration(vectors: Array) -> int:
     """Factor that makes residual vectors (n, 2) visible, the same for all: 1, 2, 5, 10, ..."""
     lengths = np.linalg.norm(vectors, axis=1)
-    long = (
-        float(np.nanpercentile(lengths, 90))
-        if np.isfinite(lengths).any()
-        else _VECTOR_PX
-    )
-    factors = [1, 2, 5, 10, 20, 50, 100]
-    return max([factor for factor in factors if factor * long <= _VECTOR_PX], default=1)
+    if not np.isfinite(lengths).any():
+        return 1
+    longest = float(np.nanpercentile(lengths, 90))
+    for factor in (100, 50, 20, 10, 5, 2):
+        if factor * longest <= _VECTOR_PX:
+            return factor
+    return 1
 
 
 def colour_map(values: Array, limits: tuple[float, float]) -> Image:
@@ -157,9 +159,8 @@ def colour_map(values: Array, limits: tuple[float, float]) -> Image:
     steps = np.round(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
     colours = np.full((len(values), 3), _NAN_COLOUR, np.uint8)
     if len(values):
-        colours[finite] = cv2.applyColorMap(steps[:, None], cv2.COLORMAP_VIRIDIS)[
-            finite, 0, ::-1
-        ]
+        bgr = cv2.applyColorMap(steps[:, None], cv2.COLORMAP_VIRIDIS)
+        colours[finite] = bgr[finite, 0, ::-1]
     return colours
 
 
@@ -168,10 +169,11 @@ def resized(image: Image, width: int) -> Image:
     import cv2
 
     height = max(1, round(image.shape[0] * width / image.shape[1]))
-    method = cv2.INTER_AREA if image.shape[1] > width else cv2.INTER_CUBIC
-    return np.asarray(
-        cv2.resize(image, (width, height), interpolation=method), np.uint8
-    )
+    method = cv2.INTER_CUBIC
+    if image.shape[1] > width:
+        method = cv2.INTER_AREA
+    other = cv2.resize(image, (width, height), interpolation=method)
+    return np.asarray(other, np.uint8)
 
 
 def _draw_legend(image: Image, text: str, limits: tuple[float, float]) -> None:
@@ -179,17 +181,17 @@ def _draw_legend(image: Image, text: str, limits: tuple[float, float]) -> None:
 
     scale = max(0.4, min(0.8, image.shape[1] / 1000))
     words = f"{limits[0]:.3g}  {text}  {limits[1]:.3g}"
-    (width, line), _ = cv2.getTextSize(words, _FONT, scale, 1)
-    width = width + 2 * _MARGIN
+    (length, line), _ = cv2.getTextSize(words, _FONT, scale, 1)
+    width = length + 2 * _MARGIN
     height = 2 * line + 3 * _MARGIN
     if width > image.shape[1] or height > image.shape[0]:
         return
     panel = image[-height:, -width:]
     panel[:] = 255
-    ramp = colour_map(np.linspace(*limits, num=width - 2 * _MARGIN), limits)
+    ramp = colour_map(np.linspace(*limits, num=length), limits)
     panel[_MARGIN : _MARGIN + line, _MARGIN:-_MARGIN] = ramp
-    at = (image.shape[1] - width + _MARGIN, image.shape[0] - _MARGIN)
-    cv2.putText(image, words, at, _FONT, scale, (0, 0, 0), 1, cv2.LINE_AA)
+    origin = (image.shape[1] - width + _MARGIN, image.shape[0] - _MARGIN)
+    cv2.putText(image, words, origin, _FONT, scale, (0, 0, 0), 1, cv2.LINE_AA)
 
 
 def origin_in_view(camera: Camera, camera_from_frame: SE3) -> tuple[Array, str]:
@@ -198,7 +200,9 @@ def origin_in_view(camera: Camera, camera_from_frame: SE3) -> tuple[Array, str]:
     if camera_from_frame.translation_m[2] <= 0:
         return pixel, "behind the camera"
     inside = (pixel > -0.5) & (pixel < (camera.width - 0.5, camera.height - 0.5))
-    return pixel, "" if inside.all() else "outside the image"
+    if inside.all():
+        return pixel, ""
+    return pixel, "outside the image"
 
 
 def axes_in_view(
@@ -236,7 +240,8 @@ def draw_axes(
     for letter, line, colour in zip("xyz", lines, _AXES, strict=True):
         end = line[0] + 1.15 * (line[-1] - line[0])
         if (np.abs(end) < 1e5).all():
-            at = round(float(end[0])) - 5, round(float(end[1])) + 5
-            cv2.putText(drawn, letter, at, 0, 0.6, (255, 255, 255), 5, cv2.LINE_AA)
-            cv2.putText(drawn, letter, at, 0, 0.6, colour, 2, cv2.LINE_AA)
+            x, y = end.round().astype(int).tolist()
+            origin = (x - 5, y + 5)
+            for ink, width_px in (((255, 255, 255), 5), (colour, 2)):
+                cv2.putText(drawn, letter, origin, 0, 0.6, ink, width_px, cv2.LINE_AA)
     return drawn

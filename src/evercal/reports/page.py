@@ -49,30 +49,28 @@ class Table:
     def of_records(cls, records: Sequence[Any], caption: str = "") -> Self:
         """One row for each dataclass record, one column for each field."""
         header = [field.name.replace("_", " ") for field in fields(records[0])]
-        return cls(
-            header,
-            [[_cell(*item) for item in vars(r).items()] for r in records],
-            caption,
-        )
+        rows = []
+        for record in records:
+            rows.append([_cell(name, value) for name, value in vars(record).items()])
+        return cls(header, rows, caption)
 
     @property
     def columns(self) -> list[int]:
         """Indices of the columns to show."""
-        shown = range(len(self.header))
-        return [
-            i
-            for i in shown
-            if not self.rows or not all(_blank(row[i]) for row in self.rows)
-        ]
+        everything = list(range(len(self.header)))
+        if not self.rows:
+            return everything
+        return [i for i in everything if not all(map(_blank, self._column(i)))]
 
     @property
     def numeric(self) -> set[int]:
         """Indices of the columns that hold only numbers and blanks."""
-        return {
-            i
-            for i in self.columns
-            if self.rows and all(_number(row[i]) for row in self.rows)
-        }
+        if not self.rows:
+            return set()
+        return {i for i in self.columns if all(map(_number, self._column(i)))}
+
+    def _column(self, index: int) -> list[str | int | float]:
+        return [row[index] for row in self.rows]
 
 
 class Tile(NamedTuple):
@@ -106,11 +104,13 @@ def environment() -> "Environment":
 
 
 def _cell(name: str, value: object) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.{3 if name.endswith('_deg') else 2}f}"
-    return "-" if value is None else str(value)
+        digits = 2 + name.endswith("_deg")
+        return f"{value:.{digits}f}"
+    words = {None: "-", True: "yes", False: "no"}
+    if value is None or isinstance(value, bool):
+        return words[value]
+    return str(value)
 
 
 def _blank(cell: str | int | float) -> bool:

@@ -6,7 +6,7 @@ corrections of `mapping.map_frame`, usually about a millimetre.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -21,7 +21,8 @@ Plane = tuple[int, int]
 
 DRAWN_M = 0.05
 """Longest half axis of a drawn ellipsoid."""
-_SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500)
+_SCALES = (500, 200, 100, 50, 20, 10, 5, 2)
+"""Factors that enlarge drawn ellipsoids."""
 MOST_POINTS = 50_000
 """Landmarks that are shown of all scenes together; more are thinned out evenly."""
 THUMBNAIL_PX = 160
@@ -31,6 +32,7 @@ ABOVE: Plane = (0, 1)
 CHI2_95 = 7.8147
 """Squared Mahalanobis distance of 95 % of three-dimensional errors."""
 _DRAWN_POINTS = 6000
+"""Landmarks in a chart, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +57,8 @@ class Frustum:
         high = np.tan(self.fov_rad / 2)
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         plane = signs * [high * self.aspect, high]
-        return self.base_from_camera.apply(
-            depth_m * np.column_stack([plane, np.ones(4)])
-        )
+        rays = np.column_stack([plane, np.ones(4)])
+        return self.base_from_camera.apply(depth_m * rays)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,10 +93,12 @@ def readable_scale(ellipsoids: list[Ellipsoid], drawn_m: float = DRAWN_M) -> int
 
     Without ellipsoids, that of a standard deviation of 1 mm.
     """
-    longest = max(
-        (float(ellipsoid.axes_m[-1]) for ellipsoid in ellipsoids), default=0.001
-    )
-    return max([scale for scale in _SCALES if scale * longest <= drawn_m], default=1)
+    lengths = [float(ellipsoid.axes_m[-1]) for ellipsoid in ellipsoids]
+    longest = max(lengths, default=0.001)
+    for scale in _SCALES:
+        if scale * longest <= drawn_m:
+            return scale
+    return 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +122,8 @@ class Landmarks3D:
         sigma = [np.zeros(0)]
         for i, marks in enumerate(keyframes.landmarks):
             local = marks.surface(keyframes.cameras[i])[0]
-            points.append(
-                scene.frame.points_to_base(keyframes.base_from_camera[i].apply(local))
-            )
+            in_map = keyframes.base_from_camera[i].apply(local)
+            points.append(scene.frame.points_to_base(in_map))
             column, row = np.round(marks.pixels).astype(int).T
             grey.append(keyframes.grey(i)[row, column])
             # The error of a depth 1 / d is sigma / d^2; along the ray it is as much longer.
@@ -131,9 +133,8 @@ class Landmarks3D:
         valid = np.flatnonzero(np.isfinite(joined).all(1))
         if len(valid) > most:
             valid = valid[np.linspace(0, len(valid) - 1, most).round().astype(int)]
-        return cls(
-            joined[valid], np.concatenate(grey)[valid], np.concatenate(sigma)[valid]
-        )
+        pixels = np.concatenate(grey)[valid]
+        return cls(joined[valid], pixels, np.concatenate(sigma)[valid])
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -142,12 +143,11 @@ class Landmarks3D:
         """(n, 3) RGB: the pixel of the image, or viridis of the height or of the uncertainty."""
         if by == "image":
             return np.repeat(self.grey[:, None], 3, axis=1)
-        sigma = np.log(np.maximum(self.sigma_mm, 1e-6))
-        values = np.asarray(
-            self.points_m[:, 2] if by == "height" else sigma, np.float64
-        )
-        if not len(values):
+        if not len(self):
             return np.zeros((0, 3), np.uint8)
+        values = np.log(np.maximum(self.sigma_mm, 1e-6))
+        if by == "height":
+            values = np.asarray(self.points_m[:, 2], np.float64)
         low, high = np.percentile(values, [2, 98]).tolist()
         return colour_map(values, (low, high))
 
@@ -185,7 +185,10 @@ def keyframe_views(scene: SceneMap) -> list[KeyframeView]:
 
 
 def _scale(scene: SceneMap) -> float:
-    return 1.0 if scene.frame.similarity is None else scene.frame.similarity.scale
+    similarity = scene.frame.similarity
+    if similarity is None:
+        return 1.0
+    return similarity.scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,47 +234,59 @@ def ellipse(pose: UncertainPose, times: float, plane: Plane) -> Array:
     return pose.pose.translation_m[list(plane)] + circle * half_axes @ vectors.T
 
 
+class Axes(NamedTuple):
+    """The two axes of a view."""
+
+    plane: Plane = ABOVE
+    """Numbers of the axes of the frame."""
+    frame: str = "base"
+    """Name of the frame."""
+    unit: str = "m"
+    """Of both axes."""
+
+    def label(self, axis: int) -> str:
+        """What an axis shows."""
+        return f"{'xyz'[axis]} of {self.frame[:24]} ({self.unit})"
+
+
 def view_panel(
     size: tuple[int, int],
-    plane: Plane,
+    axes: Axes,
     around: Surroundings,
-    seen: Array,
+    shown: Array,
     view: Frustum | None,
     shapes: Sequence[Shape] = (),
-    names: tuple[str, str] = ("base", "m"),
 ) -> Panel:
     """Show a map, the axes of its frame, the view of a camera, and shapes.
 
-    Points (n, 3) are `seen`. Both axes have one scale: where the points need less than the panel,
-    more is shown. `names` are those of frame and unit.
+    Points (n, 3) are `shown`. Both axes have one scale: where the points need less than the panel,
+    more is shown.
     """
-    bounds = around.bounds(seen)
+    plane = axes.plane
+    bounds = around.bounds(shown)
     extent = float(np.ptp(bounds, axis=0).max())
     low, high = bounds[:, plane]
     half = np.array(size) * ((high - low) / size).max() / 2
     limits = (low + high) / 2 + np.stack([-half, half])
     flat = around.points_m[:, plane]
-    shade = np.where(
-        ((flat > limits[0]) & (flat < limits[1])).all(axis=1), around.grey // 52, -1
-    )
-    # Neither ink nor paper.
-    drawn = [
-        Shape("dots", flat[shade == i], "text", 1.9, 0.65 - 0.12 * i) for i in range(5)
-    ]
-    lines = [(_edges(view, 0.04 * extent), ("blue", 1.2)) for view in around.keyframes]
-    axes = 0.08 * extent * np.insert(np.eye(3)[:, None], 0, 0, axis=1)
-    lines += [
-        (axis, (ink, 2.5))
-        for axis, ink in zip(axes, ("red", "green", "blue"), strict=True)
-    ]
+    inside = ((flat > limits[0]) & (flat < limits[1])).all(axis=1)
+    shade = np.where(inside, around.grey // 52, -1)
+    drawn = []
+    for i in range(5):  # neither ink nor paper
+        opacity = 0.65 - 0.12 * i
+        drawn.append(Shape("dots", flat[shade == i], "text", 1.9, opacity))
+    drawn += shapes
+    for frustum in around.keyframes:
+        outline = _edges(frustum, 0.04 * extent)
+        drawn.append(Shape("line", outline[:, plane], "blue", 1.2))
+    ends = 0.08 * extent * np.insert(np.eye(3)[:, None], 0, 0, axis=1)
+    for line, ink in zip(ends, ("red", "green", "blue"), strict=True):
+        drawn.append(Shape("line", line[:, plane], ink, 2.5))
     if view is not None:
-        lines.append((_edges(view, 0.08 * extent), ("orange", 2.2)))
-    drawn += [
-        *shapes,
-        *(Shape("line", points[:, plane], *style) for points, style in lines),
-    ]
-    x, y = (f"{'xyz'[axis]} of {names[0][:24]} ({names[1]})" for axis in plane)
-    return Panel(size, limits, (x, y), drawn)
+        outline = _edges(view, 0.08 * extent)
+        drawn.append(Shape("line", outline[:, plane], "orange", 2.2))
+    labels = (axes.label(plane[0]), axes.label(plane[1]))
+    return Panel(size, limits, labels, drawn)
 
 
 def _edges(view: Frustum, length_m: float) -> Array:

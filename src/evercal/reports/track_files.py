@@ -10,6 +10,7 @@ from evercal.localization.tracking import TrackedFrame
 from evercal.reports.answers import Answer, answer_row
 
 ENDINGS = (".jsonl", ".tum", ".txt")
+"""Of the names of files."""
 _TUM_HEADER = (
     "# timestamp tx ty tz qx qy qz qw: base_from_camera, in the unit of the map\n"
 )
@@ -50,7 +51,9 @@ class TrackFile(AbstractContextManager["TrackFile"]):
 
     def write(self, frame: TrackedFrame, row: dict[str, object]) -> None:
         """Append a frame; `row` is that of `track_row`."""
-        line = _tum_line(frame) if self._tum else json.dumps(row) + "\n"
+        line = json.dumps(row) + "\n"
+        if self._tum:
+            line = _tum_line(frame)
         self._file.write(line)
         self._file.flush()
 

@@ -13,7 +13,7 @@ from evercal.errors import InputError
 from evercal.reports.answers import Answer, finite_pose
 from evercal.reports.charts import Panel, Shape, paint, write
 from evercal.reports.overlay import draw_landmarks
-from evercal.reports.scene import ABOVE, Frustum, Surroundings, view_panel
+from evercal.reports.scene import ABOVE, Axes, Frustum, Surroundings, view_panel
 from evercal.typing import Image
 
 if TYPE_CHECKING:
@@ -21,21 +21,30 @@ if TYPE_CHECKING:
 
 
 ENDING = ".mp4"
+"""Of the names of videos."""
 FRAMES_A_SECOND = 10
+"""Located images in a second of a video."""
 _CODEC = "vp09"
 """VP9: OpenCV's wheels write it, and browsers play it."""
-_SIZE, _PICTURE, _PANEL = (1280, 560), (620, 440), (540, 404)
-"""Width and height of a frame, of its picture at most, and of its chart, pixels."""
+_SIZE = (1280, 560)
+"""Width and height of a frame, pixels."""
+_PICTURE = (620, 440)
+"""Width and height of its picture at most, pixels."""
+_PANEL = (540, 404)
+"""Width and height of its chart, pixels."""
 _LEFT = 15
+"""Left edge of the picture, pixels."""
 _PANEL_LEFT = 726
+"""Left edge of the chart, pixels."""
 _TOP = 84
+"""Upper edge of both, pixels."""
 
 
 def require_ending(path: Path) -> None:
     """Check the name of a video before the images are located."""
     if path.suffix.lower() != ENDING:
         raise InputError(
-            f"--video {path}: not a video format of evercal; help: end it with {ENDING}"
+            f"`video` {path}: not a video format of evercal; help: end it with {ENDING}"
         )
 
 
@@ -53,8 +62,8 @@ def write_video(path: Path, frames: Iterator[Image]) -> None:
         )
         if not writer.isOpened():
             raise InputError(
-                "--video: this OpenCV cannot write videos; help: install opencv-python-headless,"
-                " or pass --overlay DIR for pictures"
+                "`video`: this OpenCV cannot write videos; help: install opencv-python-headless,"
+                " or pass `overlay` DIR for pictures"
             )
         for image in itertools.chain([first], frames):
             writer.write(image[..., ::-1])
@@ -69,12 +78,17 @@ def animate(
 ) -> Iterator[Image]:
     """Draw one frame for each answer; `read` reads an image file."""
     scenes = {scene.name: scene for scene in localizer.contents.scenes}
-    found = [a.estimate.scene for a in answers if a.estimate.scene is not None]
-    maps = {name: Surroundings.of(scenes[name]) for name in set(found)}
-    shown = found[0] if found else None
+    maps = dict[str, Surroundings]()
+    for answer in answers:
+        name = answer.estimate.scene
+        if name is not None and name not in maps:
+            maps[name] = Surroundings.of(scenes[name])
+    shown = next(iter(maps), None)
     for i, answer in enumerate(answers):
-        good = answer.estimate.status == "ok"
-        shown = answer.estimate.scene if good else shown
+        ink = "red"
+        if answer.estimate.status == "ok":
+            ink = "green"
+            shown = answer.estimate.scene
         frame = np.full((*_SIZE[::-1], 3), 255, np.uint8)
         image = read(answer.path)
         width = min(_PICTURE[0], _PICTURE[1] * image.shape[1] // image.shape[0])
@@ -82,15 +96,11 @@ def animate(
         frame[_TOP:, _LEFT:][: len(drawn.image), :width] = drawn.image
         write(frame, (textwrap.shorten(drawn.summary, 90), _LEFT, _TOP - 12, 0))
         if shown is not None:
-            paint(
-                frame,
-                _from_above(scenes[shown], maps[shown], answers, i),
-                _PANEL_LEFT,
-                _TOP,
-            )
+            panel = _from_above(scenes[shown], maps[shown], answers, i)
+            paint(frame, panel, _PANEL_LEFT, _TOP)
             words = f"{shown[:24]} from above: keyframes blue, camera and path orange"
             write(frame, (words, _PANEL_LEFT - 52, 32, 0))
-        write(frame, (_words(answer), _LEFT, 32, 0), 19, "green" if good else "red")
+        write(frame, (_words(answer), _LEFT, 32, 0), 19, ink)
         yield frame
 
 
@@ -98,23 +108,22 @@ def _from_above(
     scene: Any, around: Surroundings, answers: Sequence[Answer], number: int
 ) -> Panel:
     """A map with the camera of an image and its path up to it."""
-    own = [
-        (a, a.estimate.status == "ok" and a.estimate.scene == scene.name)
-        for a in answers
-    ]
-    poses = [a.estimate.base_from_camera if shown else None for a, shown in own]
-    eyes = np.array(
-        [np.full(3, np.nan) if p is None else p.translation_m for p in poses]
-    )
-    seen = np.concatenate([np.zeros((1, 3)), eyes[np.isfinite(eyes[:, 0])]])
-    view = (
-        None
-        if (pose := poses[number]) is None
-        else Frustum.of(pose, scene.adjusted_camera)
-    )
+    eyes = np.full((len(answers), 3), np.nan)
+    view = None
+    unit = "m"
+    for i, answer in enumerate(answers):
+        pose = answer.estimate.base_from_camera
+        if answer.estimate.status != "ok" or answer.estimate.scene != scene.name:
+            continue
+        if not answer.unit_known:
+            unit = "unit unknown"
+        if pose is not None:
+            eyes[i] = pose.translation_m
+        if pose is not None and i == number:
+            view = Frustum.of(pose, scene.adjusted_camera)
+    points = np.concatenate([np.zeros((1, 3)), eyes[np.isfinite(eyes[:, 0])]])
     path = Shape("line", eyes[: number + 1, ABOVE], "orange", 2)
-    unit = "m" if all(a.unit_known for a, shown in own if shown) else "unit unknown"
-    return view_panel(_PANEL, ABOVE, around, seen, view, [path], ("base", unit))
+    return view_panel(_PANEL, Axes(unit=unit), around, points, view, [path])
 
 
 def _words(answer: Answer) -> str:
