@@ -38,8 +38,13 @@ _UNIT = re.compile(
 _SHORT = {"deg": "deg", "rad": "rad", "mil": "mm", "met": "m", "inc": "inch"}
 """Units by the first three letters of their names."""
 _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+"""Units of time in a second."""
+_SINCE_1970 = {"ms": 1e11, "us": 1e14, "ns": 1e17}
+"""Stamps above this are in a unit: times since 1970 are about 1.7e9 s."""
 _EARLIEST_S = 1e9
-_LATEST_S = 4e9  # 2001 and 2096 in seconds since 1970
+"""Earliest time in the name of an image, seconds since 1970: the year 2001."""
+_LATEST_S = 4e9
+"""Latest time in the name of an image, seconds since 1970: the year 2096."""
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$")
 
 
@@ -66,9 +71,8 @@ def read_rows(path: Path, contents: str) -> LabelledRows:
         rows = cells[1:]
         names, stamps, others = row_labels(header, rows.T.tolist(), len(rows))
         columns = tuple(header[i] for i in others)
-        return LabelledRows(
-            names, stamps, columns, cell_numbers(rows[:, others], columns)
-        )
+        values = cell_numbers(rows[:, others], columns)
+        return LabelledRows(names, stamps, columns, values)
 
 
 def table_cells(lines: Sequence[str]) -> Cells:
@@ -79,48 +83,59 @@ def table_cells(lines: Sequence[str]) -> Cells:
     """
     first = next((line for line in lines if line.strip()), "")
     separator = _separator(first)
-    count = len(first.split()) if separator == " " else first.count(separator) + 1
-    _require_few_cells(count, len(lines))
+    columns = first.count(separator) + 1
     if separator == " ":
+        columns = len(first.split())
         lines = [line.replace("\t", " ") for line in lines]
-    # Empty cells at the end of a line are missing cells.
-    stripped = (line.lstrip(" ").rstrip(f" \t\r\n{separator}") + "\n" for line in lines)
-    # The bound below on the length of a cell is stricter, and names its place.
-    csv.field_size_limit(max(csv.field_size_limit(), bounds().text_bytes))
-    # A cell whose quote is never closed swallows the line after the last one.
-    rows = csv.reader(
-        chain(stripped, ["end"]), delimiter=separator, skipinitialspace=True
-    )
-    cells: list[list[str]] = []
-    for row in rows:
-        width = len(cells[0]) if cells else len(row)
-        _require_few_cells(width, len(lines))  # lines of one row come together
-        if len(row) > width:
-            raise ValueError(
-                f"no table: line {rows.line_num} has {len(row)} cells, not {width}"
-            )
-        if row:
-            cells.append([*row, *[""] * (width - len(row))])
-    if cells.pop()[:1] != ["end"]:
-        raise ValueError("no table: a quotation mark is not closed")
-    if not cells:
+    _require_few_cells(columns, len(lines))
+    rows = _split(lines, separator)
+    if not rows:
         return np.empty((0, 0), dtype=object)
-    cells = [[cell.strip() for cell in row] for row in cells]
-    # Beside numbers with points, commas are those of thousands.
-    if separator != "," and not any(
-        "." in cell and is_number(cell) for row in cells for cell in row
-    ):
-        cells = [[_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in row] for row in cells]
-    return text_cells(cells)
+    cells = text_cells([map(str.strip, row) for row in rows])
+    points = [cell for cell in cells.ravel().tolist() if "." in cell]
+    if separator == "," or any(map(is_number, points)):
+        return cells  # beside numbers with points, commas are those of thousands
+    for index, cell in np.ndenumerate(cells):
+        cells[index] = _DECIMAL_COMMA.sub(r"\1.\2", cell)
+    return cells
 
 
 def _separator(line: str) -> str:
     words = line.split()
-    if words[1:] and all(
-        "," not in word or _DECIMAL_COMMA.match(word) for word in words
-    ):
-        return next((s for s in (";", "\t") if s in line), " ")
-    return next((s for s in (";", ",", "\t") if s in line), " ")
+    separators = ";,\t"
+    if words[1:] and all("," not in w or _DECIMAL_COMMA.match(w) for w in words):
+        separators = ";\t"
+    for separator in separators:
+        if separator in line:
+            return separator
+    return " "
+
+
+def _split(lines: Sequence[str], separator: str) -> list[list[str]]:
+    """Cells of each line, as many as the first line has."""
+    # Empty cells at the end of a line are missing cells.
+    stripped = (line.lstrip(" ").rstrip(f" \t\r\n{separator}") + "\n" for line in lines)
+    # The bound of `text_cells` on the length of a cell is stricter, and names its place.
+    csv.field_size_limit(max(csv.field_size_limit(), bounds().text_bytes))
+    # A cell whose quote is never closed swallows the line after the last one.
+    reader = csv.reader(
+        chain(stripped, ["end"]), delimiter=separator, skipinitialspace=True
+    )
+    rows: list[list[str]] = []
+    width = 0
+    for row in reader:
+        if not rows:
+            width = len(row)
+        _require_few_cells(width, len(lines))  # lines of one row come together
+        if len(row) > width:
+            raise ValueError(
+                f"no table: line {reader.line_num} has {len(row)} cells, not {width}"
+            )
+        if row:
+            rows.append(row + [""] * (width - len(row)))
+    if rows.pop()[:1] != ["end"]:
+        raise ValueError("no table: a quotation mark is not closed")
+    return rows
 
 
 def _require_few_cells(columns: int, rows: int) -> None:
@@ -131,9 +146,10 @@ def _require_few_cells(columns: int, rows: int) -> None:
 def text_cells(rows: Iterable[Iterable[str]]) -> Cells:
     """(n, k) cells of rows."""
     cells = np.array([list(row) for row in rows], dtype=object)
-    lengths = [len(cell) for cell in cells.flat]
+    lengths = [*map(len, cells.flat)]
     longest = max(lengths, default=0)
-    if longest > (most := bounds().cell_characters):
+    most = bounds().cell_characters
+    if longest > most:
         row, column = divmod(lengths.index(longest), cells.shape[1])
         where = f"row {row + 1}, column {column + 1}"
         raise ValueError(f"{where}: {longest:,} characters, at most {most:,} are read")
@@ -143,11 +159,13 @@ def text_cells(rows: Iterable[Iterable[str]]) -> Cells:
 def cell_numbers(cells: Cells, words: Sequence[str] = ()) -> Array:
     """Convert cells (n, k) to finite numbers; ValueError names the first other cell."""
     for (row, column), cell in np.ndenumerate(cells):
-        if not is_number(cell) or not np.isfinite(float(cell)):
-            name = repr(words[column]) if words else column + 1
-            hint = "; write all poses with brackets, or none" * ("[" in cell)
-            problem = f"{str(cell)!r} is not a finite number{hint}"
-            raise ValueError(f"row {row + 1}, column {name}: {problem}")
+        if is_number(cell) and np.isfinite(float(cell)):
+            continue
+        name = repr(words[column]) if words else column + 1
+        problem = f"{str(cell)!r} is not a finite number"
+        if "[" in cell:
+            problem += "; write all poses with brackets, or none"
+        raise ValueError(f"row {row + 1}, column {name}: {problem}")
     return cells.astype(np.float64)
 
 
@@ -155,12 +173,14 @@ def name_and_unit(cell: str) -> tuple[str, str | None]:
     """Split a column's name into its plain name and its unit."""
     require_at_most(len(cell), "name_characters", "characters of a name")
     name = re.sub(r"^(.*/)?((pose|transform|header)[._/])+", "", cell.strip().lower())
+    unit = None
     match = _UNIT.search(re.sub("[°º]", " deg", name))
-    unit = match.group(1) if match else None
-    name = match.string[: match.start()] if match else name
-    return re.sub(r"[\s./\[]+", "_", name.rstrip("]")), _SHORT.get(
-        (unit or "")[:3], unit
-    )
+    if match:
+        name = match.string[: match.start()]
+        unit = match[1]
+    if unit:
+        unit = _SHORT.get(unit[:3], unit)
+    return re.sub(r"[\s./\[]+", "_", name.rstrip("]")), unit
 
 
 def row_labels(
@@ -172,38 +192,54 @@ def row_labels(
     """Image names and seconds of `count` rows, None if missing, and indices of other columns."""
     plain = [name_and_unit(word)[0] for word in words]
     if plural:
-        plain = [word.removesuffix("s") if word.endswith("s") else "" for word in plain]
-    stamp = next((plain.index(word) for word in _STAMPS if word in plain), None)
-    name = next((plain.index(word) for word in _NAMES if word in plain), None)
+        plain = [word[:-1] if word.endswith("s") else "" for word in plain]
+    stamp = _first_of(_STAMPS, plain)
+    name = _first_of(_NAMES, plain)
     if name is None:
-        files = [
-            i
-            for i, column in enumerate(columns)
-            if column
-            and all(str(cell).lower().endswith(IMAGE_ENDINGS) for cell in column)
-        ]
-        if len(files) > 1:
-            found = " and ".join(words[i] for i in files)
-            raise ValueError(f"{found} name image files; call the right one 'image'")
-        name = files[0] if files else None
-    for i in (i for i in (name, stamp) if i is not None):
-        if len(columns[i]) != count:
-            raise ValueError(
-                f"{words[i]!r} holds {len(columns[i])} entries for {count} poses"
-            )
-        if None in columns[i]:
-            raise ValueError(
-                f"some poses have {words[i]!r}, others lack it; give it to all poses"
-            )
-    others = [
-        i for i, word in enumerate(plain) if word not in _NAMES + _STAMPS and i != name
-    ]
-    names = None if name is None else tuple(map(str, columns[name]))
+        name = _column_of_files(words, columns)
+    names = None
+    if name is not None:
+        _require_whole(words[name], columns[name], count)
+        names = tuple(map(str, columns[name]))
     stamps = None
     if stamp is not None:
+        _require_whole(words[stamp], columns[stamp], count)
         times = number_array(columns[stamp], f"{words[stamp]!r}")
         stamps = in_unit(times, name_and_unit(words[stamp])[1])
+    labels = {*_NAMES, *_STAMPS}
+    others = [i for i, word in enumerate(plain) if word not in labels and i != name]
     return names, stamps, others
+
+
+def _first_of(names: Sequence[str], words: list[str]) -> int | None:
+    """Index of the word that is the first of names, if any is there."""
+    for name in names:
+        if name in words:
+            return words.index(name)
+    return None
+
+
+def _column_of_files(
+    words: Sequence[str], columns: Sequence[Sequence[object]]
+) -> int | None:
+    """Index of the only column of nothing but names of image files, if there is one."""
+    files: list[int] = []
+    for i, column in enumerate(columns):
+        if column and all(str(cell).lower().endswith(IMAGE_ENDINGS) for cell in column):
+            files.append(i)
+    if len(files) > 1:
+        listed = " and ".join(words[i] for i in files)
+        raise ValueError(f"{listed} name image files; call the right one 'image'")
+    return next(iter(files), None)
+
+
+def _require_whole(word: str, column: Sequence[object], count: int) -> None:
+    if len(column) != count:
+        raise ValueError(f"{word!r} holds {len(column)} entries for {count} poses")
+    if None in column:
+        raise ValueError(
+            f"some poses have {word!r}, others lack it; give it to all poses"
+        )
 
 
 def number_array(values: object, what: str) -> Array:
@@ -239,38 +275,38 @@ def arrays_as_lists(path: Path) -> Any:
 def _matlab(file: IO[bytes]) -> dict[str, Any]:
     from scipy.io import loadmat, whosmat
 
-    kinds = re.compile("double|single|u?int(8|16|32|64)")
-    shapes = {
-        name: shape for name, shape, kind in whosmat(file) if kinds.fullmatch(kind)
-    }
-    require_at_most(sum(map(math.prod, shapes.values())), "numbers", "numbers")
+    numeric = re.compile("double|single|u?int(8|16|32|64)")
+    names = []
+    count = 0
+    for name, shape, kind in whosmat(file):
+        if numeric.fullmatch(kind):
+            names.append(name)
+            count += math.prod(shape)
+    require_at_most(count, "numbers", "numbers")
     file.seek(0)
-    loaded = loadmat(file, variable_names=[*shapes])
-    return {name: loaded[name].tolist() for name in shapes}
+    loaded = loadmat(file, variable_names=names)
+    return {name: loaded[name].tolist() for name in names}
 
 
 def _require_few_numbers(file: IO[bytes]) -> None:
     """Check the shape that an array states, before its numbers are read."""
-    version = np.lib.format.read_magic(file)
-    read = {(1, 0): np.lib.format.read_array_header_1_0}.get(
-        version, np.lib.format.read_array_header_2_0
-    )
-    shape, _, dtype = read(file)
+    if np.lib.format.read_magic(file) == (1, 0):
+        shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    else:
+        shape, _, dtype = np.lib.format.read_array_header_2_0(file)
     if dtype.hasobject:
         raise ValueError("Python objects; save arrays of numbers")
-    require_at_most(
-        math.prod(shape) * max(dtype.itemsize, 8) // 8, "numbers", "numbers"
-    )
+    size = math.prod(shape) * max(dtype.itemsize, 8) // 8
+    require_at_most(size, "numbers", "numbers")
 
 
 def in_unit(stamps: Array, unit: str | None = None) -> Array:
-    """Convert stamps (n,) to seconds from `s`, `ms`, `us` or `ns`, by their size if omitted.
-
-    Times since 1970 are about 1.7e9 s. Numbers far larger are in a smaller unit.
-    """
+    """Convert stamps (n,) to seconds from `s`, `ms`, `us` or `ns`, by their size if omitted."""
     middle = float(np.median(stamps)) if stamps.size else 0.0
-    sizes = {"ns": 1e17, "us": 1e14, "ms": 1e11}
-    likely = next((name for name, size in sizes.items() if middle > size), "s")
+    likely = "s"
+    for name, size in _SINCE_1970.items():
+        if middle > size:
+            likely = name
     if not np.isfinite(stamps).all():
         raise ValueError("a stamp is inf or nan; leave such rows out")
     if stamps.ndim != 1 or (unit == "s" and likely != "s"):
@@ -300,20 +336,26 @@ def times_in_names(names: Sequence[str]) -> Array | None:
     if not stems or not all(re.fullmatch(r"\d+(\.\d+)?", stem) for stem in stems):
         return None
     times = in_unit(np.array(stems, dtype=np.float64))
-    since_1970 = ((times > _EARLIEST_S) & (times < _LATEST_S)).all()
-    return times if since_1970 or any("." in stem for stem in stems) else None
+    since_1970 = (times > _EARLIEST_S) & (times < _LATEST_S)
+    if since_1970.all() or "." in "".join(stems):
+        return times
+    return None
 
 
 def without_ending(name: str) -> str:
     """Name of an image without folder and image ending; `12.5` stays as it is."""
     path = PureWindowsPath(name)
-    return path.stem if path.suffix.lower() in IMAGE_ENDINGS else path.name
+    if path.suffix.lower() in IMAGE_ENDINGS:
+        return path.stem
+    return path.name
 
 
 def same_numbers(first: Sequence[str], second: Sequence[str]) -> bool:
     """Whether names of two kinds end in the same numbers, as pose_1 and image-001.png."""
-    numbers = [
-        re.findall(r"(\d+)\D*$", without_ending(name)) for name in (*first, *second)
-    ]
-    plain = [int(each[0]) if each else -1 for each in numbers]
-    return -1 not in plain and plain[: len(first)] == plain[len(first) :]
+    numbers = [*map(_last_number, first)]
+    return None not in numbers and numbers == [*map(_last_number, second)]
+
+
+def _last_number(name: str) -> int | None:
+    match = re.search(r"(\d+)\D*$", without_ending(name))
+    return match and int(match[1])
