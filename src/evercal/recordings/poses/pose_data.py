@@ -1,12 +1,13 @@
 """Poses in nested lists and objects, as JSON, YAML, NPZ and MATLAB files hold them.
 
 Poses are lists of numbers, matrices, objects with named numbers, or rotations and translations
-under two keys. They are in a list, under the names of images, or under a key.
+under two keys. They are in a list, under the names of images, or under a key. The order of keys
+does not matter.
 """
 
 import re
-from collections.abc import Mapping
-from itertools import product
+from collections.abc import Mapping, Sequence
+from itertools import chain, product
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from evercal.recordings.poses.conventions import (
     PoseConvention,
     pose_convention,
 )
-from evercal.recordings.poses.pose_table import (
+from evercal.recordings.poses.pose_columns import (
     HEADERS,
     PoseTable,
     has_position,
@@ -31,33 +32,48 @@ from evercal.recordings.poses.row_files import (
     row_labels,
     text_cells,
 )
+from evercal.storage.text_files import natural_key
 from evercal.typing import Array
 
 Columns = Mapping[str, Any]
 """Values by key: of one pose, or lists of the values of all poses."""
+Shape = tuple[int, ...]
+"""Lengths of nested lists."""
 
 _KEYS = ("poses", "T", "transforms", "matrices", "samples", "pose", "matrix")
 """Keys of poses of anything."""
-_ROLES = [
-    re.compile(rf"(?:{words})(?:_(.+))?|(.+)_(?:{words})")
-    for words in (
-        "camera_from_board|camera_poses?|tracking|optical|board|marker|target2cam"
-        "|object_wrt_sensor|camera_marker_samples",
-        "base_from_gripper|robot_poses?|robot|tcp_poses?|gripper|end_effector|gripper2base"
-        "|effector_wrt_world|hand_world_samples",
-    )
-]
-"""Keys of the camera, then of the robot; among others OpenCV's, MoveIt's and easy_handeye's."""
+_CAMERA = (
+    "camera_from_board|camera_poses?|tracking|optical|board|marker|target2cam|object_wrt_sensor"
+    "|camera_marker_samples"
+)
+"""Keys of the camera; among others OpenCV's, MoveIt's and easy_handeye's."""
+_ROBOT = (
+    "base_from_gripper|robot_poses?|robot|tcp_poses?|gripper|end_effector|gripper2base"
+    "|effector_wrt_world|hand_world_samples"
+)
+"""Keys of the robot."""
+_ROLES = {
+    is_robot: re.compile(rf"(?:{words})(?:_(.+))?|(.+)_(?:{words})")
+    for is_robot, words in ((False, _CAMERA), (True, _ROBOT))
+}
+"""Keys of the robot or of the camera, with the rest of the key after or before."""
 _INVERSE = re.compile("base2gripper|gripper_from_base|cam2target|board_from_camera")
 _WIDTHS = (6, 7, 8, 12, 13, 16, 17)
 """Numbers of a pose, possibly after a stamp."""
 _MATRICES = ((4, 4), (3, 4))
 _LISTS = {
     "translation_m": ("x_m", "y_m", "z_m"),
-    "xyz": "xyz",
+    "xyz": ("x", "y", "z"),
     "rpy": ("roll", "pitch", "yaw"),
 }
 """Columns of lists."""
+_STAMPS = (
+    ("nanosec", "sec"),
+    ("nsecs", "secs"),
+    ("nsec", "sec"),
+    ("nanoseconds", "seconds"),
+)
+"""Keys of a stamp in nanoseconds and seconds: of ROS 2, of ROS 1, and of others."""
 _ROTATION = re.compile(
     r"(?:rotation_matri(?:x|ces)|rotations?|rot|rmats?|rvecs?|rotvecs?|r)(_.*)?"
 )
@@ -74,90 +90,118 @@ def pose_data(data: Any, given: PoseConvention | None, robot: bool = True) -> Po
     data = _plain(data)
     if isinstance(data, Mapping):
         return _of_object(data, given, robot)
-    if (
-        not isinstance(data, list)
-        or len({isinstance(each, Mapping) for each in data}) != 1
-    ):
+    if not isinstance(data, list) or len({isinstance(v, Mapping) for v in data}) != 1:
         raise ValueError(
             "poses are a list of objects, or of lists of numbers, not of both"
         )
-    if not isinstance(data[0], Mapping):
-        numbers = _first(number_array(data, "a list of poses"), _MATRICES)
-        if numbers.shape[-2:] == (6, 1):  # ViSP's vectors of poses
-            numbers = numbers.reshape(-1, 6)
-            given = given or pose_convention("ur")
-        single = numbers.ndim == 1 or numbers.shape in _MATRICES
-        return plain_numbers(numbers[None] if single else numbers, given)
+    if isinstance(data[0], Mapping):
+        return _of_objects(data, given, robot)
+    numbers = _poses_first(number_array(data, "a list of poses"), _MATRICES)
+    if numbers.shape[-2:] == (6, 1):  # ViSP's vectors of poses
+        numbers = numbers.reshape(-1, 6)
+        given = given or pose_convention("ur")
+    if numbers.ndim == 1 or numbers.shape in _MATRICES:
+        numbers = numbers[None]
+    return plain_numbers(numbers, given)
+
+
+def _of_objects(
+    entries: list[Any], given: PoseConvention | None, robot: bool
+) -> PoseTable:
+    """Poses of a list of one object for each."""
     # Messages of /tf.
-    if all(isinstance(entry.get("transforms"), list) for entry in data):
-        data = [each for entry in data for each in entry["transforms"]]
-    rows = [_flat(entry) for entry in data]
-    keys = dict.fromkeys(key for row in rows for key in row)
+    if all(isinstance(entry.get("transforms"), list) for entry in entries):
+        entries = [*chain.from_iterable(entry["transforms"] for entry in entries)]
+    rows = [*map(_flat, entries)]
+    keys = dict.fromkeys(chain.from_iterable(rows))
     require_at_most(len(keys), "columns", "keys")
     require_at_most(len(keys) * len(rows), "numbers", "values")
-    columns = _of_role(
-        {key: [row.get(key) for row in rows] for key in keys}, given, robot
-    )
-    frames = sorted({str(frame) for frame in columns.get("child_frame_id", ())})
-    if frames[1:]:
+    columns: Columns = {}
+    for key in keys:
+        columns[key] = [row.get(key) for row in rows]
+    columns = _of_role(columns, given, robot)
+    frames = sorted({*map(str, columns.get("child_frame_id", ()))})
+    if len(frames) > 1:
         raise ValueError(
             f"it holds poses of {' and '.join(frames)}; keep those of one frame"
         )
     table = _of_arrays(columns, given, plural=False)
     if table is None:
-        rows = [
-            _cells({key: columns[key][i] for key in columns}) for i in range(len(rows))
-        ]
-        words = [*dict.fromkeys(word for row in rows for word in row)]
-        require_at_most(len(words) * len(rows), "numbers", "values")
-        cells = text_cells([str(row.get(word)) for word in words] for row in rows)
-        table = _labelled(named_numbers(words, cells, given), columns, plural=False)
-    return table._replace(
-        fixed="quaternion_wxyz" in columns and "matrix" not in columns
-    )
+        table = _of_cells(columns, given)
+    fixed = "quaternion_wxyz" in columns and "matrix" not in columns
+    return table._replace(fixed=fixed)
+
+
+def _of_cells(columns: Columns, given: PoseConvention | None) -> PoseTable:
+    """Poses whose numbers have a key each, or lists of some of them."""
+    rows = []
+    for values in zip(*columns.values(), strict=True):
+        rows.append(_cells(dict(zip(columns, values, strict=True))))
+    words = [*dict.fromkeys(chain.from_iterable(rows))]
+    require_at_most(len(words) * len(rows), "numbers", "values")
+    cells = []
+    for row in rows:
+        cells.append([str(row.get(word)) for word in words])
+    table = named_numbers(words, text_cells(cells), given)
+    return _labelled(table, columns, plural=False)
 
 
 def _of_object(data: Columns, given: PoseConvention | None, robot: bool) -> PoseTable:
-    stems = {re.sub(r"\d+", "", key) for key in data}
-    numbered = len(stems) == 1 and not stems & data.keys()
-    if data and (numbered or all(key.lower().endswith(IMAGE_ENDINGS) for key in data)):
-        return pose_data([*data.values()], given, robot)._replace(names=tuple(data))
-    kind = (
-        data["parameters"]
-        if isinstance(data.get("parameters"), Mapping) and robot
-        else {}
-    )
-    fixed = (
-        kind.get("calibration_type") == "eye_on_base"
-        or kind.get("eye_on_hand") is False
-    )
-    if fixed and not (given and given.has("inverse")):
-        problem = (
-            "easy_handeye states gripper_from_base for a fixed camera (eye_to_hand)"
-        )
-        raise ConventionError(problem, "wxyz:inverse in place of --invert")
+    """Poses of an object: by image or number, under one key, or with their numbers under keys."""
+    names = _keys_of_images(data)
+    if names:
+        table = pose_data([data[name] for name in names], given, robot)
+        return table._replace(names=tuple(names))
+    if robot:
+        _refuse_eye_on_base(data, given)
     columns = _of_role(data, given, robot)
-    inner = [key for key in columns if key in _KEYS and len(_shape(columns[key])) < 2]
+    shapes = {key: _shape(value) for key, value in columns.items()}
+    inner = [key for key in columns if key in _KEYS and len(shapes[key]) < 2]
     if len(inner) == 1:
-        return _labelled(
-            pose_data(columns[inner[0]], given, robot), columns, plural=True
-        )
-    nested = any(_shape(value)[1:] for value in columns.values())
-    table = _of_arrays(columns, given, plural=True) if nested else None
-    if table is not None:
-        return table
+        table = pose_data(columns[inner[0]], given, robot)
+        return _labelled(table, columns, plural=True)
+    if max(map(len, shapes.values()), default=0) > 1:
+        table = _of_arrays(columns, given, plural=True)
+        if table is not None:
+            return table
     if has_position([*_cells(_flat(columns))]):
         return pose_data([columns], given, robot)
-    lists = [[*v.values()] if isinstance(v, Mapping) else v for v in columns.values()]
-    if not has_position([*columns]) or not all(
-        isinstance(each, list) for each in lists
-    ):
+    lists = []
+    for value in columns.values():
+        if isinstance(value, Mapping):
+            value = [*value.values()]
+        lists.append(value)
+    if not has_position([*columns]) or not all(isinstance(v, list) for v in lists):
         raise _unclear([], data)
-    rows = [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
+    rows = []
+    for values in zip(*lists, strict=True):
+        rows.append(dict(zip(columns, values, strict=True)))
     return pose_data(rows, given, robot)
 
 
-def _unclear(keys: list[str], data: Columns) -> ValueError:
+def _keys_of_images(data: Columns) -> list[str]:
+    """Keys that are names of images, or one word with numbers; else none."""
+    if all(key.lower().endswith(IMAGE_ENDINGS) for key in data):
+        return [*data]
+    words = {re.sub(r"\d+", "", key) for key in data}
+    if len(words) == 1 and words.isdisjoint(data):
+        return sorted(data, key=natural_key)
+    return []
+
+
+def _refuse_eye_on_base(data: Columns, given: PoseConvention | None) -> None:
+    parameters = data.get("parameters")
+    if not isinstance(parameters, Mapping) or (given and given.has("inverse")):
+        return
+    on_base = parameters.get("calibration_type") == "eye_on_base"
+    if on_base or parameters.get("eye_on_hand") is False:
+        problem = (
+            "easy_handeye states gripper_from_base for a fixed camera (eye_to_hand)"
+        )
+        raise ConventionError(problem, "wxyz:inverse in place of `invert`")
+
+
+def _unclear(keys: Sequence[str], data: Columns) -> ValueError:
     return ValueError(
         f"{' and '.join(keys) or 'none'} of its keys ({', '.join(data)}) may hold the poses;"
         f" call the right one 'poses'"
@@ -166,21 +210,26 @@ def _unclear(keys: list[str], data: Columns) -> ValueError:
 
 def _of_role(columns: Columns, given: PoseConvention | None, robot: bool) -> Columns:
     """Columns of the robot or of the camera without that word, and of neither."""
-    found = {key: match for key in columns if (match := _ROLES[robot].fullmatch(key))}
-    own = {match[1] or match[2] or "pose": columns[key] for key, match in found.items()}
+    keys = []
+    of_role: dict[str, Any] = {}
+    others: dict[str, Any] = {}
+    for key, value in columns.items():
+        match = _ROLES[robot].fullmatch(key)
+        if match:
+            keys.append(key)
+            of_role[match[1] or match[2] or "pose"] = value
+        elif not _ROLES[not robot].fullmatch(key):
+            others[key] = value
+    if keys:
+        if len(of_role) < len(keys):
+            raise _unclear(keys, columns)
+        return others | of_role
     inverse = [key for key in columns if _INVERSE.search(key)]
-    if inverse and not own and not (given and given.has("inverse")):
+    if inverse and not (given and given.has("inverse")):
         raise ConventionError(
             f"{inverse[0]} is the inverse of the pose", "such as matrix:inverse"
         )
-    if len(own) < len(found):
-        raise _unclear([*found], columns)
-    others = {
-        key: columns[key]
-        for key in columns
-        if not any(r.fullmatch(key) for r in _ROLES)
-    }
-    return others | own if own else columns
+    return columns
 
 
 def _of_arrays(
@@ -189,87 +238,110 @@ def _of_arrays(
     """Poses of a key that holds arrays, or of keys for rotations and translations."""
     shapes = {key: _shape(value) for key, value in columns.items()}
     keys = [key for key in columns if key in _KEYS and len(shapes[key]) > 1]
-    plain = {} if keys else {key: name_and_unit(key)[0] for key in columns}
-    parts = [
-        (first, second)
-        for first, second in product(plain, plain)
-        if len(shapes[first]) > 1 and len(shapes[second]) > (not plural)
-        if (r := _ROTATION.fullmatch(plain[first]))
-        if (t := _TRANSLATION.fullmatch(plain[second])) and r[1] == t[1]
-    ]
-    for key in plain:
-        table = (
-            len(shapes[key]) == 2
-            and shapes[key][1] in _WIDTHS
-            and "joint" not in key.lower()
-        )
-        matrices = shapes[key][-2:] in _MATRICES or shapes[key][:2] in _MATRICES
-        keys += [key] if matrices or (table and plural) else []
-    if len(keys) + len(parts) > 1:
-        raise _unclear(keys + [f"{r} with {t}" for r, t in parts], columns)
-    labels = {
-        key: columns[key] for key in columns if key not in (*keys, *sum(parts, ()))
-    }
-    if parts:
-        return _labelled(_composed(columns, *parts[0], given), labels, plural)
-    return (
-        _labelled(pose_data(columns[keys[0]], given), labels, plural) if keys else None
-    )
+    pairs = []
+    if not keys:
+        keys = [key for key in columns if _are_poses(key, shapes[key], plural)]
+        pairs = _rotations_with_translations(shapes, plural)
+    if len(keys) + len(pairs) > 1:
+        raise _unclear(keys + [f"{r} with {t}" for r, t in pairs], columns)
+    labels = dict(columns)
+    for key in chain(keys, *pairs):
+        del labels[key]
+    if pairs:
+        return _labelled(_composed(columns, *pairs[0], given), labels, plural)
+    if keys:
+        return _labelled(pose_data(columns[keys[0]], given), labels, plural)
+    return None
+
+
+def _are_poses(key: str, shape: Shape, plural: bool) -> bool:
+    """Whether an array of a shape holds matrices, or rows of numbers other than joint values."""
+    if shape[-2:] in _MATRICES or shape[:2] in _MATRICES:
+        return True
+    is_table = len(shape) == 2 and shape[1] in _WIDTHS
+    return plural and is_table and "joint" not in key.lower()
+
+
+def _rotations_with_translations(
+    shapes: Mapping[str, Shape], plural: bool
+) -> list[tuple[str, str]]:
+    """Keys of rotations and of translations that end alike."""
+    rotations = {}
+    translations = {}
+    for key, shape in shapes.items():
+        name = name_and_unit(key)[0]
+        rotation = _ROTATION.fullmatch(name)
+        if rotation and len(shape) > 1:
+            rotations[key] = rotation[1]
+        translation = _TRANSLATION.fullmatch(name)
+        if translation and (len(shape) > 1 or (plural and shape)):
+            translations[key] = translation[1]
+    pairs = product(rotations, translations)
+    return [(r, t) for r, t in pairs if rotations[r] == translations[t]]
 
 
 def _composed(
     columns: Columns, rotation: str, translation: str, given: PoseConvention | None
 ) -> PoseTable:
+    """Poses of rotations (matrices, quaternions, vectors or angles) and translations."""
     unit = name_and_unit(translation)[1] or "m"
-    second = _rows(number_array(columns[translation], repr(translation)), 3)
-    first = _first(number_array(columns[rotation], repr(rotation)), ((3, 3),))
-    width = first.size // max(len(second), 1)
-    kinds = {9: ("r", HEADERS["rotation matrix"].ends), 4: ("q", "1234")}
-    prefix, ends = kinds.get(width, ("rotvec_" if "vec" in rotation else "r", "xyz"))
-    words = [f"{axis}_{unit}" for axis in "xyz"] + [prefix + end for end in ends]
-    numbers = np.concatenate([second, _rows(first, width)], -1)
-    return named_numbers(
-        words, text_cells([map(repr, row) for row in numbers.tolist()]), given
-    )
+    words = [f"x_{unit}", f"y_{unit}", f"z_{unit}"]
+    translations = _rows(number_array(columns[translation], repr(translation)), 3)
+    array = number_array(columns[rotation], repr(rotation))
+    rotations = _poses_first(array, ((3, 3),))
+    width = rotations.size // max(len(translations), 1)
+    if width == 9:
+        words += [f"r{end}" for end in HEADERS["rotation matrix"].ends]
+    elif width == 4:
+        words += ["q1", "q2", "q3", "q4"]
+    elif "vec" in rotation:
+        words += ["rotvec_x", "rotvec_y", "rotvec_z"]
+    else:
+        words += ["rx", "ry", "rz"]
+    numbers = np.concatenate([translations, _rows(rotations, width)], -1)
+    cells = text_cells(map(repr, row) for row in numbers.tolist())
+    return named_numbers(words, cells, given)
 
 
 def _rows(array: Array, width: int) -> Array:
     """(n, width) numbers of arrays with an axis too many, or with the poses last as in MATLAB."""
     array = np.squeeze(array)
-    turned = array.ndim == 2 and array.shape[1] != width == array.shape[0]
-    return (array.T if turned else array).reshape(-1, width)
+    if array.ndim == 2 and array.shape[1] != width == array.shape[0]:
+        array = array.T
+    return array.reshape(-1, width)
 
 
-def _first(array: Array, shapes: tuple[tuple[int, int], ...]) -> Array:
+def _poses_first(array: Array, shapes: tuple[tuple[int, int], ...]) -> Array:
     """(n, rows, columns) matrices of an array that has the poses last, as in MATLAB."""
     if array.ndim != 3 or array.shape[:2] not in shapes:
         return array
     block = array[..., :3, :3]
     whole = np.abs(np.swapaxes(block, 1, 2) @ block - np.eye(3)).max() < 0.01
-    return array if array.shape[1:] in shapes and whole else np.moveaxis(array, -1, 0)
+    if whole and array.shape[1:] in shapes:
+        return array
+    return np.moveaxis(array, -1, 0)
 
 
 def _labelled(table: PoseTable, columns: Columns, plural: bool) -> PoseTable:
+    """A table with the image names and stamps of the columns that hold one value a pose."""
     lists = {key: value for key, value in columns.items() if len(_shape(value)) == 1}
-    names, stamps, _ = row_labels(
-        [*lists], [*lists.values()], len(table.numbers), plural
-    )
-    stamps = stamps if table.stamps_s is None else table.stamps_s
+    count = len(table.numbers)
+    names, stamps, _ = row_labels([*lists], [*lists.values()], count, plural)
+    if table.stamps_s is not None:
+        stamps = table.stamps_s
     return table._replace(names=table.names or names, stamps_s=stamps)
 
 
 def _plain(data: Any) -> Any:
     """Matrices of OpenCV and ViSP (rows, cols, data) as nested lists, and keys as text."""
     if isinstance(data, Mapping) and {"rows", "cols", "data"} <= data.keys():
-        return (
-            number_array(data["data"], "data")
-            .reshape(data["rows"], data["cols"])
-            .tolist()
-        )
+        numbers = number_array(data["data"], "data")
+        return numbers.reshape(data["rows"], data["cols"]).tolist()
     if isinstance(data, Mapping):
         return {str(key): _plain(value) for key, value in data.items()}
-    nested = isinstance(data, list) and any(isinstance(each, Mapping) for each in data)
-    return [_plain(each) for each in data] if nested else data
+    if isinstance(data, list) and any(isinstance(value, Mapping) for value in data):
+        return [*map(_plain, data)]
+    return data
 
 
 def _flat(entry: Columns) -> dict[str, Any]:
@@ -277,13 +349,14 @@ def _flat(entry: Columns) -> dict[str, Any]:
     cells: dict[str, Any] = {}
     for key, value in entry.items():
         require_at_most(len(key), "name_characters", "characters of a key")
-        if key == "stamp" and isinstance(value, Mapping) and len(value) == 2:
-            seconds, nanoseconds = value.values()
-            cells["stamp_s"] = seconds + 1e-9 * nanoseconds
-        elif isinstance(value, Mapping):
-            cells |= {f"{key}_{inner}": each for inner, each in _flat(value).items()}
-        else:
+        if not isinstance(value, Mapping):
             cells[key] = value
+        elif key == "stamp" and tuple(sorted(value)) in _STAMPS:
+            nanoseconds, seconds = sorted(value)
+            cells["stamp_s"] = value[seconds] + 1e-9 * value[nanoseconds]
+        else:
+            for inner, number in _flat(value).items():
+                cells[f"{key}_{inner}"] = number
     return cells
 
 
@@ -291,19 +364,23 @@ def _cells(row: Columns) -> dict[str, object]:
     """One value a column: those of a list are columns of their own."""
     cells: dict[str, object] = {}
     for key, value in row.items():
-        values = value if isinstance(value, list) else [value]
-        require_at_most(len(values), "columns", "numbers of one key")
-        names = [f"{key}_{i}" for i in range(len(values))] if values is value else [key]
+        names = [key]
+        values = [value]
+        if isinstance(value, list):
+            require_at_most(len(value), "columns", "numbers of one key")
+            names = [f"{key}_{i}" for i in range(len(value))]
+            values = value
         order = key[-4:].lower()  # such as quaternion_wxyz
-        names = [f"q{axis}" for axis in order] if order in ("wxyz", "xyzw") else names
+        if order in ("wxyz", "xyzw"):
+            names = [f"q{axis}" for axis in order]
         cells |= dict(zip(_LISTS.get(key, names), values, strict=False))
     return cells
 
 
-def _shape(value: object) -> tuple[int, ...]:
+def _shape(value: object) -> Shape:
     """Lengths of nested lists, by the first of each: all are compared when numbers are read."""
-    return (
-        (len(value), *_shape(value[0] if value else None))
-        if isinstance(value, list)
-        else ()
-    )
+    if not isinstance(value, list):
+        return ()
+    if not value:
+        return (0,)
+    return (len(value), *_shape(value[0]))

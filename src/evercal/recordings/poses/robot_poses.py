@@ -20,8 +20,9 @@ from evercal.recordings.poses.conventions import (
     checked_poses,
     pose_convention,
 )
+from evercal.recordings.poses.pose_columns import PoseTable
 from evercal.recordings.poses.pose_data import pose_data
-from evercal.recordings.poses.pose_table import PoseTable, read_pose_table
+from evercal.recordings.poses.pose_table import read_pose_table
 from evercal.recordings.poses.row_files import Names, arrays_as_lists
 from evercal.robot.arm import Arm
 from evercal.storage.text_files import (

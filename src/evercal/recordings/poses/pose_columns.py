@@ -1,0 +1,320 @@
+"""Which columns of a table hold a pose: by their names, or by their number.
+
+Columns with names define a convention, or leave it open between several, such as angles. Rows
+without names have the numbers of a convention, optionally after a stamp.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import chain, product
+from typing import NamedTuple
+
+import numpy as np
+
+from evercal.bounds import require_at_most
+from evercal.recordings.poses.conventions import (
+    KNOWN_CONVENTIONS,
+    UNITS,
+    ConventionError,
+    PoseConvention,
+    matrix_convention,
+    pose_convention,
+)
+from evercal.recordings.poses.row_files import (
+    Cells,
+    Names,
+    cell_numbers,
+    in_unit,
+    name_and_unit,
+    row_labels,
+)
+from evercal.typing import Array
+
+
+class PoseTable(NamedTuple):
+    """Numbers of n poses."""
+
+    numbers: Array
+    """(n, k) in the convention."""
+    convention: PoseConvention
+    names: Names = None
+    """(n,) names of images or rows, if there are any."""
+    stamps_s: Array | None = None
+    """(n,) seconds, if there are any."""
+    fixed: bool = False
+    """Whether keys of the file state the poses themselves."""
+
+
+class ColumnGroup(NamedTuple):
+    """Columns that belong together: a position or a rotation."""
+
+    prefixes: str
+    """Words before the end of a name, between commas."""
+    ends: Sequence[str]
+    """End of the name of each column; after tvec_ and rvec_ also its index."""
+    conventions: Sequence[str] = ()
+    """Conventions that the columns of a rotation may hold."""
+    ask: str = ""
+    """Conventions to ask for; empty if the columns define the first one."""
+    axes: str = ""
+    """Axis of each column, for conventions that order their numbers by axis."""
+
+    def names(self, index: int) -> set[str]:
+        """Possible names of one column."""
+        names = set()
+        for prefix in self.prefixes.split(","):
+            names.add(prefix + self.ends[index])
+            if self.ends == "xyz" and prefix.endswith("_"):
+                names.add(f"{prefix}{index}")
+        return names
+
+    def candidates(self, words: Sequence[str]) -> list[list[int]]:
+        """Columns of a table that may be each column of the group."""
+        candidates = []
+        for index in range(len(self.ends)):
+            names = self.names(index)
+            candidates.append([i for i, word in enumerate(words) if word in names])
+        return candidates
+
+    def ordered(self, columns: list[int], convention: PoseConvention) -> list[int]:
+        """Columns of this rotation in the order of a convention; none if they do not hold it."""
+        layout = convention.layout.lower()
+        stated = convention.base in self.conventions
+        if stated and layout == "columns":
+            return np.reshape(columns, (-1, 4)).T.ravel().tolist()
+        generic = convention.base.startswith(("fixed_", "moving_"))
+        if (stated or generic) and self.axes and sorted(layout) == sorted(self.axes):
+            return [columns[self.axes.index(axis)] for axis in layout]
+        if stated:
+            return columns
+        # Letters without an axis are in the order of the convention that is stated.
+        by_axis = self.axes and (self.axes != "xyz" or len(set(layout)) == 3)
+        if convention.has_angles and len(layout) == len(columns) and not by_axis:
+            return columns
+        return []
+
+
+def _grid(digits: str) -> list[str]:
+    return [row + column for row, column in product(digits, repeat=2)]
+
+
+_GRID = _grid("0123")
+_DOWN = np.arange(16).reshape(4, 4).T.ravel().astype(str).tolist()
+_ANGLES = ("ur", "yaskawa", "staubli", "fanuc", "rpy")
+_ORDERS = ("abb", "wxyz", "xyzw", "tum")
+_Q = "q,q_,quat,quat_,quaternion_,orientation_,rotation_,q_rs_"
+_R = "r,r_,rot_,rotation_"
+HEADERS = {
+    "position": ColumnGroup(",t,t_,p,p_,pos_,position_,translation_,tvec_,p_rs_r_", "xyz"),
+    "quaternion": ColumnGroup(_Q, "wxyz", ("wxyz", *_ORDERS), axes="wxyz"),
+    "rotation vector": ColumnGroup("rotvec_,rvec_,rotation_vector_", "xyz", ("ur",), axes="-"),
+    "matrix": ColumnGroup("m", _GRID, ("matrix", "franka")),
+    "3x4 matrix": ColumnGroup("m", _GRID[:12], ("matrix", "franka")),
+    "O_T_EE": ColumnGroup("o_t_ee,o_t_ee_", _DOWN, ("matrix", "franka")),
+    "RTDE": ColumnGroup("actual_tcp_pose_", "012345", ("ur",)),
+    "rotation matrix": ColumnGroup(_R, _grid("012"), ("matrix",)),
+    "matrix from r11": ColumnGroup(_R, _grid("123"), ("matrix",)),
+    "W P R": ColumnGroup("", "wpr", ("fanuc",)),
+    "O A T": ColumnGroup("", "oat", ("kawasaki",)),
+    "q1 to q4": ColumnGroup(_Q, "1234", _ORDERS, "abb, wxyz or xyzw"),
+    "q0 to q3": ColumnGroup(_Q, "0123", _ORDERS, "wxyz or xyzw"),
+    "angles": ColumnGroup(
+        _R, "xyz", _ANGLES, "ur (rotation vector), yaskawa, staubli, fanuc or rpy", "xyz"
+    ),
+    "roll pitch yaw": ColumnGroup(
+        "", ("roll", "pitch", "yaw"), ("rpy", "yaskawa", "staubli", "fanuc", "kuka"),
+        "rpy:rad or rpy:deg", "xyz",
+    ),
+    "A B C": ColumnGroup("", "abc", ("kuka",), "kuka (A about z) or mitsubishi (A about x)"),
+    "U V W": ColumnGroup("", "uvw", ("kuka",), "epson (U about z)"),
+}  # fmt: skip
+"""Columns of a position and of rotations; definite rotations come first."""
+_INDICES = (
+    "", "index", "idx", "id", "no", "nr", "i", "n", "number", "row", "pose", "sample",
+)  # fmt: skip
+"""Columns that only count."""
+
+_Groups = dict[str, list[int]]
+"""Columns by key of `HEADERS`."""
+
+
+def has_position(words: Sequence[str]) -> bool:
+    """Whether columns of these names hold a position."""
+    return "position" in groups_of(words)
+
+
+def named_numbers(
+    words: Sequence[str], rows: Cells, given: PoseConvention | None
+) -> PoseTable:
+    """Numbers of rows (n, k) whose columns have names.
+
+    ValueError, also of the functions below: the columns hold no pose, or their convention is not
+    defined.
+    """
+    require_at_most(len(words), "columns", "columns")
+    groups = groups_of(words)
+    free = [*words]
+    for column in chain.from_iterable(groups.values()):
+        free[column] = ""
+    names, stamps, others = row_labels(free, rows.T.tolist(), len(rows))
+    convention = given or pose_convention(_defined(groups, words))
+    position = groups.pop("position", [])
+    columns: list[int] = []
+    for key, group in groups.items():
+        columns = columns or HEADERS[key].ordered(group, convention)
+    if not groups:
+        others = [i for i in others if name_and_unit(words[i])[0] not in _INDICES]
+        if not position and not convention.is_matrix:
+            position = others[:3]
+        columns = [i for i in others if i not in position]
+    convention = _in_units(convention, [words[i] for i in position], "m", "mm")
+    if convention.has_angles:
+        convention = _in_units(convention, [words[i] for i in columns], "rad", "deg")
+    if not convention.is_matrix:
+        columns = position + columns
+    elif len(columns) == 9 and len(position) == 3:
+        columns = np.c_[np.reshape(columns, (3, 3)), position].ravel().tolist()
+    if len(columns) in convention.counts:
+        numbers = cell_numbers(rows[:, columns], [words[i] for i in columns])
+        return PoseTable(numbers, convention, names, stamps)
+    raise ConventionError(
+        f"the columns {', '.join(words)} are none of {convention.name} ({convention.meaning})",
+        f"of the columns, or name them as {convention.meaning.split(',')[0]!r}",
+    )
+
+
+def _in_units(
+    convention: PoseConvention, words: Sequence[str], *known: str
+) -> PoseConvention:
+    """The convention in the unit that columns state, unless its own name has one."""
+    units = {name_and_unit(word)[1] for word in words}
+    columns = f"the columns {', '.join(words)}"
+    if len(units) > 1:
+        raise ValueError(f"{columns} differ in unit")
+    for unit in units - {None}:
+        if unit not in known:
+            raise ValueError(f"{columns} are in {unit}; write {' or '.join(known)}")
+        if not convention.has(*known):
+            return replace(convention, **UNITS[unit])
+    return convention
+
+
+def plain_numbers(
+    numbers: Array, given: PoseConvention | None, names: Names = None
+) -> PoseTable:
+    """Matrices (n, 4, 4) or (n, 3, 4), or numbers (n, k) or with stamps (n, 1 + k)."""
+    if numbers.ndim != 2:
+        given = given or pose_convention("matrix")
+        if numbers.shape[1:] not in ((4, 4), (3, 4)) or not given.is_matrix:
+            raise ValueError(
+                f"poses are (n, 4, 4), (n, 3, 4) or (n, k) numbers, got {numbers.shape} for"
+                f" {given.name} ({given.meaning})"
+            )
+        numbers = numbers.reshape(len(numbers), -1)
+    width = numbers.shape[1]
+    if given is None and width in (12, 13, 16, 17):
+        given = matrix_convention(numbers[:, width % 4 :])
+    if given is None:
+        raise ConventionError(
+            f"{width} columns without a header do not define a pose; write a header such as"
+            f" x,y,z,qw,qx,qy,qz",
+            f"NAME, one of {KNOWN_CONVENTIONS}",
+        )
+    numbers = _with_seconds(numbers, given)
+    width = numbers.shape[1]
+    stamps = None
+    if width - 1 in given.counts:
+        stamps = in_unit(numbers[:, 0])
+        numbers = numbers[:, 1:]
+    # A misplaced number shows in quaternions and matrices, but not in angles.
+    misplaced = stamps is not None and given.has_angles and (np.diff(stamps) < 0).any()
+    if numbers.shape[1] not in given.counts or misplaced:
+        raise ValueError(
+            f"rows have {width} numbers; {given.name} takes {' or '.join(map(str, given.counts))}"
+            f" ({given.meaning}), optionally after a name and a stamp that increases"
+        )
+    return PoseTable(numbers, given, names, stamps)
+
+
+def _with_seconds(numbers: Array, convention: PoseConvention) -> Array:
+    """Numbers with one stamp in place of the seconds and nanoseconds of ROS."""
+    stamps = numbers[:, :2]
+    if numbers.shape[1] - 2 not in convention.counts or (stamps // [4e9, 1e9]).any():
+        return numbers
+    if (stamps % 1).any() or not stamps[:, 0].min() > 1e9:
+        return numbers
+    return np.c_[stamps @ [1, 1e-9], numbers[:, 2:]]
+
+
+def groups_of(words: Sequence[str]) -> _Groups:
+    """Columns of `HEADERS` by their names, or by those after one beginning, such as `ee_`."""
+    names = [name_and_unit(word)[0] for word in words]
+    groups = _matched(names, words)
+    if groups:
+        return groups
+    beginnings = set()
+    for position in HEADERS["position"].names(0):
+        for name in names:
+            if name.endswith(f"_{position}"):
+                beginnings.add(name.removesuffix(position))
+    poses: dict[str, _Groups] = {}
+    for beginning in sorted(beginnings):
+        ends = [
+            name.removeprefix(beginning) if name.startswith(beginning) else ""
+            for name in names
+        ]
+        groups = _matched(ends, words)
+        if len(groups) > 1:
+            poses[beginning] = groups
+    if len(poses) > 1:
+        raise ValueError(
+            f"it holds poses of {' and '.join(poses)}; keep the columns of one"
+        )
+    return next(iter(poses.values()), {})
+
+
+def _matched(names: Sequence[str], words: Sequence[str]) -> _Groups:
+    groups: _Groups = {}
+    used: set[int] = set()
+    for key, group in HEADERS.items():
+        candidates = group.candidates(names)
+        columns = [first for first, *_ in filter(None, candidates)]
+        # rotation_x belongs to a quaternion if there is a rotation_w.
+        if not all(candidates) or not used.isdisjoint(columns):
+            continue
+        for repeated in candidates:
+            if len(repeated) > 1:
+                listed = " and ".join(words[column] for column in repeated)
+                raise ValueError(
+                    f"the columns {listed} may both be the {key}'s; keep those of the pose"
+                )
+        groups[key] = columns
+        used.update(columns)
+    return groups
+
+
+def _defined(groups: _Groups, words: Sequence[str]) -> str:
+    """The convention that columns define."""
+    rotations = [key for key in groups if key != "position"]
+    definite = []
+    for key in rotations:
+        unit = name_and_unit(words[groups[key][0]])[1]
+        if not HEADERS[key].ask or (key == "roll pitch yaw" and unit):
+            definite.append(key)
+    conventions = [HEADERS[key].conventions[0] for key in definite]
+    if len(definite) == 1:
+        count = len(groups[definite[0]])
+        if "position" in groups or count in pose_convention(conventions[0]).counts:
+            return conventions[0]
+    if len(definite) > 1:
+        raise ConventionError(
+            f"the header names {' and '.join(definite)}", " or ".join(conventions)
+        )
+    if rotations and not definite:
+        columns = ", ".join(words[column] for column in groups[rotations[0]])
+        problem = f"columns {columns} do not define a rotation"
+        raise ConventionError(problem, HEADERS[rotations[0]].ask)
+    raise ConventionError(
+        f"the columns {', '.join(words)} name no known pose (such as x y z qw qx qy qz)",
+        f"NAME, one of {KNOWN_CONVENTIONS}",
+    )
