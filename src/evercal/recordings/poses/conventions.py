@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from itertools import product
-from typing import Any
+from itertools import chain, product
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,16 +22,22 @@ from scipy.spatial.transform import Rotation
 from evercal.geometry.se3 import SE3
 from evercal.typing import Array, BoolArray
 
-_FAR_M = 10.0  # largest distance of a gripper from its base, metres
-_NEAR_M = (
-    0.01  # smallest distance of a gripper from its base, metres, for at least one pose
-)
-_LARGEST_DEG = 361.0
-_TOLERANCE = (
-    1e-2  # error of a quaternion's length, or of R^T R, if printed with three digits
-)
-# Its own inverse.
+ConventionName: TypeAlias = Literal[
+    "wxyz", "xyzw", "tum", "abb", "ur", "rpy", "kuka", "fanuc", "yaskawa", "staubli",
+    "kawasaki", "matrix", "franka", "mitsubishi", "denso", "techman", "jaka", "dobot",
+    "aubo", "xarm", "epson", "nachi", "doosan", "comau", "universal_robots", "motoman",
+]  # fmt: skip
+"""Names of conventions without modifiers, but for fixed_xyz, moving_zyx and the like."""
+_MAX_REACH_M = 10.0
+"""Largest distance of a gripper from its base, metres."""
+_MIN_REACH_M = 0.01
+"""Smallest distance of a gripper from its base, metres; at least one pose exceeds it."""
+_MAX_DEG = 361.0
+"""Largest angle, degrees: a rotation, and some rounding."""
+_TOLERANCE = 1e-2
+"""Error of a quaternion's length, or of R^T R, if printed with three digits."""
 _OPENGL_FROM_OPENCV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
+"""Rotation between the camera axes of OpenGL and OpenCV; its own inverse."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +49,9 @@ class PoseConvention:
     layout: str
     """`wxyz`, `xyzw`, `vector` or Euler axes of scipy after a position, else `rows`, `columns`."""
     meaning: str
+    """Names of the numbers, units and axes, for messages."""
     metres_per_unit: float = 1.0
+    """Length of a unit of the position."""
     degrees: bool = False
     """Whether angles are in degrees, else radians."""
 
@@ -65,7 +73,11 @@ class PoseConvention:
     @property
     def counts(self) -> tuple[int, ...]:
         """Possible lengths of a pose; matrices may lack the row 0 0 0 1."""
-        return (12, 16) if self.is_matrix else (6,) if self.has_angles else (7,)
+        if self.is_matrix:
+            return (12, 16)
+        if self.has_angles:
+            return (6,)
+        return (7,)
 
     def has(self, *modifiers: str) -> bool:
         """Whether the name has one of these modifiers."""
@@ -87,40 +99,32 @@ def asking_for(option: str | None) -> Iterator[None]:
     try:
         yield
     except ConventionError as error:
-        what = option or "the convention"
-        raise ValueError(f"{error.problem}; give {what} {error.remedy}") from None
+        option = option or "the convention"
+        raise ValueError(f"{error.problem}; give {option} {error.remedy}") from None
 
 
-CONVENTIONS = {
-    convention.name: convention
-    for convention in (
-        PoseConvention("wxyz", "wxyz", "x y z qw qx qy qz, metres"),
-        PoseConvention("xyzw", "xyzw", "x y z qx qy qz qw, metres, as ROS"),
-        PoseConvention("tum", "xyzw", "stamp, then x y z qx qy qz qw, metres"),
-        PoseConvention("abb", "wxyz", "X Y Z q1 q2 q3 q4, millimetres, q1 is w", 0.001),
-        PoseConvention("ur", "vector", "x y z rx ry rz, metres, rotation vector"),
-        PoseConvention("rpy", "xyz", "x y z roll pitch yaw, metres, radians, as URDF"),
-        PoseConvention(
-            "kuka", "ZYX", "X Y Z A B C, mm, degrees, A about z", 0.001, True
-        ),
-        PoseConvention(
-            "fanuc", "xyz", "X Y Z W P R, mm, degrees, W about x", 0.001, True
-        ),
-        PoseConvention(
-            "yaskawa", "xyz", "X Y Z Rx Ry Rz, mm, degrees, fixed axes", 0.001, True
-        ),
-        PoseConvention(
-            "staubli", "XYZ", "X Y Z RX RY RZ, mm, degrees, moving axes", 0.001, True
-        ),
-        PoseConvention(
-            "kawasaki", "ZYZ", "X Y Z O A T, mm, degrees, about z y z", 0.001, True
-        ),
-        PoseConvention("matrix", "rows", "4x4 or 3x4 matrix row after row, metres"),
-        PoseConvention(
-            "franka", "columns", "matrix column after column, metres (O_T_EE)"
-        ),
-    )
-}
+_CONVENTIONS = (
+    PoseConvention("wxyz", "wxyz", "x y z qw qx qy qz, metres"),
+    PoseConvention("xyzw", "xyzw", "x y z qx qy qz qw, metres, as ROS"),
+    PoseConvention("tum", "xyzw", "stamp, then x y z qx qy qz qw, metres"),
+    PoseConvention("abb", "wxyz", "X Y Z q1 q2 q3 q4, millimetres, q1 is w", 0.001),
+    PoseConvention("ur", "vector", "x y z rx ry rz, metres, rotation vector"),
+    PoseConvention("rpy", "xyz", "x y z roll pitch yaw, metres, radians, as URDF"),
+    PoseConvention("kuka", "ZYX", "X Y Z A B C, mm, degrees, A about z", 0.001, True),
+    PoseConvention("fanuc", "xyz", "X Y Z W P R, mm, degrees, W about x", 0.001, True),
+    PoseConvention(
+        "yaskawa", "xyz", "X Y Z Rx Ry Rz, mm, degrees, fixed axes", 0.001, True
+    ),
+    PoseConvention(
+        "staubli", "XYZ", "X Y Z RX RY RZ, mm, degrees, moving axes", 0.001, True
+    ),
+    PoseConvention(
+        "kawasaki", "ZYZ", "X Y Z O A T, mm, degrees, about z y z", 0.001, True
+    ),
+    PoseConvention("matrix", "rows", "4x4 or 3x4 matrix row after row, metres"),
+    PoseConvention("franka", "columns", "matrix column after column, metres (O_T_EE)"),
+)
+CONVENTIONS = {convention.name: convention for convention in _CONVENTIONS}
 """All conventions by name, without modifiers."""
 VENDORS = {
     "mitsubishi": "yaskawa", "denso": "yaskawa", "techman": "yaskawa", "jaka": "yaskawa",
@@ -132,16 +136,15 @@ KNOWN_CONVENTIONS = (
     f"{', '.join([*CONVENTIONS, *VENDORS])}, fixed_xyz or moving_zyx with any order of axes,"
     f" followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
 )
-CONVENTIONS |= {
-    f"{sense}_{axes}": PoseConvention(
-        f"{sense}_{axes}",
-        axes if sense == "fixed" else axes.upper(),
-        f"x y z and angles about {' '.join(axes)}, {sense} axes",
-    )
-    for axes in map("".join, product("xyz", repeat=3))
-    for sense in ("fixed", "moving")
-    if axes[0] != axes[1] != axes[2]
-}
+for _first, _second, _third in product("xyz", repeat=3):
+    if _first != _second != _third:
+        _axes = _first + _second + _third
+        _meaning = f"x y z and angles about {_first} {_second} {_third}"
+        _fixed = PoseConvention(f"fixed_{_axes}", _axes, f"{_meaning}, fixed axes")
+        _moving = PoseConvention(
+            f"moving_{_axes}", _axes.upper(), f"{_meaning}, moving axes"
+        )
+        CONVENTIONS |= {_fixed.name: _fixed, _moving.name: _moving}
 UNITS: dict[str, dict[str, Any]] = {
     "m": {"metres_per_unit": 1.0}, "mm": {"metres_per_unit": 0.001},
     "rad": {"degrees": False}, "deg": {"degrees": True},
@@ -149,28 +152,35 @@ UNITS: dict[str, dict[str, Any]] = {
 """What a unit changes of a convention."""
 
 
+_UNIT_NAMES = {"m": "metres", "mm": "millimetres", "rad": "radians", "deg": "degrees"}
+_OTHER_UNIT = {"m": "mm", "mm": "m", "rad": "deg", "deg": "rad"}
+
+
 def pose_convention(name: str) -> PoseConvention:
     """Parse the name of a convention with modifiers, such as `kuka:m:inverse`."""
     base, *modifiers = name.strip().lower().split(":")
     base = VENDORS.get(base, base)
     if base not in CONVENTIONS:
-        close = get_close_matches(base, [*CONVENTIONS, *VENDORS], 1)
-        problem = f"pose convention {name!r} is not known{f', {close[0]} is' if close else ''}"
+        problem = f"pose convention {name!r} is not known"
+        for nearest in get_close_matches(base, [*CONVENTIONS, *VENDORS], 1):
+            problem += f", {nearest} is"
         raise ConventionError(problem, f"NAME, one of {KNOWN_CONVENTIONS}")
     convention = replace(CONVENTIONS[base], name=":".join([base, *modifiers]))
-    kinds = [("m", "mm"), ("rad", "deg"), ("inverse",), ("opengl",)]
-    kinds = kinds if convention.has_angles else [kinds[0], *kinds[2:]]
+    kinds = [("m", "mm"), ("inverse",), ("opengl",)]
+    if convention.has_angles:
+        kinds.insert(1, ("rad", "deg"))
+    known = [*chain(*kinds)]
     for modifier in modifiers:
-        if not any(modifier in kind for kind in kinds):
-            known = ", ".join(word for kind in kinds for word in kind)
+        if modifier not in known:
             raise ValueError(
-                f"pose convention {name!r}: {modifier!r} is not one of {known}"
+                f"pose convention {name!r}: {modifier!r} is not one of {', '.join(known)}"
             )
         convention = replace(convention, **UNITS.get(modifier, {}))
-    if any(sum(word in kind for word in modifiers) > 1 for kind in kinds):
-        raise ValueError(
-            f"pose convention {name!r} repeats a modifier; give each kind once"
-        )
+    for kind in kinds:
+        if sum(map(modifiers.count, kind)) > 1:
+            raise ValueError(
+                f"pose convention {name!r} repeats a modifier; give each kind once"
+            )
     return convention
 
 
@@ -184,25 +194,26 @@ def poses_from_numbers(
     ValueError: numbers are no pose; the message names the first of them.
     """
     numbers = np.asarray(numbers, dtype=np.float64)
-    if not numbers.ndim or numbers.shape[-1] not in convention.counts:
+    width = numbers.shape[-1] if numbers.ndim else 1
+    if width not in convention.counts:
         raise ValueError(
             f"a pose as {convention.name!r} has {' or '.join(map(str, convention.counts))} numbers"
-            f" ({convention.meaning}), got {numbers.shape[-1] if numbers.ndim else 1}"
+            f" ({convention.meaning}), got {width}"
         )
-    _refuse(
-        ~np.isfinite(numbers).all(-1),
-        "a number is inf or nan; leave untracked poses out",
-    )
+    finite = np.isfinite(numbers).all(-1)
+    _refuse(~finite, "a number is inf or nan; leave untracked poses out")
     if convention.is_matrix:
         poses = _from_matrices(numbers, convention)
     else:
-        translation = numbers[..., :3] * convention.metres_per_unit
-        rotation = _rotations(numbers[..., 3:], convention)
-        poses = SE3.of(rotation, translation, canonical=False)
-    poses = poses.inverse() if convention.has("inverse") else poses
+        quaternion = _rotations(numbers[..., 3:], convention).as_quat(scalar_first=True)
+        poses = SE3(quaternion, numbers[..., :3] * convention.metres_per_unit)
+    if convention.has("inverse"):
+        poses = poses.inverse()
     if not convention.has("opengl"):
         return poses
-    return _OPENGL_FROM_OPENCV @ poses if camera_from else poses @ _OPENGL_FROM_OPENCV
+    if camera_from:
+        return _OPENGL_FROM_OPENCV @ poses
+    return poses @ _OPENGL_FROM_OPENCV
 
 
 def checked_poses(
@@ -219,17 +230,20 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
 
     Quaternions get w >= 0. In gimbal lock the third angle is 0.
     """
-    poses = poses @ _OPENGL_FROM_OPENCV if convention.has("opengl") else poses
-    poses = poses.inverse() if convention.has("inverse") else poses
+    if convention.has("opengl"):
+        poses = poses @ _OPENGL_FROM_OPENCV
+    if convention.has("inverse"):
+        poses = poses.inverse()
     translation = poses.translation_m / convention.metres_per_unit
     layout = convention.layout
     degrees = convention.degrees
     if convention.is_matrix:
         matrix = poses.matrix()
         matrix[..., :3, 3] = translation
-        matrix = matrix if layout == "rows" else np.swapaxes(matrix, -1, -2)
+        if layout == "columns":
+            matrix = np.swapaxes(matrix, -1, -2)
         return matrix.reshape(*poses.shape, 16)
-    rotation = poses.rotation
+    rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
     if layout == "vector":
         numbers = rotation.as_rotvec(degrees=degrees)
     elif convention.has_angles:
@@ -241,21 +255,22 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
 
 def matrix_convention(numbers: Array) -> PoseConvention:
     """`matrix` or `franka`, whichever makes rigid transforms of (n, 12 or 16) numbers."""
-    orders = [CONVENTIONS[name] for name in ("matrix", "franka")]
-    rigid = [
-        order for order in orders if _rigid(_matrices(numbers, order.layout)).all()
-    ]
-    if len(rigid) == 1 and (rigid[0].name == "matrix" or numbers.shape[-1] == 16):
-        return rigid[0]
-    problem = f"rows of {numbers.shape[-1]} numbers are rigid transforms in"
-    if len(rigid) == 1:
+    in_rows = _rigid(_matrices(numbers, "rows")).all()
+    in_columns = _rigid(_matrices(numbers, "columns")).all()
+    width = numbers.shape[-1]
+    problem = f"rows of {width} numbers are rigid transforms in"
+    if in_rows and not in_columns:
+        return CONVENTIONS["matrix"]
+    if in_columns and not in_rows:
+        if width == 16:
+            return CONVENTIONS["franka"]
         raise ConventionError(
             f"{problem} columns, or rotations in rows before x y z",
             "franka (column after column), or a header r11,r12,r13,r21,r22,r23,r31,r32,r33,x,y,z",
         )
+    orders = "both orders" if in_rows else "no order"
     raise ConventionError(
-        f"{problem} {'both orders' if rigid else 'no order'}",
-        "matrix (row after row) or franka (column after column)",
+        f"{problem} {orders}", "matrix (row after row) or franka (column after column)"
     )
 
 
@@ -263,34 +278,37 @@ def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
     """Refuse numbers (n, k) that look like another unit than the convention only implies."""
     numbers = np.asarray(numbers, dtype=np.float64)
     if not convention.has("m", "mm"):
-        at = numbers
+        positions = numbers[..., :3]
         if convention.is_matrix:
-            at = _matrices(numbers, convention.layout)[..., 3]
-        _check_lengths(np.linalg.norm(at[..., :3], axis=-1), convention)
-    angles = np.abs(numbers[..., 3:]) if convention.has_angles else np.zeros(0)
-    angles = (
-        np.linalg.norm(angles, axis=-1) if convention.layout == "vector" else angles
-    )
+            positions = _matrices(numbers, convention.layout)[..., :3, 3]
+        _check_lengths(np.linalg.norm(positions, axis=-1), convention)
+    if not convention.has_angles:
+        return
+    angles = np.abs(numbers[..., 3:])
+    if convention.layout == "vector":
+        angles = np.linalg.norm(angles, axis=-1)
     largest = float(angles.max(initial=0.0))
-    if convention.degrees and largest > _LARGEST_DEG:
+    if convention.degrees and largest > _MAX_DEG:
         raise ValueError(
             f"angles up to {largest:.4g} deg; do columns hold {convention.meaning}?"
         )
-    if convention.has_angles and not convention.has("rad", "deg"):
-        degrees = largest > 2 * np.pi + 1e-6
-        if largest > 0 and degrees != convention.degrees:
-            problem = f"angles up to {largest:.4g} look like"
-            raise _other_unit("deg" if degrees else "rad", problem, convention)
+    if not largest > 0 or convention.has("rad", "deg"):
+        return
+    likely = "deg" if largest > 2 * np.pi + 1e-6 else "rad"
+    if convention.degrees != (likely == "deg"):
+        problem = f"angles up to {largest:.4g} look like"
+        raise _other_unit(likely, problem, convention)
 
 
 def _check_lengths(lengths: Array, convention: PoseConvention) -> None:
+    """Refuse distances (n,) from the base that arms do not have."""
     metres = lengths * convention.metres_per_unit
-    far = metres > _FAR_M
-    near = (metres > 0) & (metres < _NEAR_M) & (convention.metres_per_unit < 1.0)
+    far = metres > _MAX_REACH_M
+    near = (metres > 0) & (metres < _MIN_REACH_M) & (convention.metres_per_unit < 1.0)
     odd = far if far.any() else near
     usual = metres[~odd]
     if odd.any() and len(usual) and 0.03 < np.median(usual) < 3.0:
-        poses = ", ".join(str(i + 1) for i in np.flatnonzero(odd)[:5])
+        poses = ", ".join((np.flatnonzero(odd)[:5] + 1).astype(str))
         raise ValueError(
             f"positions are {np.median(usual):.3g} m from the base, but those of poses {poses} are"
             f" {metres[odd][0]:.3g} m; millimetres and metres may be mixed: write all in one unit"
@@ -303,15 +321,12 @@ def _check_lengths(lengths: Array, convention: PoseConvention) -> None:
 
 
 def _other_unit(unit: str, problem: str, convention: PoseConvention) -> ConventionError:
-    other = {"m": "mm", "mm": "m", "rad": "deg", "deg": "rad"}[unit]
-    base = ":".join(
-        word for word in convention.name.split(":") if word not in (unit, other)
-    )
-    name = {"m": "metres", "mm": "millimetres", "rad": "radians", "deg": "degrees"}[
-        unit
-    ]
+    """An error that offers the convention in a likely unit, and in the other one."""
+    other = _OTHER_UNIT[unit]
+    words = [word for word in convention.name.split(":") if word not in (unit, other)]
+    base = ":".join(words)
     remedy = f"{base}:{unit} (or {base}:{other} if the unit is right as it is)"
-    return ConventionError(f"{problem} {name}", remedy)
+    return ConventionError(f"{problem} {_UNIT_NAMES[unit]}", remedy)
 
 
 def _rotations(numbers: Array, convention: PoseConvention) -> Rotation:
@@ -339,24 +354,27 @@ def _matrices(numbers: Array, layout: str) -> Array:
 
 
 def _rigid(matrices: Array) -> BoolArray:
+    """(...) whether matrices (..., 3 or 4, 4) are rigid transforms."""
     block = matrices[..., :3, :3]
-    last = matrices[..., 3:, :]
-    drift = np.abs(np.swapaxes(block, -1, -2) @ block - np.eye(3)).max(
-        (-1, -2), initial=0.0
-    )
-    homogeneous = np.abs(last - (0.0, 0.0, 0.0, 1.0)).max((-1, -2), initial=0.0) < 1e-6
-    return (drift < _TOLERANCE) & (np.linalg.det(block) > 0) & homogeneous
+    gram = np.swapaxes(block, -1, -2) @ block
+    drift = np.abs(gram - np.eye(3)).max((-1, -2), initial=0.0)
+    last_row = matrices[..., 3:, :]
+    scale = np.abs(last_row - (0.0, 0.0, 0.0, 1.0)).max((-1, -2), initial=0.0)
+    return (drift < _TOLERANCE) & (np.linalg.det(block) > 0) & (scale < 1e-6)
 
 
 def _from_matrices(numbers: Array, convention: PoseConvention) -> SE3:
+    stated = "matrix"
+    other = "franka"
+    order = "column after column"
+    if convention.layout == "columns":
+        stated = "franka"
+        other = "matrix"
+        order = "row after row"
     matrices = _matrices(numbers, convention.layout)
-    stated, other = (
-        ("matrix", "franka") if convention.layout == "rows" else ("franka", "matrix")
-    )
     broken = ~_rigid(matrices)
     if broken.any() and _rigid(_matrices(numbers, CONVENTIONS[other].layout)).all():
         remedy = ":".join([other, *convention.name.split(":")[1:]])
-        order = "row after row" if other == "matrix" else "column after column"
         raise ConventionError(f"the matrices are written {order}", remedy)
     _refuse(
         broken,
@@ -368,7 +386,9 @@ def _from_matrices(numbers: Array, convention: PoseConvention) -> SE3:
 
 
 def _refuse(broken: ArrayLike, reason: str) -> None:
+    """Raise ValueError for the first of broken poses (...)."""
     indices = np.flatnonzero(broken)
-    if len(indices):
-        more = f" (and {len(indices) - 1} more)" if len(indices) > 1 else ""
-        raise ValueError(f"pose {indices[0] + 1}{more}: {reason}")
+    if not len(indices):
+        return
+    more = f" (and {len(indices) - 1} more)" if len(indices) > 1 else ""
+    raise ValueError(f"pose {indices[0] + 1}{more}: {reason}")

@@ -3,11 +3,13 @@
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PureWindowsPath
+from typing import Any
 
 import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.recordings.poses.conventions import ConventionName
 from evercal.recordings.poses.joint_tables import interpolate
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
@@ -37,20 +39,18 @@ def pair_images(
     in natural order, are paired in order, and their numbers must be equal.
     """
     if rows.names is not None:
-        which, notes = _by_name(images, rows.names, file)
-        return [None if i is None else rows.poses[i] for i in which], notes
-    times = None if rows.stamps_s is None else _image_times(images, stamps_s)
+        numbers, notes = _by_name(images, rows.names, file)
+        return _of_rows(rows.poses, numbers), notes
+    times = _image_times(images, rows, stamps_s)
     if times is not None and rows.stamps_s is not None:
         return _by_time(times, PoseTrack(rows.stamps_s, rows.poses), file)
     if len(rows.poses) != len(images):
-        how = (
-            "an image column"
-            if rows.stamps_s is None
-            else "a stamps.csv (image, stamp_s)"
-        )
+        remedy = "a stamps.csv (image, stamp_s)"
+        if rows.stamps_s is None:
+            remedy = "an image column"
         raise InputError(
             f"{file}: {len(rows.poses)} poses for {len(images)} images in {images[0].parent}; give"
-            f" each image a row, or add {how} to pair them"
+            f" each image a row, or add {remedy} to pair them"
         )
     # A shell's *.png puts image-10 before image-2, unlike the rows.
     for before, after in itertools.pairwise(images):
@@ -60,11 +60,8 @@ def pair_images(
                 f"{file}: {after.name} is given after {before.name}, so the order of the rows is"
                 f" ambiguous; give the folder, or name the images in a column image"
             )
-    first = images[0].name
-    last = images[-1].name
-    return list(rows.poses), [
-        f"images and poses were paired in order, {first} to {last}"
-    ]
+    ends = f"{images[0].name} to {images[-1].name}"
+    return list(rows.poses), [f"images and poses were paired in order, {ends}"]
 
 
 def pair_joints(
@@ -75,35 +72,57 @@ def pair_joints(
 ) -> list[Array | None]:
     """Joint values (k,) of every image, paired as its pose; None without any."""
     values = rows.joints
-    times = rows.stamps_s
     if values is None:
         return [None] * len(images)
     if rows.names is not None:
-        which, _ = _by_name(images, rows.names, file)
-        return [None if i is None else values[i] for i in which]
-    at = None if times is None else _image_times(images, stamps_s)
-    if at is None or times is None:
+        numbers, _ = _by_name(images, rows.names, file)
+        return _of_rows(values, numbers)
+    times = _image_times(images, rows, stamps_s)
+    if times is None or rows.stamps_s is None:
         return list(values)
-    return list(
-        np.stack([interpolate(times, column, at)[0] for column in values.T], axis=1)
-    )
+    at_images = np.empty((len(times), values.shape[1]))
+    for joint, column in enumerate(values.T):
+        at_images[:, joint], _ = interpolate(rows.stamps_s, column, times)
+    return list(at_images)
 
 
 def poses_of_images(
-    file: Path, images: Sequence[Path], convention: str | None = None
+    file: Path, images: Sequence[Path], convention: ConventionName | str | None = None
 ) -> tuple[SE3, list[str]]:
     """Read (n,) base_from_gripper of n images, with notes, for the commands with `--convention`."""
     rows = read_robot_poses(file, convention, option="--convention")
-    poses, notes = pair_images(images, rows, None, file)
-    missing = [
-        image.name for image, pose in zip(images, poses, strict=True) if pose is None
-    ]
+    paired, notes = pair_images(images, rows, None, file)
+    names = [image.name for image in images]
+    poses = []
+    missing = []
+    for name, pose in zip(names, paired, strict=True):
+        if pose is None:
+            missing.append(name)
+        else:
+            poses.append(pose)
     if missing:
-        alone = few(missing, {*(rows.names or ())} - {image.name for image in images})
+        listed = few(missing, {*(rows.names or ())}.difference(names))
         raise InputError(
-            f"{file}: has no pose for {alone}; add it or leave the image out"
+            f"{file}: has no pose for {listed}; add it or leave the image out"
         )
-    return SE3.stack([pose for pose in poses if pose is not None]), notes
+    return SE3.stack(poses), notes
+
+
+def unpaired(images: Sequence[str], rows: Sequence[str], file: str) -> list[str]:
+    """Notes of images and rows of a file whose names have no counterpart."""
+    notes = []
+    if images:
+        count = _count(len(images), "image")
+        notes.append(f"{count} without a row in {file}: {few(images, rows)}")
+    if rows:
+        count = _count(len(rows), "row")
+        notes.append(f"{count} of {file} without an image: {few(rows)}")
+    return notes
+
+
+def _of_rows(values: Any, numbers: Sequence[int | None]) -> list[Any]:
+    """Values of rows, and None for None."""
+    return [None if number is None else values[number] for number in numbers]
 
 
 def _by_name(
@@ -114,42 +133,50 @@ def _by_name(
     files = [image.name for image in images]
     with named_errors(file, "poses"):
         refuse_repeated(keys, "give every image one row")
-    by_name = {key: number for number, key in enumerate(keys)}
     # A table may omit the ending.
-    paired = [by_name.pop(i.name, by_name.pop(i.stem, None)) for i in images]
-    # Such as frame-1.color.png and frame-1.pose, but not 1.5.png.
-    if len(by_name) == len(keys):
-        heads = [[name.partition(".")[0] for name in part] for part in (files, keys)]
-        if all(len({*part}) == len(part) and not is_number(part[0]) for part in heads):
-            by_name = {head: number for number, head in enumerate(heads[1])}
-            paired = [by_name.pop(head, None) for head in heads[0]]
-    if all(row is None for row in paired) and same_numbers(names, files):
-        return [*range(len(images))], [
-            f"paired by numbers: {names[0]} with {images[0].name}, and so on"
-        ]
-    if all(row is None for row in paired):
-        raise InputError(
-            f"{file}: names no image of {images[0].parent}; its first is {names[0]!r}, the first"
-            f" image is {images[0].name!r}; correct the names, or leave them out to pair in order"
-        )
-    alone = [name for name, row in zip(files, paired, strict=True) if row is None]
-    return paired, unpaired(alone, [*by_name], file.name)
+    rows, unused = _rows_of_keys([(image.stem, image.name) for image in images], keys)
+    if len(unused) == len(keys):
+        # Such as frame-1.color.png and frame-1.pose, but not 1.5.png.
+        starts = [*map(_start, files)]
+        key_starts = [*map(_start, keys)]
+        if _are_names(starts) and _are_names(key_starts):
+            rows, unused = _rows_of_keys([*zip(starts)], key_starts)
+    if len(unused) < len(keys):
+        alone = [name for name, row in zip(files, rows, strict=True) if row is None]
+        return rows, unpaired(alone, unused, file.name)
+    if same_numbers(names, files):
+        note = f"paired by numbers: {names[0]} with {files[0]}, and so on"
+        return [*range(len(images))], [note]
+    raise InputError(
+        f"{file}: names no image of {images[0].parent}; its first is {names[0]!r}, the first"
+        f" image is {files[0]!r}; correct the names, or leave them out to pair in order"
+    )
 
 
-def unpaired(images: Sequence[str], rows: Sequence[str], file: str) -> list[str]:
-    """Notes of images and rows of a file whose names have no counterpart."""
-    notes = []
-    if images:
-        count = _count(len(images), "image")
-        notes.append(f"{count} without a row in {file}: {few(images, rows)}")
-    if rows:
-        notes.append(
-            f"{_count(len(rows), 'row')} of {file} without an image: {few(rows)}"
-        )
-    return notes
+def _rows_of_keys(
+    names: Sequence[tuple[str, ...]], keys: Sequence[str]
+) -> tuple[list[int | None], list[str]]:
+    """Number of the key that is one of each image's names, the last if several; unused keys."""
+    unused = {key: number for number, key in enumerate(keys)}
+    rows = []
+    for names_of_image in names:
+        row = None
+        for name in names_of_image:
+            row = unused.pop(name, row)
+        rows.append(row)
+    return rows, [*unused]
+
+
+def _start(name: str) -> str:
+    return name.partition(".")[0]
+
+
+def _are_names(starts: Sequence[str]) -> bool:
+    return len({*starts}) == len(starts) and not is_number(starts[0])
 
 
 def _by_time(times: Array, track: PoseTrack, file: Path) -> Pairing:
+    """Poses interpolated at the times of images; None outside of the track and in its gaps."""
     poses, valid = track.at(times)
     if not valid.any():
         first = track.stamps_s[0]
@@ -161,24 +188,33 @@ def _by_time(times: Array, track: PoseTrack, file: Path) -> Pairing:
         )
     notes = [f"poses were interpolated at the times of {_count(len(times), 'image')}"]
     if not valid.all():
+        invalid = _count(int((~valid).sum()), "image")
         notes.append(
-            f"{_count(int((~valid).sum()), 'image')} taken outside the recorded poses or in a gap"
-            f" of more than {MAX_GAP_S:g} s with motion"
+            f"{invalid} taken outside the recorded poses or in a gap of more than {MAX_GAP_S:g} s"
+            f" with motion"
         )
-    return [pose if ok else None for pose, ok in zip(poses, valid, strict=True)], notes
+    paired: list[SE3 | None] = list(poses)
+    for index in np.flatnonzero(~valid):
+        paired[index] = None
+    return paired, notes
 
 
 def _image_times(
-    images: Sequence[Path], stamps_s: Mapping[str, float] | None
+    images: Sequence[Path], rows: RobotPoses, stamps_s: Mapping[str, float] | None
 ) -> Array | None:
+    """(n,) seconds of images, if rows have times and images are at known times."""
+    if rows.stamps_s is None:
+        return None
     if stamps_s is None:
         return times_in_names([image.name for image in images])
-    times = [stamps_s.get(i.name, stamps_s.get(i.stem)) for i in images]
-    if None in times:
-        missing = images[times.index(None)]
-        raise InputError(
-            f"{missing}: stamps.csv has no row for it; add one for every image"
-        )
+    times = []
+    for image in images:
+        time = stamps_s.get(image.name, stamps_s.get(image.stem))
+        if time is None:
+            raise InputError(
+                f"{image}: stamps.csv has no row for it; add one for every image"
+            )
+        times.append(time)
     return np.array(times, dtype=np.float64)
 
 
