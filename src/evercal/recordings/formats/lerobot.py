@@ -8,11 +8,6 @@
 
 The format has no intrinsics, so a camera file is required. Frames of all episodes are training
 frames with base_from_gripper. Paths in the dataset must stay inside its folder.
-
-A pose is a feature whose names end in x, y, z and qx, qy, qz, qw, or wx, wy, wz for a rotation
-vector; the first numbers of a feature in a convention that the user gives; or, with a URDF, the
-joints of observation.state. `--gripper-frame` selects the feature if several hold poses, or the
-arm, such as left_ee, if one feature holds left_ee.x and right_ee.x.
 """
 
 import functools
@@ -27,25 +22,17 @@ import numpy as np
 
 from evercal.errors import InputError, optional_module
 from evercal.recordings.cameras.camera_file import read_camera_of_size
+from evercal.recordings.formats.lerobot_poses import feature_poses, pose_feature
 from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, decode_image, files_in, image_file
-from evercal.recordings.poses.conventions import (
-    asking_for,
-    checked_poses,
-    pose_convention,
-)
-from evercal.recordings.poses.joint_tables import in_radians, poses_of_arm
-from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
-from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import (
     library_errors,
     named_errors,
     path_inside,
     read_json,
-    refuse_repeated,
 )
 from evercal.typing import Array, Image
 
@@ -58,12 +45,6 @@ USES = (
     "pose_convention",
 )
 INFO = Path("meta") / "info.json"
-_STATE = "observation.state"
-# Names of the numbers of a pose, by convention.
-_PARTS = {
-    "xyzw": ("x", "y", "z", "qx", "qy", "qz", "qw"),
-    "ur": ("x", "y", "z", "wx", "wy", "wz"),
-}
 
 
 def detect(root: Path) -> bool:
@@ -85,32 +66,35 @@ def _load(root: Path, options: ReadOptions) -> Recording:
     key = _camera_key(root, info, options.image_topic)
     if options.camera is None:
         raise InputError(
-            f"{root}: LeRobot datasets hold no intrinsics; give them with --camera"
+            f"{root}: LeRobot datasets hold no intrinsics; give them with `camera`"
         )
-    shape = [int(n) for n in info["features"][key]["shape"]]
-    # Some state channels first.
-    height, width = shape[1:3] if shape[0] == 3 else shape[:2]
-    camera = read_camera_of_size(options.camera, (width, height), key)
-    column = _pose_feature(root, info, options)
+    size = _image_size(info["features"][key])
+    camera = read_camera_of_size(options.camera, size, key)
+    column = pose_feature(root, info, options)
     rows, values = _rows(root, column)
-    stated, notes = _feature_poses(root, info, column, values, options)
-    names = [f"episode_{row.episode:06d}/{row.number:06d}" for row in rows]
-    frames = tuple(
-        Frame(
-            name, image, camera, None, stated.poses[i], joints_rad=stated.joints_of(i)
+    stated, notes = feature_poses(root, info, column, values, options)
+    frames = []
+    for i, image in enumerate(_images(root, info, key, rows)):
+        name = f"episode_{rows[i].episode:06d}/{rows[i].number:06d}"
+        joints = stated.joints_of(i)
+        frames.append(
+            Frame(name, image, camera, None, stated.poses[i], joints_rad=joints)
         )
-        for i, (name, image) in enumerate(
-            zip(names, _images(root, info, key, rows), strict=True)
-        )
-    )
-    here = len({row.episode for row in rows})
+    episodes = len({row.episode for row in rows})
     total = int(info.get("total_episodes", 0))
-    if here < total:
-        notes.append(f"{here} of {total} episodes are in the folder")
+    if episodes < total:
+        notes.append(f"{episodes} of {total} episodes are in the folder")
     frames[0].read_image()
-    return Recording(
-        root.resolve().name, frames, (), notes=tuple(notes), arm=stated.arm
-    )
+    name = root.resolve().name
+    return Recording(name, tuple(frames), (), notes=tuple(notes), arm=stated.arm)
+
+
+def _image_size(feature: Mapping[str, Any]) -> tuple[int, int]:
+    shape = [int(n) for n in feature["shape"]]
+    if shape[0] == 3:  # some state channels first
+        shape = shape[1:]
+    height, width = shape[:2]
+    return width, height
 
 
 def _info(root: Path) -> dict[str, Any]:
@@ -121,10 +105,8 @@ def _info(root: Path) -> dict[str, Any]:
         raise InputError(
             f"{root / INFO}: version {version}; this evercal reads v2 and v3"
         )
-    if (
-        not all(isinstance(f, dict) for f in features.values())
-        or not float(info["fps"]) > 0
-    ):
+    are_objects = all(isinstance(feature, dict) for feature in features.values())
+    if not are_objects or not float(info["fps"]) > 0:
         raise ValueError("'features' is an object of objects and 'fps' a number > 0")
     for name in ("data_path", "video_path"):
         if info.get(name) is not None:
@@ -133,22 +115,19 @@ def _info(root: Path) -> dict[str, Any]:
 
 
 def _camera_key(root: Path, info: Mapping[str, Any], wanted: str | None) -> str:
-    keys = [
-        k for k, f in info["features"].items() if f.get("dtype") in ("video", "image")
-    ]
-    # Stated in `info`, in older versions under other names.
-    keys = [
-        k
-        for k in keys
-        if not re.search(r"is_depth_map'\W+True", str(info["features"][k]))
-    ]
+    keys = []
+    for key, feature in info["features"].items():
+        # Stated in `info`, in older versions under other names.
+        is_depth = re.search(r"is_depth_map'\W+True", str(feature))
+        if feature.get("dtype") in ("video", "image") and not is_depth:
+            keys.append(key)
     if wanted is None and len(keys) == 1:
         return keys[0]
     if wanted in keys:
         return str(wanted)
     what = f"no picture in {wanted!r}" if wanted else f"{len(keys)} cameras"
     raise InputError(
-        f"{root}: {what}; name one with --image-topic: {', '.join(keys) or 'none'}"
+        f"{root}: {what}; name one with `image_topic`: {', '.join(keys) or 'none'}"
     )
 
 
@@ -172,7 +151,7 @@ def _rows(root: Path, column: str) -> tuple[list[_Row], Array]:
             f"{root / 'data'}: no parquet files; download the data folder too"
         )
     rows: list[_Row] = []
-    parts = []
+    tables = []
     for file in files:
         *cells, poses = _columns(
             file, ["episode_index", "frame_index", "timestamp", column]
@@ -183,10 +162,10 @@ def _rows(root: Path, column: str) -> tuple[list[_Row], Array]:
             values = number_array(poses, column)
         if values.ndim != 2 or not np.isfinite(values).all():
             raise InputError(f"{file}: {column} holds no rows of finite numbers")
-        parts.append(values)
+        tables.append(values)
     if not rows:
         raise InputError(f"{root}: the dataset has no frames")
-    return rows, np.concatenate(parts)
+    return rows, np.concatenate(tables)
 
 
 def _images(
@@ -196,29 +175,23 @@ def _images(
         return [_Embedded(root, key, row.file, row.row) for row in rows]
     videos = Videos(float(info["fps"]))
     starts = _video_starts(root, info, key, {row.episode for row in rows})
-    if lost := sorted({row.episode for row in rows} - starts.keys()):
+    lost = sorted({row.episode for row in rows} - starts.keys())
+    if lost:
         raise InputError(
             f"{root / 'meta' / 'episodes'}: episode {lost[0]} is not listed"
         )
-    places = [(row, *starts[row.episode]) for row in rows]
-    return [
-        VideoFrame(videos, path, start + row.seconds) for row, path, start in places
-    ]
+    frames: list[StoredImage] = []
+    for row in rows:
+        path, start = starts[row.episode]
+        frames.append(VideoFrame(videos, path, start + row.seconds))
+    return frames
 
 
 def _video_starts(
     root: Path, info: Mapping[str, Any], key: str, episodes: set[int]
 ) -> dict[int, tuple[Path, float]]:
     """By episode: its video, and the time in the video at which it starts."""
-
-    def video(**fields: object) -> Path:
-        def field(match: re.Match[str]) -> str:
-            return str({"video_key": key, **fields}[match[1]]).zfill(int(match[2] or 0))
-
-        # Not by `str.format`, where the dataset would choose widths without limit.
-        path = re.sub(r"\{(\w+)(?::0(\d)d)?\}", field, str(info["video_path"]))
-        return root / path_inside(path, "'video_path'")
-
+    video = functools.partial(_video, root, str(info["video_path"]), video_key=key)
     if str(info["codebase_version"]).startswith("v2"):
         size = int(info.get("chunks_size", 1000))
         return {
@@ -226,11 +199,21 @@ def _video_starts(
         }
     parts = ("chunk_index", "file_index", "from_timestamp")
     names = ["episode_index", *(f"videos/{key}/{part}" for part in parts)]
-    return {
-        int(episode): (video(chunk_index=chunk, file_index=number), float(start))
-        for file in files_in(root / "meta" / "episodes", (".parquet",), "*/*")
-        for episode, chunk, number, start in zip(*_columns(file, names), strict=True)
-    }
+    starts = {}
+    for file in files_in(root / "meta" / "episodes", (".parquet",), "*/*"):
+        for episode, chunk, number, start in zip(*_columns(file, names), strict=True):
+            path = video(chunk_index=chunk, file_index=number)
+            starts[int(episode)] = (path, float(start))
+    return starts
+
+
+def _video(root: Path, template: str, **fields: object) -> Path:
+    def field(match: re.Match[str]) -> str:
+        return str(fields[match[1]]).zfill(int(match[2] or 0))
+
+    # Not by `str.format`, where the dataset would choose widths without limit.
+    path = re.sub(r"\{(\w+)(?::0(\d)d)?\}", field, template)
+    return root / path_inside(path, "'video_path'")
 
 
 @contextmanager
@@ -276,10 +259,8 @@ class _Embedded(StoredImage):
 
     def _content(self) -> bytes:
         with _parquet(self.path) as table:
-            groups = range(table.num_row_groups)
-            ends = np.cumsum(
-                [table.metadata.row_group(group).num_rows for group in groups]
-            )
+            groups = map(table.metadata.row_group, range(table.num_row_groups))
+            ends = np.cumsum([group.num_rows for group in groups])
             group = int(np.searchsorted(ends, self.row, side="right"))
             cell = _row_group(self.path, group, self.key)[self.row - int(ends[group])]
         if cell["bytes"]:
@@ -287,140 +268,3 @@ class _Embedded(StoredImage):
         where = f"{self.path}: row {self.row}: image {cell['path']!r}"
         with named_errors(where, "file"):
             return (self.root / path_inside(cell["path"], "the path")).read_bytes()
-
-
-def _pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> str:
-    features = info["features"]
-    if options.urdf is not None:
-        return _STATE
-    if options.pose_convention is not None:
-        column = options.gripper_frame or _STATE
-        if column not in features:
-            names = ", ".join(features)
-            raise InputError(
-                f"{root}: no feature {column!r}; --gripper-frame is one of {names}"
-            )
-        return column
-    observed = {
-        key: _names(info, key) for key in features if key.startswith("observation")
-    }
-    keys = [key for key, names in observed.items() if _convention_of(names)]
-    if options.gripper_frame is not None:
-        keys = [
-            key for key in keys if options.gripper_frame in (key, *_arms(observed[key]))
-        ]
-    if _STATE in keys or len(keys) == 1:
-        return _STATE if _STATE in keys else keys[0]
-    if keys:
-        raise InputError(
-            f"{root}: gripper poses are in {' and '.join(keys)}; give --gripper-frame"
-        )
-    named = {
-        key: names for key, names in observed.items() if names and "image" not in key
-    }
-    listed = "; ".join(f"{key}: {', '.join(names)}" for key, names in named.items())
-    raise InputError(
-        f"{root}: no feature holds a pose (x, y, z and qx, qy, qz, qw or wx, wy, wz), there are"
-        f" {listed or 'no named numbers'}; for joint angles give --urdf, for a pose in another form"
-        f" --pose-convention and --gripper-frame FEATURE"
-    )
-
-
-def _feature_poses(
-    root: Path,
-    info: Mapping[str, Any],
-    column: str,
-    values: Array,
-    options: ReadOptions,
-) -> tuple[RobotPoses, list[str]]:
-    names = _names(info, column)
-    if options.urdf is not None:
-        return _joint_poses(root, names, values, options)
-    if options.base_frame is not None:
-        raise InputError(f"{root}: --base-frame goes with --urdf only; leave it out")
-    count = values.shape[1]
-    notes = []
-    with named_errors(f"{root}: {column}", "poses"), asking_for("--pose-convention"):
-        if options.pose_convention is not None:
-            convention = pose_convention(options.pose_convention)
-            taken = convention.counts[-1]
-            numbers = values[:, :taken]
-            if taken < count:
-                used = f" ({', '.join(names[:taken])})" if names else ""
-                notes = [f"the first {taken} of its {count} numbers were taken{used}"]
-        elif len(names) != count:
-            raise ValueError(f"has {count} numbers and {len(names)} names")
-        else:
-            name, columns = _pose_columns(names, options.gripper_frame)
-            convention = pose_convention(name)
-            numbers = values[:, columns]
-        poses = checked_poses(numbers, convention)
-    notes = [f"gripper poses are {column}: {convention.meaning}", *notes]
-    return RobotPoses(None, None, poses), notes
-
-
-def _joint_poses(
-    root: Path, names: list[str], stated: Array, options: ReadOptions
-) -> tuple[RobotPoses, list[str]]:
-    assert options.urdf is not None
-    unit = options.pose_convention
-    count = stated.shape[1]
-    source = f"{root}: {_STATE}"
-    if len(names) != count:
-        raise InputError(f"{source} has {count} numbers and {len(names)} names")
-    with named_errors(source, "names"):
-        refuse_repeated(names, "rename the numbers")
-    model = RobotModel(options.urdf)
-    values = in_radians(model, names, stated, [unit] * count)
-    moved = model.poses(
-        names, values, options.base_frame, options.gripper_frame, source
-    )
-    return poses_of_arm(moved), moved.notes
-
-
-def _pose_columns(names: list[str], arm: str | None) -> tuple[str, list[int]]:
-    """Name of the convention of a pose, and its columns."""
-    arms = _arms(names)
-    chosen = _of_arm(names, arm) if arm in arms else names
-    convention = _convention_of(chosen)
-    assert convention is not None
-    last = [name.rpartition(".")[2] for name in chosen]
-    if any(last.count(part) > 1 for part in _PARTS[convention]):
-        which = " or ".join(filter(None, arms))
-        remedy = (
-            f"--gripper-frame {which}"
-            if which
-            else "names that tell them apart in info.json"
-        )
-        raise ValueError(f"holds several poses ({', '.join(names)}); give {remedy}")
-    return convention, [last.index(part) for part in _PARTS[convention]]
-
-
-def _convention_of(names: list[str]) -> str | None:
-    last = [name.rpartition(".")[2] for name in names]
-    return next(
-        (c for c, parts in _PARTS.items() if all(p in last for p in parts)), None
-    )
-
-
-def _arms(names: list[str]) -> list[str]:
-    prefixes = dict.fromkeys(name.rpartition(".")[0] for name in names)
-    return [arm for arm in prefixes if _convention_of(_of_arm(names, arm))]
-
-
-def _of_arm(names: list[str], arm: str) -> list[str]:
-    """The names of one arm, others as empty strings."""
-    return [name if name.rpartition(".")[0] == arm else "" for name in names]
-
-
-def _names(info: Mapping[str, Any], column: str) -> list[str]:
-    names = info["features"].get(column, {}).get("names") or []
-    # {"motors": [...]}, or several arms with the same names.
-    if isinstance(names, dict):
-        groups = {key: group for key, group in names.items() if isinstance(group, list)}
-        names = [
-            f"{key}.{name}" if len(groups) > 1 else name
-            for key, group in groups.items()
-            for name in group
-        ]
-    return [str(name).removesuffix(".pos") for name in names]

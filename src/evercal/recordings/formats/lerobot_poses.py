@@ -1,0 +1,176 @@
+"""Gripper poses in a LeRobot dataset.
+
+A pose is a feature whose names end in x, y, z and qx, qy, qz, qw, or wx, wy, wz for a rotation
+vector; the first numbers of a feature in a convention that the user gives; or, with a URDF, the
+joints of observation.state. `gripper_frame` selects the feature if several hold poses, or the arm,
+such as left_ee, if one feature holds left_ee.x and right_ee.x.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from evercal.errors import InputError
+from evercal.recordings.poses.conventions import (
+    asking_for,
+    checked_poses,
+    pose_convention,
+)
+from evercal.recordings.poses.joint_tables import in_radians, poses_of_arm
+from evercal.recordings.poses.robot_poses import RobotPoses
+from evercal.recordings.read_options import ReadOptions
+from evercal.robot.robot_model import RobotModel
+from evercal.storage.text_files import named_errors, refuse_repeated
+from evercal.typing import Array
+
+_STATE = "observation.state"
+"""Feature of the joints."""
+_PARTS = {
+    "xyzw": ("x", "y", "z", "qx", "qy", "qz", "qw"),
+    "ur": ("x", "y", "z", "wx", "wy", "wz"),
+}
+"""Names of the numbers of a pose, by convention."""
+
+
+def pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> str:
+    """Name of the feature with the poses, or with the joints where there is a URDF."""
+    features = info["features"]
+    if options.urdf is not None:
+        return _STATE
+    if options.pose_convention is not None:
+        column = options.gripper_frame or _STATE
+        if column not in features:
+            names = ", ".join(features)
+            raise InputError(
+                f"{root}: no feature {column!r}; `gripper_frame` is one of {names}"
+            )
+        return column
+    observed = {
+        key: _names(info, key) for key in features if key.startswith("observation")
+    }
+    keys = [key for key, names in observed.items() if _convention_of(names)]
+    if options.gripper_frame is not None:
+        keys = [
+            key for key in keys if options.gripper_frame in (key, *_arms(observed[key]))
+        ]
+    if _STATE in keys:
+        return _STATE
+    if len(keys) == 1:
+        return keys[0]
+    if keys:
+        raise InputError(
+            f"{root}: gripper poses are in {' and '.join(keys)}; give `gripper_frame`"
+        )
+    named = []
+    for key, names in observed.items():
+        if names and "image" not in key:
+            named.append(f"{key}: {', '.join(names)}")
+    raise InputError(
+        f"{root}: no feature holds a pose (x, y, z and qx, qy, qz, qw or wx, wy, wz), there are"
+        f" {'; '.join(named) or 'no named numbers'}; for joint angles give `urdf`, for a pose in"
+        f" another form `pose_convention` and `gripper_frame` FEATURE"
+    )
+
+
+def feature_poses(
+    root: Path,
+    info: Mapping[str, Any],
+    column: str,
+    values: Array,
+    options: ReadOptions,
+) -> tuple[RobotPoses, list[str]]:
+    """Poses from the (n, k) values of a feature, and notes."""
+    names = _names(info, column)
+    if options.urdf is not None:
+        return _joint_poses(root, names, values, options)
+    if options.base_frame is not None:
+        raise InputError(f"{root}: `base_frame` goes with `urdf` only; leave it out")
+    count = values.shape[1]
+    notes = []
+    with named_errors(f"{root}: {column}", "poses"), asking_for("`pose_convention`"):
+        if options.pose_convention is not None:
+            convention = pose_convention(options.pose_convention)
+            taken = convention.counts[-1]
+            values = values[:, :taken]
+            if taken < count:
+                used = f" ({', '.join(names[:taken])})" if names else ""
+                notes = [f"the first {taken} of its {count} numbers were taken{used}"]
+        elif len(names) != count:
+            raise ValueError(f"has {count} numbers and {len(names)} names")
+        else:
+            name, columns = _pose_columns(names, options.gripper_frame)
+            convention = pose_convention(name)
+            values = values[:, columns]
+        poses = checked_poses(values, convention)
+    notes = [f"gripper poses are {column}: {convention.meaning}", *notes]
+    return RobotPoses(None, None, poses), notes
+
+
+def _joint_poses(
+    root: Path, names: list[str], values: Array, options: ReadOptions
+) -> tuple[RobotPoses, list[str]]:
+    assert options.urdf is not None
+    count = values.shape[1]
+    source = f"{root}: {_STATE}"
+    if len(names) != count:
+        raise InputError(f"{source} has {count} numbers and {len(names)} names")
+    with named_errors(source, "names"):
+        refuse_repeated(names, "rename the numbers")
+    model = RobotModel(options.urdf)
+    values = in_radians(model, names, values, [options.pose_convention] * count)
+    links = (options.base_frame, options.gripper_frame)
+    moved = model.poses(names, values, *links, source)
+    return poses_of_arm(moved), moved.notes
+
+
+def _pose_columns(names: list[str], arm: str | None) -> tuple[str, list[int]]:
+    """Name of the convention of a pose, and its columns."""
+    arms = _arms(names)
+    chosen = _of_arm(names, arm) if arm in arms else names
+    convention = _convention_of(chosen)
+    parts = _PARTS[convention]
+    last = _last_parts(chosen)
+    if any(last.count(part) > 1 for part in parts):
+        remedy = "names that tell them apart in info.json"
+        prefixes = [prefix for prefix in arms if prefix]
+        if prefixes:
+            remedy = f"`gripper_frame` {' or '.join(prefixes)}"
+        raise ValueError(f"holds several poses ({', '.join(names)}); give {remedy}")
+    return convention, [last.index(part) for part in parts]
+
+
+def _convention_of(names: list[str]) -> str:
+    """Name of the convention of a pose; empty if the numbers are none."""
+    last = set(_last_parts(names))
+    for convention, parts in _PARTS.items():
+        if last.issuperset(parts):
+            return convention
+    return ""
+
+
+def _last_parts(names: list[str]) -> list[str]:
+    return [name.rpartition(".")[2] for name in names]
+
+
+def _arms(names: list[str]) -> list[str]:
+    prefixes = dict.fromkeys(name.rpartition(".")[0] for name in names)
+    return [arm for arm in prefixes if _convention_of(_of_arm(names, arm))]
+
+
+def _of_arm(names: list[str], arm: str) -> list[str]:
+    """The names of one arm, others as empty strings."""
+    return [name if name.rpartition(".")[0] == arm else "" for name in names]
+
+
+def _names(info: Mapping[str, Any], column: str) -> list[str]:
+    """Names of the numbers of a feature."""
+    names = info["features"].get(column, {}).get("names") or []
+    if isinstance(
+        names, dict
+    ):  # {"motors": [...]}, or several arms with the same names
+        groups = {key: group for key, group in names.items() if isinstance(group, list)}
+        names = []
+        for key, group in groups.items():
+            prefix = f"{key}." if len(groups) > 1 else ""
+            names += [f"{prefix}{name}" for name in group]
+    return [str(name).removesuffix(".pos") for name in names]
