@@ -20,7 +20,7 @@ from evercal.recordings import (
 )
 from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.formats import lerobot, wrist
-from evercal.recordings.formats.lerobot import _pose_feature
+from evercal.recordings.formats.lerobot_poses import pose_feature
 from evercal.recordings.poses.joint_tables import read_joints
 
 from .checks import assert_pose
@@ -166,7 +166,7 @@ def test_joint_tables(page: Path) -> None:
 def test_lerobot_description(page: Path) -> None:
     assert lerobot.detect(page / "pusht")
     info = json.loads((page / "pusht" / lerobot.INFO).read_text())
-    assert _pose_feature(page / "pusht", info, ReadOptions()) == "observation.ee"
+    assert pose_feature(page / "pusht", info, ReadOptions()) == "observation.ee"
 
 
 def test_touched_points(page: Path) -> None:

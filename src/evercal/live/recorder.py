@@ -17,6 +17,7 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.formats import wrist
 from evercal.recordings.frame import Frame, stated_grippers
 from evercal.recordings.images import write_jpeg
+from evercal.recordings.read_options import ReadOptions
 from evercal.storage import write_bytes, write_json
 from evercal.typing import Image
 
@@ -39,7 +40,7 @@ class WristRecorder:
                 raise InputError(
                     f"{root}: holds gripper poses, but no {POSES}; use a new folder"
                 )
-            self._frames = list(wrist.load(self._root).train)
+            self._frames = list(wrist.load(self._root, ReadOptions()).train)
             if any(frame.camera != camera for frame in self._frames):
                 raise InputError(
                     f"{root}: was recorded with other intrinsics; use a new folder"

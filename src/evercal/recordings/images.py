@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +20,8 @@ from evercal.typing import Image, PathLike
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 """Endings of image files, in lower case."""
+ImageFile: TypeAlias = tuple[str, bytes]
+"""Ending and content of an image file."""
 _JPEG = b"\xff\xd8"
 """Beginning of a JPEG file."""
 _SCAN = b"\xff\xda"
@@ -40,7 +43,7 @@ class StoredImage(ABC):
     def read(self) -> Image:
         """Decode the image to (H, W, 3) uint8 RGB."""
 
-    def file(self) -> tuple[str, bytes] | None:
+    def file(self) -> ImageFile | None:
         """Ending and content of the image file, or None if the image is not stored as a file."""
         return None
 
@@ -226,7 +229,7 @@ def decode_image(data: Image, turned: bool = True) -> Image | None:
     return as_rgb(image)
 
 
-def image_file(data: bytes) -> tuple[str, bytes] | None:
+def image_file(data: bytes) -> ImageFile | None:
     """Ending and bytes of a PNG or JPEG file, or None for other bytes."""
     for start, ending in ((_PNG, ".png"), (b"\xff\xd8\xff", ".jpg")):
         if data.startswith(start):

@@ -47,6 +47,10 @@ _MADE = "made"
 Result = TypeVar("Result")
 Contents = TypeVar("Contents")
 Names = Sequence[str]
+Payload = Mapping[str, object]
+"""Settings of a store, or a report."""
+Superseded = Callable[[str], bool]
+"""Whether a file of a kept stage, by its name, is dropped."""
 Write = Callable[[Path], None]
 """Writes the files of a stage into a folder."""
 
@@ -194,8 +198,8 @@ class StageStore(Generic[Contents]):
         self,
         name: str,
         write: Write,
-        payload: Mapping[str, object],
-        superseded: Callable[[str], bool] = lambda _: False,
+        payload: Payload,
+        superseded: Superseded = lambda _: False,
     ) -> None:
         """Add a stage: whole, or not at all; see `change`."""
         self.change(self.stages, [(name, write)], payload, superseded)
@@ -204,8 +208,8 @@ class StageStore(Generic[Contents]):
         self,
         kept: Names,
         added: Sequence[tuple[str, Write]],
-        payload: Mapping[str, object],
-        superseded: Callable[[str], bool] = lambda _: False,
+        payload: Payload,
+        superseded: Superseded = lambda _: False,
     ) -> None:
         """Keep some stages and add others after them, in one step: all of it, or nothing.
 
@@ -232,7 +236,7 @@ class StageStore(Generic[Contents]):
             settings = {**payload, _MADE: made}
             self._publish([*kept, *new], new, settings, before, superseded)
 
-    def replace(self, index: int, write: Write, payload: Mapping[str, object]) -> None:
+    def replace(self, index: int, write: Write, payload: Payload) -> None:
         """Replace a stage: whole, or not at all.
 
         `write` changes files in a copy of the stage's folder.
@@ -299,9 +303,9 @@ class StageStore(Generic[Contents]):
         self,
         stages: list[str],
         new: Mapping[str, Write],
-        payload: Mapping[str, object],
+        payload: Payload,
         before: Manifest,
-        superseded: Callable[[str], bool],
+        superseded: Superseded,
     ) -> None:
         self.root.mkdir(parents=True, exist_ok=True)
         dropped = [stage for stage in self.stages if stage not in stages]
@@ -376,6 +380,6 @@ def _made(manifest: Manifest) -> int:
     return int(manifest.payload.get(_MADE, len(manifest.payload["stages"])))
 
 
-def write_report(folder: Path, report: Mapping[str, object]) -> None:
+def write_report(folder: Path, report: Payload) -> None:
     """Write `report.json` of a stage."""
     write_json(folder / REPORT, report)

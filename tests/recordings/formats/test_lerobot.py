@@ -218,7 +218,7 @@ def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
     refuses(
         "grad: joint angles are rad or deg", root, urdf=urdf, pose_convention="grad"
     )
-    refuses("--base-frame goes with --urdf only", root, base_frame="base")
+    refuses("`base_frame` goes with `urdf` only", root, base_frame="base")
     change_names(root, ["shoulder.pos", "shoulder"], "observation.state")
     refuses(r"state: 'shoulder' comes twice", root, urdf=urdf)
     change_names(root, {"left": ["shoulder"], "right": ["reach"]}, "observation.state")
@@ -237,7 +237,7 @@ def test_poses_in_a_given_convention(tmp_path: Path) -> None:
         (
             "xyzw",
             "observation.hand",
-            r"no feature 'observation\.hand'; --gripper-frame is one of",
+            r"no feature 'observation\.hand'; `gripper_frame` is one of",
         ),
     ):
         refuses(message, root, pose_convention=convention, gripper_frame=feature)
@@ -264,9 +264,9 @@ def test_one_of_two_arms_is_selected(tmp_path: Path) -> None:
     for names, message in (
         (
             sides,
-            r"observation\.ee: holds several poses .*--gripper-frame left_ee or right_ee",
+            r"observation\.ee: holds several poses .*`gripper_frame` left_ee or right_ee",
         ),
-        ({"left": parts, "right": parts}, "--gripper-frame left or right"),
+        ({"left": parts, "right": parts}, "`gripper_frame` left or right"),
         (parts * 2, r"holds several poses .*; give names that tell them apart"),
         (parts, r"observation\.ee: has 14 numbers and 7 names"),
     ):
@@ -302,10 +302,10 @@ def test_missing_options_and_files_are_named(tmp_path: Path) -> None:
     for changed, message in (
         (
             {"image_topic": None},
-            r"2 cameras; name one with --image-topic: observation\.images\.w",
+            r"2 cameras; name one with `image_topic`: observation\.images\.w",
         ),
         ({"image_topic": "top"}, "no picture in 'top'"),
-        ({"camera": None}, "hold no intrinsics; give them with --camera"),
+        ({"camera": None}, "hold no intrinsics; give them with `camera`"),
         ({"image_topic": FRONT}, "video is missing; download it too"),
     ):
         refused(

@@ -237,7 +237,7 @@ def test_several_image_topics_need_a_choice(tmp_path: Path) -> None:
     bag.image(0.4, "/depth/image_raw", np.ones((24, 32), np.uint16), "16UC1")
     path = tmp_path / "a"
     # The depth image is no candidate.
-    expected = "images on 2 topics; give --image-topic: /cam/image_raw, /left/image_raw"
+    expected = "images on 2 topics; give `image_topic`: /cam/image_raw, /left/image_raw"
     assert expected in refusal(bag, path)
     # The only camera_info is that of the other camera.
     message = "no camera_info for /left/image_raw (/left/camera_info is expected, there is /cam/"
@@ -259,7 +259,7 @@ def test_several_image_topics_need_a_choice(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("made", "message"),
     [
-        ({"focal": 0.0}, "K is all zeros: the camera is not calibrated; give --camera"),
+        ({"focal": 0.0}, "K is all zeros: the camera is not calibrated; give `camera`"),
         ({"model": "fov"}, "a camera of model fov has omega"),
         ({"size": (64, 48)}, "is for images of 64x48, /cam/image_raw is 32x24"),
         (

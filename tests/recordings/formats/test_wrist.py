@@ -203,7 +203,7 @@ def test_camera_file_is_chosen_and_must_fit_the_images(tmp_path: Path) -> None:
     make_folder(tmp_path, ["1.png", "2.png"], some_poses(2))
     (tmp_path / "camera.json").rename(tmp_path / "other.json")
     refused(
-        r"no camera file in it; name the file .* --camera", load_recording, tmp_path
+        r"no camera file in it; name the file .* `camera`", load_recording, tmp_path
     )
     recording = load_recording(
         tmp_path, options=ReadOptions(camera=tmp_path / "other.json")
@@ -229,7 +229,12 @@ def test_missing_and_ambiguous_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"`gripper_frame`: .* holds poses already"):
         load_recording(tmp_path, options=ReadOptions(gripper_frame="tool0"))
     (tmp_path / "base_from_gripper.csv").unlink()
-    refused("no gripper poses; expected base_from_gripper", wrist.load, tmp_path)
+    refused(
+        "no gripper poses; expected base_from_gripper",
+        load_recording,
+        tmp_path,
+        "wrist",
+    )
 
 
 CAMERA_POSES = some_poses(4, seed=5)

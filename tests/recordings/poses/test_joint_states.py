@@ -133,7 +133,7 @@ def test_folder_with_joints_and_a_urdf_is_a_recording(
     (tmp_path / "joints.csv").write_text(
         "image,elbow_deg,shoulder,reach_m\n2.png,90,0.5,0.1\n0.png,-30,0.25,0.2\n1.png,5,1,0\n"
     )
-    refused("no URDF is beside it; give --urdf", load_recording, tmp_path)
+    refused("no URDF is beside it; give `urdf`", load_recording, tmp_path)
     options = ReadOptions(urdf=urdf)
     recording = load_recording(tmp_path, options=options)
     expected = [planar(0.25, np.deg2rad(-30), 0.2), planar(1, np.deg2rad(5), 0)]

@@ -30,15 +30,19 @@ from evercal.storage.text_files import (
 USES = ("metres",)
 
 _MODEL_FOLDERS = (".", "sparse", "colmap/sparse", "distorted/sparse")
-# Models of which each parameter is OpenCV's, or one of `RADIAL_MODELS`.
+"""Usual places of models; distorted/sparse is before undistortion."""
 _SUPPORTED = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
     "SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE",
     "FOV", "EUCM",
 )  # fmt: skip
+"""Camera models of which each parameter is OpenCV's, or that are `RADIAL_MODELS`."""
 _READ = "import pycolmap, sys; print(flush=True); pycolmap.Reconstruction(sys.argv[1])"
-_LEAST_S, _SLOWEST_BYTES_PER_S = 1.0, 5e6
-"""Time for reading a binary model."""
+"""Program that ends once a model is read."""
+_LEAST_S = 1.0
+"""Time for reading an empty binary model, seconds."""
+_SLOWEST_BYTES_PER_S = 5e6
+"""Bytes of a binary model that are read in a second, at least."""
 
 
 def detect(root: Path) -> bool:
@@ -46,9 +50,8 @@ def detect(root: Path) -> bool:
     return bool(_models(root))
 
 
-def load(root: Path, options: ReadOptions | None = None) -> Recording:
+def load(root: Path, options: ReadOptions) -> Recording:
     """Read the largest model; no image is opened whole."""
-    metric = options is not None and options.metres
     models = {folder: _model(folder) for folder in _models(root)}
     if not models:
         raise InputError(
@@ -56,11 +59,13 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
         )
     folder = max(models, key=lambda folder: models[folder].num_reg_images())
     model = models[folder]
-    notes = [frame_note("COLMAP", metric)]
+    notes = [frame_note("COLMAP", options.metres)]
     if len(models) > 1:
-        sizes = ", ".join(f"{f.name}: {m.num_reg_images()}" for f, m in models.items())
+        sizes = [
+            f"{path.name}: {part.num_reg_images()}" for path, part in models.items()
+        ]
         notes.append(
-            f"took model {folder.name}, the one with the most images ({sizes})"
+            f"took model {folder.name}, the one with the most images ({', '.join(sizes)})"
         )
     cameras = {key: _camera(folder, camera) for key, camera in model.cameras.items()}
     posed = [image for image in model.images.values() if image.has_pose]
@@ -70,38 +75,41 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
             f"{folder}: no image has a pose; reconstruct with more overlap"
         )
     images = _image_folder(root, folder, [image.name for image in posed])
-    frames = [
-        Frame(
-            i.name, as_stored(images / i.name), cameras[i.camera_id], _pose(folder, i)
-        )
-        for i in posed
-    ]
-    files = files_in(images, glob="**/*")
-    total = max(len(model.images), len(files) if images != root else 0)
+    frames = []
+    for image in posed:
+        file = as_stored(images / image.name)
+        pose = _pose(folder, image)
+        frames.append(Frame(image.name, file, cameras[image.camera_id], pose))
+    total = len(model.images)
+    if images != root:
+        total = max(total, len(files_in(images, glob="**/*")))
     name = root.resolve().name
     lost = total - len(frames)
-    return Recording(name, tuple(frames), (), lost, notes=tuple(notes), metric=metric)
+    return Recording(
+        name, tuple(frames), (), lost, notes=tuple(notes), metric=options.metres
+    )
 
 
 def _models(root: Path) -> list[Path]:
-    """Model folders in the first of the usual places; distorted/sparse is before undistortion."""
+    """Model folders in the first of the usual places."""
     for name in _MODEL_FOLDERS:
         parent = root / name
-        inner = sorted(parent.iterdir()) if parent.is_dir() else []
+        folders = [parent]
+        if parent.is_dir():
+            folders += sorted(parent.iterdir())
         if name == ".":  # may be a folder of models, which COLMAP numbers
-            inner = [folder for folder in inner if folder.name.isdigit()]
-        if models := [folder for folder in (parent, *inner) if _is_model(folder)]:
+            folders = [parent, *(path for path in folders[1:] if path.name.isdigit())]
+        models = [folder for folder in folders if _is_model(folder)]
+        if models:
             return models
     return []
 
 
 def _is_model(folder: Path) -> bool:
-    names = ("cameras", "images")
-    kinds = [
-        all((folder / (name + end)).is_file() for name in names)
-        for end in (".bin", ".txt")
-    ]
-    return any(kinds)
+    for end in (".bin", ".txt"):
+        if all((folder / (name + end)).is_file() for name in ("cameras", "images")):
+            return True
+    return False
 
 
 def _model(folder: Path) -> Any:
@@ -123,7 +131,12 @@ def _names(folder: Path) -> dict[int, str]:
         return {}
     text = (folder / "images.txt").read_text("utf-8")
     lines = [line for line in text.split("\n") if line[:1] != "#"]
-    return {int(w[0]): w[9] for line in lines[::2] if (w := line.split(maxsplit=9))}
+    names = {}
+    for line in lines[::2]:
+        words = line.split(maxsplit=9)
+        if words:
+            names[int(words[0])] = words[9]
+    return names
 
 
 def _require_ends(folder: Path) -> None:
@@ -154,24 +167,22 @@ def _camera(folder: Path, camera: Any) -> Camera:
             f"{folder}: camera model {name} is not supported, only {', '.join(_SUPPORTED)};"
             f" undistort the images with 'colmap image_undistorter' and read its result"
         )
-    names = camera.params_info.split(", ")  # the only coefficient is called k
-    names = ["k1" if name == "k" else name for name in names]
-    named = dict(zip(names, map(float, camera.params), strict=True))
-    focal = named.get("fx", named.get("f", 0.0)), named.get("fy", named.get("f", 0.0))
+    names = camera.params_info.split(", ")
+    values = dict(zip(names, map(float, camera.params), strict=True))
+    values.setdefault("k1", values.get("k", 0.0))  # the only coefficient is called k
+    one_focal = values.get("f", 0.0)
+    focal = (values.get("fx", one_focal), values.get("fy", one_focal))
     # COLMAP counts from the image's corner.
-    centre = (
-        named["cx"] - 0.5,
-        named["cy"] - 0.5,
-    )
+    centre = (values["cx"] - 0.5, values["cy"] - 0.5)
     size = (int(camera.width), int(camera.height))
     kind = name.lower()
     with named_errors(folder, "COLMAP model"):
         if kind in RADIAL_MODELS:
-            own = [named[key] for key in RADIAL_MODELS[kind].parameters]
-            return nearest_fisheye(kind, own, size, focal, centre)
+            parameters = [values[key] for key in RADIAL_MODELS[kind].parameters]
+            return nearest_fisheye(kind, parameters, size, focal, centre)
         model = "fisheye" if kind.endswith("fisheye") else "pinhole"
-        count = 8 if "k6" in named else 4 if "k1" in named else 0
-        distortion = tuple(named.get(key, 0.0) for key in COEFFICIENTS[model][:count])
+        count = 8 if "k6" in values else 4
+        distortion = tuple(values.get(key, 0.0) for key in COEFFICIENTS[model][:count])
         return Camera(*size, *focal, *centre, distortion, model)
 
 

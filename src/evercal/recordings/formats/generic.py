@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
 
@@ -30,8 +30,12 @@ from evercal.storage.text_files import (
 from evercal.typing import PathLike
 
 FILE = "scene.json"
+"""File that lists the frames."""
 _FORMAT = "evercal-scene"
 _VERSION = 1
+"""Version of the format of the file."""
+Split: TypeAlias = Literal["train", "test"]
+"""Part of a recording."""
 
 
 def detect(root: Path) -> bool:
@@ -46,22 +50,19 @@ def load(root: Path) -> Recording:
     with named_errors(file, "scene file"):
         frames = of_format(data, _FORMAT, _VERSION, partial(_frames, root))
     name = data.get("name")
-    train, test = (
-        tuple(f for s, f in frames if s == split) for split in ("train", "test")
-    )
+    if not isinstance(name, str) or not name:
+        name = root.resolve().name
     return Recording(
-        name if isinstance(name, str) and name else root.resolve().name,
-        train,
-        test,
+        name,
+        tuple(frame for split, frame in frames if split == "train"),
+        tuple(frame for split, frame in frames if split == "test"),
         data.get("untracked", 0),
         notes=tuple(data.get("notes", ())),
         metric=data.get("unit") != "unknown",
     )
 
 
-def _frames(
-    root: Path, data: Mapping[str, Any]
-) -> list[tuple[Literal["train", "test"], Frame]]:
+def _frames(root: Path, data: Mapping[str, Any]) -> list[tuple[Split, Frame]]:
     entries = data.get("frames")
     notes = data.get("notes", [])
     if not isinstance(entries, list) or not entries:
@@ -86,7 +87,7 @@ def write(
     recording: Recording,
     *,
     link: bool = False,
-    on_frame: Callable[[], object] | None = None,
+    on_frame: Callable[[], object] = lambda: None,
 ) -> None:
     """Write a recording with its images; image files are copied byte for byte.
 
@@ -100,10 +101,12 @@ def write(
         writer.untracked = recording.untracked
         writer.notes = recording.notes
         writer.metric = recording.metric
-        for i, frame in enumerate((*recording.train, *recording.test)):
-            writer.add(frame, "train" if i < len(recording.train) else "test")
-            if on_frame is not None:
-                on_frame()
+        for frame in recording.train:
+            writer.add(frame, "train")
+            on_frame()
+        for frame in recording.test:
+            writer.add(frame, "test")
+            on_frame()
 
 
 class SceneWriter:
@@ -145,13 +148,16 @@ class SceneWriter:
             "frames": list(self._entries.values()),
             "untracked": self.untracked,
         }
-        data |= {} if self.metric else {"unit": "unknown"}
-        data |= {"notes": list(self.notes)} if self.notes else {}
-        data |= {"render": self.render} if self.render is not None else {}
+        if not self.metric:
+            data["unit"] = "unknown"
+        if self.notes:
+            data["notes"] = list(self.notes)
+        if self.render is not None:
+            data["render"] = self.render
         with self._new(FILE) as file:
             write_json(file, data)
 
-    def add(self, frame: Frame, split: Literal["train", "test"]) -> None:
+    def add(self, frame: Frame, split: Split) -> None:
         """Write the frame's image and collect its entry of scene.json."""
         if frame.name in self._entries:
             raise InputError(
@@ -180,14 +186,16 @@ class SceneWriter:
             relative = stem + frame.image.suffix.lower()
             self._copy(frame.image, relative)
             return relative
-        stored = frame.image.file() if isinstance(frame.image, StoredImage) else None
-        relative = stem + (stored[0] if stored else ".png")
-        with self._new(relative) as path:
-            if stored:
-                path.write_bytes(stored[1])
-            else:
+        stored = None
+        if isinstance(frame.image, StoredImage):
+            stored = frame.image.file()
+        if stored is None:
+            with self._new(f"{stem}.png") as path:
                 write_image(path, frame.read_image())
-        return relative
+        else:
+            with self._new(stem + stored[0]) as path:
+                path.write_bytes(stored[1])
+        return f"images/{path.name}"
 
     def _copy(self, source: Path, relative: str) -> None:
         """Copy or link a file into the folder, unless it is that file already."""
@@ -233,16 +241,18 @@ def _cameras(data: object) -> dict[str, Camera]:
 
 def _frame(
     root: Path, entry: object, cameras: dict[str, Camera]
-) -> tuple[Literal["train", "test"], Frame]:
+) -> tuple[Split, Frame]:
     if not isinstance(entry, dict):
         raise ValueError(f"is an object, got {entry!r}")
     camera = entry.get("camera")
     split = entry.get("split")
     image = path_inside(entry.get("image"), "'image'")
     optional: dict[str, Any] = {}
-    if (depth := entry.get("depth")) is not None:
+    depth = entry.get("depth")
+    if depth is not None:
         optional["depth"] = root / path_inside(depth, "'depth'")
-    if (joints := entry.get("joints_rad")) is not None:
+    joints = entry.get("joints_rad")
+    if joints is not None:
         count = len(joints) if isinstance(joints, list) else 7
         optional["joints_rad"] = tuple(_numbers(joints, count, "joints_rad"))
     if not isinstance(camera, str) or camera not in cameras:
@@ -252,15 +262,15 @@ def _frame(
     for key in ("base_from_camera", "base_from_gripper"):
         with naming(repr(key)):
             optional[key] = _pose(entry.get(key))
-    return split, Frame(
-        str(entry.get("name", image)), root / image, cameras[camera], **optional
-    )
+    name = str(entry.get("name", image))
+    return split, Frame(name, root / image, cameras[camera], **optional)
 
 
 def _pose(data: Any) -> SE3 | None:
     if data is None:
         return None
-    data = data if isinstance(data, dict) else {}
+    if not isinstance(data, dict):
+        data = {}
     translation = np.array(_numbers(data.get("translation_m"), 3, "translation_m"))
     quaternion = np.array(_numbers(data.get("quaternion_wxyz"), 4, "quaternion_wxyz"))
     if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-2:
@@ -268,11 +278,8 @@ def _pose(data: Any) -> SE3 | None:
     return SE3(quaternion, translation)
 
 
-def _numbers(value: object, count: int, name: str) -> list[float]:
-    if (
-        not isinstance(value, list)
-        or len(value) != count
-        or not all(map(is_real, value))
-    ):
+def _numbers(value: Any, count: int, name: str) -> list[float]:
+    is_list = isinstance(value, list) and len(value) == count
+    if not is_list or not all(map(is_real, value)):
         raise ValueError(f"'{name}' is {count} numbers, got {value!r}")
-    return [float(v) for v in value]
+    return [*map(float, value)]

@@ -12,7 +12,7 @@ frames with base_from_gripper. Paths in the dataset must stay inside its folder.
 
 import functools
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +22,16 @@ import numpy as np
 
 from evercal.errors import InputError, optional_module
 from evercal.recordings.cameras.camera_file import read_camera_of_size
-from evercal.recordings.formats.lerobot_poses import feature_poses, pose_feature
+from evercal.recordings.formats.lerobot_poses import Info, feature_poses, pose_feature
 from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.images import StoredImage, decode_image, files_in, image_file
+from evercal.recordings.images import (
+    ImageFile,
+    StoredImage,
+    decode_image,
+    files_in,
+    image_file,
+)
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import (
@@ -54,11 +60,11 @@ def detect(root: Path) -> bool:
     return False
 
 
-def load(root: Path, options: ReadOptions | None = None) -> Recording:
+def load(root: Path, options: ReadOptions) -> Recording:
     """Read the tables and decode one image; the others stay in their files until needed."""
     # Features of many kinds are described in one file that other programs write.
     with library_errors(f"{root / INFO}: does not describe the dataset"):
-        return _load(root, options or ReadOptions())
+        return _load(root, options)
 
 
 def _load(root: Path, options: ReadOptions) -> Recording:
@@ -89,7 +95,7 @@ def _load(root: Path, options: ReadOptions) -> Recording:
     return Recording(name, tuple(frames), (), notes=tuple(notes), arm=stated.arm)
 
 
-def _image_size(feature: Mapping[str, Any]) -> tuple[int, int]:
+def _image_size(feature: Info) -> tuple[int, int]:
     shape = [int(n) for n in feature["shape"]]
     if shape[0] == 3:  # some state channels first
         shape = shape[1:]
@@ -97,8 +103,8 @@ def _image_size(feature: Mapping[str, Any]) -> tuple[int, int]:
     return width, height
 
 
-def _info(root: Path) -> dict[str, Any]:
-    info: dict[str, Any] = read_json(root / INFO, "LeRobot dataset")
+def _info(root: Path) -> Info:
+    info: Info = read_json(root / INFO, "LeRobot dataset")
     version = str(info["codebase_version"])
     features = info["features"]
     if not version.startswith(("v2.", "v3.")):
@@ -114,7 +120,7 @@ def _info(root: Path) -> dict[str, Any]:
     return info
 
 
-def _camera_key(root: Path, info: Mapping[str, Any], wanted: str | None) -> str:
+def _camera_key(root: Path, info: Info, wanted: str | None) -> str:
     keys = []
     for key, feature in info["features"].items():
         # Stated in `info`, in older versions under other names.
@@ -169,7 +175,7 @@ def _rows(root: Path, column: str) -> tuple[list[_Row], Array]:
 
 
 def _images(
-    root: Path, info: Mapping[str, Any], key: str, rows: Sequence[_Row]
+    root: Path, info: Info, key: str, rows: Sequence[_Row]
 ) -> list[StoredImage]:
     if info["features"][key]["dtype"] == "image":
         return [_Embedded(root, key, row.file, row.row) for row in rows]
@@ -188,7 +194,7 @@ def _images(
 
 
 def _video_starts(
-    root: Path, info: Mapping[str, Any], key: str, episodes: set[int]
+    root: Path, info: Info, key: str, episodes: set[int]
 ) -> dict[int, tuple[Path, float]]:
     """By episode: its video, and the time in the video at which it starts."""
     video = functools.partial(_video, root, str(info["video_path"]), video_key=key)
@@ -253,7 +259,7 @@ class _Embedded(StoredImage):
             raise InputError(f"{self.path}: row {self.row} holds no image")
         return image
 
-    def file(self) -> tuple[str, bytes] | None:
+    def file(self) -> ImageFile | None:
         """The PNG or JPEG file as it is stored."""
         return image_file(self._content())
 

@@ -8,7 +8,7 @@ such as left_ee, if one feature holds left_ee.x and right_ee.x.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from evercal.errors import InputError
 from evercal.recordings.poses.conventions import (
@@ -23,6 +23,8 @@ from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import named_errors, refuse_repeated
 from evercal.typing import Array
 
+Info: TypeAlias = Mapping[str, Any]
+"""Content of info.json, or of a feature in it."""
 _STATE = "observation.state"
 """Feature of the joints."""
 _PARTS = {
@@ -32,7 +34,7 @@ _PARTS = {
 """Names of the numbers of a pose, by convention."""
 
 
-def pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> str:
+def pose_feature(root: Path, info: Info, options: ReadOptions) -> str:
     """Name of the feature with the poses, or with the joints where there is a URDF."""
     features = info["features"]
     if options.urdf is not None:
@@ -74,7 +76,7 @@ def pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> s
 
 def feature_poses(
     root: Path,
-    info: Mapping[str, Any],
+    info: Info,
     column: str,
     values: Array,
     options: ReadOptions,
@@ -162,7 +164,7 @@ def _of_arm(names: list[str], arm: str) -> list[str]:
     return [name if name.rpartition(".")[0] == arm else "" for name in names]
 
 
-def _names(info: Mapping[str, Any], column: str) -> list[str]:
+def _names(info: Info, column: str) -> list[str]:
     """Names of the numbers of a feature."""
     names = info["features"].get(column, {}).get("names") or []
     if isinstance(

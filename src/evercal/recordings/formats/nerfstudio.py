@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -38,19 +38,27 @@ from evercal.storage.text_files import (
 from evercal.typing import Array
 
 FILE = "transforms.json"
-# The first one there is read. ScanNet++ keeps undistorted images beside those of the fisheye lens.
+"""Usual name of the file."""
 _FILES = (
     "transforms_undistorted.json", FILE, "transforms_train.json",
     "nerfstudio/transforms_undistorted.json", f"nerfstudio/{FILE}",
     "dslr/nerfstudio/transforms_undistorted.json", f"dslr/nerfstudio/{FILE}",
 )  # fmt: skip
+"""Usual places; the first one is read. ScanNet++ keeps undistorted images beside those of the
+fisheye lens."""
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
-# OpenGL axes (right, up, backward) from OpenCV axes (right, down, forward).
+"""Camera models that are read."""
 _GL_FROM_CV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
+"""OpenGL axes (right, up, backward) from OpenCV axes (right, down, forward)."""
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Numbers of `distortion_params`, in this order."""
 _TOLERANCE = 1e-2
+"""Largest deviation of a stated matrix from a rotation."""
 USES = ("metres",)
+Entry: TypeAlias = Mapping[str, object]
+"""Values of the file."""
+Size: TypeAlias = tuple[int, int]
+"""Width and height, pixels."""
 
 
 def frame_note(file: str, metric: bool) -> str:
@@ -59,49 +67,51 @@ def frame_note(file: str, metric: bool) -> str:
         return f"the base frame is that of {file}; if it is not the robot's, run 'evercal align'"
     return (
         f"the base frame and the unit of length are those of {file}: run 'evercal align' after"
-        " learning, or give --metres if the poses are in metres"
+        " learning, or give `metres` if the poses are in metres"
     )
 
 
 def detect(root: Path) -> bool:
     """Whether `root` holds, or is, a transforms.json or a file of that kind."""
-    named = (
-        root.name.startswith("transforms") and root.suffix == ".json" and root.is_file()
-    )
-    return named or any((root / name).is_file() for name in _FILES)
+    if root.is_file():
+        return root.name.startswith("transforms") and root.suffix == ".json"
+    return any((root / name).is_file() for name in _FILES)
 
 
-def load(root: Path, options: ReadOptions | None = None) -> Recording:
+def load(root: Path, options: ReadOptions) -> Recording:
     """Read the poses and the size of one image of every camera; no other image is opened."""
-    metric = options is not None and options.metres
-    files = [root / name for name in _FILES if (root / name).is_file()] or [root / FILE]
-    file = root if root.is_file() else files[0]
+    file = root if root.is_file() else _file_in(root)
     frames, test, bad = _frames(file)
-    splits = (
-        ("val", "test")
-        if file.name == "transforms_train.json" and root.is_dir()
-        else ()
-    )
-    for other in filter(
-        Path.is_file, (root / f"transforms_{split}.json" for split in splits)
-    ):
-        more, _, left_out = _frames(other)
-        frames = [*frames, *more]
-        bad = bad + left_out
-        test |= {frame.name for frame in more}
+    if file.name == "transforms_train.json" and root.is_dir():
+        for split in ("val", "test"):
+            other = root / f"transforms_{split}.json"
+            if other.is_file():
+                more, _, more_bad = _frames(other)
+                frames += more
+                test.update(frame.name for frame in more)
+                bad += more_bad
     with named_errors(file, "nerfstudio file"):
-        refuse_repeated(
-            (frame.name for frame in frames), "keep one entry for each image"
-        )
-    notes = [f"{bad} frames are marked as bad and left out"] if bad else []
+        names = [frame.name for frame in frames]
+        refuse_repeated(names, "keep one entry for each image")
+    notes = [frame_note(file.name, options.metres)]
+    if bad:
+        notes.insert(0, f"{bad} frames are marked as bad and left out")
+    folder = root if root.is_dir() else file.parent
     return Recording(
-        (root if root.is_dir() else file.parent).resolve().name,
+        folder.resolve().name,
         tuple(frame for frame in frames if frame.name not in test),
         tuple(frame for frame in frames if frame.name in test),
         bad,
-        notes=(*notes, frame_note(file.name, metric)),
-        metric=metric,
+        notes=tuple(notes),
+        metric=options.metres,
     )
+
+
+def _file_in(root: Path) -> Path:
+    for name in _FILES:
+        if (root / name).is_file():
+            return root / name
+    return root / FILE
 
 
 def _frames(file: Path) -> tuple[list[Frame], set[str], int]:
@@ -116,31 +126,37 @@ def _frames(file: Path) -> tuple[list[Frame], set[str], int]:
         root = file.parent
         first = entries[0]
         if isinstance(first, dict) and "file_path" in first:
-            kind = "undistorted_images" if "undistorted" in file.name else "images"
-            folders = (root, root.parent / kind, root.parent / f"resized_{kind}")
-            name = str(first["file_path"])
-            root = next(
-                (each for each in folders if _image(each, name).is_file()), root
-            )
+            root = _image_root(file, str(first["file_path"]))
             # Without a stated image size, that of the first image is taken.
-            if not {"w", "h"} & {*data, *first}:
-                names = [
-                    each.get("file_path") for each in entries if isinstance(each, dict)
-                ]
-                width, height = first_size([_image(root, str(each)) for each in names])
+            if {"w", "h"}.isdisjoint([*data, *first]):
+                stated = [entry for entry in entries if isinstance(entry, dict)]
+                images = [_image(root, str(each.get("file_path"))) for each in stated]
+                width, height = first_size(images)
                 data |= {"w": width, "h": height}
-        every = [*entries, *tested]
         frames = []
-        bad = [isinstance(each, dict) and bool(each.get("is_bad")) for each in every]
-        for i, entry in ((i, entry) for i, entry in enumerate(every) if not bad[i]):
+        bad = 0
+        for i, entry in enumerate([*entries, *tested]):
+            if isinstance(entry, dict) and entry.get("is_bad"):
+                bad += 1
+                continue
             with naming(f"frame {i}"):
                 frames.append(_frame(root, data, entry, undo, scale))
-        names = [str(each.get("file_path")) for each in every]
-        test = _test_names(root, data, names) | {*names[len(entries) :]}
-    return _resized(file, frames), test, sum(bad)
+        names = [str(entry.get("file_path")) for entry in (*entries, *tested)]
+        test = _test_names(root, data, names).union(names[len(entries) :])
+    return _resized(file, frames), test, bad
 
 
-def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
+def _image_root(file: Path, name: str) -> Path:
+    """Folder that the names of images are relative to, judged by one of them."""
+    root = file.parent
+    kind = "undistorted_images" if "undistorted" in file.name else "images"
+    for folder in (root, root.parent / kind, root.parent / f"resized_{kind}"):
+        if _image(folder, name).is_file():
+            return folder
+    return root
+
+
+def _applied(data: Entry) -> tuple[SE3, float]:
     scale = _number(data, "applied_scale", 1.0)
     if not scale > 0:
         raise ValueError(f"'applied_scale' is > 0, got {scale}")
@@ -154,9 +170,7 @@ def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
         return SE3.from_matrix(matrix / size, _TOLERANCE).inverse(), scale * size
 
 
-def _frame(
-    root: Path, data: Mapping[str, object], entry: object, undo: SE3, scale: float
-) -> Frame:
+def _frame(root: Path, data: Entry, entry: object, undo: SE3, scale: float) -> Frame:
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise ValueError("an object with 'file_path' and 'transform_matrix'")
     name = entry["file_path"]
@@ -170,14 +184,15 @@ def _frame(
 
 def _image(root: Path, name: str) -> Path:
     image = root / PureWindowsPath(name).as_posix()
-    if image.suffix.lower() in IMAGE_ENDINGS:
-        return image
-    return next(
-        (f for e in IMAGE_ENDINGS if (f := Path(f"{image}{e}")).is_file()), image
-    )
+    if image.suffix.lower() not in IMAGE_ENDINGS:
+        for ending in IMAGE_ENDINGS:
+            file = Path(f"{image}{ending}")
+            if file.is_file():
+                return file
+    return image
 
 
-def _camera(data: Mapping[str, object]) -> Camera:
+def _camera(data: Entry) -> Camera:
     model = data.get("camera_model", "OPENCV")
     if model not in _MODELS:
         raise ValueError(
@@ -185,17 +200,13 @@ def _camera(data: Mapping[str, object]) -> Camera:
             f" images first (for COLMAP: colmap image_undistorter)"
         )
     fisheye = model == "OPENCV_FISHEYE" or bool(data.get("is_fisheye"))
-    own = [_number(data, key, 0.0) for key in _LENS]
-    lens = number_array(
-        data.get("distortion_params", own), "'distortion_params'"
-    ).tolist()
-    none = [4, 5] if fisheye else [3]
-    if (
-        len(lens) != len(own)
-        or any(lens[i] for i in none)
-        or (any(own) and lens != own)
-    ):
-        zeros = " and ".join(_LENS[i] for i in none)
+    numbers = [_number(data, key, 0.0) for key in _LENS]
+    stated = data.get("distortion_params", numbers)
+    lens = number_array(stated, "'distortion_params'").tolist()
+    unused = (4, 5) if fisheye else (3,)
+    differs = any(numbers) and lens != numbers
+    if differs or len(lens) != len(_LENS) or any(lens[i] for i in unused):
+        zeros = " and ".join(_LENS[i] for i in unused)
         raise ValueError(
             f"distortion is {', '.join(_LENS)}, with {zeros} 0 for {model}, also as"
             f" 'distortion_params', got {lens}"
@@ -204,28 +215,32 @@ def _camera(data: Mapping[str, object]) -> Camera:
     height = _number(data, "h")
     fx = _focal(data, "x", width)
     fy = _focal(data, "y", height)
-    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if fx is None:
+        fx = fy
+    if fy is None:
+        fy = fx
     if fx is None or fy is None:
         raise ValueError("'fl_x' is missing, and so are 'fl_y' and 'camera_angle_x'")
     # Half a pixel: the file counts from the image's corner.
     cx = _number(data, "cx", width / 2) - 0.5
     cy = _number(data, "cy", height / 2) - 0.5
-    distortion = tuple(lens[i] for i in ((0, 1, 2, 3) if fisheye else (0, 1, 4, 5, 2)))
-    size: Any = width, height  # whole numbers, checked when constructed
+    k1, k2, k3, k4, p1, p2 = lens
+    size: Any = (width, height)  # whole numbers, checked when constructed
     kind = "fisheye" if fisheye else "pinhole"
+    distortion = (k1, k2, k3, k4) if fisheye else (k1, k2, p1, p2, k3)
     return Camera(size[0], size[1], fx, fy, cx, cy, distortion, kind)
 
 
-def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
-    if data.get(f"fl_{axis}") is not None:
-        return _number(data, f"fl_{axis}")
-    if data.get(f"camera_angle_{axis}") is None:
+def _focal(data: Entry, axis: str, size: float) -> float | None:
+    focal = f"fl_{axis}"
+    if data.get(focal) is not None:
+        return _number(data, focal)
+    name = f"camera_angle_{axis}"
+    if data.get(name) is None:
         return None
-    angle = _number(data, f"camera_angle_{axis}")
+    angle = _number(data, name)
     if not 0 < angle < math.pi:
-        raise ValueError(
-            f"'camera_angle_{axis}' is between 0 and pi radians, got {angle}"
-        )
+        raise ValueError(f"{name!r} is between 0 and pi radians, got {angle}")
     return size / 2 / math.tan(angle / 2)
 
 
@@ -236,44 +251,53 @@ def _resized(file: Path, frames: list[Frame]) -> list[Frame]:
     nerfstudio, unless only their EXIF orientation gives them the stated shape. Rotated and cropped
     images are refused.
     """
-    taken: dict[tuple[int, int], tuple[tuple[int, int], Any]] = {}
+    readers: dict[Size, tuple[Size, Any]] = {}
     resized = []
     for frame in frames:
-        stated = frame.camera.width, frame.camera.height
+        camera = frame.camera
+        stated = (camera.width, camera.height)
         assert isinstance(frame.image, Path)
-        if stated not in taken and is_readable(frame.image):
-            ways = [(image_size(way(frame.image)), way) for way in (as_stored, Path)]
-            apart = [abs(w / h / (stated[0] / stated[1]) - 1) for (w, h), _ in ways]
-            size, _ = taken[stated] = ways[apart.index(min(apart))]
-            if min(apart) > 0.01:
-                rotated = "the image was rotated after the intrinsics were written"
-                raise InputError(
-                    f"{frame.image}: is {size[0]}x{size[1]}, {file.name} says"
-                    f" {stated[0]}x{stated[1]} ({rotated if size == stated[::-1] else 'cropped?'});"
-                    f" give images of that shape"
-                )
-        size, way = taken.get(stated, (stated, Path))
-        camera = frame.camera if size == stated else frame.camera.resized(*size)
-        resized.append(replace(frame, image=way(frame.image), camera=camera))
+        if stated not in readers and is_readable(frame.image):
+            readers[stated] = _reader(frame.image, stated, file.name)
+        size, read = readers.get(stated, (stated, Path))
+        if size != stated:
+            camera = camera.resized(*size)
+        resized.append(replace(frame, image=read(frame.image), camera=camera))
     return resized
 
 
-def _test_names(root: Path, data: Mapping[str, object], frames: list[str]) -> set[str]:
+def _reader(image: Path, stated: Size, source: str) -> tuple[Size, Any]:
+    """Size of an image and how it is read, as stored or turned: whichever has the stated shape."""
+    sizes = [(image_size(read(image)), read) for read in (as_stored, Path)]
+    deviations = [abs(w / h / (stated[0] / stated[1]) - 1) for (w, h), _ in sizes]
+    least = min(deviations)
+    size, read = sizes[deviations.index(least)]
+    if least > 0.01:
+        reason = "cropped?"
+        if size == stated[::-1]:
+            reason = "the image was rotated after the intrinsics were written"
+        raise InputError(
+            f"{image}: is {size[0]}x{size[1]}, {source} says {stated[0]}x{stated[1]} ({reason});"
+            f" give images of that shape"
+        )
+    return size, read
+
+
+def _test_names(root: Path, data: Entry, frames: list[str]) -> set[str]:
     name_of = {_image(root, name): name for name in frames}
     test = set()
     for key in ("val_filenames", "test_filenames"):
         names = data.get(key, [])
-        if not isinstance(names, list) or not all(
-            isinstance(name, str) for name in names
-        ):
+        if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
             raise ValueError(f"{key!r} is a list of file names")
-        # A test frame under another name would be learned from.
-        other = [name for name in names if _image(root, name) not in name_of]
-        if other:
-            raise ValueError(
-                f"{key!r} names {other[0]!r}, which is no frame; correct the name"
-            )
-        test |= {name_of[_image(root, name)] for name in names}
+        for name in names:
+            image = _image(root, name)
+            # A test frame under another name would be learned from.
+            if image not in name_of:
+                raise ValueError(
+                    f"{key!r} names {name!r}, which is no frame; correct the name"
+                )
+            test.add(name_of[image])
     return test
 
 
@@ -284,9 +308,7 @@ def _matrix(value: object, name: str) -> Array:
     return matrix
 
 
-def _number(
-    data: Mapping[str, object], name: str, default: float | None = None
-) -> float:
+def _number(data: Entry, name: str, default: float | None = None) -> float:
     value: Any = data.get(name, default)
     if not is_real(value) or not math.isfinite(value):
         what = "is missing" if value is None else f"is a number, got {value!r}"

@@ -32,6 +32,7 @@ from evercal.recordings.formats.bags.file import (
 from evercal.recordings.formats.bags.poses import plain_name, poses_at_images
 from evercal.recordings.frame import Frame, Recording, lost_images
 from evercal.recordings.images import (
+    ImageFile,
     StoredImage,
     as_rgb,
     decode_image,
@@ -43,8 +44,6 @@ from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import named_errors
 from evercal.typing import Image
 
-# Encoding: bytes of a channel, channels, and OpenCV's COLOR_... constant if `as_rgb` needs it. ROS
-# names a Bayer pattern by its first two pixels and OpenCV by its second row.
 _ENCODINGS: dict[str, tuple[int, int, str | None]] = {
     "rgb8": (1, 3, None), "bgr8": (1, 3, "BGR2RGB"), "8UC3": (1, 3, "BGR2RGB"),
     "rgba8": (1, 4, None), "bgra8": (1, 4, "BGRA2RGB"), "8UC4": (1, 4, "BGRA2RGB"),
@@ -55,6 +54,8 @@ _ENCODINGS: dict[str, tuple[int, int, str | None]] = {
     "yuv422": (1, 2, "YUV2RGB_UYVY"), "uyvy": (1, 2, "YUV2RGB_UYVY"),
     "yuv422_yuy2": (1, 2, "YUV2RGB_YUY2"), "yuyv": (1, 2, "YUV2RGB_YUY2"),
 }  # fmt: skip
+"""Bytes of a channel, number of channels, and OpenCV's COLOR_... constant if `as_rgb` needs it. ROS
+names a Bayer pattern by its first two pixels and OpenCV by its second row."""
 USES = ("camera", "image_topic", "pose_topic", "base_frame", "gripper_frame", "urdf")
 
 
@@ -63,9 +64,8 @@ def detect(root: Path) -> bool:
     return is_bag(root)
 
 
-def load(root: Path, options: ReadOptions | None = None) -> Recording:
+def load(root: Path, options: ReadOptions) -> Recording:
     """Read stamps, intrinsics and poses; only the first image is decoded."""
-    options = options or ReadOptions()
     bag = BagFile(root)
     topic = _image_topic(bag, options.image_topic)
     shots, notes = _shots(bag, topic)
@@ -78,24 +78,20 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     poses = poses_at_images(bag, stamps, shots[0].frame_id, options)
     frames = []
     for i in np.flatnonzero(poses.valid).tolist():
-        pose = poses.stated.poses[i]
         joints = poses.stated.joints_of(i)
-        of_camera, of_gripper = (pose, None) if poses.of_camera else (None, pose)
-        name = f"{i:06d}"
-        frames.append(
-            Frame(name, shots[i], camera, of_camera, of_gripper, joints_rad=joints)
-        )
+        frame = Frame(f"{i:06d}", shots[i], camera, None, joints_rad=joints)
+        pose = {f"base_from_{poses.owner}": poses.stated.poses[i]}
+        frames.append(replace(frame, **pose))
     lost = len(shots) - len(frames)
     if lost:
         notes.append(
             f"{lost} of {len(shots)} images were taken outside the recorded poses or in a gap of"
             f" more than {MAX_GAP_S:g} s in which the gripper moved"
         )
-    notes = [*notes, *poses.notes]
+    notes += poses.notes
     arm = poses.stated.arm
-    return Recording(
-        root.resolve().stem, tuple(frames), (), lost, notes=tuple(notes), arm=arm
-    )
+    name = root.resolve().stem
+    return Recording(name, tuple(frames), (), lost, notes=tuple(notes), arm=arm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,18 +107,26 @@ class BagImage(StoredImage):
 
     def read(self) -> Image:
         """Decode the message, see `StoredImage.read`."""
-        is_compressed = self.bag.kinds[self.topic] == COMPRESSED
-        message = self.bag.message(self.topic, self.logged_ns, self.repeat)
+        message = self._message()
         with named_errors(f"{self.bag.path}: topic {self.topic}", "image"):
-            return (compressed_image_of if is_compressed else image_of)(message.content)
+            if self._is_compressed:
+                return compressed_image_of(message)
+            return image_of(message)
 
-    def file(self) -> tuple[str, bytes] | None:
+    def file(self) -> ImageFile | None:
         """JPEG or PNG of a compressed image; None for other messages."""
-        if self.bag.kinds[self.topic] != COMPRESSED:
-            return None
-        message = self.bag.message(self.topic, self.logged_ns, self.repeat)
-        is_mosaic = "bayer" in message.content.format
-        return None if is_mosaic else image_file(bytes(message.content.data))
+        if self._is_compressed:
+            message = self._message()
+            if "bayer" not in message.format:
+                return image_file(bytes(message.data))
+        return None
+
+    @property
+    def _is_compressed(self) -> bool:
+        return self.bag.kinds[self.topic] == COMPRESSED
+
+    def _message(self) -> Any:
+        return self.bag.message(self.topic, self.logged_ns, self.repeat).content
 
 
 def _image_topic(bag: BagFile, wanted: str | None) -> str:
@@ -138,41 +142,31 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
     reasons: dict[str, str | None] = {}
     for topic in topics:
         first = bag.first(topic)
-        of_pixels = bag.kinds[topic] == IMAGE
-        reasons[topic] = unsupported(
-            first.encoding if of_pixels else _pixels_in(first.format)
-        )
+        if bag.kinds[topic] == IMAGE:
+            reasons[topic] = unsupported(first.encoding)
+        else:
+            reasons[topic] = unsupported(_pixels_in(first.format))
     pictures = [topic for topic, reason in reasons.items() if reason is None]
-    if len(pictures) != 1:
-        refused = "; ".join(f"{t}: {reason}" for t, reason in reasons.items() if reason)
-        what = (
-            f"images on {len(pictures)} topics"
-            if pictures
-            else f"no pictures ({refused})"
-        )
-        raise InputError(
-            f"{bag.path}: {what}; give --image-topic: {', '.join(pictures or topics)}"
-        )
-    return pictures[0]
+    if len(pictures) == 1:
+        return pictures[0]
+    what = f"images on {len(pictures)} topics"
+    if not pictures:
+        refused = "; ".join(f"{topic}: {reason}" for topic, reason in reasons.items())
+        what = f"no pictures ({refused})"
+    names = ", ".join(pictures or topics)
+    raise InputError(f"{bag.path}: {what}; give `image_topic`: {names}")
 
 
 def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
     shots = []
     bad = []
     for message in bag.messages([topic]):
-        frame_id = plain_name(message.content.header.frame_id)
-        if bag.kinds[topic] == COMPRESSED and not is_readable(message.content.data):
+        content = message.content
+        if bag.kinds[topic] == COMPRESSED and not is_readable(content.data):
             bad.append(len(shots))
-        shots.append(
-            BagImage(
-                bag,
-                topic,
-                message.logged_ns,
-                message.repeat,
-                message.stamp_ns,
-                frame_id,
-            )
-        )
+        moment = (message.logged_ns, message.repeat, message.stamp_ns)
+        frame_id = plain_name(content.header.frame_id)
+        shots.append(BagImage(bag, topic, *moment, frame_id))
     notes = []
     if 0 < 2 * len(bad) <= len(shots):  # else the first one is refused with its format
         notes = [lost_images([f"message {i}" for i in bad], len(shots))]
@@ -196,38 +190,41 @@ def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> Camera
     if beside not in topics:
         raise InputError(
             f"{bag.path}: no camera_info for {image_topic} ({beside} is expected, there is"
-            f" {' and '.join(topics) or 'none'}); record it, or give the intrinsics with --camera"
+            f" {' and '.join(topics) or 'none'}); record it, or give the intrinsics with `camera`"
         )
     message = bag.first(beside)
     with named_errors(f"{bag.path}: {beside}", "camera_info"):
-        camera = _camera(
-            message, size, image.rpartition("/")[2].startswith("image_rect")
-        )
+        is_rectified = image.rpartition("/")[2].startswith("image_rect")
+        camera = _camera(message, size, is_rectified)
     check_size(f"{bag.path}: {beside}", camera, size, image_topic)
     return camera
 
 
 def _camera(message: Any, image_size: tuple[int, int], rectified: bool) -> Camera:
-    # ROS 1 writes K, D and P, ROS 2 k, d and p.
-    k, d, p = (
-        np.asarray(getattr(message, name, getattr(message, name.upper(), [])))
-        .reshape(-1)
-        .tolist()
-        for name in ("k", "d", "p")
-    )
+    k = _numbers(message, "k")
     if not any(k):
-        raise ValueError("K is all zeros: the camera is not calibrated; give --camera")
-    data = {"k": k, "d": d, "distortion_model": message.distortion_model}
+        raise ValueError("K is all zeros: the camera is not calibrated; give `camera`")
+    d = _numbers(message, "d")
+    model = message.distortion_model
     if rectified:
+        p = _numbers(message, "p")
         if len(p) != 12 or not any(p):
-            raise ValueError("P is missing, which rectified images need; give --camera")
-        data = {"k": [*p[:3], *p[4:7], *p[8:11]], "d": [], "distortion_model": ""}
-    data["roi"] = {
-        name: int(getattr(message.roi, name)) for name in ("x_offset", "y_offset")
-    }
-    sizes = ("width", "height", "binning_x", "binning_y")
-    data |= {name: int(getattr(message, name)) for name in sizes}
+            raise ValueError("P is missing, which rectified images need; give `camera`")
+        k = [*p[:3], *p[4:7], *p[8:11]]
+        d = []
+        model = ""
+    data: dict[str, Any] = {"k": k, "d": d, "distortion_model": model}
+    for name in ("width", "height", "binning_x", "binning_y"):
+        data[name] = int(getattr(message, name))
+    roi = message.roi
+    data["roi"] = {"x_offset": int(roi.x_offset), "y_offset": int(roi.y_offset)}
     return camera_from_fields(data, image_size)
+
+
+def _numbers(message: Any, name: str) -> list[float]:
+    # ROS 1 writes K, D and P, ROS 2 k, d and p.
+    values = getattr(message, name, getattr(message, name.upper(), []))
+    return np.asarray(values).reshape(-1).tolist()
 
 
 def unsupported(encoding: str) -> str | None:
@@ -274,15 +271,17 @@ def _rgb(pixels: NDArray[Any], encoding: str) -> Image:
 def compressed_image_of(message: Any) -> Image:
     """Decode a sensor_msgs/CompressedImage with a PNG or JPEG to (H, W, 3) uint8 RGB."""
     encoding = _pixels_in(message.format)
-    if (reason := unsupported(encoding)) is not None:
+    reason = unsupported(encoding)
+    if reason is not None:
         raise ValueError(f"format {message.format!r}: {reason}")
     image = decode_image(np.asarray(message.data, dtype=np.uint8))
     if image is None:
         what = f"format {message.format!r} is not supported or broken"
         raise ValueError(f"{what}; let 'image_transport republish' write jpeg or png")
     # JPEG of ROS 2 is converted without saying so.
-    is_mosaic = encoding.startswith("bayer") and (image == image[..., :1]).all()
-    return _rgb(image[..., :1], encoding) if is_mosaic else image
+    if encoding.startswith("bayer") and (image == image[..., :1]).all():
+        return _rgb(image[..., :1], encoding)
+    return image
 
 
 def _pixels_in(form: str) -> str:
@@ -291,12 +290,10 @@ def _pixels_in(form: str) -> str:
     The format is `jpeg`, or `bayer_rggb8; jpeg compressed bgr8`: the encoding before compression
     and, if the publisher converted it, the one after. Without the latter a mosaic is still one.
     """
-    before, _, how = form.partition(";")
-    converted = not how or how.partition("compressed")[2].strip()
-    return (
-        "16UC1"
-        if "compressedDepth" in form
-        else "rgb8"
-        if converted
-        else before.strip()
-    )
+    if "compressedDepth" in form:
+        return "16UC1"
+    before, _, compression = form.partition(";")
+    converted = compression.partition("compressed")[2].strip()
+    if converted or not compression:
+        return "rgb8"
+    return before.strip()

@@ -20,42 +20,46 @@ from evercal.storage.text_files import named_errors, read_text, refuse_repeated
 from evercal.typing import Array
 
 _SPLITS = ("TrainSplit.txt", "TestSplit.txt")
+"""Files that list sequences."""
 _FOCAL_AT_640 = 525.0
-# Poses printed with few digits, or chained in float32, deviate this much from a rotation.
+"""Focal length at 640x480, pixels."""
 _ROTATION_TOLERANCE = 1e-2
+"""Largest deviation of a pose from a rotation: poses are printed with few digits, or chained in
+float32."""
 
 
 def detect(root: Path) -> bool:
     """Whether `root` looks like this format, even if it is damaged."""
     if not root.is_dir():
         return False
-    return any((root / split).is_file() for split in _SPLITS) or any(
-        root.glob("seq-*/")
-    )
+    has_split = any((root / split).is_file() for split in _SPLITS)
+    return has_split or any(root.glob("seq-*/"))
 
 
 def load(root: Path) -> Recording:
     """Read split files and poses, and the size of one image; no other image is opened."""
-    splits = [_sequences(root, name) for name in _SPLITS]
-    shared = sorted(
-        {folder.name for folder in splits[0]} & {folder.name for folder in splits[1]}
-    )
+    train_folders, test_folders = (_sequences(root, name) for name in _SPLITS)
+    shared = {*train_folders}.intersection(test_folders)
     if shared:
         raise InputError(
-            f"{root}: {shared[0]} is in both {_SPLITS[0]} and {_SPLITS[1]}; keep one"
+            f"{root}: {min(shared).name} is in both {_SPLITS[0]} and {_SPLITS[1]}; keep one"
         )
-    images = [
-        [image for folder in folders for image in colour_images(folder)]
-        for folders in splits
-    ]
-    if not (images[0] or images[1]):
+    train_images = _images(train_folders)
+    test_images = _images(test_folders)
+    images = train_images + test_images
+    if not images:
         raise InputError(
             f"{root}: {_SPLITS[0]} and {_SPLITS[1]} are empty; name a sequence in one"
         )
-    camera = _camera(root, images[0] + images[1])
-    train, test = (tracked_frames(split, camera, folders=True) for split in images)
-    untracked = len(images[0]) + len(images[1]) - len(train) - len(test)
+    camera = _camera(root, images)
+    train = tracked_frames(train_images, camera, folders=True)
+    test = tracked_frames(test_images, camera, folders=True)
+    untracked = len(images) - len(train) - len(test)
     return Recording(root.resolve().name, train, test, untracked)
+
+
+def _images(folders: Sequence[Path]) -> list[Path]:
+    return [image for folder in folders for image in colour_images(folder)]
 
 
 def _sequences(root: Path, split: str) -> list[Path]:
@@ -98,9 +102,8 @@ def colour_images(folder: Path) -> list[Path]:
             f"{folder}: no images; expected frame-XXXXXX.color.png or .jpg"
         )
     with named_errors(folder, "images"):
-        refuse_repeated(
-            [_frame_name(i.name) for i in images], "keep its .png or its .jpg"
-        )
+        names = [_frame_name(image.name) for image in images]
+        refuse_repeated(names, "keep its .png or its .jpg")
     return images
 
 
@@ -123,7 +126,8 @@ def tracked_frames(
         if np.isfinite(matrix).all():
             with named_errors(file, "pose"):
                 pose = SE3.from_matrix(matrix, _ROTATION_TOLERANCE)
-            name = f"{image.parent.name}/{name}" if folders else name
+            if folders:
+                name = f"{image.parent.name}/{name}"
             frames.append(Frame(name, image, camera, pose))
     return tuple(frames)
 
@@ -132,12 +136,10 @@ def read_numbers(file: Path, count: int, what: str) -> Array:
     """Read the `count` numbers of a matrix from a small text file."""
     # float() on the words: np.loadtxt takes longer per file than reading the file.
     # Windows prints -1.#INF, 1.#QNAN and -nan(ind).
-    words = [
-        "nan" if {*w} & {*"#("} else w
-        for w in read_text(file, f"{what} matrix").split()
-    ]
+    text = re.sub(r"\S*[#(]\S*", "nan", read_text(file, f"{what} matrix"))
+    words = text.split()
     if len(words) != count or not all(map(is_number, words)):
         raise InputError(
             f"{file}: expected a {what} matrix of {count} numbers, got {len(words)}"
         )
-    return np.array([float(word) for word in words])
+    return np.array([*map(float, words)])

@@ -26,12 +26,10 @@ def load(root: Path) -> Recording:
     images = colour_images(root / "data")
     split = _test_count(root, len(images))
     camera = _camera(root, images)
-    train, test = (
-        tracked_frames(part, camera) for part in (images[split:], images[:split])
-    )
-    return Recording(
-        root.resolve().name, train, test, len(images) - len(train) - len(test)
-    )
+    train = tracked_frames(images[split:], camera)
+    test = tracked_frames(images[:split], camera)
+    untracked = len(images) - len(train) - len(test)
+    return Recording(root.resolve().name, train, test, untracked)
 
 
 def _test_count(root: Path, frames: int) -> int:
@@ -50,11 +48,13 @@ def _test_count(root: Path, frames: int) -> int:
 def _camera(root: Path, images: list[Path]) -> Camera:
     file = root / "info.txt"
     text = read_text(file, "calibration", "it holds m_calibrationColorIntrinsic")
-    lines = (line.partition("=") for line in text.splitlines())
-    values = {name.strip(): value for name, _, value in lines}
+    values = {}
+    for line in text.splitlines():
+        name, _, value = line.partition("=")
+        values[name.strip()] = value.split()
     keys = ("m_colorWidth", "m_colorHeight", "m_calibrationColorIntrinsic")
     with library_errors(f"{file}: needs {', '.join(keys)}"):
-        width, height, matrix = (values[key].split() for key in keys)
+        width, height, matrix = map(values.__getitem__, keys)
         fx, _, cx, _, _, fy, cy, *_ = map(float, matrix)
         camera = Camera(int(*width), int(*height), fx, fy, cx, cy)
     return camera.resized(*first_size(images))

@@ -13,8 +13,9 @@ from evercal.recordings.images import StoredImage
 from evercal.typing import Image
 
 _MOST_OPEN = 4
-# Within this time ahead, decoding frame by frame is cheaper than seeking.
+"""Maximum number of open videos."""
 _READ_AHEAD_S = 1.0
+"""Within this time ahead, decoding frame by frame is cheaper than seeking, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +51,9 @@ class _Open:
             self.last = next(self.frames, None)
             if self.last is None:
                 return None
-        return (
-            self.last.to_ndarray(format="rgb24")
-            if self.last.time <= seconds + half
-            else None
-        )
+        if self.last.time > seconds + half:
+            return None
+        return self.last.to_ndarray(format="rgb24")
 
 
 class Videos:

@@ -35,7 +35,7 @@ from evercal.storage.text_files import named_errors, read_json, refuse_repeated
 USES = ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention")
 
 
-class Layout(NamedTuple):
+class RecordingLayout(NamedTuple):
     """Paths in a recording of camera poses."""
 
     poses: str
@@ -48,31 +48,43 @@ class Layout(NamedTuple):
     """Convention of the poses, if they do not define it."""
 
 
-# EuRoC.
 LAYOUTS = (
-    Layout("groundtruth.txt", "rgb", convention="tum:m"),  # TUM RGB-D
+    RecordingLayout("groundtruth.txt", "rgb", convention="tum:m"),  # TUM RGB-D
     # ScanNet's SensReader, and ACE with the same in test.
-    Layout("pose", "color", "intrinsic/intrinsic_color.txt", "matrix:m"),
-    Layout("train/poses", "train/rgb", "train/calibration", "matrix:m"),
-    Layout("metadata", "rgb", "metadata"),  # Record3D
-    Layout("metadata.json", "rgb", "metadata.json"),
-    Layout("state_groundtruth_estimate0/data.csv", "cam0/data", "cam0/sensor.yaml"),
-    Layout(
+    RecordingLayout("pose", "color", "intrinsic/intrinsic_color.txt", "matrix:m"),
+    RecordingLayout("train/poses", "train/rgb", "train/calibration", "matrix:m"),
+    # Record3D.
+    RecordingLayout("metadata", "rgb", "metadata"),
+    RecordingLayout("metadata.json", "rgb", "metadata.json"),
+    # EuRoC.
+    RecordingLayout(
+        "state_groundtruth_estimate0/data.csv", "cam0/data", "cam0/sensor.yaml"
+    ),
+    RecordingLayout(
         "mav0/state_groundtruth_estimate0/data.csv",
         "mav0/cam0/data",
         "mav0/cam0/sensor.yaml",
     ),
 )
+"""Recordings of other programs."""
 _POSES = tuple(f"base_from_gripper{ending}" for ending in POSE_ENDINGS)
+"""Files of gripper poses."""
 _CAMERA_POSES = tuple(f"base_from_camera{ending}" for ending in POSE_ENDINGS)
+"""Files of camera poses."""
+_ONE_POSE = "base_from_camera.txt"
+"""File of camera poses, or of the one pose of a fixed camera."""
 _JOINTS = ("joints.csv", "joints.json")
+"""Files of joint angles."""
 _CAMERAS = tuple(
     f"{stem}.{ending}"
     for stem in ("camera", "camera_info")
     for ending in ("json", "yaml", "yml", "xml", "npz", "txt")
 )
+"""Files of intrinsics."""
 _FOLDERS = (".", "images", "rgb")
+"""Folders of images."""
 _RECORD3D = pose_convention("xyzw:opengl")
+"""Convention of Record3D, after its numbers are rolled."""
 
 
 def detect(root: Path) -> bool:
@@ -80,9 +92,8 @@ def detect(root: Path) -> bool:
     return root.is_dir() and bool(_layouts(root))
 
 
-def load(root: Path, options: ReadOptions | None = None) -> Recording:
+def load(root: Path, options: ReadOptions) -> Recording:
     """Read poses, intrinsics and sizes of images; no image is opened whole."""
-    options = options or ReadOptions()
     layouts = _layouts(root)
     if not layouts:
         expected = ", ".join(_POSES + _JOINTS + _CAMERA_POSES)
@@ -92,33 +103,40 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
         raise InputError(
             f"{root}: holds {names}; keep the one with the poses of the images"
         )
-    test = Layout._make(path and path.replace("train/", "test/") for path in layouts[0])
-    split = dict.fromkeys((layouts[0], test))
-    read = [
-        _frames(root, part, options) for part in split if (root / part.poses).exists()
-    ]
-    train, test = (*(part.train for part in read), ())[:2]
-    notes = tuple(note for part in read for note in part.notes)
-    return replace(
-        read[0],
-        train=train,
-        test=test,
-        untracked=sum(p.untracked for p in read),
-        notes=notes,
+    layout = layouts[0]
+    train = _frames(root, layout, options)
+    test_layout = layout._replace(
+        poses=layout.poses.replace("train/", "test/"),
+        images=layout.images.replace("train/", "test/"),
+        camera=layout.camera.replace("train/", "test/"),
     )
+    if test_layout == layout or not (root / test_layout.poses).exists():
+        return train
+    test = _frames(root, test_layout, options)
+    notes = train.notes + test.notes
+    untracked = train.untracked + test.untracked
+    return replace(train, test=test.train, untracked=untracked, notes=notes)
 
 
-def _layouts(root: Path) -> list[Layout]:
-    tables = [Layout(name) for name in _POSES + _JOINTS if (root / name).is_file()]
-    for file in (root / name for name in _CAMERA_POSES if (root / name).is_file()):
-        # base_from_camera.txt may hold the one pose of a fixed camera.
-        if file.suffix != ".txt" or len(file.read_bytes().split()) > 16:
-            tables.append(Layout(file.name))
-    there = [each for each in LAYOUTS if (root / each.poses).exists()]
-    return tables or [each for each in there if (root / each.images).is_dir()]
+def _layouts(root: Path) -> list[RecordingLayout]:
+    tables = []
+    for name in _POSES + _JOINTS + _CAMERA_POSES:
+        file = root / name
+        if not file.is_file():
+            continue
+        is_one_pose = name == _ONE_POSE and len(file.read_bytes().split()) <= 16
+        if not is_one_pose:
+            tables.append(RecordingLayout(name))
+    if tables:
+        return tables
+    layouts = []
+    for layout in LAYOUTS:
+        if (root / layout.poses).exists() and (root / layout.images).is_dir():
+            layouts.append(layout)
+    return layouts
 
 
-def _frames(root: Path, layout: Layout, options: ReadOptions) -> Recording:
+def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Recording:
     """A recording of the frames with a pose, all for training."""
     images = _images(root, [layout.images] if layout.images else _FOLDERS)
     source = root / layout.poses
@@ -129,33 +147,27 @@ def _frames(root: Path, layout: Layout, options: ReadOptions) -> Recording:
     joints = pair_joints(images, rows, stamps, source)
     if file.name == "sensor.yaml":
         with named_errors(file, "camera file"):
-            numbers = camera_fields.numbers_of(
-                camera_file.fields_of(file).get("T_BS"), "T_BS", 16
-            )
+            stated = camera_file.fields_of(file).get("T_BS")
+            numbers = camera_fields.numbers_of(stated, "T_BS", 16)
             body_from_camera = SE3.from_matrix(np.reshape(numbers, (4, 4)))
         poses = [pose and pose @ body_from_camera for pose in poses]
-    own = file if layout.camera and file.exists() else None
-    cameras = _cameras(root, options.camera or own, images)
-    owner = (
-        "base_from_gripper" if layout.poses in _POSES + _JOINTS else "base_from_camera"
-    )
+    intrinsics = options.camera
+    if intrinsics is None and layout.camera and file.exists():
+        intrinsics = file
+    cameras = _cameras(root, intrinsics, images)
+    is_gripper = layout.poses in _POSES + _JOINTS
+    owner = "base_from_gripper" if is_gripper else "base_from_camera"
     split = layout.images.rpartition("rgb")[0]
-    frames = tuple(
-        replace(
-            Frame(split + image.name, image, camera, None),
-            **{owner: pose},
-            joints_rad=None if values is None else tuple(values.tolist()),
-        )
-        for image, camera, pose, values in zip(
-            images, cameras, poses, joints, strict=True
-        )
-        if pose is not None
-    )
+    frames = []
+    for image, camera, pose, values in zip(images, cameras, poses, joints, strict=True):
+        if pose is not None:
+            angles = None if values is None else tuple(values.tolist())
+            frame = Frame(split + image.name, image, camera, None, joints_rad=angles)
+            frames.append(replace(frame, **{owner: pose}))
     lost = len(images) - len(frames)
-    notes = [*notes, *more]
-    return Recording(
-        root.resolve().name, frames, (), lost, notes=tuple(notes), arm=rows.arm
-    )
+    name = root.resolve().name
+    notes = (*notes, *more)
+    return Recording(name, tuple(frames), (), lost, notes=notes, arm=rows.arm)
 
 
 def _rows(
@@ -171,20 +183,17 @@ def _rows(
             numbers = np.roll(number_array(numbers, "'poses'"), 3, axis=-1)
             names = tuple(map(str, range(len(numbers))))
             return RobotPoses(names, None, poses_from_numbers(numbers, _RECORD3D)), []
-    unused = [
-        n
-        for n in ("urdf", "base_frame", "gripper_frame")
-        if getattr(options, n) is not None
-    ]
-    if unused:
-        raise InputError(
-            f"`{unused[0]}`: {file} holds poses already; leave the option out, or give"
-            f" joint angles in joints.csv instead"
-        )
+    for option in ("urdf", "base_frame", "gripper_frame"):
+        if getattr(options, option) is not None:
+            raise InputError(
+                f"`{option}`: {file} holds poses already; leave the option out, or give"
+                f" joint angles in joints.csv instead"
+            )
     convention = options.pose_convention or convention
-    return read_robot_poses(
-        file, convention, what="file of poses", option="--pose-convention"
-    ), []
+    poses = read_robot_poses(
+        file, convention, what="file of poses", option="`pose_convention`"
+    )
+    return poses, []
 
 
 def _urdf(root: Path, joints: Path) -> Path:
@@ -192,14 +201,15 @@ def _urdf(root: Path, joints: Path) -> Path:
     if len(files) != 1:
         number = f"{len(files)} URDF files" if files else "no URDF"
         raise InputError(
-            f"{root}: {joints.name} needs a URDF, {number} is beside it; give --urdf"
+            f"{root}: {joints.name} needs a URDF, {number} is beside it; give `urdf`"
         )
     return files[0]
 
 
 def _images(root: Path, folders: Sequence[str]) -> list[Path]:
     for folder in folders:
-        if images := files_in(root / folder):
+        images = files_in(root / folder)
+        if images:
             return images
     where = " or in ".join("it" if folder == "." else folder for folder in folders)
     raise InputError(f"{root}: no images ({', '.join(IMAGE_ENDINGS)}) in {where}")
@@ -207,38 +217,49 @@ def _images(root: Path, folders: Sequence[str]) -> list[Path]:
 
 def _cameras(root: Path, file: Path | None, images: Sequence[Path]) -> list[Camera]:
     """Of each image, from a file for all or from a folder of one for each."""
-    if file is not None and file.is_dir():
-        files = files_in(file, (".txt",))
-        if not same_numbers(
-            [own.name for own in files], [image.name for image in images]
-        ):
-            raise InputError(
-                f"{file}: lacks the file of an image; give one for all with --camera"
-            )
-        return [
-            camera_file.read_camera_of_size(
-                own, first_size([image, *images]), image.name
-            )
-            for own, image in zip(files, images, strict=True)
-        ]
     if file is None:
-        names = [name for name in _CAMERAS if (root / name).is_file()]
-        if len(names) != 1:
-            files = f"{' and '.join(names)} in it" if names else "no camera file in it"
-            raise InputError(
-                f"{root}: {files}; name the file of the intrinsics with --camera (3x3 matrix, JSON,"
-                f" YAML, NPZ or OpenCV's storage), or put it there as camera.json, .yaml, .xml,"
-                f" .npz or .txt"
-            )
-        file = root / names[0]
+        file = _camera_beside(root)
+    if file.is_dir():
+        return _cameras_in(file, images)
     camera = camera_file.read_camera_of_size(file, first_size(images), images[0].name)
-    with named_errors(file, "camera file"):
-        fields = camera_file.fields_of(file) if file.name.startswith("metadata") else {}
-        each = fields.get("perFrameIntrinsicCoeffs") or []  # of Record3D
-        own = [
-            camera_file.camera_from_fields({**fields, "K": numbers}) for numbers in each
-        ]
-    return own if len(own) == len(images) else [camera] * len(images)
+    if file.name.startswith("metadata"):  # of Record3D
+        with named_errors(file, "camera file"):
+            fields = camera_file.fields_of(file)
+            matrices = fields.get("perFrameIntrinsicCoeffs") or []
+            cameras = [
+                camera_file.camera_from_fields({**fields, "K": matrix})
+                for matrix in matrices
+            ]
+            if len(cameras) == len(images):
+                return cameras
+    return [camera] * len(images)
+
+
+def _cameras_in(folder: Path, images: Sequence[Path]) -> list[Camera]:
+    files = files_in(folder, (".txt",))
+    if not same_numbers(
+        [file.name for file in files], [image.name for image in images]
+    ):
+        raise InputError(
+            f"{folder}: lacks the file of an image; give one for all with `camera`"
+        )
+    cameras = []
+    for file, image in zip(files, images, strict=True):
+        size = first_size([image, *images])
+        cameras.append(camera_file.read_camera_of_size(file, size, image.name))
+    return cameras
+
+
+def _camera_beside(root: Path) -> Path:
+    names = [name for name in _CAMERAS if (root / name).is_file()]
+    if len(names) == 1:
+        return root / names[0]
+    files = f"{' and '.join(names)} in it" if names else "no camera file in it"
+    raise InputError(
+        f"{root}: {files}; name the file of the intrinsics with `camera` (3x3 matrix, JSON,"
+        f" YAML, NPZ or OpenCV's storage), or put it there as camera.json, .yaml, .xml,"
+        f" .npz or .txt"
+    )
 
 
 def _stamps(root: Path) -> dict[str, float] | None:

@@ -85,7 +85,7 @@ def test_joint_states_with_a_urdf_replace_tf(tmp_path: Path) -> None:
         expected = SE3.exp([1, 0, 0, 0, 0, 0]) @ SE3.exp([0, 0, 0, 0, 0, at])
         assert max(pose_distance(frame.base_from_gripper, expected)) < 1e-7
     refused(
-        r"no tf in it.*give the robot's --urdf for /joint_states", load_recording, path
+        r"no tf in it.*give the robot's `urdf` for /joint_states", load_recording, path
     )
     urdf.write_text(urdf.read_text().replace('"turn"', '"wheel"'))
     with pytest.raises(
@@ -107,7 +107,7 @@ def test_joint_on_several_topics_needs_a_pose_topic(tmp_path: Path) -> None:
     bag.info("/cam/camera_info")
     assert (
         "joint turn is on several topics, /joint_states, /joint_states_desired; choose one with"
-        " --pose-topic"
+        " `pose_topic`"
     ) in refusal(bag, tmp_path, urdf=urdf)
     path = tmp_path / "wave"
     recording = load_recording(
@@ -161,20 +161,20 @@ def test_frame_on_several_topics_needs_a_pose_topic(tmp_path: Path) -> None:
 def test_ambiguous_frames_are_refused(tmp_path: Path) -> None:
     bag = recorded_bag("mcap")
     path = bag.write(tmp_path)
-    message = "--base-frame table: no such frame in tf; it has world, base_link"
+    message = "`base_frame` table: no such frame in tf; it has world, base_link"
     assert message in refusal_of(path, base_frame="table")
-    assert "--gripper-frame hand: no such frame" in refusal_of(
+    assert "`gripper_frame` hand: no such frame" in refusal_of(
         path, gripper_frame="hand"
     )
     bag.tf(0.0, "base_link", "base", SE3.identity(), static=True)
-    assert "--base-frame (it may be base_link or base); tf has" in refusal(
+    assert "`base_frame` (it may be base_link or base); tf has" in refusal(
         bag, tmp_path / "ur"
     )
     odd = Bag("mcap")
     odd.tf(0.0, "map", "phone", SE3.identity())
     odd.image(0.0, "/cam/image_raw", picture(0))
     odd.info("/cam/camera_info")
-    message = "--base-frame (no frame has a usual name); tf has map, phone"
+    message = "`base_frame` (no frame has a usual name); tf has map, phone"
     assert message in refusal(odd, tmp_path / "odd")
 
 

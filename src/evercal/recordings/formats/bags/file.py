@@ -12,6 +12,7 @@ from evercal.recordings.images import files_in
 from evercal.storage.text_files import few, library_errors
 
 _FILES = (".bag", ".mcap", ".db3")
+"""Endings of bags."""
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -22,7 +23,9 @@ _REMEDIES = {
     "Bag index looks damaged": "; repair it with 'rosbag reindex'",
     "Profile is not ros2": "; its messages are not ROS 2's, convert it or record with ros2 bag",
 }
+"""Remedies by words in the errors of rosbags."""
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+"""Types of transforms in ROS 2 and 1."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,6 @@ class Message:
     """One message of a bag."""
 
     topic: str
-    kind: str
     logged_ns: int
     """Time of recording, nanoseconds."""
     repeat: int
@@ -94,8 +96,8 @@ class BagFile:
     def contents(self) -> str:
         """List of the topics, for messages."""
         words = [
-            f"{t} ({kind.replace('/msg', '')})"
-            for t, kind in sorted(self.kinds.items())
+            f"{topic} ({kind.replace('/msg', '')})"
+            for topic, kind in sorted(self.kinds.items())
         ]
         return few(words, most=30) or "nothing"
 
@@ -140,11 +142,13 @@ class BagFile:
         last: dict[str, tuple[int, int]] = {}
         with library_errors(f"{self.path}: damaged", _REMEDIES):
             for link, stamp, data in self._reader.messages(links, start_ns, stop_ns):
-                before, repeat = last.get(link.topic, (None, -1))
-                repeat = repeat + 1 if before == stamp else 0
+                before, repeat = last.get(link.topic, (stamp, -1))
+                repeat += 1
+                if before != stamp:
+                    repeat = 0
                 last[link.topic] = (stamp, repeat)
                 content = self._reader.deserialize(data, link.msgtype)
-                yield Message(link.topic, link.msgtype, stamp, repeat, content)
+                yield Message(link.topic, stamp, repeat, content)
 
 
 def _nanoseconds(header: Any) -> int:
@@ -160,9 +164,8 @@ def _parts(path: Path) -> list[Path]:
     if path.is_file():
         return [path] if path.suffix in _FILES else []
     metadata = path / "metadata.yaml"
-    if (
-        metadata.is_file()
-        and b"rosbag2_bagfile_information" in metadata.read_bytes()[:1000]
-    ):
-        return [path]
+    if metadata.is_file():
+        start = metadata.read_bytes()[:1000]
+        if b"rosbag2_bagfile_information" in start:
+            return [path]
     return [part for part in files_in(path, _FILES) if part.is_file()]

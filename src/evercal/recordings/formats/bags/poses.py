@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, NoReturn
+from typing import Literal, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -18,18 +18,16 @@ from evercal.robot.robot_model import RobotModel
 from evercal.typing import Array, BoolArray, IntArray
 
 _BASES = (
-    "base_link",
-    "base",
-    "panda_link0",
-    "fr3_link0",
-    "fer_link0",
-    "lbr_link_0",
-    "link_base",
-)
+    "base_link", "base", "panda_link0", "fr3_link0", "fer_link0", "lbr_link_0", "link_base",
+)  # fmt: skip
+"""Usual names of the robot's base."""
 _GRIPPERS = (
     "tool0", "flange", "ee_link", "panda_hand", "fr3_hand", "fer_hand", "lbr_link_ee", "link_eef",
     "gripper_link", "tool_link",
 )  # fmt: skip
+"""Usual names of the gripper."""
+_LENGTH_TOLERANCE = 1e-2
+"""Largest deviation of the length of a quaternion from 1."""
 
 
 class _Transform(NamedTuple):
@@ -37,9 +35,19 @@ class _Transform(NamedTuple):
 
     parent: str
     child: str
-    stamp_s: float | None  # None if static
-    quaternion: tuple[float, ...]  # wxyz
+    stamp_s: float | None
+    """None if static."""
+    quaternion: tuple[float, ...]
+    """w, x, y, z."""
     translation: tuple[float, ...]
+    """Metres."""
+
+    def is_rigid(self) -> bool:
+        """Whether the numbers are a rotation and a translation."""
+        deviation = abs(float(np.linalg.norm(self.quaternion)) - 1)
+        return bool(
+            deviation < _LENGTH_TOLERANCE and np.isfinite(self.translation).all()
+        )
 
 
 @dataclass
@@ -51,10 +59,17 @@ class _Edge:
 
     @property
     def transforms(self) -> list[_Transform]:
+        """The moving ones, or the last static one."""
         return self.moving or self.static[-1:]
 
     @property
+    def parent(self) -> str:
+        """The frame of the first transform."""
+        return self.transforms[0].parent
+
+    @property
     def parents(self) -> set[str]:
+        """The frames of all transforms."""
         return {transform.parent for transform in (*self.moving, *self.static)}
 
 
@@ -68,82 +83,69 @@ class _TfTree:
 
     def add(self, transform: _Transform, topic: str) -> None:
         """Add a transform of a topic; /tf_static belongs to /tf."""
-        length = float(np.linalg.norm(transform.quaternion))
         parent = plain_name(transform.parent)
         child = plain_name(transform.child)
-        if not (abs(length - 1) < 1e-2 and np.isfinite(transform.translation).all()):
+        if not transform.is_rigid():
             raise InputError(
                 f"{self._source}: tf {parent} -> {child}: quaternion (w x y z)"
                 f" {transform.quaternion}, translation {transform.translation}: no rigid transform;"
                 f" repair the program that publishes it"
             )
         edge = self._edges.setdefault(child, {}).setdefault(topic, _Edge())
-        part = edge.static if transform.stamp_s is None else edge.moving
-        part.append(transform._replace(parent=parent, child=child))
+        transforms = edge.static if transform.stamp_s is None else edge.moving
+        transforms.append(transform._replace(parent=parent, child=child))
 
     def frames(self) -> tuple[str, ...]:
         """All frames, parents before children."""
-        parents = {
-            p
-            for topics in self._edges.values()
-            for e in topics.values()
-            for p in e.parents
-        }
-        return tuple(
-            sorted({*parents, *self._edges}, key=lambda f: (len(self._chain(f)), f))
-        )
+        frames = {*self._edges}
+        for topics in self._edges.values():
+            for edge in topics.values():
+                frames |= edge.parents
+        return tuple(sorted(frames, key=lambda frame: (len(self._chain(frame)), frame)))
 
     def connected(self, a: str, b: str) -> bool:
         return self._chain(a)[-1] == self._chain(b)[-1]
 
     def a_from_b(self, a: str, b: str, stamps_s: Array) -> tuple[SE3, BoolArray]:
         """Interpolate (n,) poses of frame b in frame a, and whether each is valid."""
-        up = self._chain(a)
-        down = self._chain(b)
-        for child in (frame for frame in (*up, *down) if frame in self._edges):
-            self._refuse_ambiguous(child)
-        if up[-1] != down[-1]:
+        chain_a = self._chain(a)
+        chain_b = self._chain(b)
+        for child in (*chain_a, *chain_b):
+            if child in self._edges:
+                self._refuse_ambiguous(child)
+        if chain_a[-1] != chain_b[-1]:
             raise InputError(
                 f"{self._source}: tf has no chain between {a!r} and {b!r}: their roots are"
-                f" {up[-1]!r} and {down[-1]!r}; record the transform that joins them"
+                f" {chain_a[-1]!r} and {chain_b[-1]!r}; record the transform that joins them"
             )
-        shared = set(up) & set(down)
+        shared = {*chain_a}.intersection(chain_b)
         valid = np.ones(len(stamps_s), dtype=bool)
         sides = []
-        for chain in (up, down):
+        for chain in (chain_a, chain_b):
             ancestor_from_frame = SE3.identity((len(stamps_s),))
-            for child in (frame for frame in chain if frame not in shared):
-                parent_from_child, valid_here = self._at(child, stamps_s)
-                ancestor_from_frame = parent_from_child @ ancestor_from_frame
-                valid &= valid_here
+            for child in chain:
+                if child not in shared:
+                    parent_from_child, is_valid = self._parent_from(child, stamps_s)
+                    ancestor_from_frame = parent_from_child @ ancestor_from_frame
+                    valid &= is_valid
             sides.append(ancestor_from_frame)
         return sides[0].inverse() @ sides[1], valid
 
     def _edge(self, child: str) -> _Edge:
         topics = self._edges[child]
-        moving = [topic for topic, edge in topics.items() if edge.moving]
-        return topics[
-            self._topic if self._topic in topics else (moving or [*topics])[0]
-        ]
+        if self._topic in topics:
+            return topics[self._topic]
+        edges = [*topics.values()]
+        moving = [edge for edge in edges if edge.moving]
+        return (moving or edges)[0]
 
     def _refuse_ambiguous(self, child: str) -> None:
         topics = self._edges[child]
         edge = self._edge(child)
-        others = [] if self._topic in topics else [*topics.values()]
-        moving = sum(bool(other.moving) for other in others)
-        # Equal static transforms agree, and one moving topic takes precedence over static ones.
-        last = [
-            np.r_[e.transforms[-1].translation, e.transforms[-1].quaternion]
-            for e in others
-        ]
-        agree = moving == 1 or (
-            not moving and all(np.allclose(last[0], x, atol=1e-6) for x in last)
-        )
-        parent = edge.transforms[0].parent
-        if not agree or any(other.transforms[0].parent != parent for other in others):
+        if self._topic not in topics and not _agree([*topics.values()]):
             raise InputError(
-                f"{self._source}: tf {parent} -> {child} is on several topics,"
-                f" {', '.join(sorted(topics))}; choose one with --pose-topic"
+                f"{self._source}: tf {edge.parent} -> {child} is on several topics,"
+                f" {', '.join(sorted(topics))}; choose one with `pose_topic`"
             )
         if len(edge.parents) > 1:
             raise InputError(
@@ -152,25 +154,36 @@ class _TfTree:
                 f" them"
             )
 
-    def _at(self, child: str, stamps_s: Array) -> tuple[SE3, BoolArray]:
+    def _parent_from(self, child: str, stamps_s: Array) -> tuple[SE3, BoolArray]:
         edge = self._edge(child)
         _, _, stamps, quaternions, translations = zip(*edge.transforms, strict=True)
         poses = SE3(np.array(quaternions), np.array(translations))
-        if not edge.moving:
-            return poses[np.zeros(len(stamps_s), int)], np.ones(
-                len(stamps_s), dtype=bool
-            )
-        return PoseTrack(np.array(stamps), poses).at(stamps_s)
+        if edge.moving:
+            return PoseTrack(np.array(stamps), poses).at(stamps_s)
+        first = np.zeros(len(stamps_s), int)
+        return poses[first], first == 0
 
     def _chain(self, frame: str) -> list[str]:
         chain = [frame]
         while chain[-1] in self._edges:
-            parent = self._edge(chain[-1]).transforms[0].parent
+            parent = self._edge(chain[-1]).parent
             if parent in chain:
                 cycle = " -> ".join([*chain, parent])
                 raise InputError(f"{self._source}: tf has a cycle: {cycle}")
             chain.append(parent)
         return chain
+
+
+def _agree(edges: Sequence[_Edge]) -> bool:
+    """Equal static transforms agree, and one moving topic takes precedence over static ones."""
+    if len({edge.parent for edge in edges}) > 1:
+        return False
+    moving = [edge for edge in edges if edge.moving]
+    if moving:
+        return len(moving) == 1
+    last = [edge.transforms[-1] for edge in edges]
+    numbers = [(*transform.translation, *transform.quaternion) for transform in last]
+    return np.allclose(numbers[0], numbers, atol=1e-6)
 
 
 def plain_name(frame: str) -> str:
@@ -186,8 +199,10 @@ class ImagePoses:
     """(n,) base_from_gripper, or base_from_camera."""
     valid: BoolArray
     """(n,) whether each pose was recorded close enough to the image."""
-    of_camera: bool
+    owner: Literal["camera", "gripper"]
+    """Owner of the poses."""
     notes: list[str]
+    """Origin of the poses, one sentence each."""
 
 
 def poses_at_images(
@@ -199,52 +214,48 @@ def poses_at_images(
     if options.urdf is not None:
         return _from_joints(bag, stamps, zero, RobotModel(options.urdf), options)
     tree, times = _tf(bag, zero, options.pose_topic)
-    base = _frame(bag, tree, options.base_frame, _BASES, "--base-frame")
-    gripper = _frame(bag, tree, options.gripper_frame, _GRIPPERS, "--gripper-frame")
+    base = _frame(bag, tree, options.base_frame, _BASES, "base_frame")
+    gripper = _frame(bag, tree, options.gripper_frame, _GRIPPERS, "gripper_frame")
     poses, valid = tree.a_from_b(base, gripper, stamps)
     if not valid.any():
         _refuse_times(bag, stamps, times, "tf")
-    of_camera = gripper == camera_frame
-    owner = "the camera" if of_camera else "the gripper"
-    notes = [f"poses of {owner} are those of {gripper} in {base}, from tf"]
-    if (
-        not of_camera
-        and camera_frame in tree.frames()
-        and tree.connected(base, camera_frame)
-    ):
+    owner = "camera" if gripper == camera_frame else "gripper"
+    notes = [f"poses of the {owner} are those of {gripper} in {base}, from tf"]
+    has_camera = camera_frame in tree.frames() and tree.connected(base, camera_frame)
+    if has_camera and owner == "gripper":
         notes.append(
             f"tf also has the camera ({camera_frame}), which is not used; to use it, give"
-            f" --gripper-frame {camera_frame}"
+            f" `gripper_frame` {camera_frame}"
         )
-    return ImagePoses(RobotPoses(None, None, poses), valid, of_camera, notes)
+    return ImagePoses(RobotPoses(None, None, poses), valid, owner, notes)
 
 
-def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[_TfTree, list[float]]:
+def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[_TfTree, Array]:
     topics = bag.topics(*TF)
     if not topics:
         joints = bag.topics(JOINT_STATE)
-        instead = f", or give the robot's --urdf for {joints[0]}" if joints else ""
+        instead = f", or give the robot's `urdf` for {joints[0]}" if joints else ""
         raise InputError(
             f"{bag.path}: no tf in it, so there are no gripper poses; record /tf and"
             f" /tf_static{instead}. It holds {bag.contents()}"
         )
-    bag.require_topic(
-        wanted, [t for t in topics if not t.endswith("tf_static")], "transforms"
-    )
+    moving = [topic for topic in topics if not topic.endswith("tf_static")]
+    bag.require_topic(wanted, moving, "transforms")
     tree = _TfTree(str(bag.path), wanted)
     times = []
     for message in bag.messages(topics):
         for entry in message.content.transforms:
+            header = entry.header
             stamp = None
-            if not message.topic.endswith("tf_static"):
-                stamp = message.seconds(entry.header, zero_ns)
+            if message.topic in moving:
+                stamp = message.seconds(header, zero_ns)
                 times.append(stamp)
             t = entry.transform.translation
             q = entry.transform.rotation
-            frames = entry.header.frame_id, entry.child_frame_id
+            frames = (header.frame_id, entry.child_frame_id)
             link = _Transform(*frames, stamp, (q.w, q.x, q.y, q.z), (t.x, t.y, t.z))
             tree.add(link, message.topic.removesuffix("_static"))
-    return tree, times
+    return tree, np.array(times)
 
 
 def _frame(
@@ -252,26 +263,27 @@ def _frame(
 ) -> str:
     frames = tree.frames()
     if wanted is not None:
-        if plain_name(wanted) not in frames:
+        name = plain_name(wanted)
+        if name not in frames:
             raise InputError(
-                f"{bag.path}: {option} {wanted}: no such frame in tf; it has {', '.join(frames)}"
+                f"{bag.path}: `{option}` {wanted}: no such frame in tf; it has {', '.join(frames)}"
             )
-        return plain_name(wanted)
+        return name
     names = [name for name in usual if name in frames]
     if len(names) != 1:
-        which = (
-            f"it may be {' or '.join(names)}" if names else "no frame has a usual name"
-        )
+        choice = "no frame has a usual name"
+        if names:
+            choice = f"it may be {' or '.join(names)}"
         raise InputError(
-            f"{bag.path}: give {option} ({which}); tf has {', '.join(frames)}"
+            f"{bag.path}: give `{option}` ({choice}); tf has {', '.join(frames)}"
         )
     return names[0]
 
 
-def _refuse_times(
-    bag: BagFile, stamps: Array, times: Sequence[float], what: str
-) -> NoReturn:
-    covered = f"{min(times):.1f} to {max(times):.1f} s" if len(times) else "no time"
+def _refuse_times(bag: BagFile, stamps: Array, times: Array, what: str) -> NoReturn:
+    covered = "no time"
+    if times.size:
+        covered = f"{times.min():.1f} to {times.max():.1f} s"
     raise InputError(
         f"{bag.path}: no image has a pose: images were taken at {stamps.min():.1f} to"
         f" {stamps.max():.1f} s after the first, {what} covers {covered}; are the clocks the same?"
@@ -285,33 +297,33 @@ def _from_joints(
     topics = bag.topics(JOINT_STATE)
     if not topics:
         raise InputError(
-            f"{bag.path}: no joint states in it for --urdf {options.urdf}; it holds"
+            f"{bag.path}: no joint states in it for `urdf` {options.urdf}; it holds"
             f" {bag.contents()}"
         )
     bag.require_topic(options.pose_topic, topics, "joint states")
     tracks = _joint_tracks(bag, topics, zero_ns)
-    needed = model.arm(base, gripper).joints
     values = np.zeros((len(stamps), len(tracks)))
     valid = np.ones(len(stamps), dtype=bool)
-    times: Sequence[float] = ()
+    times = np.empty(0)
+    needed = model.arm(base, gripper).joints
     for column, (name, track) in enumerate(tracks.items()):
         if name not in needed:
             continue
-        if len(track) > 1 and options.pose_topic not in track:
+        topic = next(iter(track))
+        if options.pose_topic in track:
+            topic = options.pose_topic
+        elif len(track) > 1:
             raise InputError(
                 f"{bag.path}: joint {name} is on several topics, {', '.join(sorted(track))};"
-                f" choose one with --pose-topic"
+                f" choose one with `pose_topic`"
             )
-        topic = options.pose_topic if options.pose_topic in track else next(iter(track))
-        times, positions = zip(*track[topic], strict=True)
-        values[:, column], here = interpolate(
-            np.array(times), np.array(positions), stamps
-        )
-        valid &= here
+        times, positions = np.array(track[topic]).T
+        values[:, column], is_valid = interpolate(times, positions, stamps)
+        valid &= is_valid
     moved = model.poses([*tracks], values, base, gripper, bag.path)
     if not valid.any():
         _refuse_times(bag, stamps, times, "the joint states")
-    return ImagePoses(poses_of_arm(moved), valid, False, moved.notes)
+    return ImagePoses(poses_of_arm(moved), valid, "gripper", moved.notes)
 
 
 def _joint_tracks(
