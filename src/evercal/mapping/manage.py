@@ -8,7 +8,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import get_args
@@ -55,30 +55,63 @@ class _Incoming:
     scene: SceneMap
 
 
+@dataclass(frozen=True, eq=False)
+class _Merge:
+    """Scenes of a map while others are added."""
+
+    on_clash: OnClash
+    kept: dict[str, int]
+    """Indices of scenes of the map, by name."""
+    incoming: dict[str, _Incoming] = field(default_factory=dict)
+    """New scenes by name."""
+    renamed: list[tuple[str, str]] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    replaced: list[str] = field(default_factory=list)
+
+    def add(self, item: _Incoming) -> None:
+        """Add a scene of another map."""
+        name = item.scene.name
+        if name in self.kept or name in self.incoming:
+            if self.on_clash == "refuse":
+                raise InputError(
+                    f"scene {name!r} of map {item.root}: the name is taken; rename it, or choose"
+                    " with `on_clash` rename, skip or replace"
+                )
+            if self.on_clash == "skip":
+                self.skipped.append(name)
+                return
+            if self.on_clash == "replace":
+                self.replaced.append(name)
+                self.kept.pop(name, None)
+                self.incoming.pop(name, None)
+            else:
+                name = _free_name(name, {*self.kept, *self.incoming})
+                self.renamed.append((item.scene.name, name))
+        self.incoming[name] = item
+
+
 def remove_scenes(store: MapStore, names: Sequence[str]) -> None:
     """Remove scenes from a map, all in one step."""
     if not names:
         raise InputError("no scene given; name one or more to remove")
-    gone = {_index(store, name) for name in names}
-    left = [i for i in range(len(store.stages)) if i not in gone]
+    removed = {_index(store, name) for name in names}
+    left = [i for i in range(len(store.stages)) if i not in removed]
+    scenes = store.contents.scenes
     store.change([store.stages[i] for i in left], [], store.payload)
     # A localizer that still answers keeps the contents it was made with.
-    store.contents = replace(
-        store.contents, scenes=[store.contents.scenes[i] for i in left]
-    )
+    store.contents = replace(store.contents, scenes=[scenes[i] for i in left])
 
 
 def rename_scene(store: MapStore, name: str, new: str) -> None:
     """Give a scene another name."""
     index = _index(store, name)
-    scenes = list(store.contents.scenes)
-    if checked_name(new) in {scene.name for scene in scenes}:
+    if checked_name(new) in store.contents.names:
         raise InputError(
             f"scene {new!r}: map {store.root} has a scene of this name; give another"
         )
     store.replace(index, lambda folder: _write_name(folder, new), store.payload)
-    scenes[index] = replace(scenes[index], name=new)
-    store.contents = replace(store.contents, scenes=scenes)
+    renamed = replace(store.contents.scenes[index], name=new)
+    store.contents = store.contents.with_replaced(index, renamed)
 
 
 def merge_maps(
@@ -88,8 +121,8 @@ def merge_maps(
 ) -> Merged:
     """Add the scenes of other maps to a map, all in one step.
 
-    A new map takes the encoder of the first one. Scenes are copied unchanged. Their thresholds were
-    fitted in each scene alone, so a map that learned all scenes in turn gives the same answers.
+    A new map takes the encoder of the first one. Scenes are copied unchanged, and no scene depends
+    on the others, so a map that learned all scenes in turn gives the same answers.
 
     Args:
         store: The map that grows.
@@ -103,49 +136,36 @@ def merge_maps(
         )
     if not others:
         raise InputError("no map given; name one or more to merge")
-    is_new = not is_store(store.root)
-    maps = [_incoming(Path(other)) for other in others]
+    roots = [Path(other) for other in others]
+    maps = [_incoming(root) for root in roots]
     contents = store.contents
-    if is_new:
-        contents = MapStore.open(Path(others[0])).contents.empty()
-    first = maps[0][0] if is_new else Manifest.read(store.root)
-    networks = Path(others[0]) if is_new else store.root
-    incoming: dict[str, _Incoming] = {}
-    kept = {scene.name: i for i, scene in enumerate(store.contents.scenes)}
-    renamed = []
-    skipped = []
-    replaced = []
-    for other, (manifest, scenes) in zip(others, maps, strict=True):
-        if Path(other).resolve() == store.root.resolve():
+    networks = None
+    if is_store(store.root):
+        first = Manifest.read(store.root)
+        reference = store.root
+    else:
+        contents = MapStore.open(roots[0]).contents.empty()
+        first, _ = maps[0]
+        reference = roots[0]
+        networks = first
+    kept = {name: i for i, name in enumerate(store.contents.names)}
+    merge = _Merge(on_clash, kept)
+    for root, (manifest, scenes) in zip(roots, maps, strict=True):
+        if root.resolve() == store.root.resolve():
             raise InputError(
-                f"map {other}: is the map that scenes are merged into; give others"
+                f"map {root}: is the map that scenes are merged into; give others"
             )
-        _require_same_networks(first, manifest, networks, Path(other))
+        _require_same_networks(first, manifest, reference, root)
         for item in scenes:
-            name = item.scene.name
-            if name in kept or name in incoming:
-                if on_clash == "refuse":
-                    raise InputError(
-                        f"scene {name!r} of map {other}: the name is taken; rename it, or choose"
-                        " with --on-clash rename, skip or replace"
-                    )
-                if on_clash == "skip":
-                    skipped.append(name)
-                    continue
-                if on_clash == "replace":
-                    replaced.append(name)
-                    kept.pop(name, None)
-                    incoming.pop(name, None)
-                else:
-                    name = _free_name(name, {*kept, *incoming})
-                    renamed.append((item.scene.name, name))
-            incoming[name] = item
-    if incoming:
-        networks = first if is_new else None
-        _commit(
-            store, list(kept.values()), incoming, contents, networks, Path(others[0])
-        )
-    return Merged(tuple(incoming), tuple(renamed), tuple(skipped), tuple(replaced))
+            merge.add(item)
+    if merge.incoming:
+        _commit(store, merge, contents, networks, roots[0])
+    return Merged(
+        tuple(merge.incoming),
+        tuple(merge.renamed),
+        tuple(merge.skipped),
+        tuple(merge.replaced),
+    )
 
 
 def pack_map(root: Path, file: Path) -> None:
@@ -200,25 +220,23 @@ def unpack_map(file: Path, folder: Path, limits: ArchiveLimits | None = None) ->
 
 
 def _index(store: MapStore, name: str) -> int:
-    names = [scene.name for scene in store.contents.scenes]
+    names = store.contents.names
     if name not in names:
-        has = f"it has {', '.join(names)}" if names else "it has none"
+        known = "none"
+        if names:
+            known = ", ".join(names)
         raise InputError(
-            f"scene {name!r}: map {store.root} has no scene of this name; {has}"
+            f"scene {name!r}: map {store.root} has no scene of this name; it has {known}"
         )
     return names.index(name)
 
 
 def _write_name(folder: Path, name: str) -> None:
-    for file, key in (
-        (SCENE, "name"),
-        (REPORT, "scene"),
-        (f"{PREVIOUS}{SCENE}", "name"),
-    ):
-        if file.startswith(PREVIOUS) and not (folder / file).exists():
-            continue
-        content = json.loads((folder / file).read_text(encoding="utf-8"))
-        write_json(folder / file, {**content, key: name})
+    previous = f"{PREVIOUS}{SCENE}"
+    for file, key in ((SCENE, "name"), (REPORT, "scene"), (previous, "name")):
+        if file != previous or (folder / file).exists():
+            content = json.loads((folder / file).read_text(encoding="utf-8"))
+            write_json(folder / file, {**content, key: name})
 
 
 def _free_name(name: str, taken: set[str]) -> str:
@@ -230,11 +248,11 @@ def _free_name(name: str, taken: set[str]) -> str:
 
 def _incoming(root: Path) -> tuple[Manifest, list[_Incoming]]:
     def read(manifest: Manifest) -> tuple[Manifest, list[_Incoming]]:
-        stages = [str(stage) for stage in require_map(root, manifest)["stages"]]
-        return manifest, [
-            _Incoming(root, stage, manifest, read_scene(root / STAGES / stage))
-            for stage in stages
-        ]
+        scenes = []
+        for stage in map(str, require_map(root, manifest)["stages"]):
+            scene = read_scene(root / STAGES / stage)
+            scenes.append(_Incoming(root, stage, manifest, scene))
+        return manifest, scenes
 
     return read_store(root, read)
 
@@ -242,12 +260,12 @@ def _incoming(root: Path) -> tuple[Manifest, list[_Incoming]]:
 def _require_same_networks(
     first: Manifest, other: Manifest, root: Path, path: Path
 ) -> None:
-    for key, what in (("short_side", "image size"), ("strategy", "strategy")):
-        a = first.payload.get(key)
-        b = other.payload.get(key)
-        if a != b:
+    for key, meaning in (("short_side", "image size"), ("strategy", "strategy")):
+        expected = first.payload.get(key)
+        value = other.payload.get(key)
+        if value != expected:
             raise InputError(
-                f"map {path}: {what} {b}, map {root} has {a}; learn its scenes again"
+                f"map {path}: {meaning} {value}, map {root} has {expected}; learn its scenes again"
             )
     if _networks(root, first) != _networks(path, other):
         names = ", ".join(other.payload["networks"])
@@ -258,17 +276,20 @@ def _require_same_networks(
 
 
 def _networks(root: Path, manifest: Manifest) -> set[object]:
-    """What identifies the networks of a map: maps of before store the first encoder otherwise."""
-    names = [str(name) for name in manifest.payload["networks"]]
-    return {
-        read_network(root / name)[0] or manifest.files[name]["sha256"] for name in names
-    }
+    """What identifies the networks of a map.
+
+    Maps written by earlier versions store the first encoder in another format.
+    """
+    identities = set()
+    for name in map(str, manifest.payload["networks"]):
+        identity = read_network(root / name)[0]
+        identities.add(identity or manifest.files[name]["sha256"])
+    return identities
 
 
 def _commit(
     store: MapStore,
-    kept: Sequence[int],
-    incoming: dict[str, _Incoming],
+    merge: _Merge,
     contents: MapContents,
     networks: Manifest | None,
     source: Path,
@@ -283,17 +304,19 @@ def _commit(
         prefix = f"{STAGES}/{item.stage}/"
         for file in item.manifest.files:
             if file.startswith(prefix):
-                _copy(
-                    item.root, file, item.manifest, folder / file.removeprefix(prefix)
-                )
+                target = folder / file.removeprefix(prefix)
+                _copy(item.root, file, item.manifest, target)
         if name != item.scene.name:
             _write_name(folder, name)
 
-    added = [(name, partial(copy, name, item)) for name, item in incoming.items()]
+    added = []
+    scenes = [contents.scenes[i] for i in merge.kept.values()]
+    for name, item in merge.incoming.items():
+        added.append((name, partial(copy, name, item)))
+        scenes.append(replace(item.scene, name=name))
+    stages = [store.stages[i] for i in merge.kept.values()]
     payload = {**store.payload, "short_side": contents.short_side}
-    store.change([store.stages[i] for i in kept], added, payload)
-    new = [replace(item.scene, name=name) for name, item in incoming.items()]
-    scenes = [*(contents.scenes[i] for i in kept), *new]
+    store.change(stages, added, payload)
     store.contents = replace(contents, scenes=scenes)
 
 

@@ -91,17 +91,31 @@ class MapContents:
         """Size of all keyframes as they are stored."""
         return sum(scene.keyframes.bytes for scene in self.scenes)
 
+    @property
+    def names(self) -> list[str]:
+        """Names of the scenes."""
+        return [scene.name for scene in self.scenes]
+
+    def with_replaced(self, index: int, scene: SceneMap) -> "MapContents":
+        """The same map with another scene in one place.
+
+        A localizer that still answers keeps the contents it was made with.
+        """
+        scenes = list(self.scenes)
+        scenes[index] = scene
+        return MapContents(self.encoder, self.short_side, scenes)
+
     def with_scene(self, scene: SceneMap) -> "MapContents":
         """The same map with one more scene."""
         return MapContents(self.encoder, self.short_side, [*self.scenes, scene])
 
     def scene(self, name: str) -> SceneMap:
         """The map of a scene."""
-        for scene in self.scenes:
-            if scene.name == name:
-                return scene
-        names = ", ".join(scene.name for scene in self.scenes)
-        raise InputError(f"scene {name!r}: the map has only {names}")
+        if name not in self.names:
+            raise InputError(
+                f"scene {name!r}: the map has only {', '.join(self.names)}"
+            )
+        return self.scenes[self.names.index(name)]
 
     def metric_scene(self, name: str) -> SceneMap:
         """The map of a scene whose answers are in metres."""
@@ -109,8 +123,8 @@ class MapContents:
         if not scene.metric:
             raise InputError(
                 f"scene {name}: the unit of length of its recording is unknown, so there are no"
-                " millimetres; run 'evercal align' first, with --robot-poses or with --points and"
-                " --picks"
+                " millimetres; run 'evercal align' first, with `robot_poses` or with `points` and"
+                " `picks`"
             )
         return scene
 

@@ -1,7 +1,7 @@
 """`MapStore`: a map on disk.
 
 stages/0001-NAME/
-  scene.json               cameras, acceptance thresholds, relation to the base frame
+  scene.json               cameras, unit, relation to the base frame
   keyframes.safetensors    images, poses, depths, landmarks, descriptors
   correction.safetensors   slowly varying corrections, where there are any
   report.json
@@ -9,8 +9,7 @@ stages/0001-NAME/
 """
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -37,14 +36,18 @@ from evercal.storage.stages import (
 )
 from evercal.storage.tensors import load_tensors, open_tensors, save_tensors
 
-KIND, STRATEGY = "map", "evercal"
-"""Kind of store in its manifest, and its name among the strategies of `evercal learn`."""
+KIND = "map"
+"""Kind of store in its manifest."""
+STRATEGY = "evercal"
+"""Name of maps among the strategies of `evercal learn`."""
 SCENE = "scene.json"
 KEYFRAMES = "keyframes.safetensors"
 CORRECTION = "correction.safetensors"
 REFRESHES = "refreshes.json"
-_STATE, PREVIOUS = (SCENE, KEYFRAMES, CORRECTION), "previous-"
-"""Files that a refresh replaces, and the prefix of their state before."""
+_STATE = (SCENE, KEYFRAMES, CORRECTION)
+"""Files that a refresh replaces."""
+PREVIOUS = "previous-"
+"""Prefix of their state before the last refresh."""
 
 
 class MapStore(StageStore[MapContents]):
@@ -66,9 +69,8 @@ class MapStore(StageStore[MapContents]):
             path = root / first
             local = load_encoder(encoder, path)
             for name in centroids:
-                local.centroids = load_tensors(root / name)["centroids"].astype(
-                    np.float32
-                )
+                stored = load_tensors(root / name)["centroids"]
+                local.centroids = stored.astype(np.float32)
             contents = MapContents(local, int(payload["short_side"]))
             stages = [str(name) for name in payload["stages"]]
             store = cls(root, contents, stages, (first, *centroids))
@@ -148,12 +150,13 @@ class MapStore(StageStore[MapContents]):
 
     def undo(self, name: str) -> None:
         """Bring back the state of a scene before its last refresh: whole, or not at all."""
-        names = [stored.name for stored in self.contents.scenes]
+        names = self.contents.names
         if name not in names:
             raise InputError(
                 f"scene {name!r}: store {self.root} has {', '.join(names) or 'none'}"
             )
-        before = self.folder(self.stages[names.index(name)])
+        index = names.index(name)
+        before = self.folder(self.stages[index])
         if not (before / f"{PREVIOUS}{SCENE}").exists():
             raise InputError(f"scene {name!r}: no refresh to undo")
 
@@ -163,20 +166,14 @@ class MapStore(StageStore[MapContents]):
                 _move(folder / f"{PREVIOUS}{part}", folder / part)
             write_json(folder / REFRESHES, {"refreshes": refreshes(folder)[:-1]})
 
-        self.replace(names.index(name), write, self.payload)
-        scenes = [*self.contents.scenes]
-        scenes[names.index(name)] = read_scene(
-            self.folder(self.stages[names.index(name)])
-        )
-        self.contents = replace(self.contents, scenes=scenes)
+        self.replace(index, write, self.payload)
+        scene = read_scene(self.folder(self.stages[index]))
+        self.contents = self.contents.with_replaced(index, scene)
 
     def _exchange(self, scene: SceneMap, write: Callable[[Path], None]) -> None:
-        index = [stored.name for stored in self.contents.scenes].index(scene.name)
+        index = self.contents.names.index(scene.name)
         self.replace(index, write, self.payload)
-        # A localizer that still answers keeps the contents it was made with.
-        scenes = [*self.contents.scenes]
-        scenes[index] = scene
-        self.contents = replace(self.contents, scenes=scenes)
+        self.contents = self.contents.with_replaced(index, scene)
 
     @property
     def payload(self) -> dict[str, object]:
@@ -192,19 +189,14 @@ def stored_scenes(root: Path) -> list[tuple[str, Camera, dict[str, Any]]]:
     """Name, adjusted camera and report of every scene of a map; no keyframes are read."""
 
     def read(manifest: Manifest) -> list[tuple[str, Camera, dict[str, Any]]]:
-        folders = [
-            root / STAGES / str(name) for name in require_map(root, manifest)["stages"]
-        ]
-        scenes = [json.loads((folder / SCENE).read_text()) for folder in folders]
-        reports = [json.loads((folder / REPORT).read_text()) for folder in folders]
-        return [
-            (
-                checked_name(scene["name"]),
-                Camera.from_dict(scene["adjusted_camera"]),
-                report,
-            )
-            for scene, report in zip(scenes, reports, strict=True)
-        ]
+        scenes = []
+        for name in require_map(root, manifest)["stages"]:
+            folder = root / STAGES / str(name)
+            scene = json.loads((folder / SCENE).read_text())
+            report = json.loads((folder / REPORT).read_text())
+            camera = Camera.from_dict(scene["adjusted_camera"])
+            scenes.append((checked_name(scene["name"]), camera, report))
+        return scenes
 
     return read_store(root, read)
 
@@ -236,7 +228,8 @@ def write_scene(folder: Path, scene: SceneMap) -> None:
         "frame": frame_to_dict(scene.frame),
     }
     write_json(folder / SCENE, content)
-    (folder / CORRECTION).unlink(missing_ok=True)  # of the scene that is replaced
+    # That of the scene that is replaced.
+    (folder / CORRECTION).unlink(missing_ok=True)
     if scene.frame.correction is not None:
         save_tensors(folder / CORRECTION, correction_tensors(scene.frame.correction))
 
@@ -259,9 +252,8 @@ def read_scene(folder: Path) -> SceneMap:
         return _read_scene(folder)
     except (InputError, OSError):
         raise
-    except (
-        Exception
-    ) as error:  # nothing is assumed about what another program has written
+    except Exception as error:
+        # Nothing is assumed about what another program has written.
         reason = " ".join(repr(error).split())[:200]
         raise InputError(
             f"{folder}: not a scene that evercal wrote ({reason})"
@@ -291,47 +283,50 @@ def _read_scene(folder: Path) -> SceneMap:
 
 def frame_to_dict(frame: MapFrame) -> dict[str, object]:
     """A map's frame as JSON values, without its slowly varying corrections."""
+    base = None
     similarity = frame.similarity
+    if similarity is not None:
+        base = similarity.base_from_map
     covariance = frame.base_covariance
     return {
         "stated_camera_from_camera": pose_to_dict(frame.common),
         "pose_sigma": list(frame.pose_sigma),
         "frame_sigma": list(frame.frame_sigma),
-        "base_from_map": pose_to_dict(similarity.base_from_map if similarity else None),
-        "scale": 1.0 if similarity is None else similarity.scale,
+        "base_from_map": pose_to_dict(base),
+        "scale": frame.scale,
         "unit_known": similarity is None or similarity.metric,
         "base_covariance": None if covariance is None else covariance.tolist(),
     }
 
 
 def frame_of(
-    content: Mapping[str, object], correction: FrameCorrection | None
+    content: Mapping[str, Any], correction: FrameCorrection | None
 ) -> MapFrame:
     """The inverse of `frame_to_dict`."""
     base = content["base_from_map"]
     covariance = content["base_covariance"]
-    pose, shared = (
-        np.asarray(content[key], np.float64) for key in ("pose_sigma", "frame_sigma")
-    )
+    if covariance is not None:
+        covariance = np.asarray(covariance, np.float64)
     similarity = None
     if base is not None:
-        known = bool(content.get("unit_known", True))
-        scale = float(str(content["scale"]))
-        similarity = Similarity(_pose_of(base), scale, known)
+        metric = bool(content.get("unit_known", True))
+        similarity = Similarity(_pose_of(base), float(content["scale"]), metric)
     return MapFrame(
         common=_pose_of(content["stated_camera_from_camera"]),
         correction=correction,
-        pose_sigma=(float(pose[0]), float(pose[1])),
-        frame_sigma=(float(shared[0]), float(shared[1])),
+        pose_sigma=_pair(content["pose_sigma"]),
+        frame_sigma=_pair(content["frame_sigma"]),
         similarity=similarity,
-        base_covariance=None
-        if covariance is None
-        else np.asarray(covariance, np.float64),
+        base_covariance=covariance,
     )
 
 
+def _pair(values: Sequence[float]) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
 def _pose_of(values: Any) -> SE3:
-    """A pose to its last bit; maps of before hold a matrix, which rounds it."""
+    """A pose to its last bit; maps written by earlier versions hold a matrix, which rounds it."""
     if isinstance(values, list):
         return SE3.from_matrix(np.asarray(values))
     return SE3(values["quaternion_wxyz"], values["translation_m"])
@@ -349,7 +344,6 @@ def correction_tensors(correction: FrameCorrection) -> dict[str, NDArray[Any]]:
 
 def correction_of(tensors: Mapping[str, NDArray[Any]]) -> FrameCorrection:
     """The inverse of `correction_tensors`."""
-    poses, (metres, radians) = tensors["poses"], tensors["radius"].tolist()
-    return FrameCorrection(
-        SE3(poses[:, :4], poses[:, 4:]), tensors["correction"], (metres, radians)
-    )
+    poses = SE3(tensors["poses"][:, :4], tensors["poses"][:, 4:])
+    radius = _pair(tensors["radius"].tolist())
+    return FrameCorrection(poses, tensors["correction"], radius)
