@@ -8,6 +8,7 @@ import contextlib
 import difflib
 import importlib
 import io
+import itertools
 import os
 import platform
 import shutil
@@ -60,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The exit code: 0 done, 1 negative result, 2 misuse or bad input, 130 interrupted.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
+    words = sys.argv[1:] if argv is None else list(argv)
     as_json = "--json" in words
     # Spinning threads of networks take up to ten times as long when other programs use the cores,
     # and save a tenth otherwise. Read once, when torch is loaded.
@@ -125,10 +126,9 @@ def _help() -> str:
     for group, names in VERBS.items():
         lines += ["", f"{group}:"]
         for name in names:
-            summary = " ".join(
-                (verb_class(name).__doc__ or "").split("\n\n")[0].split()
-            )
-            lines.append(f"  {name:11s} {summary.split('; ')[0].rstrip('.')}")
+            summary = verb_class(name).__doc__.partition("\n\n")[0]
+            first = " ".join(summary.split()).partition("; ")[0]
+            lines.append(f"  {name:11s} {first.rstrip('.')}")
     lines += [
         "",
         "'evercal VERB --help' lists the options of a verb. Every verb has --json.",
@@ -147,14 +147,11 @@ def _parse(words: list[str], as_json: bool) -> Any:
     if words in ([], ["--help"], ["-h"]):
         print(_help())
         return 0 if words else 2
-    verbs = [name for names in VERBS.values() for name in names]
+    verbs = list(itertools.chain(*VERBS.values()))
     if words[0] not in verbs:
-        similar = difflib.get_close_matches(words[0], verbs, 1)
-        hint = (
-            f"did you mean '{similar[0]}'?"
-            if similar
-            else "'evercal --help' lists all verbs"
-        )
+        hint = "'evercal --help' lists all verbs"
+        for similar in difflib.get_close_matches(words[0], verbs, 1):
+            hint = f"did you mean '{similar}'?"
         raise InputError(f"{words[0]}: no such verb; {hint}")
     import tyro
 
@@ -173,31 +170,31 @@ def _parse(words: list[str], as_json: bool) -> Any:
             )
     except SystemExit as stop:
         shown.seek(0)
-        page = shown.read()
-        sys.stdout.write(_wrapped(page) if page else "")
+        _print_wrapped(shown.read())
         sys.stderr.write(printable(caught.getvalue()))
-        code = 0 if stop.code in (0, None) else 2
-        if code and as_json:
+        if stop.code in (0, None):
+            return 0
+        if as_json:
             from evercal.cli.console import print_json
 
             print_json({"error": _box_text(caught.getvalue())})
-        return code
+        return 2
 
 
-def _wrapped(text: str) -> str:
-    """Wrap the lines of a help page that tyro leaves longer than the terminal is wide."""
+def _print_wrapped(page: str) -> None:
+    """Print a help page; tyro leaves lines longer than the terminal is wide."""
     columns = shutil.get_terminal_size().columns
-    lines = []
-    for line in text.splitlines():
-        lines += textwrap.wrap(line, columns, break_on_hyphens=False) or [""]
-    return "\n".join(lines) + "\n"
+    for line in page.splitlines():
+        print("\n".join(textwrap.wrap(line, columns, break_on_hyphens=False)))
 
 
 def _box_text(box: str) -> str:
     """The paragraphs of tyro's framed message as one line, without the last one, on --help."""
-    text = " ".join(line.strip("│ ") for line in box.splitlines()[1:])
-    parts = [" ".join(part.strip("─╰╯ ").split()) for part in text.split("──")]
-    return (
-        "; ".join(filter(None, parts)).partition("; For full help")[0]
-        or "unusable arguments"
-    )
+    lines = [line.strip("│ ") for line in box.splitlines()[1:]]
+    paragraphs = []
+    for paragraph in " ".join(lines).split("──"):
+        words = paragraph.strip("─╰╯ ").split()
+        if words:
+            paragraphs.append(" ".join(words))
+    text = "; ".join(paragraphs).partition("; For full help")[0]
+    return text or "unusable arguments"

@@ -52,11 +52,7 @@ class Align(args.Verb):
             raise InputError(
                 "give either images with --robot-poses, or --points with --picks"
             )
-        others = (
-            bool(self.images),
-            self.convention is not None,
-            self.board_poses is not None,
-        )
+        others = (*self.images, self.convention, self.board_poses)
         if by_points and any(others):
             raise InputError(
                 "--points: images, --convention and --board-poses belong to --robot-poses; omit"
@@ -67,7 +63,11 @@ class Align(args.Verb):
 
         cell = Map(MapStore.open(self.store))
         unit = cell.localizer.contents.scene(self.scene).unit or 1.0
-        self._show(self._by_points(cell) if by_points else self._by_gripper(cell), unit)
+        if by_points:
+            alignment = self._by_points(cell)
+        else:
+            alignment = self._by_gripper(cell)
+        self._show(alignment, unit)
         return 0
 
     def _by_gripper(self, cell: "Map") -> "MapAlignment":
@@ -77,28 +77,27 @@ class Align(args.Verb):
         files = image_files(self.images)
         boards = None
         if self.board_poses is not None:
-            detected = read_board_poses(self.board_poses).detected
-            by_name = {
-                Path(image.name).name: image.camera_from_board for image in detected
-            }
-            boards = {
-                str(f): pose for f in files if (pose := by_name.get(f.name)) is not None
-            }
-        given = {
-            "robot_poses": self.robot_poses,
-            "convention": self.convention,
-            "boards": boards,
-        }
-        return cell.align(self.scene, files, unknown_scale=self.unknown_scale, **given)
+            by_name = {}
+            for image in read_board_poses(self.board_poses).detected:
+                by_name[Path(image.name).name] = image.camera_from_board
+            boards = {str(f): by_name[f.name] for f in files if f.name in by_name}
+        return cell.align(
+            self.scene,
+            files,
+            robot_poses=self.robot_poses,
+            convention=self.convention,
+            boards=boards,
+            unknown_scale=self.unknown_scale,
+        )
 
     def _by_points(self, cell: "Map") -> "MapAlignment":
         from evercal.recordings import read_image
 
         if self.points is None or self.picks is None:
             raise InputError("--points and --picks belong together; give both")
-        points = {
-            name: at for (name,), at in read_rows(self.points, 1, "name, x, y, z")
-        }
+        points = {}
+        for (name,), point in read_rows(self.points, 1, "name, x, y, z"):
+            points[name] = point
         by_image: dict[str, dict[str, np.ndarray]] = {}
         for (image, name), pixel in read_rows(self.picks, 2, "image, name, u, v"):
             if name not in points:
@@ -107,18 +106,19 @@ class Align(args.Verb):
                 )
             by_image.setdefault(image, {})[name] = pixel
         folder = self.picks.parent
-        picks = [
-            (name, read_image(folder / name), pixels)
-            for name, pixels in by_image.items()
-        ]
-        how = self.unknown_scale
-        return cell.align(self.scene, points=points, picks=picks, unknown_scale=how)
+        picks = []
+        for name, pixels in by_image.items():
+            picks.append((name, read_image(folder / name), pixels))
+        return cell.align(
+            self.scene, points=points, picks=picks, unknown_scale=self.unknown_scale
+        )
 
     def _show(self, alignment: "MapAlignment", unit: float) -> None:
         """Print it; `unit` is that of the recording, per unit of the map."""
-        similarity, (mm, deg) = alignment.similarity, alignment.sigma
+        similarity = alignment.similarity
+        mm, deg = alignment.sigma
         scale = similarity.scale / unit  # metres per unit of the recording
-        gripper = alignment.gripper_from_camera
+        mount = alignment.gripper_from_camera
         self.answer(
             {
                 "scene": self.scene,
@@ -128,9 +128,7 @@ class Align(args.Verb):
                 "sigma_deg": deg,
                 "used": alignment.used,
                 "given": alignment.given,
-                "gripper_from_camera": None
-                if gripper is None
-                else gripper.matrix().tolist(),
+                "gripper_from_camera": mount and mount.matrix().tolist(),
                 "warnings": alignment.warnings,
             },
             f"aligned {self.scene}: standard deviation {mm:.2f} mm and {deg:.3f} deg per axis in"

@@ -2,10 +2,11 @@
 
 import math
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TextIO
 
 from tyro.conf import Positional, arg
 
@@ -24,7 +25,7 @@ MAP = "evercal"
 
 
 def shown(word: str, default: str = "", **how: Any) -> Any:
-    """An argument under a word of its own in the help, with its default in words or not at all."""
+    """An argument with a placeholder for its value and its default, as the help shows them."""
     return arg(metavar=word, help_behavior_hint=default, **how)
 
 
@@ -80,6 +81,11 @@ class Verb:
             os.environ[VARIABLE] = self.limits
         os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(bounds().pixels))
 
+    @property
+    def log(self) -> TextIO:
+        """Stream of lines that are printed during the work; stdout is for the JSON object."""
+        return sys.stderr if self.json else sys.stdout
+
     def answer(self, record: object, *lines: str, then: Sequence[object] = ()) -> None:
         """Print a record as JSON; else lines, and the words of the command to run next."""
         if self.json:
@@ -125,17 +131,20 @@ class Reading:
         """Read the recording."""
         from evercal.recordings import ReadOptions, load_recording
 
-        given = {field.name: getattr(self, field.name) for field in fields(ReadOptions)}
-        options = ReadOptions(**given)
-        return load_recording(path, self.format, name, options)  # pyright: ignore[reportArgumentType]
+        options = vars(self).copy()
+        format = options.pop("format")
+        return load_recording(path, format, name, ReadOptions(**options))
 
     def words(self) -> list[str]:
         """The options that were given, as words of a command."""
         words = []
         for field in fields(self):
-            if (value := getattr(self, field.name)) != field.default:
-                words.append(option(field.name))
-                words += [] if value is True else [str(value)]
+            value = getattr(self, field.name)
+            if value == field.default:
+                continue
+            words.append(option(field.name))
+            if value is not True:
+                words.append(str(value))
         return words
 
 
@@ -148,14 +157,18 @@ def camera_for(file: Path | None, images: Sequence[Path]) -> "Camera | None":
     """The camera in the file of --camera, for the size of the first readable image."""
     from evercal.recordings.images import first_size
 
-    return None if file is None else stated_camera(file, first_size(images))
+    if file is None:
+        return None
+    return stated_camera(file, first_size(images))
 
 
 def stated_camera(file: Path | None, size: tuple[int, int]) -> "Camera | None":
     """The camera in the file of --camera, for images of (width, height)."""
     from evercal.recordings.cameras.camera_file import read_camera
 
-    return None if file is None else read_camera(file, size)
+    if file is None:
+        return None
+    return read_camera(file, size)
 
 
 def transform_of(file: Path | None) -> "SE3 | None":
@@ -172,7 +185,9 @@ def strategy_of(store: Path) -> str | None:
     from evercal.storage import read_manifest
     from evercal.storage.stages import is_store
 
-    return str(read_manifest(store)["strategy"]) if is_store(store) else None
+    if not is_store(store):
+        return None
+    return str(read_manifest(store)["strategy"])
 
 
 def open_localizer(store: Path, device: str = "auto") -> "LearnedLocalizer":
@@ -214,12 +229,12 @@ class Point(NamedTuple):
         if text is None:
             return None
         try:
-            x, y, z = (float(word) for word in text.split(","))
-        except ValueError:
-            x = y = z = math.nan
-        if not all(map(math.isfinite, (x, y, z))):
+            point = cls(*map(float, text.split(",")))
+        except (ValueError, TypeError):
+            point = cls(math.nan, math.nan, math.nan)
+        if not all(map(math.isfinite, point)):
             raise InputError(f"--at {text}: give x,y,z in metres such as 0,0.05,0.4")
-        return cls(x, y, z)
+        return point
 
     def record(self, parent_from_camera: "UncertainPose") -> dict[str, object]:
         """The point in both frames and its standard deviation per axis."""

@@ -49,13 +49,13 @@ class Audit(args.Verb):
             episodes = audit(
                 localizer, self.folder, stated, self.images, most, bar.update
             )
-        wrong = sum(episode.verdict == "wrong" for episode in episodes)
-        self.answer(
-            {"episodes": [dataclasses.asdict(episode) for episode in episodes]},
-            *(
-                f"{episode.verdict:8s} {episode.name}: {episode.reason}"
-                for episode in episodes
-            ),
-            f"{wrong} of {len(episodes)} episodes state a wrong camera pose",
-        )
+        wrong = 0
+        records = []
+        lines = []
+        for episode in episodes:
+            wrong += episode.verdict == "wrong"
+            records.append(dataclasses.asdict(episode))
+            lines.append(f"{episode.verdict:8s} {episode.name}: {episode.reason}")
+        lines.append(f"{wrong} of {len(episodes)} episodes state a wrong camera pose")
+        self.answer({"episodes": records}, *lines)
         return 1 if wrong else 0

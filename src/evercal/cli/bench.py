@@ -1,7 +1,7 @@
 """`evercal bench`."""
 
 import dataclasses
-import sys
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -91,27 +91,23 @@ class Bench(args.Verb):
             load_plugin(self.plugin)
         strategies = self._strategies()  # refused before recordings are read
         scenes = self._recorded()
+        judged = "test frames"
         if self.held_out:
-            scenes = [tuning_split(scene) for scene in scenes]
+            scenes = list(map(tuning_split, scenes))
+            judged = "held-out training frames"
+        poses = "sfm" if self.poses else "original"
+        frames = itertools.chain.from_iterable(scene.train for scene in scenes)
         options = BenchOptions(
             self._stage,
             strategies,
             seeds,
             self.order,
-            short_side(
-                self.preset, (frame for scene in scenes for frame in scene.train)
-            ),
-            settings={
-                "suite": self.suite,
-                "poses": "sfm" if self.poses else "original",
-                "judged": "held-out training frames"
-                if self.held_out
-                else "test frames",
-            },
+            short_side(self.preset, frames),
+            settings={"suite": self.suite, "poses": poses, "judged": judged},
             device=self.device,
         )
         for step in run_bench(scenes, options, self.out):
-            say(_progress(step), sys.stderr if self.json else sys.stdout)
+            say(_progress(step), self.log)
         return self._show(self.out, strategies[0].name)
 
     def _show(self, folder: Path, reference: str = "") -> int:
@@ -129,11 +125,13 @@ class Bench(args.Verb):
         from evercal.continual.benchmark.paper_tables import TABLE4
         from evercal.continual.strategies import strategy_named
 
-        words = _words(self.strategies)
-        names = [
-            name for word in words for name in (TABLE4 if word == "table4" else (word,))
-        ]
-        return tuple(strategy_named(name) for name in dict.fromkeys(names))
+        names: list[str] = []
+        for word in _words(self.strategies):
+            if word == "table4":
+                names += TABLE4
+            else:
+                names.append(word)
+        return tuple(map(strategy_named, dict.fromkeys(names)))
 
     def _recorded(self) -> "list[Recording]":
         from evercal.continual.benchmark.suites import load_suite, regions
@@ -143,13 +141,13 @@ class Bench(args.Verb):
             raise InputError(
                 f"suite {self.suite}: give scene folders for the suites custom and regions only"
             )
+        scenes = list(map(load_recording, self.recordings))
         if self.suite == "regions":
-            scenes = [load_recording(path) for path in self.recordings]
             if len(scenes) > 1:
                 raise InputError(f"suite regions: got {len(scenes)} scenes; give one")
             return regions(scenes[0], self.parts)
         if self.suite == "custom":
-            return [load_recording(path) for path in self.recordings]
+            return scenes
         return load_suite(self.suite, self.data, _words(self.scenes), self.poses)
 
     def _stage(self, seed: int) -> "StageOptions":
@@ -163,11 +161,13 @@ class Bench(args.Verb):
             stage = preset(self.preset, seed).with_memory(self.memory)
         except InputError as error:
             raise InputError(f"--{error}") from None
-        stage = BACKBONES["paper" if self.preset == "paper" else self.backbone](stage)
-        preset_steps = stage.fit.iterations
+        backbone = "paper" if self.preset == "paper" else self.backbone
+        stage = BACKBONES[backbone](stage)
+        steps = stage.fit.iterations
         if self.preset == "paper" and self.suite.startswith("sim"):
-            preset_steps = PAPER_SIM_STEPS
-        steps = preset_steps if self.steps is None else self.steps
+            steps = PAPER_SIM_STEPS
+        if self.steps is not None:
+            steps = self.steps
         if steps < 1:
             raise InputError(f"--steps {steps}: give a number >= 1")
         fit = dataclasses.replace(stage.fit, iterations=steps)
@@ -184,28 +184,29 @@ class Bench(args.Verb):
 
 def _progress(step: "Step") -> str:
     """Describe a stage: accuracy of each scene, under every name that the strategy is judged by."""
-    start = f"[{step.done}/{step.total}] "
-    if step.results.empty:
-        return (
-            f"{start}{step.strategy} seed {step.seed}: no results before the last stage"
-        )
-    shares = 100 * step.results["within_5cm_5deg"] / step.results["frames"]
-    parts = step.results["scene"] + shares.map(" {:.1f}".format)
-    names = parts.groupby(step.results["strategy"], sort=False).agg(", ".join)
-    text = "; ".join(f"{name} seed {step.seed}: {of}" for name, of in names.items())
-    return (
-        f"{start}{text} % within 5 cm, 5 deg ({step.results['seconds'].iloc[0]:.0f} s)"
-    )
+    start = f"[{step.done}/{step.total}]"
+    seed = f"seed {step.seed}"
+    rows = step.results
+    if rows.empty:
+        return f"{start} {step.strategy} {seed}: no results before the last stage"
+    shares = 100 * rows["within_5cm_5deg"] / rows["frames"]
+    scenes = rows["scene"] + shares.map(" {:.1f}".format)
+    strategies = []
+    for name, group in scenes.groupby(rows["strategy"], sort=False):
+        strategies.append(f"{name} {seed}: {', '.join(group)}")
+    seconds = rows["seconds"].iloc[0]
+    text = "; ".join(strategies)
+    return f"{start} {text} % within 5 cm, 5 deg ({seconds:.0f} s)"
 
 
 def _words(text: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in text.split(",") if word.strip())
+    return tuple(filter(None, map(str.strip, text.split(","))))
 
 
 def _numbers(text: str) -> tuple[int, ...]:
     words = _words(text)
-    if not words or not all(word.isdecimal() for word in words):
+    if not words or not all(map(str.isdecimal, words)):
         raise InputError(
             f"--seeds {text}: give comma-separated numbers >= 0, such as 0,1,2"
         )
-    return tuple(int(word) for word in words)
+    return tuple(map(int, words))

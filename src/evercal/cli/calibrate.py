@@ -3,12 +3,13 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
+from evercal.choices import MountName
 from evercal.cli import args
-from evercal.cli.console import require_writable, say_notes
+from evercal.cli.console import numbers, require_writable, say_notes
 from evercal.errors import InputError
 from evercal.progress import progress_bar
 
@@ -16,8 +17,6 @@ if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration, JointOffset, Rig
     from evercal.calibration.from_images import Images
     from evercal.localization.localizer import Localizer
-
-Mount = Literal["eye_to_hand", "eye_in_hand"]
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class Calibrate(args.Verb):
     thing in the gripper are found by the names of the images, which may repeat between folders."""
     convention: args.Name = None
     """Format of the robot poses, if the file does not state it."""
-    mount: Annotated[Mount | None, args.shown("eye_to_hand|eye_in_hand")] = None
+    mount: Annotated[MountName | None, args.shown("eye_to_hand|eye_in_hand")] = None
     """eye_to_hand for a fixed camera, eye_in_hand for one on the gripper. Default: decided from
     the camera's motion."""
     camera: args.File = None
@@ -58,8 +57,8 @@ class Calibrate(args.Verb):
 
         if folders:
             return self._rig(folders, point)
-        given = self._given(image_files(self.images))
-        calibration = self._calibrated(args.open_map(self.store), given, self.mount)
+        images = self._taken(image_files(self.images))
+        calibration = self._calibrated(args.open_map(self.store), images, self.mount)
         calibration.write(self.out)
         self.answer(
             {**calibration.to_dict(), **at_record(calibration, point)},
@@ -70,9 +69,13 @@ class Calibrate(args.Verb):
 
     def _folders(self) -> dict[str, Path]:
         """The folder of each camera of a rig; empty for one camera."""
-        named = [
-            word for word in self.images if "=" in word and not Path(word).exists()
-        ]
+        folders = {}
+        named = []
+        for word in self.images:
+            name, sign, path = word.partition("=")
+            if sign and not Path(word).exists():
+                named.append(word)
+                folders[name] = Path(path)
         if named and len(named) < len(self.images):
             raise InputError(
                 f"{named[0]}: NAME=FOLDER and plain images cannot be mixed; give NAME=FOLDER for"
@@ -80,41 +83,35 @@ class Calibrate(args.Verb):
             )
         if named and self.mount == "eye_in_hand":
             raise InputError("--mount: the cameras of a rig are fixed; omit the option")
-        return {
-            name: Path(path)
-            for name, _, path in (word.partition("=") for word in named)
-        }
+        return folders
 
-    def _given(self, files: list[Path]) -> "Images":
+    def _taken(self, files: list[Path]) -> "Images":
         from evercal.calibration.from_images import Images
 
         camera = args.camera_for(self.camera, files)
-        given = Images.of(files, camera, self.robot_poses, self.convention)
-        say_notes(given.notes)
-        return given
+        images = Images.of(files, camera, self.robot_poses, self.convention)
+        say_notes(images.notes)
+        return images
 
     def _calibrated(
-        self, localizer: "Localizer", given: "Images", mount: Mount | None
+        self, localizer: "Localizer", images: "Images", mount: MountName | None
     ) -> "Calibration":
         from evercal.calibration.from_images import calibrate
 
-        with progress_bar("localizing", len(given.images), "image") as bar:
-            calibration = calibrate(localizer, given, mount, on_image=bar.update)
-        return replace(
-            calibration, source={**calibration.source, "store": str(self.store)}
-        )
+        with progress_bar("localizing", len(images.images), "image") as bar:
+            calibration = calibrate(localizer, images, mount, on_image=bar.update)
+        source = {**calibration.source, "store": str(self.store)}
+        return replace(calibration, source=source)
 
     def _rig(self, folders: dict[str, Path], point: args.Point | None) -> int:
         from evercal.calibration.calibration import rig_of
         from evercal.recordings.image_files import image_files
 
         localizer = args.open_map(self.store)
-        cameras = {
-            name: self._calibrated(
-                localizer, self._given(image_files([folder])), "eye_to_hand"
-            )
-            for name, folder in folders.items()
-        }
+        cameras = {}
+        for name, folder in folders.items():
+            images = self._taken(image_files([folder]))
+            cameras[name] = self._calibrated(localizer, images, "eye_to_hand")
         rig = rig_of(cameras)
         rig.write(self.out)
         record = rig.to_dict()
@@ -128,7 +125,9 @@ def at_record(
     calibration: "Calibration", point: args.Point | None
 ) -> dict[str, object]:
     """The entry of --at in the JSON answer; empty without a point."""
-    return {} if point is None else {"at": point.record(calibration.uncertain_pose)}
+    if point is None:
+        return {}
+    return {"at": point.record(calibration.uncertain_pose)}
 
 
 def calibration_lines(
@@ -137,13 +136,10 @@ def calibration_lines(
     """A calibration in lines. `point` is that of --at."""
     from evercal.calibration.calibration import position_shares
 
-    x, y, z = 1000 * calibration.parent_from_child.translation_m
-    quaternion = " ".join(
-        f"{q:+.6f}" for q in calibration.parent_from_child.rotation_wxyz
-    )
+    pose = calibration.parent_from_child
     yield f"{calibration.parent_frame}_from_{calibration.child_frame}: the {calibration.meaning}"
-    yield f"  translation  {x:+.2f} {y:+.2f} {z:+.2f} mm"
-    yield f"  quaternion   {quaternion} wxyz"
+    yield f"  translation  {numbers(1000 * pose.translation_m, '+.2f')} mm"
+    yield f"  quaternion   {numbers(pose.rotation_wxyz, '+.6f')} wxyz"
     spread = f"{calibration.sigma_mm:.2f} mm, {calibration.sigma_deg:.3f} deg"
     yield f"  uncertainty  {spread} (standard deviation per axis)"
     terms = calibration.error_terms
@@ -153,49 +149,55 @@ def calibration_lines(
             yield f"    of it      {part} ({100 * share:.0f} % of the position's variance)"
     if point is not None:
         yield f"  point        {point.text(calibration.uncertain_pose)}"
-    if "repeatability_mm" in (checks := calibration.checks):
+    checks = calibration.checks
+    if "repeatability_mm" in checks:
         mm = checks["repeatability_mm"]
         deg = checks["repeatability_deg"]
         yield f"  two halves   of the images differ by {mm:.2f} mm and {deg:.3f} deg"
-    if calibration.images:
-        used = sum(image.used for image in calibration.images)
-        yield f"  images       {used} of {len(calibration.images)} used"
-    yield from (
-        f"    rejected   {i.name}: {i.reason}" for i in calibration.images if not i.used
-    )
+    images = calibration.images
+    rejected = [image for image in images if not image.used]
+    if images:
+        yield f"  images       {len(images) - len(rejected)} of {len(images)} used"
+    for image in rejected:
+        yield f"    rejected   {image.name}: {image.reason}"
     yield f"  verdict      {calibration.verdict}"
 
 
 def joint_lines(joints: Sequence["JointOffset"], file: object) -> Iterator[str]:
     """The offsets of an arm's joints in lines; `file` holds the calibration."""
-    rows = [(joint, *joint.unit) for joint in joints if not joint.open]
-    large = [row for row in rows if abs(row[0].offset) >= 2 * row[0].sigma]
-    for joint, unit, times in large:
+    corrected = False
+    bounds = []
+    for joint in joints:
+        unit, times = joint.unit
         offset = times * joint.offset
         sigma = times * joint.sigma
-        yield f"joint {joint.name}: add {offset:+.2f} {unit} (standard deviation {sigma:.2f})"
-    if large:
+        if joint.open:
+            continue
+        if abs(joint.offset) >= 2 * joint.sigma:
+            corrected = True
+            yield f"joint {joint.name}: add {offset:+.2f} {unit} (standard deviation {sigma:.2f})"
+        bounds.append(f"{abs(offset) + 2 * sigma:.2f} {unit} ({joint.name})")
+    if corrected:
         words = (
             f"export {file} --format corrected_urdf --urdf ROBOT.urdf --out NEW.urdf"
         )
         yield f"joints: the camera is that of the corrected arm; correct its URDF: evercal {words}"
-    elif rows:
-        most = [
-            (times * (abs(j.offset) + 2 * j.sigma), unit, j.name)
-            for j, unit, times in rows
-        ]
-        bounds = ", ".join(f"{value:.2f} {unit} ({name})" for value, unit, name in most)
-        yield f"joints: no offset above {bounds}"
-    yield from (f"joint {j.name}: not determined; {j.open}" for j in joints if j.open)
+    elif bounds:
+        yield f"joints: no offset above {', '.join(bounds)}"
+    for joint in joints:
+        if joint.open:
+            yield f"joint {joint.name}: not determined; {joint.open}"
 
 
 def _rig_lines(rig: "Rig", point: args.Point | None) -> Iterator[str]:
     for name, calibration in rig.cameras.items():
-        first, *rest = calibration_lines(calibration, point)
-        yield from (f"{name}: {first}", *rest)
+        first, *others = calibration_lines(calibration, point)
+        yield f"{name}: {first}"
+        yield from others
     for first, second, pose in rig.relative:
-        x, y, z = 1000 * pose.pose.translation_m
+        position = numbers(1000 * pose.pose.translation_m, "+.2f")
+        spread = f"{pose.sigma_mm:.2f} mm and {pose.sigma_deg:.3f} deg"
         yield (
-            f"{first}_from_{second}: {x:+.2f} {y:+.2f} {z:+.2f} mm, standard deviation at most"
-            f" {pose.sigma_mm:.2f} mm and {pose.sigma_deg:.3f} deg (independent errors assumed)"
+            f"{first}_from_{second}: {position} mm, standard deviation at most {spread}"
+            " (independent errors assumed)"
         )

@@ -1,6 +1,5 @@
 """`evercal check`."""
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -62,19 +61,24 @@ class Check(args.Verb):
         files = image_files(self.images)
         camera = args.camera_for(self.camera, files)
         given = Images.of(files, camera, self.robot_poses, self.convention)
-        images = given.images
-        poses = given.base_from_gripper
         localizer = args.open_map(self.store)
-        with progress_bar("localizing", len(images), "image") as bar:
-            shift = check(localizer, images, reference, camera, bar.update, poses)
-        rejected = [use for use in shift.images if not use.used]
-        self.answer(
-            check_record(shift),
-            shift_line(shift),
-            *([shift.note] if shift.note else []),
-            *(f"  rejected  {use.name}: {use.reason}" for use in rejected),
-            then=("calibrate", self.store, *self.images[:1]) if shift.moved else (),
-        )
+        with progress_bar("localizing", len(given.images), "image") as bar:
+            shift = check(
+                localizer,
+                given.images,
+                reference,
+                camera,
+                bar.update,
+                given.base_from_gripper,
+            )
+        lines = [shift_line(shift)]
+        if shift.note:
+            lines.append(shift.note)
+        for image in shift.images:
+            if not image.used:
+                lines.append(f"  rejected  {image.name}: {image.reason}")
+        then = ("calibrate", self.store, *self.images[:1]) if shift.moved else ()
+        self.answer(check_record(shift), *lines, then=then)
         return 1 if shift.moved else 0
 
     def _check_arm(self, reference: "Calibration") -> int:
@@ -94,16 +98,20 @@ class Check(args.Verb):
         )
         with TemporaryDirectory() as folder:
             new = Map.open(Path(folder) / "map")
-            (new.learn if reference.on_gripper else new.eye_to_hand)(recording)
+            learn = new.learn if reference.on_gripper else new.eye_to_hand
+            learn(recording)
             now = new.calibration()
         confidence, changed, joints = arm_change(reference, now)
         shift = shift_of(
             reference, now.parent_from_child, reference.covariance + now.covariance
         )
-        moved = f"Changed joints: {', '.join(changed)} (confidence {100 * confidence:.1f} %)."
-        lines = [moved if changed else "No joint has changed.", shift_line(shift)]
+        change = "No joint has changed."
+        if changed:
+            names = ", ".join(changed)
+            change = f"Changed joints: {names} (confidence {100 * confidence:.1f} %)."
+        lines = [change, shift_line(shift)]
         for joint in joints:
-            size, unit = (180 / math.pi, "deg") if joint.is_angle else (1000, "mm")
+            unit, size = joint.unit
             sigma = joint.open or f"standard deviation {size * joint.sigma:.3f} {unit}"
             lines.append(f"  {joint.name}  {size * joint.offset:+.3f} {unit}: {sigma}")
         record = {

@@ -38,7 +38,7 @@ def table(rows: Sequence[Mapping[str, object]]) -> list[str]:
 
     if not rows:
         return []
-    align = ("left", *("right" for _ in list(rows[0])[1:]))
+    align = ("left", *["right"] * (len(rows[0]) - 1))
     return [tabulate(list(rows), headers="keys", colalign=align, disable_numparse=True)]
 
 
@@ -47,13 +47,20 @@ def length(mm: float | None) -> str:
     return "" if mm is None else f"{mm:.2f} mm, "
 
 
+def numbers(values: "Iterable[float]", form: str) -> str:
+    """Numbers of one format, separated by spaces."""
+    return " ".join(map(f"{{:{form}}}".format, values))
+
+
 def size(count: float) -> str:
     """Format bytes: 1.2 MB."""
-    for unit in ("B", "kB", "MB"):
-        if count < 1000:
-            return f"{count:.0f} B" if unit == "B" else f"{count:.1f} {unit}"
+    if count < 1000:
+        return f"{count:.0f} B"
+    for unit in ("kB", "MB"):
         count /= 1000
-    return f"{count:.1f} GB"
+        if count < 1000:
+            return f"{count:.1f} {unit}"
+    return f"{count / 1000:.1f} GB"
 
 
 def require_writable(path: Path | None, option: str) -> None:
