@@ -131,7 +131,7 @@ class Reading:
         """Read the recording."""
         from evercal.recordings import ReadOptions, load_recording
 
-        options = vars(self).copy()
+        options: dict[str, Any] = vars(self).copy()
         format = options.pop("format")
         return load_recording(path, format, name, ReadOptions(**options))
 

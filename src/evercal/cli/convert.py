@@ -30,6 +30,7 @@ class Convert(args.Verb):
 
     def run(self) -> int:
         from evercal.recordings.formats import generic
+        from evercal.recordings.frame import stated_grippers, stated_poses
 
         if self.out.exists() and not self.out.is_dir():
             raise InputError(f"{self.out}: is a file; give a folder to write to")
@@ -41,27 +42,26 @@ class Convert(args.Verb):
             )
         with progress_bar("writing", len(frames), "image") as bar:
             generic.write(self.out, scene, link=self.hard_link, on_frame=bar.update)
+        train = len(scene.train)
+        test = len(scene.test)
+        cameras = len(stated_poses(frames))
+        grippers = len(stated_grippers(frames))
         record = {
             "out": str(self.out),
             "name": scene.name,
-            "train": len(scene.train),
-            "test": len(scene.test),
+            "train": train,
+            "test": test,
             "untracked": scene.untracked,
-            "with_base_from_camera": sum(
-                f.base_from_camera is not None for f in frames
-            ),
-            "with_base_from_gripper": sum(
-                f.base_from_gripper is not None for f in frames
-            ),
+            "with_base_from_camera": cameras,
+            "with_base_from_gripper": grippers,
             "notes": list(scene.notes),
         }
         self.answer(
             record,
-            f"{self.out}: {scene.name}, {len(scene.train)} training and {len(scene.test)} test"
-            f" frames; {record['with_base_from_camera']} with the camera's pose,"
-            f" {record['with_base_from_gripper']} with the gripper's; {scene.untracked} images"
-            " without a pose left out",
-            *(f"note: {note}" for note in scene.notes),
+            f"{self.out}: {scene.name}, {train} training and {test} test frames; {cameras} with the"
+            f" camera's pose, {grippers} with the gripper's; {scene.untracked} images without a"
+            " pose left out",
+            *map("note: {}".format, scene.notes),
             then=("inspect", self.out),
         )
         return 0

@@ -52,29 +52,23 @@ class Demo(args.Verb):
     def run(self) -> int:
         from evercal.recordings.samples import ROOMS, copy_samples, sample_rooms
 
-        if (folder := self.copy_samples) is not None:
+        folder = self.copy_samples
+        if folder is not None:
             copy_samples(folder)
             cell = folder / "cell"
+            learn = ("learn", "cell.evercal", cell / "wrist")
             self.answer(
                 {"samples": str(folder)},
                 f"copied {', '.join(ROOMS)} and the robot cell {cell} to {folder}; the cell has"
                 " recordings of a camera on the gripper (wrist) and of a fixed camera (tripod)",
-                then=(
-                    "learn",
-                    "cell.evercal",
-                    cell / "wrist",
-                    "--calibration",
-                    "wrist.json",
-                ),
+                then=(*learn, "--calibration", "wrist.json"),
             )
             return 0
         result = run_demo(self.out, sample_rooms(), quiet=self.json)
+        headlines = result.headlines()
         self.answer(
             result.to_dict(),
-            *(
-                f"{number:>12}  {meaning}"
-                for number, meaning in result.headlines().items()
-            ),
+            *map("{:>12}  {}".format, headlines, headlines.values()),
             f"wrote {self.out / REPORT} in {result.seconds:.0f} s",
             then=("localize", self.out / STORE, self.out / QUERY),
         )
@@ -118,15 +112,19 @@ def run_demo(
     finally:
         shutil.rmtree(work, ignore_errors=True)
     cell = Map.open(store)
-    result.test = _evaluate(cell, {room.scene.name: room.scene for room in rooms})
-    changed = {
-        r.scene.name: replace(r.changed, train=r.scene.train)
-        for r in rooms
-        if r.changed
-    }
+    scenes = {}
+    changed = {}
+    for room in rooms:
+        name = room.scene.name
+        scenes[name] = room.scene
+        if room.changed:
+            changed[name] = replace(room.changed, train=room.scene.train)
+    result.test = _evaluate(cell, scenes)
     result.changed = _evaluate(cell, changed)
     result.cameras = [_fixed_camera(cell, room) for room in rooms]
-    pictures = [picture for room in rooms for picture in _pictures(cell, room.scene)]
+    pictures = []
+    for room in rooms:
+        pictures += _pictures(cell, room.scene)
     write_image(out / QUERY, _spread(rooms[0].scene.test, 1)[0].read_image())
     result.seconds = time.perf_counter() - began
     write_bytes(out / REPORT, demo_page(result, pictures).encode())
@@ -143,25 +141,24 @@ def _learn(cell: "Map", scene: "Recording", result: "DemoResult", quiet: bool) -
         images=report.train_frames,
         keyframes=report.frames_kept,
         landmarks=report.landmarks,
-        residual_px=None if report.adjusted is None else report.adjusted.residual_px,
+        residual_px=report.adjusted and report.adjusted.residual_px,
         seconds=report.seconds,
     )
     result.learned.append(room)
     result.memory_bytes = report.memory_bytes
     if not quiet:
-        kept = f"{room.keyframes} keyframes, {room.landmarks} landmarks"
-        time_and_size = (
-            f"{room.seconds:.0f} s; {size(result.memory_bytes)} for all rooms"
+        say(
+            f"mapped {room.room}: {room.images} images, {room.keyframes} keyframes,"
+            f" {room.landmarks} landmarks, {room.seconds:.0f} s; {size(result.memory_bytes)} for"
+            " all rooms"
         )
-        say(f"mapped {room.room}: {room.images} images, {kept}, {time_and_size}")
 
 
 def _localize_unknown(cell: "Map", scene: "Recording", result: "DemoResult") -> None:
     """Localize images of a room that is not in the store yet."""
     frames = _spread(scene.test, UNKNOWN_IMAGES)
-    with progress_bar(
-        f"images of unknown room {scene.name}", len(frames), "image"
-    ) as bar:
+    what = f"images of unknown room {scene.name}"
+    with progress_bar(what, len(frames), "image") as bar:
         for frame in frames:
             estimate = cell.localize(frame.read_image(), frame.camera)
             result.unknown_images += 1
@@ -191,10 +188,11 @@ def _fixed_camera(cell: "Map", room: "SampleRoom") -> "FixedCamera":
     count = len(fixed.test) + len(bumped.test)
     # An InputError means that no image was localized.
     with progress_bar(f"camera in {name}", count, "image") as bar, suppress(InputError):
-        lens = fixed.test[0].camera
-        images = _images(fixed)
         calibration = cell.calibrate(
-            images, camera=lens, mount="eye_to_hand", on_image=bar.update
+            _images(fixed),
+            camera=fixed.test[0].camera,
+            mount="eye_to_hand",
+            on_image=bar.update,
         )
         if calibration.source["scene"] != name:
             return camera

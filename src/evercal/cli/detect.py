@@ -5,12 +5,13 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.choices import BoardKind, CameraModel
 from evercal.cli import args
-from evercal.cli.console import require_writable
+from evercal.cli.console import numbers, require_writable
 from evercal.errors import InputError
 from evercal.progress import progress_bar
 
@@ -20,13 +21,14 @@ if TYPE_CHECKING:
     from evercal.calibration.boards.corners import BoardView
     from evercal.calibration.boards.detection import Image
 
-_DICTIONARIES = {
+_DICTIONARIES: dict[BoardKind, str] = {
     "chessboard": "",
     "charuco": "4X4_50",
     "apriltag": "APRILTAG_36h11",
     "aprilgrid": "APRILTAG_36h11",
     "arucogrid": "4X4_50",
 }
+"""Dictionaries of markers by default."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Detect(args.Verb):
     Example: evercal detect images/ --board chessboard --size 9x6 --square-mm 25
     """
 
-    board: Literal["chessboard", "charuco", "apriltag", "aprilgrid", "arucogrid"]
+    board: BoardKind
     """Printed board; aprilgrid: Kalibr's, arucogrid: OpenCV's GridBoard."""
     images: Annotated[Positional[tuple[Path, ...]], args.shown("[IMAGE...]")] = ()
     """Image files of one camera, or a folder of them."""
@@ -59,7 +61,7 @@ class Detect(args.Verb):
     """Number of the tag, or of the first marker of a grid."""
     camera: args.File = None
     """File of the intrinsics; if omitted, they are estimated from the board."""
-    lens: Literal["pinhole", "fisheye"] = "pinhole"
+    lens: CameraModel = "pinhole"
     """Model of the estimated intrinsics: fisheye for wide lenses, from about 110 degrees."""
     out: args.OutFile = Path("board.json")
     """File of poses and corners to write."""
@@ -82,9 +84,8 @@ class Detect(args.Verb):
         board = self._board()
         files = image_files(self.images)
         try:
-            refuse_repeated(
-                (path.name for path in files), "give each image a unique name"
-            )
+            names = [path.name for path in files]
+            refuse_repeated(names, "give each image a unique name")
         except ValueError as error:
             raise InputError(str(error)) from None
         from evercal.calibration.boards.board_poses import board_poses
@@ -107,15 +108,9 @@ class Detect(args.Verb):
             source = "board"
         poses = board_poses(board, camera, views, source)
         poses.write(self.out)
-        words = (
-            "--robot-poses",
-            "FILE",
-            "--camera-poses",
-            self.out,
-            "--mount",
-            "eye_in_hand",
-        )
-        self.answer(poses.to_dict(), *_lines(poses), then=("solve", *words))
+        solve = ("solve", "--robot-poses", "FILE", "--camera-poses", self.out)
+        then = (*solve, "--mount", "eye_in_hand")
+        self.answer(poses.to_dict(), *_lines(poses), then=then)
         return 0
 
     def _make(self, path: Path) -> int:
@@ -139,6 +134,7 @@ class Detect(args.Verb):
             raise InputError(
                 "--square-mm: give the side of a square, or of the tag, millimetres"
             )
+        dictionary = self.dictionary or _DICTIONARIES[self.board]
         match = re.fullmatch(r"(\d+)[xX,](\d+)", self.size or "0x0")
         if match is None:
             raise InputError(f"--size {self.size}: give two numbers such as 9x6")
@@ -149,9 +145,7 @@ class Detect(args.Verb):
             rows=int(match[2]),
             marker_m=self.marker_mm / 1000,
             gap_m=self.gap_mm / 1000,
-            dictionary=(self.dictionary or _DICTIONARIES[self.board]).removeprefix(
-                "DICT_"
-            ),
+            dictionary=dictionary.removeprefix("DICT_"),
             tag=self.tag,
         )
 
@@ -163,25 +157,27 @@ class Detect(args.Verb):
         from evercal.recordings import read_image
 
         folder = self.out.absolute().parent
-        names = {
-            Path(os.path.relpath(f.absolute(), folder)).as_posix(): f for f in files
-        }
+        by_name = {}
+        for file in files:
+            path = Path(os.path.relpath(file.absolute(), folder))
+            by_name[path.as_posix()] = file
         with progress_bar("detecting", len(files), "image") as bar:
 
             def read(name: str) -> "Image | str":
                 bar.update()
+                file = by_name[name]
                 try:
-                    image = read_image(names[name])
+                    image = read_image(file)
                 except InputError as error:
-                    return str(error).removeprefix(f"{names[name]}: ")
+                    return str(error).removeprefix(f"{file}: ")
                 if image.shape[:2] != (height, width):
                     raise InputError(
-                        f"{names[name]}: is {image.shape[1]}x{image.shape[0]}, the first image"
+                        f"{file}: is {image.shape[1]}x{image.shape[0]}, the first image"
                         f" {width}x{height}; give images of one camera"
                     )
                 return image
 
-            return find_boards(list(names), read, board)
+            return find_boards(list(by_name), read, board)
 
 
 def _lines(poses: "BoardPoses") -> Iterator[str]:
@@ -189,16 +185,14 @@ def _lines(poses: "BoardPoses") -> Iterator[str]:
         if image.camera_from_board is None:
             yield f"{image.name}: {image.reason}"
             continue
-        x, y, z = 1000 * image.camera_from_board.translation_m
-        yield f"{image.name}: board at {x:+.1f} {y:+.1f} {z:+.1f} mm, {image.rms_px:.2f} px"
+        position = numbers(1000 * image.camera_from_board.translation_m, "+.1f")
+        yield f"{image.name}: board at {position} mm, {image.rms_px:.2f} px"
         if image.left_out:
-            where = ", ".join(f"{x:.0f} {y:.0f}" for x, y in image.left_out)
-            yield f"{image.name}: left out what leaves its neighbours, corners at x y {where}"
+            corners = ", ".join(numbers(corner, ".0f") for corner in image.left_out)
+            yield f"{image.name}: left out what leaves its neighbours, corners at x y {corners}"
     camera = poses.camera
-    numbers = ", ".join(
-        f"{key} {getattr(camera, key):.2f}" for key in ("fx", "fy", "cx", "cy")
-    )
     yield (
         f"{len(poses.detected)} of {len(poses.images)} images show the board; corner noise"
-        f" {poses.corner_sigma_px:.2f} px; camera (from the {poses.camera_from}) {numbers}"
+        f" {poses.corner_sigma_px:.2f} px; camera (from the {poses.camera_from})"
+        f" fx {camera.fx:.2f}, fy {camera.fy:.2f}, cx {camera.cx:.2f}, cy {camera.cy:.2f}"
     )

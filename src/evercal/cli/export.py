@@ -3,10 +3,11 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
+from evercal.choices import Motors
 from evercal.cli import args
 from evercal.cli.console import say
 from evercal.errors import InputError, printable
@@ -57,9 +58,7 @@ class Export(args.Verb):
     """For corrected_urdf: URDF of the arm that was recorded."""
     lerobot_calibration: args.File = None
     """For lerobot: the calibration file of the arm."""
-    lerobot_motors: Annotated[
-        Literal["feetech", "dynamixel"] | None, args.shown("feetech|dynamixel")
-    ] = None
+    lerobot_motors: Annotated[Motors | None, args.shown("feetech|dynamixel")] = None
     """For lerobot: feetech (SO-100, SO-101) or dynamixel (Koch, OMX)."""
 
     def run(self) -> int:
@@ -69,9 +68,10 @@ class Export(args.Verb):
 
         if self.format == "list" or (self.format is None and self.calibration is None):
             file = self.calibration or "CALIBRATION.json"
+            formats = {name: row.description for name, row in FORMATS.items()}
             self.answer(
-                {"formats": {name: row.description for name, row in FORMATS.items()}},
-                *(f"{name:27} {row.description}" for name, row in FORMATS.items()),
+                {"formats": formats},
+                *map("{:27} {}".format, formats, formats.values()),
                 then=("export", file, "--format", "NAME"),
             )
             return 0
@@ -90,6 +90,8 @@ class Export(args.Verb):
     def _show(self, exported: "Exported", verdict: str) -> None:
         calibration = exported.calibration
         child = calibration.child_frame
+        pose = calibration.parent_from_child
+        files = list(map(str, exported.files))
         if exported.format.frame == "tf" and self.via is None and "optical" in child:
             say(
                 f"note: most camera drivers publish {child} themselves; if yours does, give its"
@@ -105,16 +107,14 @@ class Export(args.Verb):
             "parent_frame": calibration.parent_frame,
             "child_frame": child,
             "meaning": calibration.meaning,
-            "translation_m": calibration.parent_from_child.translation_m.tolist(),
-            "quaternion_wxyz": calibration.parent_from_child.rotation_wxyz.tolist(),
+            "translation_m": pose.translation_m.tolist(),
+            "quaternion_wxyz": pose.rotation_wxyz.tolist(),
             "verdict": verdict,
-            "files": [str(file) for file in exported.files],
-            "text": None if exported.files else exported.text,
+            "files": files,
+            "text": None if files else exported.text,
         }
-        lines = [
-            f"wrote {', '.join(map(str, exported.files))}",
-            f"  {calibration.meaning}",
-        ]
-        lines += [f"  {verdict}"] if verdict else []
+        lines = [f"wrote {', '.join(files)}", f"  {calibration.meaning}"]
+        if verdict:
+            lines.append(f"  {verdict}")
         then = ("check", "MAP", "IMAGE", "--reference", self.calibration)
         self.answer(record, *lines, then=then)

@@ -1,6 +1,5 @@
 """`evercal eye-to-hand`."""
 
-import sys
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,7 +44,7 @@ class EyeToHand(args.Verb):
         with tempfile.TemporaryDirectory() as folder:
             cell = Map.open(self.map or Path(folder) / "thing")
             start = f"{recording.name}: {len(recording.train)} images"
-            with Bars(sys.stderr if self.json else sys.stdout, start) as bars:
+            with Bars(self.log, start) as bars:
                 calibration = cell.eye_to_hand(recording, on_progress=bars.step)
         calibration.write(self.out)
         self.answer(

@@ -1,5 +1,6 @@
 """`evercal info`."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,12 +33,16 @@ class Info(args.Verb):
             from evercal.continual.store import describe
 
             scenes, short_side, heads, sizes = describe(self.store)
-        total = sum(
-            file.stat().st_size for file in self.store.rglob("*") if file.is_file()
-        )
-        memory = sum(
-            bytes for file, bytes in sizes.items() if file.endswith(MEMORY_FILES)
-        )
+        files = filter(Path.is_file, self.store.rglob("*"))
+        total = sum(file.stat().st_size for file in files)
+        memory = 0
+        for name, count in sizes.items():
+            if name.endswith(MEMORY_FILES):
+                memory += count
+        adjusted = []
+        for scene in scenes:
+            if scene.get("adjusted"):
+                adjusted.append(adjusted_row(scene["name"], scene["adjusted"]))
         record = {
             "store": str(self.store),
             "strategy": strategy,
@@ -47,20 +52,15 @@ class Info(args.Verb):
             "total_bytes": total,
             "scenes": scenes,
         }
-        count = f"{len(scenes)} scene{'' if len(scenes) == 1 else 's'}"
+        plural = "" if len(scenes) == 1 else "s"
         network = f"networks {size(heads)}, " if heads else ""
         self.answer(
             record,
-            f"{self.store}: {count}, strategy {strategy}, images at {short_side} px",
+            f"{self.store}: {len(scenes)} scene{plural}, strategy {strategy}, images at"
+            f" {short_side} px",
             f"{size(total)} in all: keyframes {size(memory)}, {network}the rest is the encoder",
-            *table([_content(scene) for scene in scenes]),
-            *table(
-                [
-                    adjusted_row(s["name"], s["adjusted"])
-                    for s in scenes
-                    if s.get("adjusted")
-                ]
-            ),
+            *table(list(map(_content, scenes))),
+            *table(adjusted),
             then=("info", self.store, "--check"),
         )
         return 0
@@ -82,8 +82,9 @@ def _map(store: Path) -> tuple[Sequence[dict[str, Any]], int, int, dict[str, int
     from evercal.mapping.store import MapStore
 
     opened = MapStore.open(store)
-    scenes = [
-        {
+    scenes = []
+    for scene, report in zip(opened.contents.scenes, opened.reports(), strict=True):
+        record = {
             "name": scene.name,
             "train_frames": scene.train_frames,
             "memory_bytes": scene.keyframes.bytes,
@@ -93,38 +94,38 @@ def _map(store: Path) -> tuple[Sequence[dict[str, Any]], int, int, dict[str, int
             "adjusted": report.get("adjusted"),
             "hand_eye": report.get("hand_eye"),
         }
-        for scene, report in zip(opened.contents.scenes, opened.reports(), strict=True)
-    ]
+        scenes.append(record)
     return scenes, opened.contents.short_side, 0, opened.size_bytes()
 
 
 def _content(scene: dict[str, Any]) -> dict[str, object]:
     is_map = "landmarks" in scene
-    share = f"{100 * scene.get('inlier_threshold', 0):.0f} % inliers"
-    return {
+    row = {
         "scene": scene["name"],
         "frames": scene["train_frames"],
         "keyframes": scene["keyframes"],
-        **({"landmarks": scene["landmarks"]} if is_map else {}),
-        "memory": size(scene["memory_bytes"]),
-        **({} if is_map else {"rejected below": share}),
-        "camera": f"{scene['camera']['width']}x{scene['camera']['height']}",
     }
+    if is_map:
+        row["landmarks"] = scene["landmarks"]
+    row["memory"] = size(scene["memory_bytes"])
+    if not is_map:
+        row["rejected below"] = f"{100 * scene['inlier_threshold']:.0f} % inliers"
+    row["camera"] = f"{scene['camera']['width']}x{scene['camera']['height']}"
+    return row
 
 
 def adjusted_row(scene: str, adjusted: dict[str, Any]) -> dict[str, object]:
     """Changes by bundle adjustment."""
-    shift, rotation = (
-        adjusted[key] and sum(x * x for x in adjusted[key]) ** 0.5
-        for key in ("common_translation_mm", "common_rotation_deg")
-    )
+    shift = adjusted["common_translation_mm"]
+    shift_mm = shift and math.hypot(*shift)
+    rotation_deg = math.hypot(*adjusted["common_rotation_deg"])
     sigma = adjusted["pose_sigma_mm"]
     residual = adjusted["residual_px"]
     return {
         "bundle adjustment": scene,
         "median residual": "-" if residual is None else f"{residual:.2f} px",
         "error of stated poses": f"{length(sigma)}{adjusted['pose_sigma_deg']:.3f} deg",
-        "common transform": f"{length(shift)}{rotation:.3f} deg",
+        "common transform": f"{length(shift_mm)}{rotation_deg:.3f} deg",
         "focal length": f"{adjusted['focal_percent']:+.2f} %",
         "wrong poses": len(adjusted["wrong_poses"]),
         "untracked": len(adjusted.get("untracked", ())),

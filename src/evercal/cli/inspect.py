@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
+from evercal.cli.console import numbers
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -42,17 +43,18 @@ class Inspect(args.Verb):
         from evercal.recordings.inspection import inspect_recording
 
         recording = self.reading.recording(self.scene)
-        found = inspect_recording(recording)
-        record = asdict(found)
-        lines = [*_lines(found)]
-        if found.poses == "gripper":
+        inspection = inspect_recording(recording)
+        record = asdict(inspection)
+        lines = list(_lines(inspection))
+        if inspection.poses == "gripper":
             from evercal.calibration.from_map.next_views import open_position
             from evercal.recordings.frame import stated_grippers
 
             rough = args.transform_of(self.gripper_from_camera)
-            left = open_position(stated_grippers(recording.train), rough)
-            record["open_position"] = left and asdict(left)
-            lines += [f"warning: {left.sentence()}"] if left else []
+            open = open_position(stated_grippers(recording.train), rough)
+            record["open_position"] = open and asdict(open)
+            if open:
+                lines.append(f"warning: {open.sentence()}")
         if self.coverage or self.next is not None:
             self._advise(recording, record, lines)
         self.answer(
@@ -67,20 +69,19 @@ class Inspect(args.Verb):
         from evercal.live.coverage import Sample, coverage
         from evercal.recordings.frame import stated_grippers
 
-        frames = [
-            frame for frame in recording.train if frame.base_from_gripper is not None
-        ]
-        if not frames:
+        poses = stated_grippers(recording.train)
+        if not len(poses):
             raise InputError(
                 f"{self.scene}: states no gripper poses; --coverage and --next need them"
             )
         rough = args.transform_of(self.gripper_from_camera)
         if self.coverage:
-            covered = coverage([Sample.of(frame) for frame in frames], rough)
+            frames = [f for f in recording.train if f.base_from_gripper is not None]
+            covered = coverage(list(map(Sample.of, frames)), rough)
             record["coverage"] = asdict(covered)
             lines += _coverage_lines(covered)
         if self.next is not None:
-            views = self._next_views(self.next, stated_grippers(frames), rough)
+            views = self._next_views(self.next, poses, rough)
             record["next"] = _next_records(views)
             lines += _next_lines(views)
 
@@ -94,22 +95,26 @@ class Inspect(args.Verb):
 
 
 def _lines(found: "Inspection") -> Iterator[str]:
-    gripper = found.poses == "gripper"
-    whose = {"camera": "", "gripper": " with the gripper's pose"}.get(found.poses, "")
-    yield f"{found.name}: {found.train} training and {found.test} test frames{whose}"
-    yield f"  without a pose  {found.untracked}"
-    yield from (f"  camera          {lens}" for lens in found.cameras)
-    extent = " x ".join(f"{side:.3g}" for side in found.extent_m)
+    mover = "camera"
+    poses = ""
+    if found.poses == "gripper":
+        mover = "gripper"
+        poses = " with the gripper's pose"
     unit = "m" if found.metric else "units"
-    yield f"  {'gripper' if gripper else 'camera'} moved in {extent} {unit} (training frames)"
+    yield f"{found.name}: {found.train} training and {found.test} test frames{poses}"
+    yield f"  without a pose  {found.untracked}"
+    for camera in found.cameras:
+        yield f"  camera          {camera}"
+    extent = " x ".join(map("{:.3g}".format, found.extent_m))
+    yield f"  {mover} moved in {extent} {unit} (training frames)"
     if found.step_median_m is not None and found.step_largest_m is not None:
         middle = f"{found.step_median_m:.3g} {unit} and {found.step_median_deg:.1f} deg"
         yield f"  frame to frame  {middle} (median), {found.step_largest_m:.3g} {unit} at most"
     if found.near_training is not None:
         near = f"{found.near_training:.1f} % of the test frames"
         yield f"  near training   {near} lie within 5 cm and 5 deg of a training frame"
-    yield from (f"note: {note}" for note in found.notes)
-    yield from (f"warning: {warning}" for warning in found.warnings)
+    yield from map("note: {}".format, found.notes)
+    yield from map("warning: {}".format, found.warnings)
 
 
 def _coverage_lines(covered: "Coverage") -> Iterator[str]:
@@ -121,29 +126,27 @@ def _coverage_lines(covered: "Coverage") -> Iterator[str]:
         for axis in axes:
             yield f"  {what}        {axis.spread:.0f} {unit} {axis.name} (standard deviation)"
     for sample in covered.samples:
-        yield from (f"  {sample.name}: {problem}" for problem in sample.problems)
+        for problem in sample.problems:
+            yield f"  {sample.name}: {problem}"
 
 
 def _next_records(views: "NextViews") -> list[dict[str, object]]:
-    return [
-        {
+    records = []
+    for i, pose in enumerate(views.poses):
+        record = {
             "row": int(views.index[i]) + 1,
             "translation_m": pose.translation_m.tolist(),
             "quaternion_wxyz": pose.rotation_wxyz.tolist(),
             "sigma_mm": views.sigma_mm[i + 1],
             "sigma_deg": views.sigma_deg[i + 1],
         }
-        for i, pose in enumerate(views.poses)
-    ]
+        records.append(record)
+    return records
 
 
 def _next_lines(views: "NextViews") -> Iterator[str]:
-    sigmas = [
-        f"{mm:.2f} mm, {deg:.3f} deg"
-        for mm, deg in zip(views.sigma_mm, views.sigma_deg, strict=True)
-    ]
-    yield f"  expected sigma  {sigmas[0]} now"
+    now, *then = map("{:.2f} mm, {:.3f} deg".format, views.sigma_mm, views.sigma_deg)
+    yield f"  expected sigma  {now} now"
     for i, pose in enumerate(views.poses):
-        x, y, z = pose.translation_m
-        row = f"row {views.index[i] + 1}: {x:+.3f} {y:+.3f} {z:+.3f} m"
-        yield f"  next {i + 1}          {row}, then {sigmas[i + 1]}"
+        row = f"row {views.index[i] + 1}: {numbers(pose.translation_m, '+.3f')} m"
+        yield f"  next {i + 1}          {row}, then {then[i]}"

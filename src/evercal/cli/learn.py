@@ -2,17 +2,18 @@
 
 import dataclasses
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from evercal.choices import Preset
 from evercal.cli import args
 from evercal.cli.calibrate import joint_lines
-from evercal.cli.console import require_writable, say, say_notes, size
+from evercal.cli.console import numbers, require_writable, say, say_notes, size
 from evercal.cli.info import adjusted_row
 from evercal.errors import InputError
 from evercal.progress import Bars
@@ -33,7 +34,7 @@ MOST_CORNER_PX = 3.0
 class NetworkOptions:
     """Options of strategies that train a network; a map refuses them."""
 
-    preset: Literal["fast", "demo", "bench", "converged", "paper"] = "fast"
+    preset: Preset = "fast"
     """Amount of training: fast takes minutes on two cores, paper needs a GPU."""
     centres: Annotated[int | None, args.shown("M")] = None
     """Cluster centres that a scene adds to the network. Default: those of the preset."""
@@ -43,10 +44,11 @@ class NetworkOptions:
 
     def refuse(self) -> None:
         """Refuse options that a map does not have."""
-        for given in fields(self):
-            if (value := getattr(self, given.name)) != given.default:
+        for option in fields(self):
+            value = getattr(self, option.name)
+            if value != option.default:
                 raise InputError(
-                    f"{args.option(given.name)} {value}: a map is not trained; omit the option, or"
+                    f"{args.option(option.name)} {value}: a map is not trained; omit the option, or"
                     " choose a network with --strategy"
                 )
 
@@ -136,11 +138,16 @@ class Learn(args.Verb):
         from evercal.map import Map
 
         cell = Map.open(self.store, encoder=self.encoder)
-        where = (
-            f"{self.workers} at once" if self.ray is None else f"on Ray at {self.ray}"
-        )
-        many = "s" if len(self.recordings) > 1 else ""
-        with self._bars(f"{len(self.recordings)} recording{many}, {where}") as bars:
+        where = f"{self.workers} at once"
+        if self.ray is not None:
+            where = f"on Ray at {self.ray}"
+        plural = "s" if len(self.recordings) > 1 else ""
+        start = f"{len(self.recordings)} recording{plural}, {where}"
+        with Bars(self.log, start) as bars:
+
+            def show(report: "LearnReport") -> None:
+                bars.write("\n".join(summary(report, self.store)))
+
             reports = cell.learn_many(
                 self.recordings,
                 read=partial(read_recording, self.reading),
@@ -148,12 +155,10 @@ class Learn(args.Verb):
                 ray=self.ray,
                 results=self.results,
                 memory=self.memory,
-                on_scene=lambda report: bars.write(
-                    "\n".join(summary(report, self.store))
-                ),
+                on_scene=show,
                 on_progress=bars.step,
             )
-        record = {"scenes": [dataclasses.asdict(report) for report in reports]}
+        record = {"scenes": list(map(dataclasses.asdict, reports))}
         self.answer(record, then=("localize", self.store, "IMAGE"))
         return 0
 
@@ -180,9 +185,8 @@ class Learn(args.Verb):
 
     def _learned(self, recording: "Recording", strategy: str) -> "LearnReport":
         rough = args.transform_of(self.gripper_from_camera)
-        with self._bars(
-            f"{recording.name}: {len(recording.train)} training frames"
-        ) as bars:
+        start = f"{recording.name}: {len(recording.train)} training frames"
+        with Bars(self.log, start) as bars:
             if strategy != args.MAP:
                 return learn_into_networks(self, strategy, recording, bars)
             from evercal.map import Map
@@ -204,25 +208,19 @@ class Learn(args.Verb):
         if report.hand_eye is not None:
             return "export", self.calibration or self.store, "--format", "easy_handeye2"
         if not recording.metric:
-            return (
-                "align",
-                self.store,
-                report.scene,
-                "IMAGE...",
-                "--robot-poses",
-                "FILE",
-            )
+            images = ("IMAGE...", "--robot-poses", "FILE")
+            return "align", self.store, report.scene, *images
+        if recording.test and self.name:
+            return "evaluate", self.store, f"{self.name}={path}"
         if recording.test:
-            return "evaluate", self.store, f"{self.name}={path}" if self.name else path
+            return "evaluate", self.store, path
         return "localize", self.store, "IMAGE"
-
-    def _bars(self, start: str) -> Bars:
-        return Bars(sys.stderr if self.json else sys.stdout, start)
 
     def _refuse(self, why: str, *names: str) -> None:
         """Refuse options that were given and do not apply."""
         for name in names:
-            if (value := getattr(self, name)) is not None:
+            value = getattr(self, name)
+            if value is not None:
                 raise InputError(f"{args.option(name)} {value}: {why}")
 
 
@@ -234,9 +232,10 @@ def read_recording(
 
     recording = reading.recording(path, name)
     say_notes(recording.notes)
-    shown = look_at(recording.train)
-    for warning in shown.warnings if shown.usable else ():
-        say(f"warning: {recording.name}: {warning}", sys.stderr)
+    pictures = look_at(recording.train)
+    if pictures.usable:
+        for warning in pictures.warnings:
+            say(f"warning: {recording.name}: {warning}", sys.stderr)
     return recording
 
 
@@ -296,30 +295,31 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
         if report.landmarks < FEW_LANDMARKS * report.frames_kept:
             few = f"{report.landmarks / report.frames_kept:.0f} landmarks a keyframe are few"
             yield f"warning: {few}: most images will be refused; record sharper and textured views"
-    if (found := report.hand_eye) is not None:
+    found = report.hand_eye
+    if found is not None:
         pose = found.parent_from_camera
-        x, y, z = (1000 * value for value in found.translation_m)
-        quaternion = ", ".join(f"{value:.5f}" for value in found.quaternion_wxyz)
+        position = ", ".join(map("{:.1f}".format, 1000 * pose.pose.translation_m))
+        quaternion = ", ".join(map("{:.5f}".format, found.quaternion_wxyz))
         yield (
-            f"gripper_from_camera: ({x:.1f}, {y:.1f}, {z:.1f}) mm, quaternion wxyz ({quaternion});"
+            f"gripper_from_camera: ({position}) mm, quaternion wxyz ({quaternion});"
             f" standard deviation {pose.sigma_mm:.2f} mm and {pose.sigma_deg:.3f} deg per axis;"
             f" {found.pairs} of {found.of_pairs} image pairs are inliers"
         )
-        notes = (*found.warnings, *([found.advice] if found.advice else ()))
-        yield from (f"warning: {note}" for note in notes)
+        yield from map("warning: {}".format, found.warnings)
+        if found.advice:
+            yield f"warning: {found.advice}"
         if found.given_mm is not None:
             far = f"{found.given_mm:.1f} mm and {found.given_deg:.1f} deg"
             yield f"distance from the given one: {far}"
         yield from joint_lines(found.joints, file)
     if report.adjusted is not None:
         row = adjusted_row(report.scene, dataclasses.asdict(report.adjusted))
-        yield "; ".join(f"{what} {value}" for what, value in row.items())
+        yield "; ".join(map("{} {}".format, row, row.values()))
         yield from _warnings(report.adjusted)
 
 
 def _warnings(adjusted: "Adjusted") -> Iterator[str]:
     from evercal.calibration.hand_eye import MOST_FOCAL_PERCENT
-    from evercal.geometry import Camera
 
     if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
         yield (
@@ -328,12 +328,11 @@ def _warnings(adjusted: "Adjusted") -> Iterator[str]:
             " the poses are wrong"
         )
     if adjusted.corner_px > MOST_CORNER_PX:
-        cameras = (Camera.from_dict(camera) for camera in adjusted.intrinsics)
-        stated, now = ((c.fx, c.fy, c.cx, c.cy, *c.distortion) for c in cameras)
+        stated, now = map(_intrinsics, adjusted.intrinsics)
         yield (
             f"warning: the images move the corners of the image by {adjusted.corner_px:.1f} px: fx,"
-            f" fy, cx, cy and distortion are stated as {_few_digits(stated)}, adjusted"
-            f" {_few_digits(now)}; check the camera file"
+            f" fy, cx, cy and distortion are stated as {stated}, adjusted {now}; check the camera"
+            " file"
         )
     if abs(adjusted.time_shift_frames) > 0.02:
         yield (
@@ -351,5 +350,9 @@ def _warnings(adjusted: "Adjusted") -> Iterator[str]:
             yield f"{what}: {few(names, most=8)}"
 
 
-def _few_digits(values: Iterable[float]) -> str:
-    return " ".join(f"{value:.5g}" for value in values)
+def _intrinsics(record: dict[str, Any]) -> str:
+    from evercal.geometry import Camera
+
+    camera = Camera.from_dict(record)
+    pinhole = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return numbers((*pinhole, *camera.distortion), ".5g")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from evercal.cli import args
-from evercal.cli.console import require_folder, require_writable
+from evercal.cli.console import numbers, require_folder, require_writable
 from evercal.progress import progress_bar
 from evercal.reports.answers import (
     Answer,
@@ -63,7 +63,11 @@ class Localize(args.Verb):
         localizer = args.open_localizer(self.store, self.device)
         # All of them before the first is printed.
         answers = self._answers(localizer, files, camera)
-        lines = [line for answer in answers for line in _lines(answer, point)]
+        records = []
+        lines = []
+        for answer in answers:
+            records.append(_record(answer, point))
+            lines += _lines(answer, point)
         if self.video is not None:
             self._animate(self.video, localizer, answers)
             lines.append(f"wrote {self.video}")
@@ -74,8 +78,7 @@ class Localize(args.Verb):
             then = ("localize", self.store, files[0], "--overlay", "DIR")
         else:
             then = ("evaluate", self.store, "RECORDING")
-        record = {"images": [_record(answer, point) for answer in answers]}
-        self.answer(record, *lines, then=then)
+        self.answer({"images": records}, *lines, then=then)
         return 0 if located else 1
 
     def _answers(
@@ -128,58 +131,55 @@ class Localize(args.Verb):
 def _overlay_name(files: list[Path], number: int) -> str:
     """A file name; images of one name from two folders get different ones."""
     stems = [path.stem for path in files]
-    again = f"-{number + 1}" if stems.count(stems[number]) > 1 else ""
-    return f"{stems[number]}{again}-overlay.png"
+    stem = stems[number]
+    if stems.count(stem) > 1:
+        return f"{stem}-{number + 1}-overlay.png"
+    return f"{stem}-overlay.png"
 
 
 def _record(answer: Answer, point: args.Point | None) -> dict[str, object]:
     record = answer_row(answer)
-    pose = finite_pose(answer.estimate)
     if point is not None:
-        record["at"] = (
-            point.record(pose) if pose is not None and answer.unit_known else None
-        )
+        pose = finite_pose(answer.estimate)
+        record["at"] = None
+        if pose is not None and answer.unit_known:
+            record["at"] = point.record(pose)
     return record
 
 
 def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
     estimate = answer.estimate
-    pose = answer.estimate.base_from_camera
-    share = f"{100 * estimate.inlier_ratio:.0f} %"
-    inliers = (
-        f"  inliers      {estimate.inliers} ({share}), {answer.milliseconds:.0f} ms"
-    )
+    pose = estimate.base_from_camera
+    share = f"({100 * estimate.inlier_ratio:.0f} %)"
+    time_ms = f"{answer.milliseconds:.0f} ms"
+    inliers = f"  inliers      {estimate.inliers} {share}, {time_ms}"
     yield str(answer.path)
     if pose is None:
         yield f"  {estimate.status.replace('_', ' ')}: {estimate.reason}"
         yield inliers
         return
-    sd = ["", ""]
+    sd_mm = ""
+    sd_deg = ""
     if estimate.covariance is not None:
         spread = estimate.covariance.diagonal().clip(0) ** 0.5
-        sd[0] = f"  sd {_numbers(1000 * spread[:3], '.2f')} mm"
-        sd[1] = f"  sd {_numbers(spread[3:] * 180 / math.pi, '.3f')} deg"
-    unit = (
-        f"m{sd[0]}"
-        if answer.unit_known
-        else "in an unknown unit: run 'evercal align' first"
-    )
-    held = estimate.parent_frame == "gripper"
-    note = " (a thing in the gripper: the pose is gripper_from_camera)" if held else ""
+        sd_mm = f"  sd {numbers(1000 * spread[:3], '.2f')} mm"
+        sd_deg = f"  sd {numbers(spread[3:] * 180 / math.pi, '.3f')} deg"
+    unit = f"m{sd_mm}"
+    if not answer.unit_known:
+        unit = "in an unknown unit: run 'evercal align' first"
+    note = ""
+    if estimate.parent_frame == "gripper":
+        note = " (a thing in the gripper: the pose is gripper_from_camera)"
     yield f"  scene        {estimate.scene}{note}"
-    yield f"  translation  {_numbers(pose.translation_m, '+.4f')} {unit}"
-    yield f"  quaternion   {_numbers(pose.rotation_wxyz, '+.4f')} wxyz{sd[1]}"
-    parts = sorted(budget_of(estimate), key=lambda part: -part[1])
-    causes = ", ".join(
-        f"{term.name} {100 * of:.0f} %" for term, of in parts if of >= 0.005
-    )
+    yield f"  translation  {numbers(pose.translation_m, '+.4f')} {unit}"
+    yield f"  quaternion   {numbers(pose.rotation_wxyz, '+.4f')} wxyz{sd_deg}"
+    causes = []
+    for term, fraction in sorted(budget_of(estimate), key=lambda row: -row[1]):
+        if fraction >= 0.005:
+            causes.append(f"{term.name} {100 * fraction:.0f} %")
     if causes:
-        yield f"  budget       {causes} of the position's variance"
+        yield f"  budget       {', '.join(causes)} of the position's variance"
     uncertain = finite_pose(estimate)
     if point is not None and uncertain is not None and answer.unit_known:
         yield f"  point        sd {point.text(uncertain)}"
     yield inliers
-
-
-def _numbers(values: "np.ndarray", form: str) -> str:
-    return " ".join(format(float(value), form) for value in values)

@@ -3,10 +3,11 @@
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
+from evercal.choices import OnClash
 from evercal.cli import args
 from evercal.cli.console import require_writable, size
 
@@ -57,12 +58,14 @@ class List(Action):
                 "name": scene.name,
                 "keyframes": keyframes,
                 "landmarks": scene.landmarks,
+                "memory_bytes": memory,
             }
-            scenes.append({**record, "memory_bytes": memory})
+            scenes.append(record)
             counts = f"{keyframes} keyframes, {scene.landmarks:,} landmarks"
             lines.append(f"{scene.name}: {counts}, {size(memory)}")
-        none = f"{self.store}: no scene"
-        self.answer({"store": str(self.store), "scenes": scenes}, *(lines or [none]))
+        if not lines:
+            lines.append(f"{self.store}: no scene")
+        self.answer({"store": str(self.store), "scenes": scenes}, *lines)
         return 0
 
 
@@ -114,7 +117,7 @@ class Merge(Action):
     store: args.Store
     others: Annotated[Positional[tuple[Path, ...]], args.shown("OTHER...")]
     """Folders of the other maps; they do not change."""
-    on_clash: Literal["refuse", "rename", "skip", "replace"] = "refuse"
+    on_clash: OnClash = "refuse"
     """For a scene whose name is taken: refuse the merge, rename it to NAME-2, skip it, or replace
     the scene of the map."""
 
@@ -125,8 +128,8 @@ class Merge(Action):
         merged = cell.merge(*self.others, on_clash=self.on_clash)
         words = [f"added {', '.join(merged.added) or 'no scene'}"]
         words += [f"{name} is now {new}" for name, new in merged.renamed]
-        words += [f"skipped {name}" for name in merged.skipped]
-        words += [f"replaced {name}" for name in merged.replaced]
+        words += map("skipped {}".format, merged.skipped)
+        words += map("replaced {}".format, merged.replaced)
         return self.done(cell, "; ".join(words), **dataclasses.asdict(merged))
 
 

@@ -11,7 +11,7 @@ from evercal.cli import args
 from evercal.progress import Bars
 
 _CONNECTED = 0.8
-"""Share of the frames in one part below which the video does not hold together."""
+"""Share of the frames that connect, below which a reconstruction has failed."""
 
 
 @dataclass(frozen=True)
@@ -37,19 +37,19 @@ class Reconstruct(args.Verb):
         from evercal.recordings.reconstruct import reconstruct
 
         with Bars() as bars:
-            found = reconstruct(
+            model = reconstruct(
                 self.source, self.out, self.motion, self.most, bars.step
             )
-        whole = found.posed >= _CONNECTED * found.frames
+        whole = model.posed >= _CONNECTED * model.frames
         lines = [
-            f"{self.out}: {found.posed} of {found.frames} frames have a pose, {found.points:,}"
-            f" points, residual {found.residual_px:.2f} px"
+            f"{self.out}: {model.posed} of {model.frames} frames have a pose, {model.points:,}"
+            f" points, residual {model.residual_px:.2f} px"
         ]
         if not whole:
             lines.append(
-                f"the video does not hold together: parts of {', '.join(map(str, found.parts))}"
+                f"the video does not hold together: parts of {', '.join(map(str, model.parts))}"
                 " frames; move more slowly where they end, and return to places seen before"
             )
-        record = {"out": str(self.out), **dataclasses.asdict(found)}
+        record = {"out": str(self.out), **dataclasses.asdict(model)}
         self.answer(record, *lines, then=("learn", "cell.evercal", self.out))
         return 0 if whole else 1

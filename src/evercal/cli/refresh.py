@@ -1,7 +1,6 @@
 """`evercal refresh`."""
 
 import dataclasses
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,11 +52,12 @@ class Refresh(args.Verb):
         cell = Map.open(self.store)
         if self.undo is not None:
             cell.undo_refresh(self.undo)
-            said = f"{self.undo}: the state before its last refresh is back"
-            self.answer({"scene": self.undo, "undone": True}, said)
+            line = f"{self.undo}: the state before its last refresh is back"
+            self.answer({"scene": self.undo, "undone": True}, line)
             return 0
-        with Bars(sys.stderr if self.json else sys.stdout) as bars:
-            if (recording := _recording(self.images)) is not None:
+        with Bars(self.log) as bars:
+            recording = _recording(self.images)
+            if recording is not None:
                 first = recording.train[0].camera
                 camera = args.stated_camera(self.camera, (first.width, first.height))
                 report = cell.refresh(recording, camera=camera, on_progress=bars.step)
@@ -80,21 +80,20 @@ def _recording(paths: tuple[Path, ...]) -> "Recording | None":
 
 
 def _lines(report: "RefreshReport") -> Iterator[str]:
-    seen = report.landmarks_checked
+    checked = report.landmarks_checked
     gone = report.landmarks_gone
     located = f"{report.located} of {report.images} images located"
     yield f"{report.scene}: {located}, refreshed in {report.seconds:.1f} s"
-    share = f"{100 * gone / max(seen, 1):.0f} %"
-    yield f"  landmarks    {gone:,} of {seen:,} in view are gone ({share})"
+    share = f"{100 * gone / max(checked, 1):.0f} %"
+    yield f"  landmarks    {gone:,} of {checked:,} in view are gone ({share})"
     keyframes = f"{report.keyframes_left} replaced, {report.keyframes_added} new"
     yield f"  keyframes    {keyframes}; {size(report.memory_bytes)}"
     shift = f"{length(report.shift_mm)}{report.shift_deg:.3f} deg"
     sigma = f"{length(report.shift_sigma_mm)}{report.shift_sigma_deg:.3f} deg"
     outside = f"{report.verified} images outside the map"
     yield f"  base frame   moved by {shift} (standard deviation {sigma}; {outside})"
-    left_out = list(report.left_out.items())
-    yield from (
-        f"  left out     {name}: {reason}" for name, reason in left_out[:_LISTED]
-    )
-    if len(left_out) > _LISTED:
-        yield f"  left out     and {len(left_out) - _LISTED} more images"
+    for name, reason in list(report.left_out.items())[:_LISTED]:
+        yield f"  left out     {name}: {reason}"
+    more = len(report.left_out) - _LISTED
+    if more > 0:
+        yield f"  left out     and {more} more images"

@@ -59,30 +59,34 @@ class Report(args.Verb):
         page = calibration_page(
             NamedCalibration(self.calibration.name, calibration),
             images,
-            None if self.store is None else str(self.store),
+            self.store and str(self.store),
             older,
-            None if point is None else (point.x, point.y, point.z),
+            point,
             bool(boards),
         )
         write_bytes(self.out, page.html.encode())
-        change = None if older is None else difference(calibration, older.calibration)
-        best, (mm, deg) = tier(calibration), expected_error(calibration)
+        best = tier(calibration)
+        mm, deg = expected_error(calibration)
+        sentence = calibration.verdict or verdict(calibration)
         record: dict[str, object] = {
             "report": str(self.out),
-            "verdict": calibration.verdict or verdict(calibration),
-            "tier": None if best is None else best.name,
+            "verdict": sentence,
+            "tier": best and best.name,
             "expected_error_mm": mm,
             "expected_error_deg": deg,
             "pictures": list(images.images),
-            "against": change
-            and {"translation_mm": change.mm, "rotation_deg": change.deg},
+            "against": None,
             "missing": list(page.missing),
         }
-        lines = [str(record["verdict"])]
+        if older is not None:
+            change = difference(calibration, older.calibration)
+            sizes = {"translation_mm": change.mm, "rotation_deg": change.deg}
+            record["against"] = sizes
+        lines = [sentence]
         if point is not None:
             record["at"] = point.record(calibration.uncertain_pose)
             lines.append(f"  {point.text(calibration.uncertain_pose)}")
-        lines += [f"  {line}" for line in page.missing]
+        lines += map("  {}".format, page.missing)
         then = ("export", self.calibration, "--format", "easy_handeye2")
         self.answer(record, *lines, f"wrote {self.out}", then=then)
         return 0
@@ -100,7 +104,7 @@ class Report(args.Verb):
         if calibration.camera is None:
             return annotate_images(calibration, [])
         files, reason = select_images(calibration, self.calibration.parent, given)
-        localizer = None if self.store is None else args.open_localizer(self.store)
+        localizer = self.store and args.open_localizer(self.store)
         with progress_bar("drawing", len(files), "image") as bar:
             drawn = annotate_images(
                 calibration, files, older, localizer, boards, bar.update

@@ -39,7 +39,9 @@ class Simulate(args.Verb):
 
         began = time.perf_counter()
         options = CellOptions()
-        frames = cell.WRIST_IMAGES if self.frames is None else self.frames
+        frames = cell.WRIST_IMAGES
+        if self.frames is not None:
+            frames = self.frames
         if self.size is not None:
             size = re.fullmatch(r"(\d+)x(\d+)", self.size)
             if size is None:
@@ -54,13 +56,13 @@ class Simulate(args.Verb):
             for _ in cell.record_cell(self.out, self.seed, frames, options):
                 bar.update()
         seconds = time.perf_counter() - began
-        parts = {
-            name: str(self.out / name)
-            for name in ("wrist", "tripod", "held", "truth.json")
-        }
+        wrist = str(self.out / "wrist")
         record = {
-            "scenes": [parts["wrist"]],
-            **parts,
+            "scenes": [wrist],
+            "wrist": wrist,
+            "tripod": str(self.out / "tripod"),
+            "held": str(self.out / "held"),
+            "truth.json": str(self.out / "truth.json"),
             "frames": bar.n,
             "seconds": seconds,
         }

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
+from evercal.choices import MountName
 from evercal.cli import args
 from evercal.cli.calibrate import calibration_lines
 from evercal.cli.console import require_writable, say_notes
@@ -32,7 +33,7 @@ class Solve(args.Verb):
     """base_from_gripper of every image: a pose table, JSON, NPY or NPZ."""
     camera_poses: Annotated[Path, arg(metavar="FILE")]
     """camera_from_board of every image: from 'evercal detect', or like --robot-poses."""
-    mount: Literal["eye_in_hand", "eye_to_hand"]
+    mount: MountName
     """eye_in_hand: camera on the gripper. eye_to_hand: fixed camera, board in the gripper."""
     scale: Literal["known", "unknown"] = "known"
     """unknown: estimate the scale of the camera poses, for structure from motion."""
@@ -53,13 +54,13 @@ class Solve(args.Verb):
         require_writable(self.out, "--out")
         from evercal.calibration.verdict import tier
 
-        options = {
-            key: value
-            for key, value in vars(self).items()
-            if key not in ("out", "json")
+        source = {
+            "command": "solve",
+            **vars(self),
+            "robot_poses": str(self.robot_poses),
+            "camera_poses": str(self.camera_poses),
         }
-        files = {key: str(options[key]) for key in ("robot_poses", "camera_poses")}
-        source = {"command": "solve", **options, **files}
+        del source["out"], source["json"]
         calibration = self._with_image_paths(replace(self._solved(), source=source))
         calibration.write(self.out)
         lines = (*calibration_lines(calibration), *_check_lines(calibration))
@@ -98,24 +99,21 @@ class Solve(args.Verb):
 
         def moved(name: str) -> str:
             path = folder / name
-            return (
-                Path(os.path.relpath(path, target)).as_posix()
-                if path.is_file()
-                else name
-            )
+            if not path.is_file():
+                return name
+            return Path(os.path.relpath(path, target)).as_posix()
 
-        images = tuple(
-            replace(image, name=moved(image.name)) for image in calibration.images
-        )
-        checks = {
-            key: {moved(name): item for name, item in value.items()}
-            if key in _BY_IMAGE
-            else value
-            for key, value in calibration.checks.items()
-        }
-        board = Path(os.path.relpath(self.camera_poses.absolute(), target)).as_posix()
+        images = []
+        for image in calibration.images:
+            images.append(replace(image, name=moved(image.name)))
+        checks = {**calibration.checks}
+        for key in _BY_IMAGE:
+            if key in checks:
+                values = checks[key].items()
+                checks[key] = {moved(name): value for name, value in values}
+        board = moved(self.camera_poses.name)
         source = {**calibration.source, "camera_poses": board}
-        return replace(calibration, images=images, checks=checks, source=source)
+        return replace(calibration, images=tuple(images), checks=checks, source=source)
 
 
 def _check_lines(calibration: "Calibration") -> Iterator[str]:
@@ -143,7 +141,5 @@ def _check_lines(calibration: "Calibration") -> Iterator[str]:
         offset = 1000 * checks["time_offset_s"]
         spread = 1000 * checks["time_offset_sigma_s"]
         yield f"  clocks       robot time = camera time {offset:+.1f} +- {spread:.1f} ms"
-    yield from (
-        f"  left open    {sentence}" for sentence in checks.get("left_open", ())
-    )
-    yield from (f"warning: {warning}" for warning in checks.get("warnings", ()))
+    yield from map("  left open    {}".format, checks.get("left_open", ()))
+    yield from map("warning: {}".format, checks.get("warnings", ()))

@@ -7,18 +7,27 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
-from evercal.cli.view import Page
+from evercal.cli.view import PageVerb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
     from evercal.service.studio.devices import Devices
 
-_REAL = "camera intrinsics poses pose_convention most_age reachable gripper_from_camera fixed"
+_REAL = (
+    "camera",
+    "intrinsics",
+    "poses",
+    "pose_convention",
+    "most_age",
+    "reachable",
+    "gripper_from_camera",
+    "fixed",
+)
 """Options that the virtual cell refuses."""
 
 
 @dataclass(frozen=True)
-class Studio(Page):
+class Studio(PageVerb):
     """Calibrate wrist and fixed camera in the browser, step by step.
 
     Everything is written to --out as it is made; the same command continues there. Without
@@ -75,17 +84,22 @@ class Studio(Page):
         return 0
 
     def _refuse(self) -> None:
-        given = [name for name in _REAL.split() if getattr(self, name) is not None]
-        if self.virtual and given:
-            raise InputError(
-                f"{args.option(given[0])}: the virtual cell has its own; omit it or --virtual"
-            )
-        blind = self.camera is None and self.fixed is None
-        if not self.virtual and (blind or self.poses is None):
-            missing = "--camera SOURCE" if blind else "--poses FILE"
-            raise InputError(
-                f"no {missing} given; give both, or --virtual to try it without"
-            )
+        if self.virtual:
+            for name in _REAL:
+                if getattr(self, name) is not None:
+                    raise InputError(
+                        f"{args.option(name)}: the virtual cell has its own; omit it or --virtual"
+                    )
+        else:
+            missing = ""
+            if self.camera is None and self.fixed is None:
+                missing = "--camera SOURCE"
+            elif self.poses is None:
+                missing = "--poses FILE"
+            if missing:
+                raise InputError(
+                    f"no {missing} given; give both, or --virtual to try it without"
+                )
         if self.fixed_intrinsics is not None and self.fixed is None:
             raise InputError("--fixed-intrinsics: is of --fixed, which is missing")
 
@@ -127,19 +141,14 @@ class Studio(Page):
         assert self.poses is not None, "checked before"
         convention = self.pose_convention
         fixed_intrinsics = self.fixed_intrinsics
-        sources = self.camera, self.fixed
-        wrist, fixed = (
-            None if source is None else StreamCamera(source) for source in sources
-        )
+        wrist = None if self.camera is None else StreamCamera(self.camera)
+        fixed = None if self.fixed is None else StreamCamera(self.fixed)
+        intrinsics = self.intrinsics
         begun = self.out / "wrist" / "camera.json"
-        default = (
-            fixed_intrinsics
-            if self.camera is None
-            else begun
-            if begun.is_file()
-            else None
-        )
-        intrinsics = self.intrinsics or default
+        if intrinsics is None and self.camera is None:
+            intrinsics = fixed_intrinsics
+        elif intrinsics is None and begun.is_file():
+            intrinsics = begun
         if intrinsics is None:
             raise InputError(
                 "no --intrinsics FILE given: a new recording needs the intrinsics"
@@ -158,5 +167,5 @@ class Studio(Page):
             fixed_intrinsics=fixed_intrinsics and read_camera(fixed_intrinsics),
             reachable=reachable,
             rough=args.transform_of(self.gripper_from_camera),
-            live=all(source is None or is_live(source) for source in sources),
+            live=all(map(is_live, filter(None, (self.camera, self.fixed)))),
         )

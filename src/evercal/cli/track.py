@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
-from evercal.cli.console import require_writable, say
+from evercal.cli.console import numbers, require_writable, say
 from evercal.errors import InputError
 from evercal.reports.answers import unit_known
 
@@ -44,11 +44,8 @@ class Track(args.Verb):
     """Stop after so many frames."""
 
     def run(self) -> int:
-        if (
-            self.rate <= 0
-            or self.smooth < 0
-            or (self.at_most is not None and self.at_most <= 0)
-        ):
+        late = self.at_most is not None and self.at_most <= 0
+        if late or self.rate <= 0 or self.smooth < 0:
             raise InputError("--rate and --at-most are above 0, --smooth is 0 or more")
         for path in self.out:
             require_writable(path, "--out")
@@ -94,31 +91,39 @@ class Track(args.Verb):
         import numpy as np
 
         middle, high = np.quantile(times, [0.5, 0.99]).tolist()
-        counts = {state: states[state] for state in ("tracking", "relocalized", "lost")}
-        files = [str(path) for path in self.out]
-        self.answer(
-            {
-                "frames": len(times),
-                **counts,
-                "ms_p50": middle,
-                "ms_p99": high,
-                "out": files,
-            },
-            f"{len(times)} frames: {states['tracking']} tracked, {states['relocalized']}"
-            f" relocalized, {states['lost']} lost; {middle:.0f} ms (median), {high:.0f} ms (99 %)",
-            then=()
-            if files
-            else ("track", self.store, self.source, "--out", "track.jsonl"),
+        tracked = states["tracking"]
+        relocalized = states["relocalized"]
+        lost = states["lost"]
+        record = {
+            "frames": len(times),
+            "tracking": tracked,
+            "relocalized": relocalized,
+            "lost": lost,
+            "ms_p50": middle,
+            "ms_p99": high,
+            "out": list(map(str, self.out)),
+        }
+        line = (
+            f"{len(times)} frames: {tracked} tracked, {relocalized} relocalized, {lost} lost;"
+            f" {middle:.0f} ms (median), {high:.0f} ms (99 %)"
         )
+        then: tuple[object, ...] = ()
+        if not self.out:
+            then = ("track", self.store, self.source, "--out", "track.jsonl")
+        self.answer(record, line, then=then)
 
 
 def _line(name: str, frame: "TrackedFrame", unit_known: bool) -> str:
     estimate = frame.estimate
     if frame.state == "lost" or estimate.base_from_camera is None:
         return f"{name}: lost ({estimate.reason or estimate.status})"
-    x, y, z = estimate.base_from_camera.translation_m
-    at = f"{x:+.4g} {y:+.4g} {z:+.4g} in an unknown unit"
-    if unit_known and (pose := estimate.uncertain_pose) is not None:
-        at = f"{1e3 * x:+.1f} {1e3 * y:+.1f} {1e3 * z:+.1f} +- {pose.sigma_mm:.1f} mm"
-    left = f", without {', '.join(estimate.omitted)}" if estimate.omitted else ""
-    return f"{name}: {frame.state}, {estimate.scene}, {at}, {estimate.milliseconds:.0f} ms{left}"
+    position = estimate.base_from_camera.translation_m
+    pose = estimate.uncertain_pose
+    where = f"{numbers(position, '+.4g')} in an unknown unit"
+    if unit_known and pose is not None:
+        where = f"{numbers(1e3 * position, '+.1f')} +- {pose.sigma_mm:.1f} mm"
+    line = f"{name}: {frame.state}, {estimate.scene}, {where}"
+    line += f", {estimate.milliseconds:.0f} ms"
+    if estimate.omitted:
+        line += f", without {', '.join(estimate.omitted)}"
+    return line

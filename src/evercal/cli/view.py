@@ -16,7 +16,7 @@ from evercal.errors import InputError, missing_extra
 
 
 @dataclass(frozen=True, kw_only=True)
-class Page(args.Verb):
+class PageVerb(args.Verb):
     """A verb that serves a page until Ctrl-C or SIGTERM."""
 
     host: args.Host = "127.0.0.1"
@@ -38,7 +38,7 @@ class Page(args.Verb):
 
 
 @dataclass(frozen=True)
-class View(Page):
+class View(PageVerb):
     """Show a map, calibrations, arm and tracked camera in the browser.
 
     It is stopped by Ctrl-C or SIGTERM. The printed address holds the key of the page. It is served
@@ -64,12 +64,10 @@ class View(Page):
         if self.camera is not None and self.live is None:
             raise InputError("--camera: is that of --live, which is missing")
         self.prepare()
-        from evercal.service.viewer.page import Page as ViewerPage
+        from evercal.service.viewer.page import Page
 
         address = (self.host, self.port)
-        page = ViewerPage(
-            args.open_map(self.store), self.calibrations, self.urdf, address
-        )
+        page = Page(args.open_map(self.store), self.calibrations, self.urdf, address)
         try:
             if self.live is not None:
                 page.track(self.live, self.camera)

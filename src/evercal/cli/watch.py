@@ -79,10 +79,9 @@ class Watch(args.Verb):
                     say(f"warning: {path}: {error}; skipped", sys.stderr)
                     continue
                 last = time.monotonic()
-                if not any(item.is_located for item in recent):
-                    self._print(
-                        path, {"moved": None, "reason": recent[-1].estimate.reason}
-                    )
+                if not any(image.is_located for image in recent):
+                    reason = recent[-1].estimate.reason
+                    self._print(path, {"moved": None, "reason": reason}, reason)
                     continue
                 tests += 1
                 confidence = 1 - false_alarm_share(tests)
@@ -90,17 +89,15 @@ class Watch(args.Verb):
                     reference, fuse(recent), list(recent), localizer, confidence
                 )
                 self._print(path, shift_dict(shift), shift_line(shift))
-                if shift.moved and sum(use.used for use in shift.images) >= min(
-                    3, self.window
-                ):
+                used = sum(image.used for image in shift.images)
+                if shift.moved and used >= min(3, self.window):
                     return 1
             time.sleep(self.interval)
         return 0
 
-    def _print(self, path: Path, record: dict[str, object], line: str = "") -> None:
+    def _print(self, path: Path, record: dict[str, object], line: str) -> None:
         now = datetime.now(UTC).strftime("%H:%M:%S")
-        words = f"{now} {path.name}: {line or record.get('reason')}"
-        self.answer({"image": path.name, **record}, words)
+        self.answer({"image": path.name, **record}, f"{now} {path.name}: {line}")
 
 
 class Arrivals:
