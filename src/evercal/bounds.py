@@ -16,7 +16,7 @@ from evercal.errors import InputError
 
 Kind = TypeVar("Kind", bound="Bounds")
 VARIABLE = "EVERCAL_LIMITS"
-"""`NAME=NUMBER,...`; worker processes inherit it."""
+"""Environment variable `NAME=NUMBER,...` of changed bounds; worker processes inherit it."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +98,8 @@ def reading_a_request() -> Iterator[None]:
 
 @cache
 def _changed(kind: type[Kind], changes: str) -> Kind:
-    own = {field.name for field in fields(kind)}
-    values = {}
     known = {field.name for field in fields(RequestBounds)}
+    values = {}
     for change in filter(None, changes.split(",")):
         name, _, number = change.strip().partition("=")
         try:
@@ -112,12 +111,14 @@ def _changed(kind: type[Kind], changes: str) -> Kind:
             raise InputError(
                 f"limit {change!r}: give NAME=NUMBER, the name one of {names}"
             )
-    return kind(**{name: value for name, value in values.items() if name in own})
+    own = {field.name for field in fields(kind)}
+    return kind(**{name: values[name] for name in own & values.keys()})
 
 
 def require_at_most(count: int, name: str, what: str) -> None:
     """Raise ValueError if there is more of `what` than the bound of this name allows."""
-    if count > (most := getattr(bounds(), name)):
+    most = getattr(bounds(), name)
+    if count > most:
         raise ValueError(
             f"{count:,} {what}, at most {most:,} are read; if it is right, add `limits`"
             f" {name}={count}"

@@ -13,7 +13,7 @@ from evercal.bounds import VARIABLE
 from evercal.errors import InputError, optional_module
 
 WAIT_S = 10.0
-"""Time for a cluster to accept a connection."""
+"""Time for a cluster to accept a connection, seconds."""
 _INHERITED = (VARIABLE, "OPENCV_IO_MAX_IMAGE_PIXELS")
 """Variables that bound what is read; workers get them, too."""
 
@@ -26,11 +26,11 @@ def connected(address: str) -> Iterator[Any]:
         yield ray
         return
     _require_listener(address)
-    given = {name: os.environ[name] for name in _INHERITED if name in os.environ}
+    inherited = {name: os.environ[name] for name in _INHERITED if name in os.environ}
     # Workers import from the folder that the program was started in, where a recording may lie that
     # holds any file; with a folder of their own they do not.
     with tempfile.TemporaryDirectory(prefix="evercal-") as empty:
-        environment = {"env_vars": given, "working_dir": empty}
+        environment = {"env_vars": inherited, "working_dir": empty}
         try:
             ray.init(
                 address,
@@ -53,14 +53,14 @@ def connected(address: str) -> Iterator[Any]:
 
 def _require_listener(address: str) -> None:
     """Refuse an address where nothing listens; Ray would wait for minutes."""
-    url = urlsplit(address if "://" in address else f"//{address}")
-    if address not in ("auto", "local"):
-        try:
-            socket.create_connection(
-                (url.hostname or "", url.port or 0), WAIT_S
-            ).close()
-        except (OSError, ValueError) as error:
-            raise InputError(
-                f"`ray` {address}: nothing answers ({error}); give auto, or HOST:PORT or"
-                " ray://HOST:PORT of a cluster"
-            ) from None
+    if address in ("auto", "local"):
+        return
+    _, _, host_port = address.rpartition("://")
+    url = urlsplit(f"//{host_port}")
+    try:
+        socket.create_connection((url.hostname or "", url.port or 0), WAIT_S).close()
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"`ray` {address}: nothing answers ({error}); give auto, or HOST:PORT or"
+            " ray://HOST:PORT of a cluster"
+        ) from None

@@ -24,7 +24,8 @@ class InputError(Exception):
 
     def __init__(self, message: str = ""):
         text = str(message)
-        text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
+        if len(text) > _LONGEST:
+            text = f"{text[:_LONGEST]} ..."
         super().__init__(printable(" ".join(text.splitlines())))
 
     @property
@@ -45,10 +46,12 @@ def is_plain(character: str) -> bool:
 
 def printable(text: str) -> str:
     """Escape the characters that a terminal obeys or that cannot be seen, but line breaks."""
-    return "".join(
-        c if is_plain(c) or c == "\n" else c.encode("unicode_escape").decode()
-        for c in text
-    )
+    characters = []
+    for character in text:
+        if not is_plain(character) and character != "\n":
+            character = character.encode("unicode_escape").decode()
+        characters.append(character)
+    return "".join(characters)
 
 
 def require_numbers(

@@ -38,18 +38,21 @@ def started_safely(variables: Mapping[str, str] = {}) -> Iterator[SpawnContext]:
 
 def cores() -> int:
     """Processor cores that this process may use; OMP_NUM_THREADS bounds them."""
+    count = os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):
+        count = len(os.sched_getaffinity(0))
     most = os.environ.get("OMP_NUM_THREADS", "")
-    free = (
-        len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count() or 1
-    )
-    return max(1, min(free, int(most))) if most.isdecimal() and int(most) else free
+    if most.isdecimal() and int(most):
+        count = min(count, int(most))
+    return count
 
 
 _pools: Any = None
+"""The controller of the thread pools of BLAS; None before its first use."""
 _limiting = 0
+"""Contexts of `one_product_thread` that are open."""
 _limits = threading.Lock()
+"""Guards both."""
 
 
 @contextmanager
@@ -174,9 +177,12 @@ def cause_of(status: int, times: int = 1) -> str:
     if status >= 0:
         return f"its process ended with status {status}, see the lines above"
     name = signal.Signals(-status).name
-    often = f" {times} times" if times > 1 else ""
-    hint = "; is there enough memory?" if name == "SIGKILL" else ""
-    return f"its process was killed{often} by {name}{hint}"
+    cause = f"its process was killed by {name}"
+    if times > 1:
+        cause = f"its process was killed {times} times by {name}"
+    if name == "SIGKILL":
+        cause += "; is there enough memory?"
+    return cause
 
 
 def _work(

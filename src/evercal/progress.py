@@ -12,6 +12,10 @@ if TYPE_CHECKING:
 
 OnProgress = Callable[[str, int, int], object]
 """Called with the current step, how much of it is done, and its total."""
+_INTERVALS_S = {True: 0.2, False: 10.0}
+"""Least time between two updates of a bar, on a terminal and in a file."""
+_RESUMED = 8
+"""A step whose first report says that more is done than this was resumed."""
 _UNITS = {
     "encoding": "image",
     "learning": "scene",
@@ -19,6 +23,7 @@ _UNITS = {
     "matching": "pair",
     "adjusting": "round",
 }
+"""What a step of learning counts."""
 
 
 def progress_bar(what: str, total: int, unit: str, done: int = 0) -> "tqdm":
@@ -32,7 +37,7 @@ def progress_bar(what: str, total: int, unit: str, done: int = 0) -> "tqdm":
         initial=done,
         file=sys.stderr,
         disable=total == 1,
-        mininterval=0.2 if sys.stderr.isatty() else 10.0,
+        mininterval=_INTERVALS_S[sys.stderr.isatty()],
         dynamic_ncols=True,
     )
 
@@ -74,7 +79,9 @@ class Bars:
         if bar is None or name != self._step or total != bar.total or done < bar.n:
             self._close()
             # A resumed step starts where it stopped, so that its speed is measured from there.
-            first = done if done > 8 else 0
+            first = 0
+            if done > _RESUMED:
+                first = done
             self._step = name
             bar = progress_bar(name, total, _UNITS.get(name, "step"), first)
             self._bar = bar
