@@ -77,10 +77,13 @@ class Align(args.Verb):
         files = image_files(self.images)
         boards = None
         if self.board_poses is not None:
-            by_name = {}
-            for image in read_board_poses(self.board_poses).detected:
-                by_name[Path(image.name).name] = image.camera_from_board
-            boards = {str(f): by_name[f.name] for f in files if f.name in by_name}
+            images = read_board_poses(self.board_poses).detected
+            poses = {Path(i.name).name: i.camera_from_board for i in images}
+            boards = {}
+            for file in files:
+                pose = poses.get(file.name)
+                if pose is not None:
+                    boards[str(file)] = pose
         return cell.align(
             self.scene,
             files,
@@ -106,9 +109,7 @@ class Align(args.Verb):
                 )
             by_image.setdefault(image, {})[name] = pixel
         folder = self.picks.parent
-        picks = []
-        for name, pixels in by_image.items():
-            picks.append((name, read_image(folder / name), pixels))
+        picks = [(name, read_image(folder / name), p) for name, p in by_image.items()]
         return cell.align(
             self.scene, points=points, picks=picks, unknown_scale=self.unknown_scale
         )

@@ -35,14 +35,9 @@ class Info(args.Verb):
             scenes, short_side, heads, sizes = describe(self.store)
         files = filter(Path.is_file, self.store.rglob("*"))
         total = sum(file.stat().st_size for file in files)
-        memory = 0
-        for name, count in sizes.items():
-            if name.endswith(MEMORY_FILES):
-                memory += count
-        adjusted = []
-        for scene in scenes:
-            if scene.get("adjusted"):
-                adjusted.append(adjusted_row(scene["name"], scene["adjusted"]))
+        kept = [name for name in sizes if name.endswith(MEMORY_FILES)]
+        memory = sum(sizes[name] for name in kept)
+        adjusted = [s for s in scenes if s.get("adjusted")]
         record = {
             "store": str(self.store),
             "strategy": strategy,
@@ -60,7 +55,7 @@ class Info(args.Verb):
             f" {short_side} px",
             f"{size(total)} in all: keyframes {size(memory)}, {network}the rest is the encoder",
             *table(list(map(_content, scenes))),
-            *table(adjusted),
+            *table([adjusted_row(s["name"], s["adjusted"]) for s in adjusted]),
             then=("info", self.store, "--check"),
         )
         return 0

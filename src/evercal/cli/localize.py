@@ -173,10 +173,10 @@ def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
     yield f"  scene        {estimate.scene}{note}"
     yield f"  translation  {numbers(pose.translation_m, '+.4f')} {unit}"
     yield f"  quaternion   {numbers(pose.rotation_wxyz, '+.4f')} wxyz{sd_deg}"
-    causes = []
-    for term, fraction in sorted(budget_of(estimate), key=lambda row: -row[1]):
-        if fraction >= 0.005:
-            causes.append(f"{term.name} {100 * fraction:.0f} %")
+    budget = sorted(budget_of(estimate), key=lambda row: -row[1])
+    causes = [
+        f"{term.name} {100 * part:.0f} %" for term, part in budget if part >= 0.005
+    ]
     if causes:
         yield f"  budget       {', '.join(causes)} of the position's variance"
     uncertain = finite_pose(estimate)

@@ -103,9 +103,9 @@ class Solve(args.Verb):
                 return name
             return Path(os.path.relpath(path, target)).as_posix()
 
-        images = []
-        for image in calibration.images:
-            images.append(replace(image, name=moved(image.name)))
+        images = [
+            replace(image, name=moved(image.name)) for image in calibration.images
+        ]
         checks = {**calibration.checks}
         for key in _BY_IMAGE:
             if key in checks:

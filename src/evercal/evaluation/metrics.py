@@ -137,9 +137,7 @@ def scores(results: Sequence[FrameResult]) -> Scores:
     """Compute scores of scenes from the results of all frames, at least one."""
     if not results:
         raise ValueError("scores needs at least one result, got none")
-    scenes = {}
-    for name, rows in _by_scene(results).items():
-        scenes[name] = _scene_scores(rows)
+    scenes = {name: _scene_scores(rows) for name, rows in _by_scene(results).items()}
     return Scores(
         scenes=scenes,
         mean_accuracy_5cm_5deg=_mean(scenes.values(), "accuracy_5cm_5deg"),

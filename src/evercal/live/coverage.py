@@ -121,9 +121,7 @@ def coverage(
     rank = int((principal_spreads >= ROTATION_DEG).sum())
     ready = len(good) >= MIN_GRIPPER_FRAMES and rank >= 2
     missing = _missing(len(good), rank, rotations, positions)
-    state = "cannot be learned yet"
-    if ready:
-        state = "can be learned"
+    state = "can be learned" if ready else "cannot be learned yet"
     verdict = f"{len(good)} of {len(rows)} images are good; the recording {state}."
     if missing:
         verdict += f" Missing: {'; '.join(missing[:3])}."
@@ -145,9 +143,7 @@ def _sample_reports(samples: Sequence[Sample], poses: SE3) -> tuple[SampleReport
         median = float(np.median([sample.sharpness for sample in samples]))
     rows = []
     for i, sample in enumerate(samples):
-        relative = 0.0
-        if median > 0:
-            relative = sample.sharpness / median
+        relative = sample.sharpness / median if median > 0 else 0.0
         problems = []
         if relative < SHARPNESS:
             problems.append(f"blurred (sharpness {100 * relative:.0f} % of the median)")
@@ -181,10 +177,8 @@ def _rotation_spreads_deg(poses: SE3) -> tuple[Array, Array]:
 
 
 def _axes(words: str, spreads: Array, least: float) -> tuple[AxisCoverage, ...]:
-    axes = []
-    for letter, spread in zip("xyz", spreads.tolist(), strict=True):
-        axes.append(AxisCoverage(f"{words} {letter} axis", spread, spread >= least))
-    return tuple(axes)
+    named = zip("xyz", spreads.tolist(), strict=True)
+    return tuple(AxisCoverage(f"{words} {a} axis", s, s >= least) for a, s in named)
 
 
 def _missing(

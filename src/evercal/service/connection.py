@@ -69,11 +69,8 @@ class _Connection(_Patient, H11Protocol):
         self._wait()
         if len(self.connections) <= self.bounds.connections:
             return
-        waiting = []
-        for connection in self.connections:
-            if isinstance(connection, _Connection) and connection.waits:
-                waiting.append(connection)
-        oldest = min(waiting, key=_Connection._deadline)
+        ours = [c for c in self.connections if isinstance(c, _Connection)]
+        oldest = min((c for c in ours if c.waits), key=_Connection._deadline)
         oldest.transport.abort()  # at worst this one
 
     def connection_lost(self, exc: Exception | None) -> None:

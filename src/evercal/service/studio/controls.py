@@ -15,7 +15,12 @@ from evercal.live.coverage import POSITION_MM, ROTATION_DEG
 from evercal.service.studio.devices import Which
 from evercal.service.studio.steps import STEPS
 from evercal.service.studio.studio import FIXED_IMAGES, Studio
-from evercal.service.viewer.html import calibration_rows, chip_html, rows_html
+from evercal.service.viewer.html import (
+    calibration_rows,
+    chip_html,
+    position_mm,
+    rows_html,
+)
 
 _CAMERAS: dict[str, Which] = {"camera on the gripper": "wrist", "fixed camera": "fixed"}
 """Cameras by their labels."""
@@ -124,12 +129,9 @@ class Controls:
         connection = self._studio.connection
         if self.which in connection.images:
             self._picture.image = connection.images[self.which]
-        rows = []
-        for name, problem in connection.problems.items():
-            rows.append((f"{name}: no data", problem))
+        rows = [(f"{name}: no data", why) for name, why in connection.problems.items()]
         if connection.base_from_gripper is not None:
-            x, y, z = 1000 * connection.base_from_gripper.translation_m
-            rows.append(("gripper", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"))
+            rows.append(("gripper", position_mm(connection.base_from_gripper)))
         self._arrives.content = rows_html(rows)
 
     def _connect(self) -> None:
@@ -242,16 +244,12 @@ class Controls:
         axes = [(axis, "°", ROTATION_DEG) for axis in covered.rotations]
         axes += [(axis, " mm", POSITION_MM) for axis in covered.positions]
         for axis, unit, wanted in axes:
-            enough = f"of {wanted:.0f}{unit}"
-            if axis.covered:
-                enough = "✓"
+            enough = "✓" if axis.covered else f"of {wanted:.0f}{unit}"
             rows.append((axis.name, f"{axis.spread:.0f}{unit} {enough}"))
         if which == "wrist" and self._view is not None:
-            x, y, z = 1000 * self._view.poses[0].translation_m
+            place = position_mm(self._view.poses[0], digits=0)
             now, then = self._view.sigma_mm[:2]
-            rows.append(
-                ("next view (amber)", f"gripper at {x:+.0f} {y:+.0f} {z:+.0f} mm")
-            )
+            rows.append(("next view (amber)", f"gripper at {place}"))
             rows.append(("expected 1 sigma", f"{now:.3f} mm → {then:.3f} mm"))
         for row in covered.samples:
             if row.problems:

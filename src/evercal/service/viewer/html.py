@@ -5,6 +5,7 @@ from html import escape
 
 from evercal.calibration.calibration import Calibration
 from evercal.errors import with_options
+from evercal.geometry import SE3
 from evercal.reports.scene import Ellipsoid
 
 GREEN = (22, 163, 74)
@@ -45,14 +46,20 @@ def rows_html(rows: Sequence[tuple[str, str]]) -> str:
     return html + "</table></div>"
 
 
+def position_mm(pose: SE3, digits: int = 1) -> str:
+    """Position of a pose: x, y, z."""
+    form = f"{{:+.{digits}f}}".format
+    return " ".join(map(form, 1000 * pose.translation_m)) + " mm"
+
+
 def calibration_rows(calibration: Calibration) -> list[tuple[str, str]]:
     """Names and values of a calibration."""
-    x, y, z = 1000 * calibration.parent_from_child.translation_m
+    position = position_mm(calibration.parent_from_child)
     spread = f"{calibration.sigma_mm:.2g} mm, {calibration.sigma_deg:.2g}°"
     principal = Ellipsoid.of(calibration.uncertain_pose).sigmas_mm
     return [
         ("mount", "on the gripper" if calibration.on_gripper else "fixed"),
-        (f"in {calibration.parent_frame}", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"),
+        (f"in {calibration.parent_frame}", position),
         ("1 sigma per axis", spread),
         ("principal axes", f"{principal} mm"),
     ]

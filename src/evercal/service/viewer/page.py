@@ -24,7 +24,13 @@ from evercal.reports.scene import THUMBNAIL_PX, ColourBy, Frustum, KeyframeView
 from evercal.service.hosts import is_local, listening_socket, url_of
 from evercal.service.viewer import drawing
 from evercal.service.viewer.gate import gated
-from evercal.service.viewer.html import GREEN, calibration_rows, chip_html, rows_html
+from evercal.service.viewer.html import (
+    GREEN,
+    calibration_rows,
+    chip_html,
+    position_mm,
+    rows_html,
+)
 
 _THROUGH = "/through"
 
@@ -175,8 +181,7 @@ class Page:
                 node.image = resized(image, THUMBNAIL_PX)
                 rows.append(("scene", str(estimate.scene)))
                 if unit_known(self._localizer, estimate.scene):
-                    x, y, z = 1000 * pose.pose.translation_m
-                    rows.append(("position", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"))
+                    rows.append(("position", position_mm(pose.pose)))
                     rows.append(("1 sigma per axis", f"{pose.sigma_mm:.2g} mm"))
             chip = chip_html(tracked.state, estimate.reason)
             text.content = chip + rows_html(rows)
