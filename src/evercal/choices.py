@@ -16,3 +16,9 @@ Motors = Literal["feetech", "dynamixel"]
 """Motors of an arm of LeRobot."""
 Preset = Literal["fast", "demo", "bench", "converged", "paper"]
 """Amount of training of a network."""
+ConventionName = Literal[
+    "wxyz", "xyzw", "tum", "abb", "ur", "rpy", "kuka", "fanuc", "yaskawa", "staubli",
+    "kawasaki", "matrix", "franka", "mitsubishi", "denso", "techman", "jaka", "dobot",
+    "aubo", "xarm", "epson", "nachi", "doosan", "comau", "universal_robots", "motoman",
+]  # fmt: skip
+"""Names of pose conventions without modifiers, but for fixed_xyz, moving_zyx and the like."""

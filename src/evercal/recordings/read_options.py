@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+from evercal.choices import ConventionName
 from evercal.errors import InputError
 
 
@@ -23,7 +24,7 @@ class ReadOptions:
     omitted, the usual one."""
     urdf: Path | None = None
     """URDF of the robot, for joint angles. If omitted, the file beside them."""
-    pose_convention: str | None = None
+    pose_convention: ConventionName | str | None = None
     """Convention of a pose file, see `read_robot_poses`; rad or deg for joint angles. If omitted,
     the file defines it."""
     metres: bool = False

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from itertools import chain, product
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,12 +22,6 @@ from scipy.spatial.transform import Rotation
 from evercal.geometry.se3 import SE3
 from evercal.typing import Array, BoolArray
 
-ConventionName: TypeAlias = Literal[
-    "wxyz", "xyzw", "tum", "abb", "ur", "rpy", "kuka", "fanuc", "yaskawa", "staubli",
-    "kawasaki", "matrix", "franka", "mitsubishi", "denso", "techman", "jaka", "dobot",
-    "aubo", "xarm", "epson", "nachi", "doosan", "comau", "universal_robots", "motoman",
-]  # fmt: skip
-"""Names of conventions without modifiers, but for fixed_xyz, moving_zyx and the like."""
 _MAX_REACH_M = 10.0
 """Largest distance of a gripper from its base, metres."""
 _MIN_REACH_M = 0.01
@@ -82,6 +76,10 @@ class PoseConvention:
     def has(self, *modifiers: str) -> bool:
         """Whether the name has one of these modifiers."""
         return not set(modifiers).isdisjoint(self.name.split(":")[1:])
+
+
+Given = PoseConvention | None
+"""The convention that the caller states, if any."""
 
 
 class ConventionError(ValueError):

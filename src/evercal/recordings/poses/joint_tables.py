@@ -51,12 +51,16 @@ def read_joint_poses(
     names = []
     units = []
     for column in rows.columns:
-        plain, _, ending = column.rpartition("_")
-        stated = (
-            ending in _UNITS and not model.has_joint(column) and model.has_joint(plain)
-        )
-        names.append(plain if stated else column)
-        units.append(ending if stated else unit)
+        joint, _, ending = column.rpartition("_")
+        if (
+            model.has_joint(column)
+            or not model.has_joint(joint)
+            or ending not in _UNITS
+        ):
+            joint = column
+            ending = unit
+        names.append(joint)
+        units.append(ending)
     with named_errors(path, "joint angles"):
         refuse_repeated(filter(model.has_joint, names), "keep one column of each joint")
     values = in_radians(model, names, rows.values, units)
@@ -75,13 +79,12 @@ def in_radians(
     model: RobotModel, names: Sequence[str], values: Array, units: Sequence[str | None]
 ) -> Array:
     """Convert angles in degrees to radians and leave other values (n, k) as they are."""
-    other = next((unit for unit in units if unit not in (None, *_UNITS)), None)
-    if other is not None:
-        raise InputError(f"`pose_convention` {other}: joint angles are rad or deg")
-    degrees = [
-        u == "deg" and model.rotates(name) for u, name in zip(units, names, strict=True)
-    ]
-    return np.where(degrees, np.deg2rad(values), values)
+    in_degrees = []
+    for name, unit in zip(names, units, strict=True):
+        if unit not in (None, *_UNITS):
+            raise InputError(f"`pose_convention` {unit}: joint angles are rad or deg")
+        in_degrees.append(unit == "deg" and model.rotates(name))
+    return np.where(in_degrees, np.deg2rad(values), values)
 
 
 def interpolate(
@@ -106,14 +109,14 @@ def read_joints(path: Path) -> LabelledRows:
         return read_rows(path, "joint angles")
     data = read_json(path, "file of joint angles", f"give {_JSON}")
     with library_errors(f"{path}: give {_JSON}"):
-        columns = tuple(str(name) for name in data["joint_names"])
+        columns = tuple(map(str, data["joint_names"]))
         values = np.array(data["positions"], dtype=np.float64)
         lists = {key: value for key, value in data.items() if isinstance(value, list)}
-        names, times, _ = row_labels(
+        names, stamps, _ = row_labels(
             [*lists], [*lists.values()], len(values), plural=True
         )
         if values.shape != (len(values), len(columns)) or not np.isfinite(values).all():
             raise ValueError(
                 "'positions' are rows of finite numbers, one for each joint"
             )
-        return LabelledRows(names, times, columns, values)
+        return LabelledRows(names, stamps, columns, values)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from evercal.choices import ConventionName
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.recordings.poses.conventions import ConventionName
 from evercal.recordings.poses.joint_tables import interpolate
 from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses

@@ -16,6 +16,7 @@ from evercal.recordings.poses.conventions import (
     KNOWN_CONVENTIONS,
     UNITS,
     ConventionError,
+    Given,
     PoseConvention,
     matrix_convention,
     pose_convention,
@@ -143,9 +144,7 @@ def has_position(words: Sequence[str]) -> bool:
     return "position" in groups_of(words)
 
 
-def named_numbers(
-    words: Sequence[str], rows: Cells, given: PoseConvention | None
-) -> PoseTable:
+def named_numbers(words: Sequence[str], rows: Cells, given: Given) -> PoseTable:
     """Numbers of rows (n, k) whose columns have names.
 
     ValueError, also of the functions below: the columns hold no pose, or their convention is not
@@ -199,9 +198,7 @@ def _in_units(
     return convention
 
 
-def plain_numbers(
-    numbers: Array, given: PoseConvention | None, names: Names = None
-) -> PoseTable:
+def plain_numbers(numbers: Array, given: Given, names: Names = None) -> PoseTable:
     """Matrices (n, 4, 4) or (n, 3, 4), or numbers (n, k) or with stamps (n, 1 + k)."""
     if numbers.ndim != 2:
         given = given or pose_convention("matrix")

@@ -16,7 +16,7 @@ from evercal.bounds import require_at_most
 from evercal.recordings.images import IMAGE_ENDINGS
 from evercal.recordings.poses.conventions import (
     ConventionError,
-    PoseConvention,
+    Given,
     pose_convention,
 )
 from evercal.recordings.poses.pose_columns import (
@@ -82,7 +82,7 @@ _TRANSLATION = re.compile(
 )
 
 
-def pose_data(data: Any, given: PoseConvention | None, robot: bool = True) -> PoseTable:
+def pose_data(data: Any, given: Given, robot: bool = True) -> PoseTable:
     """Poses of the robot, or else of the camera, in a convention or the one that keys define.
 
     ValueError: these are no poses, or it is not clear which ones.
@@ -105,9 +105,7 @@ def pose_data(data: Any, given: PoseConvention | None, robot: bool = True) -> Po
     return plain_numbers(numbers, given)
 
 
-def _of_objects(
-    entries: list[Any], given: PoseConvention | None, robot: bool
-) -> PoseTable:
+def _of_objects(entries: list[Any], given: Given, robot: bool) -> PoseTable:
     """Poses of a list of one object for each."""
     # Messages of /tf.
     if all(isinstance(entry.get("transforms"), list) for entry in entries):
@@ -132,7 +130,7 @@ def _of_objects(
     return table._replace(fixed=fixed)
 
 
-def _of_cells(columns: Columns, given: PoseConvention | None) -> PoseTable:
+def _of_cells(columns: Columns, given: Given) -> PoseTable:
     """Poses whose numbers have a key each, or lists of some of them."""
     rows = []
     for values in zip(*columns.values(), strict=True):
@@ -146,7 +144,7 @@ def _of_cells(columns: Columns, given: PoseConvention | None) -> PoseTable:
     return _labelled(table, columns, plural=False)
 
 
-def _of_object(data: Columns, given: PoseConvention | None, robot: bool) -> PoseTable:
+def _of_object(data: Columns, given: Given, robot: bool) -> PoseTable:
     """Poses of an object: by image or number, under one key, or with their numbers under keys."""
     names = _keys_of_images(data)
     if names:
@@ -189,7 +187,7 @@ def _keys_of_images(data: Columns) -> list[str]:
     return []
 
 
-def _refuse_eye_on_base(data: Columns, given: PoseConvention | None) -> None:
+def _refuse_eye_on_base(data: Columns, given: Given) -> None:
     parameters = data.get("parameters")
     if not isinstance(parameters, Mapping) or (given and given.has("inverse")):
         return
@@ -208,7 +206,7 @@ def _unclear(keys: Sequence[str], data: Columns) -> ValueError:
     )
 
 
-def _of_role(columns: Columns, given: PoseConvention | None, robot: bool) -> Columns:
+def _of_role(columns: Columns, given: Given, robot: bool) -> Columns:
     """Columns of the robot or of the camera without that word, and of neither."""
     keys = []
     of_role: dict[str, Any] = {}
@@ -232,9 +230,7 @@ def _of_role(columns: Columns, given: PoseConvention | None, robot: bool) -> Col
     return columns
 
 
-def _of_arrays(
-    columns: Columns, given: PoseConvention | None, plural: bool
-) -> PoseTable | None:
+def _of_arrays(columns: Columns, given: Given, plural: bool) -> PoseTable | None:
     """Poses of a key that holds arrays, or of keys for rotations and translations."""
     shapes = {key: _shape(value) for key, value in columns.items()}
     keys = [key for key in columns if key in _KEYS and len(shapes[key]) > 1]
@@ -281,7 +277,7 @@ def _rotations_with_translations(
 
 
 def _composed(
-    columns: Columns, rotation: str, translation: str, given: PoseConvention | None
+    columns: Columns, rotation: str, translation: str, given: Given
 ) -> PoseTable:
     """Poses of rotations (matrices, quaternions, vectors or angles) and translations."""
     unit = name_and_unit(translation)[1] or "m"

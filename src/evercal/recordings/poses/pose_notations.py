@@ -5,7 +5,7 @@ Notations are tf2_echo of ROS, RAPID of ABB, LS of FANUC, URScript and KRL of KU
 
 import re
 
-from evercal.recordings.poses.conventions import PoseConvention, pose_convention
+from evercal.recordings.poses.conventions import Given, pose_convention
 from evercal.recordings.poses.row_files import is_number
 
 _WORD = r'[^\s\[\](){}=,;:"]'
@@ -31,9 +31,7 @@ _NOTATIONS = {
 A word is read once, from its start."""
 
 
-def without_brackets(
-    lines: list[str], given: PoseConvention | None
-) -> tuple[list[str], PoseConvention | None]:
+def without_brackets(lines: list[str], given: Given) -> tuple[list[str], Given]:
     """Lines of a table without brackets, and the convention that a robot's notation defines.
 
     ValueError: the lines mix notations, or numbers are beside the poses.

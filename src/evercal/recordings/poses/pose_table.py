@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from evercal.recordings.poses.conventions import PoseConvention
+from evercal.recordings.poses.conventions import Given
 from evercal.recordings.poses.pose_columns import (
     PoseTable,
     groups_of,
@@ -29,7 +29,7 @@ from evercal.typing import Array
 _COMMENTS = ("#", "%", "//")
 
 
-def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
+def read_pose_table(text: str, given: Given) -> PoseTable:
     """Read a table; without a given convention, its header or notation defines it.
 
     ValueError: this is no table, or its convention is not defined.
@@ -59,7 +59,7 @@ def _is_header(words: Sequence[str]) -> bool:
     return not any(numbers) or bool(groups_of(words))
 
 
-def _without_header(rows: Cells, given: PoseConvention | None) -> PoseTable:
+def _without_header(rows: Cells, given: Given) -> PoseTable:
     """Poses of rows (n, k) of numbers, perhaps with names, or of matrices in 3 or 4 rows each."""
     constant = []  # such as a frame
     texts = []
@@ -78,7 +78,7 @@ def _without_header(rows: Cells, given: PoseConvention | None) -> PoseTable:
     return plain_numbers(numbers, given)
 
 
-def _blocks(rows: Array, given: PoseConvention | None) -> Array:
+def _blocks(rows: Array, given: Given) -> Array:
     """(n, 3 or 4, 4) matrices of rows of four numbers."""
     whole = (rows == (0, 0, 0, 1)).all(1).any()
     if given and given.layout == "columns":

@@ -9,9 +9,12 @@ from scipy.spatial.transform import Slerp
 from evercal.geometry import SE3, pose_distance
 from evercal.typing import Array, BoolArray
 
-MAX_GAP_S = 0.2  # longest time between two poses over which a moving frame is interpolated, seconds
-STILL_M, STILL_DEG = 0.001, 0.1
-"""Motion below which a frame counts as standing still over a gap of any length."""
+MAX_GAP_S = 0.2
+"""Longest time between two poses over which a moving frame is interpolated, seconds."""
+STILL_M = 0.001
+"""Motion over a gap of any length below which a frame stands still, metres."""
+STILL_DEG = 0.1
+"""The same for rotations, degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,26 +45,26 @@ class PoseTrack:
             (m,) poses and (m,) whether each is valid. Poses are invalid beyond the ends, and in
             a gap of more than `MAX_GAP_S` seconds over which the frame moved.
         """
+        times = self.stamps_s
         stamps = np.asarray(stamps_s, dtype=np.float64)
-        inside = np.clip(stamps, self.stamps_s[0], self.stamps_s[-1])
+        inside = np.clip(stamps, times[0], times[-1])
         valid = inside == stamps
-        if len(self.stamps_s) == 1:
+        if len(times) == 1:
             return self.poses[np.zeros(len(stamps), dtype=int)], valid
-        after, close = times_around(self.stamps_s, inside)
+        after, close = times_around(times, inside)
         metres, radians = pose_distance(self.poses[after - 1], self.poses[after])
         still = (metres < STILL_M) & (np.rad2deg(radians) < STILL_DEG)
-        position = [
-            np.interp(inside, self.stamps_s, axis)
-            for axis in self.poses.translation_m.T
-        ]
-        rotation = Slerp(self.stamps_s, self.poses.rotation)(inside)
-        poses = SE3.of(rotation, np.stack(position, axis=-1), canonical=False)
-        return poses, valid & (close | still)
+        rotation = Slerp(times, self.poses.rotation)(inside)
+        position = np.empty((len(inside), 3))
+        for axis, values in enumerate(self.poses.translation_m.T):
+            position[:, axis] = np.interp(inside, times, values)
+        return SE3.of(rotation, position, canonical=False), valid & (close | still)
 
 
 def times_around(times_s: Array, stamps_s: Array) -> tuple[NDArray[np.intp], BoolArray]:
     """Index of the time after each stamp, and whether no long gap is around it."""
     after = np.searchsorted(times_s, stamps_s).clip(1, len(times_s) - 1)
-    short = times_s[after] - times_s[after - 1] <= MAX_GAP_S
-    exact = (stamps_s == times_s[after]) | (stamps_s == times_s[after - 1])
-    return after, short | exact
+    end = times_s[after]
+    start = times_s[after - 1]
+    exact = (stamps_s == start) | (stamps_s == end)
+    return after, exact | (end - start <= MAX_GAP_S)

@@ -12,9 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from evercal.choices import ConventionName
 from evercal.geometry import SE3
 from evercal.recordings.images import files_in
 from evercal.recordings.poses.conventions import (
+    Given,
     PoseConvention,
     asking_for,
     checked_poses,
@@ -81,12 +83,14 @@ class RobotPoses:
 
     def joints_of(self, row: int) -> tuple[float, ...] | None:
         """Joint values of a row, if they are stated."""
-        return None if self.joints is None else tuple(self.joints[row].tolist())
+        if self.joints is None:
+            return None
+        return tuple(self.joints[row].tolist())
 
 
 def read_robot_poses(
     path: PathLike,
-    convention: str | None = None,
+    convention: ConventionName | str | None = None,
     *,
     what: str = "file of robot poses",
     option: str | None = None,
@@ -111,14 +115,22 @@ def read_robot_poses(
     path = Path(path)
     with named_errors(path, what), asking_for(option):
         given = _given(path, convention)
-        table = (_folder if path.is_dir() else _file)(path, given, what, robot)
+        if path.is_dir():
+            table = _folder(path, given, what, robot)
+        else:
+            table = _file(path, given, what, robot)
         poses = _poses(table, camera_from)
         refuse_repeated(table.names or (), "names are unique")
-        stated = (None, None) if table.fixed else (table.numbers, table.convention)
-        return RobotPoses(table.names, table.stamps_s, poses, *stated)
+        if table.fixed:
+            return RobotPoses(table.names, table.stamps_s, poses)
+        return RobotPoses(
+            table.names, table.stamps_s, poses, table.numbers, table.convention
+        )
 
 
-def read_last_robot_pose(path: PathLike, convention: str | None = None) -> SE3:
+def read_last_robot_pose(
+    path: PathLike, convention: ConventionName | str | None = None
+) -> SE3:
     """Read the last complete row of a table or of JSON lines that another program appends to.
 
     A row is complete once its line break is written. Long files are read at both ends only.
@@ -129,16 +141,16 @@ def read_last_robot_pose(path: PathLike, convention: str | None = None) -> SE3:
             lines = _complete_lines(file.read(_END_BYTES))
             file.seek(max(0, file.seek(0, os.SEEK_END) - _END_BYTES))
             last = _complete_lines(file.read())[-1:]
-        ending = path.suffix.lower().removesuffix("l")  # one line of .jsonl is JSON
-        first = next((i for i, line in enumerate(lines) if line[:1] != "#"), len(lines))
-        if first == len(lines):
+        rows = [line for line in lines if line[:1] != "#"]
+        if not rows:
             raise ValueError("no complete line of a pose in it yet")
+        ending = path.suffix.lower().removesuffix("l")  # one line of .jsonl is JSON
         if ending != ".json":
             # The first line is the header, or a row and perhaps the only one.
-            last = [
-                *lines[: first + 1],
-                *(last if last != lines[first : first + 1] else []),
-            ]
+            before = lines[: lines.index(rows[0]) + 1]
+            if last == rows[:1]:
+                last = []
+            last = before + last
         return _poses(_table("\n".join(last), ending, _given(path, convention)))[-1]
 
 
@@ -149,78 +161,83 @@ def _complete_lines(part: bytes) -> list[str]:
     return [line for line in text.splitlines() if line.strip()]
 
 
-def _given(path: Path, convention: str | None) -> PoseConvention | None:
+def _given(path: Path, convention: str | None) -> Given:
     if convention is None and path.suffix.lower() == ".tum":
         convention = "tum"
-    return None if convention is None else pose_convention(convention)
+    if convention is None:
+        return None
+    return pose_convention(convention)
 
 
-def _file(
-    path: Path, given: PoseConvention | None, what: str, robot: bool
-) -> PoseTable:
+def _file(path: Path, given: Given, what: str, robot: bool) -> PoseTable:
     ending = path.suffix.lower()
     if ending in (".npy", ".npz", ".mat"):
         return pose_data(arrays_as_lists(path), given, robot)
     return _table(read_text(path, what), ending, given, robot)
 
 
-def _folder(
-    path: Path, given: PoseConvention | None, what: str, robot: bool
-) -> PoseTable:
+def _folder(path: Path, given: Given, what: str, robot: bool) -> PoseTable:
     """Poses of files that are named alike, in the order of the numbers in their names."""
-    kinds: dict[str, list[Path]] = {}
-    for file in files_in(path, POSE_ENDINGS):
-        kinds.setdefault(re.sub(r"\d+", "N", file.name), []).append(file)
-    several = {kind: files for kind, files in kinds.items() if len(files) > 1} or kinds
-    # ViSP's poses of the end effector and of the object in the camera.
-    own = [kind for kind in several if ("fPe" if robot else "cPo") in kind] or [
-        *several
-    ]
-    if len(own) != 1:
-        found = " and ".join(own) or f"no file of {', '.join(POSE_ENDINGS)}"
-        raise ValueError(
-            f"the folder holds {found}; give a folder of one file for each pose"
-        )
     tables: dict[str, PoseTable] = {}
-    for file in several[own[0]]:
+    for file in _files_named_alike(path, robot):
         with named_errors(file, what):
-            if file.suffix.lower() == ".txt" and _UNTRACKED.search(
-                read_text(file, what)
-            ):
+            is_text = file.suffix.lower() == ".txt"
+            if is_text and _UNTRACKED.search(read_text(file, what)):
                 continue
-            table = tables[file.stem] = _file(file, given, what, robot)
+            table = _file(file, given, what, robot)
             if len(table.numbers) != 1:
                 raise ValueError(
                     "holds several poses, in a folder of one file for each pose"
                 )
+            tables[file.stem] = table
     if not tables:
         raise ValueError(
             "all poses in its files are inf or nan; give those of tracked images"
         )
     numbers = np.concatenate([table.numbers for table in tables.values()])
-    return PoseTable(numbers, next(iter(tables.values())).convention, tuple(tables))
+    first = next(iter(tables.values()))
+    return PoseTable(numbers, first.convention, tuple(tables))
 
 
-def _table(
-    text: str, ending: str, given: PoseConvention | None, robot: bool = True
-) -> PoseTable:
+def _files_named_alike(folder: Path, robot: bool) -> list[Path]:
+    """Files whose names differ in numbers only."""
+    kinds: dict[str, list[Path]] = {}
+    for file in files_in(folder, POSE_ENDINGS):
+        kinds.setdefault(re.sub(r"\d+", "N", file.name), []).append(file)
+    several = [kind for kind, files in kinds.items() if len(files) > 1] or [*kinds]
+    # ViSP's poses of the end effector, or of the object in the camera.
+    word = "fPe" if robot else "cPo"
+    chosen = [kind for kind in several if word in kind] or several
+    if len(chosen) == 1:
+        return kinds[chosen[0]]
+    names = " and ".join(chosen) or f"no file of {', '.join(POSE_ENDINGS)}"
+    raise ValueError(
+        f"the folder holds {names}; give a folder of one file for each pose"
+    )
+
+
+def _table(text: str, ending: str, given: Given, robot: bool = True) -> PoseTable:
     is_json = ending in (".json", ".jsonl")
     if is_json or ending in (".yaml", ".yml") or _YAML.match(text):
-        data = [each for each in documents(text, is_json) if each is not None]
-        return pose_data(data[0] if len(data) == 1 else data, given, robot)
+        data = [value for value in documents(text, is_json) if value is not None]
+        if len(data) == 1:
+            return pose_data(data[0], given, robot)
+        return pose_data(data, given, robot)
     return read_pose_table(text, given)
 
 
 def _poses(table: PoseTable, camera_from: bool = False) -> SE3:
+    """Poses of a table; ValueError if the numbers are none, and what may be the matter."""
+    convention = table.convention
     try:
-        return checked_poses(table.numbers, table.convention, camera_from)
+        return checked_poses(table.numbers, convention, camera_from)
     except ValueError as error:
         problem: ValueError = error
     with suppress(ValueError):
-        if not table.convention.is_matrix:
-            checked_poses(np.roll(table.numbers, 3, axis=-1), table.convention)
+        if not convention.is_matrix:
+            checked_poses(np.roll(table.numbers, 3, axis=-1), convention)
             problem = ValueError(
-                f"the rotation is before the position; write {table.convention.meaning}, or a"
-                f" header that names the columns"
+                f"the rotation is before the position; write {convention.meaning}, or a header"
+                f" that names the columns"
             )
     raise problem
