@@ -33,16 +33,13 @@ class RecordingFormat:
     """Module of `recordings.formats` with functions `detect` and `load`."""
     contents: str
     """Files that identify it, for messages."""
+    uses: tuple[str, ...] = ()
+    """Fields of `ReadOptions` that its `load` takes, apart from `every`."""
 
     @property
     def reader(self) -> ModuleType:
         """The module."""
         return importlib.import_module(f"evercal.recordings.formats.{self.module}")
-
-    @property
-    def uses(self) -> tuple[str, ...]:
-        """Fields of `ReadOptions` that it uses, apart from `every`."""
-        return getattr(self.reader, "USES", ())
 
 
 FORMATS: dict[FormatName, RecordingFormat] = {
@@ -51,13 +48,32 @@ FORMATS: dict[FormatName, RecordingFormat] = {
         "seven_scenes", "TrainSplit.txt, TestSplit.txt and seq-XX folders"
     ),
     "12scenes": RecordingFormat("twelve_scenes", "info.txt and data"),
-    "nerfstudio": RecordingFormat("nerfstudio", "transforms.json"),
-    "colmap": RecordingFormat("colmap", "sparse/0 with cameras and images"),
-    "wrist": RecordingFormat(
-        "wrist", "images beside base_from_gripper.csv, joints.csv, base_from_camera.csv"
+    "nerfstudio": RecordingFormat("nerfstudio", "transforms.json", ("metres",)),
+    "colmap": RecordingFormat(
+        "colmap", "sparse/0 with cameras and images", ("metres",)
     ),
-    "lerobot": RecordingFormat("lerobot", "meta/info.json"),
-    "rosbag": RecordingFormat("ros_bag", "a .bag or .mcap file or bag folder"),
+    "wrist": RecordingFormat(
+        "wrist",
+        "images beside base_from_gripper.csv, joints.csv, base_from_camera.csv",
+        ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention"),
+    ),
+    "lerobot": RecordingFormat(
+        "lerobot",
+        "meta/info.json",
+        (
+            "camera",
+            "image_topic",
+            "base_frame",
+            "gripper_frame",
+            "urdf",
+            "pose_convention",
+        ),
+    ),
+    "rosbag": RecordingFormat(
+        "ros_bag",
+        "a .bag or .mcap file or bag folder",
+        ("camera", "image_topic", "pose_topic", "base_frame", "gripper_frame", "urdf"),
+    ),
 }
 """All formats by name, in the order in which they are tried."""
 

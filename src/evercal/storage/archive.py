@@ -22,8 +22,12 @@ _CHUNK = 1 << 20
 _SAME_TIME = (1980, 1, 1, 0, 0, 0)
 """Date of all entries: the earliest that a zip archive can state."""
 _BROKEN = (
-    zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError,
-)  # fmt: skip
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    ValueError,
+    NotImplementedError,
+)
 """Errors of the library while it reads a damaged archive."""
 
 

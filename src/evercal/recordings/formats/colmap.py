@@ -27,15 +27,23 @@ from evercal.storage.text_files import (
     path_inside,
 )
 
-USES = ("metres",)
-
 _MODEL_FOLDERS = (".", "sparse", "colmap/sparse", "distorted/sparse")
 """Usual places of models; distorted/sparse is before undistortion."""
 _SUPPORTED = (
-    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
-    "SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE",
-    "FOV", "EUCM",
-)  # fmt: skip
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "OPENCV_FISHEYE",
+    "FOV",
+    "EUCM",
+)
 """Camera models of which each parameter is OpenCV's, or that are `RADIAL_MODELS`."""
 _READ = "import pycolmap, sys; print(flush=True); pycolmap.Reconstruction(sys.argv[1])"
 """Program that ends once a model is read."""

@@ -42,14 +42,6 @@ from evercal.storage.text_files import (
 )
 from evercal.typing import Array, Image
 
-USES = (
-    "camera",
-    "image_topic",
-    "base_frame",
-    "gripper_frame",
-    "urdf",
-    "pose_convention",
-)
 INFO = Path("meta") / "info.json"
 
 

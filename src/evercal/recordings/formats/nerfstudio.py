@@ -40,10 +40,14 @@ from evercal.typing import Array
 FILE = "transforms.json"
 """Usual name of the file."""
 _FILES = (
-    "transforms_undistorted.json", FILE, "transforms_train.json",
-    "nerfstudio/transforms_undistorted.json", f"nerfstudio/{FILE}",
-    "dslr/nerfstudio/transforms_undistorted.json", f"dslr/nerfstudio/{FILE}",
-)  # fmt: skip
+    "transforms_undistorted.json",
+    FILE,
+    "transforms_train.json",
+    "nerfstudio/transforms_undistorted.json",
+    f"nerfstudio/{FILE}",
+    "dslr/nerfstudio/transforms_undistorted.json",
+    f"dslr/nerfstudio/{FILE}",
+)
 """Usual places; the first one is read. ScanNet++ keeps undistorted images beside those of the
 fisheye lens."""
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
@@ -54,7 +58,6 @@ _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Numbers of `distortion_params`, in this order."""
 _TOLERANCE = 1e-2
 """Largest deviation of a stated matrix from a rotation."""
-USES = ("metres",)
 Entry: TypeAlias = Mapping[str, object]
 """Values of the file."""
 Size: TypeAlias = tuple[int, int]

@@ -32,8 +32,6 @@ from evercal.recordings.read_options import ReadOptions
 from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import named_errors, read_json, refuse_repeated
 
-USES = ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention")
-
 
 class RecordingLayout(NamedTuple):
     """Paths in a recording of camera poses."""

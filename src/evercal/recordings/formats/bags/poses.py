@@ -18,13 +18,27 @@ from evercal.robot.robot_model import RobotModel
 from evercal.typing import Array, BoolArray, IntArray
 
 _BASES = (
-    "base_link", "base", "panda_link0", "fr3_link0", "fer_link0", "lbr_link_0", "link_base",
-)  # fmt: skip
+    "base_link",
+    "base",
+    "panda_link0",
+    "fr3_link0",
+    "fer_link0",
+    "lbr_link_0",
+    "link_base",
+)
 """Usual names of the robot's base."""
 _GRIPPERS = (
-    "tool0", "flange", "ee_link", "panda_hand", "fr3_hand", "fer_hand", "lbr_link_ee", "link_eef",
-    "gripper_link", "tool_link",
-)  # fmt: skip
+    "tool0",
+    "flange",
+    "ee_link",
+    "panda_hand",
+    "fr3_hand",
+    "fer_hand",
+    "lbr_link_ee",
+    "link_eef",
+    "gripper_link",
+    "tool_link",
+)
 """Usual names of the gripper."""
 _LENGTH_TOLERANCE = 1e-2
 """Largest deviation of the length of a quaternion from 1."""
@@ -103,8 +117,9 @@ class _TfTree:
                 frames |= edge.parents
         return tuple(sorted(frames, key=lambda frame: (len(self._chain(frame)), frame)))
 
-    def connected(self, a: str, b: str) -> bool:
-        return self._chain(a)[-1] == self._chain(b)[-1]
+    def root(self, frame: str) -> str:
+        """The frame above a frame that has no parent."""
+        return self._chain(frame)[-1]
 
     def a_from_b(self, a: str, b: str, stamps_s: Array) -> tuple[SE3, BoolArray]:
         """Interpolate (n,) poses of frame b in frame a, and whether each is valid."""
@@ -221,7 +236,9 @@ def poses_at_images(
         _refuse_times(bag, stamps, times, "tf")
     owner = "camera" if gripper == camera_frame else "gripper"
     notes = [f"poses of the {owner} are those of {gripper} in {base}, from tf"]
-    has_camera = camera_frame in tree.frames() and tree.connected(base, camera_frame)
+    has_camera = camera_frame in tree.frames() and tree.root(camera_frame) == tree.root(
+        base
+    )
     if has_camera and owner == "gripper":
         notes.append(
             f"tf also has the camera ({camera_frame}), which is not used; to use it, give"
