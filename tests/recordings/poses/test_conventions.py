@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -9,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
+from evercal.choices import ConventionName
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.conventions import (
     CONVENTIONS,
+    VENDORS,
     asking_for,
     check_units,
     numbers_from_poses,
@@ -136,6 +139,12 @@ def test_gimbal_lock_keeps_the_rotation(name: str, middle: float) -> None:
     pose = poses_from_numbers([0, 0, 0, 20.0, middle, 50.0], convention)
     again = poses_from_numbers(numbers_from_poses(pose, convention), convention)
     assert pose_distance(again, pose)[1] < 3e-7
+
+
+def test_editors_know_the_names_of_all_conventions() -> None:
+    any_axes = ("fixed_", "moving_")
+    names = {name for name in CONVENTIONS if not name.startswith(any_axes)}
+    assert {*get_args(ConventionName)} == names | VENDORS.keys()
 
 
 def test_quaternions_are_written_with_positive_w() -> None:

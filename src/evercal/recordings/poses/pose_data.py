@@ -167,7 +167,7 @@ def _of_object(data: Columns, given: Given, robot: bool) -> PoseTable:
     lists = []
     for value in columns.values():
         if isinstance(value, Mapping):
-            value = [*value.values()]
+            value = [value[key] for key in sorted(value, key=natural_key)]
         lists.append(value)
     if not has_position([*columns]) or not all(isinstance(v, list) for v in lists):
         raise _unclear([], data)
