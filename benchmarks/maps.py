@@ -19,7 +19,7 @@ from evercal.evaluation import evaluate
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.learning.scene import LearnReport
 from evercal.localization.localizer import Localizer
-from evercal.localization.query import LocalizeOptions
+from evercal.localization.options import LocalizeOptions
 from evercal.map import Map
 from evercal.mapping.build import MapOptions
 from evercal.mapping.memory_budget import MemoryBudget

@@ -23,7 +23,7 @@ from evercal import Map
 from evercal.features.encoder import Encoder, load_encoder
 from evercal.geometry import SE3
 from evercal.localization.keyframe_bank import KeyframeBank
-from evercal.localization.query import LocalizeOptions
+from evercal.localization.options import LocalizeOptions
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import MapContents, SceneMap

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from evercal.geometry import UncertainPose as UncertainPose
     from evercal.learning.scene import LearnReport as LearnReport
     from evercal.localization.estimate import PoseEstimate as PoseEstimate
-    from evercal.localization.query import LocalizeOptions as LocalizeOptions
+    from evercal.localization.options import LocalizeOptions as LocalizeOptions
     from evercal.map import Map as Map
     from evercal.mapping.build import MapOptions as MapOptions
     from evercal.recordings import Frame as Frame
@@ -65,7 +65,7 @@ _PUBLIC = {
     "Frame": "evercal.recordings",
     "InputError": "evercal.errors",
     "LearnReport": "evercal.learning.scene",
-    "LocalizeOptions": "evercal.localization.query",
+    "LocalizeOptions": "evercal.localization.options",
     "Map": "evercal.map",
     "MapOptions": "evercal.mapping.build",
     "PoseEstimate": "evercal.localization.estimate",

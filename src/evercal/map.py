@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from evercal.learning.task import Learned
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
-    from evercal.localization.query import LocalizeOptions
+    from evercal.localization.options import LocalizeOptions
     from evercal.localization.refreshing import RefreshReport
     from evercal.localization.tracking import TrackedFrame, TrackOptions
     from evercal.mapping.build import MapOptions

@@ -10,10 +10,16 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.localization.alignment import AlignmentOptions, _shift_px, align_pose
-from evercal.localization.intrinsics import NOT_STATED, RefinedPose
+from evercal.localization.alignment import (
+    AlignmentOptions,
+    SearchedImage,
+    _shift_px,
+    align_pose,
+)
+from evercal.localization.intrinsics import NOT_STATED
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.localizer import Localizer
+from evercal.localization.pose_refinement import RefinedPose
 from evercal.mapping.landmarks import Landmarks
 from evercal.mapping.patches import cut_patches, image_pyramid, to_level
 from evercal.mapping.scene_map import MapContents
@@ -108,10 +114,18 @@ def aligned(count: int, options: AlignmentOptions | None = None) -> RefinedPose 
     """Align the keyframe's own image from a pose some pixels away."""
     image = texture()
     start = SE3.exp([0.01, -0.01, 0.005, 0.004, -0.003, 0.002])
-    pyramid = image_pyramid(image, 2)
-    walls = [wall(image, spots(count))]
+    return aligned_to(wall(image, spots(count)), image, start, options)
+
+
+def aligned_to(
+    keyframe: AlignedLandmarks,
+    image: np.ndarray,
+    start: SE3,
+    options: AlignmentOptions | None = None,
+) -> RefinedPose | None:
+    searched = SearchedImage(image_pyramid(image, 2), CAMERA, NOT_STATED)
     options = options or AlignmentOptions()
-    return align_pose(pyramid, CAMERA, walls, start, options, NOT_STATED)
+    return align_pose(searched, [keyframe], start, np.zeros(5), options)
 
 
 @pytest.mark.parametrize("count", [300, 900, 901, 1000, 1799, 3000])
@@ -130,10 +144,7 @@ def test_few_matches_widen_the_next_search() -> None:
     image = texture()
     keyframe = wall(image, spots(3000))
     image[:, 90:] = 0
-    start = SE3.exp([0.002, 0, 0, 0, 0, 0])
-    pyramid = image_pyramid(image, 2)
-    options = AlignmentOptions()
-    occluded = align_pose(pyramid, CAMERA, [keyframe], start, options, NOT_STATED)
+    occluded = aligned_to(keyframe, image, SE3.exp([0.002, 0, 0, 0, 0, 0]))
     assert occluded is not None
     assert 900 < occluded.observed.expected <= 2700
 

@@ -22,9 +22,9 @@ from evercal.localization.intrinsics import (
     prior_of,
 )
 from evercal.localization.localizer import Localizer
+from evercal.localization.options import Attempt, LocalizeOptions
 from evercal.localization.parallel import in_parallel
 from evercal.localization.pnp import PnpOptions
-from evercal.localization.query import Attempt, LocalizeOptions
 from evercal.mapping.build import MapOptions, build_map
 from evercal.mapping.map_frame import MapFrame, Similarity
 from evercal.mapping.memory_budget import MemoryBudget

@@ -67,7 +67,9 @@ def test_few_right_matches_among_the_first_are_sampled(seed: int) -> None:
     points[wrong] = rng.normal(0, 2, (len(wrong), 3))
     far = []
     for ranked in (True, False):
-        result = solve_pnp(pixels, points, CAMERA, PnpOptions(ranked=ranked))
+        result = solve_pnp(
+            pixels, points, CAMERA, PnpOptions(progressive_sampling=ranked)
+        )
         far.append(np.inf if result is None else pose_distance(result.pose, truth)[0])
     assert far[0] < 0.1 < far[1]
 

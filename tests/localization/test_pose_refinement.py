@@ -10,20 +10,20 @@ from scipy.spatial.transform import Rotation
 from scipy.special import exp1
 
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
-from evercal.localization.alignment import _moved_px
+from evercal.localization.alignment import _shift_by_intrinsics_px
 from evercal.localization.intrinsics import (
     OWN,
     SAME_MODEL,
     STATED,
     UNKNOWN,
     IntrinsicsPrior,
-    self_calibrated,
 )
 from evercal.localization.pose_refinement import (
     Minimum,
     Observed,
     linearise,
     minimise,
+    self_calibrated,
 )
 from evercal.typing import Array
 
@@ -228,7 +228,7 @@ def test_a_far_camera_is_reached_by_repetition(factor: float) -> None:
     result = self_calibrated(seen, CAMERA, matrix_and_position(NEAR), change, prior)
     moved = []
     for _ in range(8):
-        moved.append(_moved_px(CAMERA, change, result.change))
+        moved.append(_shift_by_intrinsics_px(CAMERA, result.change - change))
         if moved[-1] < 0.2:
             break
         at = matrix_and_position(result.pose.pose)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from evercal.geometry import Camera, UncertainPose, pose_distance
+from evercal.geometry import UncertainPose, pose_distance
 from evercal.localization import rivals
+from evercal.localization.hypothesis import NO_MATCHES, Aligned
 from evercal.localization.localizer import Localizer
-from evercal.localization.query import Hypothesis, Query
+from evercal.localization.query import Query
 from evercal.localization.repetition import displaced, pattern_steps
+from evercal.localization.scene_poses import ScenePoses
 from evercal.mapping.scene_map import MapContents
 from evercal.recordings.frame import Recording
 
@@ -55,27 +57,22 @@ class _WithRival(Localizer):
     weaker: float
     """Landmarks that the slipped pose expects, relative to the true one."""
 
-    def _best_hypothesis(self, query: Query, cameras: Sequence[Camera]) -> Hypothesis:
-        self.true = super()._best_hypothesis(query, cameras)
+    def _best_hypothesis(self, query: Query) -> Aligned:
+        true = super()._best_hypothesis(query)
+        assert isinstance(true, Aligned)
+        self.true = replace(true, matches=NO_MATCHES)
         return self._slipped()
 
-    def _slipped(self) -> Hypothesis:
-        assert self.true.pose is not None
+    def _slipped(self) -> Aligned:
         pose = UncertainPose(
             displaced(self.true.pose.pose, np.array([0.03, 0, 0])),
             self.true.pose.covariance,
         )
         expected = round(self.weaker * self.true.expected)
-        return replace(self.true, pose=pose, expected=expected, matches=None)
+        return replace(self.true, pose=pose, expected=expected)
 
-    def rivals(
-        self, _: Query, best: Hypothesis, camera: Camera
-    ) -> Iterator[Hypothesis]:
-        yield (
-            replace(self.true, matches=None)
-            if best is not self.true
-            else self._slipped()
-        )
+    def rivals(self, _: ScenePoses, __: Query, best: Aligned) -> Iterator[Aligned]:
+        yield self._slipped() if best is self.true else self.true
 
 
 @pytest.mark.parametrize(
@@ -88,8 +85,8 @@ def test_a_clearly_stronger_pose_wins(
     hall_map: MapContents,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(rivals, "_rivals", _WithRival.rivals)
     localizer = _WithRival(hall_map)
+    monkeypatch.setattr(rivals, "_rivals", localizer.rivals)
     frame = hall.test[5]
     localizer.weaker = weaker
     truth = frame.base_from_camera

@@ -14,6 +14,7 @@ from evercal.geometry import SE3, UncertainPose, pose_distance
 from evercal.localization import tracking
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
+from evercal.localization.scene_poses import ScenePoses
 from evercal.localization.tracking import Tracker, TrackOptions
 from evercal.mapping.scene_map import MapContents
 from evercal.recordings.frame import Recording
@@ -84,7 +85,7 @@ def test_where_a_period_of_texture_is_in_reach_the_frame_is_located_from_nothing
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     step = np.array([[0.05, 0.0, 0.0]])
-    monkeypatch.setattr(Localizer, "slips", lambda *_: step)
+    monkeypatch.setattr(ScenePoses, "slips", lambda *_: step)
     tracker = Tracker(Localizer(hall_map))
     image = views[0][0]
     # Without a known motion 0.05 m are possible in a fifteenth of a second, with one in 0.2 s.
@@ -191,7 +192,7 @@ def smoothed(
     tracker._smoothed = None
     values: list[float] = []
     jumps: list[bool] = []
-    lost = PoseEstimate("failed", "", None, None, None, 0, 0.0, 1.0)
+    lost = PoseEstimate.failed("")
     for i, x in enumerate(positions_m):
         pose = SE3.from_translation([x, 0, 0])
         uncertain = UncertainPose(pose, sigma_m**2 * np.eye(6))

@@ -16,7 +16,7 @@ from evercal.geometry import (
     average_poses,
     pose_distance_mm_deg,
 )
-from evercal.localization.learned import localize_picture
+from evercal.localization.pictures import localize_picture
 from evercal.recordings.images import Picture
 from evercal.typing import Array, BoolArray
 

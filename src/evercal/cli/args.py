@@ -16,9 +16,9 @@ from evercal.errors import InputError
 
 if TYPE_CHECKING:
     from evercal.geometry import SE3, Camera, UncertainPose
-    from evercal.localization.learned import LearnedLocalizer
     from evercal.localization.localizer import Localizer
     from evercal.recordings import Recording
+    from evercal.reports.inspected import LearnedLocalizer
 
 MAP = "evercal"
 """The strategy of a map."""

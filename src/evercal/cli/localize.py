@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from evercal.geometry import Camera
-    from evercal.localization.learned import LearnedLocalizer
+    from evercal.reports.inspected import LearnedLocalizer
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,8 @@ class Localize(args.Verb):
         self, localizer: "LearnedLocalizer", files: list[Path], camera: "Camera | None"
     ) -> "list[Answer]":
         """The answer for each image; times include decoding."""
-        from evercal.localization.learned import localize_picture
         from evercal.localization.parallel import in_parallel
+        from evercal.localization.pictures import localize_picture
         from evercal.recordings import read_image, write_image
         from evercal.reports.overlay import draw_landmarks
 

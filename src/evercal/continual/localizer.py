@@ -15,12 +15,12 @@ from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.continual.store import NetworkStore
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.localization.acceptance import without_pose
 from evercal.localization.estimate import PoseEstimate
+from evercal.localization.hypothesis import Matches, Rough
 from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.localization.matching import strided_patches
 from evercal.localization.pnp import PnpOptions, PnpResult, solve_pnp, uncertain
-from evercal.localization.query import Hypothesis, Matches, Query
+from evercal.localization.query import Encoded
 from evercal.recordings.images import as_rgb
 
 
@@ -34,8 +34,6 @@ class NetworkLocalizeOptions:
     """Scenes whose best prototype is less similar than the best scene's by more are not tried."""
     pnp: PnpOptions = field(default_factory=lambda: PnpOptions(threshold_px=8.0))
     """RANSAC settings. Points of a network scatter more than landmarks, so the radius is wider."""
-    patches_short_side: int = 480
-    """Short side of the image in a query, pixels."""
     refuses: bool = True
     """Whether a pose with too few inliers is refused; published methods answer for every image."""
 
@@ -71,16 +69,21 @@ class NetworkLocalizer:
         return tuple(record.name for record in self.contents.scenes)
 
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
-        """Locate an image; see `Localizer.localize`."""
+        """Locate an image; see `Localizer.localize`.
+
+        Inliers are patches whose predicted points agree with the pose, and the ratio is that of all
+        patches. There are no `camera`, `terms` and `support`. The status is `failed` as well if the
+        pose lies outside the cell of its scene.
+        """
         began = time.perf_counter()
         image = as_rgb(image)
         scenes = self.contents
         cameras = _fitting_cameras(camera, image, scenes.scenes)
         features = scenes.encoder.encode(image, scenes.short_side)
-        query = Query(image, features, self.options.patches_short_side)
+        encoded = Encoded(features)
         tried = [
-            self._hypothesis(query, i, cameras)
-            for i in self._candidates(query, cameras)
+            self._hypothesis(encoded, i, cameras)
+            for i in self._candidates(encoded, cameras)
         ]
         best = max(tried, key=_support)
         return self._answer(best, 1000 * (time.perf_counter() - began))
@@ -90,11 +93,13 @@ class NetworkLocalizer:
         heads = self.contents.heads
         return len(heads) == 1 and heads[0].options.condition == "descriptor"
 
-    def _candidates(self, query: Query, cameras: Sequence[Camera | None]) -> list[int]:
+    def _candidates(
+        self, encoded: Encoded, cameras: Sequence[Camera | None]
+    ) -> list[int]:
         usable = [i for i, camera in enumerate(cameras) if camera is not None]
         if self._decides_scene:
             return usable[:1]
-        _, descriptor = described(query.features, self.contents.descriptor)
+        _, descriptor = described(encoded.features, self.contents.descriptor)
         similarity = {
             i: float((self._prototypes[i] @ descriptor).max()) for i in usable
         }
@@ -104,24 +109,24 @@ class NetworkLocalizer:
 
     def _hypothesis(
         self,
-        query: Query,
+        encoded: Encoded,
         scene: int,
         cameras: Sequence[Camera | None],
         moved: bool = False,
-    ) -> Hypothesis:
+    ) -> Rough | None:
         camera = cameras[scene]
         assert camera is not None, "only scenes whose camera fits are tried"
         small = camera.short_side_resized(self.contents.short_side)
-        matches, patches = self._predicted(query, scene, small)
+        matches, patches = self._predicted(encoded, scene, small)
         rough = solve_pnp(matches.pixels, matches.points_m, small, self.options.pnp)
         if rough is None:
-            return Hypothesis(scene)
+            return None
         if self._decides_scene and not moved:
             inside = self._scene_at(rough.pose, scene)
             other = scene if inside is None else inside
             if cameras[other] not in (None, camera):
                 # The pose lies in the cell of a scene with another camera: solve once more.
-                return self._hypothesis(query, other, cameras, moved=True)
+                return self._hypothesis(encoded, other, cameras, moved=True)
             if other != scene:
                 cells = [
                     self.contents.scenes[i].cell.atlas_from_base for i in (other, scene)
@@ -132,17 +137,17 @@ class NetworkLocalizer:
                 scene = other
         pixels, points = (values[rough.inliers] for values in matches)
         pose = uncertain(pixels, points, small, rough.pose)
-        return Hypothesis(scene, pose, pixels=pixels, points_m=points, expected=patches)
+        return Rough(scene, pose, pixels, points, patches, len(pixels))
 
     @torch.inference_mode()
     def _predicted(
-        self, query: Query, scene: int, camera: Camera
+        self, encoded: Encoded, scene: int, camera: Camera
     ) -> tuple[Matches, int]:
         """Scene coordinates of patches in a scene's base frame, and the number of patches."""
         scenes = self.contents
-        patches, pixels = strided_patches(query, camera, scenes.encoder.stride, 1)
+        patches, pixels = strided_patches(encoded, camera, scenes.encoder.stride, 1)
         head, local = scenes.head_for(scene)
-        features, descriptor = described(query.features, scenes.descriptor)
+        features, descriptor = described(encoded.features, scenes.descriptor)
         with autocast(head.device):
             output = head(features, local, descriptor.expand(len(features), -1))
         points = output.points.cpu().double().numpy()
@@ -159,12 +164,23 @@ class NetworkLocalizer:
             atlas_from_base.apply(base_from_camera.translation_m)
         )
 
-    def _answer(self, best: Hypothesis, milliseconds: float) -> PoseEstimate:
+    def _answer(self, best: Rough | None, milliseconds: float) -> PoseEstimate:
+        if best is None:
+            return PoseEstimate.failed("fewer than 6 inliers", milliseconds)
         record = self.contents.scenes[best.scene]
         status, reason = self._status(best, record)
-        estimate = without_pose(best, _support(best), milliseconds)
-        estimate = replace(estimate, status=status, reason=reason)
-        if status != "ok" or best.pose is None:
+        estimate = PoseEstimate(
+            status=status,
+            reason=reason,
+            scene=None,
+            base_from_camera=None,
+            covariance=None,
+            inliers=best.inliers,
+            inlier_ratio=best.inlier_ratio,
+            milliseconds=milliseconds,
+            support=_support(best),
+        )
+        if status != "ok":
             return estimate
         return replace(
             estimate,
@@ -175,9 +191,7 @@ class NetworkLocalizer:
             points_m=best.points_m,
         )
 
-    def _status(self, best: Hypothesis, record: SceneRecord):
-        if best.pose is None:
-            return "failed", "fewer than 6 inliers"
+    def _status(self, best: Rough, record: SceneRecord):
         if self._scene_at(best.pose.pose, best.scene) != best.scene:
             return "failed", "the pose lies outside the cell of its scene"
         if self.options.refuses and best.inlier_ratio < record.inlier_threshold:
@@ -208,5 +222,7 @@ def _fitting_cameras(
     return [own if fit else None for own, fit in zip(asked, fits, strict=True)]
 
 
-def _support(hypothesis: Hypothesis) -> float:
+def _support(hypothesis: Rough | None) -> float:
+    if hypothesis is None:
+        return 0.0
     return hypothesis.inlier_ratio * hypothesis.inliers**0.5

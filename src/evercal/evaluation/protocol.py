@@ -11,7 +11,7 @@ from evercal.errors import InputError
 from evercal.evaluation.metrics import FrameResult
 from evercal.geometry import pose_distance
 from evercal.geometry.near import near_training
-from evercal.localization.learned import SceneLocalizer
+from evercal.localization.pictures import SceneLocalizer
 from evercal.recordings import (
     Frame,
     Recording,

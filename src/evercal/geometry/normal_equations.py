@@ -7,10 +7,8 @@ import numpy as np
 
 from evercal.typing import Array
 
-
-def _units(normal: Array) -> Array:
-    """(p,) units of the unknowns in which the diagonal is 1."""
-    return 1 / np.sqrt(normal.diagonal() + 1e-300)
+_TINY = 1e-300
+"""Added to the diagonal, so that an unknown without information has a finite unit."""
 
 
 def normal_inverse(normal: Array, ridge: float) -> Array:
@@ -18,7 +16,7 @@ def normal_inverse(normal: Array, ridge: float) -> Array:
 
     An unknown that is not constrained gets a huge variance.
     """
-    unit = _units(normal)
+    unit = 1 / np.sqrt(normal.diagonal() + _TINY)
     units = unit * unit[:, None]
     scaled = normal * units
     scaled.flat[:: len(unit) + 1] += ridge
@@ -27,13 +25,13 @@ def normal_inverse(normal: Array, ridge: float) -> Array:
 
 def normal_pseudo_inverse(normal: Array, rcond: float) -> Array:
     """Pseudo-inverse (p, p); scaled singular values below `rcond` of the largest count as 0."""
-    unit = _units(normal)
+    unit = 1 / np.sqrt(normal.diagonal() + _TINY)
     units = unit * unit[:, None]
     return np.linalg.pinv(normal * units, rcond) * units
 
 
 def normal_solution(normal: Array, right: Array) -> Array:
     """Solution (p,) with the smallest scaled norm of `normal @ x = right`."""
-    unit = _units(normal)
+    unit = 1 / np.sqrt(normal.diagonal() + _TINY)
     scaled = normal * (unit * unit[:, None])
     return unit * np.linalg.lstsq(scaled, unit * right, rcond=1e-13)[0]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.learning.stated_scatter import with_scatter
-from evercal.localization.acceptance import differ
+from evercal.localization.answer import differ
 from evercal.localization.localizer import Localizer
 from evercal.mapping.arm_offsets import with_offsets
 from evercal.mapping.build import MapOptions, build_map
@@ -195,11 +195,12 @@ def located_as_stated(
     localizer = Localizer(contents.empty().with_scene(scene))
     right = []
     for frame in frames:
-        estimate, found = localizer.located(frame.read_image(), frame.camera)
+        estimate, pose = localizer.located(frame.read_image(), frame.camera)
         assert frame.base_from_camera is not None, "a posed frame"
         stated = scene.frame.from_base(frame.base_from_camera)
-        if estimate.status == "ok" and not differ(found, stated):
-            right.append(frame.name)
+        if estimate.status != "ok" or pose is None or differ(pose, stated):
+            continue
+        right.append(frame.name)
     return tuple(right)
 
 

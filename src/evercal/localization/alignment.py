@@ -2,21 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from evercal.errors import InputError, require_numbers
 from evercal.geometry import SE3, Camera
-from evercal.localization.intrinsics import (
-    IntrinsicsPrior,
-    RefinedPose,
-    self_calibrated,
-)
+from evercal.localization.intrinsics import IntrinsicsPrior
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import (
-    INTRINSICS,
     Observed,
+    Pose,
+    RefinedPose,
     minimise,
+    self_calibrated,
 )
 from evercal.mapping.landmarks import project_surface
 from evercal.mapping.patches import (
@@ -28,17 +28,16 @@ from evercal.mapping.patches import (
 )
 from evercal.typing import Array, IntArray
 
-Pose = tuple[Array, Array]
-"""Rotation (3, 3) and position (3,) of map_from_camera."""
-
-_MOST_AGAIN = 8
-"""Searches after a change of the intrinsics, at most."""
+_MAX_REPEATS = 8
+"""Maximum number of searches after a change of the intrinsics."""
 _NOTICEABLE_PX = 0.2
 """Shift of projections by the intrinsics above which landmarks are searched again, pixels."""
 _HOPELESS = 0.08
 """Share of the searched landmarks that must agree; with fewer the search ends."""
 _FAR_PX = 1.0
 """Shift above which the coarse round is repeated, pixels."""
+_LOOSE_PNP = PnpOptions(threshold_px=4.0, max_iterations=200, min_iterations=20)
+"""RANSAC settings for the matches of the coarse round, many of which are wrong."""
 
 
 @dataclass(frozen=True)
@@ -46,15 +45,15 @@ class AlignmentRound:
     """One pass over the landmarks."""
 
     level: int
-    """Of the image pyramid."""
+    """Level of the image pyramid."""
     iterations: int
-    """Alignment steps of every patch."""
+    """Alignment iterations of every patch."""
     landmarks: int
-    """Landmarks that are searched, at most; more where few were matched before."""
+    """Maximum number of searched landmarks; more where few were matched before."""
     steps: int
-    """Gauss-Newton steps of the pose, at most."""
+    """Maximum number of Gauss-Newton iterations of the pose."""
     reach_px: float
-    """Largest distance of a match from its expected position, pixels of the image."""
+    """Maximum distance of a match from its expected position, pixels of the image."""
 
 
 @dataclass(frozen=True)
@@ -66,88 +65,112 @@ class AlignmentOptions:
         AlignmentRound(0, 4, 300, 3, 6.0),
         AlignmentRound(0, 3, 900, 10, 3.0),
     )
-    """From coarse to fine."""
+    """Rounds from coarse to fine."""
     enough_matched: float = 0.4
     """Share of matched landmarks below which the next round searches proportionally more."""
     most_more: float = 3.0
-    """Largest factor on the number of landmarks."""
+    """Maximum factor on the number of searched landmarks."""
     min_correlation: float = 0.7
-    """Smallest normalised cross-correlation of a match."""
+    """Minimum normalised cross-correlation of a match."""
     min_matches: int = 12
-    """Fewer landmarks give no pose."""
+    """Minimum number of matched landmarks of a pose."""
     inlier_px: float = 1.0
-    """Reprojection error below which a matched landmark is an inlier."""
+    """Reprojection error below which a matched landmark is an inlier, pixels."""
     floor_px: float = 0.1
     """Alignment error of a perfect patch for `noise` 1, pixels: with 0.8, 0.08 px at level 0."""
     noise: float = 0.8
     """Noise of aligned patches, in standard deviations of a patch's intensities."""
 
+    def __post_init__(self) -> None:
+        if len(self.rounds) < 2:
+            raise InputError(
+                "AlignmentOptions.rounds has fewer than two; the first is the coarse one"
+            )
+        for step in self.rounds:
+            require_numbers(step, ("iterations", "landmarks", "steps"), 1)
+            require_numbers(step, ("level",), 0, 1)
+            require_numbers(step, ("reach_px",), 0)
+        require_numbers(self, ("enough_matched", "min_correlation"), 0, 1)
+        require_numbers(self, ("most_more", "min_matches"), 1)
+        require_numbers(self, ("inlier_px", "floor_px", "noise"), 0)
+
+
+class SearchedImage(NamedTuple):
+    """The image that landmarks are searched in."""
+
+    pyramid: Sequence[Array]
+    camera: Camera
+    """Intrinsics at the first level of the pyramid, the mean of the prior."""
+    prior: IntrinsicsPrior
+
 
 def align_pose(
-    pyramid: Sequence[Array],
-    camera: Camera,
+    image: SearchedImage,
     keyframes: Sequence[AlignedLandmarks],
     start: SE3,
+    change: Array,
     options: AlignmentOptions,
-    prior: IntrinsicsPrior,
-    change: Array | None = None,
     coarse: bool = True,
 ) -> RefinedPose | None:
-    """Refine a rough pose by the landmarks of keyframes.
+    """Refine a rough pose by the landmarks of keyframes; None if too few landmarks match.
 
-    The camera is that of the first level of the pyramid and the mean of the prior. The start is
-    map_from_camera, roughly, with a change (5,) of the intrinsics; one that is known to some pixels
-    needs no `coarse` search. Returns None if too few landmarks match.
+    The start is map_from_camera, roughly, with a change (5,) of the intrinsics. A start that is
+    known to some pixels needs no `coarse` search.
     """
-    search = _Search(pyramid, keyframes, options)
+    search = _Search(image.pyramid, keyframes, options)
+    camera = image.camera
     pose = start.rotation_matrix(), start.translation_m
-    rounds = options.rounds if coarse else options.rounds[1:]
-    change = np.zeros(INTRINSICS) if change is None else change
+    rounds = options.rounds
+    if not coarse:
+        rounds = options.rounds[1:]
     observed = None
-    again = 0
+    repeats = 0
     while True:
-        passed = search.rounds(rounds, camera.changed(change), pose, observed)
-        if passed is None:
+        searched = search.rounds(rounds, camera.changed(change), pose, observed)
+        if searched is None:
             return None
-        pose, observed = passed
-        refined = self_calibrated(observed, camera, pose, change, prior)
-        moved = _moved_px(camera, change, refined.change)
-        if moved < _NOTICEABLE_PX:
+        pose, observed = searched
+        refined = self_calibrated(observed, camera, pose, change, image.prior)
+        inliers = np.count_nonzero(refined.residual_px < options.inlier_px)
+        shift_px = _shift_by_intrinsics_px(camera, refined.change - change)
+        if shift_px < _NOTICEABLE_PX:
             break
-        if (
-            refined.residual_px < options.inlier_px
-        ).sum() < _HOPELESS * observed.expected:
+        if inliers < _HOPELESS * observed.expected:
             break  # other intrinsics do not make it the right place
-        if again == _MOST_AGAIN:
-            if prior.other_camera:
-                break  # both are good, and it is undecided between them
+        if repeats == _MAX_REPEATS:
+            if image.prior.other_camera:
+                break  # both cameras fit
             return None  # the intrinsics do not converge
-        at = refined.pose.pose
-        pose = (at.rotation_matrix(), at.translation_m)
+        pose = refined.pose.pose.rotation_matrix(), refined.pose.pose.translation_m
         change = refined.change
-        again += 1
-        rounds = options.rounds if moved > _FAR_PX else options.rounds[-1:]
-    enough = (refined.residual_px < options.inlier_px).sum() >= options.min_matches
-    return refined if enough else None
+        repeats += 1
+        rounds = options.rounds
+        if shift_px <= _FAR_PX:
+            rounds = options.rounds[-1:]
+    if inliers < options.min_matches:
+        return None
+    return refined
 
 
-def _moved_px(camera: Camera, before: Array, after: Array) -> float:
-    change = after - before
+def _shift_by_intrinsics_px(camera: Camera, change: Array) -> float:
+    """Shift of pixels by a change (5,) of the intrinsics; a fourth of the image moves more."""
     if not change.any():
         return 0.0
-    across = [np.linspace(0, side - 1, 5) for side in (camera.width, camera.height)]
-    plane = camera.pinhole.unproject(np.stack(np.meshgrid(*across), -1).reshape(-1, 2))[
-        :, :2
-    ]
-    off = np.linalg.norm(camera.slopes(plane)[1] @ change, axis=-1)
-    return float(np.sort(off[np.isfinite(off)])[-7])  # a fourth of the grid moves more
+    columns = np.linspace(0, camera.width - 1, 5)
+    rows = np.linspace(0, camera.height - 1, 5)
+    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    plane = camera.pinhole.unproject(pixels)[:, :2]
+    _, by_intrinsics = camera.slopes(plane)
+    shifts = np.linalg.norm(by_intrinsics @ change, axis=-1)
+    return float(np.sort(shifts[np.isfinite(shifts)])[-7])
 
 
 def _consistent(observed: Observed, camera: Camera) -> Pose | None:
-    loose = PnpOptions(threshold_px=4.0, max_iterations=200, min_iterations=20)
+    """The pose that most of the matches agree with; None if few do."""
     ideal = camera.pinhole.project(camera.unproject(observed.pixels))
     valid = np.isfinite(ideal).all(1)
-    rough = solve_pnp(ideal[valid], observed.points_m[valid], camera, loose)
+    points = observed.points_m[valid]
+    rough = solve_pnp(ideal[valid], points, camera, _LOOSE_PNP)
     if rough is None or rough.inliers.sum() < _HOPELESS * observed.expected:
         return None
     return rough.pose.rotation_matrix(), rough.pose.translation_m
@@ -165,84 +188,95 @@ class _Search:
         self.pyramid = pyramid
         self.keyframes = keyframes
         self.options = options
-        surfaces = [keyframe.surface_m for keyframe in keyframes]
-        self.starts = np.cumsum([0, *(surface.shape[1] for surface in surfaces)])
+        surfaces = []
+        depth_errors = []
+        for keyframe in keyframes:
+            surface = keyframe.surface_m
+            surfaces.append(surface)
+            ray = surface[0] - keyframe.position_m
+            depth_errors.append(keyframe.depth_noise[:, None] * ray)
+        counts = [surface.shape[1] for surface in surfaces]
+        self.starts = np.cumsum([0, *counts])
         self.surface_m = np.concatenate(surfaces, 1)
         # Displacement (n, 3) of a landmark by one standard deviation of its depth.
-        self.depth_error_m = np.concatenate(
-            [
-                k.depth_noise[:, None] * (k.surface_m[0] - k.position_m)
-                for k in keyframes
-            ]
-        )
+        self.depth_error_m = np.concatenate(depth_errors)
 
-    def patches(self, level: int, which: IntArray) -> Patches:
+    def patches(self, level: int, landmarks: IntArray) -> Patches:
         """Templates of landmarks, indices in rising order."""
-        ends = np.searchsorted(which, self.starts)
-        spans = zip(self.keyframes, self.starts, ends, ends[1:], strict=False)
-        return Patches.joined(
-            [
-                keyframe.patches[level].take(which[a:b] - start)
-                for keyframe, start, a, b in spans
-            ]
-        )
+        ends = np.searchsorted(landmarks, self.starts)
+        patches = []
+        for number, keyframe in enumerate(self.keyframes):
+            shown = landmarks[ends[number] : ends[number + 1]]
+            patches.append(keyframe.patches[level].take(shown - self.starts[number]))
+        return Patches.joined(patches)
 
     def rounds(
         self,
         rounds: Sequence[AlignmentRound],
         camera: Camera,
         pose: Pose,
-        found: Observed | None,
+        observed: Observed | None,
     ) -> tuple[Pose, Observed] | None:
         """Search coarse to fine; return the matches of the last round and where it began."""
-        for step in rounds:
-            found = self.run(step, camera, pose, found)
-            if found is None:
+        *earlier, last = rounds
+        for step in earlier:
+            observed = self.run(step, camera, pose, observed)
+            if observed is None:
                 return None
-            if step is rounds[-1]:
-                return pose, found
             rough = pose
             if step.level:
                 # Many matches of the first round are wrong; RANSAC selects a consistent set.
-                rough = _consistent(found, camera)
-            if rough is None:
-                return None
-            at = minimise(found, camera, rough, step.steps)
-            pose = at.rotation, at.position
-        raise AssertionError("at least one round")
+                rough = _consistent(observed, camera)
+                if rough is None:
+                    return None
+            minimum = minimise(observed, camera, rough, step.steps)
+            pose = minimum.rotation, minimum.position
+        observed = self.run(last, camera, pose, observed)
+        if observed is None:
+            return None
+        return pose, observed
 
     def run(
         self, step: AlignmentRound, camera: Camera, pose: Pose, before: Observed | None
     ) -> Observed | None:
         """Match landmarks near their expected positions; None for too few matches."""
         options = self.options
-        share = 1.0 if before is None else len(before.pixels) / before.expected
-        more = max(1.0, options.enough_matched / max(share, 1e-3))
-        most = int(min(more, options.most_more) * step.landmarks)
+        level = step.level
+        most = step.landmarks
+        if before is not None:
+            share = len(before.pixels) / before.expected
+            more = max(1.0, options.enough_matched / max(share, 1e-3))
+            most = int(min(more, options.most_more) * step.landmarks)
         rotation = pose[0].T
         shift = -rotation @ pose[1]
-        which, pixels, affines = project_surface(
+        landmarks, pixels, affines = project_surface(
             self.surface_m, rotation, shift, camera, most
         )
-        if not len(which):
+        if not len(landmarks):
             return None
-        patches = self.patches(step.level, which)
-        level = step.level
+        patches = self.patches(level, landmarks)
         start = to_level(pixels, level)
         image = self.pyramid[level]
-        at, correlation = align_patches(patches, image, start, affines, step.iterations)
-        at = from_level(at.astype(np.float64), level)
+        matched, correlation = align_patches(
+            patches, image, start, affines, step.iterations
+        )
+        matched = from_level(matched.astype(np.float64), level)
         good = correlation > options.min_correlation
-        good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
-        which = which[good]
-        noise = options.noise * 2**level
-        if len(which) < options.min_matches:
+        good &= np.linalg.norm(matched - pixels, axis=1) < step.reach_px
+        landmarks = landmarks[good]
+        if len(landmarks) < options.min_matches:
             return None
-        points = self.surface_m[0, which]
-        error = _shift_px(points, self.depth_error_m[which], rotation, shift, camera)
-        hessian = patches.inverse_hessian[good]
-        white = whitening(affines[good], hessian, options.floor_px, noise, error)
-        return Observed(at[good], points, white, len(good))
+        points = self.surface_m[0, landmarks]
+        moves = self.depth_error_m[landmarks]
+        error = _shift_px(points, moves, rotation, shift, camera)
+        white = whitening(
+            affines[good],
+            patches.inverse_hessian[good],
+            options.floor_px,
+            options.noise * 2**level,
+            error,
+        )
+        return Observed(matched[good], points, white, len(good))
 
 
 def _shift_px(
@@ -251,8 +285,10 @@ def _shift_px(
     """(n, 2) displacement in the image of points (n, 3) that move by `moves` (n, 3)."""
     local = points @ rotation.T + shift
     move = moves @ rotation.T
-    plane = local[:, :2] / local[:, 2:]
-    step = (move[:, :2] - plane * move[:, 2:]) / local[:, 2:]
+    depth = local[:, 2:]
+    plane = local[:, :2] / depth
+    step = (move[:, :2] - plane * move[:, 2:]) / depth
     if not camera.distortion:
         return step * [camera.fx, camera.fy]
-    return np.einsum("nij,nj->ni", camera.slopes(plane)[0], step)
+    by_plane, _ = camera.slopes(plane)
+    return np.einsum("nij,nj->ni", by_plane, step)

@@ -30,7 +30,7 @@ class PoseEstimate:
     status: Status
     """`uncertain`: the scene is known, the pose is too uncertain to be useful. `ambiguous`: two
     poses explain the image, see `alternatives`. `unknown_scene`: no pose has enough support.
-    `failed`: no pose, or a network's pose outside the cell of its scene."""
+    `failed`: no pose."""
     reason: str
     """Why the status is not `ok`; empty otherwise."""
     scene: str | None
@@ -39,9 +39,9 @@ class PoseEstimate:
     covariance: np.ndarray | None
     """(6, 6) of (translation in the base frame, metres; rotation about camera axes, radians)."""
     inliers: int
-    """Landmarks that agree with the pose; for a network, patches that agree."""
+    """Landmarks that agree with the pose."""
     inlier_ratio: float
-    """Inliers as a share of the landmarks that should be visible; for a network, of all patches."""
+    """Inliers as a share of the landmarks that should be visible."""
     milliseconds: float
     """Time from image to answer, without decoding."""
     pixels: np.ndarray | None = None
@@ -49,9 +49,9 @@ class PoseEstimate:
     points_m: np.ndarray | None = None
     """(n, 3) their scene points in the base frame, metres."""
     camera: Camera | None = None
-    """Intrinsics that the pose holds for, at the size of the image; None for networks."""
+    """Intrinsics that the pose holds for, at the size of the image; None without alignment."""
     terms: tuple[CovarianceTerm, ...] = ()
-    """Shares that sum to the covariance; empty for networks."""
+    """Shares that sum to the covariance; empty without alignment."""
     alternatives: tuple[SE3, ...] = ()
     """The poses base_from_camera of an ambiguous image, the stronger one first."""
     omitted: tuple[str, ...] = ()
@@ -60,7 +60,12 @@ class PoseEstimate:
     """gripper in the map of a thing that the gripper holds: the pose is then
     gripper_from_camera."""
     support: float = 0.0
-    """-log10 of the probability of as many inliers at a wrong pose; 0 for networks."""
+    """-log10 of the probability of as many inliers at a wrong pose."""
+
+    @classmethod
+    def failed(cls, reason: str, milliseconds: float = 0.0) -> "PoseEstimate":
+        """The answer without any pose."""
+        return cls("failed", reason, None, None, None, 0, 0.0, milliseconds)
 
     @property
     def uncertain_pose(self) -> UncertainPose | None:

@@ -17,9 +17,10 @@ from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.landmarks import project_surface
 from evercal.mapping.patches import Patches, cut_patches, image_pyramid, to_level
 from evercal.mapping.scene_map import MapContents
-from evercal.typing import Float32Array, IntArray
+from evercal.typing import Array, Float32Array, IntArray
 
 ALIGNED_LEVELS = 2
+"""Levels of the image pyramid that landmarks are aligned in."""
 _SAMPLED = 6
 """Every n-th landmark decides which keyframes see a view."""
 
@@ -30,7 +31,7 @@ class MatchedCells:
 
     features: Float32Array
     """(cells, channels)."""
-    points_m: np.ndarray
+    points_m: Array
     """(cells, 3) surface points of the patches."""
 
 
@@ -38,17 +39,17 @@ class MatchedCells:
 class AlignedLandmarks:
     """Landmarks of a keyframe that are searched in an image, in the map's frame."""
 
-    surface_m: np.ndarray
+    surface_m: Array
     """(3, n, 3) landmarks and two surface points beside each, see `Landmarks.surface`."""
-    depth_noise: np.ndarray
+    depth_noise: Array
     """(n,) standard deviation of the landmarks' depths as a share of the depth."""
-    position_m: np.ndarray
+    position_m: Array
     """(3,) position of the keyframe's camera."""
     patches: tuple[Patches, ...]
     """Templates of the landmarks, one set for each pyramid level."""
 
     @cached_property
-    def pattern(self) -> np.ndarray:
+    def pattern(self) -> Array:
         """(k, 3) displacements between landmarks that look alike, see `pattern_steps`."""
         return pattern_steps(
             self.surface_m[0], self.patches[1].templates[:, 2], self.position_m
@@ -107,14 +108,14 @@ class LoadedKeyframe:
         pose = keyframes.base_from_camera[number]
         marks = keyframes.landmarks[number]
         pyramid = image_pyramid(keyframes.grey(number), ALIGNED_LEVELS)
+        patches = []
+        for level, image in enumerate(pyramid):
+            patches.append(cut_patches(image, to_level(marks.pixels, level)))
         return AlignedLandmarks(
-            pose.apply(marks.surface(keyframes.cameras[number])),
-            marks.sigma / marks.inverse_depth,
-            pose.translation_m,
-            tuple(
-                cut_patches(image, to_level(marks.pixels, level))
-                for level, image in enumerate(pyramid)
-            ),
+            surface_m=pose.apply(marks.surface(keyframes.cameras[number])),
+            depth_noise=marks.sigma / marks.inverse_depth,
+            position_m=pose.translation_m,
+            patches=tuple(patches),
         )
 
 
@@ -126,20 +127,24 @@ class KeyframeBank:
         self._most = most_loaded
         self._lock = Lock()
         self._loaded: OrderedDict[int, LoadedKeyframe] = OrderedDict()
-        self._sampled: dict[int, tuple[np.ndarray, IntArray]] = {}
-        keyframes = [scene.keyframes for scene in contents.scenes]
-        counts = [len(k) for k in keyframes]
+        self._sampled: dict[int, tuple[Array, IntArray]] = {}
+        numbers = []
+        descriptors = []
+        for scene in contents.scenes:
+            numbers.append(np.arange(len(scene.keyframes)))
+            if scene.keyframes.descriptors is not None:
+                descriptors.append(scene.keyframes.descriptors)
+        counts = [len(of_scene) for of_scene in numbers]
         self.scene = np.repeat(np.arange(len(counts)), counts)
-        self._number = np.concatenate([np.arange(count) for count in counts])
-        descriptors = [k.descriptors for k in keyframes if k.descriptors is not None]
+        self._number = np.concatenate(numbers)
         self._descriptors = np.concatenate(descriptors).astype(np.float32)
         self._used = np.ones(len(self.scene), bool)
 
     def only(self, keyframes: IntArray) -> Self:
         """The same bank with these keyframes in use; they are loaded once for both."""
-        part = copy(self)
-        part._used = np.isin(np.arange(len(self.scene)), keyframes)
-        return part
+        restricted = copy(self)
+        restricted._used = np.isin(np.arange(len(self.scene)), keyframes)
+        return restricted
 
     @property
     def encoder(self) -> Encoder:
@@ -165,45 +170,38 @@ class KeyframeBank:
 
     def ranked_of(self, scene: int, similarity: Float32Array) -> IntArray:
         """The keyframes of a scene in use, best first."""
-        own = np.flatnonzero((self.scene == scene) & self._used)
-        return own[np.argsort(-similarity[own], kind="stable")]
+        of_scene = np.flatnonzero((self.scene == scene) & self._used)
+        return of_scene[np.argsort(-similarity[of_scene], kind="stable")]
 
     def seen(self, scene: int, pose: SE3, camera: Camera) -> IntArray:
         """Rank the keyframes of a scene by their landmarks that a pose map_from_camera shows."""
-        if scene not in self._sampled:
-            frames = self._contents.scenes[scene].keyframes
-            parts = [
-                pose.apply(
-                    marks.take(np.arange(0, len(marks), _SAMPLED)).surface(camera)
-                )
-                for pose, marks, camera in zip(
-                    frames.base_from_camera,
-                    frames.landmarks,
-                    frames.cameras,
-                    strict=True,
-                )
-            ]
-            counts = [part.shape[1] for part in parts]
-            self._sampled[scene] = (
-                np.concatenate(parts, 1),
-                np.repeat(range(len(parts)), counts),
-            )
-        surface_m, owner = self._sampled[scene]
+        surface_m, owner = self._sampled_landmarks(scene)
         inverse = pose.inverse()
         rotation = inverse.rotation_matrix()
         shift = inverse.translation_m
         shown = project_surface(surface_m, rotation, shift, camera).landmark
-        own = np.flatnonzero(self.scene == scene)
-        order = own[
-            np.argsort(-np.bincount(owner[shown], minlength=len(own)), kind="stable")
-        ]
+        of_scene = np.flatnonzero(self.scene == scene)
+        counts = np.bincount(owner[shown], minlength=len(of_scene))
+        order = of_scene[np.argsort(-counts, kind="stable")]
         return order[self._used[order]]
 
-    def pattern(self, keyframes: IntArray) -> np.ndarray:
+    def _sampled_landmarks(self, scene: int) -> tuple[Array, IntArray]:
+        """Some landmarks of a scene as for `project_surface`, and their keyframes."""
+        if scene not in self._sampled:
+            frames = self._contents.scenes[scene].keyframes
+            surfaces = []
+            for number, marks in enumerate(frames.landmarks):
+                sampled = marks.take(np.arange(0, len(marks), _SAMPLED))
+                surface = sampled.surface(frames.cameras[number])
+                surfaces.append(frames.base_from_camera[number].apply(surface))
+            counts = [surface.shape[1] for surface in surfaces]
+            owner = np.repeat(range(len(surfaces)), counts)
+            self._sampled[scene] = np.concatenate(surfaces, 1), owner
+        return self._sampled[scene]
+
+    def pattern(self, keyframes: IntArray) -> Array:
         """(k, 3) displacements by which a pose before the best keyframes may have slipped."""
-        return np.concatenate(
-            [self.load(int(k)).landmarks.pattern for k in keyframes[:1]]
-        )
+        return self.load(int(keyframes[0])).landmarks.pattern
 
     def load(self, index: int) -> LoadedKeyframe:
         """A keyframe of the bank, by its index."""

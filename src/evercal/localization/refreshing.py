@@ -3,14 +3,15 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, average_poses
+from evercal.geometry import SE3, Camera, average_poses, length_mm_deg
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.learned import localize_picture
 from evercal.localization.localizer import Localizer
+from evercal.localization.pictures import localize_picture
 from evercal.mapping.prepared_frames import WorkingSize
 from evercal.mapping.refresh import RefreshOptions, refreshed
 from evercal.mapping.scene_map import SceneMap
@@ -21,9 +22,11 @@ from evercal.recordings.images import Picture
 from evercal.typing import Array
 
 LEAST_IMAGES = 5
-"""Located images that a refresh takes, at least."""
-PRECISE_M, PRECISE_RAD = 0.01, np.deg2rad(1.0)
-"""Standard deviation of a pose, per axis, above which an image is left out."""
+"""Minimum number of located images of a refresh."""
+PRECISE_M = 0.01
+"""Standard deviation of a position per axis, metres, above which an image is left out."""
+PRECISE_RAD = np.deg2rad(1.0)
+"""Standard deviation of a rotation per axis, radians, above which an image is left out."""
 VERIFIED = 4
 """Every fourth located image is left out of the map and verifies it."""
 WORSE = 0.1
@@ -37,22 +40,23 @@ class RefreshReport:
     scene: str
     seconds: float
     images: int
-    """Images given."""
+    """Number of images."""
     located: int
-    """Images that were located precisely."""
+    """Number of precisely located images."""
     left_out: dict[str, str]
     """Reason why an image was left out, by name."""
     landmarks_checked: int
-    """Landmarks that the images should show."""
+    """Number of landmarks that the images should show."""
     landmarks_gone: int
-    """Landmarks among them that were removed."""
+    """Number of removed landmarks among them."""
     keyframes_left: int
-    """Keyframes that were removed."""
+    """Number of removed keyframes."""
     keyframes_added: int
+    """Number of new keyframes."""
     memory_bytes: int
     """Size of the keyframes of this scene."""
     verified: int
-    """Images outside the map that were located before and after."""
+    """Number of images outside the map that were located before and after."""
     shift_mm: float | None
     """Their mean motion by the refresh: the shift of the base frame. None where the unit of length
     is unknown, as `shift_sigma_mm`."""
@@ -62,8 +66,17 @@ class RefreshReport:
     shift_sigma_deg: float
 
 
-_NewImage = tuple[Frame, SE3, Camera | None]
-"""A frame posed in the frame of the keyframes, its base_from_camera, and its stated intrinsics."""
+class NewImage(NamedTuple):
+    """A precisely located image."""
+
+    frame: Frame
+    """With its pose in the frame of the keyframes."""
+    pose_among_keyframes: SE3
+    """base_from_camera of `frame`."""
+    base_from_camera: SE3
+    """As it was located."""
+    camera: Camera | None
+    """Stated intrinsics."""
 
 
 def refresh_scene(
@@ -82,13 +95,11 @@ def refresh_scene(
     options = options or RefreshOptions()
     cameras = cameras or [None] * len(images)
     estimates = []
-    for number, ((_, image), camera) in enumerate(zip(images, cameras, strict=True)):
+    for (_, image), camera in zip(images, cameras, strict=True):
         estimates.append(localize_picture(localizer, image, camera))
-        on_progress("locating", number + 1, len(images))
-    names = [e.scene for e in estimates if e.status == "ok" and e.scene is not None]
-    shown = max(sorted(set(names)), key=names.count) if names else None
+        on_progress("locating", len(estimates), len(images))
     contents = localizer.contents
-    index = localizer.scenes.index(shown) if shown else -1
+    index = _shown_scene(localizer, estimates)
     scene = contents.scenes[index]
     located, left_out = _usable(images, cameras, estimates, scene)
     if len(located) < LEAST_IMAGES:
@@ -97,12 +108,10 @@ def refresh_scene(
             f"{len(located)} of {len(images)} images are located precisely; a refresh takes at"
             f" least {LEAST_IMAGES} ({reason}). The map is unchanged"
         )
-    check = located[VERIFIED - 1 :: VERIFIED]
-    used = [item for i, item in enumerate(located) if i % VERIFIED != VERIFIED - 1]
-    poses = SE3.stack(
-        [pose for frame, *_ in used if (pose := frame.base_from_camera) is not None]
-    )
-    frames = [used[i][0] for i in spread_poses(poses, options.most_frames)]
+    verifying = located[VERIFIED - 1 :: VERIFIED]
+    used = [image for i, image in enumerate(located) if i % VERIFIED != VERIFIED - 1]
+    poses = SE3.stack([image.pose_among_keyframes for image in used])
+    frames = [used[i].frame for i in spread_poses(poses, options.most_frames)]
     size = WorkingSize(
         cells=contents.short_side, patches=localizer.options.patches_short_side
     )
@@ -110,15 +119,9 @@ def refresh_scene(
     scenes = [*contents.scenes]
     scenes[index] = result.scene
     after = Localizer(replace(contents, scenes=scenes), localizer.options)
-    shift, sigma, verified = _verified(after, check, result.scene.name)
-    covariance = np.diag(np.repeat(sigma**2, 3))
-    known = scene.frame.base_covariance
-    frame = replace(
-        result.scene.frame,
-        base_covariance=covariance if known is None else known + covariance,
-    )
-    updated = replace(result.scene, frame=frame)
-    tangent = shift.log()
+    shift = _verified(after, verifying, result.scene.name)
+    updated = _with_base_covariance(result.scene, scene, shift)
+    millimetres, degrees = length_mm_deg(shift.tangent)
     report = RefreshReport(
         scene=scene.name,
         seconds=time.perf_counter() - began,
@@ -130,13 +133,21 @@ def refresh_scene(
         keyframes_left=result.left,
         keyframes_added=result.added,
         memory_bytes=updated.keyframes.bytes,
-        verified=verified,
-        shift_mm=scene.in_metres(1000 * float(np.linalg.norm(tangent[:3]))),
-        shift_deg=float(np.rad2deg(np.linalg.norm(tangent[3:]))),
-        shift_sigma_mm=scene.in_metres(1000 * float(sigma[0])),
-        shift_sigma_deg=float(np.rad2deg(sigma[1])),
+        verified=shift.images,
+        shift_mm=scene.in_metres(millimetres),
+        shift_deg=degrees,
+        shift_sigma_mm=scene.in_metres(1000 * float(shift.sigma[0])),
+        shift_sigma_deg=float(np.rad2deg(shift.sigma[1])),
     )
     return updated, report
+
+
+def _shown_scene(localizer: Localizer, estimates: Sequence[PoseEstimate]) -> int:
+    """Index of the scene that most of the images show; the last one without any."""
+    names = [e.scene for e in estimates if e.status == "ok" and e.scene is not None]
+    if not names:
+        return -1
+    return localizer.scenes.index(max(sorted(set(names)), key=names.count))
 
 
 def _usable(
@@ -144,13 +155,14 @@ def _usable(
     cameras: Sequence[Camera | None],
     estimates: Sequence[PoseEstimate],
     scene: SceneMap,
-) -> tuple[list[_NewImage], dict[str, str]]:
+) -> tuple[list[NewImage], dict[str, str]]:
     """Return the precisely located images of a scene, and why others are left out."""
     located = []
     left_out = {}
     for (name, image), stated, estimate in zip(images, cameras, estimates, strict=True):
         answer = estimate.uncertain_pose
-        if estimate.status != "ok" or answer is None:
+        camera = estimate.camera
+        if estimate.status != "ok" or answer is None or camera is None:
             left_out[name] = estimate.reason or estimate.status.replace("_", " ")
         elif estimate.scene != scene.name:
             left_out[name] = f"shows {estimate.scene}"
@@ -158,45 +170,62 @@ def _usable(
             left_out[name] = "located too roughly"
         else:
             pose = scene.frame.from_base(answer.pose)
-            assert estimate.camera is not None, "an answer from a map"
-            located.append(
-                (Frame(name, image, estimate.camera, pose), answer.pose, stated)
-            )
+            frame = Frame(name, image, camera, pose)
+            located.append(NewImage(frame, pose, answer.pose, stated))
     return located, left_out
 
 
 def _precise(estimate: PoseEstimate, scene: SceneMap) -> bool:
     """Whether the image determines its own pose well, apart from errors that all answers share."""
-    own = sum(
-        term.covariance for term in estimate.terms if term.name in ("view", "lens")
-    )
-    sigma = np.sqrt(np.diag(np.asarray(own)).reshape(2, 3).mean(1))
+    covariance = np.zeros((6, 6))
+    for term in estimate.terms:
+        if term.name in ("view", "lens"):
+            covariance = covariance + term.covariance
+    sigma = np.sqrt(np.diag(covariance).reshape(2, 3).mean(1))
     metres = scene.at_room_scale(sigma[0])
     return bool(sigma[1] < PRECISE_RAD and metres < PRECISE_M)
 
 
-def _verified(
-    after: Localizer, check: Sequence[_NewImage], scene: str
-) -> tuple[SE3, Array, int]:
-    """Locate images outside the refreshed map; return shift, its standard deviation, and count."""
+class _Shift(NamedTuple):
+    """Motion of located images by a refresh, which is that of the base frame."""
+
+    tangent: Array
+    """(6,) metres and radians."""
+    sigma: Array
+    """(2,) standard deviations per axis, metres and radians."""
+    images: int
+    """Number of images that were located before and after."""
+
+
+def _verified(after: Localizer, images: Sequence[NewImage], scene: str) -> _Shift:
+    """Locate images outside the refreshed map and return the shift of the base frame."""
     moves = []
-    for frame, before, camera in check:
-        estimate = after.localize(frame.read_image(), camera)
-        if (
-            estimate.status == "ok"
-            and estimate.scene == scene
-            and estimate.base_from_camera
-        ):
-            moves.append(estimate.base_from_camera @ before.inverse())
-    lost = len(check) - len(moves)
-    if not moves or lost > max(1, WORSE * len(check)):
+    for image in images:
+        estimate = after.localize(image.frame.read_image(), image.camera)
+        pose = estimate.base_from_camera
+        if estimate.status == "ok" and estimate.scene == scene and pose is not None:
+            moves.append(pose @ image.base_from_camera.inverse())
+    lost = len(images) - len(moves)
+    if not moves or lost > max(1, WORSE * len(images)):
         raise InputError(
-            f"the refreshed map locates {len(moves)} of {len(check)} images that the map located;"
+            f"the refreshed map locates {len(moves)} of {len(images)} images that the map located;"
             f" record more images of the changed places. The map is unchanged"
         )
     poses = SE3.stack(moves)
-    shift = average_poses(poses)
-    off = (shift.inverse() @ poses).log().reshape(-1, 2, 3)
-    own = np.sqrt((off**2).mean((0, 2)) / max(len(moves) - 1, 1))
-    size = np.sqrt((shift.log().reshape(2, 3) ** 2).mean(1))
-    return shift, np.maximum(own, size), len(moves)
+    mean = average_poses(poses)
+    tangent = mean.log()
+    scatter = (mean.inverse() @ poses).log().reshape(-1, 2, 3)
+    of_mean = np.sqrt((scatter**2).mean((0, 2)) / max(len(moves) - 1, 1))
+    size = np.sqrt((tangent.reshape(2, 3) ** 2).mean(1))
+    return _Shift(tangent, np.maximum(of_mean, size), len(moves))
+
+
+def _with_base_covariance(
+    refreshed_map: SceneMap, before: SceneMap, shift: _Shift
+) -> SceneMap:
+    """The refreshed map, whose base frame has the covariance of the shift, too."""
+    covariance = np.diag(np.repeat(shift.sigma**2, 3))
+    if before.frame.base_covariance is not None:
+        covariance = before.frame.base_covariance + covariance
+    frame = replace(refreshed_map.frame, base_covariance=covariance)
+    return replace(refreshed_map, frame=frame)

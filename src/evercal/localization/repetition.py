@@ -5,24 +5,29 @@ displacement, the pose displaced by it matches these landmarks as well, and othe
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evercal.geometry import SE3
-from evercal.typing import Array
+from evercal.typing import Array, IntArray
 
-MOST_LANDMARKS, MOST_STEPS = 400, 8
-"""Landmarks that are compared, and steps that are returned, at most."""
+MOST_LANDMARKS = 400
+"""Maximum number of landmarks that are compared."""
+MOST_STEPS = 8
+"""Maximum number of steps that are returned."""
 MOST_COMPARED = 100
-"""Frequent displacements that are compared, at most."""
+"""Maximum number of frequent displacements that are compared."""
 FREQUENT = 0.4
-"""Steps are at least this frequent, relative to the most frequent one."""
+"""Minimum frequency of a step, relative to the most frequent one."""
 ALIKE = 0.85
-"""Smallest correlation of the patches of two landmarks that look alike."""
+"""Minimum correlation of the patches of two landmarks that look alike."""
 TOLERANCE = 0.006
-"""Largest difference of shared displacements, as a share of the distance from the camera."""
+"""Maximum difference of shared displacements, as a share of the distance from the camera."""
 LEAST_STEP = 0.015
-"""Smallest step, as a share of the distance from the camera: patches overlap below."""
-LEAST_PAIRS, LEAST_SHARE = 15, 0.05
-"""Pairs that share a displacement, and their number as a share of the landmarks."""
+"""Minimum length of a step, as a share of the distance from the camera: patches overlap below."""
+LEAST_PAIRS = 15
+"""Minimum number of pairs that share a displacement."""
+LEAST_SHARE = 0.05
+"""The same as a share of the landmarks."""
 
 
 def pattern_steps(points_m: Array, templates: Array, position_m: Array) -> Array:
@@ -33,46 +38,58 @@ def pattern_steps(points_m: Array, templates: Array, position_m: Array) -> Array
     """
     if not len(points_m):
         return np.zeros((0, 3))
-    some = np.linspace(0, len(points_m) - 1, min(MOST_LANDMARKS, len(points_m))).astype(
-        int
-    )
-    points = points_m[some]
-    patches = templates[some]
-    away = float(np.median(np.linalg.norm(points - position_m, axis=1)))
+    count = min(MOST_LANDMARKS, len(points_m))
+    sampled = np.linspace(0, len(points_m) - 1, count).astype(int)
+    points = points_m[sampled]
+    patches = templates[sampled]
+    distance = float(np.median(np.linalg.norm(points - position_m, axis=1)))
     first, second = np.nonzero(patches @ patches.T > ALIKE * patches.shape[1])
     moves = points[second] - points[first]
-    moves = moves[np.linalg.norm(moves, axis=1) > LEAST_STEP * away]
+    moves = moves[np.linalg.norm(moves, axis=1) > LEAST_STEP * distance]
     if not len(moves):
         return np.zeros((0, 3))
-    least = max(LEAST_PAIRS, LEAST_SHARE * len(some))
-    return _shared(moves, TOLERANCE * away, least)
+    least = max(LEAST_PAIRS, LEAST_SHARE * count)
+    return _shared(moves, TOLERANCE * distance, least)
 
 
 def _shared(moves: Array, tolerance: float, least: float) -> Array:
     """(k, 3) displacements within the tolerance of at least so many of `moves` (n, 3)."""
-    cells = np.round(moves / tolerance).astype(np.int64)
-    _, where, of, counts = np.unique(
-        cells @ [1, 1 << 20, 1 << 40],
-        return_index=True,
-        return_inverse=True,
-        return_counts=True,
-    )
-    cells = cells[where]
-    sums = np.stack([np.bincount(of, column) for column in moves.T], 1)
-    found: list[tuple[float, Array]] = []
+    cells, counts, sums = _binned(moves, tolerance)
+    steps: list[Array] = []
+    frequencies: list[float] = []
     for cell in np.argsort(-counts, kind="stable")[:MOST_COMPARED]:
         # A displacement near the border of a cell has neighbours in the next one.
         near = (np.abs(cells - cells[cell]) <= 1).all(1)
         pairs = float(counts[near].sum())
         step = sums[near].sum(0) / pairs
-        if pairs >= least and all(
-            np.linalg.norm(step - s) > 3 * tolerance for _, s in found
-        ):
-            found.append((pairs, step))
+        if pairs < least:
+            continue
+        if any(np.linalg.norm(step - other) <= 3 * tolerance for other in steps):
+            continue
+        steps.append(step)
+        frequencies.append(pairs)
     # Multiples of a period are nearly as frequent; a pose that slipped by one takes several steps.
-    often = [step for pairs, step in found if pairs >= FREQUENT * found[0][0]]
-    often.sort(key=lambda step: float(np.linalg.norm(step)))
-    return np.array(often[:MOST_STEPS]).reshape(-1, 3)
+    frequent = []
+    for step, pairs in zip(steps, frequencies, strict=True):
+        if pairs >= FREQUENT * frequencies[0]:
+            frequent.append(step)
+    frequent.sort(key=lambda step: float(np.linalg.norm(step)))
+    return np.array(frequent[:MOST_STEPS]).reshape(-1, 3)
+
+
+def _binned(moves: Array, size: float) -> tuple[IntArray, NDArray[np.intp], Array]:
+    """Cells (k, 3) of a grid that hold displacements (n, 3), their counts (k,) and sums (k, 3)."""
+    cells = np.round(moves / size).astype(np.int64)
+    _, first, owner, counts = np.unique(
+        cells @ [1, 1 << 20, 1 << 40],
+        return_index=True,
+        return_inverse=True,
+        return_counts=True,
+    )
+    sums = np.zeros((len(counts), 3))
+    for axis in range(3):
+        sums[:, axis] = np.bincount(owner, moves[:, axis])
+    return cells[first], counts, sums
 
 
 def displaced(pose: SE3, step_m: Array) -> SE3:

@@ -14,25 +14,31 @@ from typing import Literal
 
 import numpy as np
 
+from evercal.errors import require_numbers
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.localization.acceptance import accepted, answer
+from evercal.localization.answer import answer
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.intrinsics import cameras_in_scenes
+from evercal.localization.hypothesis import Aligned, Hypothesis, accepted
+from evercal.localization.intrinsics import INTRINSICS
 from evercal.localization.localizer import Localizer
-from evercal.localization.query import Candidate, Hypothesis
+from evercal.localization.query import Candidate
+from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import as_rgb
-from evercal.typing import Array, IntArray
+from evercal.typing import Array, Image, IntArray
 
 TrackState = Literal["tracking", "relocalized", "lost"]
-_Located = tuple[PoseEstimate, Hypothesis]
+_Located = tuple[PoseEstimate, Hypothesis | None]
 _SEARCHING = "localization takes longer than the time for a frame"
+"""Reason of a frame that is located in the background."""
 _MARGIN = 1.3
 """Time allowance for an alignment, relative to the previous one."""
 _ANSWER_S = 0.002
-"""Time to answer after waiting."""
+"""Time to answer after waiting, seconds."""
 
-MOST_SPEED_M_S, MOST_ACCELERATION_M_S2 = 1.0, 10.0
-"""Motions of a camera that a prediction allows for; faster ones are rare on arms and in hands."""
+MOST_SPEED_M_S = 1.0
+"""Maximum speed of a camera that a prediction allows for; faster ones are rare on arms."""
+MOST_ACCELERATION_M_S2 = 10.0
+"""Maximum acceleration of a camera that a prediction allows for."""
 
 
 @dataclass(frozen=True)
@@ -40,23 +46,31 @@ class TrackOptions:
     """How a stream is tracked."""
 
     keyframes: int = 4
-    """Keyframes next to the predicted pose that are aligned."""
+    """Number of keyframes next to the predicted pose that are aligned."""
     fallback_s: float = 1 / 15
-    """Time between frames without stamps."""
+    """Time between frames without stamps, seconds."""
     longest_gap_s: float = 0.5
-    """After a longer gap the frame is located from nothing."""
+    """After a longer gap, seconds, the frame is located from nothing."""
     reach_m: float = 0.10
-    """A pose that is farther from its prediction is verified by locating the frame."""
+    """A pose that is farther from its prediction, metres, is verified by locating the frame."""
     reach_deg: float = 8.0
-    """The same for the rotation."""
+    """The same for the rotation, degrees."""
     settled: float = 2.0
     """Minimum support of the last pose, relative to the threshold, for using it as a prior."""
     at_most_ms: float | None = None
-    """Time for a frame; what alignment misses is located in the background, `lost` meanwhile."""
+    """Time for a frame, milliseconds; what alignment misses is located in the background, `lost`
+    meanwhile."""
     smooth: float = 0.0
     """Time constant of the smoothed pose in seconds; 0 returns measurements."""
     jump_sigmas: float = 4.0
-    """Deviation, in sigmas, of a jump: the smoothed pose follows at once."""
+    """Jumps above this many sigmas reset the smoothing."""
+
+    def __post_init__(self) -> None:
+        require_numbers(self, ("keyframes",), 1)
+        require_numbers(self, ("fallback_s", "longest_gap_s", "smooth"), 0)
+        require_numbers(self, ("reach_m", "reach_deg", "settled", "jump_sigmas"), 0)
+        if self.at_most_ms is not None:
+            require_numbers(self, ("at_most_ms",), 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +81,7 @@ class TrackedFrame:
     """From 0."""
     stamp_s: float
     state: TrackState
-    """`tracking`: found near its prediction. `relocalized`: located from nothing. `lost`: no
+    """`tracking`: located near its prediction. `relocalized`: located from nothing. `lost`: no
     pose."""
     estimate: PoseEstimate
     smoothed: SE3 | None = None
@@ -87,7 +101,8 @@ class Tracker:
     _scene: int = -1
     _poses: list[tuple[float, SE3]] = field(default_factory=list)
     """Times and poses map_from_camera of the last two frames."""
-    _change: Array | None = None
+    _change: Array = field(default_factory=lambda: np.zeros(INTRINSICS))
+    """(5,) change of the intrinsics of the last frame."""
     _smoothed: tuple[float, SE3] | None = None
     _number: int = 0
     _alignment_s: float = 0.0
@@ -103,7 +118,9 @@ class Tracker:
         """
         number = self._number
         self._number = self._number + 1
-        stamp = number * self.options.fallback_s if stamp_s is None else stamp_s
+        stamp = stamp_s
+        if stamp is None:
+            stamp = number * self.options.fallback_s
         image = as_rgb(image)
         if self.options.at_most_ms is None:
             estimate, state = self._located(image, stamp)
@@ -118,56 +135,60 @@ class Tracker:
     ) -> Iterator[TrackedFrame]:
         """Locate images, or times and images, in order."""
         for item in images:
-            stamp, image = item if isinstance(item, tuple) else (None, item)
-            yield self.track(image, stamp)
+            if isinstance(item, tuple):
+                stamp, image = item
+                yield self.track(image, stamp)
+            else:
+                yield self.track(item)
 
-    def _located(
-        self, image: np.ndarray, stamp: float
-    ) -> tuple[PoseEstimate, TrackState]:
+    def _located(self, image: Image, stamp: float) -> tuple[PoseEstimate, TrackState]:
         estimate = self._near_prediction(image, stamp)
         if estimate is not None:
             return estimate, "tracking"
         before = self._poses[-1:]
         predicted = self._predicted(stamp)
         scene = self._scene
-        estimate, found = self.localizer.located(image, self.camera)
+        estimate, pose = self.localizer.located(image, self.camera)
         self._poses.clear()
-        if estimate.status != "ok":
+        if estimate.status != "ok" or pose is None:
             return estimate, "lost"
-        self._remember(found, stamp)
+        self._remember(pose, stamp)
         same = bool(self._poses) and self._scene == scene
-        if predicted is not None and same and self._trusted(found, predicted, 1.0):
+        if predicted is not None and same and self._trusted(pose, predicted, 1.0):
             self._poses = [*before, *self._poses]  # the motion goes on
         return estimate, "relocalized"
 
     def _located_in_time(
-        self, image: np.ndarray, stamp: float, until: float
+        self, image: Image, stamp: float, until: float
     ) -> tuple[PoseEstimate, TrackState]:
         """The same until a time of the clock; what takes longer goes on in the background."""
         began = time.perf_counter()
-        adopted = self._running is not None and self._adopted(until)
+        adopted = self._adopted(until)
         estimate = self._near_prediction(image, stamp, until, adopted)
         if estimate is not None:
-            return estimate, "relocalized" if adopted else "tracking"
+            if adopted:
+                return estimate, "relocalized"
+            return estimate, "tracking"
         self._poses.clear()
         if self._running is None:
             self._pool = self._pool or ThreadPoolExecutor(1, "search")
-            self._running = (
-                stamp,
-                self._pool.submit(self.localizer.located, image, self.camera),
-            )
-            if (done := self._taken(until - _ANSWER_S)) is not None:
-                estimate, found = done[1]
-                if estimate.status == "ok":
-                    self._remember(found, stamp)
-                return estimate, "relocalized" if estimate.status == "ok" else "lost"
+            future = self._pool.submit(self.localizer.located, image, self.camera)
+            self._running = stamp, future
+            finished = self._finished(until - _ANSWER_S)
+            if finished is not None:
+                estimate, pose = finished[1]
+                if estimate.status != "ok" or pose is None:
+                    return estimate, "lost"
+                self._remember(pose, stamp)
+                return estimate, "relocalized"
         spent = 1000 * (time.perf_counter() - began)
-        nothing = PoseEstimate("failed", _SEARCHING, None, None, None, 0, 0.0, spent)
-        return replace(nothing, omitted=("localization",)), "lost"
+        searching = PoseEstimate.failed(_SEARCHING, spent)
+        return replace(searching, omitted=("localization",)), "lost"
 
-    def _taken(self, until: float) -> tuple[float, _Located] | None:
+    def _finished(self, until: float) -> tuple[float, _Located] | None:
         """Time and result of the frame in the background; None if it is not ready in time."""
-        assert self._running is not None, "a frame was given"
+        if self._running is None:
+            return None
         stamp, future = self._running
         if not wait([future], max(until - time.perf_counter(), 0.0)).done:
             return None
@@ -175,16 +196,19 @@ class Tracker:
         return stamp, future.result()
 
     def _adopted(self, until: float) -> bool:
-        earlier = self._taken(until - _MARGIN * self._alignment_s)
-        if earlier is None or earlier[1][0].status != "ok":
+        """Whether the frame in the background was located, so that its pose is the prior."""
+        finished = self._finished(until - _MARGIN * self._alignment_s)
+        if finished is None:
             return False
-        stamp, (_, found) = earlier
-        self._remember(found, stamp, settled=True)
+        stamp, (estimate, pose) = finished
+        if estimate.status != "ok" or pose is None:
+            return False
+        self._remember(pose, stamp, settled=True)
         return True
 
     def _near_prediction(
         self,
-        image: np.ndarray,
+        image: Image,
         stamp: float,
         until: float = np.inf,
         adopted: bool = False,
@@ -198,90 +222,94 @@ class Tracker:
         predicted = self._predicted(stamp)
         if predicted is None:
             return None
-        settled = self.options.settled if adopted else 1.0
-        localizer = self.localizer
-        contents = self.localizer.contents
-        cameras = cameras_in_scenes(self.camera, image, contents.scenes)
-        query = localizer.query(image, self.camera)
+        times = 1.0
+        searches = [False, True]
+        if adopted:
+            times = self.options.settled
+            searches = [True]
+        query = self.localizer.query(image, self.camera)
         candidate = Candidate(self._scene, self._next_keyframes(predicted))
-        change = np.zeros(5) if self._change is None else self._change
-        for coarse in (True,) if adopted else (False, True):
+        for coarse in searches:
             start = time.perf_counter()
             if coarse and not adopted and start + _MARGIN * self._alignment_s > until:
                 return None
-            found = localizer.aligned(
-                query, candidate, cameras[self._scene], predicted, change, coarse
+            pose = self.localizer.poses.aligned(
+                query, candidate, predicted, self._change, coarse
             )
             self._alignment_s = time.perf_counter() - start
-            if found is not None and self._trusted(found, predicted, settled):
-                if self._may_have_slipped(found, predicted, stamp):
-                    return None
-                milliseconds = 1000 * (time.perf_counter() - began)
-                estimate = answer(
-                    found, contents.scenes[found.scene], image.shape[:2], milliseconds
-                )
-                if estimate.status != "ok":  # too uncertain to be useful
-                    return None
-                self._remember(found, stamp)
-                return estimate
+            if pose is None or not self._trusted(pose, predicted, times):
+                continue
+            if self._may_have_slipped(pose, predicted, stamp):
+                return None
+            milliseconds = 1000 * (time.perf_counter() - began)
+            estimate = answer(pose, self._map, image.shape[:2], milliseconds)
+            if estimate.status != "ok":  # too uncertain to be useful
+                return None
+            self._remember(pose, stamp)
+            return estimate
         return None
 
-    def _may_have_slipped(
-        self, found: Hypothesis, predicted: SE3, stamp: float
-    ) -> bool:
+    def _may_have_slipped(self, pose: Aligned, predicted: SE3, stamp: float) -> bool:
         """Whether a pose that lies a period of repeated texture away is as near the prediction."""
-        assert found.pose is not None, "a trusted pose"
-        steps = self.localizer.slips(found)
+        steps = self.localizer.poses.slips(pose)
         if not len(steps):
             return False
         elapsed = stamp - self._poses[-1][0]
-        unsure = MOST_SPEED_M_S * elapsed
+        uncertainty_m = MOST_SPEED_M_S * elapsed
         if len(self._poses) > 1:
-            unsure = min(unsure, MOST_ACCELERATION_M_S2 / 2 * elapsed**2)
-        off, _ = pose_distance(found.pose.pose, predicted)
-        return self._at_room_scale(float(np.linalg.norm(steps[0]) - off)) < unsure
+            accelerated_m = MOST_ACCELERATION_M_S2 / 2 * elapsed**2
+            uncertainty_m = min(uncertainty_m, accelerated_m)
+        distance, _ = pose_distance(pose.pose.pose, predicted)
+        margin = float(np.linalg.norm(steps[0]) - distance)
+        return self._at_room_scale(margin) < uncertainty_m
+
+    @property
+    def _map(self) -> SceneMap:
+        """The map of the scene of the last pose."""
+        return self.localizer.contents.scenes[self._scene]
 
     def _at_room_scale(self, length: float) -> float:
         """A length of the map, see `SceneMap.at_room_scale`."""
-        scene = self.localizer.contents.scenes[self._scene]
-        return scene.at_room_scale(scene.frame.scale * length)
+        return self._map.at_room_scale(self._map.frame.scale * length)
 
     def _predicted(self, stamp: float) -> SE3 | None:
+        """The pose at a time by constant velocity; None without a recent pose."""
         if not self._poses:
             return None
-        (last, pose), before = self._poses[-1], self._poses[:-1]
-        if not 0 <= stamp - last <= self.options.longest_gap_s:
+        last_stamp, pose = self._poses[-1]
+        if not 0 <= stamp - last_stamp <= self.options.longest_gap_s:
             return None
-        if not before or last <= before[0][0]:
+        first_stamp, first = self._poses[0]
+        if last_stamp <= first_stamp:
             return pose
-        share = (stamp - last) / (last - before[0][0])
-        return pose @ SE3.exp(share * (before[0][1].inverse() @ pose).log())
+        share = (stamp - last_stamp) / (last_stamp - first_stamp)
+        return pose @ SE3.exp(share * (first.inverse() @ pose).log())
 
     def _next_keyframes(self, pose: SE3) -> IntArray:
-        keyframes = self.localizer.contents.scenes[self._scene].keyframes
-        first = sum(
-            len(s.keyframes) for s in self.localizer.contents.scenes[: self._scene]
-        )
-        metres, radians = pose_distance(pose, keyframes.base_from_camera)
+        """Keyframes in the bank next to a pose, in metres and radians."""
+        first = 0
+        for scene in self.localizer.contents.scenes[: self._scene]:
+            first += len(scene.keyframes)
+        metres, radians = pose_distance(pose, self._map.keyframes.base_from_camera)
         spread = max(float(np.median(metres)), 1e-6)
         order = np.argsort(metres / spread + radians, kind="stable")
         return first + order[: self.options.keyframes]
 
-    def _trusted(self, found: Hypothesis, predicted: SE3, times: float) -> bool:
-        if found.pose is None or not accepted(found, times):
+    def _trusted(self, pose: Hypothesis, predicted: SE3, times: float) -> bool:
+        """Whether a pose has enough support and is near its prediction."""
+        if not accepted(pose, times):
             return False
-        metres, radians = pose_distance(found.pose.pose, predicted)
+        metres, radians = pose_distance(pose.pose.pose, predicted)
         near = self._at_room_scale(float(metres)) < self.options.reach_m
         return near and float(radians) < np.deg2rad(self.options.reach_deg)
 
-    def _remember(self, found: Hypothesis, stamp: float, settled: bool = False) -> None:
-        if found.pose is None:
-            return
-        self._scene = found.scene
-        self._change = None if found.refined is None else found.refined.change
-        settled = settled or bool(self._poses)
-        settled = settled or accepted(found, self.options.settled)
-        self._poses = [*self._poses[-1:], (stamp, found.pose.pose)] if settled else []
+    def _remember(self, pose: Hypothesis, stamp: float, settled: bool = False) -> None:
+        self._scene = pose.scene
+        self._change = np.zeros(INTRINSICS)
+        if isinstance(pose, Aligned):
+            self._change = pose.change
+        if settled or self._poses or accepted(pose, self.options.settled):
+            self._poses = [*self._poses[-1:], (stamp, pose.pose.pose)]
 
     def _smooth(self, estimate: PoseEstimate, stamp: float) -> tuple[SE3 | None, bool]:
         """Return the smoothed pose, and whether it follows a jump."""
@@ -292,13 +320,11 @@ class Tracker:
         if self._smoothed is None:
             self._smoothed = (stamp, pose.pose)
             return pose.pose, True
-        last, before = self._smoothed
+        last_stamp, before = self._smoothed
+        smoothed = pose.pose
         jumped = pose.squared_mahalanobis(before) > 6 * self.options.jump_sigmas**2
-        gain = 1 - np.exp(-max(stamp - last, 0.0) / self.options.smooth)
-        now = (
-            pose.pose
-            if jumped
-            else before @ SE3.exp(gain * (before.inverse() @ pose.pose).log())
-        )
-        self._smoothed = (stamp, now)
-        return now, bool(jumped)
+        if not jumped:
+            gain = 1 - np.exp(-max(stamp - last_stamp, 0.0) / self.options.smooth)
+            smoothed = before @ SE3.exp(gain * (before.inverse() @ pose.pose).log())
+        self._smoothed = (stamp, smoothed)
+        return smoothed, bool(jumped)

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from evercal.calibration.drift import Shift
     from evercal.geometry import UncertainPose
     from evercal.localization.estimate import PoseEstimate
-    from evercal.localization.learned import LearnedLocalizer
+    from evercal.reports.inspected import LearnedLocalizer
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from evercal.reports.scene import Surroundings
 from evercal.typing import Array, Image
 
 if TYPE_CHECKING:
-    from evercal.localization.learned import LearnedLocalizer
+    from evercal.reports.inspected import LearnedLocalizer
 
 
 MAX_IMAGES = 4

@@ -10,7 +10,7 @@ from evercal.typing import Array, Image
 
 if TYPE_CHECKING:
     from evercal.localization.estimate import PoseEstimate
-    from evercal.localization.learned import LearnedLocalizer
+    from evercal.reports.inspected import LearnedLocalizer
 
 Colour = tuple[int, int, int]
 

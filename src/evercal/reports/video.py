@@ -17,7 +17,7 @@ from evercal.reports.scene import ABOVE, Axes, Frustum, Surroundings, view_panel
 from evercal.typing import Image
 
 if TYPE_CHECKING:
-    from evercal.localization.learned import LearnedLocalizer
+    from evercal.reports.inspected import LearnedLocalizer
 
 
 ENDING = ".mp4"

@@ -33,7 +33,7 @@ from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
 from evercal.features.encoder import ENCODER_FILE
 from evercal.localization import acceptance
-from evercal.localization.query import LocalizeOptions
+from evercal.localization.options import LocalizeOptions
 from evercal.recordings import Recording
 from evercal.storage import sha256_file, write_json
 from evercal.storage.settings import lock_settings, read_settings

@@ -36,9 +36,9 @@ from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.continual.threshold import fit_threshold
 from evercal.evaluation.protocol import evaluate
 from evercal.learning.scene import learn_scene
-from evercal.localization.learned import LearnedLocalizer
 from evercal.localization.localizer import Localizer
-from evercal.localization.query import LocalizeOptions
+from evercal.localization.options import LocalizeOptions
+from evercal.localization.pictures import SceneLocalizer
 from evercal.mapping.store import MapStore
 from evercal.recordings import Recording, stated_poses
 from evercal.recordings.held_out import split_held_out
@@ -117,7 +117,7 @@ class _Run:
 
     def _evaluated(
         self,
-        localizers: Mapping[str, LearnedLocalizer],
+        localizers: Mapping[str, SceneLocalizer],
         number: int,
         costs: Mapping[str, object],
     ) -> StageResults:

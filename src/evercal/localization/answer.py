@@ -1,0 +1,143 @@
+"""Answers: an accepted pose in the base frame, or the reason for rejecting it."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from evercal.geometry import SE3, UncertainPose, pose_distance, pose_distance_mm_deg
+from evercal.localization import acceptance
+from evercal.localization.estimate import CovarianceTerm, PoseEstimate
+from evercal.localization.hypothesis import Aligned, Hypothesis, accepted
+from evercal.mapping.scene_map import SceneMap
+from evercal.typing import Array
+
+
+def rejection(hypothesis: Hypothesis, scene: SceneMap) -> str:
+    """Why a pose is not accepted."""
+    share = f"{100 * hypothesis.inlier_ratio:.0f} %"
+    required = -math.log10(acceptance.FALSE_ACCEPTS)
+    return (
+        f"{hypothesis.inliers} inliers, {share} of the landmarks of {scene.name} that should be"
+        f" visible: support {hypothesis.support:.1f}, {required:.1f} is required"
+    )
+
+
+def widening(hypothesis: Hypothesis) -> float:
+    """Factor on the covariance of an accepted pose."""
+    return max(1.0, acceptance.FULL_SUPPORT / hypothesis.support)
+
+
+def differ(hypothesis: Hypothesis, other: SE3) -> bool:
+    """Whether another pose, map_from_camera, is outside the uncertainty of an accepted one."""
+    metres, radians = pose_distance(hypothesis.pose.pose, other)
+    far = metres > acceptance.APART_M or radians > acceptance.APART_RAD
+    squares = hypothesis.pose.squared_mahalanobis(other) / widening(hypothesis)
+    return bool(far and squares > acceptance.APART_SIGMAS**2)
+
+
+def in_base(
+    hypothesis: Hypothesis, scene: SceneMap
+) -> tuple[UncertainPose, tuple[CovarianceTerm, ...]]:
+    """The answer in the base frame, and the shares of its covariance."""
+    frame = scene.frame
+    factor = widening(hypothesis)
+    pose = hypothesis.pose
+    wide = UncertainPose(pose.pose, factor * pose.covariance)
+    estimate = frame.to_base(wide)
+    if not isinstance(hypothesis, Aligned):
+        return estimate, ()
+    lens = _moved(frame.slope, factor * hypothesis.by_intrinsics)
+    view = _moved(frame.slope, wide.covariance) - lens
+    poses = _moved(frame.slope, _diagonal(frame.pose_sigma))
+    stated = _moved(frame.slope, _diagonal(frame.frame_sigma))
+    base = estimate.covariance - view - lens - poses - stated
+    return estimate, (
+        CovarianceTerm("view", view),
+        CovarianceTerm("lens", lens),
+        CovarianceTerm("map", poses),
+        CovarianceTerm("stated poses", stated),
+        CovarianceTerm("base frame", base),
+    )
+
+
+def _moved(slope: Array, covariance: Array) -> Array:
+    return slope @ covariance @ slope.T
+
+
+def _diagonal(sigma: tuple[float, float]) -> Array:
+    """(6, 6) covariance of standard deviations per axis, of translation and rotation."""
+    return np.diag(np.repeat(np.square(sigma), 3))
+
+
+def answer(
+    best: Hypothesis | None,
+    scene: SceneMap,
+    size: tuple[int, ...],
+    milliseconds: float,
+    rival: Hypothesis | None = None,
+) -> PoseEstimate:
+    """The answer for a pose in the map's frame, with another one that fits as well.
+
+    `size` are height and width of the image.
+    """
+    if best is None:
+        return PoseEstimate.failed("fewer than 6 inliers", milliseconds)
+    rejected = PoseEstimate(
+        status="unknown_scene",
+        reason="",
+        scene=None,
+        base_from_camera=None,
+        covariance=None,
+        inliers=best.inliers,
+        inlier_ratio=best.inlier_ratio,
+        milliseconds=milliseconds,
+        support=best.support,
+    )
+    if not accepted(best):
+        return replace(rejected, reason=rejection(best, scene))
+    estimate, terms = in_base(best, scene)
+    rejected = replace(rejected, parent_frame=scene.parent_frame)
+    if rival is not None:
+        other = scene.frame.to_base(rival.pose).pose
+        return replace(
+            rejected,
+            status="ambiguous",
+            reason=_rival_reason(estimate.pose, other, scene),
+            scene=scene.name,
+            alternatives=(estimate.pose, other),
+        )
+    position_m = estimate.sigma_mm / 1000
+    if scene.at_room_scale(position_m) > acceptance.USELESS_M:
+        reason = _uncertain_reason(position_m, scene)
+        return replace(rejected, status="uncertain", reason=reason, scene=scene.name)
+    camera = None
+    if isinstance(best, Aligned):
+        height, width = size
+        camera = best.camera.resized(width, height)
+    return replace(
+        rejected,
+        status="ok",
+        scene=scene.name,
+        base_from_camera=estimate.pose,
+        covariance=estimate.covariance,
+        terms=terms,
+        pixels=best.pixels,
+        points_m=scene.frame.points_to_base(best.points_m),
+        camera=camera,
+    )
+
+
+def _rival_reason(pose: SE3, other: SE3, scene: SceneMap) -> str:
+    mm, deg = pose_distance_mm_deg(pose, other)
+    away = f"{deg:.1f} deg away"
+    if scene.metric:
+        away = f"{mm:.0f} mm, {away}"
+    return f"ambiguous: a second pose {away} fits equally well"
+
+
+def _uncertain_reason(position: float, scene: SceneMap) -> str:
+    sigma = f"{position:.3g}"
+    if scene.metric:
+        sigma = f"{1000 * scene.at_room_scale(position):.0f} mm"
+    return f"its position is uncertain by {sigma} per axis"
