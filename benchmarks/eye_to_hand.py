@@ -21,7 +21,6 @@ from tqdm import tqdm
 from benchmarks.accuracy import pose_error, wrong
 from benchmarks.arm_noise import grippers
 from benchmarks.hand_eye import pose
-from benchmarks.hand_eye_boards import opencv_solvers
 from benchmarks.rows import Row, save
 from evercal.calibration.boards.board import Board, dictionary_of
 from evercal.calibration.boards.board_poses import board_poses
@@ -259,7 +258,7 @@ def _from_board(
     poses = SE3.stack([camera_from_board for _, camera_from_board, _ in found])
     pairs = PosePairs(tuple(names[i] for i in rows), robot[rows], poses)
     if method == CLOSED:
-        return {"Shah": shah(pairs), **opencv_solvers(pairs, "eye_to_hand")}
+        return {"Shah": shah(pairs)}
     corners = BoardCorners(
         camera, tuple(v for _, _, v in found if v is not None), stated=True
     )

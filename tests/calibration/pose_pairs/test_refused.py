@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.board_recordings import BoardSetting, pose_pairs, record
 from benchmarks.hand_eye import Setting, error, pose, recording, rotations, shaken
-from benchmarks.hand_eye_boards import BoardSetting, pose_pairs, record
 from benchmarks.mistakes import MISTAKES, OTHER, Mistake
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve

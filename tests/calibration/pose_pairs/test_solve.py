@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from benchmarks.hand_eye import Setting, error, recording, trials
-from benchmarks.hand_eye_boards import (
+from benchmarks.board_recordings import (
     BoardRecording,
     BoardSetting,
     corner_pairs,
     project,
     record,
 )
+from benchmarks.hand_eye import Setting, error, recording, trials
 from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.board_poses import board_poses
 from evercal.calibration.boards.corners import BoardView, board_pose
