@@ -1,6 +1,5 @@
 """Small bags with a turning arm in them, written by rosbags in every container that ROS has."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,9 +29,7 @@ TOOL_FROM_OPTICAL = SE3.exp([0.02, -0.05, 0.03, 0.3, -0.2, 1.2])
 def shoulder_from_tool(seconds: float) -> SE3:
     """Turns about a slanted axis and moves on a line, both steadily."""
     rotation = Rotation.from_rotvec(np.array([0.6, -0.3, 0.8]) * seconds)
-    return SE3(
-        rotation.as_quat(scalar_first=True), np.array([0.4, 0.1, 0.5]) + 0.2 * seconds
-    )
+    return SE3.of(rotation, np.array([0.4, 0.1, 0.5]) + 0.2 * seconds)
 
 
 def picture(number: int) -> np.ndarray:
@@ -51,10 +48,9 @@ class Bag:
     messages: list[tuple[str, str, int, Any]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.store = get_typestore(
-            Stores.ROS1_NOETIC if self.kind == "ros1" else Stores.LATEST
-        )
+        self.store = get_typestore(Stores.LATEST)
         if self.kind == "ros1":  # rosbags has the common messages only
+            self.store = get_typestore(Stores.ROS1_NOETIC)
             text = "geometry_msgs/TransformStamped[] transforms"
             self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
 
@@ -97,11 +93,11 @@ class Bag:
         self.add(topic, "tf2_msgs/msg/TFMessage", seconds, transforms=[entry])
 
     def image(self, seconds: float, topic: str, pixels: np.ndarray, encoding: str = "rgb8",
-              stamped: bool = True, pad: int = 3) -> None:  # fmt: skip
+              stamped: bool = True) -> None:  # fmt: skip
         """Rows of bytes, padded."""
         height, width = pixels.shape[:2]
         rows = pixels.reshape(height, -1).view(np.uint8)
-        rows = np.pad(rows, ((0, 0), (0, pad)), constant_values=99)
+        rows = np.pad(rows, ((0, 0), (0, 3)), constant_values=99)
         self.add(
             topic,
             "sensor_msgs/msg/Image",
@@ -122,13 +118,12 @@ class Bag:
         kind = "sensor_msgs/msg/CompressedImage"
         self.add(topic, kind, seconds, header=head, format=what, data=content)
 
-    def info(self, topic: str, focal: float = 30.0, distortion: Iterable[float] = (0.1, 0, 0, 0, 0),
-             model: str = "plumb_bob", rectified_focal: float = 28.0,
+    def info(self, topic: str = "/cam/camera_info", focal: float = 30.0, model: str = "plumb_bob",
              size: tuple[int, int] = (WIDTH, HEIGHT), binning: int = 0) -> None:  # fmt: skip
         """A camera_info."""
         k = [focal, 0, 15.0, 0, focal, 11.0, 0, 0, 1] if focal else [0.0] * 9
-        p = [rectified_focal, 0, 16.0, 0, 0, rectified_focal, 12.0, 0, 0, 0, 1, 0]
-        values = {"k": k, "d": list(distortion), "r": np.eye(3).reshape(-1), "p": p}
+        p = [28.0, 0, 16.0, 0, 0, 28.0, 12.0, 0, 0, 0, 1, 0]
+        values = {"k": k, "d": [0.1, 0, 0, 0, 0], "r": np.eye(3).reshape(-1), "p": p}
         if self.kind == "ros1":
             values = {name.upper(): value for name, value in values.items()}
         roi = self.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0,
@@ -159,20 +154,16 @@ class Bag:
         """Writes all messages by time; gives the path of the bag."""
         root.mkdir(exist_ok=True)
         ordered = sorted(self.messages, key=lambda entry: entry[2])
+        encode = self.store.serialize_cdr
+        path = root / "wave"
+        writing: Any
         if self.kind == "ros1":
+            encode = self.store.serialize_ros1
             path = root / "wave.bag"
-            writing: Any = Writer1(path)
+            writing = Writer1(path)
         else:
-            path = root / "wave"
-            plugin = (
-                StoragePlugin.MCAP if self.kind == "mcap" else StoragePlugin.SQLITE3
-            )
+            plugin = StoragePlugin[self.kind.upper()]
             writing = Writer2(path, version=9, storage_plugin=plugin)
-        encode = (
-            self.store.serialize_ros1
-            if self.kind == "ros1"
-            else self.store.serialize_cdr
-        )
         links: dict[tuple[str, str], Any] = {}
         with writing as writer:
             for topic, kind, ns, message in ordered:
@@ -183,16 +174,18 @@ class Bag:
         return path
 
 
-def arm(bag: Bag, first: float = 0.0, last: float = 2.0, rate: float = 25.0) -> Bag:
-    """tf of an arm: world and stand and camera are static, the tool moves."""
-    bag.tf(
-        0.0, "world", "base_link", SE3.exp([9.0, 9.0, 9.0, 1.0, 0.0, 0.0]), static=True
-    )
+WORLD_FROM_BASE = SE3.exp([9.0, 9.0, 9.0, 1.0, 0.0, 0.0])
+
+
+def arm(kind: str = "mcap", **info: Any) -> Bag:
+    """tf of an arm: world and stand and camera are static, the tool moves. One camera_info."""
+    bag = Bag(kind)
+    bag.tf(0.0, "world", "base_link", WORLD_FROM_BASE, static=True)
     bag.tf(0.0, "base_link", "shoulder", BASE_FROM_SHOULDER, static=True)
     bag.tf(0.0, "tool0", "camera_optical", TOOL_FROM_OPTICAL, static=True)
-    for i in range(round((last - first) * rate) + 1):
-        at = first + i / rate
-        bag.tf(at, "shoulder", "tool0", shoulder_from_tool(at))
+    for i in range(51):
+        bag.tf(i / 25, "shoulder", "tool0", shoulder_from_tool(i / 25))
+    bag.info(**info)
     return bag
 
 
@@ -201,18 +194,16 @@ def single(
     kind: str = "mcap", at: float = 0.5, stamped: bool = True, **info: Any,
 ) -> Bag:  # fmt: skip
     """An arm, a camera and one image."""
-    bag = arm(Bag(kind))
+    bag = arm(kind, **info)
     bag.image(at, topic, picture(0) if pixels is None else pixels, encoding, stamped)
-    bag.info("/cam/camera_info", **info)
     return bag
 
 
-def recorded_bag(kind: str) -> Bag:
+def recorded_bag(kind: str = "mcap") -> Bag:
     """An arm, a camera and its images."""
-    bag = arm(Bag(kind))
+    bag = arm(kind)
     for i, at in enumerate(SHOTS):
         bag.image(at, "/cam/image_raw", picture(i))
-    bag.info("/cam/camera_info")
     return bag
 
 
