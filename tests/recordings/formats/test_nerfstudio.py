@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evercal.errors import InputError
-from evercal.geometry import SE3
+from evercal.geometry import SE3, Camera
 from evercal.recordings import Frame, load_recording, write_image
 from evercal.recordings.formats import nerfstudio
 from evercal.recordings.inspection import inspect_recording
@@ -33,10 +33,8 @@ def look(
     return matrix
 
 
-def gl_pixel(
-    matrix: np.ndarray, intrinsics: dict[str, float], point: np.ndarray
-) -> np.ndarray:
-    """Pixel of a point, x to the right and y down from the image's corner.
+def gl_pixel(matrix: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Pixel of a point by `LENS`, x to the right and y down from the image's corner.
 
     The camera looks along -z with y up; distortion is Brown's model in the plane z = 1, y down.
     """
@@ -44,23 +42,18 @@ def gl_pixel(
     assert z < 0
     u = x / -z
     v = -y / -z
+    fx, fy, cx, cy, _, _, k1, k2, p1, p2 = LENS.values()
     r2 = u * u + v * v
-    radial = (
-        1
-        + intrinsics["k1"] * r2
-        + intrinsics["k2"] * r2 * r2
-        + intrinsics.get("k3", 0.0) * r2**3
-    )
-    p1 = intrinsics["p1"]
-    p2 = intrinsics["p2"]
+    radial = 1 + k1 * r2 + k2 * r2 * r2
     du = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
     dv = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
-    return np.array(
-        [
-            intrinsics["fl_x"] * du + intrinsics["cx"],
-            intrinsics["fl_y"] * dv + intrinsics["cy"],
-        ]
-    )
+    return np.array([fx * du + cx, fy * dv + cy])
+
+
+def black(image: Path, size: tuple[int, int] = (24, 36)) -> None:
+    """An image without content."""
+    image.parent.mkdir(parents=True, exist_ok=True)
+    write_image(image, np.zeros((*size[::-1], 3), np.uint8))
 
 
 def write(
@@ -69,12 +62,15 @@ def write(
     size: tuple[int, int] = (24, 36),
     **top: Any,
 ) -> Path:
+    """Images, and the file that lists them."""
     for frame in frames:
-        image = root / frame["file_path"]
-        image.parent.mkdir(parents=True, exist_ok=True)
-        write_image(image, np.zeros((size[1], size[0], 3), np.uint8))
+        black(root / frame["file_path"], size)
     (root / "transforms.json").write_text(json.dumps({**top, "frames": frames}))
-    return root
+    return root / "transforms.json"
+
+
+def first_camera(root: Path) -> Camera:
+    return load_recording(root).train[0].camera
 
 
 def ring(count: int = 5) -> list[np.ndarray]:
@@ -116,7 +112,7 @@ def test_projections_agree_with_the_documented_formulas(
         assert frame.read_image().shape == (36, 24, 3)  # portrait
         for point in points:
             np.testing.assert_allclose(
-                pixel_of(frame, point), gl_pixel(matrix, LENS, point), atol=1e-9
+                pixel_of(frame, point), gl_pixel(matrix, point), atol=1e-9
             )
     assert "are those of transforms.json" in inspect_recording(recording).notes[0]
 
@@ -143,7 +139,7 @@ def test_an_applied_transform_is_undone(
     for matrix, new in zip(matrices, moved, strict=True):
         entry = {"file_path": "a.png", "transform_matrix": new.tolist()}
         frame = nerfstudio._frame(Path(), data, entry, undo, divide)
-        expected = gl_pixel(matrix, LENS, np.array(point))
+        expected = gl_pixel(matrix, np.array(point))
         np.testing.assert_allclose(
             pixel_of(frame, np.array(point)), expected, atol=1e-6
         )
@@ -166,18 +162,7 @@ def test_downscaled_images_get_scaled_cameras(tmp_path: Path) -> None:
     assert (frame.camera.width, frame.camera.height) == (12, 18)
     point = np.array([0.2, -0.1, 0.3])
     # From the corner, every pixel coordinate is simply half.
-    np.testing.assert_allclose(
-        pixel_of(frame, point), gl_pixel(matrices[1], LENS, point) / 2
-    )
-
-
-def test_names_without_ending_are_read(tmp_path: Path) -> None:
-    write(tmp_path, entries(ring(2)), camera_angle_x=0.5, w=24, h=36)
-    file = tmp_path / "transforms.json"
-    file.write_text(file.read_text().replace(".png", ""))
-    frame = load_recording(tmp_path).train[0]
-    assert (frame.camera.cx, frame.camera.cy) == (11.5, 17.5)
-    assert frame.read_image().shape == (36, 24, 3)
+    np.testing.assert_allclose(pixel_of(frame, point), gl_pixel(matrices[1], point) / 2)
 
 
 @pytest.mark.parametrize(
@@ -196,9 +181,9 @@ def test_angles_of_view_without_image_size(
     lens: dict[str, Any], focal: tuple[float, float], tmp_path: Path
 ) -> None:
     write(tmp_path, entries(ring(2)), **lens)
-    camera = load_recording(tmp_path).train[1].camera
-    assert (camera.width, camera.height) == (24, 36)
+    camera = first_camera(tmp_path)
     assert (camera.fx, camera.fy) == pytest.approx(focal)
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (24, 36, 11.5, 17.5)
 
 
 def one(matrix: np.ndarray) -> list[dict[str, Any]]:
@@ -211,7 +196,7 @@ def one(matrix: np.ndarray) -> list[dict[str, Any]]:
 def test_a_fisheye_has_k1_to_k4(tmp_path: Path, stated: dict[str, Any]) -> None:
     terms = {"k1": 0.1, "k2": -0.02, "k3": 0.003, "k4": 1e-4, "p1": 0.0, "p2": 0.0}
     write(tmp_path, entries(ring(2)), **{**LENS, **terms, **stated})
-    camera = load_recording(tmp_path).train[0].camera
+    camera = first_camera(tmp_path)
     assert (camera.model, camera.distortion) == ("fisheye", (0.1, -0.02, 0.003, 1e-4))
 
 
@@ -261,8 +246,7 @@ BREAKS: list[tuple[dict[str, Any], str]] = [
 def test_broken_files_are_refused(
     change: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
-    write(tmp_path, entries(ring(2)), **LENS)
-    file = tmp_path / "transforms.json"
+    file = write(tmp_path, entries(ring(2)), **LENS)
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
     with pytest.raises(InputError, match=message) as caught:
         load_recording(tmp_path)
@@ -270,10 +254,7 @@ def test_broken_files_are_refused(
 
 
 def test_distortion_params_are_k1_k2_k3_k4_p1_p2(tmp_path: Path) -> None:
-    plain = {
-        key: value for key, value in LENS.items() if key not in ("k1", "k2", "p1", "p2")
-    }
-    # Nerfstudio's get_distortion_params.
+    plain = {key: value for key, value in LENS.items() if key[0] not in "kp"}
     params = [
         0.05,
         -0.02,
@@ -281,14 +262,12 @@ def test_distortion_params_are_k1_k2_k3_k4_p1_p2(tmp_path: Path) -> None:
         0.0,
         0.003,
         -0.002,
-    ]
+    ]  # Nerfstudio's get_distortion_params
     write(tmp_path / "top", entries(ring(1)), **plain, distortion_params=params)
     write(tmp_path / "frame", entries(ring(1), distortion_params=params), **plain)
     write(tmp_path / "named", entries(ring(1)), **LENS, k3=0.01)
-    cameras = [
-        load_recording(tmp_path / n).train[0].camera for n in ("top", "frame", "named")
-    ]
-    assert cameras[0] == cameras[1] == cameras[2]
+    top, frame, named = (first_camera(tmp_path / n) for n in ("top", "frame", "named"))
+    assert top == frame == named
 
 
 def test_bad_frames_are_left_out(tmp_path: Path) -> None:
@@ -303,16 +282,13 @@ def test_bad_frames_are_left_out(tmp_path: Path) -> None:
 
 
 def test_blender_has_a_file_for_each_split(tmp_path: Path) -> None:
-    angle = {"camera_angle_x": 0.6}
     for split, count in (("train", 3), ("val", 1), ("test", 2)):
         frames = entries(ring(count))
         for i, frame in enumerate(frames):
             frame["file_path"] = f"./{split}/r_{i}.5"  # without ending, with a dot
-            write_image(
-                made(tmp_path / split / f"r_{i}.5.png"), np.zeros((36, 24, 3), np.uint8)
-            )
+            black(tmp_path / split / f"r_{i}.5.png")
         file = tmp_path / f"transforms_{split}.json"
-        file.write_text(json.dumps({**angle, "frames": frames}))
+        file.write_text(json.dumps({"camera_angle_x": 0.6, "frames": frames}))
     recording = load_recording(tmp_path)
     assert (len(recording.train), len(recording.test)) == (3, 3)
     assert {frame.name.split("/")[1] for frame in recording.test} == {"val", "test"}
@@ -320,54 +296,26 @@ def test_blender_has_a_file_for_each_split(tmp_path: Path) -> None:
     assert (len(alone.train), alone.test, alone.name) == (2, (), tmp_path.name)
 
 
-def made(file: Path) -> Path:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    return file
-
-
 @pytest.mark.parametrize("folder", ["undistorted_images", "resized_undistorted_images"])
 def test_scannetpp_keeps_images_beside_the_folder_of_the_file(
     folder: str, tmp_path: Path
 ) -> None:
-    frames = [
-        {
-            "file_path": f"DSC{i:05d}.JPG",
-            "transform_matrix": matrix.tolist(),
-            "is_bad": i == 1,
-        }
-        for i, matrix in enumerate(ring(5))
-    ]
-    for i in range(5):
-        write_image(
-            made(tmp_path / "dslr" / folder / f"{i}.png"),
-            np.zeros((36, 24, 3), np.uint8),
-        )
-        (tmp_path / "dslr" / folder / f"{i}.png").rename(
-            tmp_path / "dslr" / folder / f"DSC{i:05d}.JPG"
-        )
-    data = {
-        **LENS,
-        "camera_model": "PINHOLE",
-        "frames": frames[:3],
-        "test_frames": frames[3:],
-    }
-    file = made(tmp_path / "dslr" / "nerfstudio" / "transforms_undistorted.json")
-    file.write_text(json.dumps(data))
-    file.with_name("transforms.json").write_text(
-        json.dumps(data | {"camera_model": "OPENCV_FISHEYE"})
-    )
+    frames = entries(ring(5))
+    for i, frame in enumerate(frames):
+        frame |= {"file_path": f"DSC{i}.JPG", "is_bad": i == 1}
+        black(tmp_path / "dslr" / folder / frame["file_path"])
+    data = {**LENS, "frames": frames[:3], "test_frames": frames[3:]}
+    file = tmp_path / "dslr" / "nerfstudio" / "transforms_undistorted.json"
+    file.parent.mkdir()
+    file.write_text(json.dumps({**data, "camera_model": "PINHOLE"}))
+    other = file.with_name("transforms.json")
+    other.write_text(json.dumps({**data, "camera_model": "OPENCV_FISHEYE"}))
     for root in (tmp_path, file, file.parent):
         recording = load_recording(root)
-        assert [frame.name for frame in recording.train] == [
-            "DSC00000.JPG",
-            "DSC00002.JPG",
-        ]
-        assert [frame.name for frame in recording.test] == [
-            "DSC00003.JPG",
-            "DSC00004.JPG",
-        ]
+        assert [frame.name for frame in recording.train] == ["DSC0.JPG", "DSC2.JPG"]
+        assert [frame.name for frame in recording.test] == ["DSC3.JPG", "DSC4.JPG"]
         assert recording.untracked == 1
-    refused("OPENCV_FISHEYE", load_recording, file.with_name("transforms.json"))
+    refused("OPENCV_FISHEYE", load_recording, other)
 
 
 @pytest.mark.parametrize("stored", [True, False])
@@ -377,23 +325,19 @@ def test_images_are_taken_as_stored_unless_only_upright_ones_fit(
     """nerfstudio ignores the EXIF orientation; other programs state the size of upright images."""
     upright = np.random.default_rng(0).integers(0, 255, (36, 24, 3), np.uint8)
     pixels = upright if stored else np.ascontiguousarray(np.rot90(upright))
-    write(tmp_path, entries(ring(2)), **LENS)
+    transforms = write(tmp_path, entries(ring(2)), **LENS)
     for file in (tmp_path / "images").iterdir():
-        write_image(file.with_suffix(".jpg"), pixels)
-        tagged = with_orientation(file.with_suffix(".jpg").read_bytes(), 6)
-        file.with_suffix(".jpg").write_bytes(tagged)
+        image = file.with_suffix(".jpg")
+        write_image(image, pixels)
+        image.write_bytes(with_orientation(image.read_bytes(), 6))
         file.unlink()
-    text = (tmp_path / "transforms.json").read_text().replace(".png", ".jpg")
-    (tmp_path / "transforms.json").write_text(text)
-    read = load_recording(tmp_path)
-    assert [f.read_image().shape for f in (*read.train, *read.test)] == [
-        (36, 24, 3)
-    ] * 2
+    transforms.write_text(transforms.read_text().replace(".png", ".jpg"))
+    for frame in load_recording(tmp_path).train:
+        assert frame.read_image().shape == (36, 24, 3)
 
 
 def test_paths_of_windows_are_read(tmp_path: Path) -> None:
-    write(tmp_path, entries(ring(2)), **LENS)
-    file = tmp_path / "transforms.json"
+    file = write(tmp_path, entries(ring(2)), **LENS)
     file.write_text(file.read_text().replace("images/", "images\\\\"))
     for frame in load_recording(tmp_path).train:
         assert isinstance(frame.image, Path)
