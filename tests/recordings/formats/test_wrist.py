@@ -59,7 +59,8 @@ def test_rows_without_names_are_paired_in_natural_order(
 ) -> None:
     names = [f"image-{i}.png" for i in range(1, 13)]  # image-10 comes after image-9
     poses = some_poses(12)
-    recording = load_recording(make_folder(tmp_path / "wave", names, poses, folder))
+    root = make_folder(tmp_path / "wave", names, poses, folder)
+    recording = load_recording(root)
     assert_paired(recording, names, poses)
     assert (recording.name, recording.test, recording.untracked) == ("wave", (), 0)
     assert int(recording.train[11].read_image().mean()) == 12
@@ -71,10 +72,9 @@ def test_names_pair_in_any_order() -> None:
     rows = RobotPoses(("c", "rgb/a.png", "gone.png"), None, poses)
     images = [Path(f"rgb/{name}") for name in ("a.png", "b.png", "c.png")]
     (a, b, c), notes = pair_images(images, rows, None, Path("poses.csv"))
-    assert a is not None
-    assert c is not None
+    assert_pose(a, poses[1])
     assert b is None
-    assert max(*pose_distance(a, poses[1]), *pose_distance(c, poses[0])) < 1e-12
+    assert_pose(c, poses[0])
     assert notes == [
         "1 image without a row in poses.csv: b.png",
         "1 row of poses.csv without an image: gone.png",
@@ -85,55 +85,38 @@ SECONDS = np.arange(11) / 10
 TIMES = 1305031102.0 + SECONDS
 
 
+FEWER = r"11 poses for 1 images.*stamps\.csv"
+
+
 @pytest.mark.parametrize(
     ("images", "names", "stamps", "message"),
     [
-        (["a.png", "b.png"], ("1", "2"), None, "names no image of"),
-        (["7.25.png", "8.25.png"], ("7", "9"), None, "names no image of"),
-        (["a.png", "b.png"], ("a.png", "a.png"), None, r"'a\.png' comes twice"),
-        (
-            ["image-1.png", "image-10.png", "image-2.png"],
-            None,
-            None,
-            "is given after image-10",
-        ),
+        ("a b", ("1", "2"), None, "names no image of"),
+        ("7.25 8.25", ("7", "9"), None, "names no image of"),
+        ("a b", ("a.png", "a.png"), None, r"'a\.png' comes twice"),
+        ("image-1 image-10 image-2", None, None, "is given after image-10"),
         # Frame numbers are not times, even if the clock of the robot starts at 0.
-        (
-            ["000001.png", "000002.png"],
-            None,
-            TIMES[:3],
-            r"3 poses for 2 images.*stamps\.csv",
-        ),
-        (["20240115_000001.png"], None, SECONDS, r"11 poses for 1 images.*stamps\.csv"),
-        (["20240115000001.png"], None, SECONDS, r"11 poses for 1 images.*stamps\.csv"),
-        (["9.25.png", "9.5.png"], None, SECONDS, "are the clocks the same"),
-        (["1700000000123.png"], None, SECONDS, "are the clocks the same"),
+        ("000001 000002", None, TIMES[:3], r"3 poses for 2 images.*stamps\.csv"),
+        ("20240115_000001", None, SECONDS, FEWER),
+        ("20240115000001", None, SECONDS, FEWER),
+        ("9.25 9.5", None, SECONDS, "are the clocks the same"),
+        ("1700000000123", None, SECONDS, "are the clocks the same"),
     ],
 )
 def test_images_that_cannot_be_paired_are_refused(
-    images: list[str],
-    names: tuple[str, ...] | None,
-    stamps: np.ndarray | None,
-    message: str,
+    images: str, names: tuple[str, ...] | None, stamps: np.ndarray | None, message: str
 ) -> None:
-    count = len(images) if stamps is None else len(stamps)
+    files = [Path(f"{stem}.png") for stem in images.split()]
+    count = len(files) if stamps is None else len(stamps)
     rows = RobotPoses(names, stamps, some_poses(count))
-    refused(
-        message,
-        pair_images,
-        [Path(image) for image in images],
-        rows,
-        None,
-        Path("p.csv"),
-    )
+    refused(message, pair_images, files, rows, None, Path("p.csv"))
 
 
 def test_frame_numbers_and_folders_are_paired_in_order() -> None:
     rows = RobotPoses(None, TIMES[:3], some_poses(3))
     for images in (["0.png", "1.png", "2.png"], ["b/1.png", "b/2.png", "a/1.png"]):
-        paired, notes = pair_images(
-            [Path(image) for image in images], rows, None, Path("p")
-        )
+        files = [*map(Path, images)]
+        paired, notes = pair_images(files, rows, None, Path("p"))
         assert None not in paired
         assert "in order" in notes[0]
 
@@ -142,16 +125,16 @@ def test_poses_are_interpolated_at_times_in_image_names() -> None:
     screw = np.array([0.01, 0, 0, 0, 0.02, 0])
     poses = SE3.exp(np.outer(np.arange(11), screw))
     images = [Path(f"{TIMES[0] + t:.6f}.png") for t in (-0.1, 0.25, 0.5, 0.975)]
-    paired, notes = pair_images(
-        images, RobotPoses(None, TIMES, poses), None, Path("p.tum")
-    )
+    rows = RobotPoses(None, TIMES, poses)
+    paired, notes = pair_images(images, rows, None, Path("p.tum"))
     assert paired[0] is None
     assert notes[1].startswith("1 image taken outside the recorded poses")
     for pose, at in zip(paired[1:], (2.5, 5.0, 9.75), strict=True):
         assert pose is not None
+        metres, radians = pose_distance(pose, SE3.exp(screw * at))
         # Interpolation follows a line, not the arc of the screw: microns apart here.
-        assert pose_distance(pose, SE3.exp(screw * at))[0] < 1e-4
-        assert pose_distance(pose, SE3.exp(screw * at))[1] < 1e-6
+        assert metres < 1e-4
+        assert radians < 1e-6
 
 
 def test_poses_are_interpolated_at_times_in_a_stamps_file(tmp_path: Path) -> None:
@@ -163,11 +146,8 @@ def test_poses_are_interpolated_at_times_in_a_stamps_file(tmp_path: Path) -> Non
     (tmp_path / "stamps.csv").write_text(
         "image,stamp_ns\nimages/y.png,150000000\nx.png,50000000\n"
     )
-    first, second = load_recording(tmp_path).train
-    assert first.base_from_gripper is not None
-    assert second.base_from_gripper is not None
-    np.testing.assert_allclose(first.base_from_gripper.translation_m, [0.5, 0, 0])
-    np.testing.assert_allclose(second.base_from_gripper.translation_m, [1.5, 0, 0])
+    for frame, x in zip(load_recording(tmp_path).train, (0.5, 1.5), strict=True):
+        assert_pose(frame.base_from_gripper, SE3.exp([x, 0, 0, 0, 0, 0]))
     (tmp_path / "stamps.csv").write_text("image,stamp_s\nx.png,0.05\n")
     refused(r"y\.png: stamps\.csv has no row", load_recording, tmp_path)
 
@@ -180,14 +160,14 @@ def test_times_in_names() -> None:
         (("10.png", "10.5"), [10.0, 10.5]),
     ):
         assert times_in_names(names) == pytest.approx(times, abs=1e-6)
-    for name in (
+    for name in [
         "0000000123.png",
         "12.png",
         "frame-1.5.png",
         "-1.5.png",
         "1e3.png",
         "nan.png",
-    ):
+    ]:
         assert times_in_names([name]) is None
 
 
@@ -202,17 +182,12 @@ def test_natural_order_of_mixed_names(tmp_path: Path) -> None:
 def test_camera_file_is_chosen_and_must_fit_the_images(tmp_path: Path) -> None:
     make_folder(tmp_path, ["1.png", "2.png"], some_poses(2))
     (tmp_path / "camera.json").rename(tmp_path / "other.json")
-    refused(
-        r"no camera file in it; name the file .* `camera`", load_recording, tmp_path
-    )
-    recording = load_recording(
-        tmp_path, options=ReadOptions(camera=tmp_path / "other.json")
-    )
-    assert recording.train[0].camera == CAMERA
-    (tmp_path / "camera.txt").write_text("30 0 15\n0 31 11\n0 0 1\n")
-    assert load_recording(tmp_path).train[0].camera == Camera(
-        32, 24, 30.0, 31.0, 15.0, 11.0
-    )
+    message = r"no camera file in it; name the file .* `camera`"
+    refused(message, load_recording, tmp_path)
+    options = ReadOptions(camera=tmp_path / "other.json")
+    assert load_recording(tmp_path, options=options).train[0].camera == CAMERA
+    (tmp_path / "camera.txt").write_text(LENS_TEXT)
+    assert load_recording(tmp_path).train[0].camera == PLAIN
     (tmp_path / "camera.txt").unlink()
     wide = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
     (tmp_path / "camera.json").write_text(json.dumps(wide.to_dict()))
@@ -226,20 +201,18 @@ def test_missing_and_ambiguous_files_are_refused(tmp_path: Path) -> None:
     refused(r"holds base_from_gripper\.csv and joints\.csv", load_recording, tmp_path)
     (tmp_path / "joints.csv").unlink()
     write_image(tmp_path / "1.png", np.zeros((24, 32, 3), np.uint8))
-    with pytest.raises(InputError, match=r"`gripper_frame`: .* holds poses already"):
-        load_recording(tmp_path, options=ReadOptions(gripper_frame="tool0"))
+    options = ReadOptions(gripper_frame="tool0")
+    message = "`gripper_frame`: .* holds poses already"
+    refused(message, load_recording, tmp_path, options=options)
     (tmp_path / "base_from_gripper.csv").unlink()
-    refused(
-        "no gripper poses; expected base_from_gripper",
-        load_recording,
-        tmp_path,
-        "wrist",
-    )
+    message = "no gripper poses; expected base_from_gripper"
+    refused(message, load_recording, tmp_path, "wrist")
 
 
 CAMERA_POSES = some_poses(4, seed=5)
 LENS_TEXT = "30 0 15\n0 31 11\n0 0 1\n"
 PLAIN = Camera(32, 24, 30.0, 31.0, 15.0, 11.0)
+NUMBERS = [f"{i}.png" for i in range(4)]
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 BODY_FROM_CAMERA = some_poses(1, seed=6)[0]
 
@@ -255,30 +228,30 @@ def matrix_files(folder: Path, names: Sequence[str], poses: SE3) -> None:
         np.savetxt(folder / name, pose.matrix())
 
 
-def table(root: Path) -> None:
-    make_folder(root, [f"{i}.png" for i in range(4)], None, "images")
+def without_camera(root: Path, names: Sequence[str], folder: str) -> None:
+    """Images, and their intrinsics as text."""
+    make_folder(root, names, None, folder)
     (root / "camera.json").unlink()
     (root / "camera.txt").write_text(LENS_TEXT)
+
+
+def table(root: Path) -> None:
+    without_camera(root, NUMBERS, "images")
     rows = quaternions(CAMERA_POSES)
-    np.savetxt(
-        root / "base_from_camera.csv", rows, delimiter=",", header="x,y,z,qw,qx,qy,qz"
-    )
+    header = "x,y,z,qw,qx,qy,qz"
+    np.savetxt(root / "base_from_camera.csv", rows, delimiter=",", header=header)
 
 
 def tum(root: Path) -> None:
     """As https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats describes it."""
-    make_folder(root, [f"{1305031102.1 + i:.6f}.png" for i in range(4)], None, "rgb")
-    (root / "camera.json").unlink()
-    (root / "camera.txt").write_text(LENS_TEXT)
+    stamps = 1305031102.1 + np.arange(4)
+    without_camera(root, [f"{stamp:.6f}.png" for stamp in stamps], "rgb")
     rows = quaternions(CAMERA_POSES)[:, [0, 1, 2, 4, 5, 6, 3]]
-    lines = [
-        f"{1305031102.1 + i + d:.4f} {' '.join(map(str, row))}"
-        for i, row in enumerate(rows) for d in (-0.01, 0.01)
-    ]  # fmt: skip
-    comments = (
-        "# ground truth trajectory\n# file: 'a.bag'\n# timestamp tx ty tz qx qy qz qw\n"
-    )
-    (root / "groundtruth.txt").write_text(comments + "\n".join(lines))
+    early = np.column_stack([stamps - 0.01, rows])
+    late = np.column_stack([stamps + 0.01, rows])
+    header = "ground truth trajectory\nfile: 'a.bag'\ntimestamp tx ty tz qx qy qz qw"
+    lines = np.stack([early, late], axis=1).reshape(8, 8)
+    np.savetxt(root / "groundtruth.txt", lines, ["%.4f", *["%.17g"] * 7], header=header)
 
 
 def euroc(root: Path) -> None:
@@ -296,13 +269,12 @@ def euroc(root: Path) -> None:
              *(f" v_RS_R_{a} [m s^-1]" for a in "xyz"),
              *(f" b_w_RS_S_{a} [rad s^-1]" for a in "xyz")]  # fmt: skip
     rows = quaternions(CAMERA_POSES @ BODY_FROM_CAMERA.inverse())
-    lines = [
-        ",".join(map(str, [stamp, *row, *[0.1] * 6]))
-        for stamp, row in zip(stamps, rows, strict=True)
-    ]
-    (mav / "state_groundtruth_estimate0").mkdir()
-    file = mav / "state_groundtruth_estimate0" / "data.csv"
-    file.write_text("#" + ",".join(names) + "\n" + "\n".join(lines))
+    folder = mav / "state_groundtruth_estimate0"
+    folder.mkdir()
+    lines = ["#" + ",".join(names)]
+    for stamp, row in zip(stamps, rows.tolist(), strict=True):
+        lines.append(",".join(map(str, [stamp, *row, *[0.1] * 6])))
+    (folder / "data.csv").write_text("\n".join(lines))
 
 
 def scannet(root: Path) -> None:
@@ -318,25 +290,22 @@ def scannet(root: Path) -> None:
 
 def ace(root: Path) -> None:
     """As the scripts of ACE write 7-Scenes, but with a 3x3 matrix; a half for testing."""
-    for split, part in (("train", (0, 1)), ("test", (2, 3))):
-        names = [f"seq-01-frame-{i:06d}" for i in part]
-        make_folder(root / split, [f"{name}.color.png" for name in names], None, "rgb")
-        poses = CAMERA_POSES[np.array(part)]
-        matrix_files(
-            root / split / "poses", [f"{name}.pose.txt" for name in names], poses
-        )
-        (root / split / "calibration").mkdir()
+    for split, first in (("train", 0), ("test", 2)):
+        names = [f"seq-01-frame-{i:06d}" for i in (first, first + 1)]
+        folder = root / split
+        make_folder(folder, [f"{name}.color.png" for name in names], None, "rgb")
+        poses = CAMERA_POSES[first : first + 2]
+        matrix_files(folder / "poses", [f"{name}.pose.txt" for name in names], poses)
+        (folder / "calibration").mkdir()
         for name in names:
-            file = root / split / "calibration" / f"{name}.calibration.txt"
-            file.write_text(LENS_TEXT)
+            (folder / "calibration" / f"{name}.calibration.txt").write_text(LENS_TEXT)
 
 
 def record3d(root: Path) -> None:
     """Quaternion, then position, OpenGL's axes, and a matrix column after column."""
-    make_folder(root, [f"{i}.png" for i in range(4)], None, "rgb")
-    rows = quaternions(SE3.from_matrix(CAMERA_POSES.matrix() @ GL))[
-        :, [4, 5, 6, 3, 0, 1, 2]
-    ]
+    make_folder(root, NUMBERS, None, "rgb")
+    rows = quaternions(SE3.from_matrix(CAMERA_POSES.matrix() @ GL))
+    rows = rows[:, [4, 5, 6, 3, 0, 1, 2]]
     data = {"w": 32, "h": 24, "dw": 16, "dh": 12, "fps": 60, "cameraType": 1,
             "K": PLAIN.matrix().T.ravel().tolist(), "poses": rows.tolist()}  # fmt: skip
     (root / "metadata").write_text(json.dumps(data))
@@ -360,90 +329,92 @@ def test_folders_of_camera_poses_are_read(
 
 
 def test_cameras_of_single_images_are_read(tmp_path: Path) -> None:
-    ace(tmp_path / "ace")
-    pose = tmp_path / "ace/train/poses/seq-01-frame-000000.pose.txt"
+    root = tmp_path / "ace"
+    ace(root)
+    pose = root / "train/poses/seq-01-frame-000000.pose.txt"
     kept = pose.read_text()
     pose.write_text("-inf " * 16)
-    recording = load_recording(tmp_path / "ace")
-    assert ([frame.name for frame in recording.train], recording.untracked) == (
-        ["train/seq-01-frame-000001.color.png"],
-        1,
-    )
+    recording = load_recording(root)
+    names = [frame.name for frame in recording.train]
+    assert names == ["train/seq-01-frame-000001.color.png"]
+    assert recording.untracked == 1
     pose.write_text(kept)
-    file = tmp_path / "ace/train/calibration/seq-01-frame-000001.calibration.txt"
-    file.write_text("33.5")
-    cameras = [frame.camera for frame in load_recording(tmp_path / "ace").train]
+    first, second = sorted((root / "train/calibration").iterdir())
+    second.write_text("33.5")
+    cameras = [frame.camera for frame in load_recording(root).train]
     assert cameras == [PLAIN, Camera(32, 24, 33.5, 33.5, 15.5, 11.5)]
-    file.unlink()
-    refused("lacks the file of an image", load_recording, tmp_path / "ace")
-    own = ReadOptions(
-        camera=tmp_path / "ace/train/calibration/seq-01-frame-000000.calibration.txt"
-    )
-    assert load_recording(tmp_path / "ace", options=own).train[1].camera == PLAIN
-    gone = ReadOptions(camera=tmp_path / "gone.txt")
-    refused(
-        "gone.txt: camera file is missing",
-        load_recording,
-        tmp_path / "ace",
-        options=gone,
-    )
-    record3d(tmp_path / "phone")
-    metadata = tmp_path / "phone" / "metadata"
+    second.unlink()
+    refused("lacks the file of an image", load_recording, root)
+    options = ReadOptions(camera=first)
+    assert load_recording(root, options=options).train[1].camera == PLAIN
+    options = ReadOptions(camera=second)
+    refused("camera file is missing", load_recording, root, options=options)
+
+
+def test_the_phone_states_a_camera_for_each_image(tmp_path: Path) -> None:
+    record3d(tmp_path)
+    metadata = tmp_path / "metadata"
     data = json.loads(metadata.read_text())
     data["perFrameIntrinsicCoeffs"] = [[30 + i, 31 + i, 15, 11] for i in range(4)]
     metadata.write_text(json.dumps(data))
-    focal = [frame.camera.fx for frame in load_recording(tmp_path / "phone").train]
+    focal = [frame.camera.fx for frame in load_recording(tmp_path).train]
     assert focal == [30, 31, 32, 33]
 
 
-def test_broken_camera_poses_are_refused(tmp_path: Path) -> None:
-    for write in (scannet, euroc, record3d, table):
-        write(tmp_path / write.__name__)
-    np.savetxt(tmp_path / "scannet" / "pose" / "2.txt", np.diag([2.0, 2, 2, 1]))
-    refused("pose: .*rotation", load_recording, tmp_path / "scannet")
-    for file in (tmp_path / "scannet" / "pose").glob("*.txt"):
+def test_broken_matrices_of_a_folder_are_refused(tmp_path: Path) -> None:
+    scannet(tmp_path)
+    np.savetxt(tmp_path / "pose" / "2.txt", np.diag([2.0, 2, 2, 1]))
+    refused("pose: .*rotation", load_recording, tmp_path)
+    for file in (tmp_path / "pose").glob("*.txt"):
         file.write_text("-inf " * 16)
-    refused(
-        "all poses in its files are inf or nan", load_recording, tmp_path / "scannet"
-    )
-    sensor = tmp_path / "euroc/mav0/cam0/sensor.yaml"
-    text = sensor.read_text()
-    sensor.write_text(text.replace("T_BS", "T_CB"))
-    refused(
-        r"sensor\.yaml: 'T_BS' is a list of numbers", load_recording, tmp_path / "euroc"
-    )
+    refused("all poses in its files are inf or nan", load_recording, tmp_path)
+
+
+def test_a_broken_sensor_file_is_refused(tmp_path: Path) -> None:
+    euroc(tmp_path)
+    sensor = tmp_path / "mav0/cam0/sensor.yaml"
+    sensor.write_text(sensor.read_text().replace("T_BS", "T_CB"))
+    refused(r"sensor\.yaml: 'T_BS' is a list of numbers", load_recording, tmp_path)
     sensor.unlink()
-    refused(r"sensor\.yaml: camera file is missing", load_recording, tmp_path / "euroc")
-    metadata = tmp_path / "record3d" / "metadata"
-    for change, message in (
+    refused(r"sensor\.yaml: camera file is missing", load_recording, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
         ({"poses": None}, "has 7 numbers .* got 0"),
         ({"poses": [[1, 0, 0, 0]]}, "has 7 numbers .* got 4"),
         ({"K": None}, "camera_matrix"),
         ({"w": None}, "camera width is"),
-    ):
-        data = json.loads(metadata.read_text()) | change
-        (tmp_path / "record3d" / "metadata.json").write_text(json.dumps(data))
-        metadata.rename(tmp_path / "kept")
-        refused(message, load_recording, tmp_path / "record3d")
-        (tmp_path / "kept").rename(metadata)
-    refused(
-        "holds metadata and metadata.json; keep", load_recording, tmp_path / "record3d"
-    )
+    ],
+)
+def test_broken_metadata_are_refused(
+    tmp_path: Path, change: dict[str, object], message: str
+) -> None:
+    record3d(tmp_path)
+    metadata = tmp_path / "metadata"
+    data = json.loads(metadata.read_text()) | change
+    metadata.rename(tmp_path / "metadata.json").write_text(json.dumps(data))
+    refused(message, load_recording, tmp_path)
+
+
+def test_two_files_of_poses_are_refused(tmp_path: Path) -> None:
+    record3d(tmp_path / "phone")
+    (tmp_path / "phone" / "metadata.json").touch()
+    message = "holds metadata and metadata.json; keep"
+    refused(message, load_recording, tmp_path / "phone")
+    table(tmp_path / "table")
     write_poses(tmp_path / "table" / "base_from_gripper.csv", CAMERA_POSES)
-    refused(
-        "holds base_from_gripper.csv and base_from_camera.csv",
-        load_recording,
-        tmp_path / "table",
-    )
+    message = "holds base_from_gripper.csv and base_from_camera.csv"
+    refused(message, load_recording, tmp_path / "table")
 
 
 def test_the_one_pose_of_a_fixed_camera_is_no_table(tmp_path: Path) -> None:
     make_folder(tmp_path, ["1.png", "2.png"], None)
     np.savetxt(tmp_path / "base_from_camera.txt", np.eye(4))
     assert not wrist.detect(tmp_path)
-    np.savetxt(
-        tmp_path / "base_from_camera.txt", CAMERA_POSES[:2].matrix().reshape(2, 16)
-    )
+    rows = CAMERA_POSES[:2].matrix().reshape(2, 16)
+    np.savetxt(tmp_path / "base_from_camera.txt", rows)
     assert_pose(load_recording(tmp_path).train[1].base_from_camera, CAMERA_POSES[1])
 
 
@@ -475,8 +446,7 @@ def test_other_kinds_of_pose_files_are_read(tmp_path: Path) -> None:
     assert_paired(load_recording(tmp_path), names, poses)
     (tmp_path / "base_from_gripper.npy").unlink()
     rows = np.hstack([1000 * poses.translation_m, poses.log()[:, 3:]])
-    numbers = "\n".join(" ".join(f"{v:.12g}" for v in row) for row in rows)
-    (tmp_path / "base_from_gripper.txt").write_text(numbers)
+    np.savetxt(tmp_path / "base_from_gripper.txt", rows)
     # The convention is missing.
     refused(r"base_from_gripper\.txt", load_recording, tmp_path)
     recording = load_recording(tmp_path, options=ReadOptions(pose_convention="ur:mm"))
