@@ -16,11 +16,8 @@ def recording_of(
     train: SE3, test: SE3, camera: Camera = LENS, untracked: int = 0
 ) -> Recording:
     def frames(poses: SE3, split: str) -> tuple[Frame, ...]:
-        count = len(poses)
-        return tuple(
-            Frame(f"{split}{i}", PICTURES[i % 7], camera, poses[i])
-            for i in range(count)
-        )
+        named = enumerate(poses)
+        return tuple(Frame(f"{split}{i}", PICTURES[i % 7], camera, p) for i, p in named)
 
     return Recording("planted", frames(train, "a"), frames(test, "b"), untracked)
 

@@ -35,9 +35,8 @@ def test_rooms_are_complete_and_small(rooms: tuple[SampleRoom, ...]) -> None:
         assert room.scene.test[7].read_image().shape == (240, 320, 3)
         assert room.fixed is not None
         assert len({frame.joints_rad for frame in room.fixed.test}) == 25
-        metres, radians = pose_distance(
-            poses(room.fixed.test), poses(room.fixed.test)[0]
-        )
+        fixed = poses(room.fixed.test)
+        metres, radians = pose_distance(fixed, fixed[0])
         assert max(metres.max(), radians.max()) < 1e-9
     assert sum(path.stat().st_size for path in FOLDER.rglob("*")) <= 13e6
 
