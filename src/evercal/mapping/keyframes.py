@@ -5,7 +5,7 @@ its 1,200 features of 128 half floats 307 kB. The frozen encoder computes the sa
 image in milliseconds. A map adds depths, landmarks and a descriptor to each.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
@@ -22,6 +22,7 @@ from evercal.recordings.images import encode_jpeg
 from evercal.typing import IntArray
 
 JPEG_QUALITY = 95
+"""Quality of stored images, percent."""
 Part = TypeVar("Part")
 _LANDMARK_FIELDS = {
     "pixels": np.int16,
@@ -59,16 +60,16 @@ class Keyframes:
 
     def take(self, index: IntArray) -> "Keyframes":
         """The keyframes of an index."""
-        rows = index.tolist()
+        descriptors = self.descriptors
+        if descriptors is not None:
+            descriptors = descriptors[index]
         return Keyframes(
-            images=tuple(self.images[i] for i in rows),
-            cameras=tuple(self.cameras[i] for i in rows),
+            images=_taken(self.images, index),
+            cameras=_taken(self.cameras, index),
             base_from_camera=self.base_from_camera[index],
-            inverse_depth=tuple(self.inverse_depth[i] for i in rows)
-            if self.inverse_depth
-            else (),
-            landmarks=tuple(self.landmarks[i] for i in rows) if self.landmarks else (),
-            descriptors=None if self.descriptors is None else self.descriptors[index],
+            inverse_depth=_taken(self.inverse_depth, index),
+            landmarks=_taken(self.landmarks, index),
+            descriptors=descriptors,
         )
 
     def joined(self, other: "Keyframes") -> "Keyframes":
@@ -97,11 +98,11 @@ class Keyframes:
 
     def frames(self) -> list[Frame]:
         """The keyframes, decoded."""
-        images = [
-            np.repeat(self.grey(i)[..., None], 3, axis=-1) for i in range(len(self))
-        ]
-        views = zip(images, self.cameras, self.base_from_camera, strict=True)
-        return [Frame(f"memory-{i:05d}", *view) for i, view in enumerate(views)]
+        frames = []
+        for i, pose in enumerate(self.base_from_camera):
+            image = np.repeat(self.grey(i)[..., None], 3, axis=-1)
+            frames.append(Frame(f"memory-{i:05d}", image, self.cameras[i], pose))
+        return frames
 
     def to_tensors(self) -> dict[str, NDArray[Any]]:
         """Convert to named arrays.
@@ -113,35 +114,34 @@ class Keyframes:
             also their fields (concatenated, `landmark_*`), `landmark_counts` (n,) and `descriptors`
             (n, width).
         """
-        joined = np.frombuffer(b"".join(self.images), np.uint8).copy()
         cameras = np.zeros((len(self.images), 14))
+        distortion = np.zeros(len(self.images), np.int64)
         for i, c in enumerate(self.cameras):
+            count = len(c.distortion)
             cameras[i, :6] = c.width, c.height, c.fx, c.fy, c.cx, c.cy
-            cameras[i, 6 : 6 + len(c.distortion)] = c.distortion
+            cameras[i, 6 : 6 + count] = c.distortion
+            distortion[i] = count
+            if c.model == "fisheye":
+                distortion[i] = -count
         pose = self.base_from_camera
         poses = np.concatenate([pose.rotation_wxyz, pose.translation_m], -1)
         tensors = {
-            "images": joined,
-            "lengths": np.array([len(image) for image in self.images], np.int64),
+            "images": np.frombuffer(b"".join(self.images), np.uint8).copy(),
+            "lengths": _lengths(self.images),
             "cameras": cameras,
-            "distortion": np.array([_signed_count(c) for c in self.cameras], np.int64),
+            "distortion": distortion,
             "poses": poses.reshape(-1, 7),
         }
         if self.inverse_depth:
             tensors["inverse_depth"] = np.concatenate(self.inverse_depth)
-            tensors["cells"] = np.array(
-                [len(depth) for depth in self.inverse_depth], np.int64
-            )
+            tensors["cells"] = _lengths(self.inverse_depth)
         if self.descriptors is not None:
             tensors["descriptors"] = self.descriptors
         if self.landmarks:
-            counts = [len(marks) for marks in self.landmarks]
-            tensors["landmark_counts"] = np.array(counts, np.int64)
+            tensors["landmark_counts"] = _lengths(self.landmarks)
             for name, kind in _LANDMARK_FIELDS.items():
-                joined = np.concatenate(
-                    [getattr(marks, name) for marks in self.landmarks]
-                )
-                tensors[f"landmark_{name}"] = joined.astype(kind)
+                values = [getattr(marks, name) for marks in self.landmarks]
+                tensors[f"landmark_{name}"] = np.concatenate(values).astype(kind)
         return tensors
 
     @classmethod
@@ -151,10 +151,15 @@ class Keyframes:
         Arrays of `storage.tensors.open_tensors` stay in their file: images, depths and landmarks
         are read when they are used, so that processes share the memory.
         """
-        lengths, cameras, poses = (
-            tensors[key][:] for key in ("lengths", "cameras", "poses")
-        )
-        rows = zip(cameras.tolist(), tensors["distortion"][:].tolist(), strict=True)
+        cameras = []
+        counts = tensors["distortion"][:].tolist()
+        for row, count in zip(tensors["cameras"][:].tolist(), counts, strict=True):
+            model = "pinhole"
+            if count < 0:
+                model = "fisheye"
+            distortion = row[6 : 6 + abs(count)]
+            cameras.append(Camera(*row[:6], distortion=distortion, model=model))
+        poses = tensors["poses"][:]
         depths: Sequence[NDArray[np.float16]] = ()
         landmarks: Sequence[Landmarks] = ()
         if "cells" in tensors:
@@ -170,21 +175,17 @@ class Keyframes:
                 ),
             )
         images = tensors["images"]
-        descriptors = tensors.get("descriptors")
+        lengths = tensors["lengths"][:]
+        descriptors = None
+        if "descriptors" in tensors:
+            descriptors = tensors["descriptors"][:]
         return cls(
             images=_Parts(lengths, (images,), lambda part: images[part].tobytes()),
-            cameras=tuple(
-                Camera(
-                    *row[:6],
-                    distortion=row[6 : 6 + abs(k)],
-                    model="fisheye" if k < 0 else "pinhole",
-                )
-                for row, k in rows
-            ),
+            cameras=tuple(cameras),
             base_from_camera=SE3(poses[:, :4], poses[:, 4:]),
             inverse_depth=depths,
             landmarks=landmarks,
-            descriptors=None if descriptors is None else descriptors[:],
+            descriptors=descriptors,
         )
 
 
@@ -197,7 +198,8 @@ class _Parts(Sequence[Part]):
         stored: Sequence[Any],
         read: Callable[[slice], Part],
     ):
-        if (counts < 0).any() or any(len(array) != counts.sum() for array in stored):
+        lengths = _lengths(stored)
+        if (counts < 0).any() or (lengths != counts.sum()).any():
             raise ValueError(
                 f"parts of {counts.tolist()[:9]} rows do not make up their arrays"
             )
@@ -214,8 +216,15 @@ class _Parts(Sequence[Part]):
         return self._read(slice(self._ends[i], self._ends[i + 1]))
 
 
-def _signed_count(camera: Camera) -> int:
-    return len(camera.distortion) * (-1 if camera.model == "fisheye" else 1)
+def _taken(parts: Sequence[Part], index: IntArray) -> tuple[Part, ...]:
+    """Parts of some keyframes; none where no keyframe has any."""
+    if not parts:
+        return ()
+    return tuple(parts[i] for i in index)
+
+
+def _lengths(parts: Sequence[Sized]) -> IntArray:
+    return np.array([len(part) for part in parts], np.int64)
 
 
 def store_keyframes(frames: Sequence[Frame], short_side: int) -> Keyframes:

@@ -7,16 +7,20 @@ import cv2
 import numpy as np
 
 from evercal.geometry.camera import Camera
-from evercal.typing import Array, IntArray
+from evercal.typing import Array, Image, IntArray
 
 MIN_TEXTURE = 1e-4
 """Smallest minimum eigenvalue (cv2.cornerMinEigenVal, 5x5) of a landmark's pixel."""
 BORDER_PX = 6
 """Landmarks and their projections lie at least this far inside the image."""
 NEAREST_M = 1e-3
+"""Smallest depth of a visible landmark, metres."""
 _TANGENT_PX = 2.0
-_MIN_AREA, _MAX_AREA = 0.2, 5.0
-"""Bounds of the area of a warped patch, relative to its keyframe."""
+"""Distance of the points that span the surface of a landmark, pixels."""
+_MIN_AREA = 0.2
+"""Smallest area of a warped patch, relative to its keyframe."""
+_MAX_AREA = 5.0
+"""Largest area of a warped patch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +39,7 @@ class Landmarks:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def take(self, index: np.ndarray) -> "Landmarks":
+    def take(self, index: IntArray) -> "Landmarks":
         """The landmarks of an index."""
         return Landmarks(
             self.pixels[index],
@@ -82,25 +86,27 @@ def project_surface(
     """
     centre = rotation @ points[0].T + translation_m[:, None]
     u, v = camera.project(centre.T).T
-    inside = (
-        (u > BORDER_PX) & (u < camera.width - BORDER_PX - 1) & (centre[2] > NEAREST_M)
-    )
+    inside = centre[2] > NEAREST_M
+    inside &= (u > BORDER_PX) & (u < camera.width - BORDER_PX - 1)
     inside &= (v > BORDER_PX) & (v < camera.height - BORDER_PX - 1)
     visible = np.flatnonzero(inside)
     pixels = np.stack([u[visible], v[visible]], 1)
     beside = rotation @ points[1:, visible].transpose(0, 2, 1) + translation_m[:, None]
-    np.maximum(beside[:, 2], NEAREST_M, out=beside[:, 2])
+    depth = beside[:, 2]
+    np.maximum(depth, NEAREST_M, out=depth)
     tangents = camera.project(beside.transpose(0, 2, 1)) - pixels
     affines = tangents.transpose(1, 2, 0) / _TANGENT_PX
-    area = affines[:, 0, 0] * affines[:, 1, 1] - affines[:, 0, 1] * affines[:, 1, 0]
+    (a, b), (c, d) = affines.transpose(1, 2, 0)
+    area = a * d - b * c
     similar = np.flatnonzero((area > _MIN_AREA) & (area < _MAX_AREA))
     if most is not None and len(similar) > most:
-        similar = similar[np.linspace(0, len(similar) - 1, most).round().astype(int)]
+        spread = np.linspace(0, len(similar) - 1, most)
+        similar = similar[spread.round().astype(int)]
     return ProjectedPatches(visible[similar], pixels[similar], affines[similar])
 
 
 def detect(
-    grey: np.ndarray, grid: tuple[int, int], cell_px: float
+    grey: Image, grid: tuple[int, int], cell_px: float
 ) -> tuple[Array, IntArray]:
     """Detect the most textured pixel of every textured cell.
 
@@ -111,16 +117,18 @@ def detect(
     inner = np.zeros_like(texture)
     middle = slice(BORDER_PX, -BORDER_PX)
     inner[middle, middle] = texture[middle, middle]
-    rows, columns = (np.rint(np.arange(n + 1) * cell_px).astype(int) for n in grid)
+    edges = np.rint(np.arange(max(grid) + 1) * cell_px).astype(int).tolist()
     pixels = []
     cells = []
-    for i in range(grid[0]):
-        for j in range(grid[1]):
-            block = inner[rows[i] : rows[i + 1], columns[j] : columns[j + 1]]
-            v, u = divmod(int(block.argmax()), block.shape[1])
-            if block[v, u] > MIN_TEXTURE:
-                pixels.append((columns[j] + u, rows[i] + v))
-                cells.append(i * grid[1] + j)
+    for cell in range(grid[0] * grid[1]):
+        row, column = divmod(cell, grid[1])
+        top = edges[row]
+        left = edges[column]
+        block = inner[top : edges[row + 1], left : edges[column + 1]]
+        v, u = divmod(int(block.argmax()), block.shape[1])
+        if block[v, u] > MIN_TEXTURE:
+            pixels.append((left + u, top + v))
+            cells.append(cell)
     return np.array(pixels, float).reshape(-1, 2), np.array(cells, np.int64)
 
 

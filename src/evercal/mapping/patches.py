@@ -12,15 +12,21 @@ import cv2
 import numpy as np
 
 from evercal.geometry import resize_pixels
-from evercal.typing import Array
+from evercal.typing import Array, Image, IntArray
 
 RADIUS = 5
+"""Pixels of a patch beside its centre, along each axis."""
 SIDE = 2 * RADIUS + 1
-_MOST_ROWS = 30_000  # cv2.remap takes maps of up to 32,767 rows
+_MOST_ROWS = 30_000
+"""Patches that are aligned at once: cv2.remap takes maps of up to 32,767 rows."""
 _FLAT = 1e-3
-_ROUNDING = np.float32(1e-6)  # of the square of a blank patch, in single precision
+"""Added to the deviation of a patch, which is a divisor, in intensities."""
+_ROUNDING = np.float32(1e-6)
+"""Rounding error of the variance of a blank patch in single precision, as a share of its square."""
 _DAMPING = 1e-2
+"""Added to the diagonal of a Hessian, which is inverted."""
 _LONGEST_STEP = 2.0
+"""Largest step of an alignment along each axis, pixels."""
 
 
 def _grid(radius: int) -> Array:
@@ -33,12 +39,14 @@ _WIDE = _grid(RADIUS + 1)
 _MEAN = np.full(SIDE * SIDE, 1 / SIDE**2, np.float32)
 
 
-def image_pyramid(grey: np.ndarray, levels: int) -> list[Array]:
+def image_pyramid(grey: Image, levels: int) -> list[Array]:
     """Float images (h, w), each half the size of the previous one; level 0 is the image."""
     pyramid = [grey.astype(np.float32)]
     for _ in range(levels - 1):
-        height, width = (side // 2 for side in pyramid[-1].shape)
-        even = pyramid[-1][: 2 * height, : 2 * width]
+        image = pyramid[-1]
+        height = image.shape[0] // 2
+        width = image.shape[1] // 2
+        even = image[: 2 * height, : 2 * width]
         half = cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
         pyramid.append(half.astype(np.float32, copy=False))
     return pyramid
@@ -65,11 +73,9 @@ class Patches(NamedTuple):
     rest: Array
     """(n, 2) step of the template itself, subtracted from every step."""
 
-    def take(self, index: np.ndarray | slice) -> "Patches":
+    def take(self, index: IntArray | slice) -> "Patches":
         """The patches of an index."""
-        return Patches(
-            self.templates[index], self.inverse_hessian[index], self.rest[index]
-        )
+        return Patches(*(values[index] for values in self))
 
     @classmethod
     def joined(cls, parts: Sequence["Patches"]) -> "Patches":
@@ -83,23 +89,24 @@ def cut_patches(image: Array, pixels: Array) -> Patches:
     centre = pixels.astype(np.float32)
     wide = _sample(image, centre[:, :1] + _WIDE[:, 0], centre[:, 1:] + _WIDE[:, 1])
     wide = wide.reshape(n, SIDE + 2, SIDE + 2)
-    slope_u = (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2
-    slope_v = (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2
-    patch = wide[:, 1:-1, 1:-1].reshape(n, SIDE * SIDE)
+    rows = wide[:, 1:-1]
+    columns = wide[..., 1:-1]
+    slope_u = (rows[..., 2:] - rows[..., :-2]) / 2
+    slope_v = (columns[:, 2:] - columns[:, :-2]) / 2
+    patch = columns[:, 1:-1].reshape(n, SIDE * SIDE)
     patch = patch - patch.mean(1, keepdims=True)
     deviation = np.sqrt((patch * patch).mean(1, keepdims=True)) + _FLAT
-    gradient = np.stack(
-        [slope_u.reshape(patch.shape), slope_v.reshape(patch.shape)], -1
-    )
+    gradient = np.stack([slope_u, slope_v], -1).reshape(n, -1, 2)
     gradient /= deviation[..., None]
     hessian = gradient.transpose(0, 2, 1) @ gradient
     # Beside a flat patch the slopes are so large that the damping needs double precision.
     inverse = np.linalg.inv(hessian + _DAMPING * np.eye(2)).astype(np.float32)
     templates = np.empty((n, 3, SIDE * SIDE), np.float32)
-    templates[:, :2] = (gradient @ inverse).transpose(0, 2, 1)
-    templates[:, :2] -= templates[:, :2].mean(2, keepdims=True)
+    steps = templates[:, :2]
+    steps[:] = (gradient @ inverse).transpose(0, 2, 1)
+    steps -= steps.mean(2, keepdims=True)
     templates[:, 2] = patch / deviation
-    rest = np.einsum("nkp,np->nk", templates[:, :2], templates[:, 2])
+    rest = np.einsum("nkp,np->nk", steps, templates[:, 2])
     return Patches(templates, inverse, rest)
 
 
@@ -112,11 +119,11 @@ def align_patches(
     (n, 2) to start from. Returns pixels (n, 2) and their normalised cross-correlation (n,).
     """
     if len(centres) > _MOST_ROWS:
-        starts = range(0, len(centres), _MOST_ROWS)
-        parts = [slice(start, start + _MOST_ROWS) for start in starts]
+        head = slice(_MOST_ROWS)
+        rest = slice(_MOST_ROWS, None)
         aligned = [
             align_patches(patches.take(p), image, centres[p], affines[p], iterations)
-            for p in parts
+            for p in (head, rest)
         ]
         pixels, correlations = zip(*aligned, strict=True)
         return np.concatenate(pixels), np.concatenate(correlations)
@@ -190,12 +197,10 @@ def whitening(
             line of a landmark with an uncertain depth.
     """
     spread = (affines @ inverse_hessian @ affines.transpose(0, 2, 1)).astype(np.float64)
-    a = spread[:, 0, 0] + floor_px**2
-    b = spread[:, 0, 1]
-    c = spread[:, 1, 1] + floor_px**2
-    a = noise**2 * a
-    b = noise**2 * b
-    c = noise**2 * c
+    variance = noise**2
+    a = variance * (spread[:, 0, 0] + floor_px**2)
+    b = variance * spread[:, 0, 1]
+    c = variance * (spread[:, 1, 1] + floor_px**2)
     if shift_px is not None:
         u, v = shift_px.T
         a = a + u * u
