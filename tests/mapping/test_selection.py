@@ -36,6 +36,12 @@ def slow_sars(distance, capacity, radius):
     return sorted(buffer)
 
 
+def upright(*x):
+    """Poses along a line, without rotation."""
+    n = len(x)
+    return np.stack([x, np.zeros(n), np.zeros(n)], 1), np.tile([1.0, 0, 0, 0], (n, 1))
+
+
 def random_walk(rng, n, step=0.05):
     positions = np.cumsum(rng.normal(size=(n, 3)) * step, axis=0)
     quaternions = np.cumsum(rng.normal(size=(n, 4)) * step, axis=0)
@@ -58,8 +64,12 @@ def metric_table(positions, quaternions, weight=1.0):
     return np.stack([space.distances(i) for i in range(len(space))])
 
 
-def covering_radius(positions, quaternions, selected):
-    return metric_table(positions, quaternions)[selected].min(0).max()
+def covering_radius(poses, selected):
+    return metric_table(*poses)[selected].min(0).max()
+
+
+FILL = SarsOptions(fill=True)
+ANY = SarsOptions(radius=0.0)
 
 
 def test_metric_equals_the_formula():
@@ -105,9 +115,9 @@ def test_angle_of_known_rotations(angle):
 @pytest.mark.parametrize("capacity", [1, 2, 30, 100, 400])
 @pytest.mark.parametrize("walk", [random_walk, grid_walk])
 def test_sars_equals_slow_twin(walk, capacity, radius):
-    positions, quaternions = walk(np.random.default_rng(2), 300)
-    selected = select_sars(positions, quaternions, capacity, SarsOptions(radius=radius))
-    table = metric_table(positions, quaternions).tolist()
+    poses = walk(np.random.default_rng(2), 300)
+    selected = select_sars(*poses, capacity, SarsOptions(radius=radius))
+    table = metric_table(*poses).tolist()
     assert selected.tolist() == slow_sars(table, capacity, radius)
 
 
@@ -116,126 +126,104 @@ def test_sars_equals_slow_twin_for_a_camera_that_stops_and_returns(seed):
     rng = np.random.default_rng(seed)
     positions, quaternions = grid_walk(rng, 25)
     visits = np.repeat(rng.integers(0, 25, size=60), 5)
-    positions = positions[visits]
-    quaternions = quaternions[visits]
-    table = metric_table(positions, quaternions).tolist()
+    poses = (positions[visits], quaternions[visits])
+    table = metric_table(*poses).tolist()
     for capacity in (5, 20, 40):
-        selected = select_sars(
-            positions, quaternions, capacity, SarsOptions(radius=0.0)
-        )
+        selected = select_sars(*poses, capacity, ANY)
         assert selected.tolist() == slow_sars(table, capacity, 0.0)
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.25, 0.5])
 def test_sars_equals_twin_with_the_formula_of_the_paper(radius):
     """Nothing shared with the code: dyadic positions and one rotation make every tie exact."""
-    rng = np.random.default_rng(3)
-    positions, _ = grid_walk(rng, 300)
-    quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (300, 1))
+    positions, _ = grid_walk(np.random.default_rng(3), 300)
+    still = [1.0, 0.0, 0.0, 0.0]
     table = [
-        [
-            slow_distance(a, quaternions[0], b, quaternions[0], 1.0, 1.0)
-            for b in positions.tolist()
-        ]
+        [slow_distance(a, still, b, still, 1.0, 1.0) for b in positions.tolist()]
         for a in positions.tolist()
     ]
-    selected = select_sars(positions, quaternions, 40, SarsOptions(radius=radius))
+    options = SarsOptions(radius=radius)
+    selected = select_sars(positions, np.tile(still, (300, 1)), 40, options)
     assert selected.tolist() == slow_sars(table, 40, radius)
 
 
 def test_older_of_the_closest_pair_leaves():
-    positions = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.5, 0, 0], [1.0, 0, 0]])
-    quaternions = np.tile([1.0, 0, 0, 0], (4, 1))
-    selected = select_sars(positions, quaternions, 3, SarsOptions(radius=0.0))
-    assert selected.tolist() == [1, 2, 3]
+    assert select_sars(*upright(0, 0.1, 0.5, 1), 3, ANY).tolist() == [1, 2, 3]
 
 
-def test_distance_equal_to_radius_is_accepted_and_scale_does_not_matter():
-    positions = np.array([[0.0, 0, 0], [0.25, 0, 0], [0.5, 0, 0], [1.0, 0, 0]])
-    quaternions = np.tile([1.0, 0, 0, 0], (4, 1))
-    for scale in (1.0, 64.0):
-        assert select_sars(positions * scale, quaternions, 9).tolist() == [0, 2, 3]
+@pytest.mark.parametrize("scale", [1.0, 64.0])
+def test_distance_equal_to_radius_is_accepted_and_scale_does_not_matter(scale):
+    poses = upright(0, 0.25 * scale, 0.5 * scale, scale)
+    assert select_sars(*poses, 9).tolist() == [0, 2, 3]
 
 
 def test_selected_frames_are_a_radius_apart_and_cover_the_scene():
-    positions, quaternions = random_walk(np.random.default_rng(4), 400)
-    selected = select_sars(positions, quaternions, 400, SarsOptions(radius=0.5))
-    table = metric_table(positions, quaternions)[np.ix_(selected, selected)]
+    poses = random_walk(np.random.default_rng(4), 400)
+    selected = select_sars(*poses, 400, SarsOptions(radius=0.5))
+    table = metric_table(*poses)[np.ix_(selected, selected)]
     assert 1 < len(selected) < 400
     assert table[~np.eye(len(selected), dtype=bool)].min() >= 0.5
-    assert covering_radius(positions, quaternions, selected) < 0.5
+    assert covering_radius(poses, selected) < 0.5
 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("capacity", [0, 1, 2, 37, 300, 500])
 def test_fill_selects_exactly_the_capacity(seed, capacity):
-    positions, quaternions = random_walk(np.random.default_rng(seed), 300)
-    selected = select_sars(positions, quaternions, capacity, SarsOptions(fill=True))
+    poses = random_walk(np.random.default_rng(seed), 300)
+    selected = select_sars(*poses, capacity, FILL)
     assert len(selected) == len(set(selected.tolist())) == min(capacity, 300)
 
 
 def test_fill_on_a_line():
     """Eleven frames 0.1 apart, in order: three fit at r <= 0.5, four at r <= 0.3."""
-    fill = SarsOptions(fill=True)
-    positions = np.stack([np.arange(11.0), np.zeros(11), np.zeros(11)], axis=1)
-    quaternions = np.tile([1.0, 0, 0, 0], (11, 1))
-    assert select_sars(positions, quaternions, 3, fill).tolist() == [0, 5, 10]
-    assert select_sars(positions, quaternions, 4, fill).tolist() == [0, 3, 6, 9]
+    line = upright(*np.arange(11.0))
+    assert select_sars(*line, 3, FILL).tolist() == [0, 5, 10]
+    assert select_sars(*line, 4, FILL).tolist() == [0, 3, 6, 9]
 
 
 def test_fill_with_repeats_selects_every_pose():
     rng = np.random.default_rng(6)
     positions, quaternions = random_walk(rng, 12)
     visits = np.concatenate([np.arange(12), rng.integers(0, 12, size=288)])
-    positions = positions[visits]
-    quaternions = quaternions[visits]
-    selected = select_sars(positions, quaternions, 30, SarsOptions(fill=True))
+    poses = (positions[visits], quaternions[visits])
+    selected = select_sars(*poses, 30, FILL)
     assert len(selected) == 30
     assert set(visits[selected]) == set(range(12))
-    assert covering_radius(positions, quaternions, selected) == 0.0
+    assert covering_radius(poses, selected) == 0.0
 
 
 def test_fill_covers_better_than_the_fixed_radius():
-    positions, quaternions = random_walk(np.random.default_rng(7), 1000, step=0.01)
-    fixed = select_sars(positions, quaternions, 100)
-    filled = select_sars(positions, quaternions, 100, SarsOptions(fill=True))
+    poses = random_walk(np.random.default_rng(7), 1000, step=0.01)
+    fixed = select_sars(*poses, 100)
+    filled = select_sars(*poses, 100, FILL)
     assert len(fixed) < 100 == len(filled)
-    assert covering_radius(positions, quaternions, filled) < 0.7 * covering_radius(
-        positions, quaternions, fixed
-    )
+    assert covering_radius(poses, filled) < 0.7 * covering_radius(poses, fixed)
 
 
 def test_farthest_equals_slow_twin():
-    positions, quaternions = grid_walk(np.random.default_rng(9), 80)
-    table = metric_table(positions, quaternions).tolist()
+    poses = grid_walk(np.random.default_rng(9), 80)
+    table = metric_table(*poses).tolist()
     expected = [0]
     while len(expected) < 20:
         rest = [i for i in range(80) if i not in expected]
         expected.append(max(rest, key=lambda i: min(table[i][j] for j in expected)))
-    assert select_farthest(positions, quaternions, 20).tolist() == sorted(expected)
+    assert select_farthest(*poses, 20).tolist() == sorted(expected)
 
 
 def test_farthest_selects_repeats_last():
-    positions = np.zeros((5, 3))
-    quaternions = np.tile([1.0, 0, 0, 0], (5, 1))
-    assert select_farthest(positions, quaternions, 9).tolist() == [0, 1, 2, 3, 4]
+    assert select_farthest(*upright(*np.zeros(5)), 9).tolist() == [0, 1, 2, 3, 4]
 
 
-def test_farthest_selects_its_start():
-    positions = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [9, 0, 0], [10, 0, 0]])
-    quaternions = np.tile([1.0, 0, 0, 0], (5, 1))
-    assert select_farthest(positions, quaternions, 3, start=[1, 3]).tolist() == [
-        1,
-        2,
-        3,
-    ]
-    assert select_farthest(positions, quaternions, 2, start=[1, 3]).tolist() == [1, 3]
+@pytest.mark.parametrize(("capacity", "expected"), [(3, [1, 2, 3]), (2, [1, 3])])
+def test_farthest_selects_its_start(capacity, expected):
+    selected = select_farthest(*upright(0, 1, 3, 9, 10), capacity, start=[1, 3])
+    assert selected.tolist() == expected
 
 
 def test_scene_without_frames():
     empty = np.zeros((0, 3)), np.zeros((0, 4))
     assert select_sars(*empty, 5).size == 0
-    assert select_sars(*empty, 5, SarsOptions(fill=True)).size == 0
+    assert select_sars(*empty, 5, FILL).size == 0
     assert select_farthest(*empty, 5).size == 0
 
 
@@ -252,10 +240,3 @@ def test_scene_without_frames():
 def test_misuse_is_refused(positions, quaternions, capacity, message):
     with pytest.raises(ValueError, match=message):
         select_sars(positions, quaternions, capacity)
-
-
-def test_options_are_checked():
-    with pytest.raises(ValueError, match="radius"):
-        SarsOptions(radius=-0.1)
-    with pytest.raises(ValueError, match="rotation_weight"):
-        SarsOptions(rotation_weight=math.nan)

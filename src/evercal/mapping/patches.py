@@ -39,7 +39,7 @@ _WIDE = _grid(RADIUS + 1)
 _MEAN = np.full(SIDE * SIDE, 1 / SIDE**2, np.float32)
 
 
-def image_pyramid(grey: Image, levels: int) -> list[Array]:
+def image_pyramid(grey: Array | Image, levels: int) -> list[Array]:
     """Float images (h, w), each half the size of the previous one; level 0 is the image."""
     pyramid = [grey.astype(np.float32)]
     for _ in range(levels - 1):
@@ -96,7 +96,7 @@ def cut_patches(image: Array, pixels: Array) -> Patches:
     patch = columns[:, 1:-1].reshape(n, SIDE * SIDE)
     patch = patch - patch.mean(1, keepdims=True)
     deviation = np.sqrt((patch * patch).mean(1, keepdims=True)) + _FLAT
-    gradient = np.stack([slope_u, slope_v], -1).reshape(n, -1, 2)
+    gradient = np.stack([slope_u, slope_v], -1).reshape(n, SIDE * SIDE, 2)
     gradient /= deviation[..., None]
     hessian = gradient.transpose(0, 2, 1) @ gradient
     # Beside a flat patch the slopes are so large that the damping needs double precision.

@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.errors import require_numbers
 from evercal.features.encoder import Encoder
 from evercal.features.views import working_image
 from evercal.geometry import SE3, Camera
@@ -30,6 +31,14 @@ class WorkingSize:
     """For the encoder."""
     patches: int = 480
     """For patches; smaller images keep their size."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes below 1.
+
+        Raises:
+            InputError: No positive number of pixels.
+        """
+        require_numbers(self, ("cells", "patches"), 1)
 
 
 class PreparedFrames:

@@ -23,8 +23,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from evercal.errors import require_numbers
 from evercal.geometry.se3 import SE3
-from evercal.typing import IntArray
+from evercal.typing import Array, IntArray
 
 
 @dataclass(frozen=True)
@@ -39,22 +40,21 @@ class SarsOptions:
     """Ignore `radius` and use the largest one that fills the capacity."""
 
     def __post_init__(self) -> None:
-        """Refuse negative or non-finite numbers."""
-        for name in ("radius", "rotation_weight"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(
-                    f"SarsOptions.{name} is {value}; it is a finite number >= 0"
-                )
+        """Refuse numbers outside their range.
+
+        Raises:
+            InputError: A negative or non-finite number.
+        """
+        require_numbers(self, ("radius", "rotation_weight"), 0)
 
 
 @dataclass(frozen=True)
 class PoseSpace:
     """The poses of one scene, scaled for the metric and stored one component per row."""
 
-    positions: np.ndarray
+    positions: Array
     """(3, n) positions divided by the longest side of their box."""
-    quaternions: np.ndarray
+    quaternions: Array
     """(4, n) unit quaternions, wxyz."""
     rotation_weight: float
     """Scene sides per radian."""
@@ -62,8 +62,8 @@ class PoseSpace:
     @classmethod
     def of(
         cls,
-        positions_m: np.ndarray,
-        quaternions_wxyz: np.ndarray,
+        positions_m: Array,
+        quaternions_wxyz: Array,
         rotation_weight: float = 1.0,
     ) -> PoseSpace:
         """Check, scale and transpose ``(n, 3)`` positions and ``(n, 4)`` quaternions.
@@ -78,19 +78,19 @@ class PoseSpace:
                 f"poses are (n, 3) and (n, 4), got {positions.shape} and {quaternions.shape}"
             )
         norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
-        bad = (
-            ~np.isfinite(positions).all(axis=1)
-            | ~np.isfinite(norms[:, 0])
-            | (norms[:, 0] == 0)
-        )
+        finite = np.isfinite(np.hstack([positions, norms])).all(axis=1)
+        bad = ~finite | (norms[:, 0] == 0)
         if bad.any():
             raise ValueError(
                 f"pose {int(np.argmax(bad))} is not finite or has a zero quaternion; "
                 "leave untracked frames out"
             )
-        side = float(np.ptp(positions, axis=0).max()) if len(positions) else 0.0
+        extent = positions.max(0, initial=-np.inf) - positions.min(0, initial=np.inf)
+        side = float(extent.max())
+        if side <= 0:
+            side = 1.0
         return cls(
-            np.ascontiguousarray((positions / (side or 1.0)).T),
+            np.ascontiguousarray((positions / side).T),
             np.ascontiguousarray((quaternions / norms).T),
             rotation_weight,
         )
@@ -99,9 +99,7 @@ class PoseSpace:
         """Return the number of poses."""
         return self.positions.shape[1]
 
-    def distances(
-        self, index: int, others: slice | np.ndarray = slice(None)
-    ) -> np.ndarray:
+    def distances(self, index: int, others: slice | IntArray = slice(None)) -> Array:
         """Return D from pose `index` to the poses of another index, by default to all."""
         here = self.positions[:, index, None]
         quaternion = self.quaternions[:, index, None]
@@ -115,19 +113,19 @@ class PoseSpace:
         return angle + np.sqrt((step**2).sum(axis=0))
 
 
-def _accept_until_full(space: PoseSpace, radius: float, capacity: int) -> np.ndarray:
+def _accept_until_full(space: PoseSpace, radius: float, capacity: int) -> IntArray:
     """Return the frames SARS accepts before its buffer of `capacity` is full."""
     if radius == 0 or capacity == 0:
         return np.arange(min(capacity, len(space)))
-    gap = np.full(len(space), np.inf)  # from each frame to its nearest accepted one
+    # From each frame to its nearest accepted one.
+    gap = np.full(len(space), np.inf)
     accepted: list[int] = []
     frame = 0
     while len(accepted) < capacity:
-        free = gap[frame:] >= radius
-        ahead = int(free.argmax()) if free.size else 0
-        if not free.size or not free[ahead]:
+        free = np.flatnonzero(gap[frame:] >= radius)
+        if not len(free):
             break
-        frame += ahead
+        frame += int(free[0])
         accepted.append(frame)
         later = gap[frame + 1 :]
         np.minimum(later, space.distances(frame, slice(frame + 1, None)), out=later)
@@ -144,11 +142,11 @@ def spread_poses(poses: SE3, capacity: int) -> IntArray:
 
 
 def select_sars(
-    positions_m: np.ndarray,
-    quaternions_wxyz: np.ndarray,
+    positions_m: Array,
+    quaternions_wxyz: Array,
     capacity: int,
     options: SarsOptions | None = None,
-) -> np.ndarray:
+) -> IntArray:
     """Select frames by Algorithm 1 of the paper, run once over the scene in recorded order.
 
     A frame closer than r to the buffer is rejected. Otherwise it is appended; if the buffer is
@@ -177,7 +175,9 @@ def select_sars(
     if capacity < 0:
         raise ValueError(f"capacity is {capacity}; it is a number of frames >= 0")
     space = PoseSpace.of(positions_m, quaternions_wxyz, options.rotation_weight)
-    radius = _largest_radius(space, capacity, 1e-5) if options.fill else options.radius
+    radius = options.radius
+    if options.fill:
+        radius = _largest_radius(space, capacity, 1e-5)
     accepted = _accept_until_full(space, radius, capacity)
     if len(accepted) < capacity or not len(accepted):
         return accepted
@@ -219,12 +219,12 @@ def _largest_radius(space: PoseSpace, capacity: int, tolerance: float) -> float:
 
 
 def select_farthest(
-    positions_m: np.ndarray,
-    quaternions_wxyz: np.ndarray,
+    positions_m: Array,
+    quaternions_wxyz: Array,
     capacity: int,
     rotation_weight: float = 1.0,
     start: Sequence[int] = (),
-) -> np.ndarray:
+) -> IntArray:
     """Farthest-point sampling of poses.
 
     Starting from `start`, or the first frame, the frame farthest from all selected ones is added
@@ -238,7 +238,6 @@ def select_farthest(
         if i == len(selected):
             selected.append(int(gap.argmax()))
         np.minimum(gap, space.distances(selected[i]), out=gap)
-        gap[
-            selected[: i + 1]
-        ] = -1.0  # another frame with the same pose can still be selected
+        # Another frame with the same pose can still be selected.
+        gap[selected[: i + 1]] = -1.0
     return np.sort(np.array(selected, np.int64))
