@@ -29,7 +29,7 @@ from benchmarks.rows import Row, once, save
 from evercal.calibration.boards.corners import lens_vector
 from evercal.calibration.boards.intrinsics import moved_camera
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
-from evercal.calibration.pose_pairs.solve import solve, solve_pairs
+from evercal.calibration.pose_pairs.solve import solve, solve_pose_pairs
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3, pose_distance
@@ -120,7 +120,7 @@ def measure_sessions(name: str, count: int) -> Row:
         drawn = [record(setting, seed, session) for session in range(2)]
         try:
             fits = [
-                solve_pairs(p, setting.mount, corners=c)
+                solve_pose_pairs(p, setting.mount, corners=c)
                 for p, c in map(corner_pairs, drawn)
             ]
         except InputError:

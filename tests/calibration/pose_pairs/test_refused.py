@@ -176,7 +176,7 @@ UNUSUAL: dict[str, tuple[Mistake, str]] = {
         robot_by(scaled(1000, slice(3, 9))),
         "the robot poses mix units: row 4, row 5, row 6, row 7, row 8 and 1 more",
     ),
-    "robot transposed": (robot_by(transposed), "look transposed|--robot-convention"),
+    "robot transposed": (robot_by(transposed), "look transposed|`robot_convention`"),
     "shuffled rows": (
         lambda p: replace(
             p, camera_from_board=p.camera_from_board[np.arange(25) * 7 % 25]

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from evercal.calibration.located import locate
 from evercal.calibration.pose_pairs.fit import HandEyeFit
 from evercal.calibration.pose_pairs.pairs import PosePairs
-from evercal.calibration.pose_pairs.solve import solve_pairs
+from evercal.calibration.pose_pairs.solve import solve_pose_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, axis_deviation, cross_matrix
 from evercal.localization.intrinsics import cameras_in_scenes
@@ -115,7 +115,7 @@ def align_by_gripper(
     map_from_camera = SE3.stack([item.pose for item in located])
     names = tuple(item.name for item in located)
     pairs = PosePairs(names, base_from_gripper, map_from_camera.inverse())
-    solution = solve_pairs(pairs, "eye_in_hand", scale_known, of_board=False)
+    solution = solve_pose_pairs(pairs, "eye_in_hand", scale_known, of_board=False)
     fit = solution.fit
     similarity = Similarity(fit.at.fixed_from_board, solution.board_scale)
     size = 12 + solution.equation.extras.names.index("size")

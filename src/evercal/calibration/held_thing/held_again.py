@@ -12,7 +12,7 @@ import numpy as np
 from evercal.calibration.located import ImagePose, length_mm_deg
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solution import PairSolution
-from evercal.calibration.pose_pairs.solve import solve_pairs
+from evercal.calibration.pose_pairs.solve import solve_pose_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3
 
@@ -57,7 +57,7 @@ def held_again(
         SE3.stack([item.pose for item in items]).inverse(),
     )
     try:
-        solution = solve_pairs(pairs, "eye_to_hand", of_board=False)
+        solution = solve_pose_pairs(pairs, "eye_to_hand", of_board=False)
     except InputError:
         return None
     change = solution.fixed_from_board

@@ -3,7 +3,6 @@
 After the fit: held-out poses, repeatability, open directions, a stated size.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,21 +15,63 @@ from evercal.calibration.pose_pairs.fit import (
     refine,
     robust_fit,
 )
-from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs, listed
+from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation, Unknowns
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
+from evercal.storage.text_files import few
 from evercal.typing import IntArray
 
-_FAR_M = 20.0
+_MAX_DISTANCE_M = 20.0
+"""Distance of poses from the origin above which they are not in metres."""
 _MIN_ROTATION_DEG = 2.0
+"""Minimum root mean square angle between two poses about the main axis."""
 _MIN_SECOND_DEG = 1.0
+"""Minimum root mean square angle between two poses about a second axis."""
 _MIN_TRANSLATION_M = 0.01
+"""Minimum spread of the gripper's positions for an unknown scale."""
 _SAME_LIST = 0.1
 """Differences of robot and camera poses that make them one list, parts of the robot's motion."""
-_STILL_M = 1e-3
-_STILL_RAD = np.deg2rad(0.1)
+_AT_REST_M = 1e-3
+"""Distance from the first pose below which no pose moves."""
+_AT_REST_RAD = np.deg2rad(0.1)
+"""Angle from the first pose below which no pose moves."""
+_NAMES = 5
+"""Number of names of poses in a message."""
 _RECORD = "record 15 to 25 poses that differ by 20 to 60 deg about two axes and by 10 cm or more"
+FOLDS = 5
+"""Number of parts of the poses that are held out in turn."""
+_MIN_HALVED = 12
+"""Minimum number of poses for two calibrations from a half each."""
+_MAIN_SHARE = 0.5
+"""Share of the variance that names a cause."""
+_ELONGATED = 4.0
+"""Ratio of the two largest standard deviations that names a direction."""
+_SMALL_MM = 0.1
+"""Standard deviation below which nothing is left open."""
+_REMEDIES = {
+    "intrinsics": (
+        "the intrinsics, which trade against distance: tilt the board by 30 to 45 deg, vary the"
+        " distance by half, fill the corners of the image, or give a known lens with `camera`"
+    ),
+    "shared depth": (
+        "a depth error that all images share: add poses that turn by 30 to 60 deg about two axes,"
+        " so that the same depth points in different directions"
+    ),
+    "size": (
+        "the size of the squares, which trades against distance: measure it over the whole board,"
+        " and move the gripper by 20 cm or more between poses"
+    ),
+}
+"""Causes of uncertainty by group of extras, and what removes them."""
+SIZE_SIGMA = 0.002
+"""Relative standard deviation of a stated square size, and of a depth error of all images."""
+_SIZE_SIGMAS = 3.0
+"""Significance of a wrong size, standard deviations."""
+_LARGE_SIZE = 0.1
+"""Relative error of a size that is believed only if the residuals fall by `_MUCH_BETTER`."""
+_MUCH_BETTER = 3.0
+"""Factor by which a large error of the size reduces the residuals."""
 
 
 def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
@@ -38,18 +79,18 @@ def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
     n = len(pairs)
     if n < MIN_POSES:
         raise InputError(
-            f"{n} pose {'pair' if n == 1 else 'pairs'}; hand-eye calibration takes at least"
+            f"{_counted(n, 'pose pair')}; hand-eye calibration takes at least"
             f" {MIN_POSES}, because an outlier among fewer cannot be detected; {_RECORD}"
         )
-    _require_metres(pairs.base_from_gripper, pairs.names, "robot")
+    _require_metres(pairs, pairs.base_from_gripper, "robot")
     if scale_known:
-        _require_metres(pairs.camera_from_board, pairs.names, "camera")
+        _require_metres(pairs, pairs.camera_from_board, "camera")
     different = np.unique(pairs.repeats(scale_known))
     if len(different) < MIN_POSES:
+        names = few([pairs.names[i] for i in different], most=_NAMES)
         raise InputError(
-            f"{n} pose pairs hold only {len(different)} different"
-            f" {'one' if len(different) == 1 else 'ones'}"
-            f" ({listed([pairs.names[i] for i in different])}); repeats add nothing: {_RECORD}"
+            f"{n} pose pairs hold only {_counted(len(different), 'different one')}"
+            f" ({names}); repeats add nothing: {_RECORD}"
         )
     _require_motion(pairs[different], scale_known)
     grippers = pairs.base_from_gripper[different]
@@ -61,6 +102,12 @@ def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
             f" {1000 * spread:.1f} mm), so the scale of the camera poses is open; also move the"
             f" gripper by 10 cm or more between poses"
         )
+
+
+def _counted(n: int, what: str) -> str:
+    if n == 1:
+        return f"1 {what}"
+    return f"{n} {what}s"
 
 
 def require_two_lists(pairs: PosePairs) -> None:
@@ -95,14 +142,13 @@ def require_rotations(
 
     The angles are root mean squares between two poses, about the main and the second axis.
     """
-    rows = np.unique(
-        np.linspace(0, len(base_from_gripper) - 1, 100).round().astype(int)
-    )
-    i, j = np.triu_indices(len(rows), 1)
-    motions = base_from_gripper[rows[i]].inverse() @ base_from_gripper[rows[j]]
+    rows = np.linspace(0, len(base_from_gripper) - 1, 100).round().astype(int)
+    grippers = base_from_gripper[np.unique(rows)]
+    i, j = np.triu_indices(len(grippers), 1)
+    motions = grippers[i].inverse() @ grippers[j]
     rotations = 2.0 * motions.rotation_wxyz[:, 1:]
     values, axes = np.linalg.eigh(rotations.T @ rotations / len(rotations))
-    main, second = np.rad2deg(np.sqrt(np.maximum(values[[2, 1]], 0)))
+    _, second, main = np.rad2deg(np.sqrt(np.maximum(values, 0)))
     if main < main_deg:
         raise InputError(
             f"pure translation: the gripper hardly turned (by {main:.1f} deg rms), so the position"
@@ -119,21 +165,24 @@ def require_rotations(
         )
 
 
-def _require_metres(poses: SE3, names: Sequence[str], role: str) -> None:
+def _require_metres(pairs: PosePairs, poses: SE3, role: str) -> None:
     distance = np.linalg.norm(poses.translation_m, axis=1)
-    far = distance > _FAR_M
+    far = distance > _MAX_DISTANCE_M
     if not far.any():
         return
+    typical = float(np.median(distance[far]))
     if far.mean() > 0.9:
-        millimetres = float(np.median(distance[far])) > 10 * _FAR_M
+        unit = "another unit"
+        if typical > 10 * _MAX_DISTANCE_M:
+            unit = "millimetres"
         raise InputError(
-            f"the {role} poses look like {'millimetres' if millimetres else 'another unit'}, not"
+            f"the {role} poses look like {unit}, not"
             f" metres: their distance from the origin is {float(np.median(distance)):.0f};"
             f" convert them, or correct the unit in the file's header or pose convention"
         )
-    rows = listed([name for name, is_far in zip(names, far, strict=True) if is_far])
+    names = few([pairs.names[i] for i in np.flatnonzero(far)], most=_NAMES)
     raise InputError(
-        f"the {role} poses mix units: {rows} are {float(np.median(distance[far])):.0f} from the"
+        f"the {role} poses mix units: {names} are {typical:.0f} from the"
         f" origin, the others {float(np.median(distance[~far])):.2f}; give all of them in metres"
     )
 
@@ -160,29 +209,7 @@ def _require_motion(pairs: PosePairs, scale_known: bool) -> None:
 
 def _is_still(poses: SE3, unit_m: float) -> bool:
     metres, radians = pose_distance(poses[0], poses)
-    return bool(metres.max() / unit_m < _STILL_M and radians.max() < _STILL_RAD)
-
-
-FOLDS = 5
-_MIN_HALVED = 12
-_MAIN_SHARE, _ELONGATED = 0.5, 4.0
-"""Share of the variance that names a cause, and ratio of deviations that names a direction."""
-_SMALL_MM = 0.1
-"""Standard deviation below which nothing is left open."""
-_REMEDIES = {
-    "intrinsics": (
-        "the intrinsics, which trade against distance: tilt the board by 30 to 45 deg, vary the"
-        " distance by half, fill the corners of the image, or give a known lens with --camera"
-    ),
-    "shared depth": (
-        "a depth error that all images share: add poses that turn by 30 to 60 deg about two axes,"
-        " so that the same depth points in different directions"
-    ),
-    "size": (
-        "the size of the squares, which trades against distance: measure it over the whole board,"
-        " and move the gripper by 20 cm or more between poses"
-    ),
-}
+    return bool(metres.max() / unit_m < _AT_REST_M and radians.max() < _AT_REST_RAD)
 
 
 def held_out_error(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
@@ -200,10 +227,14 @@ def held_out_error(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
         residual = equation[rows[held_out]].system(at).residual.reshape(-1, 2, 3)
         lengths.append(np.linalg.norm(residual, axis=2))
     error = np.concatenate(lengths) * (1000.0, 180 / np.pi)
-    rms = np.sqrt((error**2).mean(0))
-    median = np.median(error, 0)
-    names = ("held_out_mm", "held_out_deg", "held_out_rms_mm", "held_out_rms_deg")
-    return dict(zip(names, (*median.tolist(), *rms.tolist()), strict=True))
+    median_mm, median_deg = np.median(error, 0).tolist()
+    rms_mm, rms_deg = np.sqrt((error**2).mean(0)).tolist()
+    return {
+        "held_out_mm": median_mm,
+        "held_out_deg": median_deg,
+        "held_out_rms_mm": rms_mm,
+        "held_out_rms_deg": rms_deg,
+    }
 
 
 def repeatability(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
@@ -211,10 +242,9 @@ def repeatability(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
     rows = np.flatnonzero(fit.inliers)
     if len(rows) < _MIN_HALVED:
         return {}
-    halves = (
-        _refined(equation, fit, rows[half::2]).parent_from_camera for half in range(2)
-    )
-    millimetres, degrees = pose_distance_mm_deg(*halves)
+    even = _refined(equation, fit, rows[0::2]).parent_from_camera
+    odd = _refined(equation, fit, rows[1::2]).parent_from_camera
+    millimetres, degrees = pose_distance_mm_deg(even, odd)
     return {"repeatability_mm": millimetres, "repeatability_deg": degrees}
 
 
@@ -227,15 +257,13 @@ def _refined(equation: PoseEquation, fit: HandEyeFit, rows: IntArray) -> Unknown
 def left_open(fit: HandEyeFit, parent: str) -> list[str]:
     """Return what the poses determine badly, and which poses to add; one sentence each."""
     position = fit.factor * fit.covariance[:3, :3]
-    total = float(np.trace(position))
-    sentences = []
-    if 1000 * np.sqrt(total / 3) < _SMALL_MM:
+    if 1000 * np.sqrt(float(np.trace(position)) / 3) < _SMALL_MM:
         return []
+    sentences = []
+    total = np.trace(fit.covariance[:3, :3])
     for group, remedy in _REMEDIES.items():
-        share = fit.contributions.get(group)
-        if share is not None and np.trace(share[:3, :3]) > _MAIN_SHARE * np.trace(
-            fit.covariance[:3, :3]
-        ):
+        share = fit.contributions.get(group, np.zeros((6, 6)))
+        if np.trace(share[:3, :3]) > _MAIN_SHARE * total:
             sentences.append(f"Most of the uncertainty is due to {remedy}.")
     values, axes = np.linalg.eigh(position)
     sigma = 1000 * np.sqrt(np.maximum(values, 0))
@@ -249,14 +277,6 @@ def left_open(fit: HandEyeFit, parent: str) -> list[str]:
     return sentences
 
 
-SIZE_SIGMA = 0.002
-"""Relative standard deviation of a stated square size, and of a depth error of all images."""
-_SIZE_SIGMAS = 3.0
-"""Significance of a wrong size, standard deviations."""
-_LARGE_SIZE, _MUCH_BETTER = 0.1, 3.0
-"""An error above the first is believed only if the residuals fall by the second factor."""
-
-
 def with_tested_size(
     equation: PoseEquation,
     fit: HandEyeFit,
@@ -268,36 +288,39 @@ def with_tested_size(
     free = replace(equation, extras=equation.extras.without_prior("size"))
     freed = robust_fit(free, agreement(free, fit.at))
     k = equation.extras.names.index("size")
-    off = float(freed.at.extras[k])
+    error = float(freed.at.extras[k])
     sigma = float(freed.sigma[12 + k])
     sigma *= float(np.sqrt(1 + _alike(freed)))
-    if abs(off) < max(_SIZE_SIGMAS * sigma, SIZE_SIGMA):
+    if abs(error) < max(_SIZE_SIGMAS * sigma, SIZE_SIGMA):
         return equation, fit, []
     # A camera in the point of rotation that sees a board of size zero fits, too.
-    if off < -0.5:
+    if error < -0.5:
         warning = "the gripper turned about one point, so a wrong size of the board stays hidden"
         return equation, fit, [warning]
+    percent = 100 * abs(error)
     what = "board" if of_board else "map"
-    larger = "larger" if off > 0 else "smaller"
-    if abs(off) > _LARGE_SIZE and _misfit(fit) < _MUCH_BETTER * _misfit(freed):
+    larger = "larger" if error > 0 else "smaller"
+    if abs(error) > _LARGE_SIZE and _misfit(fit) < _MUCH_BETTER * _misfit(freed):
         warning = (
-            f"a {100 * abs(off):.0f} % {larger} {what} improves the fit but does not explain the"
+            f"a {percent:.0f} % {larger} {what} improves the fit but does not explain the"
             f" residuals: check its size, the robot poses and the intrinsics"
         )
         return equation, fit, [warning]
-    evidence = f"by the robot's motions ({abs(off) / sigma:.0f} standard deviations)"
+    deviation = f"{percent:.2f} +- {100 * sigma:.2f} %"
+    evidence = f"by the robot's motions ({abs(error) / sigma:.0f} standard deviations)"
     if not of_board:
+        short = "short" if error > 0 else "long"
         warning = (
-            f"the lengths of the map are {100 * abs(off):.2f} +- {100 * sigma:.2f} % too"
-            f" {'short' if off > 0 else 'long'}, {evidence}: the estimated scale is used"
+            f"the lengths of the map are {deviation} too"
+            f" {short}, {evidence}: the estimated scale is used"
         )
         return free, freed, [warning]
-    size = f"a square or tag of 24 mm would measure {24 * (1 + off):.2f} mm"
+    size = f"a square or tag of 24 mm would measure {24 * (1 + error):.2f} mm"
     if corners is not None and corners.size_m is not None:
         stated = 1000 * corners.size_m
-        size = f"its side measures {stated * (1 + off):.2f} mm, not {stated:.2f} mm"
+        size = f"its side measures {stated * (1 + error):.2f} mm, not {stated:.2f} mm"
     warning = (
-        f"the board is {100 * abs(off):.2f} +- {100 * sigma:.2f} % {larger} than stated,"
+        f"the board is {deviation} {larger} than stated,"
         f" {evidence}: {size}; check its size and the focal length. The calibration uses the"
         f" estimated size"
     )
@@ -309,11 +332,10 @@ def _alike(fit: HandEyeFit) -> float:
 
     Together as large as the noise, they move the size as much as all poses with independent noise.
     """
-    noise = sum(
-        np.trace(fit.contributions[kind][:3, :3])
-        for kind in KINDS
-        if kind in fit.contributions
-    )
+    noise = 0.0
+    for kind in KINDS:
+        if kind in fit.contributions:
+            noise = noise + np.trace(fit.contributions[kind][:3, :3])
     return float(noise / np.trace(fit.covariance[:3, :3]) * fit.inliers.sum())
 
 

@@ -13,31 +13,38 @@ import numpy as np
 from scipy.stats import chi2, f
 
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation, System, Unknowns
+from evercal.geometry.normal_equations import normal_inverse, normal_solution
 from evercal.typing import Array, BoolArray
 
-_TAILS = 3.0
-"""Degrees of freedom of the Student t distribution in `agreement`."""
+_STUDENT_FREEDOM = 3.0
+"""Degrees of freedom of the Student t distribution of the residuals in `agreement`."""
 _GROSS = 40.0
 """Squared distance of gross outliers, which the first noise estimate ignores."""
 _REJECTION = 0.001
 """Probability of rejecting any pose of a recording without outliers."""
-_ROUNDS = 12
+_MAX_ROUNDS = 12
 """Maximum number of rounds of refinement, noise estimation and rejection."""
+_MAX_STEPS = 30
+"""Maximum number of Gauss-Newton steps."""
 MIN_POSES = 5
 """Minimum number of different poses; an outlier among fewer cannot be detected."""
 KINDS = ("translation", "rotation about gripper", "depth", "rotation about board")
 """Kinds of noise: two of an arm, and two of a camera unless corners tell its noise."""
 _FLOOR = np.diag([1e-14] * 6)
 """Minimum variance of a pose, metres^2 and radians^2, so that exact poses have finite weight."""
-_LEVEL_ROUNDS = 100
+_MAX_LEVEL_ROUNDS = 100
+"""Maximum number of rounds of the estimate of noise levels."""
 _COVERAGE = 0.95
+"""Coverage of the ellipsoids that `ellipsoid_factor` widens."""
 
 
 class NoiseLevels(NamedTuple):
-    """Variances (k,) of the kinds of noise, metres^2 or radians^2, and their covariance (k, k)."""
+    """Variances of the kinds of noise."""
 
     variance: Array
+    """(k,) metres^2 or radians^2."""
     uncertainty: Array
+    """(k, k) covariance of the variances."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +83,9 @@ class Agreement:
 
     at: Unknowns
     metres: float
-    """Standard deviation of the board position per axis; `radians` of its rotation."""
+    """Standard deviation of the board position per axis."""
     radians: float
+    """Standard deviation of the board rotation per axis."""
     inliers: BoolArray
     """(n,) poses without gross errors."""
 
@@ -90,48 +98,47 @@ def agreement(equation: PoseEquation, start: Unknowns) -> Agreement:
     to_sigma = np.sqrt(n / max(n - 2.0, 1.0)) / np.sqrt(chi2.ppf(0.5, 3))
     sigma = np.zeros(2)
     distance2 = np.zeros(n)
-    for _ in range(30):
+    for _ in range(_MAX_STEPS):
         system = equation.system(at)
         lengths = np.linalg.norm(system.residual.reshape(n, 2, 3), axis=2)
         sigma = np.maximum(np.median(lengths, 0) * to_sigma, 1e-8)
         distance2 = ((lengths / sigma) ** 2).sum(1)
-        weight = (_TAILS + 6) / (_TAILS + distance2)
-        step, length2 = _step(
-            system, weight[:, None, None] * np.diag(np.repeat(sigma**-2.0, 3))
-        )
+        weight = (_STUDENT_FREEDOM + 6) / (_STUDENT_FREEDOM + distance2)
+        information = np.diag(np.repeat(sigma**-2.0, 3))
+        step, length2 = _step(system, weight[:, None, None] * information)
         at = at.moved(step)
         if length2 < 1e-2:
             break
     # The median of few poses is uncertain, so an inlier may have a large distance.
     gross = _GROSS * (1 + _GROSS / max(n - 3, 1) ** 2)
-    return Agreement(at, float(sigma[0]), float(sigma[1]), distance2 < gross)
+    return Agreement(at, *sigma.tolist(), inliers=distance2 < gross)
 
 
 def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
     """Refine the result of `agreement` for at least four sorted poses, and reject outliers."""
+    n = len(equation)
     at = start.at
     inliers = start.inliers
-    levels = None
     # Outliers cannot be detected; all poses widen the covariance.
     if inliers.sum() < MIN_POSES:
-        inliers = np.ones(len(equation), dtype=bool)
-    plain = np.diag(np.repeat([start.metres**2, start.radians**2], 3))
-    weights = np.broadcast_to(plain, (len(equation), 6, 6))
-    for _ in range(_ROUNDS):
+        inliers = np.ones(n, dtype=bool)
+    levels = None
+    variances = np.repeat([start.metres**2, start.radians**2], 3)
+    weights = np.broadcast_to(np.diag(variances), (n, 6, 6))
+    for _ in range(_MAX_ROUNDS):
         at = refine(equation, at, weights, inliers)
         used = equation[inliers].system(at)
         system = equation.system(at)
         levels = estimate_levels(used, levels)
         weights = noise_of(system, levels.variance)
         information = np.linalg.inv(weights[inliers])
-        covariance = normal_inverse(_normal(used, information @ used.jacobian))
+        covariance = clipped_inverse(_normal(used, information @ used.jacobian))
         distance2 = _distances(system, weights, covariance, inliers)
         freedom = max(6 * int(inliers.sum()) - equation.unknowns, 2)
-        selected = distance2 < 6 * f.ppf(1 - _REJECTION / len(inliers), 6, freedom)
-        if (
-            selected.sum() < max(MIN_POSES, len(selected) // 2)
-            or (selected == inliers).all()
-        ):
+        limit = 6 * f.ppf(1 - _REJECTION / len(inliers), 6, freedom)
+        selected = distance2 < limit
+        too_few = selected.sum() < max(MIN_POSES, n // 2)
+        if too_few or (selected == inliers).all():
             break
         inliers = selected
     assert levels is not None
@@ -145,7 +152,7 @@ def refine(
     """Minimize least squares by Gauss-Newton steps; `weights` (n, 6, 6) are covariances."""
     selected = equation[use]
     information = np.linalg.inv(weights[use])
-    for _ in range(30):
+    for _ in range(_MAX_STEPS):
         step, length2 = _step(selected.system(at), information)
         at = at.moved(step)
         if length2 < 1e-4:
@@ -160,9 +167,8 @@ def least_sigma(equation: PoseEquation, fit: HandEyeFit) -> Array:
     """
     system = equation[fit.inliers].system(fit.at)
     information = np.repeat([1e-4, np.deg2rad(0.01)], 3) ** -2.0
-    return np.sqrt(
-        np.diag(normal_inverse(_normal(system, information[:, None] * system.jacobian)))
-    )
+    normal = _normal(system, information[:, None] * system.jacobian)
+    return np.sqrt(np.diag(clipped_inverse(normal)))
 
 
 def estimate_levels(system: System, start: NoiseLevels | None = None) -> NoiseLevels:
@@ -173,12 +179,9 @@ def estimate_levels(system: System, start: NoiseLevels | None = None) -> NoiseLe
         variance = _first_levels(system)
     else:
         variance = np.maximum(start.variance, 1e-6 * (sizes @ start.variance) / sizes)
-    weight, weighted, inverse = _weighting(system, spreads, variance)
-    for _ in range(_LEVEL_ROUNDS):
-        gradient = (
-            np.einsum("nip,ni->p", weighted, system.residual)
-            + system.prior @ system.change
-        )
+    for _ in range(_MAX_LEVEL_ROUNDS):
+        weight, weighted, inverse = _weighting(system, spreads, variance)
+        gradient = _gradient(system, weighted)
         error = system.residual - system.jacobian @ (inverse @ gradient)
         error = (weight @ error[..., None])[..., 0]
         projector = weight - weighted @ inverse @ weighted.transpose(0, 2, 1)
@@ -186,16 +189,19 @@ def estimate_levels(system: System, start: NoiseLevels | None = None) -> NoiseLe
         expected = np.einsum("nij,knji->k", projector, spreads)
         before = variance
         variance = variance * np.sqrt(forms / expected)
-        weight, weighted, inverse = _weighting(system, spreads, variance)
-        if (sizes * np.abs(variance - before)).max() <= 2e-3 * (sizes * variance).max():
+        change = (sizes * np.abs(variance - before)).max()
+        if change <= 2e-3 * (sizes * variance).max():
             break
+    weight, weighted, inverse = _weighting(system, spreads, variance)
     return NoiseLevels(variance, _level_uncertainty(spreads, weight, weighted, inverse))
 
 
 def _first_levels(system: System) -> Array:
-    metres2, radians2 = (np.mean(part**2) for part in np.split(system.residual, 2, 1))
+    metres2 = np.mean(system.residual[:, :3] ** 2)
+    radians2 = np.mean(system.residual[:, 3:] ** 2)
     rotations = [kind.startswith("rotation") for kind in system.directions]
-    return np.where(rotations, radians2, metres2) * 2 / len(rotations) + 1e-18
+    levels = np.where(rotations, radians2, metres2)
+    return levels * 2 / len(rotations) + 1e-18
 
 
 def _weighting(
@@ -203,7 +209,7 @@ def _weighting(
 ) -> tuple[Array, Array, Array]:
     weight = np.linalg.inv(system.known + _FLOOR + np.tensordot(variance, spreads, 1))
     weighted = weight @ system.jacobian
-    return weight, weighted, normal_inverse(_normal(system, weighted))
+    return weight, weighted, clipped_inverse(_normal(system, weighted))
 
 
 def _level_uncertainty(
@@ -212,17 +218,12 @@ def _level_uncertainty(
     turned = spreads @ weight
     own = np.einsum("anij,bnji->ab", turned, turned)
     sides = spreads @ weighted
-    shared = np.einsum(
-        "anip,nij,bnjq,pq->ab", sides, weight, sides, inverse, optimize=True
-    )
-    grams = (
-        np.einsum("nip,anij,njq->apq", weighted, spreads, weighted, optimize=True)
-        @ inverse
-    )
+    terms = "anip,nij,bnjq,pq->ab"
+    shared = np.einsum(terms, sides, weight, sides, inverse, optimize=True)
+    terms = "nip,anij,njq->apq"
+    grams = np.einsum(terms, weighted, spreads, weighted, optimize=True) @ inverse
     gram = own - 2 * shared + np.einsum("apq,bqp->ab", grams, grams)
-    unit = 1 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    scaled = gram * np.outer(unit, unit) + 1e-9 * np.eye(len(gram))
-    return 2.0 * np.linalg.inv(scaled) * np.outer(unit, unit)
+    return 2.0 * normal_inverse(gram, 1e-9)
 
 
 def noise_of(system: System, variance: Array) -> Array:
@@ -231,9 +232,8 @@ def noise_of(system: System, variance: Array) -> Array:
 
 
 def _spreads(system: System) -> Array:
-    return np.stack(
-        [part @ part.transpose(0, 2, 1) for part in system.directions.values()]
-    )
+    directions = system.directions.values()
+    return np.stack([part @ part.transpose(0, 2, 1) for part in directions])
 
 
 def ellipsoid_factor(covariance: Array, slopes: Array, uncertainty: Array) -> float:
@@ -250,14 +250,16 @@ def ellipsoid_factor(covariance: Array, slopes: Array, uncertainty: Array) -> fl
     gradient = np.einsum("dm,kde,em->mk", whiten, slopes, whiten)
     relative = np.einsum("mk,kl,ml->m", gradient, uncertainty, gradient).max()
     freedom = float(np.clip(2 / max(relative, 1e-300), 2.5, 1e6))
-    return max(1.0, float(d * f.ppf(_COVERAGE, d, freedom) / chi2.ppf(_COVERAGE, d)))
+    quantile = d * f.ppf(_COVERAGE, d, freedom)
+    return max(1.0, float(quantile / chi2.ppf(_COVERAGE, d)))
 
 
-def normal_inverse(normal: Array) -> Array:
+def clipped_inverse(normal: Array) -> Array:
     """Invert (p, p) normal equations; an unconstrained unknown gets a huge variance."""
     unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-200))
-    values, axes = np.linalg.eigh(normal * np.outer(unit, unit))
-    return np.outer(unit, unit) * ((axes / np.maximum(values, 1e-14)) @ axes.T)
+    units = np.outer(unit, unit)
+    values, axes = np.linalg.eigh(normal * units)
+    return units * ((axes / np.maximum(values, 1e-14)) @ axes.T)
 
 
 def _normal(system: System, weighted: Array) -> Array:
@@ -265,16 +267,16 @@ def _normal(system: System, weighted: Array) -> Array:
     return weighted.reshape(-1, p).T @ system.jacobian.reshape(-1, p) + system.prior
 
 
+def _gradient(system: System, weighted: Array) -> Array:
+    from_prior = system.prior @ system.change
+    return np.einsum("nip,ni->p", weighted, system.residual) + from_prior
+
+
 def _step(system: System, information: Array) -> tuple[Array, float]:
+    """Return the Gauss-Newton step (p,) and its squared Mahalanobis length."""
     weighted = information @ system.jacobian
     normal = _normal(system, weighted)
-    # Scale the unknowns so that the normal equations are well conditioned.
-    unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    gradient = (
-        np.einsum("nip,ni->p", weighted, system.residual) + system.prior @ system.change
-    )
-    scaled = normal * np.outer(unit, unit)
-    step = -unit * np.linalg.lstsq(scaled, unit * gradient, rcond=1e-13)[0]
+    step = -normal_solution(normal, _gradient(system, weighted))
     return step, float(step @ normal @ step)
 
 
@@ -285,27 +287,30 @@ def _result(
     used = equation[use].system(at)
     noise = noise_of(system, levels.variance)
     weighted = np.linalg.inv(noise[use]) @ used.jacobian
-    covariance = normal_inverse(_normal(used, weighted))
+    covariance = clipped_inverse(_normal(used, weighted))
     # (n, p, 6) response of the unknowns to each residual.
     gain = covariance @ weighted.transpose(0, 2, 1)
-    moves = [gain[:, :6] @ part for part in used.directions.values()]
-    slopes = np.stack([(move @ move.transpose(0, 2, 1)).sum(0) for move in moves])
-    contributions = dict(
-        zip(used.directions, slopes * levels.variance[:, None, None], strict=True)
-    )
-    contributions["known"] = (
-        gain[:, :6] @ used.known @ gain[:, :6].transpose(0, 2, 1)
-    ).sum(0)
+    by_pose = gain[:, :6]
+    slopes = np.zeros((len(levels.variance), 6, 6))
+    contributions: dict[str, Array] = {}
+    for k, (kind, directions) in enumerate(used.directions.items()):
+        moves = by_pose @ directions
+        slopes[k] = (moves @ moves.transpose(0, 2, 1)).sum(0)
+        contributions[kind] = slopes[k] * levels.variance[k]
+    known = by_pose @ used.known @ by_pose.transpose(0, 2, 1)
+    contributions["known"] = known.sum(0)
     for group in dict.fromkeys(equation.extras.groups):
-        own = 12 + equation.extras.indices(group)
-        by_prior = covariance[:6, own]
-        contributions[group] = by_prior @ used.prior[np.ix_(own, own)] @ by_prior.T
+        columns = 12 + equation.extras.indices(group)
+        by_prior = covariance[:6, columns]
+        prior = used.prior[np.ix_(columns, columns)]
+        contributions[group] = by_prior @ prior @ by_prior.T
     # Without a pose its residual no longer pulls; the leverage is the share it explains itself.
     leverage = used.jacobian @ gain
-    pull = np.linalg.solve(np.eye(6) * (1 + 1e-9) - leverage, used.residual[..., None])
+    free = np.eye(6) * (1 + 1e-9) - leverage
+    pull = np.linalg.solve(free, used.residual[..., None])
     moved = np.zeros((len(use), 6))
+    moved[use] = (by_pose @ pull)[..., 0]
     information = np.zeros(len(use))
-    moved[use] = (gain[:, :6] @ pull)[..., 0]
     information[use] = np.trace(leverage, axis1=1, axis2=2) / equation.unknowns
     return HandEyeFit(
         at=at,
@@ -328,6 +333,5 @@ def _distances(
     sign = np.where(use, -1.0, 1.0)[:, None, None]
     explained = system.jacobian @ covariance @ system.jacobian.transpose(0, 2, 1)
     spread = (1 + 1e-3) * noise + sign * explained
-    return (
-        system.residual * np.linalg.solve(spread, system.residual[..., None])[..., 0]
-    ).sum(1)
+    whitened = np.linalg.solve(spread, system.residual[..., None])[..., 0]
+    return (system.residual * whitened).sum(1)

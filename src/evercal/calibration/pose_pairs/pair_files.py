@@ -6,7 +6,11 @@ from typing import Literal
 
 import numpy as np
 
-from evercal.calibration.boards.board_poses import FORMAT, BoardPoses, read_board_poses
+from evercal.calibration.boards.board_poses import (
+    FORMAT,
+    BoardPoses,
+    read_board_poses,
+)
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PoseNumbers, PosePairs
 from evercal.calibration.pose_pairs.time_offset import CameraTrack, interpolated_pairs
 from evercal.errors import InputError
@@ -61,20 +65,23 @@ class _Poses:
     def corners_of(self, rows: IntArray) -> BoardCorners | None:
         if self.board is None:
             return None
-        images = self.board.images
+        views = []
+        left_out = []
+        for row in rows:
+            image = self.board.images[row]
+            if image.view is not None:
+                views.append(image.view)
+            for x, y in image.left_out:
+                left_out.append(f"{image.name} {x:.0f} {y:.0f}")
         printed = self.board.board
         return BoardCorners(
             self.board.camera,
-            tuple(view for row in rows if (view := images[row].view) is not None),
+            tuple(views),
             half_turn=printed.half_turn,
             quarter_turn=printed.quarter_turn,
             stated=self.board.camera_from == "file",
             size_m=printed.size_m,
-            left_out=tuple(
-                f"{images[row].name} {x:.0f} {y:.0f}"
-                for row in rows
-                for x, y in images[row].left_out
-            ),
+            left_out=tuple(left_out),
         )
 
 
@@ -103,12 +110,11 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
             f"{files.robot}: {len(robot.poses)} poses for {len(camera.poses)} images of"
             f" {files.camera}; give one row per image, or name the images in a column 'image'"
         )
-    paired = [
-        (i, row) for i, row in enumerate(rows) if row is not None and camera.measured[i]
-    ]
-    if not paired:
+    shown = np.flatnonzero(camera.measured)
+    images = np.array([i for i in shown if rows[i] is not None], dtype=np.int64)
+    robots = np.array([rows[i] for i in images], dtype=np.int64)
+    if len(images) == 0:
         raise InputError(f"{files.camera}: no image has both a board and a robot pose")
-    images, robots = np.array(paired).T
     names = camera.names or robot.row_names()
     pairs = PosePairs(
         tuple(names[i] for i in images),
@@ -127,11 +133,11 @@ def read_streams(files: PairFiles) -> tuple[PoseTrack, CameraTrack]:
     camera = _read(files, "camera")
     if robot.stamps_s is None:
         raise InputError(
-            f"{files.robot}: has no times; --time-offset takes a column stamp_s"
+            f"{files.robot}: has no times; `time_offset` takes a column stamp_s"
         )
     if camera.stamps_s is None:
         raise InputError(
-            f"{files.camera}: has no times; --time-offset takes a column stamp_s, or images named"
+            f"{files.camera}: has no times; `time_offset` takes a column stamp_s, or images named"
             f" after their time in seconds"
         )
     return _streams(robot, camera)
@@ -153,54 +159,63 @@ def _streams(robot: _Poses, camera: _Poses) -> tuple[PoseTrack, CameraTrack]:
 
 def _read(files: PairFiles, role: Literal["robot", "camera"]) -> _Poses:
     """Read the poses of one file; messages name its role and its own option."""
-    path = files.robot if role == "robot" else files.camera
-    inverted = files.invert in (role, "both")
+    path = files.robot
+    convention = files.robot_convention
+    if role == "camera":
+        path = files.camera
+        convention = files.camera_convention
     if not path.exists():
         raise InputError(
-            f"{path}: file of {role} poses is missing; check --{role}-poses"
+            f"{path}: file of {role} poses is missing; check `{role}_poses`"
         )
+    inverted = files.invert in (role, "both")
     if role == "camera" and _is_board_file(path):
-        board = read_board_poses(path)
-        images = sorted(
-            board.images, key=lambda image: natural_key(PurePath(image.name).name)
-        )
-        board = replace(board, images=tuple(images))
-        if not images:
-            raise InputError(f"{path}: holds no images; repeat evercal detect")
-        names = tuple(image.name for image in images)
-        measured = np.array([image.camera_from_board is not None for image in images])
-        poses = SE3.stack(
-            [image.camera_from_board or SE3.identity() for image in images]
-        )
-        poses = poses.inverse() if inverted else poses
-        return _Poses(names, times_in_names(names), poses, measured, board=board)
+        return _read_board_file(path, inverted)
     table = read_robot_poses(
         path,
-        files.robot_convention if role == "robot" else files.camera_convention,
+        convention,
         what=f"file of {role} poses",
         option=f"--{role}-convention",
         # Inverted, the file of the camera states board_from_camera.
         camera_from=role == "camera" and not inverted,
         robot=role == "robot",
     )
+    poses = table.poses
+    used = table.convention
+    if inverted:
+        poses = poses.inverse()
+        used = used and _inverted(used)
     stamps = table.stamps_s
-    numbers = None
     if role == "camera" and stamps is None and table.names is not None:
         stamps = times_in_names(table.names)
-    if table.numbers is not None and table.convention is not None:
-        used = _inverted(table.convention) if inverted else table.convention
+    numbers = None
+    if table.numbers is not None and used is not None:
         numbers = PoseNumbers(table.numbers, used, camera_from=role == "camera")
-    poses = table.poses.inverse() if inverted else table.poses
     return _Poses(table.names, stamps, poses, np.ones(len(poses), dtype=bool), numbers)
+
+
+def _read_board_file(path: Path, inverted: bool) -> _Poses:
+    board = read_board_poses(path)
+    if not board.images:
+        raise InputError(f"{path}: holds no images; repeat evercal detect")
+    images = sorted(
+        board.images, key=lambda image: natural_key(PurePath(image.name).name)
+    )
+    names = tuple(image.name for image in images)
+    measured = np.array([image.camera_from_board is not None for image in images])
+    poses = SE3.stack([image.camera_from_board or SE3.identity() for image in images])
+    if inverted:
+        poses = poses.inverse()
+    board = replace(board, images=tuple(images))
+    return _Poses(names, times_in_names(names), poses, measured, board=board)
 
 
 def _inverted(convention: PoseConvention) -> PoseConvention:
     words = convention.name.split(":")
-    words = (
-        [w for w in words if w != "inverse"]
-        if "inverse" in words
-        else [*words, "inverse"]
-    )
+    if "inverse" in words:
+        words.remove("inverse")
+    else:
+        words.append("inverse")
     return replace(convention, name=":".join(words))
 
 
@@ -217,23 +232,21 @@ def _rows_by_name(
     files: PairFiles, robot: tuple[str, ...], camera: tuple[str, ...]
 ) -> tuple[list[int | None], list[str]]:
     row_of = {without_ending(name): i for i, name in enumerate(robot)}
-    repeated = [
-        name for i, name in enumerate(robot) if row_of[without_ending(name)] != i
-    ]
-    if repeated:
-        raise InputError(
-            f"{files.robot}: {repeated[0]!r} comes twice, apart from folder and suffix; give every"
-            f" image a unique name"
-        )
+    for i, name in enumerate(robot):
+        if row_of[without_ending(name)] != i:
+            raise InputError(
+                f"{files.robot}: {name!r} comes twice, apart from folder and suffix; give every"
+                f" image a unique name"
+            )
     rows = [row_of.get(without_ending(name)) for name in camera]
-    if all(row is None for row in rows) and same_numbers(robot, camera):
-        note = f"paired by numbers: {robot[0]} with {camera[0]}, and so on"
-        return [*range(len(camera))], [note]
-    if all(row is None for row in rows):
+    if not any(row is not None for row in rows):
+        if same_numbers(robot, camera):
+            note = f"paired by numbers: {robot[0]} with {camera[0]}, and so on"
+            return [*range(len(camera))], [note]
         raise InputError(
             f"{files.robot}: names no image of {files.camera}; its first is {robot[0]!r}, the first"
             f" image is {camera[0]!r}"
         )
-    alone = [name for name, row in zip(camera, rows, strict=True) if row is None]
-    others = [name for i, name in enumerate(robot) if i not in rows]
+    alone = [camera[i] for i, row in enumerate(rows) if row is None]
+    others = [robot[i] for i in sorted({*range(len(robot))} - {*rows})]
     return rows, unpaired(alone, others, files.robot.name)

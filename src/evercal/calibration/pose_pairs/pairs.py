@@ -6,7 +6,7 @@ corners say about them, and the derivative of each pose by them, come from `boar
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -17,11 +17,15 @@ from evercal.calibration.boards.corners import (
     Bend,
     BoardPose,
     BoardView,
-    board_pose,
     pixel_sigma,
     strays,
 )
-from evercal.calibration.boards.intrinsics import LENS, LensPrior, lens_estimate
+from evercal.calibration.boards.intrinsics import (
+    LENS,
+    LensPrior,
+    fitted_poses,
+    lens_estimate,
+)
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.conventions import PoseConvention
@@ -29,9 +33,13 @@ from evercal.robot.mount import MountName, mount_named
 from evercal.typing import Array, BoolArray, IntArray
 
 _SAME_ROBOT_M = 1e-4
+"""Distance below which two robot poses are equal."""
 _SAME_ROBOT_RAD = np.deg2rad(0.01)
+"""Angle below which two robot poses are equal."""
 _SAME_CAMERA_M = 5e-3
+"""Distance below which two camera poses are equal."""
 _SAME_CAMERA_RAD = np.deg2rad(0.5)
+"""Angle below which two camera poses are equal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +77,8 @@ class PosePairs:
     """How robot and camera poses were paired."""
 
     def __post_init__(self) -> None:
-        counts = {
-            len(self.names),
-            len(self.base_from_gripper),
-            len(self.camera_from_board),
-        }
+        counts = {len(self.names), len(self.base_from_gripper)}
+        counts.add(len(self.camera_from_board))
         if self.camera_covariance is not None:
             counts.add(len(self.camera_covariance))
         if len(counts) != 1:
@@ -86,20 +91,21 @@ class PosePairs:
 
     def __getitem__(self, index: IntArray | BoolArray) -> Self:
         rows = np.arange(len(self))[index]
-        given = {name: value for name, value in vars(self).items() if value is not None}
-        each = given.keys() - {"names", "notes"}
-        changed = {name: given[name][rows] for name in each}
-        return replace(self, names=tuple(self.names[row] for row in rows), **changed)
+        changed: dict[str, Any] = {"names": tuple(self.names[row] for row in rows)}
+        for name, value in vars(self).items():
+            if name not in ("names", "notes") and value is not None:
+                changed[name] = value[rows]
+        return replace(self, **changed)
 
     def distinct(self, scale_known: bool = True) -> tuple[IntArray, IntArray]:
         """Return indices of different pairs, sorted by value, and (n,) the first equal pair."""
+        robot = self.base_from_gripper
+        camera = self.camera_from_board
         keys = [
-            *self.base_from_gripper.translation_m.T,
-            *self.camera_from_board.translation_m.T,
-        ]
-        keys += [
-            *_canonical(self.base_from_gripper).T,
-            *_canonical(self.camera_from_board).T,
+            *robot.translation_m.T,
+            *camera.translation_m.T,
+            *_canonical(robot).T,
+            *_canonical(camera).T,
         ]
         order = np.lexsort(keys[::-1])
         first = np.empty(len(self), dtype=np.int64)
@@ -109,21 +115,20 @@ class PosePairs:
     def repeats(self, scale_known: bool = True) -> IntArray:
         """Return (n,) the index of the first equal pair; the own index for a new pair."""
         # Equal robot poses with different camera poses are no repeats: the robot pose is stale.
+        robot = self.base_from_gripper
+        camera = self.camera_from_board
         first = np.arange(len(self))
-        positions = self.base_from_gripper.translation_m
-        close = KDTree(positions).query_pairs(_SAME_ROBOT_M, output_type="ndarray")
+        close = KDTree(robot.translation_m).query_pairs(
+            _SAME_ROBOT_M, output_type="ndarray"
+        )
         if len(close) == 0:
             return first
         i, j = np.sort(close, 1).T
-        _, robot_rad = pose_distance(
-            self.base_from_gripper[i], self.base_from_gripper[j]
-        )
-        camera_m, camera_rad = pose_distance(
-            self.camera_from_board[i], self.camera_from_board[j]
-        )
+        _, robot_rad = pose_distance(robot[i], robot[j])
+        camera_m, camera_rad = pose_distance(camera[i], camera[j])
         if not scale_known:
-            size = np.linalg.norm(self.camera_from_board.translation_m, axis=1)
-            camera_m = camera_m / max(float(np.median(size)), 1e-12)
+            distances = np.linalg.norm(camera.translation_m, axis=1)
+            camera_m = camera_m / max(float(np.median(distances)), 1e-12)
         same = (camera_m < _SAME_CAMERA_M) & (camera_rad < _SAME_CAMERA_RAD)
         same &= robot_rad < _SAME_ROBOT_RAD
         np.minimum.at(first, j[same], i[same])
@@ -140,39 +145,33 @@ class PosePairs:
     def equation(self, mount: MountName, extras: Extras) -> PoseEquation:
         """Return the equation; the board is fixed in the base for a camera on the arm."""
         mounted = mount_named(mount)
-        on_arm = mounted.moves
         robot = self.base_from_gripper
         fixed_from_parent = mounted.scene_from_parent(robot)
         covariance = self.camera_covariance
+        if covariance is None:
+            covariance = np.zeros((len(self), 6, 6))
         velocity = self.velocity
-        if velocity is not None and not on_arm:
+        if velocity is not None and not mounted.moves:
             velocity = _inverse_velocity(robot, velocity)
         return PoseEquation(
             robot_rotation=fixed_from_parent.rotation_matrix(),
             robot_translation=fixed_from_parent.translation_m,
             camera_rotation=self.camera_from_board.rotation_matrix(),
             camera_translation=self.camera_from_board.translation_m,
-            camera_covariance=np.zeros((len(self), 6, 6))
-            if covariance is None
-            else covariance,
+            camera_covariance=covariance,
             extras=extras,
-            base_is_fixed=on_arm,
+            base_is_fixed=mounted.moves,
             velocity=velocity,
         )
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return the first five names for a message."""
-    shown = ", ".join(names[:5])
-    return shown if len(names) <= 5 else f"{shown} and {len(names) - 5} more"
 
 
 def _inverse_velocity(base_from_gripper: SE3, velocity: Array) -> Array:
     linear, angular = np.split(velocity, 2, 1)
     gripper_from_base = np.swapaxes(base_from_gripper.rotation_matrix(), 1, 2)
     moved = np.cross(angular, base_from_gripper.translation_m) - linear
-    rotated = (gripper_from_base @ v[..., None] for v in (moved, -angular))
-    return np.concatenate([v[..., 0] for v in rotated], 1)
+    moved = (gripper_from_base @ moved[..., None])[..., 0]
+    turned = (gripper_from_base @ -angular[..., None])[..., 0]
+    return np.concatenate([moved, turned], 1)
 
 
 def _canonical(pose: SE3) -> Array:
@@ -202,31 +201,36 @@ class BoardCorners:
 
     def turned(self, view: BoardView) -> list[BoardView]:
         """Return a view with the other corners that may have been taken for its corners."""
-        angles = (
-            (90, 180, 270) if self.quarter_turn else (180,) if self.half_turn else ()
-        )
+        angles: tuple[int, ...] = ()
+        if self.quarter_turn:
+            angles = (90, 180, 270)
+        elif self.half_turn:
+            angles = (180,)
         middle = Bend.none(self.views).middle
-        turns = [Rotation.from_euler("z", angle, degrees=True) for angle in angles]
-        return [
-            replace(view, points_m=turn.apply(view.points_m - middle) + middle)
-            for turn in turns
-        ]
+        turned = []
+        for angle in angles:
+            turn = Rotation.from_euler("z", angle, degrees=True)
+            points = turn.apply(view.points_m - middle) + middle
+            turned.append(replace(view, points_m=points))
+        return turned
 
     def without_strays(self, names: Sequence[str], poses: Sequence[BoardPose]) -> Self:
         """Leave out corners that leave their neighbours by many sigma."""
-        views = list(self.views)
-        left_out = [*self.left_out]
-        for i, stray in enumerate(strays(self.views, poses, self.camera)):
-            left_out += [
-                f"{names[i]} {x:.0f} {y:.0f}" for x, y in views[i].pixels[stray]
-            ]
-            views[i] = views[i][~stray]
+        views = []
+        left_out = list(self.left_out)
+        stray = strays(self.views, poses, self.camera)
+        for name, view, mask in zip(names, self.views, stray, strict=True):
+            for x, y in view.pixels[mask]:
+                left_out.append(f"{name} {x:.0f} {y:.0f}")
+            views.append(view[~mask])
         return replace(self, views=tuple(views), left_out=tuple(left_out))
 
     @property
     def prior(self) -> LensPrior:
         """Knowledge of the intrinsics without the corners."""
-        return (LensPrior.stated if self.stated else LensPrior.usual)(self.camera)
+        if self.stated:
+            return LensPrior.stated(self.camera)
+        return LensPrior.usual(self.camera)
 
 
 class Measured(NamedTuple):
@@ -240,26 +244,24 @@ class Measured(NamedTuple):
 
     def applied_to(self, pairs: PosePairs) -> PosePairs:
         """Return the pairs with these camera poses and their covariances."""
-        variance = self.sigma_px**2
+        poses = [pose.camera_from_board for pose in self.poses]
+        covariances = [pose.unit_covariance for pose in self.poses]
         return replace(
             pairs,
-            camera_from_board=SE3.stack(
-                [pose.camera_from_board for pose in self.poses]
-            ),
-            camera_covariance=np.stack(
-                [variance * pose.unit_covariance for pose in self.poses]
-            ),
+            camera_from_board=SE3.stack(poses),
+            camera_covariance=self.sigma_px**2 * np.stack(covariances),
         )
 
     def extras(self, prior: LensPrior, accepted: BoolArray) -> Extras:
         """Return intrinsics and bend as unknowns; corners of `accepted` (n,) are in their prior."""
-        poses = [pose for pose, use in zip(self.poses, accepted, strict=True) if use]
+        poses = [self.poses[row] for row in np.flatnonzero(accepted)]
         change, information = lens_estimate(
             poses, self.sigma_px, self.camera, self.bend, prior
         )
         slopes = np.stack([pose.lens_slope for pose in self.poses])
         names = (*LENS[self.camera.model][: len(change) - len(BEND)], *BEND)
-        return Extras(names, ("intrinsics",) * len(names), slopes, information, change)
+        groups = ("intrinsics",) * len(names)
+        return Extras(names, groups, slopes, information, change)
 
 
 def measured(
@@ -267,10 +269,7 @@ def measured(
 ) -> Measured:
     """Fit the pose of the board in every image from (n,) starts."""
     bend = bend or Bend.none(corners.views)
-    poses = [
-        board_pose(v, camera, s, bend)
-        for v, s in zip(corners.views, starts, strict=True)
-    ]
+    poses = fitted_poses(corners.views, camera, starts, bend)
     return Measured(camera, bend, poses, pixel_sigma(poses))
 
 

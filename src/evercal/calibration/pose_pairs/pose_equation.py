@@ -9,7 +9,7 @@ Residuals are (translation, rotation vector) in the frame `fixed`, metres and ra
 """
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -39,16 +39,18 @@ class Unknowns:
         """Board pose in the fixed frame."""
         return self._pose(1)
 
-    def _pose(self, which: int) -> SE3:
-        rotation = Rotation.from_matrix(self.rotations[which])
-        return SE3.of(rotation, self.translations[which])
+    def _pose(self, row: int) -> SE3:
+        rotation = Rotation.from_matrix(self.rotations[row])
+        return SE3.of(rotation, self.translations[row])
 
     def moved(self, step: Array) -> "Unknowns":
         """Return the unknowns after a (12 + q,) step of (translation, rotation) of X, Z, extras."""
-        both = step[:12].reshape(2, 6)
-        turned = self.rotations @ Rotation.from_rotvec(both[:, 3:]).as_matrix()
+        poses = step[:12].reshape(2, 6)
+        turn = Rotation.from_rotvec(poses[:, 3:]).as_matrix()
         return Unknowns(
-            turned, self.translations + both[:, :3], self.extras + step[12:]
+            rotations=self.rotations @ turn,
+            translations=self.translations + poses[:, :3],
+            extras=self.extras + step[12:],
         )
 
 
@@ -138,11 +140,12 @@ class PoseEquation:
     add to a camera stamp."""
 
     def __getitem__(self, index: IntArray | BoolArray) -> Self:
-        arrays = {
-            k: v[index] for k, v in vars(self).items() if isinstance(v, np.ndarray)
-        }
+        changed: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                changed[name] = value[index]
         extras = replace(self.extras, slopes=self.extras.slopes[index])
-        return replace(self, extras=extras, **arrays)
+        return replace(self, extras=extras, **changed)
 
     def __len__(self) -> int:
         return len(self.robot_translation)
@@ -198,22 +201,21 @@ class PoseEquation:
         n = len(self)
         board = at.translations[1]
         parent = self.robot_translation
-        gripper = parent if self.base_is_fixed else np.zeros((n, 3))
+        gripper = np.zeros((n, 3))
+        if self.base_is_fixed:
+            gripper = parent
         directions = {
             "translation": np.broadcast_to(np.eye(6, 3), (n, 6, 3)),
             "rotation about gripper": _rotated(board - gripper),
         }
-        if "intrinsics" in self.extras.groups:
-            return directions
-        ray = board - parent - self.robot_rotation @ at.translations[0]
-        depth = np.zeros((n, 6, 1))
-        depth[:, :3, 0] = ray / np.maximum(
-            np.linalg.norm(ray, axis=1, keepdims=True), 1e-9
-        )
-        return directions | {
-            "depth": depth,
-            "rotation about board": _rotated(np.zeros((n, 3))),
-        }
+        if "intrinsics" not in self.extras.groups:
+            ray = board - parent - self.robot_rotation @ at.translations[0]
+            length = np.linalg.norm(ray, axis=1, keepdims=True)
+            depth = np.zeros((n, 6, 1))
+            depth[:, :3, 0] = ray / np.maximum(length, 1e-9)
+            directions["depth"] = depth
+            directions["rotation about board"] = _rotated(np.zeros((n, 3)))
+        return directions
 
 
 def _log_slope(rotvec: Array) -> Array:
@@ -223,13 +225,11 @@ def _log_slope(rotvec: Array) -> Array:
     """
     matrix = cross_matrix(rotvec)
     angle2 = (rotvec**2).sum(1)[:, None, None]
-    square = matrix @ matrix
-    return (
-        np.eye(3) - 0.5 * matrix + (1 / 12 + angle2 / 720 + angle2**2 / 30240) * square
-    )
+    series = 1 / 12 + angle2 / 720 + angle2**2 / 30240
+    return np.eye(3) - 0.5 * matrix + series * (matrix @ matrix)
 
 
 def _rotated(lever: Array) -> Array:
-    return np.concatenate(
-        [-cross_matrix(lever), np.broadcast_to(np.eye(3), (len(lever), 3, 3))], 1
-    )
+    """Return (n, 6, 3) residuals due to rotations about a point at `lever` (n, 3)."""
+    identity = np.broadcast_to(np.eye(3), (len(lever), 3, 3))
+    return np.concatenate([-cross_matrix(lever), identity], 1)

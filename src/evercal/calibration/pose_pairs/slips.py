@@ -5,18 +5,17 @@ the residuals fall if one of them changes there? Interleaved halves of such a re
 no other check notices it.
 """
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import f
 
-from evercal.calibration.pose_pairs.fit import HandEyeFit, normal_inverse
+from evercal.calibration.pose_pairs.fit import HandEyeFit, clipped_inverse
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
 from evercal.typing import Array, BoolArray, IntArray
 
-_FEWEST = 2
+_MIN_POSES = 2
 """Minimum number of poses before and after a slip; a single one is an outlier."""
 _GROSS = 30.0
 """Largest squared distance of a pose; an outlier counts as much, wherever it is."""
@@ -35,9 +34,30 @@ class Slip(NamedTuple):
     what: str
     """`camera` if `parent_from_camera` changed, `board` if `fixed_from_board` did, or either."""
     metres: float
+    """Length of its translation."""
     radians: float
+    """Angle of its rotation."""
     spread: Array
     """(p, p) to add to the covariance of the unknowns: they differ before and after the step."""
+
+
+_FIRST_UNKNOWN = {"camera": 0, "board": 6}
+"""Index of the first of the six unknowns of each pose that may slip."""
+
+
+class _Step(NamedTuple):
+    """A fit with a step of the camera or of the board, or without."""
+
+    cost: float
+    """Sum of squared residuals."""
+    what: str = ""
+    """Key of `_FIRST_UNKNOWN`; empty without a step."""
+    place: int = 0
+    """Number of poses before the step."""
+    change: Array = np.zeros(0)
+    """Change of the unknowns; the last six are the step."""
+    covariance: Array = np.zeros((0, 0))
+    """Its covariance."""
 
 
 def find_slip(equation: PoseEquation, fit: HandEyeFit, rows: IntArray) -> Slip | None:
@@ -49,70 +69,73 @@ def find_slip(equation: PoseEquation, fit: HandEyeFit, rows: IntArray) -> Slip |
         rows: (n,) indices of the pose pairs, which are in the order of time.
     """
     order = np.argsort(rows)
-    every = np.ones(len(order), dtype=bool)
-    found = [
-        s
-        for use in (every, fit.inliers[order])
-        for s in _steps(equation, fit, order, use)
-    ]
-    before = min(cost for cost, k, *_ in found if k == 0)
-    kinds = [
-        min((s for s in found if s[2] == first), key=lambda s: s[0]) for first in (0, 6)
-    ]
-    after, k, first, change, covariance = min(kinds, key=lambda s: s[0])
+    steps = _steps(equation, fit, order, np.ones(len(order), dtype=bool))
+    steps += _steps(equation, fit, order, fit.inliers[order])
+    best = {}
+    for step in sorted(steps, key=lambda step: step.cost):
+        best.setdefault(step.what, step)
+    camera = best["camera"]
+    board = best["board"]
+    step = min(camera, board, key=lambda step: step.cost)
     # All other unknowns have priors.
     freedom = 6 * len(order) - 18
-    ratio = (before / after - 1) * freedom / 6
+    ratio = (best[""].cost / step.cost - 1) * freedom / 6
     if freedom < 6 or 2 * len(order) * f.sf(ratio, 6, freedom) > _FALSE_ALARM:
         return None
     what = "camera or board"
-    if abs(freedom * np.log(kinds[0][0] / kinds[1][0])) > _CLEARLY:
-        what = "board" if first else "camera"
-    metres, radians = np.linalg.norm(change[-6:].reshape(2, 3), axis=1)
-    second = np.outer(change, change) + covariance
-    before_it = np.eye(equation.unknowns, len(change))
-    after_it = before_it.copy()
-    after_it[first : first + 6, -6:] = np.eye(6)
-    spread = (before_it @ second @ before_it.T + after_it @ second @ after_it.T) / 2
-    return Slip(int(rows[order[k]]), what, float(metres), float(radians), spread)
+    if abs(freedom * np.log(camera.cost / board.cost)) > _CLEARLY:
+        what = step.what
+    metres, radians = np.linalg.norm(step.change[-6:].reshape(2, 3), axis=1)
+    second = np.outer(step.change, step.change) + step.covariance
+    before = np.eye(equation.unknowns, len(step.change))
+    after = before.copy()
+    first = _FIRST_UNKNOWN[step.what]
+    after[first : first + 6, -6:] = np.eye(6)
+    spread = (before @ second @ before.T + after @ second @ after.T) / 2
+    row = int(rows[order[step.place]])
+    return Slip(row, what, float(metres), float(radians), spread)
 
 
 def _steps(
     equation: PoseEquation, fit: HandEyeFit, order: IntArray, use: BoolArray
-) -> Iterator[tuple[float, int, int, Array, Array]]:
-    """Fit each step: squared residuals, row and kind, change of the unknowns and its covariance.
+) -> list[_Step]:
+    """Fit each step, and none; the poses `use` estimate it, but all judge it.
 
-    The last six unknowns are the step; row 0 means no step. The poses `use` estimate it, but all
-    judge it. Errors of an arm that grow with its position are no step: they are unknowns as large
-    as the noise, over the root mean square of the positions.
+    Errors of an arm that grow with its position are no step: they are unknowns as large as the
+    noise, over the root mean square of the positions.
     """
     system = equation[order].system(fit.at)
     whiten = np.linalg.inv(np.linalg.cholesky(fit.weights[order]))
     residual = (whiten @ system.residual[..., None])[..., 0]
     place = equation.robot_translation[order] - equation.robot_translation.mean(0)
     place /= max(float(np.sqrt((place**2).sum(1).mean())), 1e-9)
-    by_place = whiten @ np.linalg.cholesky(fit.weights.mean(0))
-    by_place = [by_place * place[:, k, None, None] for k in range(3)]
+    noise = whiten @ np.linalg.cholesky(fit.weights.mean(0))
+    by_place = [noise * place[:, k, None, None] for k in range(3)]
     jacobian = np.concatenate([whiten @ system.jacobian, *by_place], 2)
     used = jacobian.transpose(0, 2, 1) * use[:, None, None]
     normal = (used @ jacobian).sum(0) + block_diag(system.prior, np.eye(18))
-    pull = np.r_[system.prior @ system.change, np.zeros(18)]
-    gradient = (used @ residual[..., None]).sum((0, 2)) + pull
-    for moved in (residual, residual - jacobian @ (normal_inverse(normal) @ gradient)):
-        yield _cost(moved), 0, 0, gradient, normal
-    for first in (0, 6):
-        own = slice(first, first + 6)
+    from_prior = np.r_[system.prior @ system.change, np.zeros(18)]
+    gradient = (used @ residual[..., None]).sum((0, 2)) + from_prior
+    refined = residual - jacobian @ (clipped_inverse(normal) @ gradient)
+    steps = [_Step(_cost(residual)), _Step(_cost(refined))]
+    for what, first in _FIRST_UNKNOWN.items():
+        unknowns = slice(first, first + 6)
+        by_step = jacobian[:, :, unknowns]
         # Sums over the poses from each on.
-        shared = np.cumsum((used @ jacobian[:, :, own])[::-1], 0)[::-1]
-        pull = np.cumsum((used[:, own] @ residual[..., None])[::-1, :, 0], 0)[::-1]
-        for k in range(_FEWEST, len(order) - _FEWEST + 1):
-            both = np.block([[normal, shared[k]], [shared[k].T, shared[k, own]]])
-            covariance = normal_inverse(both)
-            change = -covariance @ np.r_[gradient, pull[k]]
+        shared = np.cumsum((used @ by_step)[::-1], 0)[::-1]
+        pulls = (used[:, unknowns] @ residual[..., None])[::-1, :, 0]
+        pulls = np.cumsum(pulls, 0)[::-1]
+        for k in range(_MIN_POSES, len(order) - _MIN_POSES + 1):
+            block = shared[k]
+            whole = np.block([[normal, block], [block.T, block[unknowns]]])
+            covariance = clipped_inverse(whole)
+            change = -covariance @ np.r_[gradient, pulls[k]]
             moved = residual + jacobian @ change[:-6]
-            moved[k:] += jacobian[k:, :, own] @ change[-6:]
-            yield _cost(moved), k, first, change, covariance
+            moved[k:] += by_step[k:] @ change[-6:]
+            steps.append(_Step(_cost(moved), what, k, change, covariance))
+    return steps
 
 
 def _cost(residual: Array) -> float:
+    """Sum of squared distances (n, 6); gross ones count `_GROSS`."""
     return float(np.minimum((residual**2).sum(1), _GROSS).sum())

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.intrinsics import LENS, moved_lens
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
-from evercal.calibration.located import length_mm_deg
 from evercal.calibration.pose_pairs.checks import (
     held_out_error,
     left_open,
@@ -24,7 +23,7 @@ from evercal.calibration.pose_pairs.pairs import (
 )
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
 from evercal.calibration.verdict import verdict
-from evercal.geometry import SE3, Camera, pose_to_dict
+from evercal.geometry import SE3, Camera, length_mm_deg, pose_to_dict
 from evercal.robot.mount import MountName, mount_named
 from evercal.typing import Array, IntArray
 
@@ -38,6 +37,7 @@ _CAUSES = {
     "shared depth": "distance from camera to board, all images",
     "size": "size of the squares, or scale",
 }
+"""Names of the error terms, by kind of noise and group of extras."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +46,13 @@ class PairSolution:
 
     pairs: PosePairs
     rows: IntArray
-    """Pairs of the equation, sorted by value; `first` (n,) is the first pair equal to each."""
+    """Pairs of the equation, sorted by value."""
     first: IntArray
+    """(n,) the first pair that is equal to each pair."""
     equation: PoseEquation
+    """The equation of `rows`, with all unknowns."""
     fit: HandEyeFit
+    """Its fit."""
     mount: MountName
     scale: float
     """Metres per unit of the camera's lengths."""
@@ -110,11 +113,15 @@ class PairSolution:
 
     def _checks(self, time_offset_s: float | None) -> dict[str, Any]:
         fit = self.fit
-        extras = self.equation.extras
-        used = fit.residual[fit.inliers].reshape(-1, 2, 3)
-        rms = np.sqrt((used**2).sum(2).mean(0))
+        names = self.pairs.names
+        residuals = fit.residual[fit.inliers].reshape(-1, 2, 3)
+        rms = np.sqrt((residuals**2).sum(2).mean(0))
         distance = np.linalg.norm(self.equation.camera_translation[fit.inliers], axis=1)
-        fixed = mount_named(self.mount).scene
+        moved = 1000 * np.linalg.norm(fit.moved[:, :3], axis=1)
+        boards: dict[str, object] = {}
+        for i, pose in zip(self.rows, self.camera_from_board, strict=True):
+            boards[names[i]] = pose_to_dict(pose)
+        scene = mount_named(self.mount).scene
         checks: dict[str, Any] = {
             "poses_given": len(self.pairs),
             "poses_used": int(fit.inliers.sum()),
@@ -123,34 +130,27 @@ class PairSolution:
             **held_out_error(self.equation, fit),
             **repeatability(self.equation, fit),
             "target_m": float(np.median(distance)),
-            f"{fixed}_from_board": pose_to_dict(self.fixed_from_board),
-            "leave_one_out_mm": self._by_name(
-                1000 * np.linalg.norm(fit.moved[:, :3], axis=1)
-            ),
+            f"{scene}_from_board": pose_to_dict(self.fixed_from_board),
+            "leave_one_out_mm": self._by_name(moved),
             "information_percent": self._by_name(100 * fit.information),
-            "camera_from_board": {
-                self.pairs.names[i]: pose_to_dict(pose)
-                for i, pose in zip(self.rows, self.camera_from_board, strict=True)
-            },
+            "camera_from_board": boards,
             "left_open": left_open(fit, self.parent),
             "warnings": list(self.warnings),
         }
-        sigma = dict(zip(extras.names, fit.sigma[12:].tolist(), strict=True))
-        value = dict(zip(extras.names, fit.at.extras.tolist(), strict=True))
+        extras = self.equation.extras.names
+        sigma = dict(zip(extras, fit.sigma[12:].tolist(), strict=True))
         if "clock" in sigma:
-            offset = value["clock"] if time_offset_s is None else time_offset_s
-            checks |= {"time_offset_s": offset, "time_offset_sigma_s": sigma["clock"]}
-        checks |= {"scale": self.board_scale, "scale_sigma": sigma["size"]}
-        if self.lens is not None:
+            if time_offset_s is None:
+                time_offset_s = float(fit.at.extras[extras.index("clock")])
+            checks["time_offset_s"] = time_offset_s
+            checks["time_offset_sigma_s"] = sigma["clock"]
+        checks["scale"] = self.board_scale
+        checks["scale_sigma"] = sigma["size"]
+        if self.lens is not None and self.corners is not None:
             checks["corner_sigma_px"] = self.lens.sigma_px
-            checks["corners_left_out"] = (
-                list(self.corners.left_out) if self.corners else []
-            )
-            checks["camera_sigma"] = {
-                name: sigma[name]
-                for name in LENS[self.lens.camera.model]
-                if name in sigma
-            }
+            checks["corners_left_out"] = list(self.corners.left_out)
+            intrinsics = LENS[self.lens.camera.model]
+            checks["camera_sigma"] = {k: sigma[k] for k in intrinsics if k in sigma}
         return checks
 
     def _by_name(self, values: Array) -> dict[str, float]:
@@ -158,37 +158,35 @@ class PairSolution:
         return {self.pairs.names[i]: value for i, used, value in named if used}
 
     def _images(self) -> tuple[ImageUse, ...]:
+        names = self.pairs.names
         row_of = {int(pair): row for row, pair in enumerate(self.rows)}
         uses = []
-        for i, name in enumerate(self.pairs.names):
-            if i not in row_of:
-                other = self.pairs.names[self.first[i]]
-                uses.append(
-                    ImageUse(name, False, f"repeats {other}, which adds nothing")
-                )
+        for i, name in enumerate(names):
+            row = row_of.get(i)
+            if row is None:
+                reason = f"repeats {names[self.first[i]]}, which adds nothing"
+                uses.append(ImageUse(name, False, reason))
                 continue
-            row = row_of[i]
             mm, deg = length_mm_deg(self.fit.residual[row])
-            sigmas = float(np.sqrt(self.fit.distance2[row] / 6))
-            reason = (
-                f"disagrees with the others by {mm:.1f} mm and {deg:.2f} deg, {sigmas:.1f} times"
-                " their noise"
-            )
             used = bool(self.fit.inliers[row])
-            uses.append(ImageUse(name, used, "" if used else reason, mm, deg))
+            reason = ""
+            if not used:
+                sigmas = float(np.sqrt(self.fit.distance2[row] / 6))
+                reason = (
+                    f"disagrees with the others by {mm:.1f} mm and {deg:.2f} deg, {sigmas:.1f}"
+                    " times their noise"
+                )
+            uses.append(ImageUse(name, used, reason, mm, deg))
         return tuple(uses)
 
     def _error_terms(self) -> tuple[ErrorTerm, ...]:
         fit = self.fit
+        least = 1e-6 * np.trace(fit.covariance[:6, :6])
         terms = []
         for name, cause in _CAUSES.items():
-            part = fit.contributions.get(name)
-            if part is not None and np.trace(part) > 1e-6 * np.trace(
-                fit.covariance[:6, :6]
-            ):
+            part = fit.contributions.get(name, np.zeros((6, 6)))
+            if np.trace(part) > least:
                 terms.append(ErrorTerm.of(cause, part))
         rest = fit.factor * fit.covariance[:6, :6] - sum(fit.contributions.values())
-        return (
-            *terms,
-            ErrorTerm.of("few poses, and errors alike in similar poses", rest),
-        )
+        rest_name = "few poses, and errors alike in similar poses"
+        return (*terms, ErrorTerm.of(rest_name, rest))

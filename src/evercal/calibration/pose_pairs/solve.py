@@ -21,7 +21,7 @@ from evercal.calibration.pose_pairs.fit import (
     least_sigma,
     robust_fit,
 )
-from evercal.calibration.pose_pairs.mistakes import quick_fit, require_agreement
+from evercal.calibration.pose_pairs.mistakes import require_agreement
 from evercal.calibration.pose_pairs.pairs import BoardCorners as BoardCorners
 from evercal.calibration.pose_pairs.pairs import (
     Measured,
@@ -30,20 +30,24 @@ from evercal.calibration.pose_pairs.pairs import (
     middle_of,
 )
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation, Unknowns
-from evercal.calibration.pose_pairs.slips import find_slip
+from evercal.calibration.pose_pairs.slips import Slip, find_slip
 from evercal.calibration.pose_pairs.solution import PairSolution
+from evercal.calibration.pose_pairs.starts import quick_fit
 from evercal.errors import InputError
 from evercal.geometry import SE3, cross_matrix, pose_distance
 from evercal.robot.mount import MountName, mount_named
 from evercal.typing import BoolArray, IntArray
 
-_REACH_M, _OTHER_MOUNT = 0.4, 4.0
-"""Distance from the gripper of what it carries, and its ratio to what the base carries, above which
-the mount may be the other one."""
+_REACH_M = 0.4
+"""Distance from the gripper of what it carries above which the mount may be the other one."""
+_OTHER_MOUNT = 4.0
+"""Ratio of that distance to the distance of what the base carries, above which it may be."""
 _SCALE_SIGMA = 0.1
 """Maximum relative standard deviation of an unknown scale."""
-_MOST_LENSES, _SAME_LENS = 8, 0.01
-"""Maximum number of changes of the intrinsics; squared Mahalanobis length of one to ignore."""
+_MAX_LENSES = 8
+"""Maximum number of changes of the intrinsics."""
+_SAME_LENS = 0.01
+"""Squared Mahalanobis length of a change of the intrinsics that is ignored."""
 _LENS_WARNING = 3.0
 """Deviation of stated intrinsics from the estimate that is reported, standard deviations."""
 
@@ -76,10 +80,10 @@ def solve(
     Returns:
         `gripper_from_camera` or `base_from_camera`.
     """
-    return solve_pairs(pairs, mount, scale_known, corners).calibration()
+    return solve_pose_pairs(pairs, mount, scale_known, corners).calibration()
 
 
-def solve_pairs(
+def solve_pose_pairs(
     pairs: PosePairs,
     mount: MountName,
     scale_known: bool = True,
@@ -102,16 +106,9 @@ def solve_pairs(
         lens = measured(corners, corners.camera, pairs.camera_from_board)
         pairs = lens.applied_to(pairs)
         start, scale = quick_fit(pairs[rows], mount, scale_known)
-        robot = pairs[rows].base_from_gripper
-        fixed_from_parent = mount_named(mount).scene_from_parent(robot)
-        at = start.at
-        predicted = (
-            fixed_from_parent @ at.parent_from_camera
-        ).inverse() @ at.fixed_from_board
-        predicted = SE3(predicted.rotation_wxyz, predicted.translation_m / scale)
-        corners, poses = _other_board_poses(
-            corners, lens, rows, ~start.inliers, predicted
-        )
+        predicted = _predicted(pairs[rows], mount, start.at, scale)
+        outliers = ~start.inliers
+        corners, poses = _other_board_poses(corners, lens, rows, outliers, predicted)
         lens = measured(corners, corners.camera, poses)
     problem = _Problem(mount, scale, scale_known, corners, of_board)
     equation, fit, lens = problem.fitted(pairs, rows, start.at, lens)
@@ -122,18 +119,42 @@ def solve_pairs(
         fit = widened(equation, fit)
     slip = find_slip(equation, fit, rows)
     if slip is not None:
-        what = slip.what if of_board else slip.what.replace("board", "map")
         fit = replace(fit, covariance=fit.covariance + slip.spread)
-        warnings.append(
-            f"the {what} looks moved by {1000 * slip.metres:.1f} mm and"
-            f" {np.rad2deg(slip.radians):.2f} deg before {pairs.names[slip.row]}, or the arm"
-            " drifts: calibrate from the poses before or after it, or fasten it and record again"
-        )
+        warnings.append(_slip_warning(slip, pairs.names[slip.row], of_board))
     warnings += _lens_warnings(fit, equation, corners, lens)
-    warnings += _mount_warnings(fit.at, mount) if of_board else []
+    if of_board:
+        warnings += _mount_warnings(fit.at, mount)
     _require_determined(pairs[rows[fit.inliers]], fit, equation, scale_known)
     return PairSolution(
-        pairs, rows, first, equation, fit, mount, scale, tuple(warnings), corners, lens
+        pairs=pairs,
+        rows=rows,
+        first=first,
+        equation=equation,
+        fit=fit,
+        mount=mount,
+        scale=scale,
+        warnings=tuple(warnings),
+        corners=corners,
+        lens=lens,
+    )
+
+
+def _predicted(pairs: PosePairs, mount: MountName, at: Unknowns, scale: float) -> SE3:
+    """Return (n,) board poses by the robot's poses, in units of the camera poses."""
+    fixed_from_parent = mount_named(mount).scene_from_parent(pairs.base_from_gripper)
+    fixed_from_camera = fixed_from_parent @ at.parent_from_camera
+    predicted = fixed_from_camera.inverse() @ at.fixed_from_board
+    return SE3(predicted.rotation_wxyz, predicted.translation_m / scale)
+
+
+def _slip_warning(slip: Slip, name: str, of_board: bool) -> str:
+    what = slip.what
+    if not of_board:
+        what = what.replace("board", "map")
+    return (
+        f"the {what} looks moved by {1000 * slip.metres:.1f} mm and"
+        f" {np.rad2deg(slip.radians):.2f} deg before {name}, or the arm"
+        " drifts: calibrate from the poses before or after it, or fasten it and record again"
     )
 
 
@@ -156,12 +177,12 @@ class _Problem:
         lens: Measured | None,
     ) -> tuple[PoseEquation, HandEyeFit, Measured | None]:
         """Fit all unknowns; with corners, until the intrinsics no longer change."""
-        at = start
+        # The board's origin becomes the middle of its corners, see `equation`.
         shifts = start.translations.copy()
-        shifts[1] += at.rotations[1] @ middle_of(self.corners)
-        at = replace(at, translations=shifts)
+        shifts[1] += start.rotations[1] @ middle_of(self.corners)
+        at = replace(start, translations=shifts)
         accepted = np.ones(len(pairs), dtype=bool)
-        for turn in range(_MOST_LENSES):
+        for remaining in reversed(range(_MAX_LENSES)):
             equation = self.equation(pairs, lens, accepted)[rows]
             at = replace(at, extras=np.zeros(len(equation.extras.names)))
             fit = robust_fit(equation, agreement(equation, at))
@@ -173,10 +194,10 @@ class _Problem:
             at = fit.at
             change = at.extras[group]
             information = equation.extras.information[np.ix_(group, group)]
+            length2 = change @ information @ change
+            same = (accepted == before).all() and length2 < _SAME_LENS
             # A pose at the threshold of rejection may alternate for ever, and the lens with it.
-            least = len(change) if turn == _MOST_LENSES - 1 else _SAME_LENS
-            same = (accepted == before).all() or turn == _MOST_LENSES - 1
-            if same and change @ information @ change < least:
+            if same or (not remaining and length2 < len(change)):
                 return equation, fit, lens
             try:
                 camera, bend = moved_lens(lens.camera, lens.bend, change)
@@ -186,7 +207,7 @@ class _Problem:
             lens = measured(self.corners, camera, poses, bend)
         raise InputError(
             "the corners and the robot's motions leave the intrinsics open; tilt the board by 20 to"
-            " 45 deg in several directions, or give --camera to evercal detect"
+            " 45 deg in several directions, or give `camera` to evercal detect"
         )
 
     def equation(
@@ -202,10 +223,9 @@ class _Problem:
             extras = lens.extras(self.corners.prior, accepted)
         # The board's origin is a convention; noise about its middle is the same in any other.
         middle = middle_of(self.corners)
+        rotations = pairs.camera_from_board.rotation_matrix()
         lever = np.broadcast_to(np.eye(6), (len(pairs), 6, 6)).copy()
-        lever[:, :3, 3:] = -pairs.camera_from_board.rotation_matrix() @ cross_matrix(
-            middle
-        )
+        lever[:, :3, 3:] = -rotations @ cross_matrix(middle)
         lever[:, :3] *= self.scale
         extras = replace(extras, slopes=lever @ extras.slopes)
         about = pairs.camera_from_board @ SE3.from_translation(middle)
@@ -218,9 +238,10 @@ class _Problem:
             depth = np.pad(length[:, 2:], ((0, 0), (2, 3)))
             extras = extras.with_one("shared depth", depth, SIZE_SIGMA)
         size = np.pad(length, ((0, 0), (0, 3)))
-        extras = extras.with_one(
-            "size", size, SIZE_SIGMA if self.scale_known else np.inf
-        )
+        sigma = np.inf
+        if self.scale_known:
+            sigma = SIZE_SIGMA
+        extras = extras.with_one("size", size, sigma)
         if pairs.velocity is not None:
             extras = extras.with_one("clock", np.zeros((len(pairs), 6)), np.inf)
         return moved.equation(self.mount, extras)
@@ -242,26 +263,24 @@ def _lens_warnings(
         return []
     return [
         f"the stated focal length is {stated.mean[0]:.1f} px, corners and motions give {now:.1f}"
-        f" px: check --camera, or omit it"
+        f" px: check `camera`, or omit it"
     ]
 
 
 def _mount_warnings(at: Unknowns, mount: MountName) -> list[str]:
     """The other mount with inverted robot poses obeys the same equation."""
-    both = np.stack(
-        [at.parent_from_camera.translation_m, at.fixed_from_board.translation_m]
-    )
-    camera, board = np.linalg.norm(both, axis=1).tolist()
+    camera, board = np.linalg.norm(at.translations, axis=1).tolist()
     mounted = mount_named(mount)
-    carried = camera if mounted.moves else board
-    on = (mounted.parent, mounted.scene)
-    other = mounted.other.name
+    carried = board
+    if mounted.moves:
+        carried = camera
     if carried < max(_REACH_M, _OTHER_MOUNT * min(camera, board)):
         return []
     return [
-        f"the camera is {camera:.2f} m from the {on[0]} and the board {board:.2f} m from the"
-        f" {on[1]}: if it is the other way round, the robot poses are gripper_from_base, as"
-        f" easy_handeye states for a fixed camera; use --mount {other} and --invert robot"
+        f"the camera is {camera:.2f} m from the {mounted.parent} and the board {board:.2f} m from"
+        f" the {mounted.scene}: if it is the other way round, the robot poses are"
+        f" gripper_from_base, as easy_handeye states for a fixed camera; use `mount`"
+        f" {mounted.other.name} and `invert` robot"
     ]
 
 
@@ -283,14 +302,12 @@ def _other_board_poses(
         nearest = np.inf
         view = corners.views[i]
         old = lens.poses[i]
+        most = 4 * old.squared_px + 0.1 * old.corners
         for candidate in (view, *corners.turned(view)):
             pose = board_pose(candidate, lens.camera, predicted[row])
             # All orders of a symmetric board fit; the other poses decide between them.
             _, turn = pose_distance(pose.camera_from_board, predicted[row])
-            if (
-                pose.squared_px < 4 * old.squared_px + 0.1 * old.corners
-                and turn < nearest
-            ):
+            if pose.squared_px < most and turn < nearest:
                 views[i] = candidate
                 poses[i] = pose.camera_from_board
                 nearest = float(turn)
@@ -310,9 +327,8 @@ def _require_determined(
             " move the gripper by 10 cm or more between poses"
         )
     spread = np.sqrt(np.abs(fit.covariance[:3, :3].trace()))
-    if not (
-        np.isfinite(fit.covariance).all() and spread < 1.0 and least[:3].max() < 0.1
-    ):
+    finite = np.isfinite(fit.covariance).all()
+    if not (finite and spread < 1.0 and least[:3].max() < 0.1):
         raise InputError(
             "the poses leave the position of the camera open by more than a metre; record 15 to 25"
             " poses that turn by 20 to 60 deg about two axes"

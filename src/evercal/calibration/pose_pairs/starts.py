@@ -11,14 +11,31 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evercal.calibration.pose_pairs.pose_equation import PoseEquation, Unknowns
+from evercal.calibration.pose_pairs.fit import Agreement, agreement
+from evercal.calibration.pose_pairs.pairs import PosePairs
+from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation, Unknowns
+from evercal.robot.mount import MountName
 from evercal.typing import Array, IntArray
 
 _SAMPLES = 150
 """Number of samples; even with 50 % outliers about 20 samples contain inliers only."""
-_SCORED = 60
+_MAX_SCORED = 60
 """Maximum number of poses that score a sample."""
-_FLOOR = 1e-9
+_MIN_DISTANCE = 1e-9
+"""Minimum distance from the mean, metres and radians, so that exact poses have a score."""
+_REFINEMENTS = 3
+"""Number of times that the mean of the better half is computed."""
+
+
+class _Hypotheses(NamedTuple):
+    """`parent_from_camera` by each of h samples."""
+
+    rotations: Array
+    """(h, 3, 3)."""
+    translations: Array
+    """(h, 3) metres."""
+    scales: Array
+    """(h,) metres per unit of the camera's translations."""
 
 
 class Start(NamedTuple):
@@ -32,31 +49,42 @@ class Start(NamedTuple):
 def consensus_start(equation: PoseEquation, scale_known: bool = True) -> Start:
     """Return the hypothesis that agrees best with the better half of three or more poses."""
     n = len(equation)
-    scored = equation[np.unique(np.linspace(0, n - 1, _SCORED).round().astype(int))]
+    rows = np.linspace(0, n - 1, _MAX_SCORED).round().astype(int)
+    scored = equation[np.unique(rows)]
+    a, b, c = _triples(n).T
+    first = np.stack([a, a, b], 1)
+    second = np.stack([b, c, c], 1)
+    samples = _solve_motions(equation, first, second, scale_known)
     i, j = np.triu_indices(len(scored), 1)
-    triples = _triples(n)
-    sampled = _solve_motions(
-        equation, triples[:, [0, 0, 1]], triples[:, [1, 2, 2]], scale_known
-    )
     whole = _solve_motions(scored, i[None], j[None], scale_known)
-    rotations, shifts, scales = (
-        np.concatenate(both) for both in zip(sampled, whole, strict=True)
-    )
+    rotations = np.concatenate([samples.rotations, whole.rotations])
+    shifts = np.concatenate([samples.translations, whole.translations])
+    scales = np.concatenate([samples.scales, whole.scales])
     # (h, n) board poses in the fixed frame by each hypothesis.
     fixed_from_camera = scored.robot_rotation @ rotations[:, None]
-    turned = fixed_from_camera @ scored.camera_rotation
-    placed = (fixed_from_camera @ scored.camera_translation[..., None])[..., 0]
-    placed = placed * scales[:, None, None] + scored.robot_translation
-    placed += (scored.robot_rotation @ shifts[:, None, :, None])[..., 0]
-    cost, mean_rotations, mean_shifts = _spread(turned, placed)
+    board_rotations = fixed_from_camera @ scored.camera_rotation
+    boards = (fixed_from_camera @ scored.camera_translation[..., None])[..., 0]
+    boards = boards * scales[:, None, None] + scored.robot_translation
+    boards += (scored.robot_rotation @ shifts[:, None, :, None])[..., 0]
+    cost, mean_rotations, mean_shifts = _spread(board_rotations, boards)
     cost[~(scales > 0)] = np.inf
     best = int(np.argmin(cost))
     at = Unknowns(
-        np.stack([rotations[best], mean_rotations[best]]),
-        np.stack([shifts[best], mean_shifts[best]]),
-        np.zeros(len(equation.extras.names)),
+        rotations=np.stack([rotations[best], mean_rotations[best]]),
+        translations=np.stack([shifts[best], mean_shifts[best]]),
+        extras=np.zeros(len(equation.extras.names)),
     )
     return Start(at, float(scales[best]))
+
+
+def quick_fit(
+    pairs: PosePairs, mount: MountName, scale_known: bool
+) -> tuple[Agreement, float]:
+    """Return a robust estimate of X and Z alone, and the scale."""
+    blank = Extras.nothing(len(pairs))
+    start = consensus_start(pairs.equation(mount, blank), scale_known)
+    equation = pairs.scaled(start.scale).equation(mount, blank)
+    return agreement(equation, start.at), start.scale
 
 
 def _triples(n: int) -> IntArray:
@@ -71,12 +99,8 @@ def _solve_motions(
     first: IntArray,
     second: IntArray,
     scale_known: bool,
-) -> tuple[Array, Array, Array]:
-    """Solve A X = X B for h sets of m motions between the poses `first` and `second`, (h, m).
-
-    Returns:
-        Rotations (h, 3, 3), translations (h, 3) and scales (h,) of `parent_from_camera`.
-    """
+) -> _Hypotheses:
+    """Solve A X = X B for h sets of m motions between the poses `first` and `second`, (h, m)."""
     robot = equation.robot_rotation
     camera = equation.camera_rotation
     inverse = robot[first].transpose(0, 1, 3, 2)
@@ -86,27 +110,33 @@ def _solve_motions(
     translation_a = (inverse @ shift[..., None])[..., 0]
     board = equation.camera_translation
     translation_b = board[first] - (rotation_b @ board[second][..., None])[..., 0]
-    rotations = _nearest(
-        _sine_axes(rotation_a).transpose(0, 2, 1) @ _sine_axes(rotation_b)
-    )
+    axes_a = _sine_axes(rotation_a)
+    axes_b = _sine_axes(rotation_b)
+    rotations = _nearest(axes_a.transpose(0, 2, 1) @ axes_b)
     system = rotation_a - np.eye(3)
     right_side = -translation_a
     rotated = translation_b @ rotations.transpose(0, 2, 1)
-    unit = np.sqrt((translation_b**2).mean((1, 2), keepdims=True)) + 1e-300
+    scales = np.ones(len(system))
     if scale_known:
-        right_side = right_side + rotated
+        solution = _least_squares(system, right_side + rotated)
     else:
+        unit = np.sqrt((translation_b**2).mean((1, 2), keepdims=True)) + 1e-300
         system = np.concatenate([system, -(rotated / unit)[..., None]], -1)
+        solution = _least_squares(system, right_side)
+        scales = solution[:, 3] / unit[:, 0, 0]
+    return _Hypotheses(rotations, solution[:, :3], scales)
+
+
+def _least_squares(system: Array, right_side: Array) -> Array:
+    """Solve h systems (h, m, 3, k) for (h, k) unknowns, with a small ridge."""
     h = len(system)
-    unknowns = system.shape[-1]
-    system = system.reshape(h, -1, unknowns)
-    right_side = right_side.reshape(h, -1, 1)
-    normal = system.transpose(0, 2, 1) @ system
+    k = system.shape[-1]
+    system = system.reshape(h, -1, k)
+    transposed = system.transpose(0, 2, 1)
+    normal = transposed @ system
     ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12
-    projected = system.transpose(0, 2, 1) @ right_side
-    solution = np.linalg.solve(normal + ridge * np.eye(unknowns), projected)[..., 0]
-    scales = np.ones(h) if scale_known else solution[:, 3] / unit[:, 0, 0]
-    return rotations, solution[:, :3], scales
+    projected = transposed @ right_side.reshape(h, -1, 1)
+    return np.linalg.solve(normal + ridge * np.eye(k), projected)[..., 0]
 
 
 def _sine_axes(rotations: Array) -> Array:
@@ -121,20 +151,21 @@ def _spread(rotations: Array, translations: Array) -> tuple[Array, Array, Array]
     rows = np.arange(h)[:, None]
     mean_rotation = _nearest(np.median(rotations, 1))
     mean_translation = np.median(translations, 1)
-    spread = np.zeros((2, h))
-    for _ in range(3):
-        metres2 = ((translations - mean_translation[:, None]) ** 2).sum(-1) + _FLOOR**2
-        radians2 = ((rotations - mean_rotation[:, None]) ** 2).sum(
-            (-1, -2)
-        ) / 2 + _FLOOR**2
+    spread = np.zeros(h)
+    for _ in range(_REFINEMENTS):
+        metres2 = ((translations - mean_translation[:, None]) ** 2).sum(-1)
+        metres2 += _MIN_DISTANCE**2
+        chord2 = ((rotations - mean_rotation[:, None]) ** 2).sum((-1, -2))
+        radians2 = chord2 / 2 + _MIN_DISTANCE**2
         # Each distance is divided by its median so that the two can be added.
         ratio = metres2 / np.median(metres2, 1, keepdims=True)
         ratio += radians2 / np.median(radians2, 1, keepdims=True)
         nearest = np.argsort(ratio, 1)[:, :half]
         mean_rotation = _nearest(rotations[rows, nearest].mean(1))
         mean_translation = translations[rows, nearest].mean(1)
-        spread = np.stack([d[rows, nearest].mean(1) for d in (metres2, radians2)])
-    return np.log(spread[0]) + np.log(spread[1]), mean_rotation, mean_translation
+        spread = np.log(metres2[rows, nearest].mean(1))
+        spread += np.log(radians2[rows, nearest].mean(1))
+    return spread, mean_rotation, mean_translation
 
 
 def _nearest(matrices: Array) -> Array:

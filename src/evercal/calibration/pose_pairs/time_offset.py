@@ -11,7 +11,7 @@ import numpy as np
 
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
-from evercal.calibration.pose_pairs.solve import solve_pairs
+from evercal.calibration.pose_pairs.solve import solve_pose_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.pose_track import PoseTrack
@@ -19,8 +19,17 @@ from evercal.robot.mount import MountName
 from evercal.typing import Array, BoolArray
 
 _STEP_S = 0.01
-_MAX_SIGMA_S, _HALF_S = 0.05, 0.005
-"""Maximum standard deviation of the offset; half the interval of the robot's velocity."""
+"""Step of the grid of offsets."""
+_MAX_SIGMA_S = 0.05
+"""Maximum standard deviation of the offset."""
+_HALF_S = 0.005
+"""Half of the interval over which the robot's velocity is computed."""
+_MAX_ROUNDS = 6
+"""Maximum number of fits, each with the robot poses at the offset of the last one."""
+_CONVERGED_S = 1e-4
+"""Change of the offset that ends them."""
+_MAX_CHANGE_S = 0.02
+"""Maximum change of the offset in the last of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,21 +76,21 @@ def solve_with_offset(
         standard deviation `time_offset_sigma_s`.
     """
     offset = _coarse_offset(robot, camera, largest_s)
-    turns = 0
+    rounds = 0
     while True:
         pairs, overlapping = _pairs_at(robot, camera, offset)
-        solution = solve_pairs(pairs, mount, scale_known, overlapping.corners)
-        correction = float(solution.fit.at.extras[-1])
+        solution = solve_pose_pairs(pairs, mount, scale_known, overlapping.corners)
+        change = float(solution.fit.at.extras[-1])
         sigma = float(solution.fit.sigma[-1])
-        offset += float(np.clip(correction, -largest_s, largest_s))
-        turns += 1
-        if abs(correction) < 1e-4 or turns == 6:
+        offset += float(np.clip(change, -largest_s, largest_s))
+        rounds += 1
+        if abs(change) < _CONVERGED_S or rounds == _MAX_ROUNDS:
             break
-    if not sigma < _MAX_SIGMA_S or abs(correction) > 0.02:
+    if not sigma < _MAX_SIGMA_S or abs(change) > _MAX_CHANGE_S:
         raise InputError(
             f"the time offset is not determined (standard deviation {1000 * sigma:.0f} ms): too few"
             f" images show the robot in motion; move it while recording, or pair images and poses"
-            f" of a still robot and omit --time-offset"
+            f" of a still robot and omit `time_offset`"
         )
     return solution.calibration(offset)
 
@@ -98,30 +107,32 @@ def _pairs_at(
     robot: PoseTrack, camera: CameraTrack, offset: float
 ) -> tuple[PosePairs, CameraTrack]:
     """Return the pairs within the robot's track, with velocities."""
-    times = camera.stamps_s + offset
-    poses, inside = robot.at(np.asarray(times, dtype=np.float64))
+    times = np.asarray(camera.stamps_s + offset, dtype=np.float64)
+    poses, inside = robot.at(times)
+    begin = robot.stamps_s[0]
+    end = robot.stamps_s[-1]
     if not inside.any():
         raise InputError(
             f"no image was taken while robot poses were recorded: images at {times.min():.3f} to"
-            f" {times.max():.3f} s, robot poses at {robot.stamps_s[0]:.3f} to"
-            f" {robot.stamps_s[-1]:.3f} s; check that both use the same clock"
+            f" {times.max():.3f} s, robot poses at {begin:.3f} to"
+            f" {end:.3f} s; check that both use the same clock"
         )
     overlapping = camera[inside]
-    poses = poses[inside]
-    times = np.asarray(times[inside], dtype=np.float64)
-    before, after = (robot.at(times + sign * _HALF_S)[0] for sign in (-1, 1))
+    times = times[inside]
+    before, _ = robot.at(times - _HALF_S)
+    after, _ = robot.at(times + _HALF_S)
     # At the ends of the track the interval is shorter.
-    duration = np.clip(times + _HALF_S, None, robot.stamps_s[-1]) - np.clip(
-        times - _HALF_S, robot.stamps_s[0], None
-    )
+    duration = np.minimum(times + _HALF_S, end) - np.maximum(times - _HALF_S, begin)
     linear = after.translation_m - before.translation_m
     angular = (after @ before.inverse()).log()[:, 3:]
-    velocity = (
-        np.concatenate([linear, angular], 1) / np.maximum(duration, 1e-9)[:, None]
+    moved = np.concatenate([linear, angular], 1)
+    pairs = PosePairs(
+        names=overlapping.names,
+        base_from_gripper=poses[inside],
+        camera_from_board=overlapping.camera_from_board,
+        velocity=moved / np.maximum(duration, 1e-9)[:, None],
     )
-    names = overlapping.names
-    boards = overlapping.camera_from_board
-    return PosePairs(names, poses, boards, velocity=velocity), overlapping
+    return pairs, overlapping
 
 
 def _coarse_offset(robot: PoseTrack, camera: CameraTrack, largest_s: float) -> float:
@@ -132,11 +143,11 @@ def _coarse_offset(robot: PoseTrack, camera: CameraTrack, largest_s: float) -> f
     best = (np.inf, 0.0)
     for offset in np.arange(-largest_s, largest_s + _STEP_S / 2, _STEP_S):
         poses, inside = robot.at(stamps + offset)
-        both = inside[:-1] & inside[1:]
-        if both.sum() < max(3, 0.5 * len(both)):
+        overlapping = inside[:-1] & inside[1:]
+        if overlapping.sum() < max(3, 0.5 * len(overlapping)):
             continue
         # An outlier spoils two angles, so the worst quarter is ignored.
-        error = np.sort(np.abs(_angles(poses) - angles)[both])
+        error = np.sort(np.abs(_angles(poses) - angles)[overlapping])
         cost = float(error[: max(3, (3 * len(error)) // 4)].mean())
         best = min(best, (cost, float(offset)))
     if not np.isfinite(best[0]):
