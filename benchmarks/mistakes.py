@@ -57,7 +57,7 @@ def misread(side: str, written: str, read: str) -> tuple[Mistake, str]:
         return replace(pairs, **{part: poses, f"{side}_numbers": given})
 
     same = [name for name in CONVENTIONS if order_of(name) == order_of(written)]
-    return mistake, rf"--{side}-convention ({'|'.join(same)})(:\w+)*[; ]"
+    return mistake, rf"`{side}_convention` ({'|'.join(same)})(:\w+)*[; ]"
 
 
 def order_of(convention: str) -> str:
