@@ -22,3 +22,33 @@ ConventionName = Literal[
     "aubo", "xarm", "epson", "nachi", "doosan", "comau", "universal_robots", "motoman",
 ]  # fmt: skip
 """Names of pose conventions without modifiers, but for fixed_xyz, moving_zyx and the like."""
+ExportFormat = Literal[
+    "easy_handeye2",
+    "easy_handeye",
+    "moveit_samples",
+    "static_transform_publisher",
+    "launch_py",
+    "ros1_launch",
+    "transform_stamped",
+    "camera_info",
+    "urdf",
+    "opencv",
+    "csv",
+    "npy",
+    "json",
+    "tum",
+    "colmap",
+    "nerfstudio",
+    "zivid",
+    "ur",
+    "kuka",
+    "abb",
+    "fanuc",
+    "yaskawa",
+    "staubli",
+    "franka",
+    "joint_offsets",
+    "corrected_urdf",
+    "lerobot",
+]
+"""Format of an exported calibration; the last three describe the arm."""

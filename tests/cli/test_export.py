@@ -20,6 +20,7 @@ from evercal.calibration.export.request import (
     read_link_from_optical,
     standard_link_from_optical,
 )
+from evercal.errors import with_options
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.robot_poses import read_robot_poses
 from evercal.robot.mount import MountName
@@ -54,7 +55,9 @@ def test_the_list_names_every_format(run: Any) -> None:
     lines = run("export", "--format", "list").out.splitlines()
     assert [line.split()[0] for line in lines] == [*FORMATS, "next:"]
     listed = json.loads(run("export", "--format", "list", "--json").out)["formats"]
-    assert listed == {name: row.description for name, row in FORMATS.items()}
+    assert listed == {
+        name: with_options(row.description) for name, row in FORMATS.items()
+    }
 
 
 @pytest.mark.parametrize("name", ["easy_handeye2", "urdf", "opencv", "kuka"])

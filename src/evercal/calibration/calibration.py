@@ -23,6 +23,7 @@ import numpy as np
 from evercal.calibration.framed_pose import FramedPose
 from evercal.calibration.framed_pose import ImageUse as ImageUse
 from evercal.calibration.framed_pose import JointOffset as JointOffset
+from evercal.choices import ExportFormat
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_distance
 from evercal.robot.mount import MountName
@@ -180,7 +181,9 @@ class Calibration(FramedPose):
         """Write the file atomically."""
         write_json(path, self.to_dict())
 
-    def export(self, format: str, path: PathLike | None = None, **options: Any) -> str:
+    def export(
+        self, format: ExportFormat | str, path: PathLike | None = None, **options: Any
+    ) -> str:
         """Export to a format of other programs and return the text, see `export_files`."""
         from evercal.calibration.export.formats import export_files
 

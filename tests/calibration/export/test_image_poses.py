@@ -159,7 +159,7 @@ def test_tum_of_a_camera_on_the_arm(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["tum", "colmap", "nerfstudio"])
 def test_missing_inputs_are_refused(name: str) -> None:
     with pytest.raises(
-        InputError, match=f"{name}: .* give the gripper's poses with --robot-poses"
+        InputError, match=f"{name}: .* give the gripper's poses with `robot_poses`"
     ):
         ON_ARM.export(name)
     fixed = calibration_of(SE3.identity())
@@ -212,7 +212,7 @@ def test_moveit_samples_are_pairs_of_matrices(named: bool) -> None:
 @pytest.mark.parametrize(
     ("target", "message"),
     [
-        (None, r"--robot-poses and the board's poses .* --target-poses"),
+        (None, r"`robot_poses` and the board's poses .* `target_poses`"),
         (
             RobotPoses(("a", "b", "c"), None, random_poses(3)),
             "'c' has only one of its two poses",

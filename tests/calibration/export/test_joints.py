@@ -167,9 +167,9 @@ def test_a_calibration_without_joints_says_what_to_record(name: str) -> None:
 
 
 def test_missing_options_and_undetermined_joints_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"give the URDF of the arm .* with --urdf"):
+    with pytest.raises(InputError, match=r"give the URDF of the arm .* with `urdf`"):
         ARM.export("corrected_urdf")
-    with pytest.raises(InputError, match="--lerobot-motors feetech or dynamixel"):
+    with pytest.raises(InputError, match="`lerobot_motors` feetech or dynamixel"):
         ARM.export("lerobot", lerobot_calibration=tmp_path / "arm.json")
     still = with_joints(replace(JOINTS[1], open="move elbow more between the images"))
     with pytest.raises(

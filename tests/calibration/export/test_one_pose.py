@@ -8,7 +8,7 @@ import sys
 import types
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 from xml.etree import ElementTree
 
 import cv2
@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.export.formats import FORMATS
+from evercal.choices import ExportFormat
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.cameras.camera_file import read_camera
@@ -345,3 +346,7 @@ def test_invalid_frame_names_are_refused(name: str) -> None:
 def test_valid_frame_names_are_written(name: str) -> None:
     text = calibration_of(SE3.identity()).export("transform_stamped", child=name)
     assert stamped(text)[2] == name
+
+
+def test_names_of_formats_are_those_of_the_table() -> None:
+    assert get_args(ExportFormat) == tuple(FORMATS)

@@ -62,7 +62,7 @@ def test_messages_name_the_file_and_its_option(tmp_path: Path, role: str) -> Non
         read_pairs(PairFiles(robot, camera))
     broken.unlink()
     with pytest.raises(
-        InputError, match=f"file of {role} poses is missing; check --{role}-poses"
+        InputError, match=f"file of {role} poses is missing; check `{role}_poses`"
     ):
         read_pairs(PairFiles(robot, camera))
 

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -228,3 +229,11 @@ def test_a_wrong_size_of_the_squares_is_named_and_estimated(mount: MountName) ->
     )
     distance = calibration.uncertain_pose.squared_mahalanobis(truth.parent_from_camera)
     assert distance < 16.8
+
+
+def test_a_misspelt_mount_is_refused() -> None:
+    mount: Any = "wrist"
+    pairs = recording(EXACT, 0).pairs
+    message = "^mount 'wrist': give eye_to_hand or eye_in_hand$"
+    with pytest.raises(InputError, match=message):
+        solve(pairs, mount)

@@ -9,6 +9,7 @@ from evercal.calibration.export import joints as arm
 from evercal.calibration.export import writers as to
 from evercal.calibration.export.request import Export, ExportOptions, prepare_export
 from evercal.calibration.framed_pose import FramedPose
+from evercal.choices import ExportFormat
 from evercal.errors import InputError
 from evercal.storage import write_bytes
 from evercal.typing import PathLike
@@ -18,13 +19,14 @@ Content: TypeAlias = str | bytes | dict[str, str]
 
 
 @dataclass(frozen=True)
-class Format:
+class Exporter:
     """One export format; every format takes fixed cameras and cameras on the arm."""
 
     frame: Literal["tf", "optical", "any"]
     """Child frame. `tf`: a frame of the robot's tf tree. `optical`: only the camera's optical
     frame, so `via` is refused. `any`: plain numbers of either frame."""
     write: Callable[[Export], Content]
+    """Writes the content of the file."""
     ending: str
     """Usual ending of the file; empty for a folder."""
     description: str
@@ -33,75 +35,83 @@ class Format:
     """Whether a camera on the arm needs the robot's pose of every image."""
 
 
-FORMATS = {
-    "easy_handeye2": Format(
+FORMATS: dict[str, Exporter] = {
+    "easy_handeye2": Exporter(
         "tf", to.easy_handeye2, ".calib", "for ~/.ros2/easy_handeye2"
     ),
-    "easy_handeye": Format(
+    "easy_handeye": Exporter(
         "tf", to.easy_handeye, ".yaml", "for ~/.ros/easy_handeye of ROS 1"
     ),
-    "moveit_samples": Format(
+    "moveit_samples": Exporter(
         "optical", to.moveit, ".yaml", "MoveIt Calibration's pairs", True
     ),
-    "static_transform_publisher": Format(
+    "static_transform_publisher": Exporter(
         "tf", to.command, ".sh", "shell command for ROS 2"
     ),
-    "launch_py": Format(
+    "launch_py": Exporter(
         "tf", to.launch_py, ".launch.py", "ROS 2 launch file with a tf publisher"
     ),
-    "ros1_launch": Format(
+    "ros1_launch": Exporter(
         "tf", to.ros1_launch, ".launch", "ROS 1 launch file, like MoveIt's"
     ),
-    "transform_stamped": Format(
+    "transform_stamped": Exporter(
         "tf", to.stamped, ".yaml", "geometry_msgs/TransformStamped"
     ),
-    "camera_info": Format("optical", to.camera_info, ".yaml", "intrinsics for ROS"),
-    "urdf": Format(
+    "camera_info": Exporter("optical", to.camera_info, ".yaml", "intrinsics for ROS"),
+    "urdf": Exporter(
         "tf", to.urdf, ".urdf", "fixed joint for a URDF, rpy about fixed axes"
     ),
-    "opencv": Format("optical", to.opencv, ".yml", "rvec and tvec, parent to camera"),
-    "csv": Format("any", to.csv, ".csv", "4x4 matrix, metres, one matrix row per line"),
-    "npy": Format("any", to.npy, ".npy", "4x4 matrix, metres, for numpy"),
-    "json": Format(
+    "opencv": Exporter("optical", to.opencv, ".yml", "rvec and tvec, parent to camera"),
+    "csv": Exporter(
+        "any", to.csv, ".csv", "4x4 matrix, metres, one matrix row per line"
+    ),
+    "npy": Exporter("any", to.npy, ".npy", "4x4 matrix, metres, for numpy"),
+    "json": Exporter(
         "any", to.as_json, ".json", "matrix, quaternion wxyz, covariance, frames"
     ),
-    "tum": Format(
+    "tum": Exporter(
         "optical", to.tum, ".tum", "stamp, translation, quaternion x y z w", True
     ),
-    "colmap": Format("optical", to.colmap, "", "a model without points (folder)", True),
-    "nerfstudio": Format("optical", to.nerfstudio, ".json", "transforms.json", True),
-    "zivid": Format(
+    "colmap": Exporter(
+        "optical", to.colmap, "", "a model without points (folder)", True
+    ),
+    "nerfstudio": Exporter("optical", to.nerfstudio, ".json", "transforms.json", True),
+    "zivid": Exporter(
         "any", to.zivid, ".txt", "4x4 matrix in millimetres for Zivid's SDK"
     ),
-    "ur": Format("any", to.ur, ".txt", "Universal Robots: p[x, y, z, rx, ry, rz]"),
-    "kuka": Format("any", to.kuka, ".txt", "KUKA: {X, Y, Z, A, B, C}, mm and degrees"),
-    "abb": Format("any", to.abb, ".txt", "ABB: [[x,y,z],[q1,q2,q3,q4]], mm"),
-    "fanuc": Format("any", to.fanuc, ".txt", "FANUC: X Y Z W P R, mm and degrees"),
-    "yaskawa": Format(
+    "ur": Exporter("any", to.ur, ".txt", "Universal Robots: p[x, y, z, rx, ry, rz]"),
+    "kuka": Exporter(
+        "any", to.kuka, ".txt", "KUKA: {X, Y, Z, A, B, C}, mm and degrees"
+    ),
+    "abb": Exporter("any", to.abb, ".txt", "ABB: [[x,y,z],[q1,q2,q3,q4]], mm"),
+    "fanuc": Exporter("any", to.fanuc, ".txt", "FANUC: X Y Z W P R, mm and degrees"),
+    "yaskawa": Exporter(
         "any", to.yaskawa, ".txt", "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"
     ),
-    "staubli": Format(
+    "staubli": Exporter(
         "any", to.staubli, ".txt", "Staubli: X Y Z RX RY RZ, mm and degrees"
     ),
-    "franka": Format("any", to.franka, ".txt", "Franka: 16 numbers by column, metres"),
-    "joint_offsets": Format(
+    "franka": Exporter(
+        "any", to.franka, ".txt", "Franka: 16 numbers by column, metres"
+    ),
+    "joint_offsets": Exporter(
         "any", arm.joint_offsets, ".json", "offsets of the arm's joints"
     ),
-    "corrected_urdf": Format(
-        "any", arm.corrected_urdf, ".urdf", "--urdf with these offsets"
+    "corrected_urdf": Exporter(
+        "any", arm.corrected_urdf, ".urdf", "`urdf` with these offsets"
     ),
-    "lerobot": Format(
-        "any", arm.lerobot, ".json", "--lerobot-calibration with these offsets"
+    "lerobot": Exporter(
+        "any", arm.lerobot, ".json", "`lerobot_calibration` with these offsets"
     ),
 }
-"""All formats by name."""
+"""All formats by name, an `ExportFormat`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Exported:
     """A calibration with the exported frames in another format."""
 
-    format: Format
+    format: Exporter
     calibration: FramedPose
     text: str
     """Exported text; empty for a binary file or a folder."""
@@ -111,7 +121,7 @@ class Exported:
 
 def export_files(
     calibration: FramedPose,
-    format: str,
+    format: ExportFormat | str,
     path: PathLike | None = None,
     **options: Unpack[ExportOptions],
 ) -> Exported:
@@ -128,39 +138,45 @@ def export_files(
         raise InputError(
             f"export format {format!r} is not known; use one of {', '.join(FORMATS)}"
         )
-    row = FORMATS[key]
+    exporter = FORMATS[key]
     # easy_handeye2 looks up ~/cell.calib under the name cell.
-    name = "evercal" if path is None else Path(path).name.split(".")[0] or "evercal"
+    name = "evercal"
+    if path is not None:
+        name = Path(path).name.split(".")[0] or name
     export = prepare_export(calibration, name, **options)
-    if row.frame == "optical" and options.get("via") is not None:
+    if exporter.frame == "optical" and options.get("via") is not None:
         raise InputError(
-            f"{key} holds the pose of the camera, not of {export.child!r}; omit --via"
+            f"{key} holds the pose of the camera, not of {export.child!r}; omit `via`"
         )
     try:
-        content = row.write(export)
+        content = exporter.write(export)
     except InputError as error:
         raise InputError(f"{key}: {error}") from None
-    text = content if isinstance(content, str) else ""
-    if path is None and not text:
-        raise InputError(f"{key} is not text and cannot be printed; give --out")
-    files = () if path is None else _write(Path(path), content)
-    return Exported(row, export.calibration, text, files)
+    text = ""
+    if isinstance(content, str):
+        text = content
+    if path is not None:
+        files = _write(Path(path), content)
+        return Exported(exporter, export.calibration, text, files)
+    if not text:
+        raise InputError(f"{key} is not text and cannot be printed; give `out`")
+    return Exported(exporter, export.calibration, text, ())
 
 
 def _write(path: Path, content: Content) -> tuple[Path, ...]:
     """Write a file, or a folder that does not yet hold such files."""
     if isinstance(content, dict):
-        files = {path / name: text.encode() for name, text in content.items()}
-        for file in files:
+        for name in content:
+            file = path / name
             if file.exists():
-                raise InputError(f"{file}: already there; give a new folder with --out")
+                raise InputError(f"{file}: already there; give a new folder with `out`")
         path.mkdir(parents=True, exist_ok=True)
-    else:
-        if not path.absolute().parent.is_dir():
-            raise InputError(
-                f"--out {path}: its folder does not exist; create it first"
-            )
-        files = {path: content.encode() if isinstance(content, str) else content}
-    for file, data in files.items():
-        write_bytes(file, data)
-    return tuple(files)
+        for name, text in content.items():
+            write_bytes(path / name, text.encode())
+        return tuple(path / name for name in content)
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"`out` {path}: its folder does not exist; create it first")
+    if isinstance(content, str):
+        content = content.encode()
+    write_bytes(path, content)
+    return (path,)

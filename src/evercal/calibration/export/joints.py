@@ -16,19 +16,26 @@ from evercal.storage.text_files import library_errors, read_json
 _LEROBOT_TICKS = 4095 / 360
 """A degree of LeRobot is this many ticks: it divides by the resolution minus 1."""
 _FEETECH_MOST = 2047
-"""The motor has 11 bits and a sign for the offset."""
+"""Largest offset of a Feetech motor, which has 11 bits and a sign for it."""
+_OFFSET_SIGN = {"feetech": -1, "dynamixel": 1}
+"""Sign of the homing offset in the position that the motor reports."""
 _TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")
 
 
 def joint_offsets(export: Export) -> str:
     """Write offset, standard deviation and covariance; null where it is not determined."""
+    _determined(export)
     rows: dict[str, dict[str, object]] = {}
-    for joint in _determined(export) and export.calibration.joints:
-        units = {"rad": 1.0, "deg": joint.unit[1]} if joint.is_angle else {"m": 1.0}
+    for joint in export.calibration.joints:
         row = rows.setdefault(joint.name, {"open": joint.open})
-        for unit, times in units.items():
-            row[f"offset_{unit}"] = None if joint.open else times * joint.offset
-            row[f"sigma_{unit}"] = times * joint.sigma
+        units = {"m": 1.0}
+        if joint.is_angle:
+            units = {"rad": 1.0, "deg": joint.unit[1]}
+        for unit, factor in units.items():
+            row[f"offset_{unit}"] = factor * joint.offset
+            row[f"sigma_{unit}"] = factor * joint.sigma
+            if joint.open:
+                row[f"offset_{unit}"] = None
     record = {
         "meaning": "add each offset to the value that the robot reports",
         "joints": rows,
@@ -43,15 +50,19 @@ def corrected_urdf(export: Export) -> bytes:
     From the values that the robot reports, its readers compute the poses of corrected ones.
     """
     offsets = {joint.name: joint.offset for joint in _determined(export)}
-    if (file := export.options.get("urdf")) is None:
-        raise InputError("give the URDF of the arm that was recorded with --urdf")
+    file = export.options.get("urdf")
+    if file is None:
+        raise InputError("give the URDF of the arm that was recorded with `urdf`")
     model = RobotModel(file)
     for joint in export.calibration.joints:
-        rotates = model.origins_with({joint.name: 0.0}).get(joint.name, (None, None))[1]
-        if rotates != joint.is_angle:
-            kind = f"{'revolute' if joint.is_angle else 'prismatic'} joint {joint.name}"
+        kind = "prismatic"
+        if joint.is_angle:
+            kind = "revolute"
+        origin = model.origins_with({joint.name: 0.0}).get(joint.name)
+        if origin is None or origin[1] != joint.is_angle:
             raise InputError(
-                f"{file}: has no {kind} with a value of its own; give the arm's URDF"
+                f"{file}: has no {kind} joint {joint.name} with a value of its own; give the arm's"
+                f" URDF"
             )
     with library_errors(f"{file}: no usable URDF"):
         return _with_origins(Path(file).read_bytes(), model.origins_with(offsets))
@@ -64,8 +75,10 @@ def _with_origins(urdf: bytes, moved: Mapping[str, tuple[SE3, bool]]) -> bytes:
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
         path.append((tag, attributes.get("name", "")))
-        if [tag for tag, _ in path[1:]] in (["joint"], ["joint", "origin"]):
-            places.setdefault((path[1][1], tag), parser.CurrentByteIndex)
+        inside_robot = [tag for tag, _ in path[1:]]
+        if inside_robot in (["joint"], ["joint", "origin"]):
+            joint = path[1][1]
+            places.setdefault((joint, tag), parser.CurrentByteIndex)
 
     parser = expat.ParserCreate()
     parser.StartElementHandler = begin
@@ -73,15 +86,22 @@ def _with_origins(urdf: bytes, moved: Mapping[str, tuple[SE3, bool]]) -> bytes:
     parser.Parse(urdf, True)
     # The last first, so that places before it stay.
     for name in sorted(moved, key=lambda name: -places[name, "joint"]):
-        part, key = (slice(3, 6), b"rpy") if moved[name][1] else (slice(3), b"xyz")
-        numbers = " ".join(
-            map(repr, pose_numbers(moved[name][0], "rpy")[part].tolist())
-        ).encode()
+        origin, rotates = moved[name]
+        numbers = pose_numbers(origin, "rpy").tolist()
+        key = b"xyz"
+        values = numbers[:3]
+        if rotates:
+            key = b"rpy"
+            values = numbers[3:]
+        attribute = b'<origin %s="%s"' % (key, " ".join(map(repr, values)).encode())
+        has_origin = (name, "origin") in places
         start = places.get((name, "origin"), places[name, "joint"])
         end = next(_TAG.finditer(urdf, start)).end()
-        tag = re.sub(rb"\s%s\s*=\s*(\"[^\"]*\"|'[^']*')" % key, b"", urdf[start:end])
-        tag += b"" if (name, "origin") in places else b"<origin/>"
-        tag = tag.replace(b"<origin", b'<origin %s="%s"' % (key, numbers), 1)
+        tag = urdf[start:end]
+        tag = re.sub(rb"\s%s\s*=\s*(\"[^\"]*\"|'[^']*')" % key, b"", tag)
+        if not has_origin:
+            tag += b"<origin/>"
+        tag = tag.replace(b"<origin", attribute, 1)
         urdf = urdf[:start] + tag + urdf[end:]
     return urdf
 
@@ -92,14 +112,13 @@ def lerobot(export: Export) -> str:
     Feetech's position is the encoder's minus the offset, Dynamixel's is the sum. The range stays,
     because zero degrees are in its middle.
     """
-    file, motors = (
-        export.options.get(f"lerobot_{word}") for word in ("calibration", "motors")
-    )
+    file = export.options.get("lerobot_calibration")
+    motors = export.options.get("lerobot_motors")
     determined = _determined(export)
-    sign = {"feetech": -1, "dynamixel": 1}.get(str(motors), 0)
-    if file is None or not sign:
+    sign = _OFFSET_SIGN.get(str(motors), 0)
+    if file is None or sign == 0:
         raise InputError(
-            "give --lerobot-calibration FILE, --lerobot-motors feetech or dynamixel"
+            "give `lerobot_calibration` FILE, `lerobot_motors` feetech or dynamixel"
         )
     record = read_json(Path(file), "LeRobot calibration")
     for joint in determined:
@@ -108,24 +127,25 @@ def lerobot(export: Export) -> str:
             raise InputError(
                 f"{file}: has no homing_offset of a joint {joint.name} that turns"
             )
-        row["homing_offset"] += sign * round(
-            joint.unit[1] * joint.offset * _LEROBOT_TICKS
-        )
+        ticks = round(joint.unit[1] * joint.offset * _LEROBOT_TICKS)
+        row["homing_offset"] += sign * ticks
         if sign < 0 and abs(row["homing_offset"]) > _FEETECH_MOST:
-            what = f"the homing offset of {joint.name} would exceed {_FEETECH_MOST}"
             raise InputError(
-                f"{file}: {what}; calibrate it in LeRobot with another middle first"
+                f"{file}: the homing offset of {joint.name} would exceed {_FEETECH_MOST}; calibrate"
+                f" it in LeRobot with another middle first"
             )
     return json.dumps(record, indent=4) + "\n"
 
 
 def _determined(export: Export) -> list[JointOffset]:
     """The offsets that are determined, at least one."""
-    if not (joints := export.calibration.joints):
+    joints = export.calibration.joints
+    if not joints:
         raise InputError(
             "no offsets of joints; record joints.csv and a URDF, not gripper poses"
         )
-    if not (determined := [joint for joint in joints if not joint.open]):
+    determined = [joint for joint in joints if not joint.open]
+    if not determined:
         why = "; ".join(f"{joint.name}: {joint.open}" for joint in joints)
         raise InputError(f"no offset is determined ({why})")
     return determined

@@ -69,9 +69,13 @@ class Export:
     name: str
     """Name of the calibration in easy_handeye."""
     robot_frame: str | None
+    """See `ExportOptions.robot_frame`."""
     robot_poses: RobotPoses | None
+    """base_from_gripper of every image."""
     target_poses: RobotPoses | None
+    """camera_from_target of every image."""
     options: ExportOptions
+    """All options, as given."""
 
     @property
     def parent(self) -> str:
@@ -130,24 +134,19 @@ def prepare_export(
             f"parent and child frame are both called {parent!r}; rename one of them"
         )
     link_from_optical = _link_from_optical(child, options)
-    for role, frame in {
-        "parent": parent,
-        "child": link or child,
-        "robot": other,
-    }.items():
+    if link is not None:
+        moved = calibration.uncertain_pose @ link_from_optical.inverse()
+        calibration = replace(
+            calibration, parent_from_child=moved.pose, covariance=moved.covariance
+        )
+        child = link
+    for role, frame in (("parent", parent), ("child", child), ("robot", other)):
         if frame is not None and not _FRAME.fullmatch(frame):
             raise InputError(
                 f"{role} frame {frame!r} is no name of a tf frame; use letters, digits, _ . - and"
-                f" inner /, such as 'camera_color_optical_frame' (rename with --parent or --child)"
+                f" inner /, such as 'camera_color_optical_frame' (rename with `parent` or `child`)"
             )
-    calibration = replace(calibration, parent_frame=parent, child_frame=link or child)
-    if link is not None:
-        moved = calibration.uncertain_pose @ link_from_optical.inverse()
-        pose = moved.pose
-        covariance = moved.covariance
-        calibration = replace(
-            calibration, parent_from_child=pose, covariance=covariance
-        )
+    calibration = replace(calibration, parent_frame=parent, child_frame=child)
     robot = options.get("robot_poses")
     target = options.get("target_poses")
     if robot is not None and not isinstance(robot, RobotPoses):
@@ -160,18 +159,16 @@ def prepare_export(
 
 
 def _link_from_optical(optical: str, options: ExportOptions) -> SE3:
-    link, file, offset = (
-        options.get(key) for key in ("via", "via_transform", "via_offset")
-    )
-    sources = (
-        (file is not None) + (offset is not None) + options.get("via_optical", False)
-    )
-    if link is None and sources:
-        raise InputError("name the driver's root frame with --via, such as camera_link")
-    if link is not None and sources != 1:
+    link = options.get("via")
+    file = options.get("via_transform")
+    offset = options.get("via_offset")
+    sources = [file is not None, offset is not None, options.get("via_optical", False)]
+    if link is None and any(sources):
+        raise InputError("name the driver's root frame with `via`, such as camera_link")
+    if link is not None and sum(sources) != 1:
         raise InputError(
-            f"--via {link} needs the pose of the optical frame in it; give one of --via-transform"
-            f" FILE, --via-offset X Y Z, or --via-optical if their origins are the same"
+            f"`via` {link} needs the pose of the optical frame in it; give one of `via_transform`"
+            f" FILE, `via_offset` X Y Z, or `via_optical` if their origins are the same"
         )
     if link is not None and file is not None:
         return read_link_from_optical(file, link, optical)
@@ -221,30 +218,35 @@ def read_link_from_optical(path: PathLike, link: str, optical: str) -> SE3:
         frames = ", ".join(sorted({parent for parent, _ in transforms}))
         raise InputError(
             f"{path}: no transform leads from {link!r} to {optical!r}; its frames are {frames}."
-            f" Name the optical frame with --child and the driver's root frame with --via"
+            f" Name the optical frame with `child` and the driver's root frame with `via`"
         )
     return link_from[optical]
 
 
 def _transforms(data: Any) -> _Transforms:
-    if isinstance(data, Mapping) and "transforms" in data:
-        data = data["transforms"]
     if isinstance(data, list):
-        return {
-            pair: pose for entry in data for pair, pose in _transforms(entry).items()
-        }
-    if isinstance(data, Mapping) and "transform" in data:
-        body = data["transform"]
-        pair = data["header"]["frame_id"], data["child_frame_id"]
-        translation = [float(body["translation"][axis]) for axis in "xyz"]
-        quaternion = [float(body["rotation"][axis]) for axis in "wxyz"]
-    elif isinstance(data, Mapping) and "parent_frame" in data:
-        pair = data["parent_frame"], data["child_frame"]
+        transforms: _Transforms = {}
+        for entry in data:
+            transforms |= _transforms(entry)
+        return transforms
+    if not isinstance(data, Mapping):
+        return {}
+    if "transforms" in data:
+        return _transforms(data["transforms"])
+    if "transform" in data:
+        transform = data["transform"]
+        parent = data["header"]["frame_id"]
+        child = data["child_frame_id"]
+        translation = [float(transform["translation"][axis]) for axis in "xyz"]
+        quaternion = [float(transform["rotation"][axis]) for axis in "wxyz"]
+    elif "parent_frame" in data:
+        parent = data["parent_frame"]
+        child = data["child_frame"]
         translation = data["translation_m"]
         quaternion = data["quaternion_wxyz"]
     else:
         return {}
     if abs(float(np.linalg.norm(quaternion)) - 1.0) > 1e-2:
         raise ValueError(f"quaternion {quaternion} is not of length 1")
-    parent, child = (str(frame).lstrip("/") for frame in pair)
-    return {(parent, child): SE3(np.array(quaternion), np.array(translation))}
+    frames = (str(parent).lstrip("/"), str(child).lstrip("/"))
+    return {frames: SE3(np.array(quaternion), np.array(translation))}

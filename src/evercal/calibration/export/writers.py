@@ -132,7 +132,7 @@ def easy_handeye2(export: Export) -> str:
     """Write the message HandeyeCalibration of easy_handeye2."""
     parameters = {
         "name": export.name,
-        "calibration_type": "eye_in_hand" if export.in_hand else "eye_on_base",
+        "calibration_type": ("eye_on_base", "eye_in_hand")[export.in_hand],
         **_handeye_frames(export),
         "freehand_robot_movement": True,
         **_MOVE_GROUP,
@@ -182,10 +182,14 @@ def _transform(export: Export) -> dict[str, dict[str, float]]:
 
 
 def _handeye_frames(export: Export) -> dict[str, str]:
-    other = export.robot_frame
+    base = export.parent
+    effector = export.robot_frame or "gripper"
+    if export.in_hand:
+        base = export.robot_frame or "base"
+        effector = export.parent
     return {
-        "robot_base_frame": other or "base" if export.in_hand else export.parent,
-        "robot_effector_frame": export.parent if export.in_hand else other or "gripper",
+        "robot_base_frame": base,
+        "robot_effector_frame": effector,
         "tracking_base_frame": export.child,
         "tracking_marker_frame": "no_marker",  # the tools require a name
     }
@@ -260,7 +264,7 @@ def _image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
     if robot is None:
         raise InputError(
             "the pose of a camera on the arm changes with each image; give the gripper's poses with"
-            " --robot-poses"
+            " `robot_poses`"
         )
     names = robot.names or tuple(f"{i:06d}.png" for i in range(len(robot)))
     return names, robot.poses @ export.pose
@@ -282,7 +286,8 @@ def tum(export: Export) -> str:
 
 def colmap(export: Export) -> dict[str, str]:
     """Write a sparse model without points: camera_from_base, quaternion w x y z."""
-    camera, (names, poses) = export.camera, _image_poses(export)
+    camera = export.camera
+    names, poses = _image_poses(export)
     lines = []
     rows = pose_numbers(poses, "wxyz:inverse").tolist()
     for i, (name, row) in enumerate(zip(names, rows, strict=True)):
@@ -295,13 +300,16 @@ def colmap(export: Export) -> dict[str, str]:
     if camera.model == "fisheye":
         model = "OPENCV_FISHEYE"
         parameters += camera.distortion
+    elif any(camera.distortion) and len(camera.distortion) == 4:
+        model = "OPENCV"
+        parameters += camera.distortion
     elif any(camera.distortion):
-        four = len(camera.distortion) == 4
-        model = "OPENCV" if four else "FULL_OPENCV"
-        parameters += camera.distortion if four else camera.coefficients
+        model = "FULL_OPENCV"
+        parameters += camera.coefficients
+    intrinsics = " ".join(map(repr, parameters))
     return {
         "cameras.txt": "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
-        f"1 {model} {camera.width} {camera.height} {' '.join(map(repr, parameters))}\n",
+        f"1 {model} {camera.width} {camera.height} {intrinsics}\n",
         "images.txt": "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
         "# POINTS2D[] as (X, Y, POINT3D_ID)\n" + "\n".join([*lines, ""]),
         "points3D.txt": "# no points\n",
@@ -310,26 +318,34 @@ def colmap(export: Export) -> dict[str, str]:
 
 def nerfstudio(export: Export) -> str:
     """Write transforms.json: base_from_camera with camera axes x right, y up, z back."""
-    camera, (names, poses) = export.camera, _image_poses(export)
-    matrices = pose_numbers(poses, "matrix:opengl").reshape(-1, 4, 4).tolist()
-    fisheye = camera.model == "fisheye"
-    terms = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    camera = export.camera
+    names, poses = _image_poses(export)
+    model = "OPENCV"
+    terms = ("k1", "k2", "p1", "p2", "k3")
+    if camera.model == "fisheye":
+        model = "OPENCV_FISHEYE"
+        terms = ("k1", "k2", "k3", "k4")
     if any(camera.distortion[len(terms) :]):
         # nerfstudio's k4 is the fourth coefficient of a polynomial, not OpenCV's k4.
         raise InputError(
             "there are no terms for k4 k5 k6 of this camera; calibrate it with k1 k2 p1 p2 k3,"
             " or undistort the images"
         )
+    frames = []
+    matrices = pose_numbers(poses, "matrix:opengl").reshape(-1, 4, 4).tolist()
+    for name, matrix in zip(names, matrices, strict=True):
+        frames.append({"file_path": name, "transform_matrix": matrix})
     record = {
-        "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
-        **{"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy},
-        **{"cx": camera.cx + 0.5, "cy": camera.cy + 0.5},
+        "camera_model": model,
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx + 0.5,
+        "cy": camera.cy + 0.5,
         **dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0),
         **dict(zip(terms, camera.coefficients, strict=False)),
-        "frames": [
-            {"file_path": name, "transform_matrix": matrix}
-            for name, matrix in zip(names, matrices, strict=True)
-        ],
+        "frames": frames,
     }
     return json.dumps(record, indent=1, allow_nan=False) + "\n"
 
@@ -340,26 +356,25 @@ def moveit(export: Export) -> str:
     target = export.target_poses
     if robot is None or target is None:
         raise InputError(
-            "a calibration holds no pose pairs; give the gripper's poses with --robot-poses"
-            " and the board's poses in the camera with --target-poses"
+            "a calibration holds no pose pairs; give the gripper's poses with `robot_poses`"
+            " and the board's poses in the camera with `target_poses`"
         )
-    camera_from_target = target.poses
+    targets = target.poses
     if robot.names and target.names and robot.names != target.names:
         single = sorted({*robot.names} ^ {*target.names})
         if single:
             raise InputError(f"{single[0]!r} has only one of its two poses")
-        camera_from_target = target.poses[
-            [target.names.index(name) for name in robot.names]
-        ]
+        targets = targets[[target.names.index(name) for name in robot.names]]
     if len(robot) != len(target):
         raise InputError(
             f"{len(robot)} robot poses and {len(target)} target poses; give one of each for every"
             " image"
         )
-    rows = (
-        pose_numbers(poses, "matrix").tolist()
-        for poses in (robot.poses, camera_from_target)
-    )
-    names = ("effector_wrt_world", "object_wrt_sensor")
-    samples = [dict(zip(names, pair, strict=True)) for pair in zip(*rows, strict=True)]
+    effectors = pose_numbers(robot.poses, "matrix").tolist()
+    objects = pose_numbers(targets, "matrix").tolist()
+    samples = []
+    for effector, target_object in zip(effectors, objects, strict=True):
+        samples.append(
+            {"effector_wrt_world": effector, "object_wrt_sensor": target_object}
+        )
     return _yaml(samples, None, 1000)
