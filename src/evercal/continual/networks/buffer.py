@@ -2,22 +2,22 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
 from operator import attrgetter
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from evercal.continual.networks.descriptor import Descriptor, described
-from evercal.continual.networks.loss import MAX_RADIUS2, Target
+from evercal.continual.networks.loss import Target, radial_factor
 from evercal.features.encoder import Encoder
 from evercal.features.views import View, ViewOptions, augmented_view, frame_view
 from evercal.geometry.se3 import SE3
 from evercal.recordings.frame import Frame
 
 UNDISTORT_STEPS = 10
+"""Fixed-point iterations that invert the radial distortion."""
 
 
 @dataclass
@@ -39,16 +39,29 @@ class Rows:
         return _combined([self], lambda values: values[0][where])
 
 
-_TARGET = "target.pixels", "target.intrinsics", "target.camera_from_atlas"
-_tensors = attrgetter("features", "scene", "descriptor", *_TARGET)
+def _combined(
+    batches: Sequence[Rows], change: Callable[[list[Tensor]], Tensor]
+) -> Rows:
+    """Change every column of batches; known points are those of the batches that have some."""
 
+    def changed(name: str) -> Tensor:
+        return change(list(map(attrgetter(name), batches)))
 
-def _combined(parts: Sequence[Rows], change: Callable[[list[Tensor]], Tensor]) -> Rows:
-    columns = zip(*map(_tensors, parts), strict=True)
-    features, scene, descriptor, *target = (change(list(column)) for column in columns)
-    known = [part.known for part in parts if part.known is not None]
-    points = change(known) if known else None
-    return Rows(features, scene, descriptor, Target(*target), points)
+    known = None
+    with_points = [batch.known for batch in batches if batch.known is not None]
+    if with_points:
+        known = change(with_points)
+    return Rows(
+        features=changed("features"),
+        scene=changed("scene"),
+        descriptor=changed("descriptor"),
+        target=Target(
+            pixels=changed("target.pixels"),
+            intrinsics=changed("target.intrinsics"),
+            camera_from_atlas=changed("target.camera_from_atlas"),
+        ),
+        known=known,
+    )
 
 
 class FeatureBuffer:
@@ -80,19 +93,17 @@ class FeatureBuffer:
 
         `encoded` are features (cells, channels) and a descriptor (width,) on any device.
         """
-        features, descriptor = (values.cpu() for values in encoded)
-        camera_from_atlas = (
-            (self.atlas_from_base @ view.base_from_camera).inverse().matrix()[:3]
-        )
+        features, descriptor = encoded
+        atlas_from_camera = self.atlas_from_base @ view.base_from_camera
+        camera_from_atlas = torch.from_numpy(atlas_from_camera.inverse().matrix()[:3])
+        count = int(keep.sum())
         part = {
-            "features": features[keep].half(),
+            "features": features.cpu()[keep].half(),
             "pixels": torch.tensor(view.cell_pixels, device="cpu")[keep],
-            "view": torch.full(
-                (int(keep.sum()),), self.views, dtype=torch.int32, device="cpu"
-            ),
+            "view": torch.full((count,), self.views, dtype=torch.int32, device="cpu"),
             "intrinsics": torch.from_numpy(view.intrinsics)[None],
-            "camera_from_atlas": torch.from_numpy(camera_from_atlas)[None].float(),
-            "descriptors": descriptor[None].float(),
+            "camera_from_atlas": camera_from_atlas[None].float(),
+            "descriptors": descriptor.cpu()[None].float(),
         }
         self.extend(part)
 
@@ -105,16 +116,18 @@ class FeatureBuffer:
     @property
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name, on the buffer's device."""
-        if self._merged is None:
-            names = self._parts[0]
-            self._merged = {
-                name: torch.cat([part[name].cpu() for part in self._parts]).to(
-                    self.device
-                )
-                for name in names
-            }
-            self._parts = [self._merged]  # one copy in memory
-        return self._merged
+        if self._merged is not None:
+            return self._merged
+        merged: dict[str, Tensor] = {}
+        for name in self._parts[0]:
+            columns = [part[name].cpu() for part in self._parts]
+            merged[name] = torch.cat(columns).to(self.device)
+        self._replace(merged)
+        return merged
+
+    def _replace(self, tensors: dict[str, Tensor]) -> None:
+        self._merged = tensors
+        self._parts = [tensors]  # one copy in memory
 
     def __len__(self) -> int:
         return len(self.tensors["features"])
@@ -123,74 +136,83 @@ class FeatureBuffer:
     def starts(self) -> Tensor:
         """(views + 1,) first row of every view, and the number of rows; on the CPU."""
         view = self.tensors["view"].cpu()
-        return torch.searchsorted(
-            view, torch.arange(self.views + 1, dtype=view.dtype, device="cpu")
-        )
+        numbers = torch.arange(self.views + 1, dtype=view.dtype, device="cpu")
+        return torch.searchsorted(view, numbers)
 
     def correct_lens(self, correction: Tensor) -> None:
         """Undistort the pixels and correct the intrinsics; see `reprojection_error`."""
-        t = self.tensors
-        view = self.tensors["view"].long()
-        focal, dx, dy, k1, k2 = correction.to(t["pixels"]).unbind()
-        scale = t["intrinsics"][:, :2]
-        focals = scale * (1 + focal)
-        centres = t["intrinsics"][:, 2:] + scale * torch.stack([dx, dy])
-        distorted = (t["pixels"] - centres[view]) / focals[view]
+        tensors = self.tensors
+        view = tensors["view"].long()
+        focal, dx, dy, k1, k2 = correction.to(tensors["pixels"]).unbind()
+        nominal_focals = tensors["intrinsics"][:, :2]
+        nominal_centres = tensors["intrinsics"][:, 2:]
+        focals = nominal_focals * (1 + focal)
+        centres = nominal_centres + nominal_focals * torch.stack([dx, dy])
+        distorted = (tensors["pixels"] - centres[view]) / focals[view]
         plane = distorted
         for _ in range(UNDISTORT_STEPS):
-            radius2 = (plane * plane).sum(-1, keepdim=True).clamp(max=MAX_RADIUS2)
-            plane = distorted / (1 + k1 * radius2 + k2 * radius2 * radius2)
-        pixels = plane * focals[view] + centres[view]
-        intrinsics = torch.cat([focals, centres], -1)
-        self._merged = {**t, "pixels": pixels, "intrinsics": intrinsics}
-        self._parts = [self._merged]
+            plane = distorted / radial_factor(plane, k1, k2)
+        corrected = {
+            "pixels": plane * focals[view] + centres[view],
+            "intrinsics": torch.cat([focals, centres], -1),
+        }
+        self._replace(tensors | corrected)
 
-    def draw(self, count: int, generator: torch.Generator) -> Rows:
+    def draw(self, count: int, generator: Generator) -> Rows:
         """Draw `count` random rows with replacement, equal on every device."""
-        return self.rows(
-            torch.randint(len(self), (count,), generator=generator, device="cpu")
-        )
+        return self.rows(random_indices(len(self), count, generator))
 
     def rows(self, index: Tensor) -> Rows:
         """Return the rows at `index` (n,), which may be on any device."""
-        t = self.tensors
-        index = index.to(t["view"].device)
-        view = t["view"][index].long()
-        target = Target(
-            t["pixels"][index], t["intrinsics"][view], t["camera_from_atlas"][view]
+        tensors = self.tensors
+        index = index.to(tensors["view"].device)
+        view = tensors["view"][index].long()
+        known = None
+        if self.known is not None:
+            known = self.known[index].float()
+        return Rows(
+            features=tensors["features"][index],
+            scene=torch.full((len(index),), self.scene, device=index.device),
+            descriptor=tensors["descriptors"][view],
+            target=Target(
+                pixels=tensors["pixels"][index],
+                intrinsics=tensors["intrinsics"][view],
+                camera_from_atlas=tensors["camera_from_atlas"][view],
+            ),
+            known=known,
         )
-        scene = torch.full((len(index),), self.scene, device=index.device)
-        known = None if self.known is None else self.known[index].float()
-        return Rows(t["features"][index], scene, t["descriptors"][view], target, known)
 
 
-def join(parts: Sequence[Rows]) -> Rows:
-    """Concatenate batches."""
-    if len(parts) == 1:
-        return parts[0]
-    if any(part.known is not None for part in parts):
-        nan = torch.full((1, 3), torch.nan, device=parts[0].scene.device)
-        parts = [
-            replace(part, known=nan.expand(len(part.scene), 3))
-            if part.known is None
-            else part
-            for part in parts
-        ]
-    return _combined(parts, torch.cat)
+def random_indices(count: int, size: int, generator: Generator) -> Tensor:
+    """Draw indices (size,) below `count` with replacement, equal on every device."""
+    return torch.randint(count, (size,), generator=generator, device="cpu")
 
 
-def diffused(rows: Rows, deviation: float, generator: torch.Generator) -> Rows:
+def join(batches: Sequence[Rows]) -> Rows:
+    """Concatenate batches; rows of those without known points have NaN if others have some."""
+    if len(batches) == 1:
+        return batches[0]
+    joined = _combined(batches, torch.cat)
+    if joined.known is None:
+        return joined
+    columns = []
+    for batch in batches:
+        known = batch.known
+        if known is None:
+            known = joined.known.new_full((len(batch.scene), 3), torch.nan)
+        columns.append(known)
+    return replace(joined, known=torch.cat(columns))
+
+
+def diffused(rows: Rows, deviation: float, generator: Generator) -> Rows:
     """Add noise to unit descriptors of rows (GLACE's feature diffusion); `deviation` per channel.
 
     The generator is on the device of the rows.
     """
-    noise = torch.randn(
-        rows.descriptor.shape, generator=generator, device=generator.device
-    )
-    descriptor = F.normalize(
-        rows.descriptor + deviation * noise.to(rows.descriptor), dim=-1
-    )
-    return replace(rows, descriptor=descriptor)
+    descriptor = rows.descriptor
+    noise = torch.randn(descriptor.shape, generator=generator, device=generator.device)
+    noisy = descriptor + deviation * noise.to(descriptor)
+    return replace(rows, descriptor=F.normalize(noisy, dim=-1))
 
 
 @dataclass(frozen=True)
@@ -202,7 +224,9 @@ class EncodePlan:
     cells: int = 600
     """Rows taken from an augmented view; a plain view gives all rows."""
     seed: int = 0
+    """Seed of augmentations and of the cells that are taken."""
     view: ViewOptions = field(default_factory=ViewOptions)
+    """Size and augmentation of the views."""
 
 
 def encode_frames(
@@ -217,19 +241,18 @@ def encode_frames(
     Pass 0 shows the frames unchanged, later passes augmented. A view and its cells depend only on
     (seed, pass, frame).
     """
-    for visit, (position, frame) in product(
-        range(plan.views_per_frame), enumerate(frames)
-    ):
-        rng = np.random.default_rng([plan.seed, visit, position])
-        if visit == 0:
-            view = frame_view(frame, encoder.stride, plan.view)
-        else:
-            view = augmented_view(frame, encoder.stride, plan.view, rng)
-        some = rng.permutation(np.flatnonzero(view.valid))[
-            : plan.cells if visit else None
-        ]
-        keep = np.zeros(len(view.valid), bool)
-        keep[some] = True
-        encoded = described(encoder(view.grey), descriptor)
-        buffer.append(view, encoded, torch.from_numpy(keep))
-        yield buffer.views
+    stride = encoder.stride
+    for visit in range(plan.views_per_frame):
+        for position, frame in enumerate(frames):
+            rng = np.random.default_rng([plan.seed, visit, position])
+            if visit == 0:
+                view = frame_view(frame, stride, plan.view)
+                keep = view.valid
+            else:
+                view = augmented_view(frame, stride, plan.view, rng)
+                valid = rng.permutation(np.flatnonzero(view.valid))
+                keep = np.zeros(len(view.valid), bool)
+                keep[valid[: plan.cells]] = True
+            encoded = described(encoder(view.grey), descriptor)
+            buffer.append(view, encoded, torch.from_numpy(keep))
+            yield buffer.views

@@ -8,14 +8,17 @@ import torch
 from torch import Tensor
 
 MIN_DEPTH_M = 0.1
+"""Minimum depth of a valid point, metres."""
 MAX_DEPTH_M = 1000.0
+"""Maximum depth of a valid point, metres."""
 MAX_ERROR_PX = 1000.0
+"""Maximum L1 reprojection error of a valid point, pixels."""
 FIXED_CLAMP_PX = 5.0
+"""Soft clamp of losses that are compared between steps, pixels."""
 SURFACE_PX = 5.0
-"""Least scale of the loss on known points, about the error of swept depths."""
+"""Minimum scale of the loss on known points, pixels: about the error of swept depths."""
 MAX_RADIUS2 = 1.0
-"""Squared radius in the normalised image plane beyond which distortion is constant. A polynomial
-is not valid further out."""
+"""Squared radius in the normalised image plane beyond which the distortion is constant."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,7 @@ class LossOptions:
     clamp_start_px: float = 100.0
     """Soft clamp at the first step. With `circle`, its excess over `clamp_end_px`."""
     clamp_end_px: float = 1.0
+    """Soft clamp at the last step, pixels."""
     proxy_depth_m: float = 10.0
     """Invalid points are attracted to the point at this depth on their ray."""
 
@@ -43,16 +47,25 @@ class Target:
     camera_from_atlas: Tensor
     """(n, 3, 4)."""
 
+    @property
+    def focals(self) -> Tensor:
+        """(n, 2) fx, fy."""
+        return self.intrinsics[:, :2]
+
+    @property
+    def centres(self) -> Tensor:
+        """(n, 2) cx, cy."""
+        return self.intrinsics[:, 2:]
+
 
 def clamp_px(options: LossOptions, progress: float) -> float:
     """Return the soft clamp tau at `progress` in [0, 1]."""
+    start = options.clamp_start_px
+    end = options.clamp_end_px
     if options.schedule == "exponential":
-        return (
-            options.clamp_start_px
-            * (options.clamp_end_px / options.clamp_start_px) ** progress
-        )
+        return start * (end / start) ** progress
     q = 1.0 - math.sqrt(max(0.0, 1.0 - progress * progress))
-    return options.clamp_start_px * (1.0 - q) + options.clamp_end_px
+    return start * (1.0 - q) + end
 
 
 def reprojection_error(
@@ -63,25 +76,37 @@ def reprojection_error(
     A correction (n, 5) of the nominal pinhole camera is the relative focal length, the shift of the
     principal point in focal lengths (x, y), and OpenCV's k1 and k2.
     """
-    matrix = target.camera_from_atlas
-    in_camera = _rotated(matrix[:, :, :3], points) + matrix[:, :, 3]
+    in_camera = _in_camera(points, target)
     depth = in_camera[:, 2:].clamp(min=MIN_DEPTH_M)
     plane = in_camera[:, :2] / depth
     if correction is not None:
-        radius2 = (plane * plane).sum(-1, keepdim=True).clamp(max=MAX_RADIUS2)
-        radial = (
-            1.0 + correction[:, 3:4] * radius2 + correction[:, 4:5] * radius2 * radius2
-        )
-        plane = plane * radial * (1.0 + correction[:, :1]) + correction[:, 1:3]
-    projected = plane * target.intrinsics[:, :2] + target.intrinsics[:, 2:]
+        focal, dx, dy, k1, k2 = correction.split(1, dim=1)
+        radial = radial_factor(plane, k1, k2)
+        plane = plane * radial * (1.0 + focal) + torch.cat([dx, dy], 1)
+    projected = plane * target.focals + target.centres
     return projected - target.pixels, in_camera
 
 
-def _rotated(matrices: Tensor, points: Tensor) -> Tensor:
-    if points.device.type == "cpu":
-        return torch.einsum("nij,nj->ni", matrices, points)
+def radial_factor(plane: Tensor, k1: Tensor, k2: Tensor) -> Tensor:
+    """Radial distortion (n, 1) at points (n, 2) of the image plane, OpenCV's 1 + k1 r^2 + k2 r^4.
+
+    Beyond `MAX_RADIUS2` the polynomial is not valid, and the factor is constant.
+    """
+    radius2 = (plane * plane).sum(-1, keepdim=True).clamp(max=MAX_RADIUS2)
+    return 1.0 + k1 * radius2 + k2 * radius2 * radius2
+
+
+def _in_camera(points: Tensor, target: Target) -> Tensor:
+    """Camera coordinates (n, 3) of points (n, 3) of the atlas."""
+    return _rotated(points, target) + target.camera_from_atlas[:, :, 3]
+
+
+def _rotated(vectors: Tensor, target: Target) -> Tensor:
+    matrices = target.camera_from_atlas[:, :, :3]
+    if vectors.device.type == "cpu":
+        return torch.einsum("nij,nj->ni", matrices, vectors)
     # A matrix product may round to TF32, an error of millimetres in a room; a sum does not.
-    return (matrices * points[:, None]).sum(-1)
+    return (matrices * vectors[:, None]).sum(-1)
 
 
 def reprojection_loss(
@@ -102,15 +127,13 @@ def reprojection_loss(
     depth = in_camera[:, 2]
     valid = (depth > MIN_DEPTH_M) & (depth < MAX_DEPTH_M) & (error < MAX_ERROR_PX)
     robust = tau * torch.tanh(error / tau)
-    focal = target.intrinsics[:, :2]
-    centre = target.intrinsics[:, 2:]
-    ray = torch.cat(
-        [(target.pixels - centre) / focal, torch.ones_like(error)[:, None]], -1
-    )
-    proxy = (ray * options.proxy_depth_m - in_camera).abs().sum(-1)
-    loss = torch.where(valid, robust, proxy)
-    pixels = torch.where(valid, residual.detach().norm(dim=-1), torch.inf)
-    return loss, pixels
+    plane = (target.pixels - target.centres) / target.focals
+    ray = torch.cat([plane, torch.ones_like(plane[:, :1])], -1)
+    proxy = ray * options.proxy_depth_m
+    to_proxy = (proxy - in_camera).abs().sum(-1)
+    loss = torch.where(valid, robust, to_proxy)
+    pixels = residual.detach().norm(dim=-1)
+    return loss, torch.where(valid, pixels, torch.inf)
 
 
 def surface_loss(
@@ -126,14 +149,12 @@ def surface_loss(
     """
     has_point = ~known[:, 0].isnan()
     known = torch.where(has_point[:, None], known, points.detach())
-    matrix = target.camera_from_atlas
-    gap = _rotated(matrix[:, :, :3], points - known).abs().sum(-1)
-    depth = (_rotated(matrix[:, :, :3], known) + matrix[:, :, 3])[:, 2].clamp(
-        min=MIN_DEPTH_M
-    )
+    gap = _rotated(points - known, target).abs().sum(-1)
+    depth = _in_camera(known, target)[:, 2].clamp(min=MIN_DEPTH_M)
     error = gap * target.intrinsics[:, 0] / depth
     scale = max(tau_px, SURFACE_PX)
-    return torch.where(has_point, scale * torch.log1p(error / scale), 0.0)
+    robust = scale * torch.log1p(error / scale)
+    return torch.where(has_point, robust, 0.0)
 
 
 def fixed_clamp_loss(

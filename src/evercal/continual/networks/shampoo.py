@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 MOMENTUM = 0.95
+"""Decay of the running mean of gradients per step."""
 DECAY = 0.9
 """Decay of the second moment per step."""
 EVERY = 10
@@ -39,27 +40,30 @@ class OneSidedShampoo(torch.optim.Optimizer):
             gradients = torch.stack([matrix.grad for matrix in matrices])
             # One product for all matrices of a group: their state is that of the first.
             changes = self._changes(self.state[matrices[0]], gradients)
+            rate = group["lr"]
+            decay = rate * group["weight_decay"]
             for matrix, change in zip(matrices, changes, strict=True):
-                matrix.mul_(1 - group["lr"] * group["weight_decay"])
-                matrix.add_(change, alpha=-group["lr"])
+                matrix.mul_(1 - decay)
+                matrix.add_(change, alpha=-rate)
 
     def _changes(self, state: dict[str, Tensor], gradients: Tensor) -> Tensor:
         if not state:
             state["momentum"] = torch.zeros_like(gradients)
             # On the CPU, so that no step waits for a GPU.
             state["step"] = torch.zeros((), device="cpu")
-        state["momentum"].lerp_(gradients, 1 - MOMENTUM)
-        direction = gradients.lerp(state["momentum"], MOMENTUM)
-        moment = direction.mT @ direction
-        state["moment"] = (
-            state["moment"].lerp_(moment, 1 - DECAY) if "moment" in state else moment
-        )
+        momentum = state["momentum"].lerp_(gradients, 1 - MOMENTUM)
+        direction = gradients.lerp(momentum, MOMENTUM)
+        squares = direction.mT @ direction
+        moment = state.setdefault("moment", squares)
+        if moment is not squares:
+            moment.lerp_(squares, 1 - DECAY)
         if int(state["step"]) % EVERY == 0:
-            state["root"] = inverse_root(state["moment"])
+            state["root"] = inverse_root(moment)
         state["step"] += 1
         changes = direction @ state["root"]
         norm = torch.linalg.matrix_norm(changes, keepdim=True).clamp(min=1e-12)
-        return changes * (gradients.shape[-1] ** 0.5 / norm)
+        orthogonal = gradients.shape[-1] ** 0.5
+        return changes * (orthogonal / norm)
 
 
 def inverse_root(moments: Tensor) -> Tensor:
@@ -67,13 +71,14 @@ def inverse_root(moments: Tensor) -> Tensor:
 
     c is the mean eigenvalue; steps do not depend on it.
     """
-    mean = moments.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None].clamp(min=1e-30)
-    scaled = moments / mean + FLOOR * torch.eye(
-        moments.shape[-1], device=moments.device
-    )
+    mean = moments.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
+    unit = torch.eye(moments.shape[-1], device=moments.device)
+    scaled = moments / mean.clamp(min=1e-30) + FLOOR * unit
     try:
         values, vectors = torch.linalg.eigh(scaled)
     except RuntimeError:  # LinAlgError, which torch does not export
         # LAPACK's divide and conquer sometimes does not converge in single precision.
-        values, vectors = (part.float() for part in torch.linalg.eigh(scaled.double()))
-    return (vectors * values.clamp(min=FLOOR).rsqrt()[..., None, :]) @ vectors.mT
+        values, vectors = torch.linalg.eigh(scaled.double())
+    roots = values.float().clamp(min=FLOOR).rsqrt()
+    vectors = vectors.float()
+    return (vectors * roots[..., None, :]) @ vectors.mT
