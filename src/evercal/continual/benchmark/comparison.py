@@ -1,7 +1,7 @@
 """Comparison of strategies: scores of every run, and tables with one row per strategy."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pandas as pd
@@ -11,9 +11,13 @@ from evercal.errors import InputError
 from evercal.evaluation.metrics import ContinualScores, continual_scores
 
 COARSE_COLUMN = "within_5cm_5deg"
+"""Column of results.csv that counts frames within 5 cm and 5 deg."""
 FINE_COLUMN = "within_1cm_1deg"
+"""Column of results.csv that counts frames within 1 cm and 1 deg."""
 FINAL = "final %"
+"""Column of `run_scores`: accuracy after the last stage."""
 AREA = "area to 20 cm"
+"""Column of `run_scores`: area under the curve of recall over position error."""
 LEGEND = """\
 Accuracy: share of all test frames strictly below 5 cm and 5 deg, mean over scenes.
 final: accuracy after the last stage. last scene: accuracy on the scene learned last.
@@ -43,24 +47,34 @@ def run_scores(results: Table) -> Table:
 
     Forgetting and memory of joint training are NaN.
     """
-    scores = {key: _scores(run) for key, run in _runs(complete_runs(results)).items()}
-    return pd.DataFrame.from_dict(scores, orient="index").rename_axis(
-        ["strategy", "seed"]
-    )
+    scores = {(name, seed): _scores(run) for name, seed, run in _runs(results)}
+    table = pd.DataFrame.from_dict(scores, orient="index")
+    return table.rename_axis(["strategy", "seed"])
 
 
-def _runs(results: Table) -> dict[tuple[str, int], Table]:
-    grouped = results.groupby(["strategy", "seed"], sort=False)
-    return {(str(name), int(seed)): run for (name, seed), run in grouped}
+def _runs(results: Table) -> Iterator[tuple[str, int, Table]]:
+    """Strategy, seed and rows of every complete run."""
+    complete = complete_runs(results)
+    for (name, seed), run in complete.groupby(["strategy", "seed"], sort=False):
+        yield str(name), int(seed), run
+
+
+def last_stage(results: Table) -> Table:
+    """Return the rows of the last stage."""
+    return results[results["stage"] == results["stage"].max()]
 
 
 def _scores(run: Table) -> dict[str, float]:
-    coarse, fine = (
-        continual(matrix(run, name)) for name in (COARSE_COLUMN, FINE_COLUMN)
-    )
-    last = run[run["stage"] == run["stage"].max()]
-    located = last["with_covariance"].sum()
-    jointly = math.isnan(coarse.total_forgetting)
+    coarse = continual(matrix(run))
+    fine = continual(matrix(run, FINE_COLUMN))
+    last = last_stage(run)
+    inside = math.nan
+    with_covariance = last["with_covariance"].sum()
+    if with_covariance:
+        inside = 100 * last["inside_95"].sum() / with_covariance
+    memory_mb = last["memory_bytes"].iloc[0] / 1e6
+    if math.isnan(coarse.total_forgetting):  # joint training needs all frames again
+        memory_mb = math.nan
     return {
         FINAL: coarse.final_accuracy,
         "1 cm 1 deg %": fine.final_accuracy,
@@ -72,14 +86,16 @@ def _scores(run: Table) -> dict[str, float]:
         "BWT": coarse.backward_transfer,
         "wrong scene %": 100 * float((last["wrong_scene"] / last["frames"]).mean()),
         "refused %": 100 * float((last["refused"] / last["frames"]).mean()),
-        "in 95 % ellipsoid": 100 * last["inside_95"].sum() / located
-        if located
-        else math.nan,
-        # Joint training needs all frames again.
-        "memory MB": math.nan if jointly else last["memory_bytes"].iloc[0] / 1e6,
+        "in 95 % ellipsoid": inside,
+        "memory MB": memory_mb,
         "heads MB": last["head_bytes"].iloc[0] / 1e6,
-        "s": float(run.groupby("stage")["seconds"].last().sum()),
+        "s": _seconds(run),
     }
+
+
+def _seconds(run: Table) -> float:
+    """Seconds of learning, all stages."""
+    return float(run.groupby("stage")["seconds"].last().sum())
 
 
 def matrix(run: Table, column: str = COARSE_COLUMN) -> Table:
@@ -87,16 +103,18 @@ def matrix(run: Table, column: str = COARSE_COLUMN) -> Table:
 
     `column` is one of `WITHIN`.
     """
-    scenes = run.loc[run["stage"] == run["stage"].max(), "scene"]
-    shares = run.assign(share=100 * run[column] / run["frames"])
+    scenes = list(last_stage(run)["scene"])
+    percent = 100 * run[column] / run["frames"]
+    shares = run.assign(share=percent)
     accuracies = shares.pivot_table(index="stage", columns="scene", values="share")
-    return accuracies.reindex(index=range(len(scenes)), columns=list(scenes))
+    return accuracies.reindex(index=range(len(scenes)), columns=scenes)
 
 
 def continual(accuracies: Table) -> ContinualScores:
     """Return final accuracy and forgetting; forgetting is NaN for joint training."""
     values = accuracies.to_numpy(float)
-    if np.isfinite(values[np.tril_indices(len(values))]).all():
+    measured = values[np.tril_indices(len(values))]
+    if np.isfinite(measured).all():
         return continual_scores(values)
     nan = math.nan
     last = values[-1]
@@ -113,25 +131,26 @@ def method_table(scores: Table) -> Table:
     runs = grouped.size()
     spread = grouped[FINAL].std()
     table = formatted(means)
-    table[FINAL] = [
-        mean if np.isnan(deviation) else f"{mean} ± {deviation:.1f}"
-        for mean, deviation in zip(table[FINAL], spread, strict=True)
-    ]
+    several = table[FINAL] + " ± " + formatted(spread)
+    table[FINAL] = table[FINAL].where(spread.isna(), several)
     table.insert(0, "runs", runs)
-    return table.loc[means[FINAL].sort_values(ascending=False, kind="stable").index]
+    best_first = means[FINAL].sort_values(ascending=False, kind="stable")
+    return table.loc[best_first.index]
 
 
 def scene_table(results: Table) -> Table:
     """Tabulate the accuracy of each scene: just after learning it -> at the end, means of runs."""
-    rows = []
-    for (name, _), run in _runs(complete_runs(results)).items():
+    runs = []
+    for name, _, run in _runs(results):
         accuracies = matrix(run)
-        ends = zip(
-            accuracies.columns, np.diag(accuracies), accuracies.iloc[-1], strict=True
-        )
-        rows += [(name, scene, first, end) for scene, first, end in ends]
-    cells = pd.DataFrame(rows, columns=["strategy", "scene", "learned", "end"])
-    means = cells.groupby(["strategy", "scene"], sort=False)[["learned", "end"]].mean()
+        columns = {
+            "strategy": name,
+            "scene": accuracies.columns,
+            "learned": np.diag(accuracies),
+            "end": accuracies.iloc[-1].to_numpy(),
+        }
+        runs.append(pd.DataFrame(columns))
+    means = pd.concat(runs).groupby(["strategy", "scene"], sort=False).mean()
     text = formatted(means)
     return (text["learned"] + " -> " + text["end"]).unstack(sort=False)
 
@@ -142,25 +161,33 @@ def contrast_table(scores: Table, pairs: Sequence[tuple[str, str]]) -> Table:
     Final accuracy and area, each with the bounds of `seeds_interval`, which hold for all pairs
     together, and the number of runs in which the first strategy is better.
     """
-    scores = scores[[FINAL, AREA]]
-    by_name = dict(list(scores.groupby(level="strategy")))
-    heads = [head for name in (FINAL, AREA) for head in (name, "bounds", "better in")]
+    by_name = dict(list(scores[[FINAL, AREA]].groupby(level="strategy")))
+    none = scores[:0][[FINAL, AREA]]
     rows = {}
     for ours, theirs in pairs:
-        a, b = (
-            by_name.get(name, scores[:0]).droplevel("strategy")
-            for name in (ours, theirs)
-        )
-        gains = (a - b).dropna()
+        first = by_name.get(ours, none).droplevel("strategy")
+        second = by_name.get(theirs, none).droplevel("strategy")
+        gains = (first - second).dropna()
         cells: list[object] = [len(gains)]
         for name in (FINAL, AREA):
-            low, high = seeds_interval(gains[name], len(pairs))
-            bounds = "-" if math.isnan(low) else f"{low:+.1f} to {high:+.1f}"
-            mean = f"{gains[name].mean():+.1f}" if len(gains) else "-"
-            cells += [mean, bounds, int((gains[name] > 0).sum()) if len(gains) else "-"]
+            cells += _contrast_cells(gains[name], len(pairs))
         rows[f"{ours} - {theirs}"] = cells
+    columns = ["runs"]
+    for name in (FINAL, AREA):
+        columns += [name, "bounds", "better in"]
     index = pd.Index(rows, name="contrast, points")
-    return pd.DataFrame(list(rows.values()), index, columns=["runs", *heads])
+    return pd.DataFrame(list(rows.values()), index, columns=columns)
+
+
+def _contrast_cells(gains: Table, comparisons: int) -> list[object]:
+    """Mean, bounds and number of positive ones of gains (runs,); `-` where there are too few."""
+    if not len(gains):
+        return ["-", "-", "-"]
+    bounds = "-"
+    low, high = seeds_interval(gains, comparisons)
+    if not math.isnan(low):
+        bounds = f"{low:+.1f} to {high:+.1f}"
+    return [f"{gains.mean():+.1f}", bounds, int((gains > 0).sum())]
 
 
 def seeds_interval(
@@ -185,14 +212,14 @@ def seeds_interval(
 
 def formatted(table: Table) -> Table:
     """Format numbers with one digit; NaN becomes `-`."""
-    return table.map(lambda value: "-" if math.isnan(value) else f"{value:.1f}")
+    return table.map("{:.1f}".format).where(table.notna(), "-")
 
 
 def summary(results: Table) -> dict[str, list[dict[str, object]]]:
     """Summarize every complete run for JSON, by strategy; NaN becomes None."""
     strategies: dict[str, list[dict[str, object]]] = {}
-    for (name, seed), run in _runs(complete_runs(results)).items():
-        last = run[run["stage"] == run["stage"].max()].iloc[0]
+    for name, seed, run in _runs(results):
+        last = last_stage(run).iloc[0]
         coarse = matrix(run)
         strategies.setdefault(name, []).append(
             {
@@ -203,12 +230,12 @@ def summary(results: Table) -> dict[str, list[dict[str, object]]]:
                 **continual(coarse).to_dict(),
                 "memory_bytes": int(last["memory_bytes"]),
                 "head_bytes": int(last["head_bytes"]),
-                "seconds": float(run.groupby("stage")["seconds"].last().sum()),
+                "seconds": _seconds(run),
             }
         )
     return strategies
 
 
 def _plain(accuracies: Table) -> list[list[float | None]]:
-    known = accuracies.notna()
-    return accuracies.round(3).astype(object).where(known, None).to_numpy().tolist()
+    values = accuracies.round(3).astype(object)
+    return values.where(accuracies.notna(), None).to_numpy().tolist()

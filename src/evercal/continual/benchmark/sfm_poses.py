@@ -19,9 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3
 from evercal.recordings.frame import Recording
 from evercal.storage.text_files import read_text
+
+_SOURCE = "https://github.com/tsattler/visloc_pseudo_gt_limitations"
+"""Repository of the pose files."""
 
 
 def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
@@ -35,12 +38,20 @@ def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
         file = folder / f"{name}_{split}.txt"
         poses = _read(file)
         posed = []
-        for frame in (f for f in frames if _key(f.name) in poses):
-            pose, focal = poses[_key(frame.name)]
-            c = frame.camera
-            # The middle of the image, counted from the centre of the first pixel.
-            middle = (c.width - 1) / 2, (c.height - 1) / 2
-            camera = Camera(c.width, c.height, focal, focal, *middle, c.distortion)
+        for frame in frames:
+            key = _key(frame.name)
+            if key not in poses:
+                continue
+            pose, focal = poses[key]
+            camera = frame.camera
+            camera = replace(
+                camera,
+                fx=focal,
+                fy=focal,
+                # The middle of the image, counted from the centre of the first pixel.
+                cx=(camera.width - 1) / 2,
+                cy=(camera.height - 1) / 2,
+            )
             posed.append(replace(frame, camera=camera, base_from_camera=pose))
         if frames and not posed:
             first = _key(frames[0].name)
@@ -60,23 +71,24 @@ def _key(name: str) -> str:
 
 
 def _read(file: Path) -> dict[str, tuple[SE3, float]]:
-    source = "https://github.com/tsattler/visloc_pseudo_gt_limitations"
-    lines = read_text(
-        file, "pose file", f"get the folder pgt/sfm of {source}"
-    ).splitlines()
+    text = read_text(file, "pose file", f"get the folder pgt/sfm of {_SOURCE}")
     poses = {}
-    for number, line in enumerate(filter(str.strip, lines), start=1):
+    for number, line in enumerate(filter(str.strip, text.splitlines()), start=1):
         name, *words = line.split()
         try:
-            numbers = np.array([float(word) for word in words])
-            if len(numbers) != 8 or not np.isfinite(numbers).all() or numbers[7] <= 0:
-                raise ValueError
-            camera_from_base = SE3(
-                numbers[:4] / np.linalg.norm(numbers[:4]), numbers[4:7]
-            )
+            poses[_key(name)] = _pose_and_focal(words)
         except ValueError:
             raise InputError(
                 f"{file}: line {number} is not 'image qw qx qy qz tx ty tz focal': {line[:60]!r}"
             ) from None
-        poses[_key(name)] = camera_from_base.inverse(), float(numbers[7])
     return poses
+
+
+def _pose_and_focal(words: list[str]) -> tuple[SE3, float]:
+    """base_from_camera and focal length of a line; ValueError for other words."""
+    numbers = np.array(words, float)
+    if len(numbers) != 8 or not np.isfinite(numbers).all() or numbers[7] <= 0:
+        raise ValueError
+    quaternion = numbers[:4] / np.linalg.norm(numbers[:4])
+    camera_from_base = SE3(quaternion, numbers[4:7])
+    return camera_from_base.inverse(), float(numbers[7])

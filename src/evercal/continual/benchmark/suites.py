@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from evercal.recordings import (
     stated_poses,
 )
 from evercal.recordings.samples import sample_rooms
+from evercal.typing import Array
 
 
 @dataclass(frozen=True)
@@ -26,10 +28,26 @@ class Suite:
     scenes: tuple[str, ...]
     """Names in order of learning; each is a folder of the data."""
     source: str
+    """Where the recordings are from."""
 
 
 _THREE = ("bedroom", "kitchen", "living")
-_TWELVE = tuple(f"{room}-{i}" for i in range(1, 5) for room in _THREE)
+"""Kinds of rendered rooms."""
+_TWELVE = (
+    "bedroom-1",
+    "kitchen-1",
+    "living-1",
+    "bedroom-2",
+    "kitchen-2",
+    "living-2",
+    "bedroom-3",
+    "kitchen-3",
+    "living-3",
+    "bedroom-4",
+    "kitchen-4",
+    "living-4",
+)
+"""Four rooms of each kind."""
 
 
 def _rendered(name: str, scenes: tuple[str, ...] = _THREE) -> Suite:
@@ -54,13 +72,18 @@ SUITES: dict[str, Suite] = {
     ),
     "i12s": Suite(
         (
-            *(f"apt1/{room}" for room in ("kitchen", "living")),
-            *(f"apt2/{room}" for room in ("bed", "kitchen", "living", "luke")),
-            *(
-                f"office1/{room}"
-                for room in ("gates362", "gates381", "lounge", "manolis")
-            ),
-            *(f"office2/{room}" for room in ("5a", "5b")),
+            "apt1/kitchen",
+            "apt1/living",
+            "apt2/bed",
+            "apt2/kitchen",
+            "apt2/living",
+            "apt2/luke",
+            "office1/gates362",
+            "office1/gates381",
+            "office1/lounge",
+            "office1/manolis",
+            "office2/5a",
+            "office2/5b",
         ),
         "https://graphics.stanford.edu/projects/reloc/",
     ),
@@ -82,33 +105,33 @@ def load_suite(
         names = ", ".join([*SUITES, "custom", "regions"])
         raise InputError(f"suite {name!r}: unknown; choose one of {names}")
     if poses is not None and name not in ("i7s", "i12s"):
-        raise InputError(f"suite {name}: --poses are for i7s and i12s")
+        raise InputError(f"suite {name}: `poses` are for i7s and i12s")
     suite = SUITES[name]
-    unknown = [scene for scene in only if scene not in suite.scenes]
-    if unknown:
-        raise InputError(
-            f"scene {unknown[0]!r}: not in suite {name}; choose from {', '.join(suite.scenes)}"
-        )
+    for scene in only:
+        if scene not in suite.scenes:
+            raise InputError(
+                f"scene {scene!r}: not in suite {name}; choose from {', '.join(suite.scenes)}"
+            )
     names = [scene for scene in suite.scenes if not only or scene in only]
     if name == "sim-mini":
         rooms = {room.scene.name: room.scene for room in sample_rooms()}
         return [rooms[scene] for scene in names]
     if data is None:
-        raise InputError("this suite needs recordings: give their folder with --data")
-    missing = [scene for scene in names if not (data / scene).is_dir()]
-    if missing:
-        raise InputError(
-            f"suite {name}: {data / missing[0]} is missing; get it from {suite.source}, or select"
-            " other scenes with --scenes"
-        )
-    # Names of scenes have no slashes: apt1/kitchen becomes apt1-kitchen.
-    scenes = [
-        load_recording(data / scene, name=scene.replace("/", "-")) for scene in names
-    ]
-    if poses is None:
-        return scenes
-    folders = [scene.replace("/", "_") for scene in names]
-    return [with_sfm_poses(s, poses, n) for s, n in zip(scenes, folders, strict=True)]
+        raise InputError("this suite needs recordings: give their folder with `data`")
+    for scene in names:
+        if not (data / scene).is_dir():
+            raise InputError(
+                f"suite {name}: {data / scene} is missing; get it from {suite.source}, or select"
+                " other scenes with `scenes`"
+            )
+    recordings = []
+    for scene in names:
+        # Names of scenes have no slashes: apt1/kitchen becomes apt1-kitchen.
+        recording = load_recording(data / scene, name=scene.replace("/", "-"))
+        if poses is not None:
+            recording = with_sfm_poses(recording, poses, scene.replace("/", "_"))
+        recordings.append(recording)
+    return recordings
 
 
 def tuning_split(scene: Recording) -> Recording:
@@ -117,15 +140,14 @@ def tuning_split(scene: Recording) -> Recording:
     Of ten equal runs of training frames, the third and the eighth become test frames.
     """
     frames = posed_frames(scene.train)
-    tenth = [10 * i // len(frames) for i in range(len(frames))]
-    train = tuple(
-        f for f, part in zip(frames, tenth, strict=True) if part not in (2, 7)
-    )
-    test = tuple(f for f, part in zip(frames, tenth, strict=True) if part in (2, 7))
+    tenth = 10 * np.arange(len(frames)) // len(frames)
+    is_test = np.isin(tenth, (2, 7))
+    train = tuple(compress(frames, ~is_test))
+    test = tuple(compress(frames, is_test))
     if len(train) < MIN_TRAIN_FRAMES:
         raise InputError(
             f"{scene.name}: {len(train)} of {len(frames)} training frames remain to learn; at least"
-            f" {MIN_TRAIN_FRAMES} are needed; omit --held-out"
+            f" {MIN_TRAIN_FRAMES} are needed; omit `held_out`"
         )
     return replace(scene, train=train, test=test)
 
@@ -140,34 +162,39 @@ def regions(scene: Recording, parts: int) -> list[Recording]:
     from scipy.cluster.vq import kmeans2, vq
 
     if parts < 2:
-        raise InputError(f"--parts {parts}: give at least 2")
+        raise InputError(f"`parts` {parts}: give at least 2")
     train = posed_frames(scene.train)
     test = posed_frames(scene.test)
     if len(train) < parts or not test:
         raise InputError(
             f"{scene.name}: {len(train)} training and {len(test)} test frames are too few for"
-            f" --parts {parts}"
+            f" `parts` {parts}"
         )
-    centres, region = kmeans2(
-        _ahead(train), parts, minit="++", rng=np.random.default_rng(0)
-    )
-    nearest, _ = vq(_ahead(test), centres)
+    rng = np.random.default_rng(0)
+    centres, train_region = kmeans2(_ahead(train), parts, minit="++", rng=rng)
+    test_region, _ = vq(_ahead(test), centres)
     recordings = []
-    for number, part in enumerate(dict.fromkeys(region.tolist()), start=1):
-        part_train = tuple(f for f, r in zip(train, region, strict=True) if r == part)
-        part_test = tuple(f for f, r in zip(test, nearest, strict=True) if r == part)
+    for number, region in enumerate(dict.fromkeys(train_region.tolist()), start=1):
+        region_train = tuple(compress(train, train_region == region))
+        region_test = tuple(compress(test, test_region == region))
         name = f"{scene.name}-{number}"
-        if len(part_train) < MIN_TRAIN_FRAMES or not part_test:
+        if len(region_train) < MIN_TRAIN_FRAMES or not region_test:
             raise InputError(
-                f"{name}: {len(part_train)} training and {len(part_test)} test frames are too few"
-                f" (at least {MIN_TRAIN_FRAMES} and 1); give fewer --parts"
+                f"{name}: {len(region_train)} training and {len(region_test)} test frames are too few"
+                f" (at least {MIN_TRAIN_FRAMES} and 1); give fewer `parts`"
             )
         recordings.append(
-            replace(scene, name=name, train=part_train, test=part_test, base=scene.name)
+            replace(
+                scene,
+                name=name,
+                train=region_train,
+                test=region_test,
+                base=scene.name,
+            )
         )
     return recordings
 
 
-def _ahead(frames: Sequence[Frame]) -> np.ndarray:
+def _ahead(frames: Sequence[Frame]) -> Array:
     poses = stated_poses(frames)
     return poses.translation_m + poses.rotation_matrix()[:, :, 2]

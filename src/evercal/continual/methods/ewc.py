@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
+from evercal.continual.networks.buffer import random_indices
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.networks.loss import fixed_clamp_loss
 
@@ -25,7 +25,7 @@ class ElasticWeightConsolidation(Method):
     append are free.
     """
 
-    citation: ClassVar[str] = "Kirkpatrick et al., PNAS 2017"
+    citation = "Kirkpatrick et al., PNAS 2017"
     strength: float = 1e6
     """Weight of the mean squared change, weighted by importances of mean 1."""
     images: int = 200
@@ -38,62 +38,67 @@ class ElasticWeightConsolidation(Method):
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
         """Return `anchor.NAME` and `importance.NAME` of every parameter, half precision."""
         importances = scaled_to_mean_one(fisher_information(scene, self.images))
-        anchors = {
-            f"anchor.{k}": _half(v.detach()) for k, v in scene.head.named_parameters()
-        }
-        return anchors | {f"importance.{k}": _half(v) for k, v in importances.items()}
+        state: dict[str, Tensor] = {}
+        for name, value in scene.head.named_parameters():
+            state[f"anchor.{name}"] = _half(value.detach())
+        for name, importance in importances.items():
+            state[f"importance.{name}"] = _half(importance)
+        return state
 
 
 class _TiedWeights(TrainingHooks):
     def __init__(self, method: ElasticWeightConsolidation, start: StageStart):
         self.method = method
         self._head = start.head
-        # Of each earlier scene, by parameter name: anchor and importance of the first rows.
-        named = list(start.head.named_parameters())
-        self._ties = [
-            {k: (s[f"anchor.{k}"].to(v), s[f"importance.{k}"].to(v)) for k, v in named}
-            for s in start.states
-        ]
+        self._ties: list[dict[str, Tensor]] = []
+        for state in start.states:
+            self._ties.append({k: v.to(start.head.code) for k, v in state.items()})
 
     def regularizer(self) -> Tensor | None:
         if not self._ties:
             return None
         cost = torch.zeros((), device=self._head.device)
+        count = 0
         for name, value in self._head.named_parameters():
+            count += value.numel()
             for tie in self._ties:
-                anchor, importance = tie[name]
-                cost = (
-                    cost + (importance * (value[: len(anchor)] - anchor).square()).sum()
-                )
-        count = sum(value.numel() for value in self._head.parameters())
+                anchor = tie[f"anchor.{name}"]
+                importance = tie[f"importance.{name}"]
+                change = value[: len(anchor)] - anchor
+                cost = cost + (importance * change.square()).sum()
         return self.method.strength * (0.5 / count * cost)
 
 
 def fisher_information(scene: FinishedScene, images: int) -> dict[str, Tensor]:
     """Average the squared gradients of the losses of some images, by parameter name."""
     buffer = scene.rows()
-    generator = torch.Generator().manual_seed(buffer.scene)
-    names, values = zip(*scene.head.named_parameters(), strict=True)
-    total = dict(zip(names, map(torch.zeros_like, values), strict=True))
+    generator = Generator().manual_seed(buffer.scene)
+    parameters = dict(scene.head.named_parameters())
+    total = {name: torch.zeros_like(value) for name, value in parameters.items()}
     starts = buffer.starts.tolist()
-    drawn = torch.randperm(buffer.views, generator=generator, device="cpu")[:images]
-    for number in drawn.tolist():
-        start, end = starts[number : number + 2]
-        some = torch.randint(
-            end - start, (IMAGE_ROWS,), generator=generator, device="cpu"
-        )
-        rows = buffer.rows(start + some)
+    shuffled = torch.randperm(buffer.views, generator=generator, device="cpu")
+    drawn = shuffled[:images].tolist()
+    for view in drawn:
+        start = starts[view]
+        count = starts[view + 1] - start
+        rows = buffer.rows(start + random_indices(count, IMAGE_ROWS, generator))
         loss, _ = fixed_clamp_loss(scene.output(rows).points, rows.target)
-        gradients = torch.autograd.grad(loss.mean(), values, materialize_grads=True)
-        for name, gradient in zip(names, gradients, strict=True):
+        gradients = torch.autograd.grad(
+            loss.mean(), list(parameters.values()), materialize_grads=True
+        )
+        for name, gradient in zip(total, gradients, strict=True):
             total[name] += gradient.square() / len(drawn)
     return total
 
 
 def scaled_to_mean_one(importance: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Divide importances by their mean over all weights."""
-    count = sum(value.numel() for value in importance.values())
-    mean = sum(float(value.sum()) for value in importance.values()) / count
+    count = 0
+    total = 0.0
+    for value in importance.values():
+        count += value.numel()
+        total += float(value.sum())
+    mean = total / count
     return {name: value / max(mean, 1e-30) for name, value in importance.items()}
 
 

@@ -8,11 +8,10 @@ scene t by <g_t, u>, with g_t the gradient of that loss.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from evercal.continual.methods.method import FinishedScene, StageStart
 from evercal.continual.methods.penalties import Reprojection
@@ -23,6 +22,7 @@ from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 from evercal.continual.networks.loss import fixed_clamp_loss
 
 REFERENCE_ROWS = 8192
+"""Rows of the keyframes from which the loss after learning a scene is computed."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class EpisodicConstraint(EpisodicMemory):
     has no natural size when the learning rate changes in every step.
     """
 
-    citation: ClassVar[str] = "Lai et al., GEC, NeurIPS 2025, several constraints"
+    citation = "Lai et al., GEC, NeurIPS 2025, several constraints"
     clamp_px: float = 50.0
     """Fixed soft clamp of remembered losses, pixels. A fixed clamp makes losses of different steps
     comparable; a wide one leaves forgotten rows a gradient."""
@@ -54,9 +54,9 @@ class EpisodicConstraint(EpisodicMemory):
     warm_steps: int = 5
     """Steps of plain replay at the start of a stage."""
 
-    def begin(self, start: StageStart) -> TrainingHooks:
-        """Constrain the steps after the warm-up, from the second scene on."""
-        return _ConstraintHooks(self, start) if start.memories else TrainingHooks()
+    def hooks(self, start: StageStart) -> TrainingHooks:
+        """Constrain the steps after the warm-up."""
+        return _ConstraintHooks(self, start)
 
     def loss(self, output: HeadOutput, rows: Rows) -> Tensor:
         """Compute the mean loss of remembered rows with the fixed clamp."""
@@ -74,17 +74,17 @@ class EpisodicConstraint(EpisodicMemory):
             return changes
         h = proposed.losses - (1 + self.slack) * references
         # The bound follows the learning rate, which ends at zero.
-        most = -self.alpha * self.eta * proposed.schedule * h
-        added = nearest_change(changes, g, most) - changes
+        bounds = -self.alpha * self.eta * proposed.schedule * h
+        added = nearest_change(changes, g, bounds) - changes
         limit = self.longest * changes.norm() / added.norm().clamp(min=1e-12)
         return changes + limit.clamp(max=1.0) * added
 
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
         """Return `reference`, the loss on remembered rows as they are replayed."""
         buffer = scene.remembered()
-        rows = buffer.draw(REFERENCE_ROWS, torch.Generator().manual_seed(scene.number))
+        rows = buffer.draw(REFERENCE_ROWS, Generator().manual_seed(scene.number))
         if scene.diffusion:
-            noise = torch.Generator(rows.features.device).manual_seed(scene.number)
+            noise = Generator(rows.features.device).manual_seed(scene.number)
             rows = diffused(rows, scene.diffusion, noise)
         with torch.no_grad():
             output = scene.output(rows)
@@ -98,10 +98,8 @@ class _ConstraintHooks(MemoryHooks):
         super().__init__(start)
         self._method = method
         self._steps = 0
-        references = [
-            start.states[memory.scene]["reference"] for memory in self.memories
-        ]
-        self._references = torch.stack(references)
+        states = [start.states[memory.scene] for memory in self.memories]
+        self._references = torch.stack([state["reference"] for state in states])
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         if self._steps >= self._method.warm_steps:
@@ -109,42 +107,52 @@ class _ConstraintHooks(MemoryHooks):
         return Reprojection()(output, None, rows, tau_px)
 
     def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
-        each = len(rows.scene) // len(self.memories)  # rows are ordered by scene
-        parts = [slice(i * each, (i + 1) * each) for i in range(len(self.memories))]
-        return [self._method.loss(output.part(part), rows.part(part)) for part in parts]
+        count = len(rows.scene) // len(self.memories)  # rows are ordered by scene
+        losses = []
+        for start in range(0, count * len(self.memories), count):
+            of_scene = slice(start, start + count)
+            loss = self._method.loss(output.part(of_scene), rows.part(of_scene))
+            losses.append(loss)
+        return losses
 
     def edit_step(self, proposed: ProposedStep) -> None:
         changes = _flat(proposed.changes)
-        g = torch.stack([_flat(constraint) for constraint in proposed.constraints])
-        allowed = self._method.edit_step(changes, g, proposed, self._references.to(g))
+        g = torch.stack(list(map(_flat, proposed.constraints)))
+        references = self._references.to(g)
+        allowed = self._method.edit_step(changes, g, proposed, references)
         self._steps = proposed.step + 1
-        sizes = [change.numel() for change in proposed.changes.values()]
-        for name, part in zip(proposed.changes, allowed.split(sizes), strict=True):
-            proposed.changes[name] = part.view_as(proposed.changes[name])
+        start = 0
+        for name, change in proposed.changes.items():
+            end = start + change.numel()
+            proposed.changes[name] = allowed[start:end].view_as(change)
+            start = end
 
 
-def nearest_change(changes: Tensor, g: Tensor, most: Tensor) -> Tensor:
-    """Find the change u nearest to a given one with <g_t, u> <= most_t for every t.
+def nearest_change(changes: Tensor, g: Tensor, bounds: Tensor) -> Tensor:
+    """Find the change u nearest to a given one with <g_t, u> <= b_t for every t.
 
-    u = changes - sum_t lambda_t g_t with lambda >= 0. The dual, min 1/2 l'Gl - l'b with G = g g'
-    and b = g changes - most, is a non-negative least-squares problem in the root of G. Constraints
+    u = changes - sum_t lambda_t g_t with lambda >= 0. The dual, min 1/2 l'Gl - l'e with G = g g'
+    and e = g changes - b, is a non-negative least-squares problem in the root of G. Constraints
     are first divided by the length of their gradient, which does not change the solution. The
     change is (p,), gradients (t, p), and bounds (t,).
     """
-    size = g.norm(dim=1)
-    some = size > 0  # no change affects a loss without a gradient
-    g, most = g[some] / size[some, None], most.to(g)[some] / size[some]
-    over = (g @ changes - most).double().cpu().numpy()
-    if (over <= 0).all():
+    lengths = g.norm(dim=1)
+    nonzero = lengths > 0  # no change affects a loss without a gradient
+    lengths = lengths[nonzero]
+    unit = g[nonzero] / lengths[:, None]
+    bounds = bounds.to(g)[nonzero] / lengths
+    excess = (unit @ changes - bounds).double().cpu().numpy()
+    if (excess <= 0).all():
         return changes
     from scipy.optimize import nnls
 
-    gram = (g @ g.T).double().cpu().numpy()
+    gram = (unit @ unit.T).double().cpu().numpy()
     values, vectors = np.linalg.eigh(gram)
     # G is singular for parallel constraints; the offset keeps the solution finite.
-    root = np.sqrt(np.maximum(values, 0) + 1e-9 * max(values.max(), 1e-12))
-    weights, _ = nnls((vectors * root).T, (vectors / root).T @ over)
-    return changes - torch.from_numpy(weights).to(g) @ g
+    offset = 1e-9 * max(values.max(), 1e-12)
+    root = np.sqrt(np.maximum(values, 0) + offset)
+    weights, _ = nnls((vectors * root).T, (vectors / root).T @ excess)
+    return changes - torch.from_numpy(weights).to(unit) @ unit
 
 
 def _flat(named: Mapping[str, Tensor]) -> Tensor:

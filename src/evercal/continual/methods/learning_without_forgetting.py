@@ -1,15 +1,14 @@
 """Learning without forgetting: distillation of the old head on new images."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from evercal.continual.methods.method import Method, StageStart
 from evercal.continual.methods.penalties import PX_PER_M
 from evercal.continual.methods.replay import teacher_output
-from evercal.continual.networks.buffer import Rows
+from evercal.continual.networks.buffer import Rows, random_indices
 from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
 
@@ -23,7 +22,7 @@ class LearningWithoutForgetting(Method):
     `code`); with condition `descriptor`, old and new targets of a row contradict each other.
     """
 
-    citation: ClassVar[str] = "Li and Hoiem, Learning without forgetting, ECCV 2016"
+    citation = "Li and Hoiem, Learning without forgetting, ECCV 2016"
     weight: float = 0.3
     """Weight of each earlier scene's distance."""
     px_per_m: float = PX_PER_M
@@ -40,24 +39,22 @@ class _DistillationHooks(TrainingHooks):
     def __init__(self, method: LearningWithoutForgetting, teacher: Head, rows: int):
         self.method = method
         self._teacher = teacher
-        self._each = max(1, rows // teacher.scenes)
+        self._rows_of_scene = max(1, rows // teacher.scenes)
 
     def replayed(
-        self, fresh: Rows, step: int, rate: float, generator: torch.Generator
+        self, fresh: Rows, step: int, rate: float, generator: Generator
     ) -> list[Rows]:
         # New rows once more, one part with the index of each earlier scene.
-        parts = []
-        count = len(fresh.scene)
+        replayed = []
         for scene in range(self._teacher.scenes):
-            drawn = torch.randint(
-                count, (self._each,), generator=generator, device="cpu"
-            )
-            part = fresh.part(drawn.to(fresh.scene.device))
-            part.scene = torch.full_like(part.scene, scene)
-            parts.append(part)
-        return parts
+            drawn = random_indices(len(fresh.scene), self._rows_of_scene, generator)
+            rows = fresh.part(drawn.to(fresh.scene.device))
+            rows.scene = torch.full_like(rows.scene, scene)
+            replayed.append(rows)
+        return replayed
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         old = teacher_output(self._teacher, rows)
         drift = (output.points - old.points).abs().sum(-1).mean()
-        return self._teacher.scenes * self.method.weight * self.method.px_per_m * drift
+        method = self.method
+        return self._teacher.scenes * method.weight * method.px_per_m * drift

@@ -9,13 +9,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from typing import ClassVar
 
-import numpy as np
 from torch import Tensor
 
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
 from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.selection.frame_statistics import FrameStatistics
+from evercal.typing import IntArray
 
 MethodState = Mapping[str, Tensor]
 """Named tensors that a method stores with a finished scene; they count as memory."""
@@ -36,6 +36,7 @@ class StageStart:
     replay_rows: int
     """Rows to replay in a step, for all remembered scenes together."""
     seed: int
+    """Seed of the stage."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class FinishedScene:
     """Inputs of a method after a scene was learned."""
 
     head: Head
+    """Head after the training of the scene."""
     number: int
     """Index of the scene in the head."""
     rows: Callable[[], FeatureBuffer]
@@ -62,11 +64,13 @@ class Method:
     """Base of all methods: trains on the new scene alone and stores nothing."""
 
     citation: ClassVar[str] = ""
+    """Source of the method, for results."""
     replays: ClassVar[bool] = False
     """Whether training needs the rows of remembered keyframes."""
     head_per_scene: ClassVar[bool] = False
+    """Whether every scene has a head of its own."""
 
-    def select(self, frames: FrameStatistics, capacity: int) -> np.ndarray | None:
+    def select(self, frames: FrameStatistics, capacity: int) -> IntArray | None:
         """Select the keyframes: sorted indices into the recorded frames, or None for no memory."""
         return None
 
@@ -83,17 +87,15 @@ class Method:
 class FineTuning(Method):
     """Trains on each new scene from the weights after the last one."""
 
-    citation: ClassVar[str] = "control: the same head and steps, no replay"
+    citation = "control: the same head and steps, no replay"
 
 
 @dataclass(frozen=True)
 class Isolation(Method):
     """A head per scene, initialised from the last one; scenes share no weights."""
 
-    citation: ClassVar[str] = (
-        "after ESAC (Brachmann and Rother, ICCV 2019): an expert per scene"
-    )
-    head_per_scene: ClassVar[bool] = True
+    citation = "after ESAC (Brachmann and Rother, ICCV 2019): an expert per scene"
+    head_per_scene = True
 
 
 def described(record: object) -> dict[str, object]:
@@ -102,5 +104,7 @@ def described(record: object) -> dict[str, object]:
     plain: dict[str, object] = {"kind": type(record).__name__}
     for field in fields(record):
         value = getattr(record, field.name)
-        plain[field.name] = described(value) if is_dataclass(value) else value
+        if is_dataclass(value):
+            value = described(value)
+        plain[field.name] = value
     return plain

@@ -2,14 +2,13 @@
 
 import copy
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Generator, Tensor
 
 from evercal.continual.methods.method import StageStart
 from evercal.continual.methods.replay import Replay, ReplayHooks
-from evercal.continual.networks.buffer import FeatureBuffer, Rows
+from evercal.continual.networks.buffer import FeatureBuffer, Rows, random_indices
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.networks.loss import fixed_clamp_loss
@@ -23,9 +22,7 @@ class MaximallyInterferedRetrieval(Replay):
     each remembered scene.
     """
 
-    citation: ClassVar[str] = (
-        "Aljundi et al., Maximally interfered retrieval, NeurIPS 2019"
-    )
+    citation = "Aljundi et al., Maximally interfered retrieval, NeurIPS 2019"
     candidates: int = 48
     """Candidate views per scene."""
     chosen: int = 8
@@ -38,9 +35,9 @@ class MaximallyInterferedRetrieval(Replay):
     """Fixed soft clamp of the virtual step and its losses, pixels. It is wide, because under a
     narrow clamp the loss of a forgotten view is constant."""
 
-    def begin(self, start: StageStart) -> TrainingHooks:
-        """Replay the selected views, from the second scene on."""
-        return _MirHooks(self, start) if start.memories else TrainingHooks()
+    def hooks(self, start: StageStart) -> TrainingHooks:
+        """Replay the selected views."""
+        return _MirHooks(self, start)
 
     def interfered_views(
         self,
@@ -55,15 +52,14 @@ class MaximallyInterferedRetrieval(Replay):
         The head is not changed. `rate` is the root mean square change of each parameter in the
         virtual step.
         """
-        drawn = torch.randperm(memory.views, generator=generator, device="cpu")[
-            : self.candidates
-        ]
-        start = memory.starts[drawn, None]
-        sizes = memory.starts.diff()[drawn, None]
-        offsets = torch.rand(
-            len(drawn), self.view_rows, generator=generator, device="cpu"
-        )
-        index = (start + offsets * sizes).long()
+        shuffled = torch.randperm(memory.views, generator=generator, device="cpu")
+        drawn = shuffled[: self.candidates]
+        starts = memory.starts
+        first = starts[drawn, None]
+        sizes = starts.diff()[drawn, None]
+        shape = (len(drawn), self.view_rows)
+        offsets = torch.rand(shape, generator=generator, device="cpu")
+        index = (first + offsets * sizes).long()
         rows = memory.rows(index.clamp(max=len(memory) - 1).flatten())
         moved = copy.deepcopy(head)
         before = self._view_losses(head, rows)
@@ -75,11 +71,13 @@ class MaximallyInterferedRetrieval(Replay):
                 size = gradient.square().mean().sqrt().clamp(min=1e-12)
                 parameter.sub_(rate * gradient / size)
         harm = self._view_losses(moved, rows) - before
-        return drawn[harm.topk(min(self.chosen, len(drawn))).indices.cpu()]
+        worst = harm.topk(min(self.chosen, len(drawn)))
+        return drawn[worst.indices.cpu()]
 
     def _losses(self, head: Head, rows: Rows) -> Tensor:
         points = head(rows.features.float(), rows.scene, rows.descriptor).points
-        return fixed_clamp_loss(points, rows.target, self.clamp_px)[0]
+        losses, _ = fixed_clamp_loss(points, rows.target, self.clamp_px)
+        return losses
 
     @torch.no_grad()
     def _view_losses(self, head: Head, rows: Rows) -> Tensor:
@@ -96,19 +94,16 @@ class _MirHooks(ReplayHooks):
     def replayed(
         self, fresh: Rows, step: int, rate: float, generator: Generator
     ) -> list[Rows]:
-        if step % self._options.every_steps == 0 or not self._views:
+        method = self._options
+        if step % method.every_steps == 0 or not self._views:
             self._views = [
-                self._options.interfered_views(
-                    self._head, fresh, memory, rate, generator
-                )
+                method.interfered_views(self._head, fresh, memory, rate, generator)
                 for memory in self.memories
             ]
-        rows = []
+        replayed = []
         for memory, views in zip(self.memories, self._views, strict=True):
             view = memory.tensors["view"]
-            where = torch.nonzero(torch.isin(view, views.to(view.device)))[:, 0]
-            drawn = torch.randint(
-                len(where), (self.each,), generator=generator, device="cpu"
-            )
-            rows.append(memory.rows(where[drawn.to(where.device)]))
-        return rows
+            usable = torch.nonzero(torch.isin(view, views.to(view.device)))[:, 0]
+            drawn = random_indices(len(usable), self.each, generator)
+            replayed.append(memory.rows(usable[drawn.to(usable.device)]))
+        return replayed

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from evercal.continual.methods.spdd import SpddOptions, spdd_loss
 from evercal.continual.networks.buffer import Rows
@@ -45,16 +46,15 @@ def _distance_m(student: HeadOutput, teacher: HeadOutput) -> Tensor:
 
 
 def _reprojection(student: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
-    return reprojection_loss(student.points, rows.target, tau_px, LossOptions())[
-        0
-    ].mean()
+    loss, _ = reprojection_loss(student.points, rows.target, tau_px, LossOptions())
+    return loss.mean()
 
 
 @dataclass(frozen=True)
 class Reprojection(Penalty):
     """The reprojection loss of new rows, with the same schedule of the clamp."""
 
-    needs_teacher: ClassVar[bool] = False
+    needs_teacher = False
 
     def _loss(
         self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
@@ -98,9 +98,8 @@ class BoundedByTeacher(Penalty):
         _, bound = fixed_clamp_loss(teacher.points, rows.target)
         distance = _distance_m(student, teacher)
         bounded = torch.where(error > bound, distance, 0.0).mean()
-        return (
-            0.5 * _reprojection(student, rows, tau_px) + 0.5 * self.px_per_m * bounded
-        )
+        reprojection = _reprojection(student, rows, tau_px)
+        return 0.5 * reprojection + 0.5 * self.px_per_m * bounded
 
 
 @dataclass(frozen=True)
@@ -123,15 +122,15 @@ class Relations(Penalty):
     ) -> Tensor:
         # Rows are ordered by scene, so an even spacing covers all scenes.
         count = len(student.hidden)
-        few = min(count, self.related_rows)
+        compared = min(count, self.related_rows)
         device = student.hidden.device
-        chosen = torch.linspace(0, count - 1, few, device=device).round().long()
+        index = torch.linspace(0, count - 1, compared, device=device).round().long()
+        others = ~torch.eye(compared, dtype=torch.bool, device=device)
 
         def similarity(hidden: Tensor) -> Tensor:
-            unit = torch.nn.functional.normalize(hidden[chosen], dim=-1)
-            others = ~torch.eye(len(unit), dtype=torch.bool, device=unit.device)
-            logits = (unit @ unit.T / self.temperature)[others].view(len(unit), -1)
-            return logits.log_softmax(-1)
+            unit = F.normalize(hidden[index], dim=-1)
+            cosines = unit @ unit.T / self.temperature
+            return cosines[others].view(compared, -1).log_softmax(-1)
 
         old = similarity(teacher.hidden.detach())
         new = similarity(student.hidden)

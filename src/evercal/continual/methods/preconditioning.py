@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +21,7 @@ ROWS = 8192
 class PreconditionedReplay(Replay):
     """Anchored replay of SARS keyframes with preconditioned steps."""
 
-    citation: ClassVar[str] = "this project: anchored replay with preconditioned steps"
+    citation = "this project: anchored replay with preconditioned steps"
     selector: str = "sars_filled"
     penalty: Penalty = field(default_factory=AnchoredReprojection)
     weight: float = 0.5
@@ -30,9 +29,9 @@ class PreconditionedReplay(Replay):
     strength: float = 0.5
     """Damping of a step along the inputs of each remembered scene; 0 disables it."""
 
-    def begin(self, start: StageStart) -> TrainingHooks:
-        """Replay with preconditioned steps, from the second scene on."""
-        return _PreconditionedHooks(self, start) if start.memories else TrainingHooks()
+    def hooks(self, start: StageStart) -> TrainingHooks:
+        """Replay with preconditioned steps."""
+        return _PreconditionedHooks(self, start)
 
 
 class _PreconditionedHooks(ReplayHooks):
@@ -41,13 +40,12 @@ class _PreconditionedHooks(ReplayHooks):
     def __init__(self, method: PreconditionedReplay, start: StageStart):
         super().__init__(method, start)
         self._fixed = owned_rows(start.head, start.memories)
+        self._damping: dict[str, Tensor] = {}
         moments = input_moments(start.head, start.memories, start.seed)
-        self._damping = {
-            name: torch.linalg.inv(
-                torch.eye(len(m), dtype=m.dtype, device=m.device) + method.strength * m
-            ).float()
-            for name, m in moments.items()
-        }
+        for name, moment in moments.items():
+            unit = torch.eye(len(moment), dtype=moment.dtype, device=moment.device)
+            damping = torch.linalg.inv(unit + method.strength * moment)
+            self._damping[name] = damping.float()
 
     def edit_step(self, proposed: ProposedStep) -> None:
         """Damp changes of shared matrices, and undo changes of rows owned by remembered scenes.
@@ -66,25 +64,23 @@ class _PreconditionedHooks(ReplayHooks):
         Intelligence 2019) and gradient projection memory (Saha et al., ICLR 2021). Nothing is
         stored, because C_s is computed from the remembered frames.
         """
-        for name, where in self._fixed.items():
-            proposed.changes[name][where] = 0.0
+        changes = proposed.changes
+        for name, rows in self._fixed.items():
+            changes[name][rows] = 0.0
         for name, damping in self._damping.items():
-            proposed.changes[name] = proposed.changes[name] @ damping
+            changes[name] = changes[name] @ damping
 
 
 def owned_rows(head: Head, memories: Sequence[FeatureBuffer]) -> dict[str, Tensor]:
     """Return the rows owned by remembered scenes, by parameter name; empty for shared centres."""
     if head.options.centres != "grow":
         return {}
-    scenes = torch.tensor(
-        [memory.scene for memory in memories], device=head.centre_scene.device
-    )
+    numbers = [memory.scene for memory in memories]
+    scenes = torch.tensor(numbers, device=head.centre_scene.device)
     owned = {"code": scenes}
     if head.options.offsets == "per_centre":
         centres = torch.nonzero(torch.isin(head.centre_scene, scenes))[:, 0]
-        owned |= dict.fromkeys(
-            ("logit", "logit_bias", "offset", "offset_bias"), centres
-        )
+        owned |= dict.fromkeys(head.owned_by_centres, centres)
     return owned
 
 
@@ -95,22 +91,22 @@ def input_moments(
 
     The mean of the diagonal is 1 per scene; the moments are double.
     """
-    names = {
-        m: f"{name}.weight"
-        for name, m in head.named_modules()
-        if isinstance(m, nn.Linear)
-    }
     moments: dict[str, Tensor] = {}
+    handles = []
 
-    def accumulate(layer: nn.Module, inputs: tuple[Tensor, ...], _: Tensor) -> None:
-        assert isinstance(layer, nn.Linear)
-        x = inputs[0].double()
-        moment = x.T @ x
-        scaled = moment / (moment.trace() / len(moment)).clamp(min=1e-12)
-        name = names[layer]
-        moments[name] = moments[name] + scaled if name in moments else scaled
+    def observe(name: str, layer: nn.Module) -> None:
+        def accumulate(_: nn.Module, inputs: tuple[Tensor], __: Tensor) -> None:
+            x = inputs[0].double()
+            moment = x.T @ x
+            mean = moment.trace() / len(moment)
+            scaled = moment / mean.clamp(min=1e-12)
+            moments[name] = moments.get(name, 0) + scaled
 
-    handles = [layer.register_forward_hook(accumulate) for layer in names]
+        handles.append(layer.register_forward_hook(accumulate))
+
+    for name, layer in head.named_modules():
+        if isinstance(layer, nn.Linear):
+            observe(f"{name}.weight", layer)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for memory in memories:

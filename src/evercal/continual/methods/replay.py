@@ -4,11 +4,9 @@ Most methods differ only in the selected frames and the loss of replayed rows; b
 """
 
 from dataclasses import dataclass, field
-from typing import ClassVar
 
-import numpy as np
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from evercal.continual.methods.method import Method, StageStart
 from evercal.continual.methods.penalties import Penalty, Reprojection
@@ -18,19 +16,30 @@ from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.networks.precision import autocast
 from evercal.continual.selection.frame_statistics import FrameStatistics
 from evercal.continual.selection.selectors import SELECTORS
+from evercal.typing import IntArray
 
 
 @dataclass(frozen=True)
 class EpisodicMemory(Method):
     """Base of methods that use keyframes during training."""
 
-    replays: ClassVar[bool] = True
+    replays = True
     selector: str = "reservoir"
     """Rule that selects the keyframes: a key of SELECTORS."""
 
-    def select(self, frames: FrameStatistics, capacity: int) -> np.ndarray | None:
+    def select(self, frames: FrameStatistics, capacity: int) -> IntArray | None:
         """Apply the selector."""
         return SELECTORS[self.selector](frames, capacity)
+
+    def begin(self, start: StageStart) -> TrainingHooks:
+        """Use the keyframes from the second scene on."""
+        if not start.memories:
+            return TrainingHooks()
+        return self.hooks(start)
+
+    def hooks(self, start: StageStart) -> TrainingHooks:
+        """Create the hooks of a stage that has remembered scenes."""
+        raise NotImplementedError
 
 
 class MemoryHooks(TrainingHooks):
@@ -41,7 +50,7 @@ class MemoryHooks(TrainingHooks):
         self.each = max(1, start.replay_rows // len(start.memories))
 
     def replayed(
-        self, fresh: Rows, step: int, rate: float, generator: torch.Generator
+        self, fresh: Rows, step: int, rate: float, generator: Generator
     ) -> list[Rows]:
         """Draw rows of each remembered scene."""
         return [memory.draw(self.each, generator) for memory in self.memories]
@@ -51,18 +60,17 @@ class MemoryHooks(TrainingHooks):
 class Replay(EpisodicMemory):
     """Replays keyframes (Chaudhry et al., On tiny episodic memories, 2019)."""
 
-    citation: ClassVar[str] = (
-        "Vitter 1985; Chaudhry et al., On tiny episodic memories, 2019"
-    )
+    citation = "Vitter 1985; Chaudhry et al., On tiny episodic memories, 2019"
     penalty: Penalty = field(default_factory=Reprojection)
+    """Loss of the replayed rows."""
     weight: float = 1.0
     """Weight of the penalty, the mean over the rows of all remembered scenes."""
     every_scene: bool = False
     """Multiply the weight by the number of remembered scenes; the paper has one for all of them."""
 
-    def begin(self, start: StageStart) -> TrainingHooks:
-        """Replay from the stage's memories, from the second scene on."""
-        return ReplayHooks(self, start) if start.memories else TrainingHooks()
+    def hooks(self, start: StageStart) -> TrainingHooks:
+        """Replay from the stage's memories."""
+        return ReplayHooks(self, start)
 
 
 class ReplayHooks(MemoryHooks):
@@ -71,14 +79,18 @@ class ReplayHooks(MemoryHooks):
     def __init__(self, method: Replay, start: StageStart):
         super().__init__(start)
         self.method = method
-        self._teacher = start.teacher if method.penalty.needs_teacher else None
+        self._teacher = start.teacher
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         """Compute the weighted penalty."""
-        teacher = None if self._teacher is None else teacher_output(self._teacher, rows)
-        scenes = len(self.memories) if self.method.every_scene else 1
-        penalty = self.method.penalty(output, teacher, rows, tau_px)
-        return scenes * self.method.weight * penalty
+        method = self.method
+        old_output = None
+        if method.penalty.needs_teacher and self._teacher is not None:
+            old_output = teacher_output(self._teacher, rows)
+        weight = method.weight
+        if method.every_scene:
+            weight = len(self.memories) * weight
+        return weight * method.penalty(output, old_output, rows, tau_px)
 
 
 def teacher_output(teacher: Head, rows: Rows) -> HeadOutput:

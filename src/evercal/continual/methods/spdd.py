@@ -73,9 +73,8 @@ def spdd_loss(
     shared = student.offsets.shape[1] < student.logits.shape[1]
     rows, old = teacher.logits.shape
     teacher_logits = teacher.logits.detach()
-    masked = torch.isneginf(teacher_logits) | torch.isneginf(
-        student.logits.detach()[:, :old]
-    )
+    student_logits = student.logits.detach()[:, :old]
+    masked = torch.isneginf(teacher_logits) | torch.isneginf(student_logits)
     count = min(options.active_centres, old)
     best = teacher_logits.masked_fill(masked, -torch.inf).topk(count, dim=1)
     dead = torch.isneginf(best.values)
@@ -85,9 +84,8 @@ def spdd_loss(
         metric = (student.offsets - teacher.offsets.detach()).abs()
     else:
         index = best.indices[:, :, None].expand(-1, -1, 3)
-        gap = student.offsets.gather(1, index) - teacher.offsets.detach().gather(
-            1, index
-        )
+        teacher_offsets = teacher.offsets.detach().gather(1, index)
+        gap = student.offsets.gather(1, index) - teacher_offsets
         metric = gap.masked_fill(dead[:, :, None], 0.0).abs()
     output = (student.points - teacher.points.detach()).abs()
 
@@ -108,13 +106,11 @@ def _prior(
 ) -> Tensor:
     dead = torch.isneginf(best.values)
     target = _log_softmax(best.values / temperature)
-    logits = torch.cat(
-        [student_logits.gather(1, best.indices), student_logits[:, old:]], dim=1
-    )
+    active = student_logits.gather(1, best.indices)
     # A centre that only one head masks must not take part in either softmax.
-    excluded = torch.isneginf(logits)
-    excluded[:, : dead.shape[1]] |= dead
-    student = _log_softmax(logits.masked_fill(excluded, -torch.inf) / temperature)
+    active = active.masked_fill(dead, -torch.inf)
+    logits = torch.cat([active, student_logits[:, old:]], dim=1)
+    student = _log_softmax(logits / temperature)
     gap = target - student[:, : dead.shape[1]]
     return (temperature**2 * target.exp() * gap).masked_fill(dead, 0.0)
 

@@ -6,13 +6,16 @@ Every scene keeps its own base frame; `atlas_from_base` only shifts it into the 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry.se3 import SE3
+from evercal.typing import Array
 
 MIN_CELL_M = 5.0
+"""Minimum side of a scene's cell, and distance of the positions of cells, metres."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,11 @@ class Cell:
     def atlas_from_base(self) -> SE3:
         """Translation from the scene's base frame into the atlas."""
         shift = np.subtract(self.centre_m, self.origin_m)
-        return SE3(np.array([1.0, 0.0, 0.0, 0.0]), shift)
+        return SE3.from_translation(shift)
+
+    def distance_m(self, position_m: Array) -> float:
+        """Largest difference in x or y between an atlas position (3,) and the centre."""
+        return float(np.abs(position_m[:2] - self.centre_m[:2]).max())
 
 
 @dataclass
@@ -46,39 +53,42 @@ class Atlas:
     """Scenes of the paper's layout; 0 for the open one."""
     cells: list[Cell] = field(default_factory=list)
 
-    def place(self, positions_m: np.ndarray) -> Cell:
+    def place(self, positions_m: Array) -> Cell:
         """Assign a cell to a new scene with (n, 3) camera positions in its base frame."""
         origin = positions_m.mean(axis=0)
-        side = max(MIN_CELL_M, 2.0 * float(np.ptp(positions_m, axis=0).max()))
         if self.expected:
-            if len(self.cells) >= self.expected:
-                raise InputError(
-                    f"atlas: the paper layout is full with {self.expected} scenes; expect more"
-                    " scenes, or use the open layout"
-                )
-            centre = paper_grid(self.expected)[len(self.cells)]
             side = MIN_CELL_M
+            centre = self._next_of_grid()
         else:
-            centre = next(c for c in spiral() if self._free(c, side))
+            extent = float(np.ptp(positions_m, axis=0).max())
+            side = max(MIN_CELL_M, 2.0 * extent)
+            centre = next(filter(partial(self._is_free, side), spiral()))
         cell = Cell(tuple(centre.tolist()), side, tuple(origin.tolist()))
         self.cells.append(cell)
         return cell
 
-    def _free(self, centre: np.ndarray, side: float) -> bool:
-        return all(
-            np.abs(centre[:2] - cell.centre_m[:2]).max() >= (side + cell.side_m) / 2
-            for cell in self.cells
+    def _next_of_grid(self) -> Array:
+        if len(self.cells) < self.expected:
+            return paper_grid(self.expected)[len(self.cells)]
+        raise InputError(
+            f"atlas: the paper layout is full with {self.expected} scenes; expect more"
+            " scenes, or use the open layout"
         )
 
-    def scene_at(self, position_m: np.ndarray) -> int | None:
+    def _is_free(self, side: float, centre: Array) -> bool:
+        return all(
+            cell.distance_m(centre) >= (side + cell.side_m) / 2 for cell in self.cells
+        )
+
+    def scene_at(self, position_m: Array) -> int | None:
         """Return the index of the scene whose cell contains an atlas position (3,), or None."""
         for i, cell in enumerate(self.cells):
-            if np.abs(position_m[:2] - cell.centre_m[:2]).max() <= cell.side_m / 2:
+            if cell.distance_m(position_m) <= cell.side_m / 2:
                 return i
         return None
 
 
-def camera_clusters(positions_m: np.ndarray, count: int, seed: int) -> np.ndarray:
+def camera_clusters(positions_m: Array, count: int, seed: int) -> Array:
     """Return (k, 3) k-means of camera positions (n, 3); k is at most the distinct positions."""
     from scipy.cluster.vq import kmeans2
 
@@ -90,7 +100,7 @@ def camera_clusters(positions_m: np.ndarray, count: int, seed: int) -> np.ndarra
 
 
 def combined_centres(
-    positions_m: Sequence[np.ndarray], count: int, seed: int
+    positions_m: Sequence[Array], count: int, seed: int
 ) -> tuple[tuple[float, float, float], ...]:
     """Compute the cluster centres of all scenes in the paper's layout.
 
@@ -98,32 +108,32 @@ def combined_centres(
     each scene's base frame; `count` is K of the paper.
     """
     atlas = Atlas(len(positions_m))
-    in_atlas = [
-        atlas.place(scene).atlas_from_base.apply(scene) for scene in positions_m
-    ]
+    in_atlas = []
+    for scene in positions_m:
+        cell = atlas.place(scene)
+        in_atlas.append(cell.atlas_from_base.apply(scene))
     means = camera_clusters(np.concatenate(in_atlas), count, seed)
-    return tuple((x, y, z) for x, y, z in means.tolist())
+    return tuple(map(tuple, means.tolist()))
 
 
-def spiral() -> Iterator[np.ndarray]:
+def spiral() -> Iterator[Array]:
     """Yield the points of an endless square spiral around the origin, 5 m apart."""
-    x = y = 0
-    dx = 1
-    dy = 0
+    position = np.zeros(3)
+    step = np.array([MIN_CELL_M, 0.0, 0.0])
     leg = 1
     while True:
         for _ in range(2):
             for _ in range(leg):
-                yield np.array([x, y, 0.0]) * MIN_CELL_M
-                x = x + dx
-                y = y + dy
-            dx, dy = -dy, dx
+                yield position.copy()
+                position += step
+            step[:2] = (-step[1], step[0])
         leg += 1
 
 
-def paper_grid(count: int) -> np.ndarray:
+def paper_grid(count: int) -> Array:
     """Return the (count, 3) cell centres of GLACE's combined scenes, metres."""
     columns = math.ceil(math.sqrt(count))
     i = np.arange(count)
-    row = -(-(i + 1) // columns) - 1
-    return MIN_CELL_M * np.stack([-row, -(i % columns), 0 * i], -1).astype(float)
+    row = i // columns
+    column = i % columns
+    return MIN_CELL_M * np.stack([-row, -column, 0 * i], -1)

@@ -1,5 +1,6 @@
 """The global descriptor: one vector per image that identifies the scene."""
 
+import copy
 import json
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from evercal.features.encoder import WEIGHTS
 from evercal.typing import Float32Array
 
 DESCRIPTOR_FILE = WEIGHTS / "descriptor.safetensors"
+"""The shipped descriptor; beside another encoder, the file of its own descriptor has this name."""
 DESCRIBED_ENCODER = WEIGHTS / "encoder-1.onnx"
 """The encoder whose features the shipped descriptor was trained with."""
 
@@ -42,7 +44,8 @@ class GlobalDescriptor(nn.Module):
         """Map (b, inputs, h, w) local features of any grid size to (b, width) unit vectors."""
         lifted = F.relu(self.lift(features))
         weights = self.attention(lifted).flatten(2).softmax(-1)
-        pooled = torch.einsum("bmn,bcn->bmc", weights, self.value(lifted).flatten(2))
+        values = self.value(lifted).flatten(2)
+        pooled = torch.einsum("bmn,bcn->bmc", weights, values)
         pooled = F.normalize(pooled, dim=-1).flatten(1)
         return F.normalize(self.project(pooled), dim=-1)
 
@@ -67,7 +70,8 @@ class PooledDescriptor(nn.Module):
         """Map (b, inputs, h, w) local features of any grid size to (b, width) unit vectors."""
         cells = features.flatten(2)
         pooled = torch.cat([cells.mean(-1), cells.std(-1)], -1)
-        return F.normalize(F.normalize(pooled, dim=-1) @ self.projection, dim=-1)
+        pooled = F.normalize(pooled, dim=-1)
+        return F.normalize(pooled @ self.projection, dim=-1)
 
 
 Descriptor = GlobalDescriptor | PooledDescriptor
@@ -83,10 +87,10 @@ def load_descriptor(path: Path = DESCRIPTOR_FILE) -> Descriptor:
         with safe_open(path, "pt") as file:
             settings = json.loads((file.metadata() or {})["descriptor"])
             state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
-        pooled = settings.pop("layout", None) == PooledDescriptor.__name__
-        descriptor = (
-            PooledDescriptor(**settings) if pooled else GlobalDescriptor(**settings)
-        )
+        layout = GlobalDescriptor
+        if settings.pop("layout", None) == PooledDescriptor.__name__:
+            layout = PooledDescriptor
+        descriptor = layout(**settings)
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise InputError(
             f"descriptor {path}: not an evercal descriptor ({error!r})"
@@ -105,7 +109,7 @@ def descriptor_bytes(descriptor: Descriptor) -> bytes:
     """Serialise a descriptor in half precision, with its settings as metadata."""
     from safetensors.torch import save
 
-    state = {k: v.cpu().half().contiguous() for k, v in descriptor.state_dict().items()}
+    state = copy.deepcopy(descriptor).cpu().half().state_dict()
     settings = {**descriptor.settings, "layout": type(descriptor).__name__}
     return save(state, {"descriptor": json.dumps(settings)})
 
@@ -127,4 +131,5 @@ def described(features: Float32Array, descriptor: Descriptor) -> tuple[Tensor, T
     Returns features (rows * columns, channels) and descriptor (width,), on the descriptor's device.
     """
     grid = torch.from_numpy(features).to(device_of_network(descriptor))
-    return grid.flatten(0, 1), descriptor(grid.permute(2, 0, 1)[None])[0]
+    [vector] = descriptor(grid.permute(2, 0, 1)[None])
+    return grid.flatten(0, 1), vector

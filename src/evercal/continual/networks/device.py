@@ -27,7 +27,7 @@ def device_of(name: str | torch.device = "auto") -> torch.device:
             f"device {word!r}: PyTorch {torch.__version__} finds no CUDA device on this machine;"
             " use auto or cpu"
         )
-    index = int(number) if number else torch.cuda.current_device()
+    index = int(number or torch.cuda.current_device())
     if index >= torch.cuda.device_count():
         raise InputError(
             f"device {word!r}: this machine has {torch.cuda.device_count()} CUDA devices, counted"

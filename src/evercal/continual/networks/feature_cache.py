@@ -27,7 +27,8 @@ def cache_features(encoder: Encoder, folder: Path) -> None:
     def cached(grey: Float32Array) -> Array:
         digest = hashlib.blake2b(grey.tobytes(), digest_size=16).hexdigest()
         path = folder / f"{'x'.join(map(str, grey.shape))}-{digest}.npy"
-        if (features := read_cached(path)) is None:
+        features = read_cached(path)
+        if features is None:
             features = np.asarray(compute(grey), np.float16)
             write_cached(path, features)
         return features.astype(np.float32)

@@ -22,9 +22,13 @@ from torch.nn import functional as F
 from evercal.errors import InputError
 
 SCALE_MAX = 4.0
+"""GLACE's s_max: the reciprocal of the smallest homogeneous coordinate (no unit)."""
 SCALE_MIN = 0.01
+"""GLACE's s_min: the reciprocal of the largest homogeneous coordinate (no unit)."""
 WHITENING = 0.5
 """Strength of the input whitening, from 0 (none) to 1 (fully decorrelated)."""
+PER_CENTRE = ("logit", "logit_bias", "offset", "offset_bias")
+"""Parameters with a row for each centre; with shared offsets only the first two."""
 
 
 @dataclass(frozen=True)
@@ -88,19 +92,23 @@ class Head(nn.Module):
             )
         self.options = options
         width = options.width
-        inputs = features + (descriptor if options.condition == "descriptor" else 0)
+        inputs = features
+        if options.condition == "descriptor":
+            inputs += descriptor
         self.first = nn.ModuleList([nn.Linear(inputs, width), *_linears(width, 2)])
-        self.skip = nn.Identity() if inputs == width else nn.Linear(inputs, width)
+        self.skip = nn.Identity()
+        if inputs != width:
+            self.skip = nn.Linear(inputs, width)
         self.blocks = nn.ModuleList(_linears(width, 3) for _ in range(options.blocks))
         self.last = _linears(width, 2)
         # One bias per layer and scene; `grow` appends rows.
         self.code = nn.Parameter(torch.zeros(0, self.layers, width))
         self.logit = nn.Parameter(torch.zeros(0, width))
         self.logit_bias = nn.Parameter(torch.zeros(0))
-        offsets = 0 if options.offsets == "per_centre" else 1
-        self.offset = nn.Parameter(torch.zeros(offsets, 4, width))
-        self.offset_bias = nn.Parameter(torch.zeros(offsets, 4))
-        if offsets:
+        shared = int(options.offsets == "shared")
+        self.offset = nn.Parameter(torch.zeros(shared, 4, width))
+        self.offset_bias = nn.Parameter(torch.zeros(shared, 4))
+        if shared:
             nn.init.kaiming_uniform_(self.offset.data.view(4, width), a=math.sqrt(5))
         self.register_buffer("feature_mean", torch.zeros(features))
         self.register_buffer("feature_map", torch.eye(features))
@@ -119,15 +127,11 @@ class Head(nn.Module):
         state: Mapping[str, Tensor],
     ) -> "Head":
         """Build a head from a `state_dict()` in half or single precision."""
-        head = fresh_head(features, descriptor, options, seed=0).to(
-            state["code"].device
-        )
-        state = {
-            name: v.float() if v.dtype == torch.half else v for name, v in state.items()
-        }
+        head = fresh_head(features, descriptor, options, seed=0)
+        head.to(state["code"].device)
         # The shapes of these depend on the number of scenes, so they are taken from the state.
-        for name in ("code", "logit", "logit_bias", "offset", "offset_bias"):
-            setattr(head, name, nn.Parameter(state[name].clone()))
+        for name in ("code", *PER_CENTRE):
+            setattr(head, name, nn.Parameter(state[name].float().clone()))
         head.centres = state["centres"].clone()
         head.centre_scene = state["centre_scene"].clone()
         head.load_state_dict(state)
@@ -140,14 +144,16 @@ class Head(nn.Module):
         state = dict(self.state_dict())
         state["code"] = state["code"][:0]
         if self.options.centres == "grow":
-            owned = ["logit", "logit_bias", "centres", "centre_scene"]
-            owned += (
-                ["offset", "offset_bias"]
-                if self.options.offsets == "per_centre"
-                else []
-            )
-            state |= {name: state[name][:0] for name in owned}
+            for name in ("centres", "centre_scene", *self.owned_by_centres):
+                state[name] = state[name][:0]
         return Head.from_state(self.features, self.descriptor, self.options, state)
+
+    @property
+    def owned_by_centres(self) -> tuple[str, ...]:
+        """Names of the parameters that have a row for each centre."""
+        if self.options.offsets == "per_centre":
+            return PER_CENTRE
+        return PER_CENTRE[:2]
 
     @property
     def features(self) -> int:
@@ -184,10 +190,12 @@ class Head(nn.Module):
         features = features.double()
         mean = features.mean(0)
         centred = features - mean
-        variance, axes = torch.linalg.eigh(centred.T @ centred / len(centred))
-        spread = variance.clamp(min=0).sqrt()
+        covariance = centred.T @ centred / len(centred)
+        variance, axes = torch.linalg.eigh(covariance)
+        deviation = variance.clamp(min=0).sqrt()
         # The floor keeps constant directions from being amplified.
-        gain = (spread + 1e-3 * spread.max() + 1e-12) ** -WHITENING
+        floor = 1e-3 * deviation.max()
+        gain = (deviation + floor + 1e-12) ** -WHITENING
         mapping = (axes * gain) @ axes.T
         mapping /= (centred @ mapping).std().clamp(min=1e-12)
         self.feature_mean.copy_(mean)
@@ -204,19 +212,16 @@ class Head(nn.Module):
         count = len(centres)
 
         def draw(*shape: int, scale: float) -> Tensor:
-            return (
-                torch.rand(*shape, generator=generator, device="cpu") * 2 - 1
-            ) * scale
+            uniform = torch.rand(*shape, generator=generator, device="cpu")
+            return (uniform * 2 - 1) * scale
 
         bound = 1 / math.sqrt(width)
         self.code = _append(self.code, draw(1, self.layers, width, scale=0.2))
         self.logit = _append(self.logit, draw(count, width, scale=bound))
-        self.logit_bias = _append(self.logit_bias, self.logit_bias.new_zeros(count))
+        self.logit_bias = _append(self.logit_bias, torch.zeros(count))
         if self.options.offsets == "per_centre":
             self.offset = _append(self.offset, draw(count, 4, width, scale=bound))
-            self.offset_bias = _append(
-                self.offset_bias, self.offset_bias.new_zeros(count, 4)
-            )
+            self.offset_bias = _append(self.offset_bias, torch.zeros(count, 4))
         scene = torch.full((count,), self.scenes - 1, device=self.device)
         self.centres = torch.cat([self.centres, centres.to(self.centres)])
         self.centre_scene = torch.cat([self.centre_scene, scene])
@@ -249,28 +254,28 @@ class Head(nn.Module):
             "condition 'descriptor' needs the image descriptors"
         )
         x = torch.cat([descriptor.to(features.dtype), features], dim=-1)
-        return self._trunk(x, None)
+        return self._trunk(x, lambda z, layer: z)
 
     def _add_code(self, scene: Tensor | int) -> Callable[[Tensor, int], Tensor]:
+        """A function that adds the code of a layer to its output, in place."""
         if isinstance(scene, int):
             return lambda z, layer: z.add_(self.code[scene, layer].to(z.dtype))
         # A product with one-hot rows, because the gradient of indexing is slow.
         one_hot = F.one_hot(scene, self.scenes)
-        return lambda z, layer: z.addmm_(
-            one_hot.to(z.dtype), self.code[:, layer].to(z.dtype)
-        )
 
-    def _trunk(
-        self, x: Tensor, add_code: Callable[[Tensor, int], Tensor] | None
-    ) -> Tensor:
+        def add(z: Tensor, layer: int) -> Tensor:
+            codes = self.code[:, layer]
+            return z.addmm_(one_hot.to(z.dtype), codes.to(z.dtype))
+
+        return add
+
+    def _trunk(self, x: Tensor, add_code: Callable[[Tensor, int], Tensor]) -> Tensor:
         number = iter(range(self.layers))
-        activation = F.gelu if self.options.activation == "gelu" else F.relu
+        activation = getattr(F, self.options.activation)
 
         def through(layers: nn.Module, y: Tensor) -> Tensor:
             for linear in layers.children():
-                z = linear(y)
-                i = next(number)
-                y = activation(z if add_code is None else add_code(z, i))
+                y = activation(add_code(linear(y), next(number)))
             return y
 
         hidden = self.skip(x) + through(self.first, x)
@@ -280,21 +285,26 @@ class Head(nn.Module):
 
     def decode(self, hidden: Tensor, scene: Tensor | int) -> HeadOutput:
         """Compute the output from (n, width) activations of the last hidden layer, fp32."""
+        all_rows = slice(None)
+        rows = all_rows
         coded = self.options.condition == "code"
-        rows = slice(None)
         if coded and isinstance(scene, int):
             # Shapes do not depend on later scenes, so the output stays equal to the last bit.
             rows = slice(*self._owned[scene : scene + 2])
         logits = F.linear(hidden, self.logit[rows], self.logit_bias[rows])
         if coded and not isinstance(scene, int):
             logits = logits.masked_fill(self.centre_scene != scene[:, None], -torch.inf)
-        which = rows if self.options.offsets == "per_centre" else slice(None)
-        offset = self.offset[which].flatten(0, 1)
-        bias = self.offset_bias[which].flatten()
-        raw = F.linear(hidden, offset, bias).unflatten(-1, (-1, 4))
-        offsets = raw[..., :3] / homogeneous_scale(raw[..., 3:])
+        offset_rows = all_rows
+        if self.options.offsets == "per_centre":
+            offset_rows = rows
+        weight = self.offset[offset_rows].flatten(0, 1)
+        bias = self.offset_bias[offset_rows].flatten()
+        homogeneous = F.linear(hidden, weight, bias).unflatten(-1, (-1, 4))
+        scale = homogeneous_scale(homogeneous[..., 3:])
+        offsets = homogeneous[..., :3] / scale
+        candidates = self.centres[rows] + offsets
         share = logits.softmax(-1)
-        points = (share.unsqueeze(-1) * (self.centres[rows] + offsets)).sum(1)
+        points = (share.unsqueeze(-1) * candidates).sum(1)
         return HeadOutput(logits, offsets, points, hidden)
 
 
@@ -314,8 +324,10 @@ def homogeneous_scale(raw: Tensor) -> Tensor:
     h = min(softplus_b(raw) + 1 / s_max, 1 / s_min), softplus_b(z) = ln(1 + e^(b z)) / b,
     b = ln 2 / (1 - 1 / s_max).
     """
-    beta = math.log(2.0) / (1.0 - 1.0 / SCALE_MAX)
-    return (F.softplus(raw, beta=beta) + 1.0 / SCALE_MAX).clamp(max=1.0 / SCALE_MIN)
+    lowest = 1.0 / SCALE_MAX
+    beta = math.log(2.0) / (1.0 - lowest)
+    scale = F.softplus(raw, beta=beta) + lowest
+    return scale.clamp(max=1.0 / SCALE_MIN)
 
 
 def _linears(width: int, count: int) -> nn.ModuleList:

@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from evercal.continual.networks.buffer import Rows
 from evercal.continual.networks.head import HeadOutput
@@ -33,7 +32,7 @@ class TrainingHooks:
     """Whether `edit_step` is called. It costs a copy of all weights per step."""
 
     def replayed(
-        self, fresh: Rows, step: int, rate: float, generator: torch.Generator
+        self, fresh: Rows, step: int, rate: float, generator: Generator
     ) -> list[Rows]:
         """Select remembered rows for a step: as many parts of equal size every time.
 

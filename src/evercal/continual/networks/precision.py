@@ -14,9 +14,13 @@ import torch
 from evercal.errors import InputError
 
 VARIABLE = "EVERCAL_PRECISION"
+"""Name of the environment variable."""
 AUTO = "auto"
+"""The hardware decides."""
 BFLOAT16 = "bfloat16"
+"""Products in bfloat16 on every machine."""
 FLOAT32 = "float32"
+"""Products in float32 on every machine."""
 
 
 def fast_bfloat16(device: torch.device | str = "cpu") -> bool:

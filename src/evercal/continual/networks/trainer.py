@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from evercal.continual.networks.buffer import FeatureBuffer, Rows, diffused, join
 from evercal.continual.networks.device import tf32
@@ -21,6 +21,7 @@ from evercal.continual.networks.precision import autocast
 from evercal.continual.networks.shampoo import OneSidedShampoo
 
 INLIER_PX = 5.0
+"""Reprojection error below which a row of `Progress.inlier_share` is an inlier, pixels."""
 CORRECTION_FROM_PX = 20.0
 """Soft clamp below which the camera is corrected. Earlier errors come from the points."""
 
@@ -30,6 +31,7 @@ class FitOptions:
     """One stage of training."""
 
     iterations: int = 4000
+    """Steps of the optimisers."""
     batch: int = 2048
     """Rows of the scenes being learned in a step."""
     replay_batch: int = 1024
@@ -49,6 +51,7 @@ class FitOptions:
     surface_weight: float = 0.0
     """Weight of the distance to points from depths; with 0, no depths are estimated."""
     loss: LossOptions = field(default_factory=LossOptions)
+    """Reprojection loss of new rows."""
 
 
 @dataclass
@@ -58,6 +61,7 @@ class Progress:
     step: int
     """Completed steps."""
     total: int
+    """Steps of the whole training."""
     costs: Tensor
     """(n,) loss of each new row in the last step."""
     errors_px: Tensor
@@ -95,12 +99,12 @@ class HeadTrainer:
         self.options = options
         self.seed = seed
         self.step = 0
-        self.hooks = TrainingHooks() if hooks is None else hooks
-        self.correction = torch.nn.Parameter(
-            torch.zeros(len(buffers), 5, device=head.device)
-        )
-        correctable = [[float(buffer.correctable)] for buffer in buffers]
-        self._correctable = torch.tensor(correctable, device=head.device)
+        self.hooks = hooks or TrainingHooks()
+        correction = torch.zeros(len(buffers), 5, device=head.device)
+        self.correction = torch.nn.Parameter(correction)
+        self._correctable = torch.zeros(len(buffers), 1, device=head.device)
+        for i, buffer in enumerate(buffers):
+            self._correctable[i] = float(buffer.correctable)
         self._optimisers = _optimisers(head, self.correction, options)
 
     def run(self) -> Iterator[Progress]:
@@ -114,48 +118,51 @@ class HeadTrainer:
 
     def _train_step(self) -> Progress:
         options = self.options
-        rate = one_cycle(self.options, self.step)
+        rate = one_cycle(options, self.step)
         rows, fresh = self._rows(rate)
         for optimiser in self._optimisers:
             for group in optimiser.param_groups:
                 group["lr"] = rate * group["share"]
             optimiser.zero_grad()
-        # A single scene is a plain bias; a scene per row costs a product in every layer.
-        single = len(self.buffers) == 1 and fresh == len(rows.scene)
-        scene = self.buffers[0].scene if single else rows.scene
+        replays = fresh < len(rows.scene)
+        scene = rows.scene
+        if len(self.buffers) == 1 and not replays:
+            # A single scene is a plain bias; a scene per row costs a product in every layer.
+            scene = self.buffers[0].scene
         with autocast(self.head.device):
             output = self.head(rows.features.float(), scene, rows.descriptor)
         tau_px = clamp_px(options.loss, self.step / options.iterations)
-        costs, errors = self._fresh_costs(
-            output.points[:fresh], rows.part(slice(0, fresh)), tau_px
-        )
-        loss = costs.mean()
+        new_rows = rows.part(slice(fresh))
+        costs, errors = self._fresh_costs(output.points[:fresh], new_rows, tau_px)
         replayed = output.part(slice(fresh, None))
         remembered = rows.part(slice(fresh, None))
-        more = [self.hooks.regularizer()]
-        if fresh < len(rows.scene):
-            more.append(self.hooks.cost(replayed, remembered, tau_px))
-        for cost in more:
-            loss = loss if cost is None else loss + cost
+        loss = costs.mean()
+        terms = [self.hooks.regularizer()]
+        if replays:
+            terms.append(self.hooks.cost(replayed, remembered, tau_px))
+        for term in terms:
+            if term is not None:
+                loss = loss + term
         losses = self.hooks.constraints(replayed, remembered)
-        constraints = [self._gradients(constraint) for constraint in losses]
+        constraints = list(map(self._gradients, losses))
         loss.backward()
         self._take_step(losses, constraints, rate / options.peak_rate)
         self.step += 1
         return Progress(self.step, options.iterations, costs.detach(), errors)
 
     def _rows(self, rate: float) -> tuple[Rows, int]:
-        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
+        generator = Generator().manual_seed(self.seed * 1_000_003 + self.step)
         share = self.options.batch // len(self.buffers)
-        parts = [buffer.draw(share, generator) for buffer in self.buffers]
-        fresh = len(parts)
-        parts += self.hooks.replayed(join(parts), self.step, rate, generator)
-        if self.head.options.condition == "descriptor":
-            # Drawn on the device of the rows.
-            seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
-            noise = torch.Generator(self.head.device).manual_seed(seed)
-            parts = [diffused(part, self.options.diffusion, noise) for part in parts]
-        return join(parts), fresh * share
+        drawn = [buffer.draw(share, generator) for buffer in self.buffers]
+        drawn += self.hooks.replayed(join(drawn), self.step, rate, generator)
+        fresh = len(self.buffers) * share
+        if self.head.options.condition != "descriptor":
+            return join(drawn), fresh
+        # Drawn on the device of the rows.
+        seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
+        noise = Generator(self.head.device).manual_seed(seed)
+        diffusion = self.options.diffusion
+        return join([diffused(rows, diffusion, noise) for rows in drawn]), fresh
 
     def _fresh_costs(
         self, points: Tensor, rows: Rows, tau_px: float
@@ -164,9 +171,8 @@ class HeadTrainer:
         correction = None
         if options.intrinsics_rate > 0 and tau_px < CORRECTION_FROM_PX:
             share = len(points) // len(self.buffers)
-            correction = (self.correction * self._correctable).repeat_interleave(
-                share, 0
-            )
+            of_buffers = self.correction * self._correctable
+            correction = of_buffers.repeat_interleave(share, 0)
         costs, errors = reprojection_loss(
             points, rows.target, tau_px, options.loss, correction
         )
@@ -188,31 +194,34 @@ class HeadTrainer:
         constraints: list[dict[str, Tensor]],
         schedule: float,
     ) -> None:
-        named = dict(self.head.named_parameters()) if self.hooks.edits_steps else {}
-        before = {name: value.detach().clone() for name, value in named.items()}
-        for optimiser in self._optimisers:
-            optimiser.step()
-        if not before:
+        if not self.hooks.edits_steps:
+            self._step_optimisers()
             return
+        parameters = dict(self.head.named_parameters())
+        before = {name: value.detach().clone() for name, value in parameters.items()}
+        self._step_optimisers()
         with torch.no_grad():
-            empty = torch.zeros(0, device=self.head.device)
-            values = (
-                torch.stack([loss.detach() for loss in losses]) if losses else empty
-            )
-            changes = {name: value - before[name] for name, value in named.items()}
+            values = torch.zeros(len(losses), device=self.head.device)
+            for i, loss in enumerate(losses):
+                values[i] = loss
+            changes = {name: value - before[name] for name, value in parameters.items()}
             self.hooks.edit_step(
                 ProposedStep(changes, values, constraints, self.step, schedule)
             )
-            for name, value in named.items():
+            for name, value in parameters.items():
                 value.copy_(before[name] + changes[name])
+
+    def _step_optimisers(self) -> None:
+        for optimiser in self._optimisers:
+            optimiser.step()
 
 
 def _optimisers(
     head: Head, correction: torch.nn.Parameter, options: FitOptions
 ) -> list[torch.optim.Optimizer]:
-    hidden = []
-    decay = []
-    plain = []
+    hidden: list[torch.nn.Parameter] = []
+    decay: list[torch.nn.Parameter] = []
+    plain: list[torch.nn.Parameter] = []
     for name, parameter in head.named_parameters():
         if name.startswith(("code", "logit")):
             plain.append(parameter)
@@ -240,12 +249,11 @@ def one_cycle(options: FitOptions, step: int) -> float:
     The shape is that of torch's OneCycleLR, but without state to save.
     """
     rise = max(1.0, options.warm_share * options.iterations)
+    high = options.peak_rate
     if step < rise:
-        low = options.peak_rate / 25
-        high = options.peak_rate
+        low = high / 25
         share = 1 - step / rise
     else:
         low = 0.0
-        high = options.peak_rate
         share = (step - rise) / max(1.0, options.iterations - rise)
     return low + (high - low) * 0.5 * (1 + math.cos(math.pi * share))
