@@ -13,7 +13,7 @@ from evercal.cli.console import say
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.continual.benchmark.bench import Step
+    from evercal.continual.benchmark.bench import CompletedStage
     from evercal.continual.learning.stage import StageOptions
     from evercal.continual.strategies import Strategy
     from evercal.recordings import Recording
@@ -182,7 +182,7 @@ class Bench(args.Verb):
         return dataclasses.replace(stage, head=head, fit=fit)
 
 
-def _progress(step: "Step") -> str:
+def _progress(step: "CompletedStage") -> str:
     """Describe a stage: accuracy of each scene, under every name that the strategy is judged by."""
     start = f"[{step.done}/{step.total}]"
     seed = f"seed {step.seed}"

@@ -16,7 +16,7 @@ import pytest
 from evercal.continual import threshold
 from evercal.continual.benchmark.bench import (
     BenchOptions,
-    Step,
+    CompletedStage,
     begin_bench,
     in_order,
     run_bench,
@@ -91,14 +91,14 @@ def comparable(out: Path, *strategies: str) -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def complete(
     arcs: Arcs, options: BenchOptions, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, list[Step]]:
+) -> tuple[Path, list[CompletedStage]]:
     """The folder of a complete benchmark, and its steps."""
     out = tmp_path_factory.mktemp("bench")
     return out, list(run_bench(arcs, options, out))
 
 
 def test_all_learned_scenes_are_evaluated_after_every_stage(
-    complete: tuple[Path, list[Step]],
+    complete: tuple[Path, list[CompletedStage]],
 ) -> None:
     out, steps = complete
     names = ["er", "er", "finetune", "finetune", "joint", "joint"]
@@ -119,7 +119,9 @@ def test_all_learned_scenes_are_evaluated_after_every_stage(
     assert set(frames["strategy"]) == {"er", "finetune", "joint"}
 
 
-def test_strategies_share_the_first_stage(complete: tuple[Path, list[Step]]) -> None:
+def test_strategies_share_the_first_stage(
+    complete: tuple[Path, list[CompletedStage]],
+) -> None:
     out, _ = complete
     first = read(out).query("stage == 0").set_index("strategy")
     errors = ["median_mm", "median_deg", "area_20cm"]
@@ -132,7 +134,10 @@ def test_strategies_share_the_first_stage(complete: tuple[Path, list[Step]]) -> 
 
 
 def test_processes_share_the_runs(
-    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[Step]], tmp_path: Path
+    arcs: Arcs,
+    options: BenchOptions,
+    complete: tuple[Path, list[CompletedStage]],
+    tmp_path: Path,
 ) -> None:
     """While one process has a run, another takes the others; together they have all."""
     first = run_bench(arcs, options, tmp_path)
@@ -145,7 +150,7 @@ def test_processes_share_the_runs(
 
 
 def test_options_that_decide_a_result_are_recorded(
-    complete: tuple[Path, list[Step]],
+    complete: tuple[Path, list[CompletedStage]],
 ) -> None:
     settings = json.loads((complete[0] / SETTINGS).read_text())
     assert settings["fit"]["iterations"] == 6
@@ -158,7 +163,7 @@ def test_options_that_decide_a_result_are_recorded(
 def test_interruption_does_not_change_results(
     arcs: Arcs,
     options: BenchOptions,
-    complete: tuple[Path, list[Step]],
+    complete: tuple[Path, list[CompletedStage]],
     tmp_path: Path,
     stages: int,
 ) -> None:
@@ -202,7 +207,7 @@ def test_missing_rows_of_a_stage_are_added(
 
 
 def test_other_settings_and_strategies_are_refused(
-    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[Step]]
+    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[CompletedStage]]
 ) -> None:
     other = replace(strategy_named("er"), method=Replay("sars", weight=0.3))
     for change, message in (
@@ -223,7 +228,10 @@ def test_other_settings_and_strategies_are_refused(
 
 
 def test_strategies_can_be_added(
-    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[Step]], tmp_path: Path
+    arcs: Arcs,
+    options: BenchOptions,
+    complete: tuple[Path, list[CompletedStage]],
+    tmp_path: Path,
 ) -> None:
     row = Strategy("er_3", Replay(weight=0.9))
     more = replace(options, strategies=(*named("er"), row))

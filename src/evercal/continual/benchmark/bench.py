@@ -15,6 +15,7 @@ each takes runs that no other has.
 import json
 from collections.abc import Generator, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -36,15 +37,29 @@ from evercal.localization import acceptance
 from evercal.localization.options import LocalizeOptions
 from evercal.recordings import Recording
 from evercal.storage import sha256_file, write_json
-from evercal.storage.settings import lock_settings, read_settings
+from evercal.storage.settings import lock_settings
+
+ACCEPTANCE = (
+    "CHANCE",
+    "SAME_SURFACE",
+    "FALSE_ACCEPTS",
+    "FULL_SUPPORT",
+    "USELESS_M",
+    "APART_SIGMAS",
+    "APART_M",
+    "APART_RAD",
+)
+"""Constants of `localization.acceptance` that decide which poses are answers."""
 
 
 @dataclass(frozen=True)
-class Step:
+class CompletedStage:
     """A complete stage."""
 
     strategy: str
+    """Name of the strategy."""
     seed: int
+    """Seed of the run."""
     results: Table
     """Rows of results.csv; empty before the last stage of joint training."""
     done: int
@@ -55,7 +70,7 @@ class Step:
 
 def run_bench(
     scenes: Sequence[Recording], options: BenchOptions, out: Path
-) -> Generator[Step, None, None]:
+) -> Generator[CompletedStage, None, None]:
     """Run all runs of two or more scenes that are not complete; yields after every stage.
 
     `out`, the folder of results, is created if missing.
@@ -68,21 +83,26 @@ def run_bench(
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
         try:
-            claim = FileLock(runs / f"{strategy.name}-{seed}.claim").acquire(
-                blocking=False
-            )
+            claim = FileLock(runs / f"{strategy.name}-{seed}.claim")
+            claim.acquire(blocking=False)
         except Timeout:  # another process has this run
             continue
-        with claim:
+        try:
             stored = results.read(out)  # another process may have added some
-            if _complete((seed, strategy), stored, len(scenes)):
+            if _is_complete(stored, strategy, seed, len(scenes)):
                 continue
             for stage in run_strategy(strategy, ordered, options, seed, out):
                 results.append(out, stage)
-                yield Step(
-                    strategy.name, seed, stage.results, done + stage.stage + 1, total
+                yield CompletedStage(
+                    strategy=strategy.name,
+                    seed=seed,
+                    results=stage.results,
+                    done=done + stage.stage + 1,
+                    total=total,
                 )
             done += len(scenes)
+        finally:
+            claim.release()
 
 
 def begin_bench(
@@ -96,63 +116,61 @@ def begin_bench(
         lock_settings(out / results.SETTINGS, settings)
         _record_strategies(out, options.strategies)
     stored = results.read(out)
-    runs = [
-        (seed, strategy) for seed in options.seeds for strategy in options.strategies
-    ]
-    return [run for run in runs if not _complete(run, stored, len(scenes))]
+    missing = []
+    for seed, strategy in product(options.seeds, options.strategies):
+        if not _is_complete(stored, strategy, seed, len(scenes)):
+            missing.append((seed, strategy))
+    return missing
 
 
-def _complete(run: tuple[int, Strategy], stored: Table, scenes: int) -> bool:
-    seed, strategy = run
+def _is_complete(stored: Table, strategy: Strategy, seed: int, scenes: int) -> bool:
     rows = results.run_of(stored, strategy.name, seed)
-    last = rows[rows["stage"] == scenes - 1].groupby("strategy").size()
-    return len(rows) > 0 and all(
-        last.get(name) == scenes for name in rows["strategy"].unique()
-    )
+    is_last = rows["stage"] == scenes - 1
+    evaluated = is_last.groupby(rows["strategy"]).sum()
+    return len(rows) > 0 and bool((evaluated == scenes).all())
 
 
 def _record_strategies(out: Path, strategies: Sequence[Strategy]) -> None:
     path = out / results.STRATEGIES
-    recorded = read_settings(path) if path.exists() else {}
+    recorded = results.read_records(path)
     for strategy in strategies:
         now = json.loads(json.dumps(strategy.description()))
         before = recorded.setdefault(strategy.name, now)
         if before != now:
             raise InputError(
                 f"{out}: strategy {strategy.name!r} was {before}, now it is {now}; give it another"
-                " name or another --out"
+                " name or another `out`"
             )
     write_json(path, recorded)
 
 
 def in_order(scenes: Sequence[Recording], order: Order, seed: int) -> list[Recording]:
     """Return the scenes in order of learning."""
+    ordered = list(scenes)
     if order == "reversed":
-        return list(scenes)[::-1]
-    if order == "balanced":
+        ordered.reverse()
+    elif order == "balanced":
         # Over N seeds each scene is learned in each place once. Six seeds are all orders of three.
         rounds, places = divmod(seed, len(scenes))
-        turned = [scenes[(i + places) % len(scenes)] for i in range(len(scenes))]
-        return turned[::-1] if rounds % 2 else turned
-    if order == "shuffled":
-        return [
-            scenes[i]
-            for i in np.random.default_rng([seed, 11]).permutation(len(scenes))
-        ]
-    return list(scenes)
+        ordered = ordered[places:] + ordered[:places]
+        if rounds % 2:
+            ordered.reverse()
+    elif order == "shuffled":
+        rng = np.random.default_rng([seed, 11])
+        ordered = [scenes[i] for i in rng.permutation(len(scenes))]
+    return ordered
 
 
 def _settings(scenes: Sequence[Recording], options: BenchOptions) -> dict[str, object]:
     stage = options.stage(0)
-    networks = ENCODER_FILE, DESCRIBED_ENCODER, DESCRIPTOR_FILE
+    stage = replace(stage, seed=0, encode=replace(stage.encode, seed=0))
+    networks = (ENCODER_FILE, DESCRIBED_ENCODER, DESCRIPTOR_FILE)
     return {
-        **asdict(replace(stage, seed=0, encode=replace(stage.encode, seed=0))),
+        **asdict(stage),
         "networks": [sha256_file(file)[:12] for file in networks],
         "localize": asdict(LocalizeOptions()),
         "localize_networks": asdict(NETWORK_LOCALIZE),
-        "acceptance": {
-            k: v for k, v in vars(acceptance).items() if isinstance(v, float)
-        },
+        "acceptance": {name: getattr(acceptance, name) for name in ACCEPTANCE},
         "order": options.order,
         "short_side": options.short_side,
         "scenes": [[scene.name, len(scene.train), len(scene.test)] for scene in scenes],

@@ -19,7 +19,14 @@ def environment() -> dict[str, str]:
 
     from evercal.continual.networks.precision import BFLOAT16, FLOAT32, fast_bfloat16
 
-    gpu = torch.cuda.is_available()
+    gpu = "none"
+    device = "cpu"
+    if torch.cuda.is_available():
+        gpu = torch.cuda.get_device_name()
+        device = "cuda"
+    precision = FLOAT32
+    if fast_bfloat16(device):
+        precision = BFLOAT16
     return {
         "commit": _commit(),
         "python": platform.python_version(),
@@ -27,9 +34,9 @@ def environment() -> dict[str, str]:
         "numpy": np.__version__,
         "processor": _processor(),
         "instructions": torch.backends.cpu.get_cpu_capability(),
-        "precision": BFLOAT16 if fast_bfloat16("cuda" if gpu else "cpu") else FLOAT32,
+        "precision": precision,
         "threads": str(torch.get_num_threads()),
-        "gpu": torch.cuda.get_device_name() if gpu else "none",
+        "gpu": gpu,
     }
 
 
@@ -40,8 +47,10 @@ def _commit() -> str:
     try:
         if not git("ls-files", Path(__file__).name):
             raise FileNotFoundError(__file__)
-        changed = git("diff", "HEAD")
-        return git("rev-parse", "HEAD")[:12] + ("-dirty" if changed else "")
+        commit = git("rev-parse", "HEAD")[:12]
+        if git("diff", "HEAD"):
+            commit += "-dirty"
+        return commit
     except OSError:
         return f"evercal {version('evercal')}"
 
@@ -51,9 +60,8 @@ def _processor() -> str:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return platform.processor() or platform.machine()
-    names = [
-        line.partition(":")[2].strip()
-        for line in lines
-        if line.startswith("model name")
-    ]
-    return f"{len(names)} x {names[0]}" if names else platform.machine()
+    names = [line for line in lines if line.startswith("model name")]
+    if not names:
+        return platform.machine()
+    _, _, name = names[0].partition(":")
+    return f"{len(names)} x {name.strip()}"

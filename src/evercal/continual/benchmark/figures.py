@@ -18,8 +18,11 @@ COLOURS = (
     "#000000",
     "#999999",
 )
+"""Colours of lines."""
 _MARKERS = "os^Dv<>P"
+"""Markers of lines."""
 _LINES = ("-", "--", "-.", ":")
+"""Dashes of lines."""
 
 
 def new_figure(width: float, height: float) -> Figure:

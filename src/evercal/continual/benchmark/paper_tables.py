@@ -33,7 +33,14 @@ ABLATIONS: Mapping[str, tuple[tuple[str, str], ...]] = {
 As printed, the first step changes the selector and keeps iCaRL's penalty, which uses true poses.
 The second step replaces it by a penalty without true poses.
 """
-TABLE4 = tuple(dict.fromkeys(name for steps in ABLATIONS.values() for _, name in steps))
+TABLE4 = (
+    "icarl",
+    "sars_old_output",
+    "sars_spdd",
+    "er",
+    "sars_reprojection",
+    "reservoir_spdd",
+)
 """Strategies of `ABLATIONS`."""
 PUBLISHED: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "i7s": {
@@ -67,10 +74,10 @@ def paper_table(results: Table, suite: str = "") -> Table:
     others. Published numbers of the suite are added if there are any.
     """
     results = comparison.complete_runs(results)
-    last = results[results["stage"] == results["stage"].max()]
-    within = (
-        comparison.FINE_COLUMN if suite.startswith("sim") else comparison.COARSE_COLUMN
-    )
+    last = comparison.last_stage(results)
+    within = comparison.COARSE_COLUMN
+    if suite.startswith("sim"):
+        within = comparison.FINE_COLUMN
     cells: Table = pd.DataFrame(
         {
             "t, cm": last["median_mm"] / 10,
@@ -88,13 +95,10 @@ def paper_table(results: Table, suite: str = "") -> Table:
         "Mean": dict(table.xs("Acc, %", axis=1, level=1).mean()),
         "TFR": dict(forgetting),
     }
-    if suite in PUBLISHED:
-        totals["Mean, published"] = {
-            name: pair[0] for name, pair in PUBLISHED[suite].items()
-        }
-        totals["TFR, published"] = {
-            name: pair[1] for name, pair in PUBLISHED[suite].items()
-        }
+    published = pd.DataFrame(PUBLISHED.get(suite, {}), ["Mean", "TFR"])
+    for title, values in published.iterrows():
+        if len(values):
+            totals[f"{title}, published"] = dict(values)
     for title, values in totals.items():
         table.loc[title] = math.nan
         for name in names:
@@ -113,29 +117,39 @@ def ablation_table(scores: Table, suite: str = "") -> Table:
     rows = []
     published = PUBLISHED.get(suite)
     for title, steps in ABLATIONS.items():
-        if sum(name in final for _, name in steps) < 2:
+        if final.index.isin(dict(steps).values()).sum() < 2:
             continue
-        for i, (label, name) in enumerate(steps):
+        before = ""
+        for label, name in steps:
+            step = comparison.contrast_table(scores, [(name, before)]).iloc[0]
+            before = name
             if name not in final:
                 continue
-            before = steps[i - 1][1] if i else ""
-            step = comparison.contrast_table(scores, [(name, before)]).iloc[0]
-            row = {"ablation": title, "": label, comparison.FINAL: f"{final[name]:.1f}"}
-            row |= {"step": step[comparison.FINAL], "95 %": step["bounds"].iloc[0]}
+            row = {
+                "ablation": title,
+                "": label,
+                comparison.FINAL: f"{final[name]:.1f}",
+                "step": step[comparison.FINAL],
+                "95 %": step["bounds"].iloc[0],
+            }
             if published:
-                row["published %"] = (
-                    f"{published[name][0]:.1f}" if title == "as printed" else ""
-                )
+                row["published %"] = ""
+                if title == "as printed":
+                    row["published %"] = f"{published[name][0]:.1f}"
             rows.append(row)
     return pd.DataFrame(rows)
 
 
 def latex(table: Table, index: bool = True) -> str:
     """Format a table in LaTeX (needs booktabs); NaN becomes `--`."""
+
+    def text(value: float) -> str:
+        return f"{value:.1f}".replace("inf", r"$\infty$")
+
     return table.to_latex(
         index=index,
         na_rep="--",
-        float_format=lambda value: r"$\infty$" if math.isinf(value) else f"{value:.1f}",
+        float_format=text,
         escape=True,
         multicolumn_format="c",
     )

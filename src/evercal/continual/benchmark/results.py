@@ -29,10 +29,15 @@ from evercal.storage.settings import read_settings
 Table = Any
 """A DataFrame of pandas, whose methods pyright cannot check without stubs."""
 RESULTS = "results.csv"
+"""File of the rows of stages and scenes."""
 FRAMES = "frames.csv"
+"""File of the rows of test frames."""
 SETTINGS = "settings.json"
+"""File of the options that decide the results."""
 STRATEGIES = "strategies.json"
+"""File of the descriptions of strategies."""
 ENVIRONMENTS = "environments.json"
+"""File of commits, versions and processors."""
 UNALIGNED = ":unaligned"
 """Suffix of a strategy for results by the first pose, before landmarks are aligned."""
 WITHIN = {
@@ -46,6 +51,7 @@ WITHIN = {
 KEY = ["strategy", "seed", "stage", "scene"]
 """Columns that identify a row of results.csv."""
 _FRAME_KEY = ["strategy", "seed", "scene", "frame"]
+"""Columns that identify a row of frames.csv."""
 _REQUIRED = {
     *KEY,
     "frames",
@@ -55,6 +61,7 @@ _REQUIRED = {
     "head_bytes",
     "environment",
 }
+"""Columns that results.csv must have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,13 +83,13 @@ def scene_row(frames: Sequence[metrics.FrameResult]) -> dict[str, object]:
     squared = np.array([frame.squared_mahalanobis for frame in frames])
     wrong = np.array([frame.wrong_scene for frame in frames])
     middle = len(frames) // 2  # a mean of the two middle errors may include infinity
+    within: dict[str, int] = {}
+    for name, (most_m, most_rad) in WITHIN.items():
+        within[name] = int(((metres < most_m) & (radians < most_rad)).sum())
     return {
         "scene": frames[0].scene,
         "frames": len(frames),
-        **{
-            name: int(((metres < m) & (radians < r)).sum())
-            for name, (m, r) in WITHIN.items()
-        },
+        **within,
         "median_mm": round(1000 * float(np.sort(metres)[middle]), 3),
         "median_deg": round(math.degrees(np.sort(radians)[middle]), 4),
         "area_20cm": round(metrics.recall_area(metres), 4),
@@ -95,13 +102,17 @@ def scene_row(frames: Sequence[metrics.FrameResult]) -> dict[str, object]:
 
 def frame_row(frame: metrics.FrameResult) -> dict[str, object]:
     """Columns of frames.csv that depend on the frame."""
-    outcome = "inside" if frame.squared_mahalanobis < metrics.CHI2_6 else "outside"
+    squared = frame.squared_mahalanobis
     if frame.wrong_scene:
         outcome = "wrong scene"
     elif not math.isfinite(frame.translation_error_m):
         outcome = "refused"
-    elif math.isnan(frame.squared_mahalanobis):
+    elif math.isnan(squared):
         outcome = "no covariance"
+    elif squared < metrics.CHI2_6:
+        outcome = "inside"
+    else:
+        outcome = "outside"
     return {
         "scene": frame.scene,
         "frame": frame.frame,
@@ -127,12 +138,17 @@ def append(folder: Path, stage: StageResults) -> None:
         new = new[~pd.MultiIndex.from_frame(new[KEY]).isin(stored)]
     with locked(folder):
         # Frames come first: a stage whose results are complete has its frames.
-        for name, rows in ((FRAMES, stage.frames), (RESULTS, new)):
-            if len(rows):
-                with open(folder / name, "a", encoding="utf-8") as file:
-                    rows.to_csv(file, header=file.tell() == 0, index=False)
-                    file.flush()
-                    os.fsync(file.fileno())
+        _append_rows(folder / FRAMES, stage.frames)
+        _append_rows(folder / RESULTS, new)
+
+
+def _append_rows(path: Path, rows: Table) -> None:
+    if rows.empty:
+        return
+    with open(path, "a", encoding="utf-8") as file:
+        rows.to_csv(file, header=file.tell() == 0, index=False)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def run_of(results: Table, strategy: str, seed: int) -> Table:
@@ -153,7 +169,7 @@ def read_frames(folder: Path) -> Table:
 
 
 def _read(folder: Path, name: str, required: set[str]) -> Table:
-    path = next(iter(sorted(folder.glob(f"{name}*"))), None)
+    path = min(folder.glob(f"{name}*"), default=None)
     if path is None:
         return pd.DataFrame(columns=sorted(required))
     if path.name == name:
@@ -167,7 +183,8 @@ def _read(folder: Path, name: str, required: set[str]) -> Table:
         )
     except (ValueError, OSError) as error:
         raise InputError(f"{path}: not a table of results ({error})") from error
-    if missing := required - set(table):
+    missing = required.difference(table)
+    if missing:
         raise InputError(f"{path}: no columns {', '.join(sorted(missing))}")
     return table
 
@@ -182,9 +199,8 @@ def _remove_incomplete_line(folder: Path, path: Path) -> None:
 def record_environment(folder: Path) -> str:
     """Add the record of this process to environments.json and return its key."""
     record = environment()
-    key = hashlib.blake2b(
-        json.dumps(record, sort_keys=True).encode(), digest_size=4
-    ).hexdigest()
+    text = json.dumps(record, sort_keys=True)
+    key = hashlib.blake2b(text.encode(), digest_size=4).hexdigest()
     with locked(folder):
         before = read_environments(folder)
         if key not in before:
@@ -194,5 +210,11 @@ def record_environment(folder: Path) -> str:
 
 def read_environments(folder: Path) -> dict[str, Any]:
     """Read the records of a folder by key; empty without the file."""
-    path = folder / ENVIRONMENTS
-    return read_settings(path) if path.exists() else {}
+    return read_records(folder / ENVIRONMENTS)
+
+
+def read_records(path: Path) -> dict[str, Any]:
+    """Read records in JSON by key; empty without the file."""
+    if not path.exists():
+        return {}
+    return read_settings(path)

@@ -86,7 +86,7 @@ def _read(file: Path) -> dict[str, tuple[SE3, float]]:
 
 def _pose_and_focal(words: list[str]) -> tuple[SE3, float]:
     """base_from_camera and focal length of a line; ValueError for other words."""
-    numbers = np.array(words, float)
+    numbers = np.array(list(map(float, words)))
     if len(numbers) != 8 or not np.isfinite(numbers).all() or numbers[7] <= 0:
         raise ValueError
     quaternion = numbers[:4] / np.linalg.norm(numbers[:4])

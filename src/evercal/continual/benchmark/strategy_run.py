@@ -48,7 +48,6 @@ NETWORK_LOCALIZE = NetworkLocalizeOptions(refuses=False)
 """Networks answer for every image, as published methods do. A refusal rule would favour methods
 whose inliers stay above the threshold that was fitted when a scene was learned."""
 
-
 Order = Literal["given", "reversed", "shuffled", "balanced"]
 
 
@@ -88,7 +87,9 @@ def run_strategy(
     if strategy.method is None:
         return _MapRun(strategy, scenes, options, seed, out).stages()
     run = _NetworkRun(strategy, scenes, options, seed, out)
-    return run.jointly() if strategy.jointly else run.stages()
+    if strategy.jointly:
+        return run.jointly()
+    return run.stages()
 
 
 class _Run:
@@ -124,21 +125,19 @@ class _Run:
         """Evaluate all scenes learned so far by localizers, by the names of their results."""
         results = []
         frames = []
-        environment = record_environment(self.out)
+        costs = {**costs, "environment": record_environment(self.out)}
+        learned = {scene.name: scene for scene in self.scenes[: number + 1]}
         for name, localizer in localizers.items():
-            run = {"strategy": name, "seed": self.stage.seed, "stage": number}
-            evaluated = evaluate(
-                localizer, {s.name: s for s in self.scenes[: number + 1]}
-            )
-            for scene in self.scenes[: number + 1]:
-                of_scene = [frame for frame in evaluated if frame.scene == scene.name]
-                results.append(
-                    {**run, **scene_row(of_scene), **costs, "environment": environment}
-                )
-                frames += [{**run, **frame_row(frame)} for frame in of_scene]
-        table = pd.DataFrame(frames).drop(columns="stage")
-        last = number == len(self.scenes) - 1
-        return StageResults(number, pd.DataFrame(results), table if last else table[:0])
+            run = {"strategy": name, "seed": self.stage.seed}
+            evaluated = evaluate(localizer, learned)
+            for scene in learned:
+                of_scene = [frame for frame in evaluated if frame.scene == scene]
+                results.append({**run, "stage": number, **scene_row(of_scene), **costs})
+                frames += [run | frame_row(frame) for frame in of_scene]
+        table = pd.DataFrame(frames)
+        if len(learned) < len(self.scenes):
+            table = table[:0]
+        return StageResults(number, pd.DataFrame(results), table)
 
 
 class _MapRun(_Run):
@@ -157,10 +156,9 @@ class _MapRun(_Run):
                 scene, report = learn_scene(self.scenes[number], contents, size)
                 opened.commit(scene, asdict(report))
             name = self.strategy.name
-            unaligned = LocalizeOptions(align=False)
             named = {
                 name: Localizer(contents),
-                name + UNALIGNED: Localizer(contents, unaligned),
+                name + UNALIGNED: Localizer(contents, LocalizeOptions(align=False)),
             }
             costs = {
                 "seconds": float(opened.reports()[-1]["seconds"]),
@@ -182,10 +180,9 @@ class _NetworkRun(_Run):
 
     def stages(self) -> Iterator[StageResults]:
         self._begin()
-        for number in range(
-            len(NetworkStore.open(self.store).stages) - 1, len(self.scenes)
-        ):
-            if number >= len(NetworkStore.open(self.store).stages):
+        complete = len(NetworkStore.open(self.store).stages)
+        for number in range(complete - 1, len(self.scenes)):
+            if number >= complete:
                 self._learn(self.store, self.scenes[number], self.strategy)
             opened = NetworkStore.open(self.store)
             seconds = float(opened.reports()[-1]["seconds"])
@@ -195,18 +192,21 @@ class _NetworkRun(_Run):
     def jointly(self) -> Iterator[StageResults]:
         self._remove()  # an interrupted run starts again
         empty = self._prepared(self._new_store().contents)
-        splits = [split_held_out(scene.train) for scene in self.scenes]
-        train = [
-            replace(s, train=t.train) for s, t in zip(self.scenes, splits, strict=True)
-        ]
+        recordings = []
+        held_out = []
+        for scene in self.scenes:
+            split = split_held_out(scene.train)
+            recordings.append(replace(scene, train=split.train))
+            held_out.append(split.held_out)
         began = time.perf_counter()
-        learned = learn_jointly(empty, train, self.stage)
-        for number, split in enumerate(splits):
-            learned.scenes[number] = fit_threshold(learned, split.held_out, number)
+        learned = learn_jointly(empty, recordings, self.stage)
+        for number, frames in enumerate(held_out):
+            learned.scenes[number] = fit_threshold(learned, frames, number)
         seconds = time.perf_counter() - began
         last = len(self.scenes) - 1
         nothing = pd.DataFrame()
-        yield from (StageResults(number, nothing, nothing) for number in range(last))
+        for number in range(last):
+            yield StageResults(number, nothing, nothing)
         yield self._located(learned, last, seconds)
 
     def _learn(self, store: Path, scene: Recording, strategy: Strategy) -> None:
@@ -271,7 +271,7 @@ class _NetworkRun(_Run):
         costs = {
             "seconds": seconds,
             "memory_bytes": scenes.memory_bytes,
-            "head_bytes": sum(head_bytes(head) for head in scenes.heads),
+            "head_bytes": sum(map(head_bytes, scenes.heads)),
             "frames_kept": scenes.frames_kept,
         }
         named = {self.strategy.name: NetworkLocalizer(scenes, NETWORK_LOCALIZE)}
@@ -281,9 +281,9 @@ class _NetworkRun(_Run):
 def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOptions:
     if stage.head.centres != "fixed" or stage.fixed_centres_m:
         return stage
-    positions = [
-        stated_poses(split_held_out(scene.train).train).translation_m
-        for scene in scenes
-    ]
+    positions = []
+    for scene in scenes:
+        split = split_held_out(scene.train)
+        positions.append(stated_poses(split.train).translation_m)
     centres = combined_centres(positions, stage.head.centres_per_scene, stage.seed)
     return replace(stage, grid_scenes=len(scenes), fixed_centres_m=centres)

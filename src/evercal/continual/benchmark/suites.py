@@ -93,7 +93,7 @@ SUITES: dict[str, Suite] = {
 def load_suite(
     name: str,
     data: Path | None = None,
-    only: Sequence[str] = (),
+    scenes: Sequence[str] = (),
     poses: Path | None = None,
 ) -> list[Recording]:
     """Load the scenes of a suite in order of learning, by default all.
@@ -107,12 +107,12 @@ def load_suite(
     if poses is not None and name not in ("i7s", "i12s"):
         raise InputError(f"suite {name}: `poses` are for i7s and i12s")
     suite = SUITES[name]
-    for scene in only:
+    for scene in scenes:
         if scene not in suite.scenes:
             raise InputError(
                 f"scene {scene!r}: not in suite {name}; choose from {', '.join(suite.scenes)}"
             )
-    names = [scene for scene in suite.scenes if not only or scene in only]
+    names = [scene for scene in suite.scenes if not scenes or scene in scenes]
     if name == "sim-mini":
         rooms = {room.scene.name: room.scene for room in sample_rooms()}
         return [rooms[scene] for scene in names]
@@ -180,8 +180,8 @@ def regions(scene: Recording, parts: int) -> list[Recording]:
         name = f"{scene.name}-{number}"
         if len(region_train) < MIN_TRAIN_FRAMES or not region_test:
             raise InputError(
-                f"{name}: {len(region_train)} training and {len(region_test)} test frames are too few"
-                f" (at least {MIN_TRAIN_FRAMES} and 1); give fewer `parts`"
+                f"{name}: {len(region_train)} training and {len(region_test)} test frames are too"
+                f" few (at least {MIN_TRAIN_FRAMES} and 1); give fewer `parts`"
             )
         recordings.append(
             replace(
