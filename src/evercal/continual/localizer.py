@@ -22,6 +22,7 @@ from evercal.localization.matching import strided_patches
 from evercal.localization.pnp import PnpOptions, PnpResult, solve_pnp, uncertain
 from evercal.localization.query import Encoded
 from evercal.recordings.images import as_rgb
+from evercal.typing import Image
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,9 @@ class NetworkLocalizer:
     ):
         self.contents = scenes
         self.options = options or NetworkLocalizeOptions()
-        self._prototypes = [
-            r.prototypes.float().to(scenes.device) for r in scenes.scenes
-        ]
+        self._prototypes: list[torch.Tensor] = []
+        for record in scenes.scenes:
+            self._prototypes.append(record.prototypes.float().to(scenes.device))
         for head in scenes.heads:
             head.eval()
 
@@ -68,7 +69,7 @@ class NetworkLocalizer:
         """Names of the scenes, in order of learning."""
         return tuple(record.name for record in self.contents.scenes)
 
-    def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
+    def localize(self, image: Image, camera: Camera | None = None) -> PoseEstimate:
         """Locate an image; see `Localizer.localize`.
 
         Inliers are patches whose predicted points agree with the pose, and the ratio is that of all
@@ -81,10 +82,9 @@ class NetworkLocalizer:
         cameras = _fitting_cameras(camera, image, scenes.scenes)
         features = scenes.encoder.encode(image, scenes.short_side)
         encoded = Encoded(features)
-        tried = [
-            self._hypothesis(encoded, i, cameras)
-            for i in self._candidates(encoded, cameras)
-        ]
+        tried: list[Rough | None] = []
+        for scene in self._candidates(encoded, cameras):
+            tried.append(self._hypothesis(encoded, scene, cameras))
         best = max(tried, key=_support)
         return self._answer(best, 1000 * (time.perf_counter() - began))
 
@@ -100,12 +100,13 @@ class NetworkLocalizer:
         if self._decides_scene:
             return usable[:1]
         _, descriptor = described(encoded.features, self.contents.descriptor)
-        similarity = {
-            i: float((self._prototypes[i] @ descriptor).max()) for i in usable
-        }
-        usable.sort(key=lambda i: -similarity[i])
-        floor = similarity[usable[0]] - self.options.margin
-        return [i for i in usable if similarity[i] >= floor][: self.options.candidates]
+        similarity = np.full(len(cameras), -np.inf)
+        for i in usable:
+            similarity[i] = float((self._prototypes[i] @ descriptor).max())
+        floor = similarity.max() - self.options.margin
+        best_first = np.argsort(-similarity, kind="stable")
+        similar = best_first[similarity[best_first] >= floor]
+        return similar[: self.options.candidates].tolist()
 
     def _hypothesis(
         self,
@@ -122,22 +123,25 @@ class NetworkLocalizer:
         if rough is None:
             return None
         if self._decides_scene and not moved:
-            inside = self._scene_at(rough.pose, scene)
-            other = scene if inside is None else inside
+            other = self._scene_at(rough.pose, scene)
+            if other is None:
+                other = scene
             if cameras[other] not in (None, camera):
                 # The pose lies in the cell of a scene with another camera: solve once more.
                 return self._hypothesis(encoded, other, cameras, moved=True)
             if other != scene:
-                cells = [
-                    self.contents.scenes[i].cell.atlas_from_base for i in (other, scene)
-                ]
-                across = cells[0].inverse() @ cells[1]
+                atlas_from_other = self._atlas_from_base(other)
+                across = atlas_from_other.inverse() @ self._atlas_from_base(scene)
                 rough = PnpResult(across @ rough.pose, rough.inliers)
                 matches = Matches(matches.pixels, across.apply(matches.points_m))
                 scene = other
-        pixels, points = (values[rough.inliers] for values in matches)
+        pixels = matches.pixels[rough.inliers]
+        points = matches.points_m[rough.inliers]
         pose = uncertain(pixels, points, small, rough.pose)
         return Rough(scene, pose, pixels, points, patches, len(pixels))
+
+    def _atlas_from_base(self, scene: int) -> SE3:
+        return self.contents.scenes[scene].cell.atlas_from_base
 
     @torch.inference_mode()
     def _predicted(
@@ -150,19 +154,17 @@ class NetworkLocalizer:
         features, descriptor = described(encoded.features, scenes.descriptor)
         with autocast(head.device):
             output = head(features, local, descriptor.expand(len(features), -1))
-        points = output.points.cpu().double().numpy()
-        points = (
-            scenes.scenes[scene].cell.atlas_from_base.inverse().apply(points)[patches]
-        )
+        in_atlas = output.points.cpu().double().numpy()
+        base_from_atlas = self._atlas_from_base(scene).inverse()
+        points = base_from_atlas.apply(in_atlas)[patches]
         valid = np.isfinite(points).all(1)
         return Matches(pixels[valid], points[valid]), len(patches)
 
     def _scene_at(self, base_from_camera: SE3, scene: int) -> int | None:
         """The scene in whose cell a pose of one scene lies."""
-        atlas_from_base = self.contents.scenes[scene].cell.atlas_from_base
-        return self.contents.atlas().scene_at(
-            atlas_from_base.apply(base_from_camera.translation_m)
-        )
+        atlas_from_base = self._atlas_from_base(scene)
+        position = atlas_from_base.apply(base_from_camera.translation_m)
+        return self.contents.atlas().scene_at(position)
 
     def _answer(self, best: Rough | None, milliseconds: float) -> PoseEstimate:
         if best is None:
@@ -203,23 +205,23 @@ class NetworkLocalizer:
 
 
 def _fitting_cameras(
-    camera: Camera | None, image: np.ndarray, scenes: Sequence[SceneRecord]
+    camera: Camera | None, image: Image, scenes: Sequence[SceneRecord]
 ) -> list[Camera | None]:
     """Intrinsics of an image in each scene, never guessed; None where its shape does not fit."""
     height, width = image.shape[:2]
-    recorded = [scene.adjusted_camera for scene in scenes]
-    fits = [camera is not None or own.fits(width, height) for own in recorded]
-    if not any(fits):
-        sizes = ", ".join(
-            f"{scene.name} {own.width}x{own.height}"
-            for scene, own in zip(scenes, recorded, strict=True)
-        )
+    cameras: list[Camera | None] = list(cameras_in_scenes(camera, image, scenes))
+    sizes: list[str] = []
+    for i, scene in enumerate(scenes):
+        recorded = scene.adjusted_camera
+        sizes.append(f"{scene.name} {recorded.width}x{recorded.height}")
+        if camera is None and not recorded.fits(width, height):
+            cameras[i] = None
+    if not any(cameras):
         raise InputError(
-            f"image {width}x{height}: no scene was recorded at this aspect ratio ({sizes});"
-            " give the image's intrinsics with --camera"
+            f"image {width}x{height}: no scene was recorded at this aspect ratio"
+            f" ({', '.join(sizes)}); give the image's intrinsics with `camera`"
         )
-    asked = cameras_in_scenes(camera, image, scenes)
-    return [own if fit else None for own, fit in zip(asked, fits, strict=True)]
+    return cameras
 
 
 def _support(hypothesis: Rough | None) -> float:

@@ -21,6 +21,7 @@ from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
 
 MAX_PROTOTYPES = 256
+"""Maximum number of descriptors that are stored of a scene."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,11 @@ class SceneRecord:
     camera: Camera
     """Intrinsics of its first training frame."""
     cell: Cell
+    """Its place in the atlas."""
     prototypes: Tensor
     """(p, width) descriptors of training frames spread over the recording, half precision."""
     train_frames: int
+    """Number of training frames."""
     refined_camera: Camera | None = None
     """`camera` as training corrected it; None without a correction."""
     inlier_threshold: float = 0.0
@@ -51,15 +54,13 @@ class SceneRecord:
         """Apply the intrinsics of the training to the scene's rows; see `corrected_camera`."""
         nominal = self.camera
         refined = self.refined_camera
-        if refined is not None:
-            k1, k2 = refined.distortion[:2] or (0.0, 0.0)
-            shift = (
-                (refined.cx - nominal.cx) / nominal.fx,
-                (refined.cy - nominal.cy) / nominal.fy,
-            )
-            rows.correct_lens(
-                torch.tensor([refined.fx / nominal.fx - 1, *shift, k1, k2])
-            )
+        if refined is None:
+            return
+        focal = refined.fx / nominal.fx - 1
+        dx = (refined.cx - nominal.cx) / nominal.fx
+        dy = (refined.cy - nominal.cy) / nominal.fy
+        k1, k2 = refined.distortion[:2] or (0.0, 0.0)
+        rows.correct_lens(torch.tensor([focal, dx, dy, k1, k2]))
 
     @property
     def frame(self) -> MapFrame:
@@ -72,7 +73,9 @@ class LearnedScenes:
     """Everything that localization and the next stage need."""
 
     encoder: Encoder
+    """Network of local features."""
     descriptor: Descriptor
+    """Network of global descriptors."""
     strategy: str
     """Key of STRATEGIES."""
     short_side: int
@@ -102,17 +105,18 @@ class LearnedScenes:
     @property
     def memory_bytes(self) -> int:
         """Size of the memory for later stages: keyframes and method states."""
-        frames = sum(
-            keyframes.bytes for keyframes in self.keyframes if keyframes is not None
-        )
-        states = (value for state in self.method_states for value in state.values())
-        return frames + sum(value.nbytes for value in states)
+        size = 0
+        for keyframes in self.keyframes:
+            if keyframes is not None:
+                size += keyframes.bytes
+        for state in self.method_states:
+            size += sum(value.nbytes for value in state.values())
+        return size
 
     @property
     def frames_kept(self) -> int:
         """Keyframes of the newest scene."""
-        newest = self.keyframes[-1]
-        return 0 if newest is None else len(newest)
+        return len(self.keyframes[-1] or ())
 
     def atlas(self, grid_scenes: int = 0) -> Atlas:
         """Cells of the scenes learned so far; `grid_scenes` of the paper's layout, 0: open."""
@@ -137,12 +141,16 @@ class LearnedScenes:
 
 def corrected_camera(camera: Camera, correction: Tensor) -> Camera:
     """A nominal pinhole with the correction (5,) of training (see `reprojection_error`)."""
-    focal, dx, dy, k1, k2 = (float(value) for value in correction)
-    fx = camera.fx * (1 + focal)
-    fy = camera.fy * (1 + focal)
-    cx = camera.cx + dx * camera.fx
-    cy = camera.cy + dy * camera.fy
-    return Camera(camera.width, camera.height, fx, fy, cx, cy, (k1, k2, 0.0, 0.0))
+    focal, dx, dy, k1, k2 = correction.tolist()
+    return Camera(
+        width=camera.width,
+        height=camera.height,
+        fx=camera.fx * (1 + focal),
+        fy=camera.fy * (1 + focal),
+        cx=camera.cx + dx * camera.fx,
+        cy=camera.cy + dy * camera.fy,
+        distortion=(k1, k2, 0.0, 0.0),
+    )
 
 
 def prototypes(descriptors: Tensor) -> Tensor:

@@ -44,9 +44,13 @@ from evercal.storage.stages import (
 from evercal.storage.tensors import load_tensors, save_tensors
 
 HEAD = "head.safetensors"
+"""File of the weights of a head."""
 RECORD = "network.json"
+"""File of the record of a scene."""
 PROTOTYPES = "prototypes.safetensors"
+"""File of the prototypes of a scene."""
 STATE = "state.safetensors"
+"""File of what the method keeps of a scene."""
 
 
 class NetworkStore(StageStore[LearnedScenes]):
@@ -77,17 +81,16 @@ class NetworkStore(StageStore[LearnedScenes]):
 
         def read(manifest: Manifest) -> Self:
             payload = manifest.payload
-            networks = tuple(str(name) for name in payload["networks"])
+            networks = tuple(map(str, payload["networks"]))
             encoder = load_encoder(root / networks[0])
             for name in networks[1:-1]:
-                encoder.centroids = load_tensors(root / name)["centroids"].astype(
-                    np.float32
-                )
+                centroids = load_tensors(root / name)["centroids"]
+                encoder.centroids = centroids.astype(np.float32)
             described = descriptor.load_descriptor(root / networks[-1])
             strategy = str(payload["strategy"])
             short_side = int(payload["short_side"])
             scenes = LearnedScenes(encoder, described, strategy, short_side)
-            stages = [str(name) for name in payload["stages"]]
+            stages = list(map(str, payload["stages"]))
             store = cls(root, scenes, stages, networks)
             for name in stages:
                 store._read_stage(name, manifest)
@@ -102,28 +105,29 @@ class NetworkStore(StageStore[LearnedScenes]):
         def listed(file: str) -> bool:
             return f"{STAGES}/{name}/{file}" in manifest.files
 
+        keyframes = None
+        if listed(KEYFRAMES):
+            keyframes = Keyframes.from_tensors(load_tensors(folder / KEYFRAMES))
+        state: dict[str, Tensor] = {}
+        if listed(STATE):
+            state = _tensors(folder / STATE)
         scenes.scenes.append(_read_record(folder))
-        scenes.keyframes.append(
-            Keyframes.from_tensors(load_tensors(folder / KEYFRAMES))
-            if listed(KEYFRAMES)
-            else None
-        )
-        scenes.method_states.append(_tensors(folder / STATE) if listed(STATE) else {})
+        scenes.keyframes.append(keyframes)
+        scenes.method_states.append(state)
         if listed(HEAD):
             scenes.heads.append(_read_head(folder, scenes.encoder.width))
 
     def commit(self, scenes: LearnedScenes, report: Mapping[str, object]) -> None:
         """Add the newest scene of `scenes`: whole, or not at all."""
+        record = scenes.scenes[-1]
         keyframes = scenes.keyframes[-1]
 
         def write(folder: Path) -> None:
             if not self.networks:
                 self.networks = self._write_networks(scenes)
-            record = scenes.scenes[-1]
             write_json(folder / RECORD, _plain(record))
-            save_tensors(
-                folder / PROTOTYPES, _arrays({"prototypes": record.prototypes})
-            )
+            prototypes = {"prototypes": record.prototypes}
+            save_tensors(folder / PROTOTYPES, _arrays(prototypes))
             _write_head(folder, scenes.heads[-1])
             if keyframes is not None:
                 save_tensors(folder / KEYFRAMES, keyframes.to_tensors())
@@ -137,9 +141,7 @@ class NetworkStore(StageStore[LearnedScenes]):
             "strategy": scenes.strategy,
             "short_side": scenes.short_side,
         }
-        self.add(
-            scenes.scenes[-1].name, write, payload, lambda file: shared and file == HEAD
-        )
+        self.add(record.name, write, payload, lambda file: shared and file == HEAD)
         self.contents = scenes
 
     def _write_networks(self, scenes: LearnedScenes) -> tuple[str, ...]:
@@ -155,9 +157,11 @@ def describe(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]
     contents = store.contents
     scenes = []
     for record, kept in zip(contents.scenes, contents.keyframes, strict=True):
-        size, count = (kept.bytes, len(kept)) if kept is not None else (0, 0)
-        scenes.append(_plain(record) | {"memory_bytes": size, "keyframes": count})
-    heads = sum(head_bytes(head) for head in contents.heads)
+        scene = _plain(record) | {"memory_bytes": 0, "keyframes": 0}
+        if kept is not None:
+            scene |= {"memory_bytes": kept.bytes, "keyframes": len(kept)}
+        scenes.append(scene)
+    heads = sum(map(head_bytes, contents.heads))
     return scenes, contents.short_side, heads, store.size_bytes()
 
 
@@ -167,13 +171,12 @@ def head_bytes(head: Head) -> int:
 
 
 def _stored(head: Head) -> dict[str, Tensor]:
-    # Centres stay fp32: half floats are 4 to 16 mm apart at the size of an atlas.
-    return {
-        key: value
-        if key == "centres" or not value.is_floating_point()
-        else value.half()
-        for key, value in head.state_dict().items()
-    }
+    state = head.state_dict()
+    for name, value in state.items():
+        # Centres stay fp32: half floats are 4 to 16 mm apart at the size of an atlas.
+        if name != "centres" and value.is_floating_point():
+            state[name] = value.half()
+    return state
 
 
 def _write_head(folder: Path, head: Head) -> None:
@@ -210,18 +213,23 @@ def _plain(record: SceneRecord) -> dict[str, Any]:
     """A record as in its file, without its prototypes."""
     content = {**vars(record), "cell": asdict(record.cell)}
     del content["prototypes"]
-    return {k: v.to_dict() if isinstance(v, Camera) else v for k, v in content.items()}
+    for name in ("camera", "refined_camera"):
+        if content[name] is not None:
+            content[name] = content[name].to_dict()
+    return content
 
 
 def _read_record(folder: Path) -> SceneRecord:
     content = json.loads((folder / RECORD).read_text())
     checked_name(content["name"])
     cell = content["cell"]
-    refined = content["refined_camera"]
-    read = {
-        "camera": Camera.from_dict(content["camera"]),
-        "cell": Cell(tuple(cell["centre_m"]), cell["side_m"], tuple(cell["origin_m"])),
-        "refined_camera": Camera.from_dict(refined) if refined else None,
-        **_tensors(folder / PROTOTYPES),
-    }
-    return SceneRecord(**{**content, **read})
+    content["cell"] = Cell(
+        centre_m=tuple(cell["centre_m"]),
+        side_m=cell["side_m"],
+        origin_m=tuple(cell["origin_m"]),
+    )
+    for name in ("camera", "refined_camera"):
+        if content[name] is not None:
+            content[name] = Camera.from_dict(content[name])
+    tensors = _tensors(folder / PROTOTYPES)
+    return SceneRecord(prototypes=tensors["prototypes"], **content)

@@ -4,6 +4,7 @@ import importlib.util
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeGuard
 
 from evercal.continual.methods.ewc import ElasticWeightConsolidation
 from evercal.continual.methods.gec import EpisodicConstraint
@@ -39,13 +40,18 @@ class Strategy:
     @property
     def citation(self) -> str:
         """Source of the strategy."""
-        return self.source or (self.method.citation if self.method else "")
+        if self.source or self.method is None:
+            return self.source
+        return self.method.citation
 
     def description(self) -> dict[str, object]:
         """Convert to plain data: method with hyper-parameters, map, joint training."""
-        method = None if self.method is None else described(self.method)
-        jointly = {"jointly": True} if self.jointly else {}
-        return {"method": method, "map": self.method is None, **jointly}
+        record: dict[str, object] = {"method": None, "map": self.method is None}
+        if self.method is not None:
+            record["method"] = described(self.method)
+        if self.jointly:
+            record["jointly"] = True
+        return record
 
 
 # Settings with the best mean over the suites of `benchmarks tune`; see docs/methods.md.
@@ -114,11 +120,7 @@ def load_plugin(path: Path) -> tuple[str, ...]:
     except Exception as error:
         raise InputError(f"plugin {path}: {type(error).__name__}: {error}") from error
     strategies = getattr(module, "STRATEGIES", None)
-    usable = isinstance(strategies, dict) and all(
-        isinstance(strategy, Strategy) and strategy.name == name
-        for name, strategy in strategies.items()
-    )
-    if not usable or not strategies:
+    if not _is_named(strategies):
         raise InputError(
             f"plugin {path}: defines no STRATEGIES; define a dict from names to Strategy records"
             " of these names"
@@ -130,3 +132,13 @@ def load_plugin(path: Path) -> tuple[str, ...]:
             )
     STRATEGIES.update(strategies)
     return tuple(strategies)
+
+
+def _is_named(strategies: object) -> TypeGuard[dict[str, Strategy]]:
+    """Whether strategies are a dict from names to records of these names, with one at least."""
+    if not isinstance(strategies, dict) or not strategies:
+        return False
+    return all(
+        isinstance(strategy, Strategy) and strategy.name == name
+        for name, strategy in strategies.items()
+    )

@@ -11,9 +11,20 @@ from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.geometry import pose_distance
 from evercal.recordings.frame import Frame
 from evercal.simulation.box_room import BoxRoom, default_camera
+from evercal.typing import Image
 
 NEGATIVE_ROOM_SEED = 8_990
+"""Seed of the first box room of negative images."""
+_NEGATIVE_ROOMS = 4
+"""Number of box rooms of negative images."""
+_VIEWS = 4
+"""Negative images of each room."""
 CHI2_6_MEDIAN = 5.348
+"""Median of the chi-squared distribution with six degrees of freedom."""
+_NEAR_M = 0.25
+"""Position error below which a pose counts for the covariance scale, metres."""
+_NEAR_RAD = np.deg2rad(15)
+"""Rotation error below which a pose counts for the covariance scale, radians."""
 ACCEPTANCE_FRACTION = 1 / 6
 """Position of the threshold between the inlier ratios of negative and positive images."""
 
@@ -33,35 +44,37 @@ def fit_threshold(
     records = list(scenes.scenes)
     records[index] = replace(records[index], inlier_threshold=0.0, covariance_scale=1.0)
     localizer = NetworkLocalizer(replace(scenes, scenes=records))
-    squared = []
-    ratios = []
+    squared: list[float] = []
+    positives: list[float] = []
     for frame in held_out:
         estimate = localizer.localize(frame.read_image(), frame.camera)
-        ratios.append(estimate.inlier_ratio)
+        positives.append(estimate.inlier_ratio)
         pose = estimate.uncertain_pose
         if pose is None or frame.base_from_camera is None:
             continue
         metres, radians = pose_distance(pose.pose, frame.base_from_camera)
-        if metres < 0.25 and radians < np.deg2rad(15):
+        if metres < _NEAR_M and radians < _NEAR_RAD:
             squared.append(pose.squared_mahalanobis(frame.base_from_camera))
     small = records[index].camera.short_side_resized(scenes.short_side)
-    others = _negative_views(small.width, small.height)
-    negatives = [localizer.localize(image).inlier_ratio for image in others]
-    top = float(np.quantile(negatives, 0.95))
-    low = float(np.quantile(ratios, 0.05)) if ratios else 1.0
-    threshold = top + ACCEPTANCE_FRACTION * max(0.0, low - top)
-    scale = float(np.median(squared)) / CHI2_6_MEDIAN if squared else 1.0
+    negatives: list[float] = []
+    for image in _negative_views(small.width, small.height):
+        negatives.append(localizer.localize(image).inlier_ratio)
+    high = float(np.quantile(negatives, 0.95))
+    low = float(np.quantile(positives or [1.0], 0.05))
+    threshold = high + ACCEPTANCE_FRACTION * max(0.0, low - high)
+    scale = float(np.median(squared or [CHI2_6_MEDIAN])) / CHI2_6_MEDIAN
     return replace(
         records[index], inlier_threshold=threshold, covariance_scale=max(scale, 1.0)
     )
 
 
 @lru_cache(maxsize=4)
-def _negative_views(width: int, height: int) -> list[np.ndarray]:
-    plain = default_camera(width, height)
-    images = []
-    for seed in range(NEGATIVE_ROOM_SEED, NEGATIVE_ROOM_SEED + 4):
+def _negative_views(width: int, height: int) -> list[Image]:
+    camera = default_camera(width, height)
+    images: list[Image] = []
+    for seed in range(NEGATIVE_ROOM_SEED, NEGATIVE_ROOM_SEED + _NEGATIVE_ROOMS):
         room = BoxRoom(seed, texture_px=192)
         rng = np.random.default_rng(seed)
-        images += [room.render(plain, room.random_view(rng)) for _ in range(4)]
+        for _ in range(_VIEWS):
+            images.append(room.render(camera, room.random_view(rng)))
     return images

@@ -144,7 +144,9 @@ def latex(table: Table, index: bool = True) -> str:
     """Format a table in LaTeX (needs booktabs); NaN becomes `--`."""
 
     def text(value: float) -> str:
-        return f"{value:.1f}".replace("inf", r"$\infty$")
+        if math.isinf(value):
+            return r"$\infty$"
+        return f"{value:.1f}"
 
     return table.to_latex(
         index=index,

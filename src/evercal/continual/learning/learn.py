@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,7 +13,7 @@ from evercal.continual.learning.stage_rows import StageRows
 from evercal.continual.learning.surfaces import shared_depths, surface_points
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
 from evercal.continual.networks.atlas import Atlas, Cell, camera_clusters
-from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.buffer import FeatureBuffer, join
 from evercal.continual.networks.head import Head, fresh_head
 from evercal.continual.networks.trainer import HeadTrainer
 from evercal.continual.scenes import (
@@ -26,8 +25,10 @@ from evercal.continual.scenes import (
 from evercal.continual.selection.frame_statistics import FrameStatistics
 from evercal.mapping.keyframes import store_keyframes
 from evercal.recordings.frame import Frame, Recording, stated_poses
+from evercal.typing import Array
 
 WHITENING_ROWS = 20_000
+"""Rows of the first scenes to which the whitening of a head is fitted."""
 
 
 def learn(
@@ -42,19 +43,27 @@ def learn(
     Thresholds are not fitted yet.
     """
     after = scenes.copy_for_training()
-    teacher = copy.deepcopy(after.heads[-1]).eval() if after.heads else None
+    teacher = None
+    if after.heads:
+        teacher = copy.deepcopy(after.heads[-1]).eval()
     rows = StageRows(after, options, on_event)
     atlas = after.atlas(options.grid_scenes)
     cell, buffer = _begun(rows, atlas, recording, method.head_per_scene)
     head = after.heads[-1]
     if teacher is None:
         _whiten(head, [buffer], options.seed)
-    memories = rows.remembered() if method.replays else []
-    states = scenes.method_states
-    replayed = options.fit.replay_batch
-    hooks = method.begin(
-        StageStart(head, teacher, memories, states, replayed, options.seed)
+    memories: list[FeatureBuffer] = []
+    if method.replays:
+        memories = rows.remembered()
+    start = StageStart(
+        head=head,
+        teacher=teacher,
+        memories=memories,
+        states=scenes.method_states,
+        replay_rows=options.fit.replay_batch,
+        seed=options.seed,
     )
+    hooks = method.begin(start)
     trainer = HeadTrainer(head, [buffer], options.fit, options.seed, hooks)
     for progress in trainer.run():
         on_event(progress)
@@ -79,18 +88,22 @@ def learn_jointly(
     fit = options.fit
     encoder = StageRows(after, options, on_event)
     atlas = after.atlas(options.grid_scenes)
-    begun = [_begun(encoder, atlas, scene) for scene in recordings]
-    buffers = [buffer for _, buffer in begun]
-    (head,) = after.heads
+    buffers: list[FeatureBuffer] = []
+    for recording in recordings:
+        _, buffer = _begun(encoder, atlas, recording)
+        buffers.append(buffer)
+    [head] = after.heads
     _whiten(head, buffers, options.seed)
-    rows = fit.batch + (fit.replay_batch if len(recordings) > 1 else 0)
-    whole = replace(fit, iterations=fit.iterations * len(recordings), batch=rows)
+    batch = fit.batch
+    if len(recordings) > 1:
+        batch += fit.replay_batch
+    iterations = fit.iterations * len(recordings)
+    whole = replace(fit, iterations=iterations, batch=batch)
     trainer = HeadTrainer(head, buffers, whole, options.seed)
     for progress in trainer.run():
         on_event(progress)
-    for number, (recording, (cell, _)) in enumerate(
-        zip(recordings, begun, strict=True)
-    ):
+    for number, recording in enumerate(recordings):
+        cell = atlas.cells[number]
         after.scenes.append(trained_record(recording, cell, trainer, number))
         after.keyframes.append(None)
         after.method_states.append({})
@@ -98,7 +111,7 @@ def learn_jointly(
 
 
 def _begun(
-    rows: StageRows, atlas: Atlas, recording: Recording, own: bool = False
+    rows: StageRows, atlas: Atlas, recording: Recording, separate: bool = False
 ) -> tuple[Cell, FeatureBuffer]:
     """Place a scene in the atlas, grow a head by it, and encode its frames."""
     after = rows.scenes
@@ -107,7 +120,7 @@ def _begun(
     number = len(atlas.cells)
     positions = stated_poses(frames).translation_m
     cell = atlas.place(positions)
-    head = _head_to_grow(after, own, options)
+    head = _head_to_grow(after, separate, options)
     local = head.scenes
     centres = _new_centres(head, options, cell.atlas_from_base.apply(positions))
     head.grow(centres, options.seed + number)
@@ -120,21 +133,27 @@ def _begun(
     return cell, buffer
 
 
-def _head_to_grow(scenes: LearnedScenes, own: bool, options: StageOptions) -> Head:
-    """A new head, the last one, or with `own` a copy of its weights without scenes."""
+def _head_to_grow(scenes: LearnedScenes, separate: bool, options: StageOptions) -> Head:
+    """A new head, the last one, or with `separate` a copy of its weights without scenes."""
     if not scenes.heads:
-        widths = scenes.encoder.width, scenes.descriptor.width
-        return fresh_head(*widths, options.head, options.seed).to(scenes.device)
-    return scenes.heads[-1].without_scenes() if own else scenes.heads.pop()
+        head = fresh_head(
+            features=scenes.encoder.width,
+            descriptor=scenes.descriptor.width,
+            options=options.head,
+            seed=options.seed,
+        )
+        return head.to(scenes.device)
+    if separate:
+        return scenes.heads[-1].without_scenes()
+    return scenes.heads.pop()
 
 
-def _new_centres(head: Head, options: StageOptions, positions_m: np.ndarray) -> Tensor:
+def _new_centres(head: Head, options: StageOptions, positions_m: Array) -> Tensor:
     """(k, 3) centres that a scene adds, from its camera positions (n, 3) in the atlas."""
     if head.options.centres == "grow":
         count = head.options.centres_per_scene
-        return torch.from_numpy(
-            camera_clusters(positions_m, count, options.seed)
-        ).float()
+        clusters = camera_clusters(positions_m, count, options.seed)
+        return torch.from_numpy(clusters).float()
     if len(head.centres):
         return torch.zeros(0, 3)
     return torch.tensor(options.fixed_centres_m).reshape(-1, 3)
@@ -144,10 +163,9 @@ def _whiten(head: Head, buffers: Sequence[FeatureBuffer], seed: int) -> None:
     if not head.options.whiten:
         return
     generator = torch.Generator().manual_seed(seed)
-    drawn = [
-        buffer.draw(WHITENING_ROWS // len(buffers), generator) for buffer in buffers
-    ]
-    head.whiten(torch.cat([rows.features for rows in drawn]))
+    count = WHITENING_ROWS // len(buffers)
+    rows = join([buffer.draw(count, generator) for buffer in buffers])
+    head.whiten(rows.features)
 
 
 def finish_scene(
@@ -165,19 +183,22 @@ def finish_scene(
     newest = len(scenes.scenes) - 1
     head, local = scenes.head_for(newest)
     statistics = FrameStatistics(frames, head, rows, options.seed, newest)
-    selected = method.select(
-        statistics, options.memory.capacity(frames, scenes.short_side)
-    )
+    capacity = options.memory.capacity(frames, scenes.short_side)
+    selected = method.select(statistics, capacity)
     keyframes = None
     if selected is not None:
-        chosen = [frames[i] for i in selected]
+        chosen: list[Frame] = []
         refined = scenes.scenes[-1].refined_camera
-        if refined is not None:  # replay uses the camera as training corrected it
-            chosen = [replace(frame, camera=refined) for frame in chosen]
+        for i in selected:
+            # Replay uses the camera as training corrected it.
+            camera = refined or frames[i].camera
+            chosen.append(replace(frames[i], camera=camera))
         keyframes = store_keyframes(chosen, scenes.short_side)
         keyframes = keyframes.take(options.memory.fitting(keyframes))
     scenes.keyframes.append(keyframes)
-    diffusion = options.fit.diffusion if head.options.condition == "descriptor" else 0.0
+    diffusion = 0.0
+    if head.options.condition == "descriptor":
+        diffusion = options.fit.diffusion
     remembered = partial(StageRows(scenes, options).of_keyframes, newest)
     finished = FinishedScene(head.eval(), local, rows, remembered, diffusion)
     scenes.method_states.append(method.after_scene(finished))
@@ -193,5 +214,12 @@ def trained_record(
     refined = None
     if options.intrinsics_rate > 0 and options.iterations > 0 and buffer.correctable:
         refined = corrected_camera(camera, trainer.correction[number].detach())
-    spread = prototypes(buffer.tensors["descriptors"][: len(scene.train)])
-    return SceneRecord(scene.name, camera, cell, spread, len(scene.train), refined)
+    frames = len(scene.train)
+    return SceneRecord(
+        name=scene.name,
+        camera=camera,
+        cell=cell,
+        prototypes=prototypes(buffer.tensors["descriptors"][:frames]),
+        train_frames=frames,
+        refined_camera=refined,
+    )

@@ -42,6 +42,7 @@ class NetworkLearnOptions:
     device: str = "auto"
     """Device of the networks, see `device_of`."""
     seed: int = 0
+    """Seed of all random draws."""
     stage: StageOptions | None = None
     """Options of the stage in place of preset, memory and centres."""
     short_side: int | None = None
@@ -57,7 +58,7 @@ class NetworkLearnOptions:
         if self.centres is None:
             return stage
         if self.centres < 1:
-            raise InputError(f"--centres {self.centres}: give a number >= 1")
+            raise InputError(f"`centres` {self.centres}: give a number >= 1")
         return replace(stage, head=replace(stage.head, centres_per_scene=self.centres))
 
     def opened(
@@ -87,13 +88,15 @@ class NetworkLearnOptions:
             )
         heads = opened.contents.heads
         method = strategy.method
-        shared = method is not None and not method.head_per_scene and heads
-        if shared and self.centres not in (None, heads[-1].options.centres_per_scene):
-            raise InputError(
-                f"--centres {self.centres}: {store} was made with"
-                f" {heads[-1].options.centres_per_scene} per scene; leave the option out or start a"
-                " new store"
-            )
+        if self.centres is None or method is None or method.head_per_scene:
+            return opened
+        for head in heads[-1:]:
+            count = head.options.centres_per_scene
+            if self.centres != count:
+                raise InputError(
+                    f"`centres` {self.centres}: {store} was made with {count} per scene; leave the"
+                    " option out or start a new store"
+                )
         return opened
 
 
@@ -112,9 +115,10 @@ def learn_networks(
         on_event: called with every event, for progress bars.
     """
     began = time.perf_counter()
-    named = options.strategy
     stage = options.stage_options()
-    strategy = named if isinstance(named, Strategy) else strategy_named(named)
+    strategy = options.strategy
+    if isinstance(strategy, str):
+        strategy = strategy_named(strategy)
     if strategy.method is None or strategy.jointly:
         raise InputError(
             f"strategy {strategy.name!r}: does not train a network scene by scene; use another"
@@ -123,9 +127,8 @@ def learn_networks(
     opened = options.opened(store, strategy, stage, recording.train)
     with opened.writing():
         contents = opened.contents.to(device_of(options.device))
-        recording = named_recording(
-            recording, None, [record.name for record in contents.scenes]
-        )
+        taken = [record.name for record in contents.scenes]
+        recording = named_recording(recording, None, taken)
         if lacks_camera_poses(recording):
             raise InputError(
                 f"scene {recording.name!r}: only gripper poses are stated, and strategy"
@@ -149,7 +152,7 @@ def learn_networks(
             train_frames=len(split.train),
             held_out_frames=len(split.held_out),
             iterations=stage.fit.iterations,
-            head_bytes=sum(head_bytes(head) for head in learned.heads),
+            head_bytes=sum(map(head_bytes, learned.heads)),
         )
         opened.commit(learned, asdict(report))
     return report

@@ -65,8 +65,10 @@ def preset(name: str, seed: int = 0) -> StageOptions:
     return replace(options, seed=seed, encode=replace(options.encode, seed=seed))
 
 
-SHORT_SIDE, PAPER_SHORT_SIDE = 240, 480
-"""Short side of the working images, pixels: ours, and at most the paper's."""
+SHORT_SIDE = 240
+"""Short side of the working images, pixels."""
+PAPER_SHORT_SIDE = 480
+"""Maximum short side of the paper's working images, pixels."""
 PAPER_SIM_STEPS = 5_000
 """Steps per scene of preset `paper` on the paper's simulation."""
 
@@ -78,9 +80,10 @@ def short_side(name: str, frames: Iterable[Frame]) -> int:
     """
     if name != "paper":
         return SHORT_SIDE
-    sides = (min(frame.camera.width, frame.camera.height) for frame in frames)
-    recorded = min(sides, default=SHORT_SIDE)
-    return max(SHORT_SIDE, min(PAPER_SHORT_SIDE, recorded))
+    side = PAPER_SHORT_SIDE
+    for frame in frames:
+        side = min(side, frame.camera.width, frame.camera.height)
+    return max(SHORT_SIDE, side)
 
 
 def on_paper_backbone(options: StageOptions) -> StageOptions:

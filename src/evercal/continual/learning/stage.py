@@ -16,6 +16,7 @@ class StageOptions:
     head: HeadOptions = field(default_factory=HeadOptions)
     """Shape of a new head; later stages keep it."""
     fit: FitOptions = field(default_factory=FitOptions)
+    """Training of the head."""
     encode: EncodePlan = field(default_factory=EncodePlan)
     """Views of the new scene's frames."""
     replay_views_per_frame: int = 4
@@ -27,6 +28,7 @@ class StageOptions:
     grid_scenes: int = 0
     """Scenes of the paper's layout, see `Atlas`; 0 gives each scene the next free cell."""
     seed: int = 0
+    """Seed of weights, rows and selected keyframes."""
 
     def with_memory(self, memory: str | int) -> "StageOptions":
         """The same options with a memory budget such as `10%` or `5MB`."""
@@ -38,10 +40,13 @@ class Encoding:
     """Images are being encoded."""
 
     done: int
+    """Encoded views."""
     total: int
+    """Views of all frames."""
 
 
 OnEvent = Callable[[Encoding | Progress], object]
+"""Observer of a stage, for progress bars."""
 
 
 def unobserved(event: Encoding | Progress) -> None:

@@ -15,8 +15,11 @@ class StageRows:
     """Encodes frames with the networks of scenes and the options of a stage."""
 
     scenes: LearnedScenes
+    """Scenes with the networks that encode."""
     options: StageOptions
+    """Options of the stage."""
     on_event: OnEvent = unobserved
+    """Called after every view."""
 
     def of_scene(
         self, local: int, cell: Cell, frames: Sequence[Frame]
@@ -25,10 +28,13 @@ class StageRows:
 
         The camera can be corrected if the frames share one without distortion.
         """
-        one = all(frame.camera == frames[0].camera for frame in frames)
-        correctable = one and not frames[0].camera.distortion
+        camera = frames[0].camera
+        one_camera = all(frame.camera == camera for frame in frames)
         buffer = FeatureBuffer(
-            local, cell.atlas_from_base, correctable, self.scenes.device
+            scene=local,
+            atlas_from_base=cell.atlas_from_base,
+            correctable=one_camera and not camera.distortion,
+            device=self.scenes.device,
         )
         return self._encoded(buffer, frames, self.options.encode)
 
@@ -37,18 +43,20 @@ class StageRows:
         scenes = self.scenes
         keyframes = self.scenes.keyframes[number]
         assert keyframes is not None, "a method that uses keyframes selects some"
-        cell, (_, local) = scenes.scenes[number].cell, scenes.head_for(number)
+        cell = scenes.scenes[number].cell
+        _, local = scenes.head_for(number)
         buffer = FeatureBuffer(local, cell.atlas_from_base, device=scenes.device)
-        plan = replace(
-            self.options.encode, views_per_frame=self.options.replay_views_per_frame
-        )
+        views = self.options.replay_views_per_frame
+        plan = replace(self.options.encode, views_per_frame=views)
         return self._encoded(buffer, keyframes.frames(), plan)
 
     def remembered(self) -> list[FeatureBuffer]:
         """Encode the keyframes of all scenes that have some: one buffer per scene."""
-        return [
-            self.of_keyframes(i) for i, kept in enumerate(self.scenes.keyframes) if kept
-        ]
+        buffers: list[FeatureBuffer] = []
+        for number, keyframes in enumerate(self.scenes.keyframes):
+            if keyframes:
+                buffers.append(self.of_keyframes(number))
+        return buffers
 
     def _encoded(
         self, buffer: FeatureBuffer, frames: Sequence[Frame], plan: EncodePlan

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,18 +16,19 @@ from evercal.continual.networks.feature_cache import (
     write_cached,
 )
 from evercal.features.encoder import Encoder
-from evercal.geometry import SE3
 from evercal.mapping.pose_check import depth_scale, matched_pairs
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
 from evercal.recordings.frame import Frame, stated_poses
 from evercal.typing import Array
 
 SOURCE_VIEWS = 8
-"""Frames that a depth is swept over, at most."""
+"""Maximum number of source frames of a plane sweep."""
 AGREEING = 2
 """Other frames whose depths must agree with that of a cell."""
 TOLERANCE = 0.04
 """Relative difference of depths that agree."""
+_NEAR_M = 0.05
+"""Minimum depth of a point in another frame, metres."""
 
 
 def frame_depths(
@@ -39,16 +41,17 @@ def frame_depths(
     columns) are along the optical axis in metres; NaN where frames disagree.
     """
     prepared = PreparedFrames(frames, encoder, WorkingSize(short_side, short_side))
-    features = [prepared.features(i) for i in range(len(prepared))]
+    numbers = range(len(prepared))
+    features = list(map(prepared.features, numbers))
     pairs = matched_pairs(prepared, encoder.vlad(features))
     prepared.depth_scale = depth_scale(prepared, pairs)
-    swept = []
-    sources = []
-    for i in range(len(prepared)):
+    swept: list[Array] = []
+    sources: list[list[int]] = []
+    for i in numbers:
         inverse, near = prepared.swept(i, SOURCE_VIEWS)
         swept.append(1 / inverse.astype(np.float64))
         sources.append(near)
-    return [_agreed(prepared, i, swept, sources[i]) for i in range(len(prepared))]
+    return [_agreed(prepared, i, swept, sources[i]) for i in numbers]
 
 
 def _agreed(
@@ -60,20 +63,20 @@ def _agreed(
     votes = np.zeros(len(points), int)
     for j in near:
         other = prepared.posed_cells(j)
-        within = other.base_from_camera.inverse().apply(points)
-        pixels = other.camera.project(np.where(within[:, 2:] > 0.05, within, np.nan))
-        seen = _at_pixels(swept[j].reshape(other.grid), pixels, other.stride)
-        votes += np.abs(seen - within[:, 2]) < TOLERANCE * within[:, 2]
-    return np.where(votes >= AGREEING, swept[i], np.nan).reshape(view.grid)
+        in_camera = other.base_from_camera.inverse().apply(points)
+        depth = in_camera[:, 2]
+        in_camera[depth <= _NEAR_M] = np.nan
+        pixels = other.camera.project(in_camera)
+        surface = _at_pixels(swept[j].reshape(other.grid), pixels, other.stride)
+        votes += np.abs(surface - depth) < TOLERANCE * depth
+    depths = np.where(votes >= AGREEING, swept[i], np.nan)
+    return depths.reshape(view.grid)
 
 
 def _at_pixels(depths: Array, pixels: Array, stride: int) -> Array:
     """Depths (n,) of the cells nearest to pixels (n, 2); NaN outside the grid."""
-    cell = (
-        np.nan_to_num((pixels - (stride - 1) / 2) / stride, nan=-9.0)
-        .round()
-        .astype(int)
-    )
+    position = (pixels - (stride - 1) / 2) / stride
+    cell = np.nan_to_num(position, nan=-9.0).round().astype(int)
     inside = ((cell >= 0) & (cell < depths.shape[::-1])).all(1)
     column, row = cell[inside].T
     known = np.full(len(pixels), np.nan)
@@ -91,13 +94,14 @@ def shared_depths(
     if cache is None:
         return frame_depths(frames, encoder, short_side)
     key = hashlib.blake2b(digest_size=16)
-    for frame, pose in zip(frames, stated_poses(frames).matrix(), strict=True):
-        key.update(
-            f"{frame.name} {frame.camera} {short_side}".encode() + pose.tobytes()
-        )
+    poses = stated_poses(frames).matrix()
+    for frame, pose in zip(frames, poses, strict=True):
+        key.update(f"{frame.name} {frame.camera} {short_side}".encode())
+        key.update(pose.tobytes())
     key.update(encoder_key(encoder).encode())
     path = cache / f"depths-{key.hexdigest()}.npy"
-    if (cached := read_cached(path)) is not None:
+    cached = read_cached(path)
+    if cached is not None:
         return list(cached)
     depths = frame_depths(frames, encoder, short_side)
     if len({depth.shape for depth in depths}) == 1:
@@ -117,20 +121,18 @@ def surface_points(
     Frames are in the order in which they were encoded. A row takes the depth of the nearest cell of
     its frame, along its own ray; the point is NaN where the depth is unknown.
     """
-    tensors = {name: value.cpu() for name, value in buffer.tensors.items()}
-    starts = buffer.starts.tolist()
+    all_pixels = buffer.tensors["pixels"].cpu().double().numpy()
+    all_intrinsics = buffer.tensors["intrinsics"].cpu().numpy()
     points = np.full((len(buffer), 3), np.nan)
-    for number, four in enumerate(tensors["intrinsics"].numpy()):
+    for number, (start, end) in enumerate(pairwise(buffer.starts.tolist())):
         frame = frames[number % len(frames)]
         depth = depths[number % len(frames)]
         assert frame.base_from_camera is not None, "training frames are posed"
-        where = slice(*starts[number : number + 2])
-        pixels = tensors["pixels"][where].double().numpy()
-        ray = np.concatenate(
-            [(pixels - four[2:]) / four[:2], np.ones((len(pixels), 1))], 1
-        )
+        focal, centre = all_intrinsics[number].reshape(2, 2)
+        plane = (all_pixels[start:end] - centre) / focal
+        ray = np.column_stack([plane, np.ones(len(plane))])
         camera = frame.camera.short_side_resized(stride * min(depth.shape))
         known = _at_pixels(depth, camera.project(ray), stride)
-        pose: SE3 = buffer.atlas_from_base @ frame.base_from_camera
-        points[where] = pose.apply(ray * known[:, None])
+        atlas_from_camera = buffer.atlas_from_base @ frame.base_from_camera
+        points[start:end] = atlas_from_camera.apply(ray * known[:, None])
     return torch.from_numpy(points).float()

@@ -2,21 +2,26 @@
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from evercal.continual.networks.buffer import FeatureBuffer, Rows
+from evercal.continual.networks.buffer import FeatureBuffer, Rows, random_indices
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.loss import fixed_clamp_loss
 from evercal.recordings.frame import Frame, stated_poses
+from evercal.typing import Array, IntArray
 
 RELIABLE_PX = 10.0
+"""Reprojection error below which a predicted point belongs to a part, pixels."""
 PARTS = 625
 """Largest number of parts of a scene: the 25 x 25 clusters of HSCNet that Buff-CS uses."""
 PART_POINTS = 20_000
+"""Maximum number of points from which the parts are clustered."""
 GRADIENT_ROWS = 256
+"""Rows of each frame from which a gradient is computed."""
 
 
 class FrameStatistics:
@@ -67,18 +72,20 @@ class FrameStatistics:
         return self._buffer.rows(torch.arange(start, end, device="cpu"))
 
     def _hidden(self, rows: Rows) -> Tensor:
-        return self._head.hidden(
-            rows.features.float(), self._buffer.scene, rows.descriptor
-        )
+        features = rows.features.float()
+        return self._head.hidden(features, self._buffer.scene, rows.descriptor)
+
+    def _points(self, hidden: Tensor) -> Tensor:
+        return self._head.decode(hidden.float(), self._buffer.scene).points
 
     @torch.no_grad()
-    def features(self) -> np.ndarray:
+    def features(self) -> Array:
         """Compute (n, width) activations of the last hidden layer, averaged over each image."""
         pooled = [self._hidden(self._rows_of(i)).mean(0) for i in range(len(self))]
         return torch.stack(pooled).double().cpu().numpy()
 
     @torch.no_grad()
-    def visible_parts(self) -> list[np.ndarray]:
+    def visible_parts(self) -> list[IntArray]:
         """Return the numbers of the scene's parts that each frame shows.
 
         Parts are at most 625 k-means cells of predicted points that reproject within 10 px. They
@@ -86,48 +93,43 @@ class FrameStatistics:
         """
         from scipy.cluster.vq import kmeans, vq
 
-        reliable = []
+        reliable: list[Array] = []
         for i in range(len(self)):
             rows = self._rows_of(i)
-            points = self._head.decode(
-                self._hidden(rows).float(), self._buffer.scene
-            ).points
+            points = self._points(self._hidden(rows))
             _, error = fixed_clamp_loss(points, rows.target)
             reliable.append(points[error < RELIABLE_PX].double().cpu().numpy())
-        every = np.concatenate(reliable)
-        if not len(every):
-            return [np.zeros(0, dtype=np.int64) for _ in reliable]
+        points = np.concatenate(reliable)
+        if not len(points):
+            return [np.zeros(0, dtype=np.int64)] * len(reliable)
         rng = self.rng()
-        some = every[rng.permutation(len(every))[:PART_POINTS]]
-        start = some[rng.permutation(len(some))[:PARTS]]
-        centres, _ = kmeans(some, start, thresh=1e-3)
+        sample = points[rng.permutation(len(points))[:PART_POINTS]]
+        start = sample[rng.permutation(len(sample))[:PARTS]]
+        centres, _ = kmeans(sample, start, thresh=1e-3)
         return [np.unique(vq(points, centres)[0]) for points in reliable]
 
-    def gradients(self) -> np.ndarray:
+    def gradients(self) -> Array:
         """Compute (n, p) gradients of each frame's loss by the scene's logits and offsets.
 
         Fixed centres belong to no scene; with them, gradients are by all logits and offsets.
         """
         head = self._head
         generator = torch.Generator().manual_seed(self._seed)
-        parameters = (head.logit, head.offset)
         shared_centres = head.options.centres != "grow"
-        own = torch.nonzero(shared_centres | (head.centre_scene == self._buffer.scene))[
-            :, 0
-        ]
+        of_scene = shared_centres | (head.centre_scene == self._buffer.scene)
+        centres = torch.nonzero(of_scene)[:, 0]
         gradients = []
-        for i in range(len(self)):
-            start, end = self._starts[i : i + 2]
-            drawn = torch.randint(
-                start, end, (GRADIENT_ROWS,), generator=generator, device="cpu"
-            )
-            rows = self._buffer.rows(drawn)
+        for start, end in pairwise(self._starts[: len(self) + 1]):
+            drawn = random_indices(end - start, GRADIENT_ROWS, generator)
+            rows = self._buffer.rows(start + drawn)
             with torch.no_grad():
-                hidden = self._hidden(rows).float()
-            points = head.decode(hidden, self._buffer.scene).points
-            loss, _ = fixed_clamp_loss(points, rows.target)
-            by_logit, by_offset = torch.autograd.grad(loss.mean(), parameters)
-            shared = len(by_offset) != len(by_logit)
-            parts = (by_logit[own], by_offset if shared else by_offset[own])
-            gradients.append(torch.cat([part.flatten() for part in parts]))
+                hidden = self._hidden(rows)
+            loss, _ = fixed_clamp_loss(self._points(hidden), rows.target)
+            by_logit, by_offset = torch.autograd.grad(
+                loss.mean(), (head.logit, head.offset)
+            )
+            if len(by_offset) == len(by_logit):
+                by_offset = by_offset[centres]
+            by_logit = by_logit[centres]
+            gradients.append(torch.cat([by_logit.flatten(), by_offset.flatten()]))
         return torch.stack(gradients).double().cpu().numpy()

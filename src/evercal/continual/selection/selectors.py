@@ -5,17 +5,20 @@ a class and the mean over an image as its feature. All return sorted indices.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
+from numpy.random import Generator
 
 from evercal.continual.selection.frame_statistics import FrameStatistics
 from evercal.mapping.selection import SarsOptions, select_sars
+from evercal.typing import Array, IntArray
 
 GSS_COMPARED = 10
 """Buffered frames with which gradient-based selection compares a new frame."""
 
 
-def select_reservoir(count: int, capacity: int, rng: np.random.Generator) -> np.ndarray:
+def select_reservoir(count: int, capacity: int, rng: Generator) -> IntArray:
     """Reservoir sampling: every frame is selected with the same probability.
 
     Frames are appended until the buffer is full. Later the n-th frame draws one of n slots and
@@ -26,60 +29,63 @@ def select_reservoir(count: int, capacity: int, rng: np.random.Generator) -> np.
         slot = int(rng.integers(frame + 1))
         if slot < capacity:
             selected[slot] = frame
-    return np.sort(np.array(selected, dtype=np.int64))
+    return _sorted(selected)
 
 
-def select_herding(features: np.ndarray, capacity: int) -> np.ndarray:
+def select_herding(features: Array, capacity: int) -> IntArray:
     """Herding of iCaRL (Rebuffi et al., CVPR 2017, Algorithm 4).
 
     Each next frame is the one that brings the mean of the selection closest to the mean of all
     frames. Ties go to the earlier frame. The rows of features (n, c) are scaled to unit length.
     """
     unit = _unit(features)
-    mean = unit.mean(0) if len(unit) else np.zeros(features.shape[1])
+    if not len(unit):
+        return _sorted([])
+    mean = unit.mean(0)
     free = np.ones(len(unit), dtype=bool)
     total = np.zeros(unit.shape[1])
-    selected = []
-    for taken in range(1, min(capacity, len(unit)) + 1):
-        gap = np.linalg.norm(mean - (total + unit) / taken, axis=1)
-        chosen = int(np.where(free, gap, np.inf).argmin())
-        free[chosen] = False
-        total += unit[chosen]
-        selected.append(chosen)
-    return np.sort(np.array(selected, dtype=np.int64))
+    selected: list[int] = []
+    for count in range(1, min(capacity, len(unit)) + 1):
+        means = (total + unit) / count
+        gap = np.linalg.norm(mean - means, axis=1)
+        frame = int(np.where(free, gap, np.inf).argmin())
+        free[frame] = False
+        total += unit[frame]
+        selected.append(frame)
+    return _sorted(selected)
 
 
-def leverage_scores(features: np.ndarray, rank: int) -> np.ndarray:
+def leverage_scores(features: Array, rank: int) -> Array:
     """Compute rank-r leverage: squared row norms of the first r left singular vectors of (n, c).
 
     The scores sum to the rank. FedCBDR prints the full left factor, whose rows all have norm 1; the
     thin one is used here.
     """
-    left, values, _ = np.linalg.svd(
-        np.asarray(features, np.float64), full_matrices=False
-    )
-    used = int((values > values.max(initial=0) * 1e-9).sum())
-    return (left[:, : min(rank, used)] ** 2).sum(1)
+    double = np.asarray(features, np.float64)
+    left, values, _ = np.linalg.svd(double, full_matrices=False)
+    floor = values.max(initial=0) * 1e-9
+    used = min(rank, np.count_nonzero(values > floor))
+    return (left[:, :used] ** 2).sum(1)
 
 
 def select_leverage(
-    features: np.ndarray, capacity: int, rng: np.random.Generator, rank: int = 32
-) -> np.ndarray:
+    features: Array, capacity: int, rng: Generator, rank: int = 32
+) -> IntArray:
     """Global-perspective data replay (GDR of FedCBDR, Qi et al., NeurIPS 2025) for one party.
 
     Frames are drawn without replacement, with probabilities proportional to their leverage.
     Encryption and bias weights, which serve several parties, are omitted.
     """
-    score = leverage_scores(features, rank)
     # Frames without leverage can still fill the capacity.
-    share = (score + 1e-12) / (score + 1e-12).sum()
-    count = min(capacity, len(score))
-    return np.sort(rng.choice(len(score), size=count, replace=False, p=share))
+    scores = leverage_scores(features, rank) + 1e-12
+    shares = scores / scores.sum()
+    count = min(capacity, len(scores))
+    return np.sort(rng.choice(len(scores), size=count, replace=False, p=shares))
 
 
 def select_coverage(
-    visible: Sequence[np.ndarray], capacity: int, rng: np.random.Generator
-) -> np.ndarray:
+    visible: Sequence[IntArray], capacity: int, rng: Generator
+) -> IntArray:
     """Coverage score of Buff-CS (Wang et al., ICCV 2021) inside one scene.
 
     Frames arrive in random order and are appended until the buffer is full. Later a frame enters if
@@ -87,24 +93,22 @@ def select_coverage(
     m / n as in a reservoir (m buffered, n earlier frames). Each entering frame replaces a random
     one, as in the released code. `visible` are the numbers of the parts that each frame shows.
     """
-    count = 1 + max((int(parts.max()) for parts in visible if len(parts)), default=-1)
-    shows = np.zeros((len(visible), count), dtype=bool)
-    for frame, parts in enumerate(visible):
-        shows[frame, parts] = True
+    if not capacity:
+        return _sorted([])
+    shows = [set(parts.tolist()) for parts in visible]
     selected: list[int] = []
     for earlier, frame in enumerate(rng.permutation(len(visible)).tolist()):
         if len(selected) < capacity:
             selected.append(frame)
             continue
-        novel = bool((shows[frame] & ~shows[selected].any(0)).any())
-        if selected and (novel or rng.random() <= len(selected) / earlier):
+        covered = set().union(*(shows[i] for i in selected))
+        is_novel = not shows[frame] <= covered
+        if is_novel or rng.random() <= len(selected) / earlier:
             selected[int(rng.integers(len(selected)))] = frame
-    return np.sort(np.array(selected, dtype=np.int64))
+    return _sorted(selected)
 
 
-def select_gradients(
-    gradients: np.ndarray, capacity: int, rng: np.random.Generator
-) -> np.ndarray:
+def select_gradients(gradients: Array, capacity: int, rng: Generator) -> IntArray:
     """Gradient-based sample selection, greedy (GSS, Aljundi et al., NeurIPS 2019, Algorithm 2).
 
     A frame's score c is one plus its largest cosine with a few buffered frames. Frames are appended
@@ -113,31 +117,48 @@ def select_gradients(
     gradients (n, p) are those of the loss on each frame.
     """
     unit = _unit(gradients)
-    selected: list[int] = []
-    scores = np.zeros(min(capacity, len(unit)))
-    for frame in range(len(unit) if capacity else 0):
-        compared = [selected[i] for i in rng.permutation(len(selected))[:GSS_COMPARED]]
-        cosines = unit[compared] @ unit[frame] if selected else np.array([-0.9])
-        score = float(cosines.max()) + 1.0
+    selected = np.zeros(0, int)
+    scores = np.zeros(0)
+    if not capacity:
+        return selected
+    for frame, gradient in enumerate(unit):
+        compared = selected[rng.permutation(len(selected))[:GSS_COMPARED]]
+        cosine = -0.9
+        if len(compared):
+            cosine = float((unit[compared] @ gradient).max())
+        score = cosine + 1.0
         if len(selected) < capacity:
-            scores[len(selected)] = score
-            selected.append(frame)
+            scores = np.append(scores, score)
+            selected = np.append(selected, frame)
         elif score < 1.0:
+            slot = 0
             total = scores.sum()
-            slot = int(rng.choice(len(selected), p=scores / total)) if total > 0 else 0
+            if total > 0:
+                slot = int(rng.choice(len(selected), p=scores / total))
             if rng.random() * (scores[slot] + score) < scores[slot]:
                 selected[slot] = frame
                 scores[slot] = score
-    return np.sort(np.array(selected, dtype=np.int64))
+    return np.sort(selected)
 
 
-def _unit(rows: np.ndarray) -> np.ndarray:
+def _sorted(frames: list[int]) -> IntArray:
+    return np.sort(np.array(frames, dtype=np.int64))
+
+
+def _unit(rows: Array) -> Array:
     rows = np.asarray(rows, dtype=np.float64)
-    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows / np.maximum(lengths, 1e-12)
 
 
-Select = Callable[[FrameStatistics, int], np.ndarray]
+Select = Callable[[FrameStatistics, int], IntArray]
 """Maps the frames of a finished scene and a capacity to sorted indices of the keyframes."""
+
+
+def _sars(frames: FrameStatistics, capacity: int, fill: bool = False) -> IntArray:
+    options = SarsOptions(fill=fill)
+    return select_sars(frames.positions_m, frames.quaternions_wxyz, capacity, options)
+
 
 SELECTORS: dict[str, Select] = {
     "reservoir": lambda f, capacity: select_reservoir(len(f), capacity, f.rng()),
@@ -147,11 +168,7 @@ SELECTORS: dict[str, Select] = {
     ),
     "leverage": lambda f, capacity: select_leverage(f.features(), capacity, f.rng()),
     "gradients": lambda f, capacity: select_gradients(f.gradients(), capacity, f.rng()),
-    "sars": lambda f, capacity: select_sars(
-        f.positions_m, f.quaternions_wxyz, capacity
-    ),
-    "sars_filled": lambda f, capacity: select_sars(
-        f.positions_m, f.quaternions_wxyz, capacity, SarsOptions(fill=True)
-    ),
+    "sars": _sars,
+    "sars_filled": partial(_sars, fill=True),
 }
 """`sars` uses the paper's fixed radius, `sars_filled` the largest radius that fills the memory."""
