@@ -40,14 +40,14 @@ def test_suites_load_their_scenes_in_order() -> None:
             lambda _: load_suite("sim-mini", None, ["attic"]),
             "scene 'attic': not in suite sim-mini",
         ),
-        (lambda _: load_suite("real2"), "--data"),
+        (lambda _: load_suite("real2"), "`data`"),
         (
             lambda data: load_suite("i7s", data),
             "chess is missing; get it from https://www.micro",
         ),
         (
             lambda data: load_suite("sim-mini", poses=data),
-            "--poses are for i7s and i12s",
+            "`poses` are for i7s and i12s",
         ),
         (
             lambda data: load_suite("sim", data),
@@ -74,7 +74,7 @@ def test_tuning_split_uses_training_frames_only() -> None:
     test = [6, 7, 8, 21, 22, 23]
     assert [int(f.name) for f in scene.test] == test
     assert [int(f.name) for f in scene.train] == [i for i in range(30) if i not in test]
-    with pytest.raises(InputError, match=r"hall: 12 of 15 .* omit --held-out"):
+    with pytest.raises(InputError, match=r"hall: 12 of 15 .* omit `held_out`"):
         tuning_split(Recording("hall", train[:16], ()))
 
 
@@ -90,9 +90,9 @@ def test_regions_share_the_base_frame_and_split_every_frame() -> None:
     assert [len(scene.test) for scene in parts] == [1, 2, 1]
     assert parts[0].test == test[2:3]
     for count, message in (
-        (1, "--parts 1"),
+        (1, "`parts` 1"),
         (4, "are too few"),
-        (61, "too few for --parts 61"),
+        (61, "too few for `parts` 61"),
     ):
         with pytest.raises(InputError, match=message):
             regions(Recording("hall", train, test), count)

@@ -102,8 +102,8 @@ def test_bad_input_is_refused_and_leaves_the_store_unchanged(
         (gamma, {"strategy": "evercal"}, r"'evercal'.*scene by scene"),
         (gamma, {"encoder": Path("encoder.onnx")}, "keeps the encoder"),
         (gamma, {"stage": None, "memory": "auto"}, "memory auto"),
-        (gamma, {"stage": None, "centres": 0}, "--centres 0"),
-        (gamma, {"centres": 5}, "--centres 5: .* made with 3"),
+        (gamma, {"stage": None, "centres": 0}, "`centres` 0"),
+        (gamma, {"centres": 5}, "`centres` 5: .* made with 3"),
         (replace(gamma, train=tuple(gripper)), {}, "only gripper poses"),
         (few, {}, "'gamma': 15 training frames"),
     ):
