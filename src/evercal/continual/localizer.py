@@ -13,7 +13,7 @@ from evercal.continual.networks.device import device_of
 from evercal.continual.networks.precision import autocast
 from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.continual.store import NetworkStore
-from evercal.errors import InputError
+from evercal.errors import InputError, require_numbers
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.hypothesis import Matches, Rough
@@ -37,6 +37,11 @@ class NetworkLocalizeOptions:
     """RANSAC settings. Points of a network scatter more than landmarks, so the radius is wider."""
     refuses: bool = True
     """Whether a pose with too few inliers is refused; published methods answer for every image."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        require_numbers(self, ("candidates",), 1)
+        require_numbers(self, ("margin",), 0)
 
 
 def open_networks(path: Path, device: str = "auto") -> "NetworkLocalizer":

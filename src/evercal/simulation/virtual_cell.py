@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator, default_rng
 
-from evercal.errors import InputError
+from evercal.errors import InputError, require_numbers
 from evercal.geometry import SE3
 from evercal.simulation.box_room import default_camera, look_at
 from evercal.simulation.cell_room import (
@@ -79,6 +79,12 @@ class CellOptions:
     """Whether motions take wall time; otherwise the time of the cell jumps."""
     show_arm: bool = True
     """Whether cameras see the arm."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        require_numbers(self, ("width", "height"), 1)
+        numbers = ("arm_noise_mm", "arm_noise_deg", "image_noise", "exposure_s")
+        require_numbers(self, numbers, 0)
 
 
 @dataclass(frozen=True, eq=False)

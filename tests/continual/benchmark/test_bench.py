@@ -15,6 +15,7 @@ import pytest
 
 from evercal.continual import threshold
 from evercal.continual.benchmark.bench import (
+    ACCEPTANCE,
     BenchOptions,
     CompletedStage,
     begin_bench,
@@ -34,6 +35,7 @@ from evercal.continual.methods.replay import Replay
 from evercal.continual.store import NetworkStore
 from evercal.continual.strategies import Strategy, strategy_named
 from evercal.errors import InputError
+from evercal.localization import acceptance
 
 if TYPE_CHECKING:
     from evercal.continual.learning.stage import StageOptions
@@ -157,6 +159,28 @@ def test_options_that_decide_a_result_are_recorded(
     assert settings["localize"]["align"] is True
     assert settings["localize"]["pnp"]["threshold_px"] > 0
     assert 0 < settings["acceptance"]["FALSE_ACCEPTS"] < 1
+
+
+@pytest.mark.parametrize(
+    ("constant", "value"),
+    [("CHANCE", (20.0, 300.0)), ("SAME_SURFACE", 4), ("FALSE_ACCEPTS", 1e-5)],
+)
+def test_results_of_another_law_of_acceptance_are_refused(
+    constant: str,
+    value: object,
+    arcs: Arcs,
+    options: BenchOptions,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    begin_bench(arcs, options, tmp_path)
+    monkeypatch.setattr(acceptance, constant, value)
+    with pytest.raises(InputError, match="other settings: acceptance"):
+        begin_bench(arcs, options, tmp_path)
+
+
+def test_settings_name_every_constant_of_acceptance() -> None:
+    assert set(ACCEPTANCE) == {name for name in vars(acceptance) if name.isupper()}
 
 
 @pytest.mark.parametrize("stages", [0, 1, 2])

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from evercal.continual.networks.buffer import EncodePlan
 from evercal.continual.networks.head import HeadOptions
 from evercal.continual.networks.trainer import FitOptions, Progress
+from evercal.errors import require_numbers
 from evercal.mapping.memory_budget import MemoryBudget
 
 
@@ -29,6 +30,11 @@ class StageOptions:
     """Scenes of the paper's layout, see `Atlas`; 0 gives each scene the next free cell."""
     seed: int = 0
     """Seed of weights, rows and selected keyframes."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        require_numbers(self, ("replay_views_per_frame",), 1)
+        require_numbers(self, ("grid_scenes",), 0)
 
     def with_memory(self, memory: str | int) -> "StageOptions":
         """The same options with a memory budget such as `10%` or `5MB`."""

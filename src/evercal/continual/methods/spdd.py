@@ -4,13 +4,13 @@ SPDD is the complete replay loss of the paper; it contains no reprojection error
 summed over active centres and coordinates and averaged over rows.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from evercal.continual.networks.head import HeadOutput
+from evercal.errors import require_numbers
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,9 @@ class SpddOptions:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        weights = self.prior_weight, self.metric_weight, self.output_weight
-        if not all(0 <= weight < math.inf for weight in weights):
-            raise ValueError(f"{self}: give weights that are finite and >= 0")
-        if not 0 < self.temperature < math.inf or self.active_centres < 1:
-            raise ValueError(f"{self}: give a temperature > 0 and active_centres >= 1")
+        require_numbers(self, ("prior_weight", "metric_weight", "output_weight"), 0)
+        require_numbers(self, ("temperature",), 1e-9)
+        require_numbers(self, ("active_centres",), 1)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from evercal.continual.networks.descriptor import Descriptor, described
 from evercal.continual.networks.loss import Target, radial_factor
+from evercal.errors import require_numbers
 from evercal.features.encoder import Encoder
 from evercal.features.views import View, ViewOptions, augmented_view, frame_view
 from evercal.geometry.se3 import SE3
@@ -227,6 +228,10 @@ class EncodePlan:
     """Seed of augmentations and of the cells that are taken."""
     view: ViewOptions = field(default_factory=ViewOptions)
     """Size and augmentation of the views."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        require_numbers(self, ("views_per_frame", "cells"), 1)
 
 
 def encode_frames(

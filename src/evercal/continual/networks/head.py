@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evercal.errors import InputError
+from evercal.errors import InputError, require_numbers
 
 SCALE_MAX = 4.0
 """GLACE's s_max: the reciprocal of the smallest homogeneous coordinate (no unit)."""
@@ -51,6 +51,11 @@ class HeadOptions:
     """Centre, scale and half decorrelate the features, so that weak directions count; or scale."""
     activation: Literal["gelu", "relu"] = "gelu"
     """Activation between layers; ACE and GLACE use `relu`."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        require_numbers(self, ("width", "centres_per_scene"), 1)
+        require_numbers(self, ("blocks",), 0)
 
 
 @dataclass

@@ -7,6 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from evercal.errors import require_numbers
+
 MIN_DEPTH_M = 0.1
 """Minimum depth of a valid point, metres."""
 MAX_DEPTH_M = 1000.0
@@ -34,6 +36,10 @@ class LossOptions:
     """Soft clamp at the last step, pixels."""
     proxy_depth_m: float = 10.0
     """Invalid points are attracted to the point at this depth on their ray."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        require_numbers(self, vars(self).keys() - {"schedule"}, 1e-9)
 
 
 @dataclass

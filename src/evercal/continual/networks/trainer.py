@@ -19,6 +19,7 @@ from evercal.continual.networks.loss import (
 )
 from evercal.continual.networks.precision import autocast
 from evercal.continual.networks.shampoo import OneSidedShampoo
+from evercal.errors import require_numbers
 
 INLIER_PX = 5.0
 """Reprojection error below which a row of `Progress.inlier_share` is an inlier, pixels."""
@@ -52,6 +53,11 @@ class FitOptions:
     """Weight of the distance to points from depths; with 0, no depths are estimated."""
     loss: LossOptions = field(default_factory=LossOptions)
     """Reprojection loss of new rows."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        require_numbers(self, vars(self).keys() - {"loss"}, 0)
+        require_numbers(self, ("batch",), 1)
 
 
 @dataclass
