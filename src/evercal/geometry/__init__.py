@@ -1,9 +1,9 @@
 """Rigid transforms, poses with covariance and the camera model: numpy, float64, no I/O."""
 
+from evercal.geometry.averages import average_poses as average_poses
 from evercal.geometry.camera import Camera as Camera
 from evercal.geometry.camera import resize_pixels as resize_pixels
 from evercal.geometry.se3 import SE3 as SE3
-from evercal.geometry.se3 import average_poses as average_poses
 from evercal.geometry.se3 import cross_matrix as cross_matrix
 from evercal.geometry.se3 import deviations as deviations
 from evercal.geometry.se3 import length_mm_deg as length_mm_deg

@@ -16,22 +16,30 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
 
 from evercal.choices import CameraModel
+from evercal.geometry.distortion import (
+    angle_per_radius,
+    radial_fisheye,
+    radial_pinhole,
+    widest_fisheye,
+    widest_pinhole,
+)
 from evercal.typing import Array
 
-FISHEYE_DEG = 85.0
-"""Largest angle to the optical axis of a ray of a fisheye."""
 COEFFICIENTS: dict[str, tuple[str, ...]] = {
     "pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
 """Names of the distortion coefficients of each model, in OpenCV's order."""
 _COEFFICIENT_COUNTS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
+"""Allowed numbers of coefficients of each model."""
 _EXACT = 1e-10
 """Tolerance of undistorted points on the plane z = 1."""
 _ASPECT_TOLERANCE = 0.01
+"""Maximum relative difference of aspect ratios."""
 
 
 def resize_pixels(pixels: ArrayLike, scale: float | Array) -> Array:
@@ -73,7 +81,8 @@ class Camera:
             object.__setattr__(self, name, int(value))
         for name in ("fx", "fy", "cx", "cy"):
             value = float(getattr(self, name))
-            if not math.isfinite(value) or (name.startswith("f") and value <= 0):
+            positive = value > 0 or name in ("cx", "cy")
+            if not math.isfinite(value) or not positive:
                 raise ValueError(
                     f"camera {name} is finite (and > 0 for fx, fy), got {value}"
                 )
@@ -88,8 +97,11 @@ class Camera:
                 f"camera distortion has {', '.join(map(str, counts[:-1]))} or {counts[-1]} finite"
                 f" coefficients (OpenCV's {names}), got {distortion}"
             )
-        none = (0.0,) * 4 if self.model == "fisheye" else ()
-        object.__setattr__(self, "distortion", distortion if any(distortion) else none)
+        if not any(distortion):
+            distortion = ()
+            if self.model == "fisheye":
+                distortion = (0.0,) * 4
+        object.__setattr__(self, "distortion", distortion)
 
     @classmethod
     def from_matrix(
@@ -103,16 +115,21 @@ class Camera:
         k = np.asarray(matrix, dtype=np.float64)
         if k.shape != (3, 3):
             raise ValueError(f"an intrinsic matrix is 3x3, got {k.shape}")
-        if (
-            abs(k[0, 1]) > 1e-9
-            or abs(k[1, 0]) > 1e-9
-            or not np.allclose(k[2], (0, 0, 1))
-        ):
+        zeros = np.abs([k[0, 1], k[1, 0]])
+        if zeros.max() > 1e-9 or not np.allclose(k[2], (0, 0, 1)):
             raise ValueError(
                 f"an intrinsic matrix is [fx 0 cx; 0 fy cy; 0 0 1], got {k.tolist()}; skew is"
                 f" not supported"
             )
-        return cls(width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], distortion)
+        return cls(
+            width,
+            height,
+            fx=k[0, 0],
+            fy=k[1, 1],
+            cx=k[0, 2],
+            cy=k[1, 2],
+            distortion=distortion,
+        )
 
     @property
     def coefficients(self) -> tuple[float, ...]:
@@ -126,52 +143,28 @@ class Camera:
         Beyond it the polynomial folds back, so points far outside the view land in the image.
         """
         if self.model == "fisheye":
-            folds = _roots(
-                [
-                    1.0,
-                    *(
-                        n * k
-                        for n, k in zip((3, 5, 7, 9), self.distortion, strict=True)
-                    ),
-                ]
-            )
-            return math.tan(
-                min(math.sqrt(min(folds, default=9.0)), math.radians(FISHEYE_DEG))
-            )
-        k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
-        if not (k4 or k5 or k6):
-            return math.sqrt(
-                min(_roots([1.0, 3 * k1, 5 * k2, 7 * k3]), default=math.inf)
-            )
-        squared = np.polynomial.Polynomial([0, 1])
-        above = np.polynomial.Polynomial([1, k1, k2, k3])
-        below = np.polynomial.Polynomial([1, k4, k5, k6])
-        slope = above * below + 2 * squared * (
-            above.deriv() * below - above * below.deriv()
-        )
-        return math.sqrt(
-            min([*_roots(slope.coef), *_roots(below.coef)], default=math.inf)
-        )
+            return widest_fisheye(self.distortion)
+        return widest_pinhole(self.coefficients)
 
     @property
     def pinhole(self) -> "Camera":
         """The same camera without distortion."""
-        return (
-            replace(self, distortion=(), model="pinhole") if self.distortion else self
-        )
+        if not self.distortion:
+            return self
+        return replace(self, distortion=(), model="pinhole")
 
     def changed(self, change: ArrayLike) -> "Camera":
         """The camera after a change (5,) of the parameters of `slopes`."""
-        log_focal, x, y, *radial = np.asarray(change, np.float64).tolist()
-        coefficients = self.coefficients[: max(4, len(self.distortion))]
-        factor, (k1, k2, *others) = math.exp(log_focal), coefficients
+        log_focal, x, y, more_k1, more_k2 = np.asarray(change, np.float64).tolist()
+        k1, k2, *others = self.coefficients[: max(4, len(self.distortion))]
+        factor = math.exp(log_focal)
         return replace(
             self,
             fx=factor * self.fx,
             fy=factor * self.fy,
             cx=self.cx + x,
             cy=self.cy + y,
-            distortion=(k1 + radial[0], k2 + radial[1], *others),
+            distortion=(k1 + more_k1, k2 + more_k2, *others),
         )
 
     def fits(self, width: int, height: int) -> bool:
@@ -182,7 +175,11 @@ class Camera:
     def matrix(self) -> Array:
         """(3, 3) intrinsic matrix."""
         return np.array(
-            [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
+            [
+                [self.fx, 0.0, self.cx],
+                [0.0, self.fy, self.cy],
+                [0.0, 0.0, 1.0],
+            ]
         )
 
     def resized(self, width: int, height: int) -> "Camera":
@@ -190,16 +187,26 @@ class Camera:
         sx = width / self.width
         sy = height / self.height
         cx, cy = resize_pixels((self.cx, self.cy), np.array([sx, sy])).tolist()
-        fx = self.fx * sx
-        fy = self.fy * sy
-        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=cx,
+            cy=cy,
+        )
 
     def short_side_resized(self, short_side: int) -> "Camera":
         """The camera of the image resized so that its shorter side is `short_side` pixels."""
         scale = short_side / min(self.width, self.height)
+        width = short_side
+        height = short_side
         if self.width <= self.height:
-            return self.resized(short_side, max(1, round(self.height * scale)))
-        return self.resized(max(1, round(self.width * scale)), short_side)
+            height = max(1, round(self.height * scale))
+        else:
+            width = max(1, round(self.width * scale))
+        return self.resized(width, height)
 
     def zoomed(self, factor: float) -> "Camera":
         """The camera with its focal lengths multiplied by a factor."""
@@ -223,10 +230,12 @@ class Camera:
         y = y / depth
         if self.distortion:
             within = x * x + y * y < self.widest**2
-            (x, y), _ = self._distorted(
-                np.where(within, x, np.nan), np.where(within, y, np.nan)
-            )
-        return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
+            x = np.where(within, x, np.nan)
+            y = np.where(within, y, np.nan)
+            (x, y), _ = self._distorted(x, y)
+        u = self.fx * x + self.cx
+        v = self.fy * y + self.cy
+        return np.stack([u, v], axis=-1)
 
     def unproject(self, pixels: ArrayLike) -> Array:
         """Pixels (..., 2) to rays (..., 3) with z = 1; NaN outside the range of the distortion."""
@@ -236,7 +245,8 @@ class Camera:
         plane = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
         if self.distortion and pixels.size:
             plane = self._undistorted(plane)
-        return np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
+        depth = np.ones((*plane.shape[:-1], 1))
+        return np.concatenate([plane, depth], axis=-1)
 
     def slopes(self, plane: ArrayLike) -> tuple[Array, Array]:
         """Derivatives of pixels by ideal points (..., 2) of the plane z = 1, and by intrinsics.
@@ -260,34 +270,34 @@ class Camera:
         next_power = r2
         if self.model == "fisheye":
             next_power = np.arctan(np.sqrt(r2)) ** 2
-            first = next_power * _angle_per_radius(r2)
+            first = next_power * angle_per_radius(r2)
         elif any(self.coefficients[5:]):
-            _, _, _, _, _, k4, k5, k6 = self.coefficients
+            k4, k5, k6 = self.coefficients[5:]
             first = r2 / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        for row, focal, ideal, distorted in ((0, self.fx, x, u), (1, self.fy, y, v)):
-            lens[row, 0] = focal * distorted
-            lens[row, 1 + row] = 1
-            lens[row, 3] = focal * ideal * first
-            lens[row, 4] = lens[row, 3] * next_power
-        return np.moveaxis(by_plane, (0, 1), (-2, -1)), np.moveaxis(
-            lens, (0, 1), (-2, -1)
-        )
+        lens[0, 0] = self.fx * u
+        lens[1, 0] = self.fy * v
+        lens[0, 1] = 1
+        lens[1, 2] = 1
+        lens[0, 3] = self.fx * x * first
+        lens[1, 3] = self.fy * y * first
+        lens[:, 4] = lens[:, 3] * next_power
+        by_plane = np.moveaxis(by_plane, (0, 1), (-2, -1))
+        return by_plane, np.moveaxis(lens, (0, 1), (-2, -1))
 
     def to_dict(self) -> dict[str, object]:
         """Plain numbers for JSON; the model only of a fisheye."""
-        model = {"model": self.model} if self.model == "fisheye" else {}
-        numbers = {
-            name: value for name, value in asdict(self).items() if name != "model"
-        }
-        return {**numbers, "distortion": list(self.distortion), **model}
+        values: dict[str, object] = asdict(self)
+        values["distortion"] = list(self.distortion)
+        if self.model != "fisheye":
+            del values["model"]
+        return values
 
     @classmethod
     def from_dict(cls, data: Mapping[str, object]) -> Self:
         """Inverse of `to_dict`; unknown keys are ignored, `distortion` is optional."""
-        names = ("width", "height", "fx", "fy", "cx", "cy")
-        numbers: dict[str, Any] = {
-            name: _number(data.get(name), name) for name in names
-        }
+        numbers: dict[str, Any] = {}
+        for name in ("width", "height", "fx", "fy", "cx", "cy"):
+            numbers[name] = _number(data.get(name), name)
         distortion = data.get("distortion", ())
         if not isinstance(distortion, (list, tuple)):
             raise ValueError(
@@ -304,95 +314,67 @@ class Camera:
         self, x: Array, y: Array
     ) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
         """Distorted points (u, v), and their derivatives du/dx, du/dy = dv/dx and dv/dy."""
-        p1, p2 = (0.0, 0.0) if self.model == "fisheye" else self.coefficients[2:4]
-        r2 = x * x + y * y
-        radial, change = self._radial(r2)
+        xx = x * x
+        yy = y * y
+        r2 = xx + yy
+        if self.model == "fisheye":
+            p1 = 0.0
+            p2 = 0.0
+            radial, change = radial_fisheye(self.distortion, r2)
+        else:
+            p1, p2 = self.coefficients[2:4]
+            radial, change = radial_pinhole(self.coefficients, r2)
         twice = 2 * change
         u = x * radial
         v = y * radial
         cross = x * y * twice
-        a = radial + x * x * twice
-        d = radial + y * y * twice
+        a = radial + xx * twice
+        d = radial + yy * twice
         if p1 or p2:
-            u = u + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-            v = v + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+            u = u + 2 * p1 * x * y + p2 * (r2 + 2 * xx)
+            v = v + p1 * (r2 + 2 * yy) + 2 * p2 * x * y
             cross = cross + 2 * (p1 * x + p2 * y)
             a = a + 2 * p1 * y + 6 * p2 * x
             d = d + 6 * p1 * y + 2 * p2 * x
         return (u, v), (a, cross, d)
 
-    def _radial(self, r2: Array) -> tuple[Array, Array]:
-        """Distorted over ideal radius, and its derivative by the ideal squared radius `r2`."""
-        if self.model == "fisheye":
-            k1, k2, k3, k4 = self.distortion
-            ratio = _angle_per_radius(r2)
-            t2 = np.arctan(np.sqrt(r2)) ** 2
-            longer = 1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
-            steeper = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-            radial = ratio * longer
-            change = (steeper / (1 + r2) - radial) / (2 * np.maximum(r2, 1e-8))
-            return radial, np.where(r2 > 1e-8, change, k1 - 1 / 3)
-        k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
-        above = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        steeper = k1 + r2 * (2 * k2 + r2 * 3 * k3)
-        if not (k4 or k5 or k6):
-            return above, steeper
-        below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        radial = above / below
-        return radial, (steeper - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
-
     def _angles(self, radii: Array) -> Array:
         """Angles of a fisheye at distorted radii (...); NaN outside its range."""
         k1, k2, k3, k4 = self.distortion
-        radius = np.polynomial.Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4])
+        radius = Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4])
         slope = radius.deriv()
         most = math.atan(self.widest)
         angles = np.minimum(radii, most)
-        off = radius(angles) - radii
+        error = radius(angles) - radii
         for _ in range(50):  # Newton's method: a few steps but close to a fold
-            if (np.abs(off) < _EXACT).all():
+            if (np.abs(error) < _EXACT).all():
                 break
-            angles = np.clip(angles - off / np.maximum(slope(angles), 1e-6), 0, most)
-            off = radius(angles) - radii
-        return np.where(np.abs(off) < _EXACT, angles, np.nan)
+            step = error / np.maximum(slope(angles), 1e-6)
+            angles = np.clip(angles - step, 0, most)
+            error = radius(angles) - radii
+        return np.where(np.abs(error) < _EXACT, angles, np.nan)
 
     def _undistorted(self, distorted: Array) -> Array:
+        """(..., 2) ideal points of the plane z = 1; NaN outside the range of the distortion."""
         if self.model == "fisheye":
             radii = np.linalg.norm(distorted, axis=-1, keepdims=True)
             return distorted * np.tan(self._angles(radii)) / np.maximum(radii, 1e-12)
         plane = distorted
         lost = np.ones(distorted.shape[:-1], bool)
         for _ in range(50):  # Newton's method: a few steps but close to `widest`
-            far = np.sqrt((plane**2).sum(-1, keepdims=True))
-            plane = plane * np.minimum(
-                1, 0.999999 * self.widest / np.maximum(far, 1e-12)
-            )
-            at, (a, b, d) = self._distorted(plane[..., 0], plane[..., 1])
-            u = at[0] - distorted[..., 0]
-            v = at[1] - distorted[..., 1]
+            radius = np.sqrt((plane**2).sum(-1, keepdims=True))
+            inside = 0.999999 * self.widest / np.maximum(radius, 1e-12)
+            plane = plane * np.minimum(1, inside)
+            (u, v), (a, b, d) = self._distorted(plane[..., 0], plane[..., 1])
+            u = u - distorted[..., 0]
+            v = v - distorted[..., 1]
             lost = np.maximum(np.abs(u), np.abs(v)) > _EXACT
             if not lost.any():
                 break
-            step = (
-                np.stack([d * u - b * v, a * v - b * u], -1)
-                / (a * d - b * b)[..., None]
-            )
-            plane = plane - step
+            step = np.stack([d * u - b * v, a * v - b * u], -1)
+            determinant = a * d - b * b
+            plane = plane - step / determinant[..., None]
         return np.where(lost[..., None], np.nan, plane)
-
-
-def _roots(coefficients: ArrayLike) -> list[float]:
-    """Positive real roots of a polynomial, from its coefficients in ascending order."""
-    roots = np.polynomial.polynomial.polyroots(
-        np.trim_zeros(np.asarray(coefficients), "b")
-    )
-    return roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].tolist()
-
-
-def _angle_per_radius(r2: Array) -> Array:
-    """atan(r) / r of squared radii."""
-    r = np.sqrt(np.maximum(r2, 1e-12))
-    return np.arctan(r) / r
 
 
 def _number(value: object, name: str) -> float:

@@ -17,6 +17,8 @@ from evercal.typing import Array
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
+"""Signs of the conjugate of a quaternion w, x, y, z."""
 _SMALL_RAD = 1e-3
 """Angle below which series replace quotients that cancel."""
 
@@ -36,10 +38,8 @@ class SE3:
     def __post_init__(self) -> None:
         quaternion = np.array(self.rotation_wxyz, dtype=np.float64)
         translation = np.array(self.translation_m, dtype=np.float64)
-        if quaternion.shape[-1:] != (4,) or translation.shape != (
-            *quaternion.shape[:-1],
-            3,
-        ):
+        batch = quaternion.shape[:-1]
+        if quaternion.shape[-1:] != (4,) or translation.shape != (*batch, 3):
             raise ValueError(
                 f"SE3 takes rotation_wxyz (..., 4) and translation_m (..., 3) with one batch shape,"
                 f" got {quaternion.shape} and {translation.shape}"
@@ -102,7 +102,8 @@ class SE3:
                 "the last row of a pose matrix is 0 0 0 1, got something else"
             )
         block = matrix[..., :3, :3]
-        drift = np.abs(np.swapaxes(block, -1, -2) @ block - np.eye(3)).max(initial=0.0)
+        gram = np.swapaxes(block, -1, -2) @ block
+        drift = np.abs(gram - np.eye(3)).max(initial=0.0)
         if drift > tolerance:
             raise ValueError(
                 f"the left 3x3 block of a pose matrix is a rotation within {tolerance:g},"
@@ -120,21 +121,23 @@ class SE3:
         tangent = np.asarray(tangent, dtype=np.float64)
         if tangent.shape[-1:] != (6,):
             raise ValueError(f"a tangent is (..., 6) = (v, w), got {tangent.shape}")
+        velocity = tangent[..., :3]
         vector = tangent[..., 3:]
         angle = np.linalg.norm(vector, axis=-1, keepdims=True)
-        quaternion = np.concatenate(
-            [np.cos(angle / 2), np.sinc(angle / 2 / np.pi) / 2 * vector], -1
-        )
+        half = angle / 2
+        imaginary = np.sinc(half / np.pi) / 2 * vector
+        quaternion = np.concatenate([np.cos(half), imaginary], -1)
         square = angle * angle
         # 1 - cos cancels for small angles, and so does angle - sin: then their series are used.
         small = angle < _SMALL_RAD
-        safe = np.where(angle < _SMALL_RAD, 1.0, angle)
+        safe = np.where(small, 1.0, angle)
         first = 2 * (np.sin(safe / 2) / safe) ** 2
         first = np.where(small, 0.5 - square / 24, first)
-        second = np.where(small, 1 / 6 - square / 120, (safe - np.sin(safe)) / safe**3)
-        once = np.cross(vector, tangent[..., :3])
-        shift = tangent[..., :3] + first * once + second * np.cross(vector, once)
-        return cls(quaternion, shift)
+        second = (safe - np.sin(safe)) / safe**3
+        second = np.where(small, 1 / 6 - square / 120, second)
+        once = np.cross(vector, velocity)
+        twice = np.cross(vector, once)
+        return cls(quaternion, velocity + first * once + second * twice)
 
     @classmethod
     def stack(cls, poses: Sequence["SE3"]) -> Self:
@@ -166,10 +169,8 @@ class SE3:
         if not self.shape:
             raise TypeError("a single SE3 cannot be indexed")
         rows = np.arange(int(np.prod(self.shape))).reshape(self.shape)[index]  # pyright: ignore[reportCallIssue, reportArgumentType]
-        return type(self)(
-            self.rotation_wxyz.reshape(-1, 4)[rows],
-            self.translation_m.reshape(-1, 3)[rows],
-        )
+        quaternion = self.rotation_wxyz.reshape(-1, 4)[rows]
+        return type(self)(quaternion, self.translation_m.reshape(-1, 3)[rows])
 
     def __iter__(self) -> Iterator[Self]:
         """Over the first batch axis."""
@@ -186,17 +187,26 @@ class SE3:
         """(..., 3, 3)."""
         # Written out because it is an inner loop.
         w, x, y, z = np.moveaxis(self.rotation_wxyz, -1, 0)
-        matrix = np.empty((*self.shape, 3, 3))
-        matrix[..., 0, 0] = 1 - 2 * (y * y + z * z)
-        matrix[..., 0, 1] = 2 * (x * y - w * z)
-        matrix[..., 0, 2] = 2 * (x * z + w * y)
-        matrix[..., 1, 0] = 2 * (x * y + w * z)
-        matrix[..., 1, 2] = 2 * (y * z - w * x)
-        matrix[..., 1, 1] = 1 - 2 * (x * x + z * z)
-        matrix[..., 2, 0] = 2 * (x * z - w * y)
-        matrix[..., 2, 1] = 2 * (y * z + w * x)
-        matrix[..., 2, 2] = 1 - 2 * (x * x + y * y)
-        return matrix
+        xx = x * x
+        yy = y * y
+        zz = z * z
+        xy = x * y
+        xz = x * z
+        yz = y * z
+        wx = w * x
+        wy = w * y
+        wz = w * z
+        matrix = np.empty((3, 3, *self.shape))
+        matrix[0, 0] = 1 - 2 * (yy + zz)
+        matrix[0, 1] = 2 * (xy - wz)
+        matrix[0, 2] = 2 * (xz + wy)
+        matrix[1, 0] = 2 * (xy + wz)
+        matrix[1, 1] = 1 - 2 * (xx + zz)
+        matrix[1, 2] = 2 * (yz - wx)
+        matrix[2, 0] = 2 * (xz - wy)
+        matrix[2, 1] = 2 * (yz + wx)
+        matrix[2, 2] = 1 - 2 * (xx + yy)
+        return np.ascontiguousarray(np.moveaxis(matrix, (0, 1), (-2, -1)))
 
     def matrix(self) -> Array:
         """(..., 4, 4) homogeneous matrices."""
@@ -208,11 +218,10 @@ class SE3:
 
     def inverse(self) -> Self:
         """`base_from_camera.inverse()` is `camera_from_base`."""
-        conjugate = self.rotation_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
+        conjugate = self.rotation_wxyz * _CONJUGATE
         transposed = np.swapaxes(self.rotation_matrix(), -1, -2)
-        return type(self)(
-            conjugate, -(transposed @ self.translation_m[..., None])[..., 0]
-        )
+        rotated = (transposed @ self.translation_m[..., None])[..., 0]
+        return type(self)(conjugate, -rotated)
 
     def __matmul__(self, other: "SE3") -> Self:
         """`a_from_b @ b_from_c` is `a_from_c`; batch shapes broadcast."""
@@ -228,7 +237,8 @@ class SE3:
             raise ValueError(f"points are (..., 3), got {points.shape}")
         if not self.shape:
             return points @ self.rotation_matrix().T + self.translation_m
-        return (self.rotation_matrix() @ points[..., None])[..., 0] + self.translation_m
+        rotated = (self.rotation_matrix() @ points[..., None])[..., 0]
+        return rotated + self.translation_m
 
     def adjoint(self) -> Array:
         """(..., 6, 6) matrices A with `self @ exp(x) == exp(A x) @ self` for tangents x."""
@@ -246,14 +256,18 @@ class SE3:
         v = np.where(w < 0, -v, v)
         sine = np.linalg.norm(v, axis=-1, keepdims=True)
         angle = 2 * np.arctan2(sine, np.abs(w))
-        vector = np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 2) * v
+        rotates = sine > 0
+        scale = angle / np.where(rotates, sine, 1)
+        vector = np.where(rotates, scale, 2) * v
         small = angle < _SMALL_RAD
-        safe = np.where(angle < _SMALL_RAD, 1.0, angle)
-        second = (1 - safe / 2 / np.tan(safe / 2)) / safe**2
+        safe = np.where(small, 1.0, angle)
+        half = safe / 2
+        second = (1 - half / np.tan(half)) / safe**2
         second = np.where(small, 1 / 12 + angle**2 / 720, second)
         once = np.cross(vector, self.translation_m)
-        shift = self.translation_m - once / 2 + second * np.cross(vector, once)
-        return np.concatenate([shift, vector], -1)
+        twice = np.cross(vector, once)
+        velocity = self.translation_m - once / 2 + second * twice
+        return np.concatenate([velocity, vector], -1)
 
 
 def pose_to_dict(pose: SE3 | None) -> dict[str, object] | None:
@@ -269,11 +283,12 @@ def pose_to_dict(pose: SE3 | None) -> dict[str, object] | None:
 def pose_distance(a: SE3, b: SE3) -> tuple[Array, Array]:
     """Metres (...) and radians (...) in [0, pi] between transforms into the same frame."""
     metres = np.linalg.norm(a.translation_m - b.translation_m, axis=-1)
-    conjugate = a.rotation_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
+    conjugate = a.rotation_wxyz * _CONJUGATE
     difference = _quaternion_product(conjugate, b.rotation_wxyz)
     # atan2 keeps full precision near 0 and pi, where arccos of the trace loses half the digits.
     sine = np.linalg.norm(difference[..., 1:], axis=-1)
-    return np.asarray(metres), 2.0 * np.arctan2(sine, np.abs(difference[..., 0]))
+    cosine = np.abs(difference[..., 0])
+    return np.asarray(metres), 2.0 * np.arctan2(sine, cosine)
 
 
 def pose_distance_mm_deg(a: SE3, b: SE3) -> tuple[float, float]:
@@ -306,32 +321,6 @@ def cross_matrix(v: ArrayLike) -> Array:
     return matrix - np.swapaxes(matrix, -1, -2)
 
 
-def average_poses(poses: SE3) -> SE3:
-    """Robust mean of poses (n,); up to nearly half of them may be outliers.
-
-    Iteratively reweighted mean, started at the medoid. Weights are Tukey's biweight of the distance
-    to the current mean, cut at four median distances, in metres and in radians.
-    """
-    if len(poses.shape) != 1 or len(poses) == 0:
-        raise ValueError(
-            f"average_poses takes a batch (n,) with n >= 1, got {poses.shape}"
-        )
-    mean = _medoid(poses)
-    for _ in range(50):
-        metres, radians = pose_distance(mean, poses)
-        weight = _biweight(metres) * _biweight(radians)
-        # Poses near in metres and poses near in radians are disjoint.
-        if weight.sum() <= 0:
-            return mean
-        translation = weight @ poses.translation_m / weight.sum()
-        rotation = _dominant(np.einsum("n,ni,nj", weight, *[poses.rotation_wxyz] * 2))
-        before = mean
-        mean = SE3(rotation, translation)
-        if max(pose_distance(before, mean)) < 1e-12:
-            break
-    return mean
-
-
 def _quaternion(matrix: Array) -> Array:
     """(..., 4) of the rotations nearest to matrices (..., 3, 3) (Bar-Itzhack, JGCD 2000)."""
     (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(matrix, (-2, -1), (0, 1))
@@ -341,10 +330,10 @@ def _quaternion(matrix: Array) -> Array:
         [c - g, b + d, e - a - i, f + h],
         [d - b, c + g, f + h, i - a - e],
     ]
-    return _dominant(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
+    return dominant_quaternion(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
 
 
-def _dominant(matrix: Array) -> Array:
+def dominant_quaternion(matrix: Array) -> Array:
     """(..., 4) eigenvectors of the largest eigenvalues of (..., 4, 4), with w >= 0."""
     vector = np.linalg.eigh(matrix)[1][..., -1]
     return np.where(vector[..., :1] < 0, -vector, vector)
@@ -354,25 +343,12 @@ def _quaternion_product(a: Array, b: Array) -> Array:
     """Hamilton product of (..., 4) wxyz; written out because it is an inner loop."""
     aw, ax, ay, az = np.moveaxis(a, -1, 0)
     bw, bx, by, bz = np.moveaxis(b, -1, 0)
-    w = aw * bw - ax * bx - ay * by - az * bz
-    x = aw * bx + ax * bw + ay * bz - az * by
-    y = aw * by - ax * bz + ay * bw + az * bx
-    z = aw * bz + ax * by - ay * bx + az * bw
+    w = aw * bw - ax * bx
+    x = aw * bx + ax * bw
+    y = aw * by - ax * bz
+    z = aw * bz + ax * by
+    w = w - ay * by - az * bz
+    x = x + ay * bz - az * by
+    y = y + ay * bw + az * bx
+    z = z - ay * bx + az * bw
     return np.stack([w, x, y, z], axis=-1)
-
-
-def _medoid(poses: SE3) -> SE3:
-    """The pose with the smallest summed distance to the others, among at most 200 candidates."""
-    candidates = np.unique(np.linspace(0, len(poses) - 1, 200).round().astype(int))
-    cost = np.zeros(len(candidates))
-    for distance in pose_distance(poses[candidates[:, None]], poses[None]):
-        # Scaled by their median, distances in metres and in radians can be added.
-        cost += distance.sum(1) / max(float(np.median(distance)), 1e-9)
-    return poses[candidates[np.argmin(cost)]]
-
-
-def _biweight(distance: Array) -> Array:
-    """Tukey's biweight of (n,) distances, cut at four medians."""
-    # The farther of the two middle poses, so that the mean of two poses lies halfway.
-    cut = 4.0 * max(float(np.sort(distance)[len(distance) // 2]), 1e-9)
-    return np.clip(1.0 - (distance / cut) ** 2, 0.0, None) ** 2

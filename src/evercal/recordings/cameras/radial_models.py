@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evercal.geometry import Camera
-from evercal.geometry.camera import FISHEYE_DEG
+from evercal.geometry.distortion import FISHEYE_DEG
 from evercal.typing import Array
 
 MAX_ERROR_PX = 0.5
