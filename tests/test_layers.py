@@ -43,9 +43,9 @@ FOR_ALL = ("bounds", "choices", "cluster", "errors", "processes", "progress", "t
 FACES = ("__init__", "__main__")
 """Modules of the root that may import everything."""
 PRODUCT = ORDER[: ORDER.index("simulation")]
-MOST_LOCALIZING = 47
+MOST_LOCALIZING = 54
 """Modules of evercal that a program loads for localizing, at most."""
-MOST_LEARNING = 78
+MOST_LEARNING = 85
 """The same for learning."""
 
 

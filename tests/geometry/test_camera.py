@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evercal.choices import CameraModel
 from evercal.geometry import Camera
-from evercal.geometry.camera import Model
 
 KINECT = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
 RATIONAL = (0.1, -0.05, 0.001, -0.002, 0.01, 0.05, 0.01, 0.002)
@@ -99,7 +99,7 @@ def test_short_side(size: tuple[int, int], expected: tuple[int, int]) -> None:
     [*product(LENSES, ["pinhole"]), *product(FISHEYES, ["fisheye"])],
 )
 def test_slopes_equal_finite_differences(
-    distortion: tuple[float, ...], model: Model
+    distortion: tuple[float, ...], model: CameraModel
 ) -> None:
     camera = camera_with(())
     step = 1e-6
