@@ -124,7 +124,11 @@ def board_poses(
                 fits[name] = board_pose(view, camera)
                 detected[name] = view
     left_out = {}
-    stray = strays(list(detected.values()), list(fits.values()), camera)
+    stray = strays(
+        list(detected.values()),
+        list(fits.values()),
+        camera,
+    )
     for name, mask in zip(fits, stray, strict=True):
         view = detected[name]
         left_out[name] = tuple((x, y) for x, y in view.pixels[mask].tolist())
@@ -153,7 +157,13 @@ def board_poses(
             reason = "the detected corners fit no pose of the board"
             image = BoardImage(name, reason=reason)
         images.append(image)
-    return BoardPoses(board, camera, tuple(images), sigma, camera_from)
+    return BoardPoses(
+        board,
+        camera,
+        tuple(images),
+        sigma,
+        camera_from,
+    )
 
 
 def _image_to_dict(image: BoardImage) -> dict[str, Any]:

@@ -122,7 +122,11 @@ class Bend(NamedTuple):
         """Return the plane of a board that views show."""
         points = np.concatenate([view.points_m for view in views])
         half = np.ptp(points, axis=0) / 2
-        return cls(points.min(0) + half, float(half.max()), np.zeros(len(BEND)))
+        return cls(
+            points.min(0) + half,
+            float(half.max()),
+            np.zeros(len(BEND)),
+        )
 
     def slopes(self, points: Array) -> Array:
         """Return the (k, b) derivative of z of points (k, 3) by the curvature."""
@@ -279,7 +283,12 @@ def strays(
             if keep.mean() <= 1 - _MAX_STRAYS or keep.sum() <= _NEIGHBOURS:
                 keep[:] = True
                 break
-            pose = board_pose(view[keep], camera, pose.camera_from_board, bend)
+            pose = board_pose(
+                view[keep],
+                camera,
+                pose.camera_from_board,
+                bend,
+            )
             apart, sigma = _apart(view[keep], pose)
         stray.append(~keep)
     return stray

@@ -32,7 +32,11 @@ _TAG_ROUNDS = ((0.1, 6.0, 0.15), (0.05, 5.0, 0.1))
 most; share of the side that is left out at either end."""
 
 
-def sharpened(grey: Image, view: BoardView, board: Board) -> BoardView:
+def sharpened(
+    grey: Image,
+    view: BoardView,
+    board: Board,
+) -> BoardView:
     """Refine the corners of squares to one or two hundredths of a pixel.
 
     First in windows around them, then by lines along the edges of the squares, which are longer.
@@ -47,7 +51,11 @@ def sharpened(grey: Image, view: BoardView, board: Board) -> BoardView:
     share = (board.size_m - board.marker_m) / (2 * board.size_m)
     along, down, area = _steps(points, pixels)
     longer = np.maximum(np.abs(along).sum(1), np.abs(down).sum(1))
-    pixels = _in_windows(grey, pixels, share * area / np.maximum(longer, 1e-9))
+    pixels = _in_windows(
+        grey,
+        pixels,
+        share * area / np.maximum(longer, 1e-9),
+    )
     along, down, area = _steps(points, pixels)
     lines = []
     for step in (along, down):
@@ -55,14 +63,28 @@ def sharpened(grey: Image, view: BoardView, board: Board) -> BoardView:
         reach = share * area / np.maximum(length, 1e-9) - _EDGE_BLUR_PX
         reach[reach < _MIN_REACH_PX] = np.nan
         reach = np.minimum(reach, _MAX_REACH_PX)
-        back = _edges(grey, pixels - 0.08 * step, pixels - 0.5 * step, reach)
-        ahead = _edges(grey, pixels + 0.08 * step, pixels + 0.5 * step, reach)
+        back = _edges(
+            grey,
+            pixels - 0.08 * step,
+            pixels - 0.5 * step,
+            reach,
+        )
+        ahead = _edges(
+            grey,
+            pixels + 0.08 * step,
+            pixels + 0.5 * step,
+            reach,
+        )
         edges = np.concatenate([back, ahead], axis=1)
         lines.append(_tangents(edges, pixels))
     return BoardView(view.points_m, _crossings(pixels, *lines))
 
 
-def _in_windows(grey: Image, pixels: Array, free_px: Array) -> Array:
+def _in_windows(
+    grey: Image,
+    pixels: Array,
+    free_px: Array,
+) -> Array:
     """Refine corners (n, 2) that have space for a window of at most `free_px` (n,) to each side."""
     half = np.minimum(free_px, _MAX_WINDOW_PX).astype(int)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
@@ -108,7 +130,14 @@ def squares_by_their_sides(grey: Image, squares: Array) -> Array:
         reach = np.clip(share * np.linalg.norm(sides, axis=1), 2.0, most_px)
         starts = corners + end * sides
         ends = corners + (1 - end) * sides
-        edges = _edges(grey, starts, ends, reach, _TAG_SAMPLES, outwards=True)
+        edges = _edges(
+            grey,
+            starts,
+            ends,
+            reach,
+            _TAG_SAMPLES,
+            outwards=True,
+        )
         by_square = edges.reshape(-1, 4, _TAG_SAMPLES, 2)
         before = np.roll(by_square, 1, axis=1).reshape(edges.shape)
         first = _tangents(before, corners)

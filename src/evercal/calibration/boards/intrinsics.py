@@ -134,7 +134,11 @@ def lens_estimate(
     return normal_solution(information, gradient), information
 
 
-def moved_lens(camera: Camera, bend: Bend, change: Array) -> tuple[Camera, Bend]:
+def moved_lens(
+    camera: Camera,
+    bend: Bend,
+    change: Array,
+) -> tuple[Camera, Bend]:
     """Return camera and bend after a (q,) change; ValueError without a positive focal length."""
     of_camera, of_bend = np.split(change, [-len(BEND)])
     moved = bend._replace(curvature=bend.curvature + of_bend)
@@ -144,7 +148,14 @@ def moved_lens(camera: Camera, bend: Bend, change: Array) -> tuple[Camera, Bend]
 def moved_camera(camera: Camera, change: Array) -> Camera:
     """Return the camera after a change of its intrinsics."""
     fx, fy, cx, cy, *distortion = (lens_vector(camera) + change).tolist()
-    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
+    return replace(
+        camera,
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        distortion=tuple(distortion),
+    )
 
 
 def fitted_poses(
@@ -235,7 +246,17 @@ def _rough(
     middle = _middle(width, height)
     if model == "fisheye":
         focals = [width / 2 / np.deg2rad(half) for half in _HALF_ANGLES_DEG]
-        cameras = [Camera(width, height, f, f, *middle, model=model) for f in focals]
+        cameras = [
+            Camera(
+                width,
+                height,
+                f,
+                f,
+                *middle,
+                model=model,
+            )
+            for f in focals
+        ]
         return min(cameras, key=lambda camera: np.median(_misfits(views, camera)))
     camera = Camera(width, height, width, width, *middle)
     points = [view.points_m.astype(np.float32) for view in views]

@@ -130,10 +130,18 @@ def find_markers(grey: Image, board: Board) -> Markers:
     corners = np.reshape(list(squares.values()), (-1, 4, 2)).astype(np.float64)
     if squares:
         corners = squares_by_their_sides(grey, corners)
-    return Markers(ids, corners, *_steps(ids, corners))
+    return Markers(
+        ids,
+        corners,
+        *_steps(ids, corners),
+    )
 
 
-def _detected_markers(grey: Image, board: Board, border: int) -> dict[int, Array]:
+def _detected_markers(
+    grey: Image,
+    board: Board,
+    border: int,
+) -> dict[int, Array]:
     """Return the corners of markers with a border of so many cells, by number."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border
@@ -277,7 +285,12 @@ def _layout(markers: Markers, board: Board) -> tuple[MarkerLayout, str]:
     if len(fits) < _MIN_STEPS:
         return layout, ""
     if fits.mean() < _AGREEING:
-        layout = _best(markers, replace(board, tag=None), _COLUMNS, 1 << 30)
+        layout = _best(
+            markers,
+            replace(board, tag=None),
+            _COLUMNS,
+            1 << 30,
+        )
         return layout, _other_layout(markers, board, layout)
     sides_px = np.linalg.norm(np.diff(markers.corners, axis=1), axis=2)
     if np.median(sides_px) < _MIN_SIDE_PX:
@@ -287,7 +300,11 @@ def _layout(markers: Markers, board: Board) -> tuple[MarkerLayout, str]:
     return layout, _other_size(board, side)
 
 
-def _other_layout(markers: Markers, board: Board, layout: MarkerLayout) -> "OtherBoard":
+def _other_layout(
+    markers: Markers,
+    board: Board,
+    layout: MarkerLayout,
+) -> "OtherBoard":
     """Return the reason for markers that fit another layout, or none."""
     ids = np.unique(markers.ids)
     fits = "they lie on no such board"
@@ -337,14 +354,25 @@ def _best(
             layouts.append(MarkerLayout(n, count, parity=0))
             continue
         for first in _first_markers(markers, board, count):
-            layouts.append(MarkerLayout(n, count, first, *STYLES[board.kind]))
+            layouts.append(
+                MarkerLayout(
+                    n,
+                    count,
+                    first,
+                    *STYLES[board.kind],
+                )
+            )
             for up in (False, True):
                 for turn in range(4):
                     layouts.append(MarkerLayout(n, count, first, turn, up))
     return max(layouts, key=lambda layout: layout.fit(markers)[0].sum())
 
 
-def _first_markers(markers: Markers, board: Board, count: int) -> Iterable[int]:
+def _first_markers(
+    markers: Markers,
+    board: Board,
+    count: int,
+) -> Iterable[int]:
     """Return candidates for the number of the first marker, the usual ones first."""
     if board.tag is not None:
         return [board.tag]

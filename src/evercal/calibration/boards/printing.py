@@ -96,7 +96,12 @@ def drawing(board: Board, paper: str = "a4") -> "tuple[PillowImage, float]":
     left = (sheet.width - picture.shape[1]) // 2
     top = (sheet.height - round(_FOOTER_MM * px_per_mm) - picture.shape[0]) // 2
     sheet.paste(Image.fromarray(picture), (left, top))
-    _draw_footer(sheet, f"{_RULER_MM} mm: {label(board)}", height, px_per_mm)
+    _draw_footer(
+        sheet,
+        f"{_RULER_MM} mm: {label(board)}",
+        height,
+        px_per_mm,
+    )
     return sheet, _MM_PER_INCH * px_per_mm
 
 
@@ -109,14 +114,24 @@ def _draw_footer(
     draw = ImageDraw.Draw(sheet)
     bottom = height_mm - _MARGIN_MM
 
-    def draw_bar(x: float, y: float, width: float, height: float) -> None:
+    def draw_bar(
+        x: float,
+        y: float,
+        width: float,
+        height: float,
+    ) -> None:
         corners_mm = [x + _MARGIN_MM, y, x + _MARGIN_MM + width, y + height]
         corners = np.array(corners_mm) * px_per_mm
         draw.rectangle(corners.round().tolist(), fill=0)
 
     draw_bar(0, bottom, _RULER_MM, 0.3)
     for tick in range(0, _RULER_MM + 1, _TICK_MM):
-        draw_bar(tick, bottom - 2, 0.2, 2)
+        draw_bar(
+            tick,
+            bottom - 2,
+            0.2,
+            2,
+        )
     origin = (_MARGIN_MM * px_per_mm, (bottom + 1) * px_per_mm)
     font = ImageFont.load_default(size=2.5 * px_per_mm)
     draw.text(origin, text, font=font, fill=0)
@@ -139,7 +154,11 @@ def label(board: Board) -> str:
     return f"{words}. Print at 100 %."
 
 
-def _sheet(board: Board, paper: str, size_mm: Array) -> tuple[float, float]:
+def _sheet(
+    board: Board,
+    paper: str,
+    size_mm: Array,
+) -> tuple[float, float]:
     """Return width and height of the sheet, turned if the board fits only or better so."""
     if paper not in PAPERS_MM:
         raise InputError(
@@ -171,7 +190,11 @@ def _sheet(board: Board, paper: str, size_mm: Array) -> tuple[float, float]:
     )
 
 
-def write_board(path: Path, board: Board, paper: str = "a4") -> None:
+def write_board(
+    path: Path,
+    board: Board,
+    paper: str = "a4",
+) -> None:
     """Write a board at true size to a PDF or PNG file; the resolution is stored in the file."""
     if path.suffix.lower() not in FILE_KINDS:
         raise InputError(

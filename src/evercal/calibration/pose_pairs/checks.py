@@ -165,7 +165,11 @@ def require_rotations(
         )
 
 
-def _require_metres(pairs: PosePairs, poses: SE3, role: str) -> None:
+def _require_metres(
+    pairs: PosePairs,
+    poses: SE3,
+    role: str,
+) -> None:
     distance = np.linalg.norm(poses.translation_m, axis=1)
     far = distance > _MAX_DISTANCE_M
     if not far.any():
@@ -223,7 +227,11 @@ def held_out_error(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
     lengths = []
     for fold in range(FOLDS):
         held_out = np.arange(len(rows)) % FOLDS == fold
-        at = _refined(equation, fit, rows[~held_out])
+        at = _refined(
+            equation,
+            fit,
+            rows[~held_out],
+        )
         residual = equation[rows[held_out]].system(at).residual.reshape(-1, 2, 3)
         lengths.append(np.linalg.norm(residual, axis=2))
     error = np.concatenate(lengths) * (1000.0, 180 / np.pi)
@@ -242,13 +250,25 @@ def repeatability(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
     rows = np.flatnonzero(fit.inliers)
     if len(rows) < _MIN_HALVED:
         return {}
-    even = _refined(equation, fit, rows[0::2]).parent_from_camera
-    odd = _refined(equation, fit, rows[1::2]).parent_from_camera
+    even = _refined(
+        equation,
+        fit,
+        rows[0::2],
+    ).parent_from_camera
+    odd = _refined(
+        equation,
+        fit,
+        rows[1::2],
+    ).parent_from_camera
     millimetres, degrees = pose_distance_mm_deg(even, odd)
     return {"repeatability_mm": millimetres, "repeatability_deg": degrees}
 
 
-def _refined(equation: PoseEquation, fit: HandEyeFit, rows: IntArray) -> Unknowns:
+def _refined(
+    equation: PoseEquation,
+    fit: HandEyeFit,
+    rows: IntArray,
+) -> Unknowns:
     use = np.zeros(len(equation), dtype=bool)
     use[rows] = True
     return refine(equation, fit.at, fit.weights, use)

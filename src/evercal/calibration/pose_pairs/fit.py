@@ -111,7 +111,11 @@ def agreement(equation: PoseEquation, start: Unknowns) -> Agreement:
             break
     # The median of few poses is uncertain, so an inlier may have a large distance.
     gross = _GROSS * (1 + _GROSS / max(n - 3, 1) ** 2)
-    return Agreement(at, *sigma.tolist(), inliers=distance2 < gross)
+    return Agreement(
+        at,
+        *sigma.tolist(),
+        inliers=distance2 < gross,
+    )
 
 
 def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
@@ -236,7 +240,11 @@ def _spreads(system: System) -> Array:
     return np.stack([part @ part.transpose(0, 2, 1) for part in directions])
 
 
-def ellipsoid_factor(covariance: Array, slopes: Array, uncertainty: Array) -> float:
+def ellipsoid_factor(
+    covariance: Array,
+    slopes: Array,
+    uncertainty: Array,
+) -> float:
     """Return the factor on a covariance (d, d) for its chi-square quantile of 95 % to cover 95 %.
 
     Squared distances by an estimated covariance follow an F distribution. A variance with nu
@@ -315,7 +323,11 @@ def _result(
     return HandEyeFit(
         at=at,
         covariance=covariance,
-        factor=ellipsoid_factor(covariance[:6, :6], slopes, levels.uncertainty),
+        factor=ellipsoid_factor(
+            covariance[:6, :6],
+            slopes,
+            levels.uncertainty,
+        ),
         inliers=use,
         residual=system.residual,
         distance2=_distances(system, noise, covariance, use),

@@ -101,7 +101,11 @@ def require_agreement(
         readings += other_conventions(pairs, mount, every=fails)
     _refuse_better(readings, fit, scale_known)
     if not fails and not own_camera:
-        _require_plausible(Reading("", pairs, mount), fit, scale_known)
+        _require_plausible(
+            Reading("", pairs, mount),
+            fit,
+            scale_known,
+        )
     small = fit.metres < _HOPELESS_M and fit.radians < _HOPELESS_RAD
     if small and fit.inliers.mean() >= 0.5:
         return
@@ -118,7 +122,11 @@ def _fails(fit: Agreement) -> bool:
     return bool(fit.metres > _MAX_METRES or fit.radians > _MAX_RADIANS or few)
 
 
-def _refuse_better(readings: list[Reading], fit: Agreement, scale_known: bool) -> None:
+def _refuse_better(
+    readings: list[Reading],
+    fit: Agreement,
+    scale_known: bool,
+) -> None:
     """Raise InputError for the most plausible of the readings that make the pairs agree best."""
     better = []
     for reading in readings:
@@ -140,7 +148,11 @@ def _refuse_better(readings: list[Reading], fit: Agreement, scale_known: bool) -
     )
 
 
-def _require_plausible(given: Reading, fit: Agreement, scale_known: bool) -> None:
+def _require_plausible(
+    given: Reading,
+    fit: Agreement,
+    scale_known: bool,
+) -> None:
     """Refuse pairs that agree, but whose geometry fits another reading far better."""
     board = given.pairs.camera_from_board.translation_m
     rays = board / np.linalg.norm(board, axis=1)[:, None].clip(1e-9)
@@ -197,7 +209,11 @@ def _plausibility(reading: Reading, fit: Agreement) -> float:
     return float(_IMAGES * directions.mean() - 0.5 * (deviations**2).sum())
 
 
-def _require_unit(pairs: PosePairs, mount: MountName, fit: Agreement) -> None:
+def _require_unit(
+    pairs: PosePairs,
+    mount: MountName,
+    fit: Agreement,
+) -> None:
     """Refuse camera lengths in another unit than the robot's."""
     free, scale = quick_fit(pairs, mount, False)
     if free.metres * _BETTER > fit.metres or free.radians > 1.5 * fit.radians + 1e-4:

@@ -190,8 +190,18 @@ def _read(files: PairFiles, role: Literal["robot", "camera"]) -> _Poses:
         stamps = times_in_names(table.names)
     numbers = None
     if table.numbers is not None and used is not None:
-        numbers = PoseNumbers(table.numbers, used, camera_from=role == "camera")
-    return _Poses(table.names, stamps, poses, np.ones(len(poses), dtype=bool), numbers)
+        numbers = PoseNumbers(
+            table.numbers,
+            used,
+            camera_from=role == "camera",
+        )
+    return _Poses(
+        table.names,
+        stamps,
+        poses,
+        np.ones(len(poses), dtype=bool),
+        numbers,
+    )
 
 
 def _read_board_file(path: Path, inverted: bool) -> _Poses:
@@ -207,7 +217,13 @@ def _read_board_file(path: Path, inverted: bool) -> _Poses:
     if inverted:
         poses = poses.inverse()
     board = replace(board, images=tuple(images))
-    return _Poses(names, times_in_names(names), poses, measured, board=board)
+    return _Poses(
+        names,
+        times_in_names(names),
+        poses,
+        measured,
+        board=board,
+    )
 
 
 def _inverted(convention: PoseConvention) -> PoseConvention:

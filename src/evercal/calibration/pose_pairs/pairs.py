@@ -142,7 +142,11 @@ class PosePairs:
         moved = SE3(camera.rotation_wxyz, scale * camera.translation_m)
         return replace(self, camera_from_board=moved)
 
-    def equation(self, mount: MountName, extras: Extras) -> PoseEquation:
+    def equation(
+        self,
+        mount: MountName,
+        extras: Extras,
+    ) -> PoseEquation:
         """Return the equation; the board is fixed in the base for a camera on the arm."""
         mounted = mount_named(mount)
         robot = self.base_from_gripper
@@ -214,7 +218,11 @@ class BoardCorners:
             turned.append(replace(view, points_m=points))
         return turned
 
-    def without_strays(self, names: Sequence[str], poses: Sequence[BoardPose]) -> Self:
+    def without_strays(
+        self,
+        names: Sequence[str],
+        poses: Sequence[BoardPose],
+    ) -> Self:
         """Leave out corners that leave their neighbours by many sigma."""
         views = []
         left_out = list(self.left_out)
@@ -223,7 +231,11 @@ class BoardCorners:
             for x, y in view.pixels[mask]:
                 left_out.append(f"{name} {x:.0f} {y:.0f}")
             views.append(view[~mask])
-        return replace(self, views=tuple(views), left_out=tuple(left_out))
+        return replace(
+            self,
+            views=tuple(views),
+            left_out=tuple(left_out),
+        )
 
     @property
     def prior(self) -> LensPrior:
@@ -252,7 +264,11 @@ class Measured(NamedTuple):
             camera_covariance=self.sigma_px**2 * np.stack(covariances),
         )
 
-    def extras(self, prior: LensPrior, accepted: BoolArray) -> Extras:
+    def extras(
+        self,
+        prior: LensPrior,
+        accepted: BoolArray,
+    ) -> Extras:
         """Return intrinsics and bend as unknowns; corners of `accepted` (n,) are in their prior."""
         poses = [self.poses[row] for row in np.flatnonzero(accepted)]
         change, information = lens_estimate(

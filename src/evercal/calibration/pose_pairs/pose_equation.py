@@ -72,9 +72,20 @@ class Extras:
     @classmethod
     def nothing(cls, n: int) -> Self:
         """No extras of n poses."""
-        return cls((), (), np.zeros((n, 6, 0)), np.zeros((0, 0)), np.zeros(0))
+        return cls(
+            (),
+            (),
+            np.zeros((n, 6, 0)),
+            np.zeros((0, 0)),
+            np.zeros(0),
+        )
 
-    def with_one(self, name: str, slopes: Array, sigma: float) -> Self:
+    def with_one(
+        self,
+        name: str,
+        slopes: Array,
+        sigma: float,
+    ) -> Self:
         """Add an unknown with slopes (n, 6), mean 0 and a standard deviation, which may be inf."""
         information = np.pad(self.information, (0, 1))
         information[-1, -1] = sigma**-2.0

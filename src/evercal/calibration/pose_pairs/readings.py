@@ -95,7 +95,13 @@ def readings_by(
     for message, change in changes.items():
         poses = change(pairs.base_from_gripper, pairs.camera_from_board)
         read = PosePairs(pairs.names, *poses)
-        readings.append(Reading(message.format(other=other), read, mount))
+        readings.append(
+            Reading(
+                message.format(other=other),
+                read,
+                mount,
+            )
+        )
     return readings
 
 
@@ -115,7 +121,11 @@ def shifted(pairs: PosePairs, mount: MountName) -> list[Reading]:
         else:
             k = _extra_row(camera, robot)
             camera_rows = np.delete(rows, k)
-        read = PosePairs(pairs.names[:-1], robot[robot_rows], camera[camera_rows])
+        read = PosePairs(
+            pairs.names[:-1],
+            robot[robot_rows],
+            camera[camera_rows],
+        )
         message = _SHIFTED.format(pairs.names[k], role)
         readings.append(Reading(message, read, mount))
     return readings
@@ -137,13 +147,22 @@ def _steps_rad(poses: SE3) -> Array:
     return pose_distance(poses[:-1], poses[1:])[1]
 
 
-def other_conventions(pairs: PosePairs, mount: MountName, every: bool) -> list[Reading]:
+def other_conventions(
+    pairs: PosePairs,
+    mount: MountName,
+    every: bool,
+) -> list[Reading]:
     """Return the pairs in other conventions of one file: `every`, or those that agree better."""
     robot = pairs.base_from_gripper
     camera = pairs.camera_from_board
     readings: list[Reading] = []
 
-    def read(role: str, field: str, numbers: PoseNumbers | None, other: SE3) -> None:
+    def read(
+        role: str,
+        field: str,
+        numbers: PoseNumbers | None,
+        other: SE3,
+    ) -> None:
         if numbers is None:  # its file leaves no choice
             return
         for names, poses in _reread(numbers):

@@ -60,7 +60,11 @@ class _Step(NamedTuple):
     """Its covariance."""
 
 
-def find_slip(equation: PoseEquation, fit: HandEyeFit, rows: IntArray) -> Slip | None:
+def find_slip(
+    equation: PoseEquation,
+    fit: HandEyeFit,
+    rows: IntArray,
+) -> Slip | None:
     """Return the step that explains the residuals best, if noise would not be explained as well.
 
     Args:
@@ -69,8 +73,18 @@ def find_slip(equation: PoseEquation, fit: HandEyeFit, rows: IntArray) -> Slip |
         rows: (n,) indices of the pose pairs, which are in the order of time.
     """
     order = np.argsort(rows)
-    steps = _steps(equation, fit, order, np.ones(len(order), dtype=bool))
-    steps += _steps(equation, fit, order, fit.inliers[order])
+    steps = _steps(
+        equation,
+        fit,
+        order,
+        np.ones(len(order), dtype=bool),
+    )
+    steps += _steps(
+        equation,
+        fit,
+        order,
+        fit.inliers[order],
+    )
     best = {}
     for step in sorted(steps, key=lambda step: step.cost):
         best.setdefault(step.what, step)
@@ -93,7 +107,13 @@ def find_slip(equation: PoseEquation, fit: HandEyeFit, rows: IntArray) -> Slip |
     after[first : first + 6, -6:] = np.eye(6)
     spread = (before @ second @ before.T + after @ second @ after.T) / 2
     row = int(rows[order[step.place]])
-    return Slip(row, what, float(metres), float(radians), spread)
+    return Slip(
+        row,
+        what,
+        float(metres),
+        float(radians),
+        spread,
+    )
 
 
 def _steps(
@@ -132,7 +152,15 @@ def _steps(
             change = -covariance @ np.r_[gradient, pulls[k]]
             moved = residual + jacobian @ change[:-6]
             moved[k:] += by_step[k:] @ change[-6:]
-            steps.append(_Step(_cost(moved), what, k, change, covariance))
+            steps.append(
+                _Step(
+                    _cost(moved),
+                    what,
+                    k,
+                    change,
+                    covariance,
+                )
+            )
     return steps
 
 

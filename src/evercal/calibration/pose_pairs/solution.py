@@ -71,7 +71,11 @@ class PairSolution:
         if self.lens is None:
             return None
         change = self.fit.at.extras[self.equation.extras.indices("intrinsics")]
-        return moved_lens(self.lens.camera, self.lens.bend, change)[0]
+        return moved_lens(
+            self.lens.camera,
+            self.lens.bend,
+            change,
+        )[0]
 
     @property
     def fixed_from_board(self) -> SE3:

@@ -98,7 +98,13 @@ def solve_pose_pairs(
     rows, first = pairs.distinct(scale_known)
     start, scale = quick_fit(pairs[rows], mount, scale_known)
     own_camera = corners is not None or not of_board
-    require_agreement(pairs[np.sort(rows)], mount, scale_known, start, own_camera)
+    require_agreement(
+        pairs[np.sort(rows)],
+        mount,
+        scale_known,
+        start,
+        own_camera,
+    )
     lens = None
     if corners is not None:
         lens = measured(corners, corners.camera, pairs.camera_from_board)
@@ -106,7 +112,12 @@ def solve_pose_pairs(
         lens = measured(corners, corners.camera, pairs.camera_from_board)
         pairs = lens.applied_to(pairs)
         start, scale = quick_fit(pairs[rows], mount, scale_known)
-        predicted = _predicted(pairs[rows], mount, start.at, scale)
+        predicted = _predicted(
+            pairs[rows],
+            mount,
+            start.at,
+            scale,
+        )
         outliers = ~start.inliers
         corners, poses = _other_board_poses(corners, lens, rows, outliers, predicted)
         lens = measured(corners, corners.camera, poses)
@@ -120,11 +131,22 @@ def solve_pose_pairs(
     slip = find_slip(equation, fit, rows)
     if slip is not None:
         fit = replace(fit, covariance=fit.covariance + slip.spread)
-        warnings.append(_slip_warning(slip, pairs.names[slip.row], of_board))
+        warnings.append(
+            _slip_warning(
+                slip,
+                pairs.names[slip.row],
+                of_board,
+            )
+        )
     warnings += _lens_warnings(fit, equation, corners, lens)
     if of_board:
         warnings += _mount_warnings(fit.at, mount)
-    _require_determined(pairs[rows[fit.inliers]], fit, equation, scale_known)
+    _require_determined(
+        pairs[rows[fit.inliers]],
+        fit,
+        equation,
+        scale_known,
+    )
     return PairSolution(
         pairs=pairs,
         rows=rows,
@@ -139,7 +161,12 @@ def solve_pose_pairs(
     )
 
 
-def _predicted(pairs: PosePairs, mount: MountName, at: Unknowns, scale: float) -> SE3:
+def _predicted(
+    pairs: PosePairs,
+    mount: MountName,
+    at: Unknowns,
+    scale: float,
+) -> SE3:
     """Return (n,) board poses by the robot's poses, in units of the camera poses."""
     fixed_from_parent = mount_named(mount).scene_from_parent(pairs.base_from_gripper)
     fixed_from_camera = fixed_from_parent @ at.parent_from_camera
@@ -147,7 +174,11 @@ def _predicted(pairs: PosePairs, mount: MountName, at: Unknowns, scale: float) -
     return SE3(predicted.rotation_wxyz, predicted.translation_m / scale)
 
 
-def _slip_warning(slip: Slip, name: str, of_board: bool) -> str:
+def _slip_warning(
+    slip: Slip,
+    name: str,
+    of_board: bool,
+) -> str:
     what = slip.what
     if not of_board:
         what = what.replace("board", "map")

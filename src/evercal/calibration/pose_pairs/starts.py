@@ -56,7 +56,12 @@ def consensus_start(equation: PoseEquation, scale_known: bool = True) -> Start:
     second = np.stack([b, c, c], 1)
     samples = _solve_motions(equation, first, second, scale_known)
     i, j = np.triu_indices(len(scored), 1)
-    whole = _solve_motions(scored, i[None], j[None], scale_known)
+    whole = _solve_motions(
+        scored,
+        i[None],
+        j[None],
+        scale_known,
+    )
     rotations = np.concatenate([samples.rotations, whole.rotations])
     shifts = np.concatenate([samples.translations, whole.translations])
     scales = np.concatenate([samples.scales, whole.scales])
@@ -124,7 +129,11 @@ def _solve_motions(
         system = np.concatenate([system, -(rotated / unit)[..., None]], -1)
         solution = _least_squares(system, right_side)
         scales = solution[:, 3] / unit[:, 0, 0]
-    return _Hypotheses(rotations, solution[:, :3], scales)
+    return _Hypotheses(
+        rotations,
+        solution[:, :3],
+        scales,
+    )
 
 
 def _least_squares(system: Array, right_side: Array) -> Array:

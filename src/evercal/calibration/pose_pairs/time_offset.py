@@ -135,7 +135,11 @@ def _pairs_at(
     return pairs, overlapping
 
 
-def _coarse_offset(robot: PoseTrack, camera: CameraTrack, largest_s: float) -> float:
+def _coarse_offset(
+    robot: PoseTrack,
+    camera: CameraTrack,
+    largest_s: float,
+) -> float:
     """Return the offset on a grid at which robot and camera rotate by the same angles."""
     order = np.argsort(camera.stamps_s)
     stamps = np.asarray(camera.stamps_s[order], dtype=np.float64)
