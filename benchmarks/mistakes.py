@@ -11,8 +11,7 @@ import numpy as np
 from scipy.stats import chi2
 from tqdm import tqdm
 
-from benchmarks.hand_eye import Setting, shaken
-from benchmarks.hand_eye_boards import (
+from benchmarks.board_recordings import (
     BoardRecording,
     BoardSetting,
     board_points,
@@ -21,6 +20,7 @@ from benchmarks.hand_eye_boards import (
     project,
     record,
 )
+from benchmarks.hand_eye import Setting, shaken
 from benchmarks.rows import Row, once, save
 from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PoseNumbers, PosePairs
