@@ -60,7 +60,7 @@ def test_measured_rotations_agree_with_true_poses(bedroom: tuple[Frame, ...]) ->
     assert np.rad2deg(np.median(off.magnitude())) < 1.0
     assert (
         np.rad2deg(np.median(np.linalg.norm(measured, axis=1)))
-        > pose_evidence.LEAST_DEG
+        > pose_evidence.MIN_ROTATION_DEG
     )
 
 

@@ -17,24 +17,38 @@ from evercal.geometry import SE3
 from evercal.recordings.frame import Frame
 from evercal.typing import Array, Float32Array
 
-PAIRS = 16  # number of image pairs that are compared
-LEAST_PAIRS = 6  # matched pairs below which there is no verdict
-LEAST_DEG = 5.0
-BEST_DEG = 12.0  # smallest and best stated rotation between the images of a pair
-MOST_FRAMES_APART = 30  # largest distance between the images of a pair, frames
-LEAST_MATCHES = (
-    40  # feature matches, and inliers of them, below which a pair is dropped
-)
-LONG_SIDE = 640  # longer side of the images that are matched, pixels
-AGREE_DEG = 2.0  # difference up to which rotations agree
-STILL_DEG = 1.0  # median measured rotation below which the images stand still
-BETTER = 3.0  # factor by which another reading must fit better to be named
-CLOSE_DEG = 0.5  # margin within which further readings are named with the best
-# Stricter for grippers: the free fixed rotation lets wrong readings fit better.
+PAIRS = 16
+"""Image pairs that are compared."""
+MIN_PAIRS = 6
+"""Matched pairs below which there is no verdict."""
+MIN_ROTATION_DEG = 5.0
+"""Smallest stated rotation between the images of a pair, degrees."""
+BEST_ROTATION_DEG = 12.0
+"""Stated rotation of the other half of the pairs, as far as frames have it, degrees."""
+MAX_FRAMES_APART = 30
+"""Largest distance between the images of a pair, frames."""
+MIN_MATCHES = 40
+"""Feature matches, and inliers of them, below which a pair is dropped."""
+RATIO = 0.75
+"""Largest ratio of the distances of the nearest descriptors (Lowe's test)."""
+EPIPOLAR_PX = 1.5
+"""Distance of inliers from their epipolar lines, pixels of the reduced image."""
+LONG_SIDE = 640
+"""Longer side of the images that are matched, pixels."""
+AGREE_DEG = 2.0
+"""Median difference up to which stated and measured rotations agree, degrees."""
+STILL_DEG = 1.0
+"""Median measured rotation below which the images stand still, degrees."""
+BETTER = 3.0
+"""Factor by which the error of another reading must be smaller to be named."""
+CLOSE_DEG = 0.5
+"""Further readings are named within this of the smallest error, degrees."""
 GRIPPER_AGREE_DEG = 1.0
+"""`AGREE_DEG` of grippers: their free fixed rotation lets wrong readings fit better."""
 GRIPPER_BETTER = 2.0
-# OpenGL's camera axes (right, up, backward) from OpenCV's (right, down, forward).
+"""`BETTER` of grippers."""
 _GL = Rotation.from_euler("x", 180, degrees=True)
+"""OpenGL's camera axes (right, up, backward) from OpenCV's (right, down, forward)."""
 
 
 def rotation_warnings(
@@ -45,28 +59,29 @@ def rotation_warnings(
     (n,) frames are in recorded order, (n,) poses base_from_camera or else base_from_gripper.
     """
     pairs, measured = measured_pairs(frames, poses)
-    if len(measured) < LEAST_PAIRS:
+    if len(measured) < MIN_PAIRS:
         return []
-    owner = "camera" if of_camera else "gripper"
-    if (
-        not of_camera
-        and np.rad2deg(np.median(np.linalg.norm(measured, axis=1))) < STILL_DEG
-    ):
-        return [
-            "the gripper rotates and the images hardly do; does the camera stand still, or are the"
-            " angles in another unit than stated?"
-        ]
+    owner = "camera"
+    error_of = _error_deg
+    better = BETTER
+    if not of_camera:
+        angles = np.linalg.norm(measured, axis=1)
+        if np.rad2deg(np.median(angles)) < STILL_DEG:
+            return [
+                "the gripper rotates and the images hardly do; does the camera stand still, or are"
+                " the angles in another unit than stated?"
+            ]
+        owner = "gripper"
+        error_of = _fitted_error_deg  # a fixed rotation to the camera is not known
+        better = GRIPPER_BETTER
     stated, readings = _readings(poses, pairs, of_camera)
-    # Between gripper and camera is a fixed rotation that is not known.
-    error_of, better = (
-        (_error_deg, BETTER) if of_camera else (_fitted_error_deg, GRIPPER_BETTER)
-    )
     error = error_of(measured, stated)
-    errors = {
-        reading: error_of(measured, vectors) for reading, vectors in readings.items()
-    }
+    errors = {}
+    for reading, vectors in readings.items():
+        errors[reading] = error_of(measured, vectors)
     improved = min(errors.values()) < error / better
-    if error < (AGREE_DEG if of_camera or not improved else GRIPPER_AGREE_DEG):
+    agree = GRIPPER_AGREE_DEG if improved and not of_camera else AGREE_DEG
+    if error < agree:
         return []
     if of_camera and not improved:
         fitted = _fitted_error_deg(measured, stated)
@@ -77,7 +92,7 @@ def rotation_warnings(
     )
     least = min(errors.values())
     if least < min(AGREE_DEG, error / better):
-        fitting = [reading for reading, e in errors.items() if e < least + CLOSE_DEG]
+        fitting = [r for r in errors if errors[r] < least + CLOSE_DEG]
         return [
             f"{problem}; the poses fit ({least:.1f} deg) if they are {', or '.join(fitting)}"
         ]
@@ -91,56 +106,62 @@ def _readings(
     poses: SE3, pairs: NDArray[np.intp], of_camera: bool
 ) -> tuple[Array, dict[str, Array]]:
     """(n, 3) rotation vectors first_from_second of pairs as stated, and in other readings."""
-    first, second = pairs.T
-    rotation = poses.rotation
-    swapped = Rotation.from_quat(poses.rotation_wxyz)
-    stated = (rotation[first].inv() * rotation[second]).as_rotvec()
-    inverse = (rotation[first] * rotation[second].inv()).as_rotvec()
-    readings = {
-        f"{'camera' if of_camera else 'gripper'}_from_base, the inverse": inverse
-    }
+    first_frames, second_frames = pairs.T
+    first = poses[first_frames].rotation
+    second = poses[second_frames].rotation
+    stated = (first.inv() * second).as_rotvec()
+    inverse = (first * second.inv()).as_rotvec()
+    readings = {}
     if of_camera:
+        readings["camera_from_base, the inverse"] = inverse
         readings["with OpenGL's camera axes (right, up, backward)"] = _GL.apply(stated)
         readings["the inverse with OpenGL's camera axes"] = _GL.apply(inverse)
-    another_order = (swapped[first].inv() * swapped[second]).as_rotvec()
-    return stated, readings | {"with quaternions in another order": another_order}
+    else:
+        readings["gripper_from_base, the inverse"] = inverse
+    swapped = Rotation.from_quat(poses.rotation_wxyz)
+    first = swapped[first_frames]
+    second = swapped[second_frames]
+    readings["with quaternions in another order"] = (first.inv() * second).as_rotvec()
+    return stated, readings
 
 
 def measured_pairs(
     frames: Sequence[Frame], poses: SE3
 ) -> tuple[NDArray[np.intp], Array]:
     """(n, 2) frames of the pairs that match, and (n, 3) `measured_rotation` of each."""
-    measured = [
-        ((i, j), measured_rotation(frames[i], frames[j])) for i, j in _pairs(poses)
-    ]
-    pairs = [pair for pair, vector in measured if vector is not None]
-    vectors = [vector for _, vector in measured if vector is not None]
+    pairs = []
+    vectors = []
+    for first, second in _pairs(poses):
+        vector = measured_rotation(frames[first], frames[second])
+        if vector is not None:
+            pairs.append((first, second))
+            vectors.append(vector)
     return np.array(pairs, np.intp).reshape(-1, 2), np.array(vectors)
 
 
 def measured_rotation(first: Frame, second: Frame) -> Array | None:
     """(3,) rotation vector first_from_second in radians; None if there are too few matches."""
-    features = [_features(frame) for frame in (first, second)]
-    if min(len(rays) for rays, _ in features) < LEAST_MATCHES:
+    first_rays, first_descriptors = _features(first)
+    second_rays, second_descriptors = _features(second)
+    if min(len(first_rays), len(second_rays)) < MIN_MATCHES:
         return None
-    neighbours = cv2.BFMatcher(cv2.NORM_L2).knnMatch(
-        features[0][1], features[1][1], k=2
-    )
-    matches = [
-        m[0] for m in neighbours if len(m) == 2 and m[0].distance < 0.75 * m[1].distance
-    ]
-    if len(matches) < LEAST_MATCHES:
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    rows = []
+    for nearest, *others in matcher.knnMatch(first_descriptors, second_descriptors, 2):
+        if others and nearest.distance < RATIO * others[0].distance:
+            rows.append((nearest.queryIdx, nearest.trainIdx))
+    if len(rows) < MIN_MATCHES:
         return None
-    a = features[0][0][[m.queryIdx for m in matches]]
-    b = features[1][0][[m.trainIdx for m in matches]]
-    threshold = 1.5 / (
-        first.camera.fx * min(1.0, LONG_SIDE / max(first.camera.width, 1))
-    )
+    first_rows, second_rows = np.transpose(rows)
+    a = first_rays[first_rows]
+    b = second_rays[second_rows]
+    scale = min(1.0, LONG_SIDE / max(first.camera.width, 1))
+    threshold = EPIPOLAR_PX / (first.camera.fx * scale)
     cv2.setRNGSeed(0)
     matrix, inliers = cv2.findEssentialMat(
         a, b, np.eye(3), cv2.RANSAC, 0.999, threshold
     )
-    if matrix is None or matrix.shape != (3, 3) or int(inliers.sum()) < LEAST_MATCHES:
+    if matrix is None or matrix.shape != (3, 3) or int(inliers.sum()) < MIN_MATCHES:
         return None
     _, second_from_first, _, _ = cv2.recoverPose(matrix, a, b, np.eye(3), mask=inliers)
     return Rotation.from_matrix(second_from_first).inv().as_rotvec()
@@ -152,12 +173,9 @@ def _features(frame: Frame) -> tuple[Array, Float32Array]:
     camera = frame.camera
     scale = LONG_SIDE / max(camera.width, camera.height)
     if scale < 1:
-        camera = camera.resized(
-            round(camera.width * scale), round(camera.height * scale)
-        )
-        image = cv2.resize(
-            image, (camera.width, camera.height), interpolation=cv2.INTER_AREA
-        )
+        size = (round(camera.width * scale), round(camera.height * scale))
+        camera = camera.resized(*size)
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     sift = cv2.SIFT_create(1500)  # pyright: ignore[reportAttributeAccessIssue]
     points, descriptors = sift.detectAndCompute(image, None)
     if descriptors is None:
@@ -177,19 +195,19 @@ def _pairs(poses: SE3) -> list[tuple[int, int]]:
     pairs = []
     firsts = np.unique(np.linspace(0, len(poses) - 2, PAIRS).round().astype(int))
     for i, first in enumerate(firsts):
-        later = np.arange(first + 1, min(first + 1 + MOST_FRAMES_APART, len(poses)))
+        later = np.arange(first + 1, min(first + 1 + MAX_FRAMES_APART, len(poses)))
         degrees = np.rad2deg((rotation[first].inv() * rotation[later]).magnitude())
-        best = (
-            np.argmin(np.abs(degrees - BEST_DEG))
-            if i % 2
-            else np.argmax(degrees > LEAST_DEG)
-        )
-        if degrees[best] > LEAST_DEG:
+        if i % 2:
+            best = np.argmin(np.abs(degrees - BEST_ROTATION_DEG))
+        else:
+            best = np.argmax(degrees > MIN_ROTATION_DEG)
+        if degrees[best] > MIN_ROTATION_DEG:
             pairs.append((int(first), int(later[best])))
     return pairs
 
 
 def _error_deg(measured: Array, stated: Array) -> float:
+    """Median angle between (n, 3) rotation vectors, degrees."""
     difference = Rotation.from_rotvec(measured).inv() * Rotation.from_rotvec(stated)
     return float(np.rad2deg(np.median(difference.magnitude())))
 
@@ -197,9 +215,11 @@ def _error_deg(measured: Array, stated: Array) -> float:
 def _fitted_error_deg(measured: Array, stated: Array) -> float:
     """Median angle after the best fixed rotation between the two frames, degrees."""
     weights = np.ones(len(measured))
-    rotation = Rotation.identity()
+    rotated = stated
     for _ in range(5):  # iterative reweighting against outliers
-        rotation = Rotation.align_vectors(measured, stated, weights)[0]
-        distance = np.linalg.norm(rotation.apply(stated) - measured, axis=1)
-        weights = 1 / (1 + (distance / max(float(np.median(distance)), 1e-6)) ** 2)
-    return _error_deg(measured, rotation.apply(stated))
+        rotation, *_ = Rotation.align_vectors(measured, stated, weights)
+        rotated = rotation.apply(stated)
+        distance = np.linalg.norm(rotated - measured, axis=1)
+        scale = max(float(np.median(distance)), 1e-6)
+        weights = 1 / (1 + (distance / scale) ** 2)
+    return _error_deg(measured, rotated)
