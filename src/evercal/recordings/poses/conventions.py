@@ -125,10 +125,20 @@ _CONVENTIONS = (
 CONVENTIONS = {convention.name: convention for convention in _CONVENTIONS}
 """All conventions by name, without modifiers."""
 VENDORS = {
-    "mitsubishi": "yaskawa", "denso": "yaskawa", "techman": "yaskawa", "jaka": "yaskawa",
-    "dobot": "yaskawa", "aubo": "yaskawa", "xarm": "yaskawa", "epson": "kuka", "nachi": "kuka",
-    "doosan": "kawasaki", "comau": "kawasaki", "universal_robots": "ur", "motoman": "yaskawa",
-}  # fmt: skip
+    "mitsubishi": "yaskawa",
+    "denso": "yaskawa",
+    "techman": "yaskawa",
+    "jaka": "yaskawa",
+    "dobot": "yaskawa",
+    "aubo": "yaskawa",
+    "xarm": "yaskawa",
+    "epson": "kuka",
+    "nachi": "kuka",
+    "doosan": "kawasaki",
+    "comau": "kawasaki",
+    "universal_robots": "ur",
+    "motoman": "yaskawa",
+}
 """Conventions of further vendors, whose units are millimetres and degrees."""
 KNOWN_CONVENTIONS = (
     f"{', '.join([*CONVENTIONS, *VENDORS])}, fixed_xyz or moving_zyx with any order of axes,"
@@ -144,9 +154,11 @@ for _first, _second, _third in product("xyz", repeat=3):
         )
         CONVENTIONS |= {_fixed.name: _fixed, _moving.name: _moving}
 UNITS: dict[str, dict[str, Any]] = {
-    "m": {"metres_per_unit": 1.0}, "mm": {"metres_per_unit": 0.001},
-    "rad": {"degrees": False}, "deg": {"degrees": True},
-}  # fmt: skip
+    "m": {"metres_per_unit": 1.0},
+    "mm": {"metres_per_unit": 0.001},
+    "rad": {"degrees": False},
+    "deg": {"degrees": True},
+}
 """What a unit changes of a convention."""
 
 

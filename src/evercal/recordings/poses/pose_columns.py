@@ -106,9 +106,13 @@ _ORDERS = ("abb", "wxyz", "xyzw", "tum")
 _Q = "q,q_,quat,quat_,quaternion_,orientation_,rotation_,q_rs_"
 _R = "r,r_,rot_,rotation_"
 HEADERS = {
-    "position": ColumnGroup(",t,t_,p,p_,pos_,position_,translation_,tvec_,p_rs_r_", "xyz"),
+    "position": ColumnGroup(
+        ",t,t_,p,p_,pos_,position_,translation_,tvec_,p_rs_r_", "xyz"
+    ),
     "quaternion": ColumnGroup(_Q, "wxyz", ("wxyz", *_ORDERS), axes="wxyz"),
-    "rotation vector": ColumnGroup("rotvec_,rvec_,rotation_vector_", "xyz", ("ur",), axes="-"),
+    "rotation vector": ColumnGroup(
+        "rotvec_,rvec_,rotation_vector_", "xyz", ("ur",), axes="-"
+    ),
     "matrix": ColumnGroup("m", _GRID, ("matrix", "franka")),
     "3x4 matrix": ColumnGroup("m", _GRID[:12], ("matrix", "franka")),
     "O_T_EE": ColumnGroup("o_t_ee,o_t_ee_", _DOWN, ("matrix", "franka")),
@@ -120,19 +124,39 @@ HEADERS = {
     "q1 to q4": ColumnGroup(_Q, "1234", _ORDERS, "abb, wxyz or xyzw"),
     "q0 to q3": ColumnGroup(_Q, "0123", _ORDERS, "wxyz or xyzw"),
     "angles": ColumnGroup(
-        _R, "xyz", _ANGLES, "ur (rotation vector), yaskawa, staubli, fanuc or rpy", "xyz"
+        _R,
+        "xyz",
+        _ANGLES,
+        "ur (rotation vector), yaskawa, staubli, fanuc or rpy",
+        "xyz",
     ),
     "roll pitch yaw": ColumnGroup(
-        "", ("roll", "pitch", "yaw"), ("rpy", "yaskawa", "staubli", "fanuc", "kuka"),
-        "rpy:rad or rpy:deg", "xyz",
+        "",
+        ("roll", "pitch", "yaw"),
+        ("rpy", "yaskawa", "staubli", "fanuc", "kuka"),
+        "rpy:rad or rpy:deg",
+        "xyz",
     ),
-    "A B C": ColumnGroup("", "abc", ("kuka",), "kuka (A about z) or mitsubishi (A about x)"),
+    "A B C": ColumnGroup(
+        "", "abc", ("kuka",), "kuka (A about z) or mitsubishi (A about x)"
+    ),
     "U V W": ColumnGroup("", "uvw", ("kuka",), "epson (U about z)"),
-}  # fmt: skip
+}
 """Columns of a position and of rotations; definite rotations come first."""
 _INDICES = (
-    "", "index", "idx", "id", "no", "nr", "i", "n", "number", "row", "pose", "sample",
-)  # fmt: skip
+    "",
+    "index",
+    "idx",
+    "id",
+    "no",
+    "nr",
+    "i",
+    "n",
+    "number",
+    "row",
+    "pose",
+    "sample",
+)
 """Columns that only count."""
 
 _Groups = dict[str, list[int]]

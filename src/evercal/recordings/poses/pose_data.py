@@ -53,8 +53,8 @@ _ROBOT = (
 )
 """Keys of the robot."""
 _ROLES = {
-    is_robot: re.compile(rf"(?:{words})(?:_(.+))?|(.+)_(?:{words})")
-    for is_robot, words in ((False, _CAMERA), (True, _ROBOT))
+    True: re.compile(rf"(?:{_ROBOT})(?:_(.+))?|(.+)_(?:{_ROBOT})"),
+    False: re.compile(rf"(?:{_CAMERA})(?:_(.+))?|(.+)_(?:{_CAMERA})"),
 }
 """Keys of the robot or of the camera, with the rest of the key after or before."""
 _INVERSE = re.compile("base2gripper|gripper_from_base|cam2target|board_from_camera")
@@ -66,7 +66,12 @@ _LISTS = {
     "xyz": ("x", "y", "z"),
     "rpy": ("roll", "pitch", "yaw"),
 }
-"""Columns of lists."""
+"""Columns of lists by key."""
+_QUATERNIONS = {
+    "wxyz": ("qw", "qx", "qy", "qz"),
+    "xyzw": ("qx", "qy", "qz", "qw"),
+}
+"""Columns of lists by the end of the key, such as quaternion_wxyz."""
 _STAMPS = (
     ("nanosec", "sec"),
     ("nsecs", "secs"),
@@ -90,7 +95,7 @@ def pose_data(data: Any, given: Given, robot: bool = True) -> PoseTable:
     data = _plain(data)
     if isinstance(data, Mapping):
         return _of_object(data, given, robot)
-    if not isinstance(data, list) or len({isinstance(v, Mapping) for v in data}) != 1:
+    if not isinstance(data, list) or len({*map(_is_object, data)}) != 1:
         raise ValueError(
             "poses are a list of objects, or of lists of numbers, not of both"
         )
@@ -108,8 +113,9 @@ def pose_data(data: Any, given: Given, robot: bool = True) -> PoseTable:
 def _of_objects(entries: list[Any], given: Given, robot: bool) -> PoseTable:
     """Poses of a list of one object for each."""
     # Messages of /tf.
-    if all(isinstance(entry.get("transforms"), list) for entry in entries):
-        entries = [*chain.from_iterable(entry["transforms"] for entry in entries)]
+    lists = [entry.get("transforms") for entry in entries]
+    if {*map(type, lists)} == {list}:
+        entries = [*chain(*lists)]
     rows = [*map(_flat, entries)]
     keys = dict.fromkeys(chain.from_iterable(rows))
     require_at_most(len(keys), "columns", "keys")
@@ -153,12 +159,17 @@ def _of_object(data: Columns, given: Given, robot: bool) -> PoseTable:
     if robot:
         _refuse_eye_on_base(data, given)
     columns = _of_role(data, given, robot)
-    shapes = {key: _shape(value) for key, value in columns.items()}
-    inner = [key for key in columns if key in _KEYS and len(shapes[key]) < 2]
+    inner = []
+    has_arrays = False
+    for key, value in columns.items():
+        is_array = len(_shape(value)) > 1
+        has_arrays |= is_array
+        if key in _KEYS and not is_array:
+            inner.append(key)
     if len(inner) == 1:
         table = pose_data(columns[inner[0]], given, robot)
         return _labelled(table, columns, plural=True)
-    if max(map(len, shapes.values()), default=0) > 1:
+    if has_arrays:
         table = _of_arrays(columns, given, plural=True)
         if table is not None:
             return table
@@ -169,7 +180,9 @@ def _of_object(data: Columns, given: Given, robot: bool) -> PoseTable:
         if isinstance(value, Mapping):
             value = [value[key] for key in sorted(value, key=natural_key)]
         lists.append(value)
-    if not has_position([*columns]) or not all(isinstance(v, list) for v in lists):
+        if not isinstance(value, list):
+            raise _unclear([], data)
+    if not has_position([*columns]):
         raise _unclear([], data)
     rows = []
     for values in zip(*lists, strict=True):
@@ -182,7 +195,8 @@ def _keys_of_images(data: Columns) -> list[str]:
     if all(key.lower().endswith(IMAGE_ENDINGS) for key in data):
         return [*data]
     words = {re.sub(r"\d+", "", key) for key in data}
-    if len(words) == 1 and words.isdisjoint(data):
+    is_numbered = len(words) == 1 and words.isdisjoint(data)
+    if is_numbered:
         return sorted(data, key=natural_key)
     return []
 
@@ -232,22 +246,29 @@ def _of_role(columns: Columns, given: Given, robot: bool) -> Columns:
 
 def _of_arrays(columns: Columns, given: Given, plural: bool) -> PoseTable | None:
     """Poses of a key that holds arrays, or of keys for rotations and translations."""
-    shapes = {key: _shape(value) for key, value in columns.items()}
-    keys = [key for key in columns if key in _KEYS and len(shapes[key]) > 1]
+    shapes = {}
+    keys = []
+    for key, value in columns.items():
+        shapes[key] = _shape(value)
+        if key in _KEYS and len(shapes[key]) > 1:
+            keys.append(key)
     pairs = []
     if not keys:
         keys = [key for key in columns if _are_poses(key, shapes[key], plural)]
         pairs = _rotations_with_translations(shapes, plural)
     if len(keys) + len(pairs) > 1:
-        raise _unclear(keys + [f"{r} with {t}" for r, t in pairs], columns)
+        raise _unclear([*keys, *map(" with ".join, pairs)], columns)
     labels = dict(columns)
     for key in chain(keys, *pairs):
         del labels[key]
     if pairs:
-        return _labelled(_composed(columns, *pairs[0], given), labels, plural)
-    if keys:
-        return _labelled(pose_data(columns[keys[0]], given), labels, plural)
-    return None
+        rotation, translation = pairs[0]
+        table = _composed(columns, rotation, translation, given)
+    elif keys:
+        table = pose_data(columns[keys[0]], given)
+    else:
+        return None
+    return _labelled(table, labels, plural)
 
 
 def _are_poses(key: str, shape: Shape, plural: bool) -> bool:
@@ -266,14 +287,17 @@ def _rotations_with_translations(
     translations = {}
     for key, shape in shapes.items():
         name = name_and_unit(key)[0]
-        rotation = _ROTATION.fullmatch(name)
-        if rotation and len(shape) > 1:
-            rotations[key] = rotation[1]
-        translation = _TRANSLATION.fullmatch(name)
-        if translation and (len(shape) > 1 or (plural and shape)):
-            translations[key] = translation[1]
-    pairs = product(rotations, translations)
-    return [(r, t) for r, t in pairs if rotations[r] == translations[t]]
+        match = _ROTATION.fullmatch(name)
+        if match and len(shape) > 1:
+            rotations[key] = match[1]
+        match = _TRANSLATION.fullmatch(name)
+        if match and (len(shape) > 1 or (plural and shape)):
+            translations[key] = match[1]
+    pairs = []
+    for rotation, translation in product(rotations, translations):
+        if rotations[rotation] == translations[translation]:
+            pairs.append((rotation, translation))
+    return pairs
 
 
 def _composed(
@@ -311,18 +335,26 @@ def _poses_first(array: Array, shapes: tuple[tuple[int, int], ...]) -> Array:
     """(n, rows, columns) matrices of an array that has the poses last, as in MATLAB."""
     if array.ndim != 3 or array.shape[:2] not in shapes:
         return array
-    block = array[..., :3, :3]
-    whole = np.abs(np.swapaxes(block, 1, 2) @ block - np.eye(3)).max() < 0.01
-    if whole and array.shape[1:] in shapes:
-        return array
+    if array.shape[1:] in shapes:
+        # Four matrices may lie along either axis: rotations are orthogonal along the right one.
+        block = array[..., :3, :3]
+        gram = np.swapaxes(block, 1, 2) @ block
+        error = np.abs(gram - np.eye(3)).max()
+        if error < 0.01:
+            return array
     return np.moveaxis(array, -1, 0)
 
 
 def _labelled(table: PoseTable, columns: Columns, plural: bool) -> PoseTable:
     """A table with the image names and stamps of the columns that hold one value a pose."""
-    lists = {key: value for key, value in columns.items() if len(_shape(value)) == 1}
+    keys = []
+    lists = []
+    for key, value in columns.items():
+        if len(_shape(value)) == 1:
+            keys.append(key)
+            lists.append(value)
     count = len(table.numbers)
-    names, stamps, _ = row_labels([*lists], [*lists.values()], count, plural)
+    names, stamps, _ = row_labels(keys, lists, count, plural)
     if table.stamps_s is not None:
         stamps = table.stamps_s
     return table._replace(names=table.names or names, stamps_s=stamps)
@@ -330,14 +362,21 @@ def _labelled(table: PoseTable, columns: Columns, plural: bool) -> PoseTable:
 
 def _plain(data: Any) -> Any:
     """Matrices of OpenCV and ViSP (rows, cols, data) as nested lists, and keys as text."""
-    if isinstance(data, Mapping) and {"rows", "cols", "data"} <= data.keys():
+    if isinstance(data, list):
+        if any(map(_is_object, data)):
+            return [*map(_plain, data)]
+        return data
+    if not _is_object(data):
+        return data
+    if {"rows", "cols", "data"} <= data.keys():
         numbers = number_array(data["data"], "data")
-        return numbers.reshape(data["rows"], data["cols"]).tolist()
-    if isinstance(data, Mapping):
-        return {str(key): _plain(value) for key, value in data.items()}
-    if isinstance(data, list) and any(isinstance(value, Mapping) for value in data):
-        return [*map(_plain, data)]
-    return data
+        matrix = numbers.reshape(data["rows"], data["cols"])
+        return matrix.tolist()
+    return {str(key): _plain(value) for key, value in data.items()}
+
+
+def _is_object(value: object) -> bool:
+    return isinstance(value, Mapping)
 
 
 def _flat(entry: Columns) -> dict[str, Any]:
@@ -360,16 +399,14 @@ def _cells(row: Columns) -> dict[str, object]:
     """One value a column: those of a list are columns of their own."""
     cells: dict[str, object] = {}
     for key, value in row.items():
-        names = [key]
-        values = [value]
-        if isinstance(value, list):
-            require_at_most(len(value), "columns", "numbers of one key")
-            names = [f"{key}_{i}" for i in range(len(value))]
-            values = value
-        order = key[-4:].lower()  # such as quaternion_wxyz
-        if order in ("wxyz", "xyzw"):
-            names = [f"q{axis}" for axis in order]
-        cells |= dict(zip(_LISTS.get(key, names), values, strict=False))
+        names = _LISTS.get(key) or _QUATERNIONS.get(key[-4:].lower())
+        values = value
+        if not isinstance(value, list):
+            values = [value]
+            names = names or [key]
+        require_at_most(len(values), "columns", "numbers of one key")
+        names = names or [f"{key}_{i}" for i in range(len(values))]
+        cells |= dict(zip(names, values, strict=False))
     return cells
 
 

@@ -21,11 +21,15 @@ _NOTATIONS = {
         "x_mm,y_mm,z_mm,qw,qx,qy,qz",
     ),
     "P[": (r"()\bP\[\d[^\[\]\n]*\]\s*\{([^{}]*)\}()", "X,Y,Z,W,P,R"),
-    "p[": (rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?p\[([^\[\]{{}}]*)\]()',
-           "x,y,z,rotvec_x,rotvec_y,rotvec_z"),
-    "{": (rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?\{{([^\[\]{{}}]*\bX\s+[-+.\d][^\[\]{{}}]*)\}}()',
-          "X,Y,Z,A,B,C"),
-}  # fmt: skip
+    "p[": (
+        rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?p\[([^\[\]{{}}]*)\]()',
+        "x,y,z,rotvec_x,rotvec_y,rotvec_z",
+    ),
+    "{": (
+        rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?\{{([^\[\]{{}}]*\bX\s+[-+.\d][^\[\]{{}}]*)\}}()',
+        "X,Y,Z,A,B,C",
+    ),
+}
 """By how it begins: a pose as a pattern of a name or stamp and two groups, and its columns.
 
 A word is read once, from its start."""

@@ -27,9 +27,20 @@ Cells = NDArray[np.object_]
 Names = tuple[str, ...] | None
 
 _NAMES = (
-    "image", "image_name", "image_file", "image_path", "img", "file", "filename", "file_name",
-    "file_path", "filepath", "path", "name", "frame",
-)  # fmt: skip
+    "image",
+    "image_name",
+    "image_file",
+    "image_path",
+    "img",
+    "file",
+    "filename",
+    "file_name",
+    "file_path",
+    "filepath",
+    "path",
+    "name",
+    "frame",
+)
 _STAMPS = ("stamp", "timestamp", "time_stamp", "time", "t")
 _UNIT = re.compile(
     r"(?<![\s_/])[\s_/]*[\s_/\[(]\s*(mm|cm|m|inch(?:es)?|(?:milli)?met(?:er|re)s?|deg(?:rees?)?"
