@@ -317,10 +317,12 @@ def _check_lengths(lengths: Array, convention: PoseConvention) -> None:
     near = (metres > 0) & (metres < _MIN_REACH_M) & (convention.metres_per_unit < 1.0)
     odd = far if far.any() else near
     usual = metres[~odd]
-    if odd.any() and len(usual) and 0.03 < np.median(usual) < 3.0:
-        poses = ", ".join((np.flatnonzero(odd)[:5] + 1).astype(str))
+    median = float(np.median(usual)) if len(usual) else 0.0
+    if odd.any() and 0.03 < median < 3.0:
+        numbers = np.flatnonzero(odd) + 1
+        poses = ", ".join(numbers[:5].astype(str))
         raise ValueError(
-            f"positions are {np.median(usual):.3g} m from the base, but those of poses {poses} are"
+            f"positions are {median:.3g} m from the base, but those of poses {poses} are"
             f" {metres[odd][0]:.3g} m; millimetres and metres may be mixed: write all in one unit"
         )
     problem = f"positions up to {metres.max(initial=0.0):.4g} m from the base look like"

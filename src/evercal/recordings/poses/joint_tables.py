@@ -99,7 +99,8 @@ def interpolate(
     valid = (stamps_s >= times[0]) & (stamps_s <= times[-1])
     if len(times) > 1:
         after, close = times_around(times, stamps_s)
-        valid &= close | (np.abs(values[after] - values[after - 1]) < _STILL_RAD)
+        motion = values[after] - values[after - 1]
+        valid &= close | (np.abs(motion) < _STILL_RAD)
     return np.interp(stamps_s, times, values), valid
 
 

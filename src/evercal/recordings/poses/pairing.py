@@ -92,7 +92,7 @@ def poses_of_images(
     """Read (n,) base_from_gripper of n images, with notes, for the commands with `--convention`."""
     rows = read_robot_poses(file, convention, option="--convention")
     paired, notes = pair_images(images, rows, None, file)
-    names = [image.name for image in images]
+    names = _names(images)
     poses = []
     missing = []
     for name, pose in zip(names, paired, strict=True):
@@ -122,7 +122,13 @@ def unpaired(images: Sequence[str], rows: Sequence[str], file: str) -> list[str]
 
 def _of_rows(values: Any, numbers: Sequence[int | None]) -> list[Any]:
     """Values of rows, and None for None."""
-    return [None if number is None else values[number] for number in numbers]
+    of_rows = []
+    for number in numbers:
+        value = None
+        if number is not None:
+            value = values[number]
+        of_rows.append(value)
+    return of_rows
 
 
 def _by_name(
@@ -130,7 +136,7 @@ def _by_name(
 ) -> tuple[list[int | None], list[str]]:
     """Number of each image's row, and notes."""
     keys = [PureWindowsPath(name).name for name in names]
-    files = [image.name for image in images]
+    files = _names(images)
     with named_errors(file, "poses"):
         refuse_repeated(keys, "give every image one row")
     # A table may omit the ending.
@@ -142,7 +148,10 @@ def _by_name(
         if _are_names(starts) and _are_names(key_starts):
             rows, unused = _rows_of_keys([*zip(starts)], key_starts)
     if len(unused) < len(keys):
-        alone = [name for name, row in zip(files, rows, strict=True) if row is None]
+        alone = []
+        for name, row in zip(files, rows, strict=True):
+            if row is None:
+                alone.append(name)
         return rows, unpaired(alone, unused, file.name)
     if same_numbers(names, files):
         note = f"paired by numbers: {names[0]} with {files[0]}, and so on"
@@ -167,12 +176,17 @@ def _rows_of_keys(
     return rows, [*unused]
 
 
+def _names(images: Sequence[Path]) -> list[str]:
+    return [image.name for image in images]
+
+
 def _start(name: str) -> str:
     return name.partition(".")[0]
 
 
 def _are_names(starts: Sequence[str]) -> bool:
-    return len({*starts}) == len(starts) and not is_number(starts[0])
+    is_unique = len({*starts}) == len(starts)
+    return is_unique and not is_number(starts[0])
 
 
 def _by_time(times: Array, track: PoseTrack, file: Path) -> Pairing:
@@ -206,7 +220,7 @@ def _image_times(
     if rows.stamps_s is None:
         return None
     if stamps_s is None:
-        return times_in_names([image.name for image in images])
+        return times_in_names(_names(images))
     times = []
     for image in images:
         time = stamps_s.get(image.name, stamps_s.get(image.stem))

@@ -27,6 +27,7 @@ from evercal.recordings.poses.row_files import (
     cell_numbers,
     in_unit,
     name_and_unit,
+    plain_names,
     row_labels,
 )
 from evercal.typing import Array
@@ -82,17 +83,19 @@ class ColumnGroup(NamedTuple):
         layout = convention.layout.lower()
         stated = convention.base in self.conventions
         if stated and layout == "columns":
-            return np.reshape(columns, (-1, 4)).T.ravel().tolist()
+            grid = np.reshape(columns, (-1, 4))
+            return grid.T.ravel().tolist()
         generic = convention.base.startswith(("fixed_", "moving_"))
-        if (stated or generic) and self.axes and sorted(layout) == sorted(self.axes):
+        same_axes = sorted(layout) == sorted(self.axes)
+        if same_axes and (stated or generic):
             return [columns[self.axes.index(axis)] for axis in layout]
         if stated:
             return columns
         # Letters without an axis are in the order of the convention that is stated.
         by_axis = self.axes and (self.axes != "xyz" or len(set(layout)) == 3)
-        if convention.has_angles and len(layout) == len(columns) and not by_axis:
-            return columns
-        return []
+        if by_axis or len(layout) != len(columns):
+            return []
+        return columns if convention.has_angles else []
 
 
 def _grid(digits: str) -> list[str]:
@@ -186,19 +189,21 @@ def named_numbers(words: Sequence[str], rows: Cells, given: Given) -> PoseTable:
     for key, group in groups.items():
         columns = columns or HEADERS[key].ordered(group, convention)
     if not groups:
-        others = [i for i in others if name_and_unit(words[i])[0] not in _INDICES]
+        plain = plain_names(words)
+        others = [i for i in others if plain[i] not in _INDICES]
         if not position and not convention.is_matrix:
             position = others[:3]
         columns = [i for i in others if i not in position]
-    convention = _in_units(convention, [words[i] for i in position], "m", "mm")
+    header = np.array(words, dtype=object)
+    convention = _in_units(convention, header[position].tolist(), "m", "mm")
     if convention.has_angles:
-        convention = _in_units(convention, [words[i] for i in columns], "rad", "deg")
+        convention = _in_units(convention, header[columns].tolist(), "rad", "deg")
     if not convention.is_matrix:
         columns = position + columns
     elif len(columns) == 9 and len(position) == 3:
         columns = np.c_[np.reshape(columns, (3, 3)), position].ravel().tolist()
     if len(columns) in convention.counts:
-        numbers = cell_numbers(rows[:, columns], [words[i] for i in columns])
+        numbers = cell_numbers(rows[:, columns], tuple(header[columns]))
         return PoseTable(numbers, convention, names, stamps)
     raise ConventionError(
         f"the columns {', '.join(words)} are none of {convention.name} ({convention.meaning})",
@@ -269,7 +274,7 @@ def _with_seconds(numbers: Array, convention: PoseConvention) -> Array:
 
 def groups_of(words: Sequence[str]) -> _Groups:
     """Columns of `HEADERS` by their names, or by those after one beginning, such as `ee_`."""
-    names = [name_and_unit(word)[0] for word in words]
+    names = plain_names(words)
     groups = _matched(names, words)
     if groups:
         return groups
@@ -295,17 +300,20 @@ def groups_of(words: Sequence[str]) -> _Groups:
 
 
 def _matched(names: Sequence[str], words: Sequence[str]) -> _Groups:
+    header = np.array(words, dtype=object)
     groups: _Groups = {}
     used: set[int] = set()
     for key, group in HEADERS.items():
         candidates = group.candidates(names)
-        columns = [first for first, *_ in filter(None, candidates)]
+        if not all(candidates):
+            continue
+        columns = [first for first, *_ in candidates]
         # rotation_x belongs to a quaternion if there is a rotation_w.
-        if not all(candidates) or not used.isdisjoint(columns):
+        if not used.isdisjoint(columns):
             continue
         for repeated in candidates:
             if len(repeated) > 1:
-                listed = " and ".join(words[column] for column in repeated)
+                listed = " and ".join(header[repeated])
                 raise ValueError(
                     f"the columns {listed} may both be the {key}'s; keep those of the pose"
                 )
@@ -316,25 +324,29 @@ def _matched(names: Sequence[str], words: Sequence[str]) -> _Groups:
 
 def _defined(groups: _Groups, words: Sequence[str]) -> str:
     """The convention that columns define."""
-    rotations = [key for key in groups if key != "position"]
-    definite = []
-    for key in rotations:
-        unit = name_and_unit(words[groups[key][0]])[1]
-        if not HEADERS[key].ask or (key == "roll pitch yaw" and unit):
-            definite.append(key)
-    conventions = [HEADERS[key].conventions[0] for key in definite]
+    definite = {}
+    unclear = []
+    for key, columns in groups.items():
+        _, unit = name_and_unit(words[columns[0]])
+        if key == "position":
+            continue
+        if HEADERS[key].ask and (key != "roll pitch yaw" or not unit):
+            unclear.append(key)
+        else:
+            definite[key] = HEADERS[key].conventions[0]
     if len(definite) == 1:
-        count = len(groups[definite[0]])
-        if "position" in groups or count in pose_convention(conventions[0]).counts:
-            return conventions[0]
+        ((key, convention),) = definite.items()
+        is_whole = len(groups[key]) in pose_convention(convention).counts
+        if "position" in groups or is_whole:
+            return convention
     if len(definite) > 1:
-        raise ConventionError(
-            f"the header names {' and '.join(definite)}", " or ".join(conventions)
-        )
-    if rotations and not definite:
-        columns = ", ".join(words[column] for column in groups[rotations[0]])
+        problem = f"the header names {' and '.join(definite)}"
+        raise ConventionError(problem, " or ".join(definite.values()))
+    if unclear and not definite:
+        key = unclear[0]
+        columns = ", ".join(np.array(words, dtype=object)[groups[key]])
         problem = f"columns {columns} do not define a rotation"
-        raise ConventionError(problem, HEADERS[rotations[0]].ask)
+        raise ConventionError(problem, HEADERS[key].ask)
     raise ConventionError(
         f"the columns {', '.join(words)} name no known pose (such as x y z qw qx qy qz)",
         f"NAME, one of {KNOWN_CONVENTIONS}",

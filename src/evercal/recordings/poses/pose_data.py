@@ -124,7 +124,8 @@ def _of_objects(entries: list[Any], given: Given, robot: bool) -> PoseTable:
     for key in keys:
         columns[key] = [row.get(key) for row in rows]
     columns = _of_role(columns, given, robot)
-    frames = sorted({*map(str, columns.get("child_frame_id", ()))})
+    frames = columns.get("child_frame_id", ())
+    frames = sorted({*map(str, frames)})
     if len(frames) > 1:
         raise ValueError(
             f"it holds poses of {' and '.join(frames)}; keep those of one frame"
@@ -138,9 +139,7 @@ def _of_objects(entries: list[Any], given: Given, robot: bool) -> PoseTable:
 
 def _of_cells(columns: Columns, given: Given) -> PoseTable:
     """Poses whose numbers have a key each, or lists of some of them."""
-    rows = []
-    for values in zip(*columns.values(), strict=True):
-        rows.append(_cells(dict(zip(columns, values, strict=True))))
+    rows = [_cells(row) for row in _rows_of(columns)]
     words = [*dict.fromkeys(chain.from_iterable(rows))]
     require_at_most(len(words) * len(rows), "numbers", "values")
     cells = []
@@ -184,10 +183,16 @@ def _of_object(data: Columns, given: Given, robot: bool) -> PoseTable:
             raise _unclear([], data)
     if not has_position([*columns]):
         raise _unclear([], data)
-    rows = []
-    for values in zip(*lists, strict=True):
-        rows.append(dict(zip(columns, values, strict=True)))
+    rows = _rows_of(dict(zip(columns, lists, strict=True)))
     return pose_data(rows, given, robot)
+
+
+def _rows_of(columns: Columns) -> list[dict[str, Any]]:
+    """An object for each pose, of the lists of its keys."""
+    rows = []
+    for values in zip(*columns.values(), strict=True):
+        rows.append(dict(zip(columns, values, strict=True)))
+    return rows
 
 
 def _keys_of_images(data: Columns) -> list[str]:
@@ -306,7 +311,8 @@ def _composed(
     """Poses of rotations (matrices, quaternions, vectors or angles) and translations."""
     unit = name_and_unit(translation)[1] or "m"
     words = [f"x_{unit}", f"y_{unit}", f"z_{unit}"]
-    translations = _rows(number_array(columns[translation], repr(translation)), 3)
+    array = number_array(columns[translation], repr(translation))
+    translations = _rows(array, 3)
     array = number_array(columns[rotation], repr(rotation))
     rotations = _poses_first(array, ((3, 3),))
     width = rotations.size // max(len(translations), 1)
@@ -318,7 +324,8 @@ def _composed(
         words += ["rotvec_x", "rotvec_y", "rotvec_z"]
     else:
         words += ["rx", "ry", "rz"]
-    numbers = np.concatenate([translations, _rows(rotations, width)], -1)
+    rotations = _rows(rotations, width)
+    numbers = np.concatenate([translations, rotations], -1)
     cells = text_cells(map(repr, row) for row in numbers.tolist())
     return named_numbers(words, cells, given)
 

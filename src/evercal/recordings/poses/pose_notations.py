@@ -34,6 +34,11 @@ _NOTATIONS = {
 
 A word is read once, from its start."""
 
+_TITLE = re.compile(r"^[^\[\]]*[:=]\s*(?=$|\[\[)")
+"""Words before a matrix."""
+_LABEL = re.compile(r"^([^\s,;:=]+)\s*(?::\s|=)\s*(?=[-+.\d])")
+"""A name before numbers, such as P1 = 412.0."""
+
 
 def without_brackets(lines: list[str], given: Given) -> tuple[list[str], Given]:
     """Lines of a table without brackets, and the convention that a robot's notation defines.
@@ -68,8 +73,10 @@ def _holds_numbers(line: str) -> bool:
 
 def _rows(poses: list[tuple[str, str, str]], columns: str) -> list[str]:
     """A header and a line for each pose."""
+    labels = []
     rows = []
-    for _, first, second in poses:
+    for label, first, second in poses:
+        labels.append(label)
         row = first
         if columns[0] == "X":
             values = dict(re.findall(r"\b([XYZABCWPR])[\s=]+([^\s,]+)", first))
@@ -77,23 +84,26 @@ def _rows(poses: list[tuple[str, str, str]], columns: str) -> list[str]:
         elif second:
             row = f"{first},{second}"
         rows.append(row)
-    labels = [label for label, _, _ in poses]
     # Labels that are all the same are a type, such as E6POS.
-    if not all(labels) or (len(labels) > 1 and len({*labels}) == 1):
+    is_type = len(labels) > 1 and len({*labels}) == 1
+    if is_type or not all(labels):
         return [columns, *rows]
     label = "stamp" if is_number(labels[0]) else "image"
-    return [f"{label},{columns}", *map(",".join, zip(labels, rows, strict=True))]
+    labelled = zip(labels, rows, strict=True)
+    return [f"{label},{columns}", *map(",".join, labelled)]
 
 
 def _without_lists(lines: list[str]) -> list[str]:
     """Lines without the brackets of numpy, Python and robots' functions, such as XY(...)."""
-    titles = re.compile(r"^[^\[\]]*[:=]\s*(?=$|\[\[)")
-    lines = [line for line in (titles.sub("", line) for line in lines) if line]
+    lines = [*filter(None, (_TITLE.sub("", line) for line in lines))]
     if not lines:
         return lines
-    cut = next((s for s in ";,\t" if s in lines[0]), " ")
-    label = re.compile(r"^([^\s,;:=]+)\s*(?::\s|=)\s*(?=[-+.\d])")  # P1 = 412.0
-    lines = [label.sub(rf"\1{cut}", line) for line in lines]
+    first = lines[0]
+    separator = " "
+    for character in "\t,;":
+        if character in first:
+            separator = character
+    lines = [_LABEL.sub(rf"\1{separator}", line) for line in lines]
     if not re.search(r"((?<!\w)\[|[({])\s*[-+.\d]", lines[0]):
         return lines
     text = re.sub(r"\b\w+\(", "(", "\n".join(lines))

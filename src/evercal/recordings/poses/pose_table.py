@@ -34,19 +34,24 @@ def read_pose_table(text: str, given: Given) -> PoseTable:
 
     ValueError: this is no table, or its convention is not defined.
     """
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    plain = [line for line in lines if not line.startswith(_COMMENTS)]
-    comments = lines[: lines.index(plain[0])] if plain else []
+    plain = []
+    comments = []
+    for line in map(str.strip, text.splitlines()):
+        if line and not line.startswith(_COMMENTS):
+            plain.append(line)
+        elif line and not plain:
+            comments.append(line)
     plain, given = without_brackets(plain, given)
     rows = table_cells(plain)
     words = rows[:1].ravel().tolist()
-    if _is_header(words):
+    has_header = _is_header(words)
+    if has_header:
         rows = rows[1:]
-    else:
-        last_comment = [line.lstrip("#%/ ") for line in comments[-1:]]
-        words = table_cells(last_comment).ravel().tolist()
     if not len(rows):
         raise ValueError("no line of numbers in it")
+    if not has_header:
+        last_comment = [line.lstrip("#%/ ") for line in comments[-1:]]
+        words = table_cells(last_comment).ravel().tolist()
     if len(words) == rows.shape[1] and _is_header(words):
         return named_numbers(words, rows, given)
     return _without_header(rows, given)
@@ -80,10 +85,12 @@ def _without_header(rows: Cells, given: Given) -> PoseTable:
 
 def _blocks(rows: Array, given: Given) -> Array:
     """(n, 3 or 4, 4) matrices of rows of four numbers."""
-    whole = (rows == (0, 0, 0, 1)).all(1).any()
-    if given and given.layout == "columns":
-        whole = True
-    height = 3 if len(rows) % 3 == 0 and not whole else 4
+    height = 4
+    if len(rows) % 3 == 0:
+        last_rows = (rows == (0, 0, 0, 1)).all(1)
+        in_columns = given is not None and given.layout == "columns"
+        if not in_columns and not last_rows.any():
+            height = 3
     if len(rows) % height:
         raise ValueError(f"{len(rows)} rows of 4 numbers are no 4x4 or 3x4 matrices")
     return rows.reshape(-1, height, 4)

@@ -52,13 +52,17 @@ class PoseTrack:
         if len(times) == 1:
             return self.poses[np.zeros(len(stamps), dtype=int)], valid
         after, close = times_around(times, inside)
-        metres, radians = pose_distance(self.poses[after - 1], self.poses[after])
+        first = self.poses[after - 1]
+        second = self.poses[after]
+        metres, radians = pose_distance(first, second)
         still = (metres < STILL_M) & (np.rad2deg(radians) < STILL_DEG)
+        valid &= close | still
         rotation = Slerp(times, self.poses.rotation)(inside)
         position = np.empty((len(inside), 3))
         for axis, values in enumerate(self.poses.translation_m.T):
             position[:, axis] = np.interp(inside, times, values)
-        return SE3.of(rotation, position, canonical=False), valid & (close | still)
+        poses = SE3.of(rotation, position, canonical=False)
+        return poses, valid
 
 
 def times_around(times_s: Array, stamps_s: Array) -> tuple[NDArray[np.intp], BoolArray]:

@@ -204,13 +204,17 @@ def _files_named_alike(folder: Path, robot: bool) -> list[Path]:
     kinds: dict[str, list[Path]] = {}
     for file in files_in(folder, POSE_ENDINGS):
         kinds.setdefault(re.sub(r"\d+", "N", file.name), []).append(file)
-    several = [kind for kind, files in kinds.items() if len(files) > 1] or [*kinds]
+    several = [kind for kind, files in kinds.items() if len(files) > 1]
+    several = several or [*kinds]
     # ViSP's poses of the end effector, or of the object in the camera.
     word = "fPe" if robot else "cPo"
     chosen = [kind for kind in several if word in kind] or several
     if len(chosen) == 1:
-        return kinds[chosen[0]]
-    names = " and ".join(chosen) or f"no file of {', '.join(POSE_ENDINGS)}"
+        (kind,) = chosen
+        return kinds[kind]
+    names = " and ".join(chosen)
+    if not names:
+        names = f"no file of {', '.join(POSE_ENDINGS)}"
     raise ValueError(
         f"the folder holds {names}; give a folder of one file for each pose"
     )
@@ -218,12 +222,13 @@ def _files_named_alike(folder: Path, robot: bool) -> list[Path]:
 
 def _table(text: str, ending: str, given: Given, robot: bool = True) -> PoseTable:
     is_json = ending in (".json", ".jsonl")
-    if is_json or ending in (".yaml", ".yml") or _YAML.match(text):
-        data = [value for value in documents(text, is_json) if value is not None]
-        if len(data) == 1:
-            return pose_data(data[0], given, robot)
-        return pose_data(data, given, robot)
-    return read_pose_table(text, given)
+    is_yaml = ending in (".yaml", ".yml") or _YAML.match(text)
+    if not is_json and not is_yaml:
+        return read_pose_table(text, given)
+    data = [value for value in documents(text, is_json) if value is not None]
+    if len(data) == 1:
+        (data,) = data
+    return pose_data(data, given, robot)
 
 
 def _poses(table: PoseTable, camera_from: bool = False) -> SE3:

@@ -10,7 +10,6 @@ import math
 import re
 import zipfile
 from collections.abc import Iterable, Sequence
-from itertools import chain
 from pathlib import Path, PureWindowsPath
 from typing import IO, Any, NamedTuple
 
@@ -56,6 +55,7 @@ _EARLIEST_S = 1e9
 """Earliest time in the name of an image, seconds since 1970: the year 2001."""
 _LATEST_S = 4e9
 """Latest time in the name of an image, seconds since 1970: the year 2096."""
+_TIME = re.compile(r"\d+(\.\d+)?")
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$")
 
 
@@ -76,12 +76,13 @@ def read_rows(path: Path, contents: str) -> LabelledRows:
     text = read_text(path, f"file with {contents}")
     with named_errors(path, contents):
         cells = table_cells([line for line in text.splitlines() if line[:1] != "#"])
-        if len(cells) < 2 or all(map(is_number, cells[0])):
-            raise ValueError(f"needs a line of column names, then rows of {contents}")
-        header = cells[0].tolist()
+        header = cells[:1].ravel()
         rows = cells[1:]
-        names, stamps, others = row_labels(header, rows.T.tolist(), len(rows))
-        columns = tuple(header[i] for i in others)
+        words = header.tolist()
+        if not len(rows) or all(map(is_number, words)):
+            raise ValueError(f"needs a line of column names, then rows of {contents}")
+        names, stamps, others = row_labels(words, rows.T.tolist(), len(rows))
+        columns = tuple(header[others])
         values = cell_numbers(rows[:, others], columns)
         return LabelledRows(names, stamps, columns, values)
 
@@ -103,18 +104,22 @@ def table_cells(lines: Sequence[str]) -> Cells:
     if not rows:
         return np.empty((0, 0), dtype=object)
     cells = text_cells([map(str.strip, row) for row in rows])
-    points = [cell for cell in cells.ravel().tolist() if "." in cell]
-    if separator == "," or any(map(is_number, points)):
+    if separator == "," or any(map(_has_point, cells.ravel().tolist())):
         return cells  # beside numbers with points, commas are those of thousands
     for index, cell in np.ndenumerate(cells):
         cells[index] = _DECIMAL_COMMA.sub(r"\1.\2", cell)
     return cells
 
 
+def _has_point(cell: str) -> bool:
+    return "." in cell and is_number(cell)
+
+
 def _separator(line: str) -> str:
     words = line.split()
+    with_commas = [word for word in words if "," in word]
     separators = ";,\t"
-    if words[1:] and all("," not in w or _DECIMAL_COMMA.match(w) for w in words):
+    if len(words) > 1 and all(map(_DECIMAL_COMMA.match, with_commas)):
         separators = ";\t"
     for separator in separators:
         if separator in line:
@@ -124,14 +129,16 @@ def _separator(line: str) -> str:
 
 def _split(lines: Sequence[str], separator: str) -> list[list[str]]:
     """Cells of each line, as many as the first line has."""
-    # Empty cells at the end of a line are missing cells.
-    stripped = (line.lstrip(" ").rstrip(f" \t\r\n{separator}") + "\n" for line in lines)
+    stripped = []
+    for line in lines:
+        # Empty cells at the end of a line are missing cells.
+        line = line.lstrip(" ").rstrip(f" \t\r\n{separator}")
+        stripped.append(line + "\n")
     # The bound of `text_cells` on the length of a cell is stricter, and names its place.
     csv.field_size_limit(max(csv.field_size_limit(), bounds().text_bytes))
     # A cell whose quote is never closed swallows the line after the last one.
-    reader = csv.reader(
-        chain(stripped, ["end"]), delimiter=separator, skipinitialspace=True
-    )
+    stripped.append("end")
+    reader = csv.reader(stripped, delimiter=separator, skipinitialspace=True)
     rows: list[list[str]] = []
     width = 0
     for row in reader:
@@ -156,14 +163,15 @@ def _require_few_cells(columns: int, rows: int) -> None:
 
 def text_cells(rows: Iterable[Iterable[str]]) -> Cells:
     """(n, k) cells of rows."""
-    cells = np.array([list(row) for row in rows], dtype=object)
+    cells = np.array([*map(list, rows)], dtype=object)
     lengths = [*map(len, cells.flat)]
     longest = max(lengths, default=0)
     most = bounds().cell_characters
     if longest > most:
         row, column = divmod(lengths.index(longest), cells.shape[1])
         where = f"row {row + 1}, column {column + 1}"
-        raise ValueError(f"{where}: {longest:,} characters, at most {most:,} are read")
+        problem = f"{longest:,} characters, at most {most:,} are read"
+        raise ValueError(f"{where}: {problem}")
     return cells
 
 
@@ -173,10 +181,11 @@ def cell_numbers(cells: Cells, words: Sequence[str] = ()) -> Array:
         if is_number(cell) and np.isfinite(float(cell)):
             continue
         name = repr(words[column]) if words else column + 1
+        where = f"row {row + 1}, column {name}"
         problem = f"{str(cell)!r} is not a finite number"
         if "[" in cell:
             problem += "; write all poses with brackets, or none"
-        raise ValueError(f"row {row + 1}, column {name}: {problem}")
+        raise ValueError(f"{where}: {problem}")
     return cells.astype(np.float64)
 
 
@@ -191,7 +200,13 @@ def name_and_unit(cell: str) -> tuple[str, str | None]:
         unit = match[1]
     if unit:
         unit = _SHORT.get(unit[:3], unit)
-    return re.sub(r"[\s./\[]+", "_", name.rstrip("]")), unit
+    name = re.sub(r"[\s./\[]+", "_", name.rstrip("]"))
+    return name, unit
+
+
+def plain_names(words: Sequence[str]) -> list[str]:
+    """Names of columns without their units."""
+    return [name_and_unit(word)[0] for word in words]
 
 
 def row_labels(
@@ -201,9 +216,9 @@ def row_labels(
     plural: bool = False,
 ) -> tuple[Names, Array | None, list[int]]:
     """Image names and seconds of `count` rows, None if missing, and indices of other columns."""
-    plain = [name_and_unit(word)[0] for word in words]
+    plain = plain_names(words)
     if plural:
-        plain = [word[:-1] if word.endswith("s") else "" for word in plain]
+        plain = [*map(_singular, plain)]
     stamp = _first_of(_STAMPS, plain)
     name = _first_of(_NAMES, plain)
     if name is None:
@@ -218,8 +233,16 @@ def row_labels(
         times = number_array(columns[stamp], f"{words[stamp]!r}")
         stamps = in_unit(times, name_and_unit(words[stamp])[1])
     labels = {*_NAMES, *_STAMPS}
-    others = [i for i, word in enumerate(plain) if word not in labels and i != name]
+    others = []
+    for i, word in enumerate(plain):
+        if word not in labels and i != name:
+            others.append(i)
     return names, stamps, others
+
+
+def _singular(name: str) -> str:
+    """A name without its s; empty for other names."""
+    return name[:-1] if name.endswith("s") else ""
 
 
 def _first_of(names: Sequence[str], words: list[str]) -> int | None:
@@ -234,14 +257,20 @@ def _column_of_files(
     words: Sequence[str], columns: Sequence[Sequence[object]]
 ) -> int | None:
     """Index of the only column of nothing but names of image files, if there is one."""
-    files: list[int] = []
+    indices: list[int] = []
+    names: list[str] = []
     for i, column in enumerate(columns):
-        if column and all(str(cell).lower().endswith(IMAGE_ENDINGS) for cell in column):
-            files.append(i)
-    if len(files) > 1:
-        listed = " and ".join(words[i] for i in files)
+        if column and all(map(_is_image, column)):
+            indices.append(i)
+            names.append(words[i])
+    if len(indices) > 1:
+        listed = " and ".join(names)
         raise ValueError(f"{listed} name image files; call the right one 'image'")
-    return next(iter(files), None)
+    return next(iter(indices), None)
+
+
+def _is_image(cell: object) -> bool:
+    return str(cell).lower().endswith(IMAGE_ENDINGS)
 
 
 def _require_whole(word: str, column: Sequence[object], count: int) -> None:
@@ -343,8 +372,8 @@ def times_in_names(names: Sequence[str]) -> Array | None:
     Times have a decimal point, or are whole milli-, micro- or nanoseconds since 1970. Frame numbers
     are neither: 000123.png was not taken at 123 s.
     """
-    stems = [without_ending(name) for name in names]
-    if not stems or not all(re.fullmatch(r"\d+(\.\d+)?", stem) for stem in stems):
+    stems = [*map(without_ending, names)]
+    if not stems or not all(map(_TIME.fullmatch, stems)):
         return None
     times = in_unit(np.array(stems, dtype=np.float64))
     since_1970 = (times > _EARLIEST_S) & (times < _LATEST_S)
