@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evercal.geometry import SE3, pose_distance
+from evercal.geometry import SE3
 from evercal.recordings import load_recording, write_image
 from evercal.recordings.formats import generic
 
-from ..checks import refused, with_orientation
+from ..checks import assert_pose, refused, with_orientation
 
 pycolmap: Any = pytest.importorskip(
     "pycolmap", reason="the extra 'colmap' is not installed"
@@ -59,11 +59,10 @@ def make(root: Path, model: str = "PINHOLE", kind: str = "bin", images: int = 4,
     for number in (1, 2):
         values = [float(v) for v in params or MODELS[model]]
         values[0] += number  # so that images are not mixed up
-        reconstruction.add_camera_with_trivial_rig(
-            pycolmap.Camera(
-                model=model, width=WIDTH, height=HEIGHT, params=values, camera_id=number
-            )
+        camera = pycolmap.Camera(
+            model=model, width=WIDTH, height=HEIGHT, params=values, camera_id=number
         )
+        reconstruction.add_camera_with_trivial_rig(camera)
     (root / "images" / "sub").mkdir(parents=True, exist_ok=True)
     for i in range(images):
         name = f"sub/image-{i + 8}.png"  # 10 comes after 9
@@ -73,13 +72,14 @@ def make(root: Path, model: str = "PINHOLE", kind: str = "bin", images: int = 4,
         write_image(root / "images" / name, np.full((HEIGHT, WIDTH, 3), i, np.uint8))
     for point in np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3)):
         reconstruction.add_point3D(point, pycolmap.Track())
-    write_image(
-        root / "images" / "sub" / "lost.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    )
-    (root / folder).mkdir(parents=True, exist_ok=True)
-    (reconstruction.write_binary if kind == "bin" else reconstruction.write_text)(
-        str(root / folder)
-    )
+    lost = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    write_image(root / "images" / "sub" / "lost.png", lost)
+    target = root / folder
+    target.mkdir(parents=True, exist_ok=True)
+    if kind == "bin":
+        reconstruction.write_binary(str(target))
+    else:
+        reconstruction.write_text(str(target))
     return reconstruction
 
 
@@ -88,25 +88,18 @@ def make(root: Path, model: str = "PINHOLE", kind: str = "bin", images: int = 4,
 def test_projections_agree_with_colmap(model: str, kind: str, tmp_path: Path) -> None:
     written = make(tmp_path, model, kind)
     recording = load_recording(tmp_path)
-    assert [frame.name for frame in recording.train] == [
-        f"sub/image-{i}.png" for i in range(8, 12)
-    ]
+    names = [frame.name for frame in recording.train]
+    assert names == [f"sub/image-{i}.png" for i in range(8, 12)]
     assert (recording.test, recording.untracked) == ((), 1)
     for i, frame in enumerate(recording.train):
-        assert frame.base_from_camera is not None
         assert int(frame.read_image().mean()) == i
-        assert (
-            max(pose_distance(frame.base_from_camera.inverse(), camera_from_world(i)))
-            < 1e-7
-        )
+        camera_from_base = camera_from_world(i)
+        assert_pose(frame.base_from_camera, camera_from_base.inverse(), 1e-7)
         theirs = written.find_image_with_name(frame.name)
         for point in written.points3D.values():
             expected = theirs.project_point(point.xyz)
             # COLMAP counts from the image's corner, this program from its first pixel's centre.
-            ours = (
-                frame.camera.project(frame.base_from_camera.inverse().apply(point.xyz))
-                + 0.5
-            )
+            ours = frame.camera.project(camera_from_base.apply(point.xyz)) + 0.5
             np.testing.assert_allclose(ours, expected, atol=1e-6)
     assert "are those of COLMAP" in recording.notes[0]
 
@@ -128,9 +121,8 @@ def test_one_of_several_models_is_read(tmp_path: Path) -> None:
     recording = load_recording(tmp_path)
     assert len(recording.train) == 6
     assert recording.train[0].camera.distortion == ()
-    assert (
-        recording.notes[1] == "took model 1, the one with the most images (0: 4, 1: 6)"
-    )
+    note = "took model 1, the one with the most images (0: 4, 1: 6)"
+    assert recording.notes[1] == note
 
 
 @pytest.mark.parametrize(
@@ -170,15 +162,17 @@ def test_the_orientation_is_ignored_as_by_colmap(value: int, tmp_path: Path) -> 
     pixels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     pixels[:, : WIDTH // 2] = 200
     files = sorted((tmp_path / "images/sub").glob("image-*.png"))
+    write_image(tmp_path / "a.jpg", pixels)
+    turned = with_orientation((tmp_path / "a.jpg").read_bytes(), value)
     for file in files:
-        write_image(tmp_path / "a.jpg", pixels)
-        file.write_bytes(with_orientation((tmp_path / "a.jpg").read_bytes(), value))
+        file.write_bytes(turned)
     stored = pycolmap.Bitmap.read(str(files[-1]), as_rgb=True).to_array()
-    frames = load_recording(tmp_path).train
-    np.testing.assert_allclose(frames[0].read_image().astype(int), stored, atol=3)
-    generic.write(tmp_path / "copy", load_recording(tmp_path))
-    copied = load_recording(tmp_path / "copy").train[0]
-    np.testing.assert_array_equal(copied.read_image(), frames[0].read_image())
+    recording = load_recording(tmp_path)
+    image = recording.train[0].read_image()
+    np.testing.assert_allclose(image.astype(int), stored, atol=3)
+    generic.write(tmp_path / "copy", recording)
+    [copied, *_] = load_recording(tmp_path / "copy").train
+    np.testing.assert_array_equal(copied.read_image(), image)
 
 
 def test_names_of_a_text_model_are_read_whole(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evercal.continual.benchmark.suites import load_suite
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import SE3, Camera
 from evercal.recordings import load_recording, write_image
 from evercal.recordings.formats import seven_scenes
 
@@ -16,8 +16,7 @@ from ..checks import assert_pose, refused
 
 
 def write_pose(file: Path, matrix: np.ndarray) -> None:
-    rows = ("\t ".join(f" {value: .7e}" for value in row) for row in matrix)
-    file.write_text("\n".join(rows) + "\n")
+    np.savetxt(file, matrix, " % .7e", delimiter="\t ")
 
 
 @pytest.fixture
@@ -41,28 +40,20 @@ def kitchen(tmp_path: Path) -> Path:
 def test_frames_are_in_the_order_of_the_split_files(kitchen: Path) -> None:
     recording = seven_scenes.load(kitchen)
     assert recording.name == "kitchen"
-    assert [frame.name for frame in recording.train] == [
-        f"seq-0{sequence}/frame-00000{i}" for sequence in (2, 1) for i in range(3)
-    ]
-    assert [frame.name for frame in recording.test] == [
-        f"seq-03/frame-00000{i}" for i in range(3)
-    ]
-    assert recording.untracked == 0
+    names = [frame.name for frame in (*recording.train, *recording.test)]
+    assert names == [f"seq-0{s}/frame-00000{i}" for s in (2, 1, 3) for i in range(3)]
+    assert (len(recording.test), recording.untracked) == (3, 0)
     frame = recording.train[1]
-    assert frame.base_from_camera is not None
-    expected = SE3.exp([2, 1, 0.0, 0.1, 0.2, 0.6])
-    assert max(pose_distance(frame.base_from_camera, expected)) < 1e-6
+    assert_pose(frame.base_from_camera, SE3.exp([2, 1, 0.0, 0.1, 0.2, 0.6]), 1e-6)
     assert frame.read_image().shape == (48, 64, 3)
 
 
 def test_camera_is_the_default_or_that_of_the_intrinsics_file(kitchen: Path) -> None:
-    assert seven_scenes.load(kitchen).train[0].camera == Camera(
-        64, 48, 52.5, 52.5, 31.5, 23.5
-    )
+    default = Camera(64, 48, 52.5, 52.5, 31.5, 23.5)
+    assert seven_scenes.load(kitchen).train[0].camera == default
     (kitchen / "camera-intrinsics.txt").write_text("51 0 30\n0 52 23.5\n0 0 1\n")
-    assert seven_scenes.load(kitchen).test[0].camera == Camera(
-        64, 48, 51.0, 52.0, 30.0, 23.5
-    )
+    stated = Camera(64, 48, 51.0, 52.0, 30.0, 23.5)
+    assert seven_scenes.load(kitchen).test[0].camera == stated
 
 
 def test_untracked_frames_are_left_out_and_counted(kitchen: Path) -> None:
@@ -112,14 +103,12 @@ def write(root: Path) -> Path:
     (root / "split.txt").write_text(SPLIT)
     for i in range(5):
         stem = root / "data" / f"frame-{i:06d}"
-        write_image(
-            stem.with_suffix(".color.jpg"), np.full((48, 64, 3), 40 * i, np.uint8)
-        )
+        image = np.full((48, 64, 3), 40 * i, np.uint8)
+        write_image(stem.with_suffix(".color.jpg"), image)
         matrix = SE3.exp([1.0, i, 0.0, 0.1 * i, 0.2, 0.3]).matrix()
         if i == 3:
             matrix[:] = -np.inf
-        rows = (" ".join(f"{value:.7f}" for value in row) for row in matrix)
-        stem.with_suffix(".pose.txt").write_text("\n".join(rows) + "\n")
+        np.savetxt(stem.with_suffix(".pose.txt"), matrix, "%.7f")
     return root
 
 
@@ -131,8 +120,8 @@ def apartment(tmp_path: Path) -> Path:
 def test_first_sequence_is_for_testing(apartment: Path) -> None:
     recording = load_recording(apartment)
     assert recording.name == "kitchen"
-    assert [frame.name for frame in recording.test] == ["frame-000000", "frame-000001"]
-    assert [frame.name for frame in recording.train] == ["frame-000002", "frame-000004"]
+    names = [frame.name[-1] for frame in (*recording.test, *recording.train)]
+    assert (names, len(recording.test)) == (["0", "1", "2", "4"], 2)
     assert recording.untracked == 1
     pose = recording.train[1].base_from_camera
     assert_pose(pose, SE3.exp([1.0, 4, 0.0, 0.4, 0.2, 0.3]), 1e-5)
@@ -151,9 +140,8 @@ def test_suite_loads_scenes_and_names_missing_ones(apartment: Path) -> None:
     write(data / "apt1" / "living")
     scenes = load_suite("i12s", data, ["apt1/living", "apt1/kitchen"])
     assert [recording.name for recording in scenes] == ["apt1-kitchen", "apt1-living"]
-    refused(
-        "apt2/bed is missing; get it from https://graphics", load_suite, "i12s", data
-    )
+    message = "apt2/bed is missing; get it from https://graphics"
+    refused(message, load_suite, "i12s", data)
 
 
 POSE = "seq-02/frame-000002.pose.txt"
