@@ -171,8 +171,9 @@ def as_rgb(image: ArrayLike) -> Image:
         is_byte = pixels.min() >= 0 and pixels.max() <= 255
         pixels = pixels.astype(np.uint8 if is_byte else pixels.dtype)
     channels = pixels.shape[2:] or (1,)
-    valid = pixels.ndim in (2, 3) and channels[0] in (1, 3, 4) and pixels.size
-    if not valid or pixels.dtype not in (np.uint8, np.uint16):
+    is_image = pixels.ndim in (2, 3) and channels[0] in (1, 3, 4)
+    is_known = pixels.dtype in (np.uint8, np.uint16)
+    if not is_image or not is_known or not pixels.size:
         raise InputError(
             f"image: array of shape {pixels.shape} and type {pixels.dtype}; give (H, W) grey,"
             f" (H, W, 3) RGB or (H, W, 4) RGBA as uint8 or uint16"
@@ -182,7 +183,8 @@ def as_rgb(image: ArrayLike) -> Image:
 
         pixels = cv2.convertScaleAbs(pixels, alpha=1 / 257).reshape(pixels.shape)
     if channels == (1,):
-        pixels = np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, axis=2)
+        grey = pixels.reshape(*pixels.shape[:2], 1)
+        pixels = np.repeat(grey, 3, axis=2)
     return np.ascontiguousarray(pixels[:, :, :3], np.uint8)
 
 

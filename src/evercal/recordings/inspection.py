@@ -186,7 +186,8 @@ def _camera_line(camera: Camera) -> str:
     distortion = "no distortion"
     if camera.distortion:
         kind = "fisheye" if camera.model == "fisheye" else "distortion"
-        distortion = f"{kind} {' '.join(f'{k:g}' for k in camera.distortion)}"
+        numbers = " ".join(f"{k:g}" for k in camera.distortion)
+        distortion = f"{kind} {numbers}"
     return (
         f"{camera.width}x{camera.height}, fx {camera.fx:.1f} fy {camera.fy:.1f}"
         f" cx {camera.cx:.1f} cy {camera.cy:.1f}, {distortion}"
@@ -210,7 +211,8 @@ def _camera_warnings(camera: Camera) -> Iterator[str]:
     name = f"camera {camera.width}x{camera.height}"
     right = (camera.cx + 0.5) / camera.width
     below = (camera.cy + 0.5) / camera.height
-    view = np.rad2deg(2 * np.arctan(camera.width / (2 * camera.fx)))
+    half_view = np.arctan(camera.width / (2 * camera.fx))
+    view = np.rad2deg(2 * half_view)
     size = "are the intrinsics those of this image size?"
     if max(abs(right - 0.5), abs(below - 0.5)) > 0.2:
         point = f"({camera.cx:.0f}, {camera.cy:.0f})"

@@ -48,11 +48,13 @@ def without(image: Image, keep: BoolArray) -> Image:
 
     `keep` has the image's size, or is smaller.
     """
-    soft = cv2.dilate(keep.astype(np.uint8), np.ones((SOFT_PX, SOFT_PX), np.uint8))
+    square = np.ones((SOFT_PX, SOFT_PX), np.uint8)
+    soft = cv2.dilate(keep.astype(np.uint8), square)
     soft = cv2.GaussianBlur(soft.astype(np.float32), (0, 0), SOFT_PX / 3)
     soft = cv2.resize(soft, image.shape[1::-1])[..., None]
-    colour = (image * soft).sum((0, 1)) / max(float(soft.sum()), 1e-6)
-    return (image * soft + colour * (1 - soft)).astype(np.uint8)
+    weighted = image * soft
+    colour = weighted.sum((0, 1)) / max(float(soft.sum()), 1e-6)
+    return (weighted + colour * (1 - soft)).astype(np.uint8)
 
 
 def with_masks(recording: Recording, root: Path) -> Recording:

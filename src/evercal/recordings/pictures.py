@@ -38,7 +38,8 @@ def look_at(frames: Sequence[Frame]) -> Pictures:
     """Look at some images of a recording, in recorded order."""
     if not frames:
         return Pictures((), usable=True)
-    chosen = np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).round().astype(int))
+    spread = np.linspace(0, len(frames) - 1, _LOOKED_AT)
+    chosen = np.unique(spread.round().astype(int))
     images = [_small(frames[i].read_image()) for i in chosen]
     blank = [image for image in images if is_blank(image)]
     if blank:
@@ -48,7 +49,8 @@ def look_at(frames: Sequence[Frame]) -> Pictures:
     tiny = [
         cv2.resize(image, (40, 30), interpolation=cv2.INTER_AREA) for image in images
     ]
-    change = np.abs(np.diff(np.array(tiny, np.float64), axis=0)).mean((1, 2, 3))
+    steps = np.diff(np.array(tiny, np.float64), axis=0)
+    change = np.abs(steps).mean((1, 2, 3))
     if len(images) > 1 and np.median(change) < _SAME:
         return Pictures(
             ("all images are the same; is each pose that of its image?",), False
@@ -94,7 +96,8 @@ def sharpness(image: Image) -> float:
     below = _structure(middle - coarse)
     if np.linalg.eigvalsh(below)[0] < _FLAT:
         return 0.0
-    return float(np.sqrt(max(eigh(above, below, eigvals_only=True)[0], 0.0)))
+    smallest = eigh(above, below, eigvals_only=True)[0]
+    return float(np.sqrt(max(smallest, 0.0)))
 
 
 def _structure(band: Any) -> Array:

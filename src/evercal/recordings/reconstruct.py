@@ -8,6 +8,7 @@ The unit of length is arbitrary until the map is aligned.
 """
 
 import itertools
+import math
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -122,7 +123,8 @@ def _chosen(source: str, images: Path, motion: float, most: int) -> list[str]:
         images.mkdir(parents=True, exist_ok=True)
         write_image(images / name, frame.image)
         names.append(name)
-    keep = names[:: max(1, -(-len(names) // most))]
+    step = max(1, math.ceil(len(names) / most))
+    keep = names[::step]
     for name in set(names) - set(keep):
         (images / name).unlink()
     if len(keep) < _LEAST_FRAMES:
@@ -183,9 +185,10 @@ def _match(pycolmap: Any, root: Path, names: list[str]) -> None:
     pycolmap.match_sequential(database)
     spread = np.linspace(0, len(names) - 1, _EXHAUSTIVE).round().astype(int)
     pairs = itertools.combinations([names[i] for i in spread], 2)
-    (root / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs))
+    file = root / "pairs.txt"
+    file.write_text("".join(f"{first} {second}\n" for first, second in pairs))
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = root / "pairs.txt"
+    pairing.match_list_path = file
     pycolmap.match_image_pairs(database, pairing_options=pairing)
 
 

@@ -104,9 +104,10 @@ def _models(root: Path) -> list[Path]:
         parent = root / name
         folders = [parent]
         if parent.is_dir():
-            folders += sorted(parent.iterdir())
-        if name == ".":  # may be a folder of models, which COLMAP numbers
-            folders = [parent, *(path for path in folders[1:] if path.name.isdigit())]
+            for folder in sorted(parent.iterdir()):
+                # The root may be a folder of models, which COLMAP numbers.
+                if name != "." or folder.name.isdigit():
+                    folders.append(folder)
         models = [folder for folder in folders if _is_model(folder)]
         if models:
             return models
@@ -190,7 +191,8 @@ def _camera(folder: Path, camera: Any) -> Camera:
             return nearest_fisheye(kind, parameters, size, focal, centre)
         model = "fisheye" if kind.endswith("fisheye") else "pinhole"
         count = 8 if "k6" in values else 4
-        distortion = tuple(values.get(key, 0.0) for key in COEFFICIENTS[model][:count])
+        names = COEFFICIENTS[model][:count]
+        distortion = tuple(values.get(name, 0.0) for name in names)
         return Camera(*size, *focal, *centre, distortion, model)
 
 

@@ -73,7 +73,8 @@ def _load(root: Path, options: ReadOptions) -> Recording:
     stated, notes = feature_poses(root, info, column, values, options)
     frames = []
     for i, image in enumerate(_images(root, info, key, rows)):
-        name = f"episode_{rows[i].episode:06d}/{rows[i].number:06d}"
+        row = rows[i]
+        name = f"episode_{row.episode:06d}/{row.number:06d}"
         joints = stated.joints_of(i)
         frames.append(
             Frame(name, image, camera, None, stated.poses[i], joints_rad=joints)
@@ -151,9 +152,8 @@ def _rows(root: Path, column: str) -> tuple[list[_Row], Array]:
     rows: list[_Row] = []
     tables = []
     for file in files:
-        *cells, poses = _columns(
-            file, ["episode_index", "frame_index", "timestamp", column]
-        )
+        names = ["episode_index", "frame_index", "timestamp", column]
+        *cells, poses = _columns(file, names)
         for i, (episode, number, seconds) in enumerate(zip(*cells, strict=True)):
             rows.append(_Row(episode, number, seconds, file, i))
         with named_errors(file, column):
@@ -172,8 +172,9 @@ def _images(
     if info["features"][key]["dtype"] == "image":
         return [_Embedded(root, key, row.file, row.row) for row in rows]
     videos = Videos(float(info["fps"]))
-    starts = _video_starts(root, info, key, {row.episode for row in rows})
-    lost = sorted({row.episode for row in rows} - starts.keys())
+    episodes = {row.episode for row in rows}
+    starts = _video_starts(root, info, key, episodes)
+    lost = sorted(episodes - starts.keys())
     if lost:
         raise InputError(
             f"{root / 'meta' / 'episodes'}: episode {lost[0]} is not listed"
@@ -207,7 +208,8 @@ def _video_starts(
 
 def _video(root: Path, template: str, **fields: object) -> Path:
     def field(match: re.Match[str]) -> str:
-        return str(fields[match[1]]).zfill(int(match[2] or 0))
+        width = int(match[2] or 0)
+        return str(fields[match[1]]).zfill(width)
 
     # Not by `str.format`, where the dataset would choose widths without limit.
     path = re.sub(r"\{(\w+)(?::0(\d)d)?\}", field, template)
@@ -256,11 +258,13 @@ class _Embedded(StoredImage):
         return image_file(self._content())
 
     def _content(self) -> bytes:
+        row = self.row
+        group = 0
         with _parquet(self.path) as table:
-            groups = map(table.metadata.row_group, range(table.num_row_groups))
-            ends = np.cumsum([group.num_rows for group in groups])
-            group = int(np.searchsorted(ends, self.row, side="right"))
-            cell = _row_group(self.path, group, self.key)[self.row - int(ends[group])]
+            while row >= table.metadata.row_group(group).num_rows:
+                row -= table.metadata.row_group(group).num_rows
+                group += 1
+            cell = _row_group(self.path, group, self.key)[row]
         if cell["bytes"]:
             return bytes(cell["bytes"])
         where = f"{self.path}: row {self.row}: image {cell['path']!r}"

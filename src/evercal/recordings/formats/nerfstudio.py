@@ -132,10 +132,11 @@ def _frames(file: Path) -> tuple[list[Frame], set[str], int]:
             root = _image_root(file, str(first["file_path"]))
             # Without a stated image size, that of the first image is taken.
             if {"w", "h"}.isdisjoint([*data, *first]):
-                stated = [entry for entry in entries if isinstance(entry, dict)]
-                images = [_image(root, str(each.get("file_path"))) for each in stated]
-                width, height = first_size(images)
-                data |= {"w": width, "h": height}
+                named = [entry for entry in entries if isinstance(entry, dict)]
+                names = [str(entry.get("file_path")) for entry in named]
+                width, height = first_size([_image(root, name) for name in names])
+                data["w"] = width
+                data["h"] = height
         frames = []
         bad = 0
         for i, entry in enumerate([*entries, *tested]):
@@ -166,11 +167,13 @@ def _applied(data: Entry) -> tuple[SE3, float]:
     if data.get("applied_transform") is None:
         return SE3.identity(), scale
     matrix = _matrix(data["applied_transform"], "applied_transform")[:3]
-    size = abs(np.linalg.det(matrix[:, :3])) ** (1 / 3)
+    volume = abs(np.linalg.det(matrix[:, :3]))
+    size = volume ** (1 / 3)
     if not size > 0:
         raise ValueError("'applied_transform' cannot be undone: its determinant is 0")
     with naming("'applied_transform'"):
-        return SE3.from_matrix(matrix / size, _TOLERANCE).inverse(), scale * size
+        applied = SE3.from_matrix(matrix / size, _TOLERANCE)
+        return applied.inverse(), scale * size
 
 
 def _frame(root: Path, data: Entry, entry: object, undo: SE3, scale: float) -> Frame:
@@ -181,8 +184,9 @@ def _frame(root: Path, data: Entry, entry: object, undo: SE3, scale: float) -> F
         matrix = _matrix(entry.get("transform_matrix"), "transform_matrix")
         stated = SE3.from_matrix(matrix, _TOLERANCE)
         camera = _camera({**data, **entry})
-    world_from_gl = undo @ SE3(stated.rotation_wxyz, stated.translation_m / scale)
-    return Frame(name, _image(root, name), camera, world_from_gl @ _GL_FROM_CV)
+    applied_from_gl = SE3(stated.rotation_wxyz, stated.translation_m / scale)
+    world_from_camera = undo @ applied_from_gl @ _GL_FROM_CV
+    return Frame(name, _image(root, name), camera, world_from_camera)
 
 
 def _image(root: Path, name: str) -> Path:
@@ -205,14 +209,18 @@ def _camera(data: Entry) -> Camera:
     fisheye = model == "OPENCV_FISHEYE" or bool(data.get("is_fisheye"))
     numbers = [_number(data, key, 0.0) for key in _LENS]
     stated = data.get("distortion_params", numbers)
-    lens = number_array(stated, "'distortion_params'").tolist()
+    coefficients = number_array(stated, "'distortion_params'").tolist()
     unused = (4, 5) if fisheye else (3,)
-    differs = any(numbers) and lens != numbers
-    if differs or len(lens) != len(_LENS) or any(lens[i] for i in unused):
+    differs = any(numbers) and coefficients != numbers
+    if (
+        differs
+        or len(coefficients) != len(_LENS)
+        or any(coefficients[i] for i in unused)
+    ):
         zeros = " and ".join(_LENS[i] for i in unused)
         raise ValueError(
             f"distortion is {', '.join(_LENS)}, with {zeros} 0 for {model}, also as"
-            f" 'distortion_params', got {lens}"
+            f" 'distortion_params', got {coefficients}"
         )
     width = _number(data, "w")
     height = _number(data, "h")
@@ -227,7 +235,7 @@ def _camera(data: Entry) -> Camera:
     # Half a pixel: the file counts from the image's corner.
     cx = _number(data, "cx", width / 2) - 0.5
     cy = _number(data, "cy", height / 2) - 0.5
-    k1, k2, k3, k4, p1, p2 = lens
+    k1, k2, k3, k4, p1, p2 = coefficients
     size: Any = (width, height)  # whole numbers, checked when constructed
     kind = "fisheye" if fisheye else "pinhole"
     distortion = (k1, k2, k3, k4) if fisheye else (k1, k2, p1, p2, k3)
@@ -271,10 +279,13 @@ def _resized(file: Path, frames: list[Frame]) -> list[Frame]:
 
 def _reader(image: Path, stated: Size, source: str) -> tuple[Size, Any]:
     """Size of an image and how it is read, as stored or turned: whichever has the stated shape."""
-    sizes = [(image_size(read(image)), read) for read in (as_stored, Path)]
-    deviations = [abs(w / h / (stated[0] / stated[1]) - 1) for (w, h), _ in sizes]
+    aspect = stated[0] / stated[1]
+    readers = (as_stored, Path)
+    sizes = [image_size(read(image)) for read in readers]
+    deviations = [abs(width / height / aspect - 1) for width, height in sizes]
     least = min(deviations)
-    size, read = sizes[deviations.index(least)]
+    chosen = deviations.index(least)
+    size = sizes[chosen]
     if least > 0.01:
         reason = "cropped?"
         if size == stated[::-1]:
@@ -283,7 +294,7 @@ def _reader(image: Path, stated: Size, source: str) -> tuple[Size, Any]:
             f"{image}: is {size[0]}x{size[1]}, {source} says {stated[0]}x{stated[1]} ({reason});"
             f" give images of that shape"
         )
-    return size, read
+    return size, readers[chosen]
 
 
 def _test_names(root: Path, data: Entry, frames: list[str]) -> set[str]:

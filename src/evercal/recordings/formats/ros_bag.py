@@ -220,7 +220,7 @@ def _camera(message: Any, image_size: tuple[int, int], rectified: bool) -> Camer
         p = _numbers(message, "p")
         if len(p) != 12 or not any(p):
             raise ValueError("P is missing, which rectified images need; give `camera`")
-        k = [*p[:3], *p[4:7], *p[8:11]]
+        k = np.reshape(p, (3, 4))[:, :3].ravel().tolist()
         d = []
         model = ""
     data: dict[str, Any] = {"k": k, "d": d, "distortion_model": model}
@@ -262,7 +262,8 @@ def image_of(message: Any) -> Image:
             f"{width}x{height} {message.encoding}, step {step}, but {data.size} bytes"
         )
     # Rows may be padded, which the package rosbags-image ignores.
-    pixels = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :line])
+    rows = data[: height * step].reshape(height, step)
+    pixels = np.ascontiguousarray(rows[:, :line])
     if size == 2:
         pixels = pixels.view(">u2" if message.is_bigendian else "<u2").astype(np.uint16)
     pixels = pixels.reshape(height, width, channels)

@@ -88,7 +88,9 @@ def _camera(root: Path, images: Sequence[Path]) -> Camera:
     file = root / "camera-intrinsics.txt"
     if not file.exists():
         focal = _FOCAL_AT_640 * max(width, height) / 640.0
-        return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+        cx = (width - 1) / 2
+        cy = (height - 1) / 2
+        return Camera(width, height, focal, focal, cx, cy)
     matrix = read_numbers(file, 9, "3x3 intrinsic").reshape(3, 3)
     with named_errors(file, "camera"):
         return Camera.from_matrix(matrix, width, height)
@@ -96,7 +98,8 @@ def _camera(root: Path, images: Sequence[Path]) -> Camera:
 
 def colour_images(folder: Path) -> list[Path]:
     """Colour images of a folder, sorted by name."""
-    images = files_in(folder, (".color.png", ".color.jpg", ".color.jpeg"))
+    endings = (".color.png", ".color.jpg", ".color.jpeg")
+    images = files_in(folder, endings)
     if not images:
         raise InputError(
             f"{folder}: no images; expected frame-XXXXXX.color.png or .jpg"

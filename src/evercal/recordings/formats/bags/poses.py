@@ -269,8 +269,10 @@ def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[_TfTree, Array]
                 times.append(stamp)
             t = entry.transform.translation
             q = entry.transform.rotation
+            rotation = (q.w, q.x, q.y, q.z)
+            translation = (t.x, t.y, t.z)
             frames = (header.frame_id, entry.child_frame_id)
-            link = _Transform(*frames, stamp, (q.w, q.x, q.y, q.z), (t.x, t.y, t.z))
+            link = _Transform(*frames, stamp, rotation, translation)
             tree.add(link, message.topic.removesuffix("_static"))
     return tree, np.array(times)
 
