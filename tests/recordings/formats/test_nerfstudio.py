@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings import Frame, load_recording, write_image
 from evercal.recordings.formats import nerfstudio
@@ -128,21 +127,16 @@ def test_an_applied_transform_is_undone(
 ) -> None:
     # What ns-process-data does to its poses: a turn, a shift, then a scale.
     applied = SE3.exp(tangent).matrix()
-    matrices = ring(3)
-    moved = []
-    for matrix in matrices:
-        new = applied @ matrix
-        new[:3, 3] *= scale
-        moved.append(new)
     data = {**LENS, "applied_transform": applied[:3].tolist(), "applied_scale": scale}
     undo, divide = nerfstudio._applied(data)
-    for matrix, new in zip(matrices, moved, strict=True):
-        entry = {"file_path": "a.png", "transform_matrix": new.tolist()}
+    for matrix in ring(3):
+        moved = applied @ matrix
+        moved[:3, 3] *= scale
+        entry = {"file_path": "a.png", "transform_matrix": moved.tolist()}
         frame = nerfstudio._frame(Path(), data, entry, undo, divide)
         expected = gl_pixel(matrix, np.array(point))
-        np.testing.assert_allclose(
-            pixel_of(frame, np.array(point)), expected, atol=1e-6
-        )
+        pixel = pixel_of(frame, np.array(point))
+        np.testing.assert_allclose(pixel, expected, atol=1e-6)
 
 
 def test_test_filenames_are_test_frames(tmp_path: Path) -> None:
@@ -248,9 +242,8 @@ def test_broken_files_are_refused(
 ) -> None:
     file = write(tmp_path, entries(ring(2)), **LENS)
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
-    with pytest.raises(InputError, match=message) as caught:
-        load_recording(tmp_path)
-    assert "transforms.json" in str(caught.value)
+    names_the_file = r"(?=.*transforms\.json)"
+    refused(f"{names_the_file}.*{message}", load_recording, tmp_path)
 
 
 def test_distortion_params_are_k1_k2_k3_k4_p1_p2(tmp_path: Path) -> None:

@@ -74,12 +74,6 @@ def test_binned_images_have_smaller_intrinsics(tmp_path: Path) -> None:
     assert frame.camera == whole.resized(32, 24)
 
 
-def test_every_second_image_is_taken(tmp_path: Path) -> None:
-    path = recorded_bag("ros1").write(tmp_path)
-    recording = load_recording(path, options=ReadOptions(every=2))
-    assert [frame.name for frame in recording.train] == ["000000", "000002", "000004"]
-
-
 FORMS = ((".png", "png"), (".jpg", "rgb8; jpeg compressed bgr8"))
 """Endings of files, and formats of their messages."""
 
