@@ -31,7 +31,8 @@ class RadialModel(NamedTuple):
 def _fov(angle: Array, omega: float) -> Array:
     if not omega:
         return np.tan(angle)
-    return np.arctan(2 * np.tan(angle) * np.tan(omega / 2)) / omega
+    half = np.tan(omega / 2)
+    return np.arctan(2 * np.tan(angle) * half) / omega
 
 
 def _omni(angle: Array, xi: float) -> Array:
@@ -41,15 +42,17 @@ def _omni(angle: Array, xi: float) -> Array:
 def _eucm(angle: Array, alpha: float, beta: float) -> Array:
     cosine = np.cos(angle)
     sine = np.sin(angle)
-    distance = np.sqrt(beta * sine**2 + cosine**2)
-    return sine / (alpha * distance + (1 - alpha) * cosine)
+    squared = beta * sine**2 + cosine**2
+    depth = alpha * np.sqrt(squared) + (1 - alpha) * cosine
+    return sine / depth
 
 
 def _ds(angle: Array, xi: float, alpha: float) -> Array:
     sine = np.sin(angle)
     shifted = xi + np.cos(angle)
     distance = np.sqrt(sine**2 + shifted**2)
-    return sine / (alpha * distance + (1 - alpha) * shifted)
+    depth = alpha * distance + (1 - alpha) * shifted
+    return sine / depth
 
 
 RADIAL_MODELS = {
@@ -76,17 +79,20 @@ def nearest_fisheye(
         ValueError: No fisheye is within `MAX_ERROR_PX`.
     """
     radius = RADIAL_MODELS[name].radius
-    corner = np.maximum(centre, np.array(size) - 1 - centre) / focal
-    largest = np.hypot(*corner) * 1.01
+    last_pixel = np.array(size) - 1
+    corner = np.maximum(centre, last_pixel - centre)
+    largest = np.hypot(*(corner / focal)) * 1.01
     angles = np.deg2rad(np.linspace(0.05, FISHEYE_DEG, 400))
     radii = radius(angles, *parameters)
-    rising = np.cumprod(np.diff(radii, append=np.inf) > 0).astype(bool)
+    steps = np.diff(radii, append=np.inf)
+    rising = np.logical_and.accumulate(steps > 0)
     in_image = rising & np.isfinite(radii) & (radii <= largest)
     angles = angles[in_image]
     radii = radii[in_image]
     powers = angles[:, None] ** np.arange(1, 10, 2)
     terms = np.linalg.lstsq(powers, radii, rcond=None)[0]
-    error = np.abs(powers @ terms - radii).max() * max(focal)
+    residuals = powers @ terms - radii
+    error = np.abs(residuals).max() * max(focal)
     if not error < MAX_ERROR_PX:
         raise ValueError(
             f"no fisheye is nearer than {error:.1f} px to this {name} model"
